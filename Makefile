@@ -1,0 +1,41 @@
+# make train   set up .venv, train two PSM arms to reach, then evaluate     (ARGS="--seed 1")
+# make test    set up .venv, run the tests                                  (ARGS="-k cli")
+# make lint    style       make typecheck    types       make clean    remove what was built
+
+PYTHON ?= $(firstword $(shell command -v python3.11 python3 python))
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+ARGS ?=
+
+.DEFAULT_GOAL := help
+.PHONY: help train test lint typecheck clean
+
+help:
+	@sed -n 's/^# make/make/p' Makefile
+
+train: $(READY)
+	$(BIN)/surgical-marl train reach --scene bimanual_psm $(ARGS)
+
+test: $(READY)
+	$(BIN)/pytest -n 2 $(ARGS)
+
+lint: $(READY)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+typecheck: $(READY)
+	$(BIN)/mypy
+
+clean:
+	rm -rf $(VENV) build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# The stamp is newer than what defines the environment, so a second call starts at once.
+$(READY): pyproject.toml constraints.txt
+	@test -n "$(PYTHON)" || { echo "surgical-marl: no Python found, install Python 3.11 or newer" >&2; exit 2; }
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo \
+	  "surgical-marl: $$($(PYTHON) --version) is too old, name Python 3.11 or newer: make PYTHON=python3.11" >&2; exit 2; }
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --no-input --quiet --progress-bar off -c constraints.txt -e '.[test]'
+	@touch $@

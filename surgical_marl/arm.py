@@ -1,0 +1,329 @@
+"""One surgical arm, read from its folder: a URDF for the body, `arm.yaml` for how it is driven.
+
+    arm = load_arm("psm")
+    arm.forward_kinematics(arm.home)            # tool tip in the base frame, 4 x 4
+    spec = arm.spec(control="position")         # mujoco.MjSpec, to attach in a scene
+
+Every number of a shipped arm and its source stands in `arms/<name>/README.md`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, fields
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import yaml
+
+from surgical_marl.content import find
+
+if TYPE_CHECKING:
+    import mujoco
+    from yourdfpy import urdf as yourdf
+
+CONTROL_MODES = ("position", "velocity", "torque")
+MOVING = ("revolute", "prismatic")
+
+
+@dataclass(frozen=True)
+class Drive:
+    """How one joint is driven. SI units: N m/rad, N m s/rad, kg m2, rad/s, rad (or N/m, N s/m, kg, m/s, m)."""
+
+    stiffness: float
+    damping: float
+    speed: float
+    armature: float = 0.0
+    home: float = 0.0
+
+
+@dataclass(frozen=True)
+class Jaw:
+    """The jaw is one command, open or closed, that moves `joint` and the joints that mimic it."""
+
+    joint: str
+    open: float
+    closed: float
+
+
+@dataclass(frozen=True)
+class Joint:
+    """A moving joint of the URDF with its drive. `leader` is the joint it mimics, or its own name."""
+
+    name: str
+    slides: bool
+    lower: float
+    upper: float
+    velocity: float
+    effort: float
+    viscous: float
+    leader: str
+    multiplier: float
+    offset: float
+    drive: Drive
+
+
+@dataclass(frozen=True)
+class Arm:
+    """A surgical arm. Angles in rad, lengths in m, in the frame of the URDF's root link (the base frame)."""
+
+    name: str
+    folder: Path
+    description: str
+    tool_tip: str
+    remote_center: bool
+    jaw: Jaw | None
+    joints: tuple[Joint, ...]
+    """All moving joints in the order of the chain, those that mimic another included."""
+    urdf: Any = field(repr=False)
+
+    @cached_property
+    def actuated(self) -> tuple[Joint, ...]:
+        """Joints with a command of their own, in the order of `q`, actions and observations."""
+        return tuple(joint for joint in self.joints if joint.leader == joint.name)
+
+    @property
+    def home(self) -> np.ndarray:
+        """Joint positions at the start of an episode, shape [n]."""
+        return np.array([joint.drive.home for joint in self.actuated])
+
+    @property
+    def lower(self) -> np.ndarray:
+        """Lower joint limits, shape [n]."""
+        return np.array([joint.lower for joint in self.actuated])
+
+    @property
+    def upper(self) -> np.ndarray:
+        """Upper joint limits, shape [n]."""
+        return np.array([joint.upper for joint in self.actuated])
+
+    def forward_kinematics(self, q: Any) -> Any:
+        """Pose of the tool tip in the base frame.
+
+        Args:
+            q: joint positions, shape [..., n], in the order of `actuated`; joints that don't move the tip (the jaw)
+                may be left out at the end. A numpy or a JAX array.
+
+        Returns:
+            Homogeneous transforms, shape [..., 4, 4], of the same kind of array.
+
+        Raises:
+            ValueError: if the last axis is too short or too long.
+        """
+        return self.link_poses(q, (self.tool_tip,))[self.tool_tip]
+
+    def jacobian(self, q: Any) -> Any:
+        """Geometric Jacobian [..., 6, n] of the tool tip: linear over angular velocity in the base frame, per joint
+        rate.
+
+        `q` as in `forward_kinematics`; n counts all of `actuated`, and joints that don't move the tip have zero
+        columns.
+        """
+        chain = [joint for joint in self._chain(self.tool_tip) if joint.type in MOVING]
+        poses = self.link_poses(q, (self.tool_tip, *(joint.child for joint in chain)))
+        tip = poses[self.tool_tip][..., :3, 3]
+        xp = tip.__array_namespace__()
+        joints = {joint.name: joint for joint in self.joints}
+        columns = {joint.name: xp.zeros((*tip.shape[:-1], 6), dtype=tip.dtype) for joint in self.actuated}
+        for element in chain:
+            joint, pose = joints[element.name], poses[element.child]
+            axis = xp.broadcast_to(pose[..., :3, :3] @ _unit(element.axis), tip.shape)
+            linear = axis if joint.slides else xp.linalg.cross(axis, tip - pose[..., :3, 3])
+            angular = xp.zeros_like(axis) if joint.slides else axis
+            columns[joint.leader] = columns[joint.leader] + joint.multiplier * xp.concatenate([linear, angular], -1)
+        return xp.stack(list(columns.values()), -1)
+
+    def link_poses(self, q: Any, links: tuple[str, ...]) -> dict[str, Any]:
+        """Poses [..., 4, 4] of some links in the base frame; `q` as in `forward_kinematics`."""
+        if not hasattr(q, "__array_namespace__"):
+            q = np.asarray(q, dtype=float)
+        xp = q.__array_namespace__()
+        names = [joint.name for joint in self.actuated]
+        joints = {joint.name: joint for joint in self.joints}
+        chains = {link: self._chain(link) for link in links}
+        moved_by = {joints[j.name].leader for chain in chains.values() for j in chain if j.type in MOVING}
+        least = max((names.index(name) + 1 for name in moved_by), default=0)
+        if q.ndim == 0 or not least <= q.shape[-1] <= len(names):
+            raise ValueError(
+                f"q of shape {tuple(q.shape)} does not fit arm {self.name!r}: "
+                f"its last axis must hold the joints {', '.join(names)}"
+            )
+        known: dict[str, Any] = {}
+        for link, chain in chains.items():
+            pose = xp.eye(4, dtype=q.dtype)
+            for element in chain:
+                if element.child not in known:
+                    known[element.child] = pose @ _matrix(element.origin)
+                    if element.type in MOVING:
+                        joint = joints[element.name]
+                        value = joint.multiplier * q[..., names.index(joint.leader)] + joint.offset
+                        known[element.child] = known[element.child] @ _motion(value, element.axis, joint.slides)
+                pose = known[element.child]
+            known[link] = pose
+        return {link: xp.broadcast_to(known[link], (*q.shape[:-1], 4, 4)) for link in links}
+
+    def _chain(self, link: str) -> list[yourdf.Joint]:
+        parents = {joint.child: joint for joint in self.urdf.joints}
+        chain: list[yourdf.Joint] = []
+        while link in parents:
+            chain.append(parents[link])
+            link = parents[link].parent
+        return chain[::-1]
+
+    def spec(self, control: str = "position") -> mujoco.MjSpec:
+        """A new MuJoCo model of the arm, its base frame at the origin, its actuators in one of `CONTROL_MODES`."""
+        from surgical_marl.arm_spec import build_spec
+
+        return build_spec(self, control)
+
+
+def load_arm(name: str | Path) -> Arm:
+    """Reads an arm by a shipped name (`list_arms()`) or the path of a folder that holds `arm.yaml`.
+
+    Raises:
+        ValueError: unknown name, or a URDF or `arm.yaml` that does not hold what it must.
+    """
+    folder = find("arms", name)
+    settings = read_yaml(folder / "arm.yaml")
+    check_keys(settings, ("description", "urdf", "tool_tip", "remote_center", "joints", "jaw"), folder / "arm.yaml")
+    urdf = _read_urdf(folder / str(settings.get("urdf", "")))
+    joints = _read_joints(urdf, settings.get("joints") or {}, folder)
+    tool_tip = str(settings.get("tool_tip"))
+    links = [link.name for link in urdf.links]
+    if tool_tip not in links:
+        raise ValueError(f"{folder / 'arm.yaml'}: tool_tip {tool_tip!r} is not a link of the URDF ({', '.join(links)})")
+    jaw = settings.get("jaw")
+    if jaw is not None:
+        jaw = _build(Jaw, jaw, folder / "arm.yaml")
+        leaders = [joint.name for joint in joints if joint.leader == joint.name]
+        if jaw.joint not in leaders:
+            raise ValueError(f"{folder / 'arm.yaml'}: jaw joint {jaw.joint!r} is not one of {', '.join(leaders)}")
+    return Arm(
+        name=folder.name,
+        folder=folder,
+        description=str(settings.get("description", "")),
+        tool_tip=tool_tip,
+        remote_center=bool(settings.get("remote_center", False)),
+        jaw=jaw,
+        joints=joints,
+        urdf=urdf,
+    )
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """Reads a YAML mapping; ValueError with the line if it does not parse."""
+    try:
+        content = yaml.safe_load(path.read_text())
+    except (OSError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path} cannot be read: {error}") from None
+    except yaml.YAMLError as error:
+        raise ValueError(f"{path} is not valid YAML: {' '.join(str(error).split())}") from None
+    if not isinstance(content, dict):
+        raise ValueError(f"{path} must hold a YAML mapping, not {type(content).__name__}")
+    return content
+
+
+def check_keys(mapping: dict[str, Any], known: tuple[str, ...], where: Path | str) -> None:
+    """ValueError if the mapping has a key that nobody reads."""
+    for key in mapping:
+        if key not in known:
+            raise ValueError(f"{where}: unknown key {key!r}; the keys are {', '.join(known)}")
+
+
+def _build(cls: type, mapping: Any, where: Path | str) -> Any:
+    if not isinstance(mapping, dict):
+        raise ValueError(f"{where}: {mapping!r} must be a mapping with the keys of {cls.__name__.lower()}")
+    names = tuple(f.name for f in fields(cls))
+    check_keys(mapping, names, where)
+    values: dict[str, Any] = {}
+    for key, value in mapping.items():
+        if cls.__annotations__[key] == "float":
+            if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+                raise ValueError(f"{where}: {key} must be a finite number, not {value!r}")
+            value = float(value)
+        values[key] = value
+    try:
+        return cls(**values)
+    except TypeError:
+        missing = [name for name in names if name not in values]
+        raise ValueError(f"{where}: a {cls.__name__.lower()} lacks {', '.join(missing)}") from None
+
+
+def _read_urdf(path: Path) -> yourdf.Robot:
+    import yourdfpy
+
+    if not path.is_file():
+        raise ValueError(f"there is no URDF file {path}")
+    try:
+        return yourdfpy.URDF.load(str(path), build_scene_graph=False, load_meshes=False).robot
+    except Exception as error:  # yourdfpy lets through whatever lxml, float() or its own code raises
+        raise ValueError(f"{path} is not a URDF that can be read: {' '.join(str(error).split())}") from None
+
+
+def _read_joints(urdf: yourdf.Robot, drives: dict[str, Any], folder: Path) -> tuple[Joint, ...]:
+    where = folder / "arm.yaml"
+    moving = {joint.name: joint for joint in urdf.joints if joint.type in MOVING}
+    if not isinstance(drives, dict):
+        raise ValueError(f"{where}: joints must be a mapping from joint name to drive")
+    check_keys(drives, tuple(moving), f"{where}, joints")
+    for joint in urdf.joints:
+        if joint.type not in (*MOVING, "fixed"):
+            raise ValueError(f"{folder}: joint {joint.name!r} is {joint.type}; revolute, prismatic and fixed work")
+    joints = []
+    for name, joint in moving.items():
+        leader = joint.mimic.joint if joint.mimic else name
+        if leader not in moving:
+            raise ValueError(f"{folder}: joint {name!r} mimics {leader!r}, which is not a moving joint of the URDF")
+        if leader not in drives:
+            raise ValueError(f"{where}: joint {leader!r} has no drive; give its stiffness, damping and speed")
+        limit = joint.limit
+        if limit is None or None in (limit.lower, limit.upper, limit.velocity, limit.effort):
+            raise ValueError(f"{folder}: joint {name!r} needs a limit with lower, upper, velocity and effort")
+        if not limit.lower < limit.upper:
+            raise ValueError(f"{folder}: joint {name!r} has lower limit {limit.lower} not below upper {limit.upper}")
+        viscous = joint.dynamics.damping if joint.dynamics else None
+        joints.append(
+            Joint(
+                name=name,
+                slides=joint.type == "prismatic",
+                lower=float(limit.lower),
+                upper=float(limit.upper),
+                velocity=float(limit.velocity),
+                effort=float(limit.effort),
+                viscous=float(viscous or 0.0),
+                leader=leader,
+                multiplier=float(_or(joint.mimic and joint.mimic.multiplier, 1.0)),
+                offset=float(_or(joint.mimic and joint.mimic.offset, 0.0)),
+                drive=_build(Drive, drives[leader], f"{where}, joint {leader!r}"),
+            )
+        )
+    return tuple(joints)
+
+
+def _or(value: Any, default: float) -> Any:
+    return default if value is None else value
+
+
+def _matrix(origin: np.ndarray | None) -> np.ndarray:
+    return np.eye(4) if origin is None else np.asarray(origin, dtype=float)
+
+
+def _unit(axis: np.ndarray) -> np.ndarray:
+    return np.asarray(axis, dtype=float) / np.linalg.norm(axis)
+
+
+def _motion(value: Any, axis: np.ndarray, slides: bool) -> Any:
+    """Transform [..., 4, 4] of a joint: a slide along its axis, or a turn about it (Rodrigues' formula)."""
+    xp = value.__array_namespace__()
+    axis = _unit(axis)
+    value = value[..., None, None]
+    if slides:
+        step = np.zeros((4, 4))
+        step[:3, 3] = axis
+        return np.eye(4) + value * step
+    x, y, z = axis
+    cross = np.zeros((4, 4))
+    cross[:3, :3] = [[0, -z, y], [z, 0, -x], [-y, x, 0]]
+    return np.eye(4) + xp.sin(value) * cross + (1 - xp.cos(value)) * (cross @ cross)

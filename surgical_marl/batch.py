@@ -1,0 +1,208 @@
+"""Many environments at once: dicts of agents to arrays with a leading axis of environments.
+
+    env = BatchedEnv("reach", "bimanual_psm", num_envs=1024, arrays="torch")
+    observations, state, infos = env.reset(seed=0)
+    step = env.step({agent: torch.zeros(1024, 7) for agent in env.agents})
+
+An environment that ends starts its next episode within the same step.
+"""
+
+from __future__ import annotations
+
+import secrets
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from gymnasium import spaces
+
+from surgical_marl.engines.mjx import MjxEngine
+from surgical_marl.env import Carry, Env
+
+ENGINES = ("auto", "mjx")
+ARRAYS = ("numpy", "torch", "jax")
+
+
+class BatchStep(NamedTuple):
+    """What a step returns. Shapes start with N, the number of environments; dicts are keyed by agent."""
+
+    observations: dict[str, Any]
+    """[N, d]; of the next episode where one ended."""
+    state: Any
+    """[N, S], the whole state for a centralised critic, likewise."""
+    rewards: dict[str, Any]
+    terminated: Any
+    """[N] bool"""
+    truncated: Any
+    """[N] bool: the time limit."""
+    final_observations: dict[str, Any]
+    """[N, d], of this step's episode even where it ended."""
+    final_state: Any
+    infos: dict[str, dict[str, Any]]
+    """agent -> tip_error [N] (m), success, collision [N] (bool), min_distance [N] (m); of this step's episode."""
+
+
+class BatchedEnv:
+    """N environments of one task on one scene.
+
+    Args:
+        task, scene, control, max_steps: as for `surgical_marl.env.Env`.
+        num_envs: how many environments.
+        engine: "mjx", or "auto" for the fastest that works.
+        device: "cpu", "cuda" or "auto".
+        arrays: library of the arrays that come back, "numpy", "torch" or "jax". Torch shares memory with the engine:
+            don't write into what you get.
+
+    Raises:
+        ValueError: naming what is unknown or out of range.
+    """
+
+    def __init__(
+        self,
+        task: str = "reach",
+        scene: str = "bimanual_psm",
+        *,
+        num_envs: int = 1,
+        control: str = "position",
+        engine: str = "auto",
+        device: str = "auto",
+        max_steps: int | None = None,
+        arrays: str = "numpy",
+    ) -> None:
+        if isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1:
+            raise ValueError(f"num_envs must be a whole number of at least 1, not {num_envs!r}")
+        if engine not in ENGINES:
+            raise ValueError(f"unknown engine {engine!r}; the engines are {', '.join(ENGINES)}")
+        if arrays not in ARRAYS:
+            raise ValueError(f"unknown arrays {arrays!r}; the libraries are {', '.join(ARRAYS)}")
+        self.env = Env(task, scene, control, max_steps)
+        self.engine = MjxEngine(self.env, num_envs, device)
+        self.num_envs, self.arrays = num_envs, arrays
+        self.agents = list(self.env.agents)
+        self.types = {name: list(agents) for name, agents in self.env.scene.types.items()}
+        self.max_steps, self.control_dt = self.env.max_steps, self.env.control_dt
+        self.task_name, self.scene, self.control = task, self.env.scene, control
+        self.device = {"cpu": "cpu"}.get(self.engine.device.platform, "cuda")
+        self._observation_spaces = {agent: self.env.observation_space(agent) for agent in self.agents}
+        self._action_spaces = {agent: self.env.action_space(agent) for agent in self.agents}
+        self.state_space = self.env.state_space
+        self._carry: Carry | None = None
+        self._stepped = False
+
+    def observation_space(self, agent: str) -> spaces.Box:
+        """Of one environment."""
+        return self._observation_spaces[agent]
+
+    def action_space(self, agent: str) -> spaces.Box:
+        """Of one environment."""
+        return self._action_spaces[agent]
+
+    def reset(self, seed: int | None = None) -> tuple[dict[str, Any], Any, dict[str, dict[str, Any]]]:
+        """Starts a new episode in all environments; returns observations, state and infos.
+
+        Args:
+            seed: environment i plays the same episodes for the same seed, whatever `num_envs`. None goes on to each
+                environment's next episode, or draws a seed if there was none yet.
+        """
+        if seed is not None and (isinstance(seed, bool) or not 0 <= seed < 2**63):
+            raise ValueError(f"seed must be a whole number from 0 to 2**63 - 1, not {seed!r}")
+        if seed is None and self._carry is not None:
+            # an environment that ended has begun its next episode already, in the step that ended it
+            begun = (self._carry.steps == 0) & self._stepped
+            state = self.engine.restart(self._carry.key, self._carry.episode + ~begun)
+        else:
+            state = self.engine.reset(secrets.randbits(63) if seed is None else int(seed))
+        self._carry, self._stepped = state.carry, False
+        return self._convert(state.observations), self._convert(state.state), self._convert(state.infos)
+
+    def step(self, actions: dict[str, Any]) -> BatchStep:
+        """One control step of all environments.
+
+        Args:
+            actions: agent -> [N, n] in [-1, 1], of any array library; larger values are clipped.
+
+        Raises:
+            ValueError: an agent is missing or unknown, a shape is wrong, or a value is not finite (numpy only).
+        """
+        if self._carry is None:
+            raise ValueError("step before reset: call reset() first")
+        state = self.engine.step(self._carry, self._check(actions))
+        self._carry, self._stepped = state.carry, True
+        return BatchStep(**{name: self._convert(getattr(state, name)) for name in BatchStep._fields})
+
+    @property
+    def qpos(self) -> np.ndarray:
+        """Joint positions of the whole scene, [N, nq], for pictures; `goals` beside it."""
+        return np.asarray(self._running().physics.qpos)
+
+    @property
+    def goal(self) -> Any:
+        """The task's goal of every environment, numpy."""
+        return jax.tree.map(np.asarray, self._running().goal)
+
+    @property
+    def steps(self) -> Any:
+        """Steps since reset in each environment, [N] int32. Set it to let episodes end at different times."""
+        return self._convert(self._running().steps)
+
+    @steps.setter
+    def steps(self, steps: Any) -> None:
+        value = self.engine.to_device(np.asarray(steps, np.int32))
+        if value.shape != (self.num_envs,):
+            raise ValueError(f"steps of shape {value.shape} must be [{self.num_envs}]")
+        self._carry = self._running()._replace(steps=value)
+
+    def carry(self) -> dict[str, np.ndarray]:
+        """All that the next step depends on, as copies, for checkpoints."""
+        leaves = jax.tree_util.tree_flatten_with_path(self._running())[0]
+        return {jax.tree_util.keystr(path): np.array(leaf) for path, leaf in leaves}
+
+    def set_carry(self, carry: dict[str, Any]) -> None:
+        """Goes on from what `carry()` returned. ValueError if it is of another scene, task or `num_envs`."""
+        shapes = jax.eval_shape(self.engine.reset, 0).carry
+        paths, tree = jax.tree_util.tree_flatten_with_path(shapes)
+        leaves = []
+        for path, shape in paths:
+            name = jax.tree_util.keystr(path)
+            value = np.asarray(carry.get(name))
+            if value.shape != shape.shape:
+                raise ValueError(f"environment state {name} of shape {value.shape} does not fit {shape.shape}")
+            leaves.append(self.engine.to_device(value.astype(shape.dtype)))
+        self._carry, self._stepped = jax.tree_util.tree_unflatten(tree, leaves), True
+
+    def _running(self) -> Carry:
+        if self._carry is None:
+            raise ValueError("no episode yet: call reset() first")
+        return self._carry
+
+    def _check(self, actions: dict[str, Any]) -> dict[str, jax.Array]:
+        for agent in actions:
+            if agent not in self._action_spaces:
+                raise ValueError(f"action for {agent!r}, which is not an agent of the scene ({', '.join(self.agents)})")
+        checked = {}
+        for agent in self.agents:
+            if agent not in actions:
+                raise ValueError(f"no action for agent {agent!r}")
+            action, shape = actions[agent], (self.num_envs, *self._action_spaces[agent].shape)
+            if tuple(np.shape(action)) != shape:
+                raise ValueError(f"action of {agent!r} has shape {tuple(np.shape(action))}, it must be {shape}")
+            if isinstance(action, np.ndarray | list | tuple):
+                action = np.asarray(action, np.float32)
+                if not np.isfinite(action).all():
+                    raise ValueError(f"action of {agent!r} holds a value that is not finite")
+            checked[agent] = self._take(action)
+        return checked
+
+    def _take(self, action: Any) -> jax.Array:
+        if type(action).__module__.startswith("torch"):
+            action = jax.dlpack.from_dlpack(action.detach().contiguous().float())
+        return self.engine.to_device(action)
+
+    def _convert(self, tree: Any) -> Any:
+        if self.arrays == "jax":
+            return tree
+        if self.arrays == "torch":
+            import torch
+
+            return jax.tree.map(torch.from_dlpack, tree)
+        return jax.tree.map(np.asarray, tree)

@@ -1,0 +1,224 @@
+"""The command `surgical-marl`: train, eval, list, doctor."""
+
+from __future__ import annotations
+
+# Only light imports up here: `list` and a typing error should answer at once. What needs torch or
+# JAX is imported by the command that needs it.
+import argparse
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+from surgical_marl.content import find, list_arms, list_policies, list_scenes, list_tasks, unknown
+
+_LISTS = {
+    "tasks": list_tasks,
+    "scenes": list_scenes,
+    "arms": list_arms,
+    "policies": list_policies,
+}
+
+# Flags of `train` that are short for `key=value`: key, good values or a placeholder, help.
+_SETTINGS: tuple[tuple[str, str | tuple[str, ...], str], ...] = (
+    ("algo", ("mappo", "ippo", "joint"), "who learns from what"),
+    ("num_envs", "N", "environments that run side by side"),
+    ("iterations", "K", "rounds of acting and learning"),
+    ("seed", "S", "seed of everything random"),
+    ("engine", ("auto", "mjx"), "what runs the physics"),
+    ("device", ("auto", "cpu", "cuda"), "where it runs"),
+    ("control", ("position", "velocity", "torque"), "what an action commands"),
+)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command; returns 0, 1 if training diverged, 2 for bad input, 130 if interrupted."""
+    try:
+        arguments = _parse(argv)
+        arguments.command(arguments)
+        sys.stdout.flush()
+    except ValueError as error:
+        print(f"surgical-marl: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    except FloatingPointError as error:
+        print(f"surgical-marl: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("surgical-marl: interrupted", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        # The reader (`| head`) has left. Point stdout away so that Python's exit does not complain.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return 0
+
+
+class _Parser(argparse.ArgumentParser):
+    """Raises instead of printing its usage, so that all bad input ends in `main` alike."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(allow_abbrev=False, **options)
+
+    def error(self, message: str) -> NoReturn:
+        raise ValueError(message)
+
+
+def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
+    # argparse cannot take `key=value` after a flag as a positional: collect what it leaves over.
+    arguments, rest = _parser().parse_known_args(argv)
+    arguments.overrides = [text for text in rest if "=" in text and not text.startswith("-")]
+    for text in rest:
+        if text not in arguments.overrides or arguments.command is not _train:
+            raise ValueError(f"unknown argument {text!r}, see surgical-marl {arguments.name} --help")
+    return arguments
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(prog="surgical-marl", description="Surgical robot arms that learn together.")
+    parser.add_argument("--version", action="version", version=f"%(prog)s {_version()}")
+    commands = parser.add_subparsers(required=True, metavar="{train,eval,list,doctor}")
+
+    train = commands.add_parser(
+        "train",
+        help="train a policy, then evaluate it",
+        usage="%(prog)s TASK --scene SCENE [options] [key=value ...]",
+        epilog="key=value sets anything in configs/, such as ppo.learning_rate=3e-4",
+    )
+    train.add_argument("task", metavar="TASK", help=f"one of: {', '.join(list_tasks())}")
+    train.add_argument("--scene", required=True, help="a name (see `list scenes`) or a .yaml file")
+    for key, good, text in _SETTINGS:
+        flag, check = f"--{key.replace('_', '-')}", str if isinstance(good, str) else _one_of(good)
+        train.add_argument(flag, type=check, metavar=good if isinstance(good, str) else "|".join(good), help=text)
+    train.add_argument("--out", type=Path, metavar="DIR", help="run folder (default: runs/...)")
+    train.add_argument("--resume", type=Path, metavar="DIR", help="run folder to continue from")
+    train.set_defaults(command=_train, name="train")
+
+    evaluate = commands.add_parser("eval", help="measure a trained policy")
+    evaluate.add_argument("policy", metavar="RUN_OR_POLICY", help="a run folder or a policy's name")
+    evaluate.add_argument("--episodes", type=_whole(1), default=200, metavar="N")
+    evaluate.add_argument("--seed", type=_whole(0), default=0, metavar="S")
+    evaluate.add_argument("--json", action="store_true", help="one JSON object instead of a table")
+    evaluate.set_defaults(command=_eval, name="eval")
+
+    names = commands.add_parser("list", help="list tasks, scenes, arms and policies")
+    names.add_argument("kind", nargs="?", type=_one_of(tuple(_LISTS)), metavar="|".join(_LISTS))
+    names.set_defaults(command=_list, name="list")
+
+    doctor = commands.add_parser("doctor", help="check this machine and this installation")
+    doctor.set_defaults(command=_doctor, name="doctor")
+    return parser
+
+
+def _list(arguments: argparse.Namespace) -> None:
+    if arguments.kind:
+        print("\n".join(_LISTS[arguments.kind]()))
+        return
+    for kind, names in _LISTS.items():
+        print(f"{kind:9} {', '.join(names()) or '-'}")
+
+
+def _doctor(arguments: argparse.Namespace) -> None:
+    from surgical_marl.doctor import report
+
+    for what, finding in report():
+        print(f"{what:16} {finding}", flush=True)
+
+
+def _train(arguments: argparse.Namespace) -> None:
+    if arguments.task not in list_tasks():
+        raise unknown("task", arguments.task, list_tasks())
+    find("scenes", arguments.scene)
+    given = ((key, getattr(arguments, key)) for key, _, _ in _SETTINGS)
+    flags = [f"{key}={value}" for key, value in given if value is not None]
+
+    from surgical_marl.learning.config import load_config
+
+    settings = load_config(arguments.task, arguments.scene, [*flags, *arguments.overrides])
+    out = arguments.out or arguments.resume or _run_folder(settings)
+
+    from surgical_marl.learning.run import write_atomic
+    from surgical_marl.learning.train import train
+
+    run = train(settings, out=out, resume=arguments.resume)
+    env, policy = _load(run, num_envs=200)
+    result = _evaluate(env, policy, episodes=200, seed=0)
+    text = json.dumps(result, indent=2) + "\n"
+    write_atomic(run / "eval.json", lambda path: path.write_text(text))
+    print(_table(result))
+    print(run, flush=True)
+
+    from surgical_marl.view.record import record
+
+    print("recording a video", file=sys.stderr)
+    record(env, policy, run / "video.mp4")
+
+
+def _eval(arguments: argparse.Namespace) -> None:
+    run = find("policies", arguments.policy)
+    env, policy = _load(run, num_envs=arguments.episodes)
+    result = _evaluate(env, policy, arguments.episodes, arguments.seed)
+    print(json.dumps(result) if arguments.json else _table(result))
+
+
+def _load(run: Path, num_envs: int) -> tuple[Any, Any]:
+    """The environment of a run, on whatever this machine has, and its policy."""
+    from surgical_marl.evaluation import MAX_BATCH
+    from surgical_marl.learning.policy import load_policy
+    from surgical_marl.learning.run import read_settings
+    from surgical_marl.learning.train import make_env
+
+    settings = read_settings(run, ["engine=auto", "device=auto"])
+    env = make_env(settings, min(num_envs, MAX_BATCH))
+    return env, load_policy(run, env)
+
+
+def _evaluate(env: Any, policy: Any, episodes: int, seed: int) -> dict[str, Any]:
+    from surgical_marl.evaluation import evaluate
+
+    print(f"evaluating {episodes} episodes", file=sys.stderr)
+    return evaluate(env, policy, episodes=episodes, seed=seed)
+
+
+def _table(result: dict[str, Any]) -> str:
+    from surgical_marl.evaluation import format_table
+
+    return format_table(result)
+
+
+def _run_folder(settings: Any) -> Path:
+    scene = Path(settings.scene).stem
+    stamp = time.strftime("%Y%m%d-%H%M%S")
+    return Path("runs") / f"{settings.task}-{scene}-{settings.algo}-seed{settings.seed}-{stamp}"
+
+
+def _one_of(good: Sequence[str]) -> Callable[[str], str]:
+    def check(text: str) -> str:
+        if text not in good:
+            raise argparse.ArgumentTypeError(str(unknown("choice", text, good)))
+        return text
+
+    return check
+
+
+def _whole(least: int) -> Callable[[str], int]:
+    def check(text: str) -> int:
+        if not text.isdecimal() or int(text) < least:
+            raise argparse.ArgumentTypeError(f"must be a whole number of {least} or more, not {text!r}")
+        return int(text)
+
+    return check
+
+
+def _version() -> str:
+    import importlib.metadata
+
+    try:
+        return importlib.metadata.version("surgical-marl")
+    except importlib.metadata.PackageNotFoundError:
+        return "not installed"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

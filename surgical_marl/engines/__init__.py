@@ -1,0 +1,1 @@
+"""What runs environments: `mjx` is the reference."""

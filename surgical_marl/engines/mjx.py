@@ -1,0 +1,72 @@
+"""The reference engine: `Env` under `jax.vmap`, physics by MuJoCo MJX."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from surgical_marl.env import Carry, Env, State
+
+DEVICES = ("auto", "cpu", "cuda")
+
+
+class MjxEngine:
+    """`num_envs` copies of an environment; every array gains a leading axis of that length."""
+
+    name = "mjx"
+
+    def __init__(self, env: Env, num_envs: int, device: str = "auto") -> None:
+        self.env, self.num_envs = env, num_envs
+        self.device = find_device(device)
+        self._first_keys = jax.jit(jax.vmap(jax.random.fold_in, (None, 0)))
+        self._reset = jax.jit(jax.vmap(env.reset))
+        self._step = jax.jit(jax.vmap(env.step), donate_argnums=0)
+        self._compiled = False
+
+    def reset(self, seed: int) -> State:
+        """First episodes. Environment i depends on `seed` and i alone, not on how many there are."""
+        with jax.default_device(self.device):
+            keys = self._first_keys(jax.random.PRNGKey(seed), jnp.arange(self.num_envs))
+            return self.restart(keys, jnp.zeros(self.num_envs, jnp.int32))
+
+    def restart(self, keys: Array, episodes: Array) -> State:
+        """The start of given episodes: keys [N, 2], episode numbers [N]."""
+        self._announce()
+        with jax.default_device(self.device):
+            return self._reset(keys, episodes)
+
+    def step(self, carry: Carry, actions: dict[str, Array]) -> State:
+        """One control step of all environments; `carry` may not be used again."""
+        with jax.default_device(self.device):
+            return self._step(carry, actions)
+
+    def to_device(self, value: Any) -> Array:
+        """Any array on the engine's device."""
+        return jax.device_put(value, self.device)
+
+    def _announce(self) -> None:
+        if not self._compiled:
+            envs = "1 environment" if self.num_envs == 1 else f"{self.num_envs} environments"
+            print(
+                f"surgical-marl: compiling {self.env.task_name} on {self.env.scene.name} for {envs} "
+                f"({self.name}, {self.device.platform}); a second start takes it from the cache",
+                file=sys.stderr,
+                flush=True,
+            )
+            self._compiled = True
+
+
+def find_device(device: str) -> Any:
+    """The JAX device for "auto", "cpu" or "cuda". ValueError if it is not there."""
+    if device not in DEVICES:
+        raise ValueError(f"unknown device {device!r}; the devices are {', '.join(DEVICES)}")
+    if device == "auto":
+        return jax.devices()[0]
+    try:
+        return jax.devices(device)[0]
+    except RuntimeError:
+        raise ValueError(f"device {device!r} is not there: JAX sees {jax.default_backend()} only") from None

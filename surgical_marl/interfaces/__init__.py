@@ -1,0 +1,1 @@
+"""Thin faces of the batched environment: PettingZoo, Gymnasium, rsl_rl."""

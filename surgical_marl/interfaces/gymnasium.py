@@ -1,0 +1,135 @@
+"""The Gymnasium face: one arm as itself, several arms as one joint agent.
+
+    env = gymnasium.make("surgical_marl/Reach-v0", scene="psm")
+    envs = gymnasium.make_vec("surgical_marl/Reach-v0", scene="psm", num_envs=1024)
+
+The numbers are those of the parallel face. A joint agent observes all observations and gives all actions, one after the
+other in the order of the scene's agents, and earns the sum of the rewards.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from surgical_marl.batch import BatchedEnv
+from surgical_marl.interfaces.pettingzoo import RENDER_MODES
+
+
+class SurgicalEnv(gymnasium.Env[np.ndarray, np.ndarray]):
+    """One environment. `info` holds tip_error (m, the worst arm's), success (of all), collision (of any), min_distance
+    (m), and for several arms also "agents": the same for each."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012 (Gymnasium's own convention)
+
+    def __init__(self, task: str = "reach", scene: str = "psm", render_mode: str | None = None, **options: Any) -> None:
+        """`options` are those of `surgical_marl.batch.BatchedEnv`: control, engine, device, max_steps."""
+        if render_mode not in RENDER_MODES:
+            raise ValueError(f"unknown render_mode {render_mode!r}; the modes are None and 'rgb_array'")
+        self.render_mode = render_mode
+        self.batch = BatchedEnv(task, scene, **options)
+        self.observation_space, self.action_space = _joint_spaces(self.batch)
+        self._picture: Any = None
+        self._over = True
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Starts an episode. With a seed the same one each time; without, the next of the last seed's episodes."""
+        super().reset(seed=seed)
+        _, state, infos = self.batch.reset(seed)
+        self._over = False
+        return np.array(state[0]), _joint_info(infos, 0)
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """One control step. ValueError for a wrong shape, a value that is not finite, or an episode that is over."""
+        if self._over:
+            raise ValueError("the episode is over: call reset() before step()")
+        step = self.batch.step(_split(self.batch, np.asarray(action)[None]))
+        terminated, truncated = bool(step.terminated[0]), bool(step.truncated[0])
+        self._over = terminated or truncated
+        reward = float(sum(reward[0] for reward in step.rewards.values()))
+        return np.array(step.final_state[0]), reward, terminated, truncated, _joint_info(step.infos, 0)
+
+    def render(self) -> np.ndarray | None:
+        """A picture [H, W, 3] uint8 with render_mode="rgb_array", else None."""
+        if self.render_mode is None:
+            return None
+        from surgical_marl.view.record import ScenePicture
+
+        self._picture = self._picture or ScenePicture(self.batch)
+        return self._picture.draw()
+
+
+class SurgicalVectorEnv(VectorEnv[np.ndarray, np.ndarray, Any]):
+    """N environments that restart in the step that ends them; `infos["final_obs"]` then holds their last
+    observation."""
+
+    metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
+
+    def __init__(
+        self, num_envs: int = 1, task: str = "reach", scene: str = "psm", max_episode_steps: int | None = None,
+        render_mode: str | None = None, **options: Any,
+    ) -> None:  # fmt: skip
+        if render_mode is not None:
+            raise ValueError(
+                f"render_mode {render_mode!r} does not work for many environments; make one with gymnasium.make"
+            )
+        options.setdefault("max_steps", max_episode_steps)
+        self.batch = BatchedEnv(task, scene, num_envs=num_envs, **options)
+        self.num_envs = num_envs
+        self.single_observation_space, self.single_action_space = _joint_spaces(self.batch)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Starts all environments anew."""
+        _, state, infos = self.batch.reset(seed)
+        return np.array(state), _joint_info(infos)
+
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """One control step of all environments: arrays [N, ...]."""
+        step = self.batch.step(_split(self.batch, np.asarray(actions)))
+        info = _joint_info(step.infos)
+        done = step.terminated | step.truncated
+        if done.any():
+            info["final_obs"] = np.array(step.final_state)
+            info["_final_obs"] = np.array(done)
+        rewards = np.sum(list(step.rewards.values()), axis=0)
+        return np.array(step.state), rewards, np.array(step.terminated), np.array(step.truncated), info
+
+
+def _joint_spaces(batch: BatchedEnv) -> tuple[spaces.Box, spaces.Box]:
+    width = sum(batch.action_space(agent).shape[0] for agent in batch.agents)
+    return batch.state_space, spaces.Box(-1.0, 1.0, (width,), np.float32)
+
+
+def _split(batch: BatchedEnv, actions: np.ndarray) -> dict[str, np.ndarray]:
+    """Joint actions [N, sum] by agent."""
+    widths = [batch.action_space(agent).shape[0] for agent in batch.agents]
+    if actions.shape[-1:] != (sum(widths),):
+        raise ValueError(f"action of shape {actions.shape[1:]} must be ({sum(widths)},)")
+    return dict(zip(batch.agents, np.split(actions, np.cumsum(widths)[:-1], axis=-1), strict=True))
+
+
+def _joint_info(infos: dict[str, dict[str, Any]], index: int | None = None) -> dict[str, Any]:
+    """The team's info, of all environments or of one as plain Python numbers."""
+    stacked = {key: np.stack([info[key] for info in infos.values()]) for key in next(iter(infos.values()))}
+    team: dict[str, Any] = {
+        "tip_error": stacked["tip_error"].max(0),
+        "success": stacked["success"].all(0),
+        "collision": stacked["collision"].any(0),
+        "min_distance": stacked["min_distance"].min(0),
+    }
+    if index is not None:
+        team = {key: value[index].item() for key, value in team.items()}
+        if len(infos) > 1:
+            team["agents"] = {a: {k: v[index].item() for k, v in info.items()} for a, info in infos.items()}
+    return team

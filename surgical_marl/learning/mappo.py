@@ -1,0 +1,309 @@
+"""Multi-agent PPO on rsl_rl (Yu et al. 2022, arXiv 2103.01955).
+
+The agent axis lives inside the tensors. Observations of an agent type are `[N, n, d]`, the joint
+action is flat `[N, sum]`, and log-probabilities, values, rewards and advantages are `[N, A]`. With
+one agent (A = 1) this is PPO, by the same code.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import torch
+from rsl_rl.algorithms import PPO
+from rsl_rl.models import MLPModel
+from rsl_rl.storage import RolloutStorage
+from tensordict import TensorDict
+from torch import Tensor, nn
+
+from surgical_marl.interfaces.rsl_rl import RslRlVecEnv
+from surgical_marl.learning.config import Settings
+
+LEARNING_RATE_RANGE = (1e-5, 1e-2)  # rsl_rl's limits of the adaptive learning rate
+# A small last layer starts every arm near its rest, which is where exploration is safe and
+# gradients are largest.
+OUTPUT_GAIN = 0.01
+
+
+class MultiAgentModel(nn.Module):
+    """One MLP for each agent type, shared by the agents of that type.
+
+    Args:
+        observations: a sample of the groups, `[N, n, d]` each.
+        outputs: width of the output of one agent, by type.
+        model: further arguments of rsl_rl's `MLPModel`.
+    """
+
+    is_recurrent = False
+
+    def __init__(self, observations: TensorDict, outputs: Mapping[str, int], **model: Any) -> None:
+        super().__init__()
+        self.counts = {name: observations[name].shape[-2] for name in outputs}
+        self.outputs = dict(outputs)
+        # MLPModel wants to be built from [N, d], and runs with any leading axes.
+        sample = TensorDict(
+            {name: observations[name][..., 0, :] for name in outputs},
+            batch_size=observations.batch_size,
+        )
+        self.models = nn.ModuleDict(
+            {name: MLPModel(sample, {name: [name]}, name, width, **model) for name, width in outputs.items()}
+        )
+
+    def forward(self, observations: TensorDict, *, stochastic_output: bool = False, **_: Any) -> Tensor:
+        """Outputs of all agents, flat: `[N, sum]`, by type and then by agent."""
+        return self._join(model(observations, stochastic_output=stochastic_output) for model in self._models())
+
+    def update_normalization(self, observations: TensorDict) -> None:
+        """Update the running mean and variance of each type's observations from a batch `[B]`."""
+        for name, model in zip(self.outputs, self._models(), strict=True):
+            model.update_normalization({name: observations[name].flatten(0, -2)})
+
+    def reset(self, dones: Tensor | None = None, hidden_state: Any = None) -> None:
+        """Part of rsl_rl's model interface: an MLP has nothing to reset."""
+
+    def get_hidden_state(self) -> None:
+        """Part of rsl_rl's model interface: an MLP has no hidden state."""
+
+    def _models(self) -> Iterable[Any]:
+        return self.models.values()
+
+    @staticmethod
+    def _join(parts: Iterable[Tensor]) -> Tensor:
+        return torch.cat([part.flatten(-2) for part in parts], -1)
+
+    def _split(self, flat: Tensor) -> list[Tensor]:
+        """Flat `[N, sum]` -> one `[N, n, a]` for each type."""
+        shapes = [(self.counts[name], self.outputs[name]) for name in self.outputs]
+        parts = flat.split([count * width for count, width in shapes], -1)
+        return [part.unflatten(-1, shape) for part, shape in zip(parts, shapes, strict=True)]
+
+
+class MultiAgentActor(MultiAgentModel):
+    """A Gaussian policy for each agent type; log-probabilities and entropies are per agent."""
+
+    def __init__(self, observations: TensorDict, outputs: Mapping[str, int], **model: Any) -> None:
+        super().__init__(observations, outputs, **model)
+        with torch.no_grad():
+            for policy in self._models():
+                policy.mlp[-1].weight.mul_(OUTPUT_GAIN)
+                policy.mlp[-1].bias.zero_()
+
+    def get_output_log_prob(self, actions: Tensor) -> Tensor:
+        """Log-probability of flat actions `[N, sum]` under the last forward pass: `[N, A]`."""
+        parts = zip(self._models(), self._split(actions), strict=True)
+        return torch.cat([model.get_output_log_prob(part) for model, part in parts], -1)
+
+    def get_kl_divergence(self, old: tuple[Tensor, ...], new: tuple[Tensor, ...]) -> Tensor:
+        """KL(old || new) of each agent, `[N, A]`, from two `output_distribution_params`."""
+        old_parts = zip(*map(self._split, old), strict=True)
+        new_parts = zip(*map(self._split, new), strict=True)
+        parts = zip(self._models(), old_parts, new_parts, strict=True)
+        return torch.cat([model.get_kl_divergence(before, after) for model, before, after in parts], -1)
+
+    @property
+    def output_distribution_params(self) -> tuple[Tensor, ...]:
+        """Mean and standard deviation of the last forward pass, flat `[N, sum]` each."""
+        params = (model.output_distribution_params for model in self._models())
+        return tuple(self._join(parts) for parts in zip(*params, strict=True))
+
+    @property
+    def output_entropy(self) -> Tensor:
+        """Entropy of each agent's last distribution, `[N, A]`."""
+        return torch.cat([model.output_entropy for model in self._models()], -1)
+
+    @property
+    def output_std(self) -> Tensor:
+        """Standard deviation of the last distribution, flat `[N, sum]`."""
+        return self._join(model.output_std for model in self._models())
+
+
+class MultiAgentStorage(RolloutStorage):
+    """rsl_rl's rollout storage with log-probabilities, values, rewards and advantages A wide."""
+
+    distribution_params: tuple[Tensor, ...] | None
+
+    def __init__(self, num_agents: int, num_envs: int, steps: int, obs: TensorDict, actions: int, device: str) -> None:
+        super().__init__("rl", num_envs, steps, obs, [actions], device)
+        for name in ("rewards", "values", "actions_log_prob", "returns", "advantages"):
+            setattr(self, name, torch.zeros(steps, num_envs, num_agents, device=device))
+
+    def add_transition(self, transition: RolloutStorage.Transition) -> None:
+        """Copy one step of all environments into the storage."""
+        if self.step >= self.num_transitions_per_env:
+            raise OverflowError(f"the storage holds {self.num_transitions_per_env} steps: clear() it first")
+        for name in ("observations", "actions", "rewards", "values", "actions_log_prob"):
+            getattr(self, name)[self.step].copy_(getattr(transition, name))
+        self.dones[self.step].copy_(transition.dones.unsqueeze(-1))
+        params = transition.distribution_params or ()
+        if self.distribution_params is None:
+            steps = self.num_transitions_per_env
+            self.distribution_params = tuple(param.new_zeros(steps, *param.shape) for param in params)
+        for stored, param in zip(self.distribution_params, params, strict=True):
+            stored[self.step].copy_(param)
+        self.step += 1
+
+
+class MAPPO(PPO):
+    """PPO with a ratio for each agent, and a critic with a value for each agent.
+
+    `act`, `compute_returns` and `save` are rsl_rl's. `update` is written again for two reasons:
+    rsl_rl's squeezes are wrong for A = 1, and it waits for the device some hundred times an update
+    where this waits once.
+
+    Args:
+        team_reward: give every agent the sum of all agents' rewards, instead of its own.
+        ppo: arguments of `rsl_rl.algorithms.PPO`.
+    """
+
+    learning_rate: float
+
+    def __init__(self, actor: Any, critic: Any, storage: Any, *, team_reward: bool = False, **ppo: Any) -> None:
+        super().__init__(actor, critic, storage, **ppo)
+        self.team_reward = team_reward
+        # As a tensor the learning rate adapts without the host having to read the divergence.
+        self._rate = torch.tensor(float(self.learning_rate), device=self.device)
+        parameters = [*self.actor.parameters(), *self.critic.parameters()]
+        self.optimizer = torch.optim.Adam(parameters, lr=self._rate, fused=True)
+
+    def process_env_step(self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: dict[str, Any]) -> None:
+        """Store one step.
+
+        A time-out is worth the value of the state it was cut off in: gamma * V(final state).
+        """
+        rewards = extras["agent_rewards"]
+        if self.team_reward:
+            rewards = rewards.sum(-1, keepdim=True).expand_as(rewards)
+        bootstrap = self.critic(extras["final_obs"]) * extras["time_outs"].unsqueeze(-1)
+        self.transition.rewards = rewards + self.gamma * bootstrap
+        self.transition.dones = dones
+        self.storage.add_transition(self.transition)
+        self.transition.clear()
+
+    def loss(self, batch: RolloutStorage.Batch) -> tuple[Tensor, Tensor]:
+        """Loss of a mini-batch; and value loss, surrogate loss, entropy and KL, detached `[4]`."""
+        self.actor(batch.observations, stochastic_output=True)
+        log_prob = self.actor.get_output_log_prob(batch.actions)
+        with torch.no_grad():
+            params = self.actor.output_distribution_params
+            divergence = self.actor.get_kl_divergence(batch.old_distribution_params, params).mean()
+        entropy = self.actor.output_entropy.mean()
+
+        ratio = torch.exp(log_prob - batch.old_actions_log_prob)
+        clipped = ratio.clamp(1 - self.clip_param, 1 + self.clip_param)
+        surrogate = -torch.min(batch.advantages * ratio, batch.advantages * clipped).mean()
+
+        values = self.critic(batch.observations)
+        value = (values - batch.returns).square()
+        if self.use_clipped_value_loss:
+            near = batch.values + (values - batch.values).clamp(-self.clip_param, self.clip_param)
+            value = torch.max(value, (near - batch.returns).square())
+        value = value.mean()
+
+        loss = surrogate + self.value_loss_coef * value - self.entropy_coef * entropy
+        return loss, torch.stack([value, surrogate, entropy, divergence]).detach()
+
+    def update(self) -> dict[str, float]:
+        """Learn from the stored rollout; returns mean losses, KL and the learning rate."""
+        total = torch.zeros(4, device=self.device)
+        for batch in self.storage.mini_batch_generator(self.num_mini_batches, self.num_learning_epochs):
+            loss, parts = self.loss(batch)
+            if self.schedule == "adaptive":
+                self._adapt_rate(parts[-1])
+            self.optimizer.zero_grad()
+            loss.backward()
+            for model in (self.actor, self.critic):
+                nn.utils.clip_grad_norm_(model.parameters(), self.max_grad_norm)
+            self.optimizer.step()
+            total += parts
+        observations = self.storage.observations.flatten(0, 1)
+        self.actor.update_normalization(observations)
+        self.critic.update_normalization(observations)
+        self.storage.clear()
+        count = self.num_mini_batches * self.num_learning_epochs
+        *losses, self.learning_rate = torch.cat([total / count, self._rate[None]]).tolist()
+        names = ("value_loss", "surrogate_loss", "entropy", "kl", "learning_rate")
+        return dict(zip(names, (*losses, self.learning_rate), strict=True))
+
+    def _adapt_rate(self, divergence: Tensor) -> None:
+        """rsl_rl's rule: slower above twice the wanted divergence, faster below half of it."""
+        low, high = LEARNING_RATE_RANGE
+        slower = (self._rate / 1.5).clamp(min=low)
+        faster = (self._rate * 1.5).clamp(max=high)
+        rate = torch.where((divergence < self.desired_kl / 2) & (divergence > 0), faster, self._rate)
+        self._rate.copy_(torch.where(divergence > self.desired_kl * 2, slower, rate))
+
+    def load(
+        self,
+        loaded_dict: dict[str, Any],
+        load_cfg: dict[str, Any] | None = None,
+        strict: bool = True,
+    ) -> bool:
+        """Load what `save` returned.
+
+        The optimizer then holds its own copy of the learning rate: share it again.
+        """
+        result = super().load(loaded_dict, load_cfg, strict)
+        group = self.optimizer.param_groups[0]
+        group["lr"] = self._rate = torch.as_tensor(group["lr"], device=self.device)
+        self.learning_rate = float(self._rate)
+        return result
+
+    @staticmethod
+    def construct_algorithm(obs: TensorDict, env: RslRlVecEnv, cfg: dict[str, Any], device: str) -> MAPPO:
+        """Build the algorithm from an rsl_rl configuration (see `rsl_rl_config`), as rsl_rl's
+        runner does it.
+
+        Raises:
+            ValueError: the configuration asks for several GPUs.
+        """
+        if cfg.get("multi_gpu"):
+            raise ValueError("MAPPO runs on one GPU: start it without torchrun")
+        layout = env.layout
+        actor = MultiAgentActor(obs, layout.action_sizes, **cfg["actor"]).to(device)
+        if cfg["centralised_critic"]:
+            critic: nn.Module = MLPModel(obs, {"critic": ["state"]}, "critic", layout.num_agents, **cfg["critic"])
+        else:
+            critic = MultiAgentModel(obs, dict.fromkeys(layout.counts, 1), **cfg["critic"])
+        steps = cfg["num_steps_per_env"]
+        storage = MultiAgentStorage(layout.num_agents, env.num_envs, steps, obs, env.num_actions, device)
+        algorithm = {name: value for name, value in cfg["algorithm"].items() if name != "class_name"}
+        return MAPPO(actor, critic.to(device), storage, device=device, **algorithm)
+
+
+def rsl_rl_config(settings: Settings) -> dict[str, Any]:
+    """The settings as a configuration that rsl_rl's own `OnPolicyRunner` also takes."""
+    network, ppo = settings.network, settings.ppo
+    mlp = {
+        "hidden_dims": list(network.hidden),
+        "activation": network.activation,
+        "obs_normalization": network.normalise_observations,
+    }
+    gaussian = {
+        "class_name": "GaussianDistribution",
+        "init_std": network.init_std,
+        "std_type": "log",
+    }
+    return {
+        "num_steps_per_env": settings.steps_per_iteration,
+        "save_interval": settings.checkpoint_every,
+        "centralised_critic": settings.algo != "ippo",
+        "actor": {**mlp, "distribution_cfg": gaussian},
+        "critic": mlp,
+        "algorithm": {
+            "class_name": MAPPO,
+            "team_reward": settings.team_reward,
+            "learning_rate": ppo.learning_rate,
+            "schedule": ppo.schedule,
+            "desired_kl": ppo.desired_kl,
+            "gamma": ppo.gamma,
+            "lam": ppo.lam,
+            "clip_param": ppo.clip,
+            "use_clipped_value_loss": ppo.clip_value,
+            "num_learning_epochs": ppo.epochs,
+            "num_mini_batches": ppo.mini_batches,
+            "value_loss_coef": ppo.value_coefficient,
+            "entropy_coef": ppo.entropy_coefficient,
+            "max_grad_norm": ppo.max_gradient_norm,
+        },
+    }

@@ -1,0 +1,171 @@
+"""Policies that act: trained, untrained, zero and random.
+
+A policy maps the observations of all agents `{agent: [..., d]}` to their actions `{agent: [...,
+a]}` in [-1, 1]; it answers NumPy arrays with NumPy arrays and tensors with tensors.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from surgical_marl.content import content_dir, list_policies
+from surgical_marl.interfaces.rsl_rl import Layout
+from surgical_marl.learning.config import Settings
+from surgical_marl.learning.mappo import MultiAgentActor, rsl_rl_config
+from surgical_marl.learning.run import (
+    CONFIG,
+    CURVE,
+    METRICS,
+    claim_folder,
+    read_checkpoint,
+    read_settings,
+    write_checkpoint,
+)
+
+if TYPE_CHECKING:
+    from surgical_marl.batch import BatchedEnv
+
+Policy = Callable[[Mapping[str, Any]], dict[str, Any]]
+
+
+def load_policy(run: str | Path, env: BatchedEnv) -> Policy:
+    """The deterministic policy of a run for the agents of an environment.
+
+    Args:
+        run: a run folder, or the name of a policy that ships, or "zero" or "random".
+        env: the environment that the policy will act in.
+
+    Raises:
+        ValueError: there is no such run, its checkpoint is damaged, or it was trained on other
+            agents.
+    """
+    if run == "zero":
+        return zero_policy(env)
+    if run == "random":
+        return random_policy(env)
+    folder = find_run(run)
+    settings, checkpoint = read_settings(folder), read_checkpoint(folder)
+    layout = Layout(env, joint=settings.algo == "joint")
+    wanted, trained = (
+        _groups(env, layout),
+        {name: list(widths) for name, widths in checkpoint["groups"].items()},
+    )
+    if wanted != trained:
+        raise ValueError(
+            f"the policy in {run} was trained in scene {settings.scene!r}, whose agents "
+            f"({_describe(trained)}) are not those of this environment ({_describe(wanted)})"
+        )
+    actor = _actor(settings, env, layout)
+    actor.load_state_dict(checkpoint["algorithm"]["actor_state_dict"])
+    return _acting(actor, layout, str(env.device))
+
+
+def untrained_policy(env: BatchedEnv, settings: Settings | None = None) -> Policy:
+    """The policy that a run with these settings starts from: fresh weights, to compare with."""
+    settings = settings or Settings()
+    layout = Layout(env, joint=settings.algo == "joint")
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(settings.seed)
+        return _acting(_actor(settings, env, layout), layout, str(env.device))
+
+
+def zero_policy(env: BatchedEnv) -> Policy:
+    """The policy that never acts."""
+    return _by_agent(env, lambda shape: np.zeros(shape, np.float32))
+
+
+def random_policy(env: BatchedEnv, seed: int = 0) -> Policy:
+    """The policy of uniform random actions in [-1, 1]."""
+    generator = np.random.default_rng(seed)
+    return _by_agent(env, lambda shape: generator.uniform(-1, 1, shape).astype(np.float32))
+
+
+def find_run(run: str | Path) -> Path:
+    """The folder of a run, by its path, or of a policy that ships, by its name.
+
+    ValueError if there is none.
+    """
+    for folder in (Path(run), content_dir("policies") / str(run)):
+        if (folder / CONFIG).is_file():
+            return folder
+    shipped = ", ".join(list_policies()) or "none yet"
+    raise ValueError(f"{str(run)!r} is not a run folder, nor zero, random or a policy that ships ({shipped})")
+
+
+def export_policy(run: str | Path, out: Path) -> Path:
+    """Copy what acting needs of a run to a new folder: not the state of training."""
+    folder, out = find_run(run), Path(out)
+    checkpoint = read_checkpoint(folder)
+    claim_folder(out)
+    weights = {"actor_state_dict": checkpoint["algorithm"]["actor_state_dict"]}
+    small = {
+        "iteration": checkpoint["iteration"],
+        "groups": checkpoint["groups"],
+        "algorithm": weights,
+    }
+    write_checkpoint(out, small)
+    for name in (CONFIG, METRICS, CURVE):
+        if (folder / name).is_file():
+            shutil.copyfile(folder / name, out / name)
+    return out
+
+
+def _samples(env: BatchedEnv, layout: Layout) -> TensorDict:
+    sizes = {agent: env.observation_space(agent).shape for agent in layout.agents}
+    zeros = {agent: torch.zeros(1, *(shape or ())) for agent, shape in sizes.items()}
+    return TensorDict({**layout.stack(zeros)}, batch_size=[1])
+
+
+def _groups(env: BatchedEnv, layout: Layout) -> dict[str, list[int]]:
+    """Agents of each group, width of their observation and of their action."""
+    samples = _samples(env, layout)
+    return {name: [count, samples[name].shape[-1], layout.action_sizes[name]] for name, count in layout.counts.items()}
+
+
+def _describe(groups: Mapping[str, list[int]]) -> str:
+    return ", ".join(f"{n} {name} of {d} observations and {a} actions" for name, (n, d, a) in groups.items())
+
+
+def _actor(settings: Settings, env: BatchedEnv, layout: Layout) -> MultiAgentActor:
+    model = rsl_rl_config(settings)["actor"]
+    return MultiAgentActor(_samples(env, layout), layout.action_sizes, **model).eval()
+
+
+def _acting(actor: MultiAgentActor, layout: Layout, device: str) -> Policy:
+    actor = actor.to(device)
+
+    def policy(observations: Mapping[str, Any]) -> dict[str, Any]:
+        tensors = {agent: torch.as_tensor(observations[agent], device=device) for agent in layout.agents}
+        batch = tensors[layout.agents[0]].shape[:-1]
+        with torch.inference_mode():
+            flat = actor(TensorDict({**layout.stack(tensors)}, batch_size=batch)).clamp(-1.0, 1.0)
+        return {agent: _like(observations[agent], action) for agent, action in layout.split(flat).items()}
+
+    return policy
+
+
+def _by_agent(env: BatchedEnv, act: Callable[[tuple[int, ...]], np.ndarray]) -> Policy:
+    widths = {agent: env.action_space(agent).shape for agent in env.agents}
+
+    def policy(observations: Mapping[str, Any]) -> dict[str, Any]:
+        return {
+            agent: _like(
+                observations[agent],
+                torch.from_numpy(act((*observations[agent].shape[:-1], *(width or ())))),
+            )
+            for agent, width in widths.items()
+        }
+
+    return policy
+
+
+def _like(example: Any, action: Tensor) -> Any:
+    return action.to(example.device) if isinstance(example, Tensor) else action.cpu().numpy()

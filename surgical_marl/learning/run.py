@@ -1,0 +1,115 @@
+"""A run folder: `config.yaml`, `checkpoint.pt`, `metrics.csv`, `curve.png` and `tensorboard/`.
+
+Every write is atomic.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import importlib.metadata
+import math
+import os
+import platform
+import tempfile
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from surgical_marl.learning.config import Settings, config_text, read_config
+
+CONFIG, CHECKPOINT, METRICS, CURVE = "config.yaml", "checkpoint.pt", "metrics.csv", "curve.png"
+PACKAGES = ("surgical-marl", "torch", "rsl-rl-lib", "jax", "mujoco", "mujoco-mjx", "numpy")
+
+
+def write_atomic(path: Path, write: Callable[[Path], object]) -> None:
+    """Let `write` fill a temporary file next to `path`, then put it in place in one step."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        write(temporary)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def claim_folder(out: Path) -> None:
+    """Make the folder of a new run. ValueError if it cannot be written or already holds a run."""
+    if any((out / name).exists() for name in (CONFIG, CHECKPOINT)):
+        raise ValueError(f"{out} already holds a run: choose another folder, or continue it with --resume {out}")
+    check_writable(out)
+
+
+def check_writable(out: Path) -> None:
+    """Make the folder where it is missing. ValueError if it cannot be written."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=out):
+            pass
+    except OSError as error:
+        raise ValueError(f"cannot write to the output folder {out}: {error.strerror}") from None
+
+
+def write_config(run: Path, settings: Settings) -> None:
+    """Write the settings, and the versions of the packages that will make the run."""
+    versions = {"python": platform.python_version()}
+    for name in PACKAGES:
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            versions[name] = importlib.metadata.version(name)
+    write_atomic(run / CONFIG, lambda path: path.write_text(config_text(settings, versions)))
+
+
+def read_settings(run: str | Path, overrides: Iterable[str] = ()) -> Settings:
+    """Settings of a run or of a shipped policy, with `key=value` overrides.
+
+    ValueError if it is not a run folder.
+    """
+    path = Path(run) / CONFIG
+    if not path.is_file():
+        raise ValueError(f"{run} is not a run folder: it has no {CONFIG}")
+    return read_config(path, overrides)
+
+
+def write_checkpoint(run: Path, checkpoint: Mapping[str, Any]) -> None:
+    """Replace the checkpoint of a run."""
+    write_atomic(run / CHECKPOINT, lambda path: torch.save(dict(checkpoint), path))
+
+
+def read_checkpoint(run: str | Path) -> dict[str, Any]:
+    """The checkpoint of a run, on the CPU. ValueError if there is none or it is damaged."""
+    path = Path(run) / CHECKPOINT
+    if not path.is_file():
+        raise ValueError(f"{run} is not a run folder: it has no {CHECKPOINT}")
+    try:
+        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception:  # torch.load raises many types for a damaged file, and all mean the same here
+        checkpoint = None
+    if not isinstance(checkpoint, dict) or not {"iteration", "groups", "algorithm"} <= checkpoint.keys():
+        raise ValueError(f"{path} is damaged, or not a checkpoint of this program: restore it from a copy")
+    return checkpoint
+
+
+def format_row(row: Mapping[str, float]) -> list[str]:
+    """Cells of a row of metrics. A rate over no episodes (NaN) is an empty cell."""
+    return ["" if math.isnan(value) else format(value, ".9g") for value in row.values()]
+
+
+def read_metrics(run: Path) -> list[dict[str, float]]:
+    """Rows of `metrics.csv`; an empty cell is NaN. No file, no rows."""
+    if not (run / METRICS).is_file():
+        return []
+    with (run / METRICS).open(newline="") as file:
+        return [{key: float(cell or "nan") for key, cell in row.items()} for row in csv.DictReader(file)]
+
+
+def write_metrics(run: Path, columns: Iterable[str], rows: Iterable[Mapping[str, float]]) -> None:
+    """Replace `metrics.csv`."""
+
+    def write(path: Path) -> None:
+        with path.open("w", newline="") as file:
+            writer = csv.writer(file)
+            writer.writerow(list(columns))
+            writer.writerows(format_row(row) for row in rows)
+
+    write_atomic(run / METRICS, write)

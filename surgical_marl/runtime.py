@@ -1,0 +1,93 @@
+"""How JAX is started: compile cache, precision, and the way around a fault of XLA on CPUs."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import importlib.metadata
+import importlib.util
+import io
+import os
+import sys
+import warnings
+from pathlib import Path
+from typing import Any
+
+FLAG = "--xla_cpu_use_fusion_emitters"
+
+# These jaxlib versions know the flag; XLA aborts the process over a flag that it does not know.
+# Their fusion emitter computes a serial chain of rotations again for each link that uses it, so
+# that an arm costs some three times more with every joint: `surgical-marl doctor` measures it.
+_KNOWS_FLAG = ((0, 7), (0, 12))
+
+# XLA's pool on a CPU has a thread a core. With two, a batched step of two arms blocks for ever
+# within some twenty steps: both wait for work that only another thread could do. One thread or
+# four never did so, and more threads than cores cost nothing that can be measured.
+_LEAST_THREADS = 8
+
+
+def cache_dir() -> Path:
+    """The folder of this package's caches, by the XDG rules."""
+    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(base) / "surgical-marl"
+
+
+def knows_flag() -> bool:
+    """Whether the installed jaxlib accepts `FLAG`, told without importing it."""
+    try:
+        version = importlib.metadata.version("jaxlib")
+    except importlib.metadata.PackageNotFoundError:
+        return False
+    low, high = _KNOWS_FLAG
+    return low <= tuple(int(part) for part in version.split(".")[:2]) < high
+
+
+@functools.cache
+def prepare_jax() -> None:
+    """Set JAX up for this package, once; call it before JAX starts. A user's own settings stay."""
+    if knows_flag() and FLAG not in (flags := os.environ.get("XLA_FLAGS", "")):
+        if _backend_started() and _on_cpu():
+            warnings.warn(
+                "JAX started before surgical_marl could prepare it, so physics on this CPU may be "
+                "very slow: call surgical_marl.runtime.prepare_jax() first, or set "
+                f"XLA_FLAGS={FLAG}=false",
+                RuntimeWarning,
+                stacklevel=2,
+            )
+        os.environ["XLA_FLAGS"] = f"{flags} {FLAG}=false".strip()
+    if not {"NPROC", "PJRT_NPROC"} & os.environ.keys():
+        os.environ["PJRT_NPROC"] = str(max(_LEAST_THREADS, os.cpu_count() or 1))
+    _set_option("jax_compilation_cache_dir", str(cache_dir() / "xla"))
+    _set_option("jax_persistent_cache_min_compile_time_secs", 0)
+    # TF32, the default of newer GPUs, has a 10-bit mantissa: too little for physics.
+    _set_option("jax_default_matmul_precision", "highest")
+    _import_mjx_quietly()
+
+
+def _set_option(name: str, value: Any) -> None:
+    """Set a JAX option by its environment variable and, where JAX is imported, in its config."""
+    if os.environ.get(name.upper()):
+        return
+    os.environ[name.upper()] = str(value)
+    if "jax" in sys.modules:
+        sys.modules["jax"].config.update(name, value)
+
+
+def _backend_started() -> bool:
+    bridge = sys.modules.get("jax._src.xla_bridge")
+    return bool(bridge and bridge.backends_are_initialized())
+
+
+def _on_cpu() -> bool:
+    return bool(sys.modules["jax"].default_backend() == "cpu")
+
+
+def _import_mjx_quietly() -> None:
+    # Without a working Warp, `import mujoco.mjx` prints two lines, to stdout; with it, a banner.
+    with contextlib.redirect_stdout(io.StringIO()):
+        if importlib.util.find_spec("warp"):
+            with contextlib.suppress(ImportError, RuntimeError):
+                import warp
+
+                warp.config.log_level = warp.LOG_WARNING
+        import mujoco.mjx  # noqa: F401

@@ -1,0 +1,86 @@
+"""Videos of frames: an mp4, or a gif where ffmpeg cannot run."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import subprocess
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import imageio.v2 as imageio
+import imageio_ffmpeg
+import numpy as np
+from numpy.typing import NDArray
+
+Frames = Iterable[NDArray[np.uint8]]
+
+
+def write_video(path: str | os.PathLike[str], frames: Frames, fps: float) -> Path:
+    """Write frames [height, width, 3] as a video and return its path.
+
+    A `.gif` stays a gif. Anything else becomes an mp4, or a gif beside it where ffmpeg cannot run.
+    The file appears whole or not at all.
+    """
+    if not fps > 0:
+        raise ValueError(f"a video of {fps!r} frames a second never moves on: use more than 0")
+    path = Path(path)
+    frames = iter(frames)
+    first = next(frames, None)
+    if first is None:
+        raise ValueError(f"no frames to write to {str(path)!r}: a video needs 1 or more")
+    gif = path.suffix == ".gif" or not ffmpeg_runs()
+    path = path.with_suffix(".gif" if gif else ".mp4")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    try:
+        (_write_gif if gif else _write_mp4)(part, first.shape, itertools.chain([first], frames), fps)
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+    return path
+
+
+def ffmpeg_runs() -> bool:
+    """Whether an mp4 can be written here."""
+    try:
+        command = [imageio_ffmpeg.get_ffmpeg_exe(), "-version"]
+        return subprocess.run(command, capture_output=True, timeout=20).returncode == 0
+    except (OSError, RuntimeError, subprocess.TimeoutExpired):
+        return False
+
+
+def _write_gif(path: Path, shape: tuple[int, ...], frames: Frames, fps: float) -> None:
+    # Gif counts time in hundredths of a second, and viewers slow down below two of them.
+    writer: Any
+    with imageio.get_writer(path, duration=max(20.0, 1000 / fps), loop=0) as writer:
+        for frame in frames:
+            writer.append_data(frame)
+
+
+def _write_mp4(path: Path, shape: tuple[int, ...], frames: Frames, fps: float) -> None:
+    # Not by imageio's own writer: it forks with a Python hook, which threads of JAX may deadlock.
+    source = f"-f rawvideo -pix_fmt rgb24 -s {shape[1]}x{shape[0]} -r {fps:g} -i -"
+    even = "-vf pad=ceil(iw/2)*2:ceil(ih/2)*2"
+    target = f"{even} -c:v libx264 -crf 20 -pix_fmt yuv420p -movflags +faststart"
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error", *source.split()]
+    with subprocess.Popen(
+        [*command, *target.split(), str(path)],
+        stdin=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        start_new_session=True,  # Ctrl-C is for us: ffmpeg then still ends its file
+    ) as ffmpeg:
+        assert ffmpeg.stdin and ffmpeg.stderr
+        try:
+            for frame in frames:
+                ffmpeg.stdin.write(np.ascontiguousarray(frame).data)
+            ffmpeg.stdin.close()
+        except BrokenPipeError:
+            pass  # ffmpeg gave up: it says why below
+        except BaseException:
+            ffmpeg.kill()
+            raise
+        complaint = ffmpeg.stderr.read().decode(errors="replace")
+    if ffmpeg.returncode:
+        raise RuntimeError(f"ffmpeg could not write {str(path)!r}: {' '.join(complaint.split())}")

@@ -1,0 +1,126 @@
+"""Targets that a scene's arms can reach: drawn on the host once, looked up by the environments.
+
+Targets are drawn from a normal distribution about the point in front of each arm, and a draw is kept only if every arm
+reaches its target within its joint limits, and if the arms stay apart both there and on the straight joint-space path
+from home. An environment then picks rows of the table, so a reset costs one lookup, whatever the arm.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from surgical_marl.arm import Arm
+from surgical_marl.runtime import cache_dir
+from surgical_marl.scene import Scene
+
+TABLE_SIZE = 4096
+CLEARANCE = 0.01
+"""Arms stay this far apart on the way to their targets, m."""
+PATH_POINTS = 8
+TOLERANCE = 1e-4
+"""A target is reached when inverse kinematics comes this close, m."""
+
+
+def target_table(scene: Scene, spread: float, seed: int = 0) -> np.ndarray:
+    """Reachable, collision-free targets for all arms of a scene at once.
+
+    Args:
+        spread: standard deviation of the draws in m, the same along each axis.
+        seed: of the draws; the same seed gives the same table.
+
+    Returns:
+        Targets [TABLE_SIZE, arms, 3] in each arm's base frame, m. Kept on disk by content, so a second call is quick.
+
+    Raises:
+        ValueError: if fewer than one draw in a hundred can be kept.
+    """
+    path = cache_dir() / "targets" / f"{_digest(scene, spread, seed)}.npy"
+    try:
+        table = np.load(path)
+        if table.shape == (TABLE_SIZE, len(scene.agents), 3):
+            return table
+    except (OSError, ValueError, EOFError):
+        pass  # not there yet, or damaged: draw it again
+    table = _draw(scene, spread, seed)
+    _save(path, table)
+    return table
+
+
+def inverse_kinematics(arm: Arm, tips: np.ndarray, q: np.ndarray, iterations: int = 24) -> np.ndarray:
+    """Joint positions [N, n] that bring the tool tip to `tips` [N, 3] (base frame, m), from a first guess `q` [n].
+
+    Damped least squares on position, within the joint limits, that prefers joints near the first guess (S. Buss,
+    Introduction to inverse kinematics, 2004). Rows that can't be reached end as near as they come.
+    """
+    start, q = q, np.broadcast_to(q, (len(tips), len(q))).copy()
+    scale = arm.upper - arm.lower  # joints of different kinds on one footing: a share of their range
+    for _ in range(iterations):
+        error = tips - arm.forward_kinematics(q)[:, :3, 3]
+        jacobian = arm.jacobian(q)[:, :3, :] * scale
+        square = jacobian @ jacobian.transpose(0, 2, 1) + 1e-6 * np.eye(3)
+        pull = 0.2 * (start - q) / scale
+        rest = error - (jacobian @ pull[..., None])[..., 0]
+        step = pull + (jacobian.transpose(0, 2, 1) @ np.linalg.solve(square, rest[..., None]))[..., 0]
+        q = np.clip(q + np.clip(step, -0.2, 0.2) * scale, arm.lower, arm.upper)
+    return q
+
+
+def _draw(scene: Scene, spread: float, seed: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    kept: list[np.ndarray] = []
+    drawn = 0
+    while sum(map(len, kept)) < TABLE_SIZE:
+        targets = rng.normal(0.0, spread, (TABLE_SIZE, len(scene.agents), 3))
+        targets += np.stack([scene.mounts[agent].workspace for agent in scene.agents])
+        kept.append(targets[_fits(scene, targets)])
+        drawn += TABLE_SIZE
+        if drawn >= 4 * TABLE_SIZE and sum(map(len, kept)) < drawn / 100:
+            raise ValueError(
+                f"scene {scene.name!r}: fewer than 1 % of targets within {spread} m of the workspace points are "
+                "reachable without collision; move the arms or their workspace points"
+            )
+    return np.concatenate(kept)[:TABLE_SIZE]
+
+
+def _fits(scene: Scene, targets: np.ndarray) -> np.ndarray:
+    """Which rows of targets [N, arms, 3] every arm reaches with clearance on the way, [N] bool."""
+    good = np.ones(len(targets), dtype=bool)
+    goals: dict[str, np.ndarray] = {}
+    for i, agent in enumerate(scene.agents):
+        arm = scene.mounts[agent].arm
+        goals[agent] = inverse_kinematics(arm, targets[:, i], arm.home)
+        reached = arm.forward_kinematics(goals[agent])[:, :3, 3]
+        good &= np.linalg.norm(reached - targets[:, i], axis=-1) < TOLERANCE
+    for share in np.linspace(0.0, 1.0, PATH_POINTS + 1)[1:]:
+        way = {agent: (1 - share) * scene.mounts[agent].arm.home + share * goals[agent] for agent in scene.agents}
+        good &= scene.clearance(way) > CLEARANCE
+    return good
+
+
+def _digest(scene: Scene, spread: float, seed: int) -> str:
+    content = hashlib.sha256(Path(__file__).read_bytes())
+    content.update(repr((TABLE_SIZE, spread, seed)).encode())
+    for agent, mount in scene.mounts.items():
+        content.update(agent.encode())
+        for values in (mount.position, mount.rotation, mount.workspace):
+            content.update(values.tobytes())
+        for file in sorted(mount.arm.folder.glob("*")):
+            if file.suffix in (".urdf", ".yaml"):
+                content.update(file.read_bytes())
+    return content.hexdigest()[:32]
+
+
+def _save(path: Path, table: np.ndarray) -> None:
+    """Writes the table at once or not at all; a cache that can't be written is no error."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
+            np.save(file, table)
+        os.replace(file.name, path)
+    except OSError:
+        return

@@ -1,0 +1,100 @@
+"""A tiny environment with the interface of `BatchedEnv`: each arm is a point with a goal."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium.spaces import Box
+from torch import Tensor
+
+
+class FakeEnv:
+    """Points in as many dimensions as `sizes` says for each type; actions are velocities."""
+
+    def __init__(self, counts: dict[str, int], sizes: dict[str, int], num_envs: int = 64, max_steps: int = 20) -> None:
+        self.types = {name: [f"{name}_{i}" for i in range(count)] for name, count in counts.items()}
+        self.agents = [agent for members in self.types.values() for agent in members]
+        self.sizes = {a: sizes[name] for name, members in self.types.items() for a in members}
+        self.num_envs, self.max_steps, self.control_dt, self.device = (
+            num_envs,
+            max_steps,
+            0.05,
+            "cpu",
+        )
+        self.task_name, self.scene = "reach", SimpleNamespace(name="fake")
+        self.state_space = self._box(2 * sum(self.sizes.values()))
+        self.generator = torch.Generator()
+        self.poison = False  # return NaN observations
+        self.terminate = False  # end episodes by termination as well
+
+    @staticmethod
+    def _box(size: int, limit: float = float("inf")) -> Box:
+        return Box(-limit, limit, (size,))
+
+    def observation_space(self, agent: str) -> Box:
+        return self._box(2 * self.sizes[agent])
+
+    def action_space(self, agent: str) -> Box:
+        return self._box(self.sizes[agent], 1.0)
+
+    def _draw(self) -> dict[str, Tensor]:
+        shapes = {agent: (self.num_envs, 2 * size) for agent, size in self.sizes.items()}
+        return {a: torch.rand(s, generator=self.generator) * 2 - 1 for a, s in shapes.items()}
+
+    def reset(self, seed: int | None = None) -> tuple[dict[str, Tensor], Tensor, dict[str, Any]]:
+        if seed is not None:
+            self.generator.manual_seed(seed)
+        self.where = self._draw()
+        self.steps = np.zeros(self.num_envs, np.int64)
+        return *self._observe(), {}
+
+    def _observe(self) -> tuple[dict[str, Tensor], Tensor]:
+        observations = {agent: where.clone() for agent, where in self.where.items()}
+        if self.poison:
+            observations[self.agents[0]][0, 0] = float("nan")
+        return observations, torch.cat(list(observations.values()), -1)
+
+    def step(self, actions: dict[str, Tensor]) -> Any:
+        infos, rewards = {}, {}
+        for agent, size in self.sizes.items():
+            assert actions[agent].shape == (self.num_envs, size) and not (actions[agent].abs() > 1).any()
+            self.where[agent] = self.where[agent].clone()
+            self.where[agent][:, :size] += 0.2 * actions[agent]
+            error = (self.where[agent][:, :size] - self.where[agent][:, size:]).norm(dim=-1)
+            rewards[agent] = -error
+            far = self.where[agent][:, 0] > 1.2
+            infos[agent] = {
+                "tip_error": error,
+                "success": error < 0.1,
+                "collision": far,
+                "min_distance": 1.2 - self.where[agent][:, 0],
+            }
+        final_observations, final_state = self._observe()
+        self.steps = self.steps + 1
+        truncated = torch.from_numpy(self.steps >= self.max_steps)
+        fresh = self._draw()
+        self.where = {a: torch.where(truncated[:, None], fresh[a], w) for a, w in self.where.items()}
+        self.steps = np.where(truncated, 0, self.steps)
+        observations, state = self._observe()
+        return SimpleNamespace(
+            observations=observations,
+            state=state,
+            rewards=rewards,
+            terminated=truncated & self.terminate,
+            truncated=truncated,
+            final_observations=final_observations,
+            final_state=final_state,
+            infos=infos,
+        )
+
+    def carry(self) -> dict[str, np.ndarray]:
+        state = {"steps": self.steps.copy(), "generator": self.generator.get_state().numpy()}
+        return state | {f"where/{agent}": where.numpy() for agent, where in self.where.items()}
+
+    def set_carry(self, carry: dict[str, np.ndarray]) -> None:
+        self.steps = carry["steps"].copy()
+        self.generator.set_state(torch.tensor(carry["generator"]))
+        self.where = {agent: torch.tensor(carry[f"where/{agent}"]) for agent in self.agents}

@@ -1,0 +1,169 @@
+"""The PSM against its published kinematics, against yourdfpy and against MuJoCo."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import yourdfpy
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from surgical_marl import list_arms, load_arm
+
+PSM = load_arm("psm")
+HALF = np.pi / 2
+# dVRK PSM.json and LARGE_NEEDLE_DRIVER_400006.json, modified (Craig) convention: alpha, a, theta offset, d, slides
+DH = [(HALF, 0, HALF, 0, 0), (-HALF, 0, -HALF, 0, 0), (HALF, 0, 0, -0.4318, 1),
+      (0, 0, 0, 0.4162, 0), (-HALF, 0, -HALF, 0, 0), (-HALF, 0.0091, -HALF, 0, 0)]  # fmt: skip
+TIP = np.array([[0, -1, 0, 0], [0, 0, 1, 0], [-1, 0, 0, 0], [0, 0, 0, 1.0]])
+
+
+def published_tip(q: np.ndarray) -> np.ndarray:
+    """Tool tip from the table alone, moved to the jaw control point 10.2 mm past the wrist yaw axis."""
+    pose = np.eye(4)
+    for (alpha, a, theta, d, slides), value in zip(DH, q, strict=True):
+        theta, d = (theta, d + value) if slides else (theta + value, d)
+        ca, sa, ct, stheta = np.cos(alpha), np.sin(alpha), np.cos(theta), np.sin(theta)
+        pose = pose @ np.array([[ct, -stheta, 0, a], [stheta * ca, ct * ca, -sa, -sa * d],
+                                [stheta * sa, ct * sa, ca, ca * d], [0, 0, 0, 1]])  # fmt: skip
+    pose = pose @ TIP
+    pose[:3, 3] += 0.0102 * pose[:3, 2]
+    return pose
+
+
+def configurations(count: int) -> np.ndarray:
+    return np.random.default_rng(0).uniform(PSM.lower, PSM.upper, (count, len(PSM.actuated)))
+
+
+def test_tip_equals_published_kinematics() -> None:
+    q = configurations(1000)
+    expected = np.stack([published_tip(row[:6]) for row in q])
+    assert np.abs(PSM.forward_kinematics(q) - expected).max() < 1e-12
+
+
+def test_tip_equals_yourdfpy_and_mujoco() -> None:
+    urdf = yourdfpy.URDF.load(str(PSM.folder / "psm.urdf"), load_meshes=False)
+    model = PSM.spec().compile()
+    data = mujoco.MjData(model)
+    names = [joint.name for joint in PSM.actuated]
+    for q in configurations(50):
+        urdf.update_cfg(dict(zip(names, q, strict=True)))
+        for name, value in zip(names, q, strict=True):
+            data.joint(name).qpos = value
+        mujoco.mj_kinematics(model, data)
+        pose = PSM.forward_kinematics(q)
+        assert np.abs(urdf.get_transform("tool_tip", "remote_center") - pose).max() < 1e-9
+        assert np.abs(data.site("tool_tip").xpos - pose[:3, 3]).max() < 1e-9
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.floats(0, 1), min_size=7, max_size=7))
+def test_shaft_passes_through_the_remote_center(shares: list[float]) -> None:
+    """The remote center is on the shaft's axis wherever the arm is."""
+    q = PSM.lower + np.array(shares) * (PSM.upper - PSM.lower)
+    shaft = PSM.link_poses(q, ("roll_link",))["roll_link"]
+    axis, origin = shaft[:3, 2], shaft[:3, 3]
+    assert np.linalg.norm(np.cross(axis, -origin)) < 1e-12
+
+
+def test_jacobian_equals_differences() -> None:
+    step = 1e-6
+    for q in configurations(10):
+        jacobian = PSM.jacobian(q)
+        pose = PSM.forward_kinematics(q)
+        for i in range(len(q)):
+            moved = q.copy()
+            moved[i] += step
+            other = PSM.forward_kinematics(moved)
+            assert np.abs((other - pose)[:3, 3] / step - jacobian[:3, i]).max() < 1e-5
+            spin = (other[:3, :3] @ pose[:3, :3].T - np.eye(3)) / step
+            assert np.abs([spin[2, 1], spin[0, 2], spin[1, 0]] - jacobian[3:, i]).max() < 1e-5
+
+
+def test_kinematics_in_jax_and_without_the_jaw() -> None:
+    import jax.numpy as jnp
+
+    q = configurations(8).reshape(2, 4, 7)
+    assert (
+        np.abs(np.asarray(PSM.forward_kinematics(jnp.asarray(q, jnp.float32))) - PSM.forward_kinematics(q)).max() < 1e-5
+    )
+    assert np.array_equal(PSM.forward_kinematics(q[..., :6]), PSM.forward_kinematics(q))
+    with pytest.raises(ValueError, match="does not fit arm 'psm'"):
+        PSM.forward_kinematics(q[..., :5])
+
+
+def test_inertia_is_that_of_the_identified_arm() -> None:
+    """M11 and M22 of the identified Classic PSM at several poses (within 5 %), and its insertion mass (within 2 %)."""
+    model = PSM.spec().compile()
+    data = mujoco.MjData(model)
+    for pitch, insertion, yaw_inertia, pitch_inertia in [
+        (0, 0.07, 0.226, 0.224), (0, 0.12, 0.210, 0.208), (0, 0.20, 0.192, 0.190),
+        (0.5, 0.12, 0.203, 0.208), (-0.5, 0.12, 0.139, 0.208),
+    ]:  # fmt: skip
+        data.joint("pitch").qpos, data.joint("insertion").qpos = pitch, insertion
+        mujoco.mj_forward(model, data)
+        mass = np.zeros((model.nv, model.nv))
+        mujoco.mj_fullM(model, data, mass)
+        assert mass[0, 0] == pytest.approx(yaw_inertia, rel=0.05)
+        assert mass[1, 1] == pytest.approx(pitch_inertia, rel=0.05)
+        assert mass[2, 2] == pytest.approx(0.713, rel=0.02)
+
+
+@pytest.mark.parametrize("name", list_arms())
+def test_jaw_fingers_open_together_and_meet_at_the_tip(name: str) -> None:
+    arm = load_arm(name)
+    if arm.jaw is None:
+        return
+    fingers = [joint for joint in arm.joints if joint.leader == arm.jaw.joint]
+    assert len(fingers) == 2
+    poses = [arm.link_poses(np.array([*arm.home[:-1], arm.jaw.open]), (f"{finger.name}_link",)) for finger in fingers]
+    left, right = (next(iter(pose.values()))[:3, :3] @ [0, 0, -0.0106] for pose in poses)
+    assert left[0] == pytest.approx(-right[0]) and left[0] < -0.004
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("<robot", "<robot <", "not a URDF"),
+        ('<mimic joint="jaw_left"', '<mimic joint="nothing"', "'nothing', which is not a moving joint"),
+        ('<limit lower="0" upper="0.24" velocity="0.2" effort="9.877926"/>', "", "'insertion' needs a limit"),
+        ('lower="0" upper="0.24"', 'lower="0.3" upper="0.24"', "not below upper"),
+        ('name="tool_tip"', 'name="tip"', "tool_tip 'tool_tip' is not a link"),
+    ],
+)  # fmt: skip
+def test_bad_urdf_is_one_sentence(tmp_path: Path, old: str, new: str, words: str) -> None:
+    folder = tmp_path / "psm"
+    shutil.copytree(PSM.folder, folder)
+    text = (folder / "psm.urdf").read_text()
+    assert old in text
+    (folder / "psm.urdf").write_text(text.replace(old, new).replace('link="tool_tip"', 'link="tip"') if "tip" in new
+                                     else text.replace(old, new))  # fmt: skip
+    with pytest.raises(ValueError, match=words) as error:
+        load_arm(folder)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("stiffness: 120.0", "stifness: 120.0", "unknown key 'stifness'"),
+        ("stiffness: 120.0", "stiffness: .nan", "must be a finite number"),
+        ("  roll: ", "  rol: ", "unknown key 'rol'"),
+        ("urdf: psm.urdf", "urdf: other.urdf", "no URDF file"),
+        ("jaw: {joint: jaw_left", "jaw: {joint: jaw_right", "jaw joint 'jaw_right'"),
+        ("joints:", "joints: [", "not valid YAML"),
+    ],
+)
+def test_bad_arm_yaml_is_one_sentence(tmp_path: Path, old: str, new: str, words: str) -> None:
+    folder = tmp_path / "psm"
+    shutil.copytree(PSM.folder, folder)
+    text = (folder / "arm.yaml").read_text()
+    assert old in text
+    (folder / "arm.yaml").write_text(text.replace(old, new, 1))
+    with pytest.raises(ValueError, match=words) as error:
+        load_arm(folder)
+    assert "\n" not in str(error.value)

@@ -1,0 +1,357 @@
+"""Training as a whole: it learns, it resumes bit for bit, and it refuses what it cannot do."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from fake_env import FakeEnv
+
+from surgical_marl.evaluation import evaluate
+from surgical_marl.learning import config, train
+from surgical_marl.learning.config import NetworkSettings, PPOSettings, Settings, load_config
+from surgical_marl.learning.episodes import Episodes
+from surgical_marl.learning.policy import (
+    export_policy,
+    load_policy,
+    random_policy,
+    untrained_policy,
+    zero_policy,
+)
+from surgical_marl.learning.run import (
+    read_checkpoint,
+    read_metrics,
+    read_settings,
+    write_atomic,
+)
+
+COUNTS, SIZES = {"psm": 2, "ecm": 1}, {"psm": 3, "ecm": 2}
+SMALL = Settings(
+    num_envs=32,
+    iterations=4,
+    steps_per_iteration=8,
+    checkpoint_every=2,
+    network=NetworkSettings(hidden=(16,)),
+    ppo=PPOSettings(epochs=2, mini_batches=2),
+)
+
+
+@pytest.fixture
+def fakes(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """Training runs on fake environments, which this list collects."""
+    made: list[Any] = []
+
+    def make_env(settings: Settings, num_envs: int | None = None) -> Any:
+        made.append(FakeEnv(COUNTS, SIZES, settings.num_envs, max_steps=10))
+        return made[-1]
+
+    monkeypatch.setattr(train, "make_env", make_env)
+    return made
+
+
+def weights(run: Path) -> dict[str, torch.Tensor]:
+    return read_checkpoint(run)["algorithm"]["actor_state_dict"]
+
+
+def without_time(rows: list[dict[str, float]]) -> str:
+    return str([{k: v for k, v in row.items() if k not in ("seconds", "steps_per_s")} for row in rows])
+
+
+@pytest.mark.parametrize("algo", ["mappo", "ippo", "joint"])
+def test_the_toy_is_learned(algo: Any, tmp_path: Path, fakes: list[Any]) -> None:
+    ppo = PPOSettings(learning_rate=3e-3, gamma=0.9, mini_batches=2)
+    settings = replace(
+        SMALL,
+        algo=algo,
+        num_envs=256,
+        iterations=40,
+        steps_per_iteration=16,
+        ppo=ppo,
+        network=NetworkSettings(hidden=(32, 32)),
+    )
+    run = train.train(settings, out=tmp_path / "run")
+    env: Any = FakeEnv(COUNTS, SIZES, num_envs=100, max_steps=10)
+    trained = evaluate(env, load_policy(run, env), episodes=100, seed=7)["mean_error_mm"]
+    nothing = evaluate(env, zero_policy(env), episodes=100, seed=7)["mean_error_mm"]
+    untrained = evaluate(env, untrained_policy(env, settings), episodes=100, seed=7)["mean_error_mm"]
+    assert trained < nothing / 3
+    assert untrained > nothing / 2
+    rows = read_metrics(run)
+    assert rows[-1]["tip_error_mm"] < rows[0]["tip_error_mm"] / 2
+    assert rows[-1]["success_rate"] > rows[0]["success_rate"]
+
+
+def test_resume_is_bit_for_bit(tmp_path: Path, fakes: list[Any]) -> None:
+    whole = train.train(SMALL, out=tmp_path / "whole")
+    half = train.train(replace(SMALL, iterations=2), out=tmp_path / "half")
+    same = train.train(SMALL, out=half, resume=half)
+    copy = train.train(replace(SMALL, iterations=2), out=tmp_path / "other")
+    moved = train.train(SMALL, out=tmp_path / "moved", resume=copy)
+    first = read_checkpoint(whole)
+    for run in (same, moved):
+        again = read_checkpoint(run)
+        for part in ("actor_state_dict", "critic_state_dict"):
+            for name, value in first["algorithm"][part].items():
+                assert torch.equal(again["algorithm"][part][name], value), name
+        moments = first["algorithm"]["optimizer_state_dict"]["state"]
+        for index, moment in again["algorithm"]["optimizer_state_dict"]["state"].items():
+            assert torch.equal(moment["exp_avg_sq"], moments[index]["exp_avg_sq"])
+        assert torch.equal(again["random"], first["random"])
+        assert torch.equal(again["env"]["observations"]["state"], first["env"]["observations"]["state"])
+        assert [row["iteration"] for row in read_metrics(run)] == [1, 2, 3, 4]
+        assert without_time(read_metrics(run)) == without_time(read_metrics(whole))
+
+
+def test_the_state_holds_running_episodes(fakes: list[Any]) -> None:
+    first, second = (train.Training(SMALL, train.make_env(SMALL)) for _ in range(2))
+    first.iterate()
+    first.episodes.collided[::2] = True
+    second.set_state(first.state())
+    assert second.iteration == 1
+    assert torch.equal(second.episodes.collided, first.episodes.collided)
+    assert (second.env.env.steps == first.env.env.steps).all()
+
+
+def test_a_seed_decides_the_run(tmp_path: Path, fakes: list[Any]) -> None:
+    runs = [train.train(replace(SMALL, seed=s), out=tmp_path / str(i)) for i, s in enumerate((0, 0, 1))]
+    name = next(name for name in weights(runs[0]) if name.endswith("mlp.0.weight"))
+    first, again, other = (weights(run)[name] for run in runs)
+    assert torch.equal(first, again) and not torch.equal(first, other)
+
+
+def test_resume_drops_rows_beyond_the_checkpoint(tmp_path: Path, fakes: list[Any]) -> None:
+    run = train.train(replace(SMALL, iterations=2), out=tmp_path / "run")
+    with (run / "metrics.csv").open("a") as file:
+        file.write((run / "metrics.csv").read_text().splitlines()[-1].replace("2,", "3,", 1) + "\n")
+    train.train(replace(SMALL, iterations=3), out=run, resume=run)
+    assert [row["iteration"] for row in read_metrics(run)] == [1, 2, 3]
+
+
+def test_a_run_folder_recreates_the_run(tmp_path: Path, fakes: list[Any]) -> None:
+    settings = replace(SMALL, team_reward=True, max_steps=10)
+    run = train.train(settings, out=tmp_path / "a" / "run")
+    assert read_settings(run) == settings
+    assert read_settings(run, ["iterations=9"]) == replace(settings, iterations=9)
+    assert "torch: " in (run / "config.yaml").read_text()
+    assert (run / "curve.png").read_bytes()[:4] == b"\x89PNG"
+    assert list((run / "tensorboard").iterdir())
+    assert not list(run.glob(".*"))
+    row = read_metrics(run)[-1]
+    assert row["env_steps"] == 4 * 8 * 32 and row["episodes"] > 0
+
+
+def test_episodes_are_counted_once_each(tmp_path: Path, fakes: list[Any]) -> None:
+    episodes = Episodes(["a", "b"], 3, "cpu")
+    flags = torch.tensor
+
+    def infos(error: float, collision: list[bool]) -> dict[str, dict[str, torch.Tensor]]:
+        tip = torch.full((3,), error)
+        hit, clear = flags(collision), flags([False] * 3)
+        return {
+            "a": {"tip_error": tip, "success": flags([True, True, False]), "collision": hit},
+            "b": {"tip_error": 3 * tip, "success": flags([True, False, False]), "collision": clear},
+        }
+
+    none, reward = flags([False] * 3), flags([1.0, 2.0, 3.0])
+    episodes.add(reward, none, infos(float("nan"), [True, False, False]))
+    episodes.add(reward, flags([True, True, False]), infos(0.25, [False, False, True]))
+    episodes.add(reward, flags([True, False, False]), infos(0.5, [False, False, False]))
+    # Ended: environment 0 (mean error 0.5, both succeed, collided before), 1 (0.5, half of them),
+    # and 0 again (1.0, both, no collision).
+    assert episodes.take().tolist() == [3.0, 2.0, 2.5, 1.0, 6.0]
+    assert episodes.collided.tolist() == [False, False, True]
+    assert episodes.take().tolist() == [0.0] * 5
+
+
+def test_nan_stops_and_keeps_the_last_checkpoint(
+    tmp_path: Path, fakes: list[Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    original = train.Training.iterate
+
+    def iterate(self: train.Training) -> dict[str, float]:
+        fakes[0].poison = self.iteration == 3
+        return original(self)
+
+    monkeypatch.setattr(train.Training, "iterate", iterate)
+    with pytest.raises(FloatingPointError, match="iteration 4"):
+        train.train(replace(SMALL, iterations=9), out=tmp_path / "run")
+    checkpoint = read_checkpoint(tmp_path / "run")
+    assert checkpoint["iteration"] == 2
+    assert all(torch.isfinite(value).all() for value in weights(tmp_path / "run").values())
+    assert len(read_metrics(tmp_path / "run")) == 3
+
+
+def test_a_nan_loss_stops(tmp_path: Path, fakes: list[Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    losses = {"value_loss": float("nan")}
+    monkeypatch.setattr(train.MAPPO, "update", lambda self: self.storage.clear() or losses)
+    with pytest.raises(FloatingPointError, match="learning_rate"):
+        train.train(SMALL, out=tmp_path / "run")
+    assert read_checkpoint(tmp_path / "run")["iteration"] == 0
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_iteration_and_saves(
+    number: int, tmp_path: Path, fakes: list[Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    original = train.Training.iterate
+
+    def iterate(self: train.Training) -> dict[str, float]:
+        if self.iteration == 2:
+            os.kill(os.getpid(), number)
+        return original(self)
+
+    monkeypatch.setattr(train.Training, "iterate", iterate)
+    before = signal.getsignal(number)
+    with pytest.raises((KeyboardInterrupt, SystemExit)) as stopped:
+        train.train(replace(SMALL, checkpoint_every=50), out=tmp_path / "run")
+    assert stopped.type is (KeyboardInterrupt if number == signal.SIGINT else SystemExit)
+    assert signal.getsignal(number) is before
+    assert read_checkpoint(tmp_path / "run")["iteration"] == 3
+
+
+def test_folders_that_cannot_be_used(tmp_path: Path, fakes: list[Any]) -> None:
+    run = train.train(replace(SMALL, iterations=1), out=tmp_path / "run")
+    (tmp_path / "file").write_text("")
+    (tmp_path / "empty").mkdir()
+    exported = export_policy(run, tmp_path / "exported")
+    cases: list[tuple[Settings, dict[str, Any], str]] = [
+        (SMALL, {"out": run}, "already holds a run"),
+        (SMALL, {"out": tmp_path / "file" / "run"}, "cannot write"),
+        (SMALL, {"out": tmp_path / "new", "resume": tmp_path / "empty"}, "not a run folder"),
+        (SMALL, {"out": tmp_path / "new", "resume": exported}, "exported policy"),
+        (replace(SMALL, iterations=1), {"out": run, "resume": run}, "already has 1 iterations"),
+        (replace(SMALL, num_envs=8), {"out": run, "resume": run}, "num_envs 32"),
+        (replace(SMALL, scene="psm"), {"out": run, "resume": run}, "'bimanual_psm'"),
+    ]
+    for settings, arguments, message in cases:
+        with pytest.raises(ValueError, match=message):
+            train.train(settings, **arguments)
+    assert not (tmp_path / "new").exists()
+
+
+def test_writing_is_atomic(tmp_path: Path) -> None:
+    path = tmp_path / "file"
+    path.write_text("old")
+
+    def fail(temporary: Path) -> None:
+        temporary.write_text("half")
+        raise OSError("disk full")
+
+    with pytest.raises(OSError, match="disk full"):
+        write_atomic(path, fail)
+    assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
+
+
+def test_policies_act_alike_on_numpy_and_tensors(tmp_path: Path, fakes: list[Any]) -> None:
+    run = train.train(replace(SMALL, iterations=1), out=tmp_path / "run")
+    exported = export_policy(run, tmp_path / "exported")
+    env: Any = FakeEnv(COUNTS, SIZES, num_envs=4)
+    observations, _ = env.reset(0)
+    arrays = {agent: value.numpy() for agent, value in observations.items()}
+    policy = load_policy(run, env)
+    actions = policy(observations)
+    for agent, action in load_policy(exported, env)(arrays).items():
+        assert action.shape == (4, env.sizes[agent]) and abs(action).max() <= 1
+        torch.testing.assert_close(torch.from_numpy(action), actions[agent])
+    alone = policy({agent: value[1] for agent, value in arrays.items()})
+    torch.testing.assert_close(torch.from_numpy(alone["psm_1"]), actions["psm_1"][1])
+    far = {agent: 1e6 * value for agent, value in observations.items()}
+    assert all(action.abs().max() <= 1 for action in policy(far).values())
+    assert not any(action.any() for action in zero_policy(env)(arrays).values())
+    noise = random_policy(env, seed=3)(arrays)["psm_0"]
+    assert noise.shape == (4, 3) and abs(noise).max() <= 1 and noise.std() > 0.3
+
+
+def test_policies_that_cannot_be_loaded(tmp_path: Path, fakes: list[Any]) -> None:
+    run = train.train(replace(SMALL, iterations=1), out=tmp_path / "run")
+    other: Any = FakeEnv({"psm": 1}, SIZES)
+    with pytest.raises(ValueError, match=r"2 psm of 8 observations.*1 psm of 6 observations"):
+        load_policy(run, other)
+    env: Any = FakeEnv(COUNTS, SIZES)
+    for name in ("nothing", str(tmp_path)):
+        with pytest.raises(ValueError, match="not a run folder"):
+            load_policy(name, env)
+    data = (run / "checkpoint.pt").read_bytes()
+    for damaged in (b"", b"junk", data[: len(data) // 2]):
+        (run / "checkpoint.pt").write_bytes(damaged)
+        with pytest.raises(ValueError, match="damaged"):
+            load_policy(run, env)
+
+
+@pytest.fixture
+def reach(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
+    """Replaces the text of `reach.yaml`."""
+    monkeypatch.setattr(config, "content_dir", lambda kind: tmp_path)
+
+    def write(text: str) -> None:
+        (tmp_path / "reach.yaml").write_text(text)
+
+    return write
+
+
+def test_settings_come_from_task_scene_and_overrides(reach: Callable[[str], None]) -> None:
+    reach("num_envs: 64\nppo: {gamma: 0.9, lam: 0.8}\nscenes: {ecm: {num_envs: 32, ppo: {lam: 0.7}}}\n")
+    assert load_config("reach", "psm").num_envs == 64
+    settings = load_config("reach", "ecm", ["ppo.learning_rate=1e-4", "network.hidden=[8, 8]"])
+    assert (settings.task, settings.scene, settings.num_envs) == ("reach", "ecm", 32)
+    assert (settings.ppo.gamma, settings.ppo.lam, settings.ppo.learning_rate) == (0.9, 0.7, 1e-4)
+    assert settings.network.hidden == (8, 8)
+    assert load_config("reach", "ecm", ["num_envs=5", "num_envs=6", "max_steps=null"]).num_envs == 6
+
+
+def test_the_shipped_settings_load() -> None:
+    settings = load_config("reach", "bimanual_psm")
+    assert settings.network == NetworkSettings()
+    assert settings.network.hidden == (256, 128, 64) and settings.network.normalise_observations
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("num_env=3", r"unknown setting 'num_env'; did you mean 'num_envs'\?"),
+        ("learning_rate=3", r"unknown setting 'learning_rate'; did you mean 'ppo.learning_rate'\?"),
+        ("ppo.gama=1", r"did you mean 'ppo.gamma'\?"),
+        ("scene=psm", "unknown setting 'scene'"),
+        ("zzz=1", "the settings are: control"),
+        ("num_envs", "not an override of the form key=value"),
+        ("num_envs=0", "num_envs must be a whole number from 1 to .*, not 0"),
+        ("num_envs=1.5", "num_envs must be a whole number.*not 1.5"),
+        ("num_envs=true", "num_envs must be a whole number.*not True"),
+        ("ppo.gamma=1.5", "ppo.gamma must be a number from 0 to 1, not 1.5"),
+        ("ppo.gamma=nan", "ppo.gamma must be a number"),
+        ("ppo.gamma=fast", "ppo.gamma must be a number from 0 to 1, not 'fast'"),
+        ("algo=qmix", "algo must be one of mappo, ippo, joint, not 'qmix'"),
+        ("team_reward=1", "team_reward must be true or false, not 1"),
+        ("network.hidden=[]", "network.hidden must be a list of whole numbers"),
+        ("network.hidden=[8, x]", "network.hidden must be a whole number"),
+        ("ppo=3", "ppo must be a mapping of settings, not 3"),
+        ("max_steps=0", "max_steps must be a whole number from 1"),
+        ("ppo.mini_batches=999999", "ppo.mini_batches must be at most num_envs"),
+    ],
+)
+def test_bad_settings_are_named(override: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message) as error:
+        load_config("reach", "psm", [override])
+    assert "\n" not in str(error.value)
+
+
+def test_bad_files_are_named(reach: Callable[[str], None]) -> None:
+    for text, message in (
+        ("num_envs: [", "not valid YAML"),
+        ("- 1", "must be a mapping"),
+        ("num_env: 3", "did you mean 'num_envs'"),
+        ("scenes: {psm: {num_env: 3}}", "did you mean 'num_envs'"),
+        ("scenes: 3", "scenes must be a mapping"),
+        ("ppo: 3", "ppo must be a mapping"),
+    ):
+        reach(text)
+        with pytest.raises(ValueError, match=message):
+            load_config("reach", "psm")
+    with pytest.raises(ValueError, match=r"'reech', did you mean 'reach'"):
+        load_config("reech", "psm")

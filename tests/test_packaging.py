@@ -1,0 +1,126 @@
+"""What an installation carries, what an import costs, and how JAX is started."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tomllib
+import zipfile
+from pathlib import Path
+
+import pytest
+from hatchling.builders.wheel import WheelBuilder
+
+from surgical_marl import runtime
+
+ROOT = Path(__file__).parents[1]
+
+
+def run_python(code: str, **env: str) -> str:
+    """What the code prints, in a fresh process without settings of JAX but those given."""
+    clean = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "XLA_", "PJRT_"))}
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, cwd=ROOT, env={**clean, **env}, capture_output=True, text=True, check=True)
+    return done.stdout
+
+
+def test_importing_the_package_and_the_command_line_imports_nothing_heavy() -> None:
+    code = "import surgical_marl, surgical_marl.cli, sys; print(*sys.modules)"
+    loaded = set(run_python(code).split())
+    assert not loaded & {"jax", "torch", "mujoco", "yourdfpy", "warp", "matplotlib"}
+
+
+def test_a_wheel_carries_code_and_content(tmp_path: Path) -> None:
+    (wheel,) = WheelBuilder(str(ROOT)).build(directory=str(tmp_path), versions=["standard"])
+    names = set(zipfile.ZipFile(wheel).namelist())
+    assert {
+        "surgical_marl/cli.py",
+        "surgical_marl/content/arms/psm/arm.yaml",
+        "surgical_marl/content/arms/psm/psm.urdf",
+        "surgical_marl/content/scenes/bimanual_psm.yaml",
+        "surgical_marl/content/configs/reach.yaml",
+    } <= names
+    roots = {name.split("/")[0] for name in names}
+    assert roots == {"surgical_marl", "surgical_marl-0.1.0.dist-info"}
+
+
+def test_an_editable_install_carries_no_copy(tmp_path: Path) -> None:
+    (wheel,) = WheelBuilder(str(ROOT)).build(directory=str(tmp_path), versions=["editable"])
+    names = zipfile.ZipFile(wheel).namelist()
+    assert not [name for name in names if name.startswith("surgical_marl/")]
+
+
+def test_every_dependency_is_pinned() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"]
+    wanted = [*project["dependencies"], *extras["test"], *extras["docs"]]
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    pins = {line.split("==")[0].lower() for line in lines if not line.startswith("#")}
+    for requirement in wanted:
+        name = requirement.split("[")[0].split(">")[0].split("=")[0].strip()
+        assert name.lower() in pins, name
+
+
+STARTED = """
+import json, os
+from surgical_marl.runtime import prepare_jax
+prepare_jax()
+import jax
+jax.numpy.ones(2).block_until_ready()
+print(json.dumps({
+    "flags": os.environ.get("XLA_FLAGS", ""),
+    "cache": jax.config.jax_compilation_cache_dir,
+    "threads": os.environ.get("PJRT_NPROC"),
+    "precision": jax.config.jax_default_matmul_precision,
+}))
+"""
+
+
+@pytest.mark.parametrize("first", ["", "import jax"])
+def test_jax_is_prepared_before_it_starts(first: str, tmp_path: Path) -> None:
+    # All that is printed is the JSON: importing mujoco.mjx must say nothing.
+    got = json.loads(run_python(f"{first}\n{STARTED}", XDG_CACHE_HOME=str(tmp_path)))
+    assert got["cache"] == str(tmp_path / "surgical-marl" / "xla")
+    assert got["precision"] == "highest"
+    # With as few threads as this machine may have cores, XLA can wait for itself for ever.
+    assert int(got["threads"]) >= 8
+    assert (f"{runtime.FLAG}=false" in got["flags"]) == runtime.knows_flag()
+
+
+@pytest.mark.skipif(not runtime.knows_flag(), reason="this jaxlib has no flag to come too late")
+def test_a_late_preparation_on_a_cpu_warns() -> None:
+    code = """
+import warnings, jax
+from surgical_marl.runtime import prepare_jax
+jax.devices()
+with warnings.catch_warnings(record=True) as caught:
+    warnings.simplefilter("always")
+    prepare_jax()
+    prepare_jax()
+print(*[w.message for w in caught if w.category is RuntimeWarning], sep="\\n")
+"""
+    (warning,) = run_python(code, JAX_PLATFORMS="cpu").splitlines()
+    assert "prepare_jax()" in warning and runtime.FLAG in warning
+
+
+def test_a_users_own_settings_of_jax_stay(tmp_path: Path) -> None:
+    own = {
+        "JAX_COMPILATION_CACHE_DIR": str(tmp_path),
+        "JAX_DEFAULT_MATMUL_PRECISION": "float32",
+        "PJRT_NPROC": "3",
+    }
+    flags = f"{runtime.FLAG}=true" if runtime.knows_flag() else ""
+    got = json.loads(run_python(STARTED, XLA_FLAGS=flags, **own))
+    assert got.pop("flags") == flags
+    assert got == {"cache": str(tmp_path), "precision": "float32", "threads": "3"}
+
+
+@pytest.mark.parametrize(
+    "version, known",
+    [("0.6.2", False), ("0.7.0", True), ("0.10.2", True), ("0.12.0.1", False), ("1.0", False)],
+)
+def test_the_flag_is_only_for_versions_that_know_it(version: str, known: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.metadata.version", lambda _: version)
+    assert runtime.knows_flag() == known
