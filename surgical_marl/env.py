@@ -257,13 +257,25 @@ class Env:
         """A control step of physics, and the least distance of each contact pair on the way (before its last step)."""
 
         def substep(now: Physics, _: None) -> tuple[Physics, Array]:
-            data = self._data.replace(**now._asdict())
-            data = self._mjx.step(self._model, data)
-            after = Physics(data.qpos, data.qvel, data.qacc_warmstart, now.ctrl)
-            return after, self._contact_distances(data)
+            data = self._mjx.forward(self._model, self._data.replace(**now._asdict()))
+            distances = self._contact_distances(data)
+            data = self._integrate(data)
+            return Physics(data.qpos, data.qvel, data.qacc_warmstart, now.ctrl), distances
 
         physics, distances = jax.lax.scan(substep, physics, None, length=DECIMATION)
         return physics, distances.min(axis=0)
+
+    def _integrate(self, data: Any) -> Any:
+        """The implicitfast step. An actuator at its effort limit can't damp any more, so its damping leaves the implicit
+        matrix, as in C MuJoCo; `mjx.step` would keep it there, and brake every joint that moves at full effort.
+        """
+        from mujoco.mjx._src.forward import implicit
+
+        model = self._model
+        low, high = model.actuator_forcerange[:, 0], model.actuator_forcerange[:, 1]
+        saturated = (data.actuator_force <= low) | (data.actuator_force >= high)
+        biasprm = jnp.where(saturated[:, None], 0.0, model.actuator_biasprm)
+        return implicit(model.replace(actuator_biasprm=biasprm), data)
 
     def _contact_distances(self, data: Any) -> Array:
         return data._impl.contact.dist if self.scene.model.npair else jnp.zeros(0, jnp.float32)

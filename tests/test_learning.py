@@ -252,7 +252,7 @@ def test_policies_act_alike_on_numpy_and_tensors(tmp_path: Path, fakes: list[Any
     run = train.train(replace(SMALL, iterations=1), out=tmp_path / "run")
     exported = export_policy(run, tmp_path / "exported")
     env: Any = FakeEnv(COUNTS, SIZES, num_envs=4)
-    observations, _ = env.reset(0)
+    observations, *_ = env.reset(0)
     arrays = {agent: value.numpy() for agent, value in observations.items()}
     policy = load_policy(run, env)
     actions = policy(observations)
