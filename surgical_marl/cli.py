@@ -134,8 +134,18 @@ def _train(arguments: argparse.Namespace) -> None:
     flags = [f"{key}={value}" for key, value in given if value is not None]
 
     from surgical_marl.learning.config import load_config
+    from surgical_marl.learning.run import read_settings
 
-    settings = load_config(arguments.task, arguments.scene, [*flags, *arguments.overrides])
+    overrides = [*flags, *arguments.overrides]
+    if arguments.resume:
+        settings = read_settings(arguments.resume, overrides)
+        if (settings.task, settings.scene) != (arguments.task, arguments.scene):
+            raise ValueError(
+                f"the run in {arguments.resume} is {settings.task} on {settings.scene}, "
+                f"not {arguments.task} on {arguments.scene}"
+            )
+    else:
+        settings = load_config(arguments.task, arguments.scene, overrides)
     out = arguments.out or arguments.resume or _run_folder(settings)
 
     from surgical_marl.learning.run import write_atomic

@@ -14,15 +14,15 @@ from pathlib import Path
 from typing import Any
 
 FLAG = "--xla_cpu_use_fusion_emitters"
+"""XLA's fusion emitter on CPUs computes a serial chain of rotations again for each link that uses it, so that an arm costs
+some three times more with every joint: `surgical-marl doctor` measures it."""
 
-# These jaxlib versions know the flag; XLA aborts the process over a flag that it does not know.
-# Their fusion emitter computes a serial chain of rotations again for each link that uses it, so
-# that an arm costs some three times more with every joint: `surgical-marl doctor` measures it.
-_KNOWS_FLAG = ((0, 7), (0, 12))
-
-# Known as long as the other. Sharing the small operations of an environment step among threads costs more than it
-# gains: on two cores 512 environments of two arms run at 9,500 steps/s with this and at 4,600 without.
 THREADS_FLAG = "--xla_cpu_multi_thread_eigen"
+"""Sharing the small operations of an environment step among threads costs more than it gains: on two cores 512
+environments of two arms run at 9,500 steps/s without and at 4,600 with it."""
+
+# The jaxlib versions that know each flag, the last excluded. XLA aborts the process over a flag that it does not know.
+_KNOWN = {FLAG: ((0, 7), (0, 11)), THREADS_FLAG: ((0, 7), (0, 12))}
 
 # XLA's pool on a CPU has a thread a core. With two, a batched step of two arms blocks for ever
 # within some twenty steps: both wait for work that only another thread could do. One thread or
@@ -36,30 +36,29 @@ def cache_dir() -> Path:
     return Path(base) / "surgical-marl"
 
 
-def knows_flag() -> bool:
-    """Whether the installed jaxlib accepts `FLAG`, told without importing it."""
+def knows_flag(flag: str = FLAG) -> bool:
+    """Whether the installed jaxlib accepts a flag, told without importing it."""
     try:
         version = importlib.metadata.version("jaxlib")
     except importlib.metadata.PackageNotFoundError:
         return False
-    low, high = _KNOWS_FLAG
+    low, high = _KNOWN[flag]
     return low <= tuple(int(part) for part in version.split(".")[:2]) < high
 
 
 @functools.cache
 def prepare_jax() -> None:
     """Set JAX up for this package, once; call it before JAX starts. A user's own settings stay."""
-    if knows_flag() and FLAG not in (flags := os.environ.get("XLA_FLAGS", "")):
-        if _backend_started() and _on_cpu():
-            warnings.warn(
-                "JAX started before surgical_marl could prepare it, so physics on this CPU may be "
-                "very slow: call surgical_marl.runtime.prepare_jax() first, or set "
-                f"XLA_FLAGS={FLAG}=false",
-                RuntimeWarning,
-                stacklevel=2,
-            )
-        ours = [f"{flag}=false" for flag in (FLAG, THREADS_FLAG) if flag not in flags]
-        os.environ["XLA_FLAGS"] = " ".join([flags, *ours]).strip()
+    flags = os.environ.get("XLA_FLAGS", "")
+    ours = [flag for flag in _KNOWN if knows_flag(flag) and flag not in flags]
+    if FLAG in ours and _backend_started() and _on_cpu():
+        warnings.warn(
+            "JAX started before surgical_marl could prepare it, so physics on this CPU may be very slow: call "
+            f"surgical_marl.runtime.prepare_jax() first, or set XLA_FLAGS={FLAG}=false",
+            RuntimeWarning,
+            stacklevel=2,
+        )
+    os.environ["XLA_FLAGS"] = " ".join([flags, *(f"{flag}=false" for flag in ours)]).strip()
     if not {"NPROC", "PJRT_NPROC"} & os.environ.keys():
         os.environ["PJRT_NPROC"] = str(max(_LEAST_THREADS, os.cpu_count() or 1))
     _set_option("jax_compilation_cache_dir", str(cache_dir() / "xla"))

@@ -86,7 +86,8 @@ def test_jax_is_prepared_before_it_starts(first: str, tmp_path: Path) -> None:
     assert got["precision"] == "highest"
     # With as few threads as this machine may have cores, XLA can wait for itself for ever.
     assert int(got["threads"]) >= 8
-    assert (f"{runtime.FLAG}=false" in got["flags"]) == runtime.knows_flag()
+    for flag in (runtime.FLAG, runtime.THREADS_FLAG):
+        assert (f"{flag}=false" in got["flags"]) == runtime.knows_flag(flag)
 
 
 @pytest.mark.skipif(not runtime.knows_flag(), reason="this jaxlib has no flag to come too late")
@@ -111,7 +112,7 @@ def test_a_users_own_settings_of_jax_stay(tmp_path: Path) -> None:
         "JAX_DEFAULT_MATMUL_PRECISION": "float32",
         "PJRT_NPROC": "3",
     }
-    flags = f"{runtime.FLAG}=true" if runtime.knows_flag() else ""
+    flags = " ".join(f"{flag}=true" for flag in (runtime.FLAG, runtime.THREADS_FLAG) if runtime.knows_flag(flag))
     got = json.loads(run_python(STARTED, XLA_FLAGS=flags, **own))
     assert got.pop("flags") == flags
     assert got == {"cache": str(tmp_path), "precision": "float32", "threads": "3"}
@@ -119,7 +120,7 @@ def test_a_users_own_settings_of_jax_stay(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "version, known",
-    [("0.6.2", False), ("0.7.0", True), ("0.10.2", True), ("0.12.0.1", False), ("1.0", False)],
+    [("0.6.2", False), ("0.7.0", True), ("0.10.2", True), ("0.11.2", False), ("1.0", False)],
 )
 def test_the_flag_is_only_for_versions_that_know_it(version: str, known: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.metadata.version", lambda _: version)

@@ -7,7 +7,7 @@ Observation   joint positions and velocities, tool tip, position targets, goal, 
               way from this tip to the nearest other tip, and the least distance to any other arm. Base frame, SI units.
 Action        one number in [-1, 1] for every joint; the jaw opens above 0 and closes otherwise.
 Reward        per agent, each step: -10 / m times the distance of tip and goal, plus exp(-distance / 5 mm) for
-              precision, minus up to 1 as another arm comes closer than 5 mm, minus 2 if they touch. The sum over the
+              precision, minus up to 1 as another arm comes closer than 10 mm, minus 2 if they touch. The sum over the
               agents is the team's: the paper's summed distance, made dense at the end of the way.
 Success       tip within 2 mm of the goal.
 Termination   none; an episode is truncated after 100 control steps (2 s).
@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from surgical_marl.workspace import target_table
+from surgical_marl.workspace import CLEARANCE, target_table
 
 if TYPE_CHECKING:
     from surgical_marl.env import ArmView
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 SPREAD = 0.05
 """Standard deviation of the goals in m, as in the paper."""
 PRECISION = 0.005
-MARGIN = 0.005
+"""Distance in m over which the reward for precision falls to a third."""
 FAR = 2.0
 """Bound in m of everything observed in space; no arm reaches that far."""
 
@@ -92,7 +92,7 @@ class Task:
         return {
             agent: -10.0 * errors[agent]
             + jnp.exp(-errors[agent] / PRECISION)
-            - jnp.clip(1.0 - view.min_distance / MARGIN, 0.0, 1.0)
+            - jnp.clip(1.0 - view.min_distance / CLEARANCE, 0.0, 1.0)
             - 2.0 * view.collision
             for agent, view in views.items()
         }

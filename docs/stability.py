@@ -1,0 +1,116 @@
+"""The sweeps behind docs/physics.md: how large a physics step may be. Run: python docs/stability.py"""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from surgical_marl import load_scene
+from surgical_marl.scene import Scene
+
+CONTROL = 0.02
+SECONDS = 10.0
+INTEGRATORS = {
+    "euler": mujoco.mjtIntegrator.mjINT_EULER,
+    "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+}
+
+
+def prepared(scene: Scene, timestep: float, integrator: str = "implicitfast", gain: float = 1.0) -> mujoco.MjModel:
+    """The scene's model at a physics step, all controller gains scaled."""
+    model = load_scene(scene.name).model
+    model.opt.timestep = timestep
+    model.opt.integrator = INTEGRATORS[integrator]
+    model.actuator_gainprm[:, 0] *= gain
+    model.actuator_biasprm[:, 1:3] *= gain
+    return model
+
+
+def targets(scene: Scene, seed: int = 0) -> np.ndarray:
+    """Random walks of all position targets at full speed, and minutes pressed against limits: [steps, nu]."""
+    rng = np.random.default_rng(seed)
+    speed = np.array([j.drive.speed for mount in scene.mounts.values() for j in mount.arm.joints])
+    low, high = scene.model.actuator_ctrlrange.T
+    now, walk = scene.home.copy(), []
+    for step in range(round(SECONDS / CONTROL)):
+        if step % 25 == 0:  # half a second one way, so that limits are reached
+            way = rng.uniform(-1, 1, len(speed))
+        now = np.clip(now + way * speed * CONTROL, low, high)
+        walk.append(now)
+    return np.array(walk)
+
+
+def rollout(model: mujoco.MjModel, scene: Scene, ctrl: np.ndarray) -> tuple[np.ndarray, float]:
+    """qpos at each control step, and the greatest share of a joint's range by which it passed a limit."""
+    data = mujoco.MjData(model)
+    data.qpos[:] = scene.home
+    low, high = model.jnt_range.T
+    found, passed = [], 0.0
+    for target in ctrl:
+        data.ctrl[:] = target
+        for _ in range(round(CONTROL / model.opt.timestep)):
+            mujoco.mj_step(model, data)
+            passed = max(passed, float(np.max(np.maximum(data.qpos - high, low - data.qpos) / (high - low))))
+        if data.warning.number.any():  # MuJoCo resets what became unstable
+            return np.array(found), np.inf
+        found.append(data.qpos.copy())
+    return np.array(found), passed
+
+
+def energy_drift(scene: Scene, timestep: float) -> float:
+    """Greatest relative change of kinetic energy in 2 s of the arm coasting, undamped, without actuators and limits."""
+    model = prepared(scene, timestep)
+    model.dof_damping[:] = 0
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY
+    data = mujoco.MjData(model)
+    data.qpos[:] = scene.home
+    for agent in scene.agents:
+        data.joint(f"{agent}/yaw").qvel = 0.3
+        data.joint(f"{agent}/pitch").qvel = 0.2
+        data.joint(f"{agent}/insertion").qvel = 0.02
+    mujoco.mj_forward(model, data)
+    start, worst = data.energy[1], 0.0
+    while data.time < 2.0:
+        mujoco.mj_step(model, data)
+        worst = max(worst, abs(data.energy[1] / start - 1))
+    return worst
+
+
+def main() -> None:
+    scene = load_scene("bimanual_psm")
+    ctrl = targets(scene)
+    reference, _ = rollout(prepared(scene, 0.0005), scene, ctrl)
+    weights = np.where(scene.model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE, 1000.0, np.degrees(1.0))
+    print("| physics step | integrator | gains | limit passed by | off the 0.5 ms path (95 %): slides | hinges |")
+    print("|---|---|---|---|---|---|")
+    for timestep in (0.02, 0.01, 0.005, 0.0025):
+        for integrator in INTEGRATORS:
+            for gain in (1.0, 2.0, 4.0):
+                path, passed = rollout(prepared(scene, timestep, integrator, gain), scene, ctrl)
+                row = f"| {1000 * timestep:g} ms | {integrator} | x{gain:g} "
+                if not np.isfinite(passed):
+                    print(row + f"| unstable after {len(path) * CONTROL:.2f} s | | |")
+                    continue
+                off = "| | |"
+                if gain == 1.0:
+                    error = np.abs(path - reference) * weights
+                    slides = scene.model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE
+                    off = f"| {np.percentile(error[:, slides], 95):.2f} mm | {np.percentile(error[:, ~slides], 95):.2f}° |"
+                print(row + f"| {passed:.2%} " + off)
+    print("\n| physics step | energy drift, 2 s |\n|---|---|")
+    for timestep in (0.01, 0.005, 0.0025, 0.001):
+        print(f"| {1000 * timestep:g} ms | {energy_drift(scene, timestep):.2%} |")
+    print("\n| Newton iterations | limit passed by | off 20 iterations (max): slides | hinges |\n|---|---|---|---|")
+    paths = {}
+    for iterations in (20, 1, 2, 4):
+        model = prepared(scene, 0.005)
+        model.opt.iterations, model.opt.ls_iterations = iterations, 4 if iterations < 20 else 50
+        paths[iterations], passed = rollout(model, scene, ctrl)
+        error = np.abs(paths[iterations] - paths[20]).max(0) * weights
+        slides = model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE
+        print(f"| {iterations} | {passed:.2%} | {error[slides].max():.4f} mm | {error[~slides].max():.4f}° |")
+
+
+if __name__ == "__main__":
+    main()
