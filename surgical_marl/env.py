@@ -266,8 +266,8 @@ class Env:
         return physics, distances.min(axis=0)
 
     def _integrate(self, data: Any) -> Any:
-        """The implicitfast step. An actuator at its effort limit can't damp any more, so its damping leaves the implicit
-        matrix, as in C MuJoCo; `mjx.step` would keep it there, and brake every joint that moves at full effort.
+        """The implicitfast step. An actuator at its effort limit can't damp any more, so its damping leaves the
+        implicit matrix, as in C MuJoCo; `mjx.step` would keep it there and brake each joint that moves at full effort.
         """
         from mujoco.mjx._src.forward import implicit
 

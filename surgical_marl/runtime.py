@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 FLAG = "--xla_cpu_use_fusion_emitters"
-"""XLA's fusion emitter on CPUs computes a serial chain of rotations again for each link that uses it, so that an arm costs
-some three times more with every joint: `surgical-marl doctor` measures it."""
+"""XLA's fusion emitter on CPUs computes a serial chain of rotations again for each link that uses it, so that an arm
+costs some three times more with every joint: `surgical-marl doctor` measures it."""
 
 THREADS_FLAG = "--xla_cpu_multi_thread_eigen"
 """Sharing the small operations of an environment step among threads costs more than it gains: on two cores 512
