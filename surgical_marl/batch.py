@@ -147,7 +147,7 @@ class BatchedEnv:
 
     @steps.setter
     def steps(self, steps: Any) -> None:
-        value = self.engine.to_device(np.asarray(steps, np.int32))
+        value = self._take(steps).astype(np.int32)
         if value.shape != (self.num_envs,):
             raise ValueError(f"steps of shape {value.shape} must be [{self.num_envs}]")
         self._carry = self._running()._replace(steps=value)
@@ -190,13 +190,14 @@ class BatchedEnv:
                 action = np.asarray(action, np.float32)
                 if not np.isfinite(action).all():
                     raise ValueError(f"action of {agent!r} holds a value that is not finite")
-            checked[agent] = self._take(action)
+            checked[agent] = self._take(action).astype(np.float32)
         return checked
 
-    def _take(self, action: Any) -> jax.Array:
-        if type(action).__module__.startswith("torch"):
-            action = jax.dlpack.from_dlpack(action.detach().contiguous().float())
-        return self.engine.to_device(action)
+    def _take(self, values: Any) -> jax.Array:
+        """Values of any array library, on the engine's device."""
+        if type(values).__module__.startswith("torch"):
+            values = jax.dlpack.from_dlpack(values.detach().contiguous())
+        return self.engine.to_device(values)
 
     def _convert(self, tree: Any) -> Any:
         if self.arrays == "jax":

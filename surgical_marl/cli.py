@@ -68,6 +68,8 @@ class _Parser(argparse.ArgumentParser):
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     # argparse cannot take `key=value` after a flag as a positional: collect what it leaves over.
     arguments, rest = _parser().parse_known_args(argv)
+    if arguments.command is _train and "=" in (arguments.task or ""):
+        arguments.task, rest = None, [arguments.task, *rest]
     arguments.overrides = [text for text in rest if "=" in text and not text.startswith("-")]
     for text in rest:
         if text not in arguments.overrides or arguments.command is not _train:
@@ -83,16 +85,17 @@ def _parser() -> argparse.ArgumentParser:
     train = commands.add_parser(
         "train",
         help="train a policy, then evaluate it",
-        usage="%(prog)s TASK --scene SCENE [options] [key=value ...]",
+        usage="%(prog)s TASK --scene SCENE [options] [key=value ...]\n"
+        "       %(prog)s --resume DIR [options] [key=value ...]",
         epilog="key=value sets anything in configs/, such as ppo.learning_rate=3e-4",
     )
-    train.add_argument("task", metavar="TASK", help=f"one of: {', '.join(list_tasks())}")
-    train.add_argument("--scene", required=True, help="a name (see `list scenes`) or a .yaml file")
+    train.add_argument("task", nargs="?", metavar="TASK", help=f"one of: {', '.join(list_tasks())}")
+    train.add_argument("--scene", help="a name (see `list scenes`) or a .yaml file")
     for key, good, text in _SETTINGS:
         flag, check = f"--{key.replace('_', '-')}", str if isinstance(good, str) else _one_of(good)
         train.add_argument(flag, type=check, metavar=good if isinstance(good, str) else "|".join(good), help=text)
     train.add_argument("--out", type=Path, metavar="DIR", help="run folder (default: runs/...)")
-    train.add_argument("--resume", type=Path, metavar="DIR", help="run folder to continue from")
+    train.add_argument("--resume", type=Path, metavar="DIR", help="run folder to go on with")
     train.set_defaults(command=_train, name="train")
 
     evaluate = commands.add_parser("eval", help="measure a trained policy")
@@ -127,9 +130,12 @@ def _doctor(arguments: argparse.Namespace) -> None:
 
 
 def _train(arguments: argparse.Namespace) -> None:
-    if arguments.task not in list_tasks():
+    if arguments.task is not None and arguments.task not in list_tasks():
         raise unknown("task", arguments.task, list_tasks())
-    find("scenes", arguments.scene)
+    if arguments.scene is not None:
+        find("scenes", arguments.scene)
+    if not arguments.resume and None in (arguments.task, arguments.scene):
+        raise ValueError(f"train needs TASK ({', '.join(list_tasks())}) and --scene ({', '.join(list_scenes())})")
     given = ((key, getattr(arguments, key)) for key, _, _ in _SETTINGS)
     flags = [f"{key}={value}" for key, value in given if value is not None]
 
@@ -139,11 +145,9 @@ def _train(arguments: argparse.Namespace) -> None:
     overrides = [*flags, *arguments.overrides]
     if arguments.resume:
         settings = read_settings(arguments.resume, overrides)
-        if (settings.task, settings.scene) != (arguments.task, arguments.scene):
-            raise ValueError(
-                f"the run in {arguments.resume} is {settings.task} on {settings.scene}, "
-                f"not {arguments.task} on {arguments.scene}"
-            )
+        for key, own in (("task", settings.task), ("scene", settings.scene)):
+            if (given_name := getattr(arguments, key)) not in (None, own):
+                raise ValueError(f"the run in {arguments.resume} is of {key} {own!r}, not {given_name!r}")
     else:
         settings = load_config(arguments.task, arguments.scene, overrides)
     out = arguments.out or arguments.resume or _run_folder(settings)

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 from gymnasium import spaces
 from jax import Array
@@ -119,6 +120,7 @@ class Env:
         self._mjx = mjx
         self._model = mjx.put_model(self.scene.model)
         self._index_model()
+        self._home_views = self._measure_home()
         self._bounds = {agent: self.task.bounds(agent) for agent in self.agents}
 
     def num_actions(self, agent: str) -> int:
@@ -144,8 +146,7 @@ class Env:
     def reset(self, key: Array, episode: Array | int = 0) -> State:
         """The start of an episode. `key` is raw (uint32 [2], as of `jax.random.PRNGKey`) and numbers its episodes."""
         carry = self._start(key, jnp.int32(episode))
-        views = self._views(carry.physics, jnp.full((self.scene.model.npair,), jnp.inf))
-        observations, state = self._observe(views, carry.goal)
+        observations, state = self._observe(self._home_views, carry.goal)
         return State(
             carry=carry,
             observations=observations,
@@ -155,7 +156,7 @@ class Env:
             truncated=jnp.bool_(False),
             final_observations=observations,
             final_state=state,
-            infos=self._infos(views, carry.goal),
+            infos=self._infos(self._home_views, carry.goal),
         )
 
     def step(self, carry: Carry, actions: dict[str, Array]) -> State:
@@ -170,9 +171,7 @@ class Env:
         final_observations, final_state = self._observe(views, carry.goal)
         going = carry._replace(physics=physics, steps=steps)
         fresh = self._start(carry.key, carry.episode + 1)
-        fresh_observations, fresh_state = self._observe(
-            self._views(fresh.physics, jnp.full_like(distances, jnp.inf)), fresh.goal
-        )
+        fresh_observations, fresh_state = self._observe(self._home_views, fresh.goal)
         done = terminated | truncated
         pick = lambda new, old: jnp.where(done, new, old)  # noqa: E731
         return State(
@@ -208,6 +207,8 @@ class Env:
         self._speed, self._effort = np.array(speed, np.float32), np.array(effort, np.float32)
         self._low, self._high = np.array(low, np.float32), np.array(high, np.float32)
         self._open, self._closed = np.array(opened, np.float32), np.array(closed, np.float32)
+        home = self.scene.home
+        self._home_command = home if self.scene.control == "position" else np.where(self._jaws, home, 0.0)
         self._qpos_index = {agent: self.scene.qpos_index(agent) for agent in self.agents}
         self._actuators = {
             agent: np.array([names.index(f"{agent}/{joint.name}") for joint in mount.arm.actuated])
@@ -227,12 +228,41 @@ class Env:
                 agent: np.flatnonzero([agent in (owner[a], owner[b]) for a, b in pairs]) for agent in self.agents
             }
 
+    def _measure_home(self) -> dict[str, ArmView]:
+        """What tasks see where every episode starts, by C MuJoCo: constants, so that a step computes no second pose."""
+        model = self.scene.model
+        data = mujoco.MjData(model)
+        data.qpos[:] = self.scene.home
+        mujoco.mj_kinematics(model, data)
+        distances = [
+            (model.geom(a).name, model.geom(b).name, mujoco.mj_geomDistance(model, data, a, b, 100.0, None))
+            for a, b in zip(model.pair_geom1, model.pair_geom2, strict=True)
+        ]
+        views = {}
+        for agent, mount in self.scene.mounts.items():
+            tip = data.site_xpos[self._sites[agent]]
+            offsets = [data.site_xpos[self._sites[other]] - tip for other in self.agents if other != agent]
+            nearest = min(offsets, key=np.linalg.norm, default=np.zeros(3))
+            near = min((d for *names, d in distances if any(n.startswith(f"{agent}/") for n in names)), default=np.inf)
+            qpos = self.scene.home[self._qpos_index[agent]]
+            start = {
+                "qpos": qpos,
+                "qvel": np.zeros_like(qpos),
+                "command": self._home_command[self._actuators[agent]],
+                "tool_tip": (tip - mount.position) @ mount.rotation,
+                "nearest_tip": nearest @ mount.rotation,
+                "min_distance": near,
+            }
+            views[agent] = ArmView(
+                **{key: jnp.asarray(value, jnp.float32) for key, value in start.items()}, collision=jnp.bool_(near < 0)
+            )
+        return views
+
     def _start(self, key: Array, episode: Array) -> Carry:
-        home = np.asarray(self.scene.home, np.float32)
         still = jnp.zeros(self.scene.model.nv, jnp.float32)
-        ctrl = jnp.asarray(home if self.scene.control == "position" else np.where(self._jaws, home, 0.0), jnp.float32)
+        home, command = (jnp.asarray(a, jnp.float32) for a in (self.scene.home, self._home_command))
         return Carry(
-            physics=Physics(jnp.asarray(home), still, still, ctrl),
+            physics=Physics(home, still, still, command),
             goal=self.task.goal(jax.random.fold_in(key, episode)),
             key=key,
             episode=episode,

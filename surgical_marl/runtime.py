@@ -87,11 +87,19 @@ def _on_cpu() -> bool:
 
 
 def _import_mjx_quietly() -> None:
-    # Without a working Warp, `import mujoco.mjx` prints two lines, to stdout; with it, a banner.
-    with contextlib.redirect_stdout(io.StringIO()):
-        if importlib.util.find_spec("warp"):
-            with contextlib.suppress(ImportError, RuntimeError):
-                import warp
+    """`import mujoco.mjx` prints two lines to stdout without Warp, and a banner with it. Warp needs an NVIDIA GPU and
+    takes a second to import: without one MJX does not get to see it."""
+    hidden = "warp" not in sys.modules and not Path("/dev/nvidiactl").exists()
+    if hidden:
+        sys.modules["warp"] = None  # type: ignore[assignment]
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):
+            if not hidden and importlib.util.find_spec("warp"):
+                with contextlib.suppress(ImportError, RuntimeError):
+                    import warp
 
-                warp.config.log_level = warp.LOG_WARNING
-        import mujoco.mjx  # noqa: F401
+                    warp.config.log_level = warp.LOG_WARNING
+            import mujoco.mjx  # noqa: F401
+    finally:
+        if hidden:
+            del sys.modules["warp"]

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import imageio.v2 as imageio
-import imageio_ffmpeg
 import numpy as np
 from numpy.typing import NDArray
 
@@ -45,9 +44,11 @@ def write_video(path: str | os.PathLike[str], frames: Frames, fps: float) -> Pat
 def ffmpeg_runs() -> bool:
     """Whether an mp4 can be written here."""
     try:
+        import imageio_ffmpeg
+
         command = [imageio_ffmpeg.get_ffmpeg_exe(), "-version"]
         return subprocess.run(command, capture_output=True, timeout=20).returncode == 0
-    except (OSError, RuntimeError, subprocess.TimeoutExpired):
+    except (ImportError, OSError, RuntimeError, subprocess.TimeoutExpired):
         return False
 
 
@@ -60,6 +61,8 @@ def _write_gif(path: Path, shape: tuple[int, ...], frames: Frames, fps: float) -
 
 
 def _write_mp4(path: Path, shape: tuple[int, ...], frames: Frames, fps: float) -> None:
+    import imageio_ffmpeg
+
     # Not by imageio's own writer: it forks with a Python hook, which threads of JAX may deadlock.
     source = f"-f rawvideo -pix_fmt rgb24 -s {shape[1]}x{shape[0]} -r {fps:g} -i -"
     even = "-vf pad=ceil(iw/2)*2:ceil(ih/2)*2"

@@ -1,0 +1,217 @@
+"""The PettingZoo and Gymnasium faces: the field's own checks, ours beyond them, and equal numbers behind both."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pettingzoo
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode
+from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test
+
+import surgical_marl as sm
+
+SCENES = ("psm", "bimanual_psm")
+STEPS = 12
+
+
+def make(scene: str = "bimanual_psm", **options: Any) -> Any:
+    return sm.parallel_env("reach", scene=scene, max_steps=STEPS, **options)
+
+
+def play(env: Any, seed: int, episodes: int = 2) -> list[Any]:
+    """Everything that whole episodes of random actions return, in order."""
+    rng, seen = np.random.default_rng(seed), []
+    for episode in range(episodes):
+        observations, infos = env.reset(seed=seed if episode == 0 else None)
+        seen += [observations, infos, env.state()]
+        while env.agents:
+            actions = {agent: rng.uniform(-1, 1, env.action_space(agent).shape) for agent in env.agents}
+            seen += [*env.step(actions), env.state()]
+    return seen
+
+
+def assert_same(one: Any, other: Any, **tolerance: float) -> None:
+    if isinstance(one, dict):
+        assert one.keys() == other.keys()
+        for key in one:
+            assert_same(one[key], other[key], **tolerance)
+    else:
+        np.testing.assert_allclose(one, other, **(tolerance or {"rtol": 0, "atol": 0}))
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_pettingzoo_accepts_it(scene: str) -> None:
+    parallel_api_test(make(scene), num_cycles=3 * STEPS)
+    parallel_seed_test(lambda: make(scene))
+    api_test(sm.reach_v0.env(scene=scene, max_steps=STEPS), num_cycles=3 * STEPS)
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_one_seed_is_the_same_for_whole_episodes(scene: str) -> None:
+    first, second, other = play(make(scene), 3), play(make(scene), 3), play(make(scene), 4)
+    assert len(first) == 2 * (3 + 6 * STEPS)
+    for one, same in zip(first, second, strict=True):
+        assert_same(one, same)
+    assert any(not np.array_equal(one["psm_0"], two["psm_0"]) for one, two in zip(first[::9], other[::9], strict=True))
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_every_observation_lies_in_its_space_and_every_info_keeps_the_contract(scene: str) -> None:
+    env, rng = make(scene), np.random.default_rng(0)
+    for episode in range(2):
+        observations, infos = env.reset(seed=episode)
+        for step in range(STEPS):
+            assert env.state_space.contains(env.state())
+            for agent in env.possible_agents:
+                assert observations[agent].dtype == np.float32
+                assert env.observation_space(agent).contains(observations[agent])
+                info = infos[agent]
+                assert [type(info[key]) for key in ("tip_error", "success", "collision", "min_distance")] == [
+                    float, bool, bool, float]  # fmt: skip
+            actions = {agent: rng.uniform(-1, 1, env.action_space(agent).shape) for agent in env.agents}
+            observations, rewards, terminations, truncations, infos = env.step(actions)
+            ended = step == STEPS - 1
+            assert set(truncations.values()) == {ended} and set(terminations.values()) == {False}
+            assert all(np.isfinite(reward) for reward in rewards.values())
+        assert env.agents == []
+
+
+def test_what_is_returned_stays_as_it_was() -> None:
+    env = make()
+    observations, _ = env.reset(seed=0)
+    kept, before = observations["psm_0"], observations["psm_0"].copy()
+    env.step({agent: np.ones(7) for agent in env.agents})
+    np.testing.assert_array_equal(kept, before)
+    kept[:] = 7.0
+    again, _ = env.reset(seed=0)
+    np.testing.assert_array_equal(again["psm_0"], before)
+
+
+@pytest.mark.parametrize("arrays", ["numpy", "torch", "jax"])
+def test_many_environments_are_the_same_dicts_with_a_leading_axis(arrays: str) -> None:
+    """The first of three environments plays what one alone plays, and goes on where that one ends."""
+    many, one, rng = make(num_envs=3, arrays=arrays), make(), np.random.default_rng(0)
+    observations, infos = many.reset(seed=5)
+    alone, alone_infos = one.reset(seed=5)
+    close = {"atol": 2e-4, "rtol": 1e-4}
+    for step in range(STEPS):
+        for agent in one.possible_agents:
+            assert observations[agent].shape == (3, *one.observation_space(agent).shape)
+            assert_same(alone[agent], np.asarray(observations[agent][0]), **close)
+            assert_same(alone_infos[agent]["tip_error"], float(infos[agent]["tip_error"][0]), **close)
+        actions = {a: rng.uniform(-1, 1, (3, 7)).astype(np.float32) for a in many.agents}
+        alone, alone_rewards, _, alone_truncations, alone_infos = one.step({a: v[0] for a, v in actions.items()})
+        sent = {a: torch.from_numpy(v) if arrays == "torch" else v for a, v in actions.items()}
+        observations, rewards, _, truncations, infos = many.step(sent)
+        for agent in many.agents:
+            assert_same(alone_rewards[agent], float(rewards[agent][0]), **close)
+            assert alone_truncations[agent] == bool(truncations[agent][0]) == (step == STEPS - 1)
+            final = infos[agent]["final_observation"]
+            assert_same(alone[agent], np.asarray(final[0]), **close)
+            if step < STEPS - 1:
+                assert_same(np.asarray(final), np.asarray(observations[agent]))
+    assert many.agents == many.possible_agents
+    assert many.state().shape == (3, *many.state_space.shape)
+
+
+def test_pettingzoo_makes_it_by_its_id() -> None:
+    env = pettingzoo.make("parallel", "surgical_marl/reach-v0", scene="psm", max_steps=STEPS)
+    assert env.reset(seed=0)[0].keys() == {"psm_0"}
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_gymnasium_accepts_it_without_a_warning(scene: str) -> None:
+    env = gymnasium.make("surgical_marl/Reach-v0", scene=scene, max_steps=STEPS, render_mode="rgb_array")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(env.unwrapped)
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_both_faces_show_the_same_numbers(scene: str) -> None:
+    joint = gymnasium.make("surgical_marl/Reach-v0", scene=scene, max_steps=STEPS)
+    team, rng = make(scene), np.random.default_rng(0)
+    observation, _ = joint.reset(seed=9)
+    team.reset(seed=9)
+    for _ in range(STEPS):
+        np.testing.assert_array_equal(observation, team.state())
+        action = rng.uniform(-1, 1, joint.action_space.shape).astype(np.float32)
+        actions = dict(zip(team.possible_agents, np.split(action, len(team.possible_agents)), strict=True))
+        observation, reward, terminated, truncated, info = joint.step(action)
+        _, rewards, _, truncations, infos = team.step(actions)
+        assert reward == pytest.approx(sum(rewards.values()), rel=1e-6)
+        assert truncated == truncations["psm_0"] and not terminated
+        assert info["tip_error"] == max(i["tip_error"] for i in infos.values())
+        assert info["success"] == all(i["success"] for i in infos.values())
+
+
+def test_a_vector_env_restarts_in_the_step_that_ends() -> None:
+    envs = gymnasium.make_vec("surgical_marl/Reach-v0", scene="psm", num_envs=3, max_steps=STEPS)
+    one = gymnasium.make("surgical_marl/Reach-v0", scene="psm", max_steps=STEPS)
+    assert envs.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
+    observations, _ = envs.reset(seed=2)
+    alone, _ = one.reset(seed=2)
+    rng = np.random.default_rng(0)
+    for step in range(STEPS):
+        assert envs.observation_space.contains(observations)
+        np.testing.assert_allclose(alone, observations[0], atol=2e-4, rtol=1e-4)
+        actions = rng.uniform(-1, 1, envs.action_space.shape).astype(np.float32)
+        alone, *_ = one.step(actions[0])
+        observations, _, terminated, truncated, infos = envs.step(actions)
+        assert truncated.all() == (step == STEPS - 1) and not terminated.any()
+    assert infos["_final_obs"].all()
+    np.testing.assert_allclose(alone, infos["final_obs"][0], atol=2e-4, rtol=1e-4)
+    assert not np.allclose(observations, infos["final_obs"])
+
+
+def test_pictures_are_for_one_environment() -> None:
+    env = make(render_mode="rgb_array")
+    env.reset(seed=0)
+    frame = env.render()
+    assert frame.dtype == np.uint8 and frame.ndim == 3 and frame.std() > 10
+    assert make().render() is None
+    with pytest.raises(ValueError, match="one environment only"):
+        make(num_envs=2, render_mode="rgb_array")
+    with pytest.warns(UserWarning), pytest.raises(ValueError, match="unknown render_mode 'ansi'"):
+        gymnasium.make("surgical_marl/Reach-v0", scene="psm", render_mode="ansi")
+
+
+@pytest.mark.parametrize(
+    ("actions", "words"),
+    [
+        ({"psm_0": np.zeros(7)}, "no action for agent 'psm_1'"),
+        ({"psm_0": np.zeros(7), "psm_1": np.zeros(6)}, "shape"),
+        ({"psm_0": np.zeros(7), "psm_1": np.full(7, np.nan)}, "not finite"),
+        ({"psm_0": np.zeros(7), "psm_1": np.zeros(7), "ecm_0": np.zeros(4)}, "'ecm_0'"),
+    ],
+)
+def test_a_bad_action_is_one_sentence_and_changes_nothing(actions: dict[str, Any], words: str) -> None:
+    env = make()
+    env.reset(seed=0)
+    before = env.state()
+    with pytest.raises(ValueError, match=words) as caught:
+        env.step(actions)
+    assert "\n" not in str(caught.value)
+    np.testing.assert_array_equal(env.state(), before)
+    env.step({agent: np.zeros(7) for agent in env.agents})
+
+
+def test_steps_out_of_turn_are_refused() -> None:
+    env, still = make(), {agent: np.zeros(7) for agent in ("psm_0", "psm_1")}
+    with pytest.raises(ValueError, match=r"reset\(\)"):
+        env.step(still)
+    env.reset(seed=0)
+    for _ in range(STEPS):
+        env.step(still)
+    with pytest.raises(ValueError, match="the episode is over"):
+        env.step(still)
+    with pytest.raises(ValueError, match="arrays='torch' needs num_envs"):
+        make(arrays="torch")
+    with pytest.raises(ValueError, match="seed must be a whole number"):
+        env.reset(seed=-1)

@@ -1,0 +1,116 @@
+"""Scenes: where arms stand, what can touch, and files that are wrong."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from surgical_marl import list_scenes, load_scene
+from surgical_marl.geometry import segment_distance
+from surgical_marl.scene import Scene
+
+BIMANUAL = load_scene("bimanual_psm")
+
+
+def least_distance(scene: Scene, qpos: np.ndarray) -> float:
+    """C MuJoCo's least distance over all contact pairs."""
+    data = mujoco.MjData(scene.model)
+    data.qpos[:] = qpos
+    mujoco.mj_kinematics(scene.model, data)
+    pairs = zip(scene.model.pair_geom1, scene.model.pair_geom2, strict=True)
+    return min(mujoco.mj_geomDistance(scene.model, data, a, b, 10.0, None) for a, b in pairs)
+
+
+def test_the_remote_centers_stand_as_measured() -> None:
+    """0.171 m apart, shafts 68.5 degrees to each other, meeting in front (jhu-daVinci-Si, suj-fixed.json)."""
+    one, other = BIMANUAL.mounts.values()
+    assert np.linalg.norm(one.position - other.position) == pytest.approx(0.171)
+    shafts = [mount.rotation @ mount.arm.forward_kinematics(mount.arm.home)[:3, 2] for mount in (one, other)]
+    assert np.degrees(np.arccos(shafts[0] @ shafts[1])) == pytest.approx(68.5)
+    ahead = [mount.position + 0.1 * shaft for mount, shaft in zip((one, other), shafts, strict=True)]
+    assert np.linalg.norm(ahead[0] - ahead[1]) < 0.171
+
+
+def test_every_moving_part_can_meet_every_part_of_the_other_arm() -> None:
+    model = BIMANUAL.model
+    pairs = {
+        tuple(model.geom(int(g)).name for g in pair) for pair in zip(model.pair_geom1, model.pair_geom2, strict=True)
+    }
+    parts = ("shaft", "wrist", "jaw_left", "jaw_right")
+    assert len(pairs) == model.npair == 16
+    for a in parts:
+        for b in parts:
+            assert any(x.startswith(f"psm_0/{a}") and y.startswith(f"psm_1/{b}") for x, y in pairs), (a, b)
+
+
+@pytest.mark.parametrize("name", list_scenes())
+def test_home_is_free_and_lies_within_limits(name: str) -> None:
+    scene = load_scene(name)
+    low, high = scene.model.jnt_range.T
+    assert ((scene.home >= low) & (scene.home <= high)).all()
+    data = mujoco.MjData(scene.model)
+    data.qpos[:] = scene.home
+    mujoco.mj_forward(scene.model, data)
+    assert data.ncon == 0
+    if len(scene.agents) > 1:
+        assert least_distance(scene, scene.home) > 0.02
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.lists(st.floats(0, 1), min_size=14, max_size=14))
+def test_clearance_equals_mujocos_distance(shares: list[float]) -> None:
+    arm = BIMANUAL.mounts["psm_0"].arm
+    q = arm.lower + np.reshape(shares, (2, 7)) * (arm.upper - arm.lower)
+    joints = dict(zip(BIMANUAL.agents, q, strict=True))
+    expected = least_distance(BIMANUAL, BIMANUAL.full_qpos(joints))
+    clearance = float(BIMANUAL.clearance(joints))
+    # where axes cross, MuJoCo's depth is by a rule of its own; before that the two are the same number
+    assert clearance == pytest.approx(expected, abs=1e-6) or (clearance < 0 and expected < 0)
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.lists(st.floats(-1, 1), min_size=12, max_size=12))
+def test_segment_distance_is_the_least_over_points(numbers: list[float]) -> None:
+    a, b, c, d = np.reshape(numbers, (4, 3))
+    shares = np.linspace(0, 1, 101)
+    points = a + shares[:, None] * (b - a), c + shares[:, None] * (d - c)
+    sampled = np.linalg.norm(points[0][:, None] - points[1][None], axis=-1).min()
+    exact = float(segment_distance(a, b, c, d))
+    assert exact <= sampled + 1e-9
+    assert sampled - exact < 0.5 * (np.linalg.norm(b - a) + np.linalg.norm(d - c)) / 100 + 1e-9
+
+
+def test_a_scene_of_ones_own_is_a_file_anywhere(tmp_path: Path) -> None:
+    path = tmp_path / "apart.yaml"
+    path.write_text("arms:\n  psm_0: {arm: psm}\n  psm_1: {arm: psm, position: [0.5, 0, 0]}\n")
+    scene = load_scene(path)
+    assert (scene.name, scene.agents) == ("apart", ("psm_0", "psm_1"))
+    assert float(scene.clearance({agent: scene.mounts[agent].arm.home for agent in scene.agents})) > 0.4
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[1, 2", "apart.yaml"),
+        ("arms: 3", "must map agent names"),
+        ("arms: {}", "must map agent names"),
+        ("arms: {psm_0: {arm: psm}}\nfriction: 1", "'friction'"),
+        ("arms: {psm_0: {arm: psn}}", "unknown arm 'psn', did you mean 'psm'"),
+        ("arms: {psm_0: {position: [0, 0, 0]}}", "names its arm"),
+        ("arms: {psm_0: {arm: psm, positon: [0, 0, 0]}}", "'positon'"),
+        ("arms: {psm_0: {arm: psm, position: [0, 0]}}", "three finite numbers"),
+        ("arms: {psm_0: {arm: psm, tilt: [0, .nan, 0]}}", "three finite numbers"),
+        ("arms: {left: {arm: psm}}", "called psm_0, psm_1"),
+    ],
+)
+def test_a_wrong_file_is_one_sentence(tmp_path: Path, text: str, words: str) -> None:
+    path = tmp_path / "apart.yaml"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=words) as caught:
+        load_scene(path)
+    assert "\n" not in str(caught.value)
