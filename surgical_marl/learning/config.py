@@ -244,4 +244,4 @@ def _as_float(value: Any) -> Any:
 def _describe(kind: Any, limits: tuple[float, float] | None) -> str:
     words = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
     text = words.get(kind, f"a {getattr(kind, '__name__', kind)}")
-    return text if limits is None else f"{text} from {limits[0]:g} to {limits[1]:g}"
+    return text if limits is None else f"{text} from {limits[0]:,.12g} to {limits[1]:,.12g}"
