@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 CONTROL_MODES = ("position", "velocity", "torque")
 MOVING = ("revolute", "prismatic")
+KEYS = ("description", "urdf", "tool_tip", "remote_center", "camera", "joints", "jaw")
 
 
 @dataclass(frozen=True)
@@ -49,6 +50,17 @@ class Jaw:
 
 
 @dataclass(frozen=True)
+class Camera:
+    """A stereo endoscope. It looks along -z of `link`, x to the right, y up, as a MuJoCo camera does."""
+
+    link: str
+    fovy: float
+    """Vertical field of view in degrees."""
+    baseline: float
+    """Distance of the two eyes along x in m."""
+
+
+@dataclass(frozen=True)
 class Joint:
     """A moving joint of the URDF with its drive. `leader` is the joint it mimics, or its own name."""
 
@@ -59,6 +71,9 @@ class Joint:
     velocity: float
     effort: float
     viscous: float
+    """Viscous friction, effort per velocity."""
+    coulomb: float
+    """Coulomb friction, effort."""
     leader: str
     multiplier: float
     offset: float
@@ -73,8 +88,10 @@ class Arm:
     folder: Path
     description: str
     tool_tip: str
-    remote_center: bool
+    remote_center: str | None
+    """The link whose z axis, the shaft, always passes through the base frame's origin; None without such a point."""
     jaw: Jaw | None
+    camera: Camera | None
     joints: tuple[Joint, ...]
     """All moving joints in the order of the chain, those that mimic another included."""
     urdf: Any = field(repr=False)
@@ -164,6 +181,19 @@ class Arm:
             known[link] = pose
         return {link: xp.broadcast_to(known[link], (*q.shape[:-1], 4, 4)) for link in links}
 
+    def remote_center_error(self, q: Any) -> Any:
+        """Distance of the shaft's axis from the remote center of motion in m, [...]; `q` as in `forward_kinematics`.
+
+        Raises:
+            ValueError: for an arm without a remote center.
+        """
+        if self.remote_center is None:
+            raise ValueError(f"arm {self.name!r} has no remote center of motion")
+        pose = self.link_poses(q, (self.remote_center,))[self.remote_center]
+        axis, origin = pose[..., :3, 2], pose[..., :3, 3]
+        xp = axis.__array_namespace__()
+        return xp.linalg.vector_norm(xp.linalg.cross(axis, origin), axis=-1)
+
     def _chain(self, link: str) -> list[yourdf.Joint]:
         parents = {joint.child: joint for joint in self.urdf.joints}
         chain: list[yourdf.Joint] = []
@@ -187,13 +217,18 @@ def load_arm(name: str | Path) -> Arm:
     """
     folder = find("arms", name)
     settings = read_yaml(folder / "arm.yaml")
-    check_keys(settings, ("description", "urdf", "tool_tip", "remote_center", "joints", "jaw"), folder / "arm.yaml")
+    check_keys(settings, KEYS, folder / "arm.yaml")
     urdf = _read_urdf(folder / str(settings.get("urdf", "")))
     joints = _read_joints(urdf, settings.get("joints") or {}, folder)
-    tool_tip = str(settings.get("tool_tip"))
     links = [link.name for link in urdf.links]
-    if tool_tip not in links:
-        raise ValueError(f"{folder / 'arm.yaml'}: tool_tip {tool_tip!r} is not a link of the URDF ({', '.join(links)})")
+    camera = settings.get("camera")
+    if camera is not None:
+        camera = _build(Camera, camera, folder / "arm.yaml")
+    remote_center = settings.get("remote_center")
+    named = {"tool_tip": settings.get("tool_tip"), "remote_center": remote_center, "camera": camera and camera.link}
+    for key, link in named.items():
+        if link not in links and (key == "tool_tip" or link is not None):
+            raise ValueError(f"{folder / 'arm.yaml'}: {key} {link!r} is not a link of the URDF ({', '.join(links)})")
     jaw = settings.get("jaw")
     if jaw is not None:
         jaw = _build(Jaw, jaw, folder / "arm.yaml")
@@ -204,9 +239,10 @@ def load_arm(name: str | Path) -> Arm:
         name=folder.name,
         folder=folder,
         description=str(settings.get("description", "")),
-        tool_tip=tool_tip,
-        remote_center=bool(settings.get("remote_center", False)),
+        tool_tip=str(settings["tool_tip"]),
+        remote_center=remote_center,
         jaw=jaw,
+        camera=camera,
         joints=joints,
         urdf=urdf,
     )
@@ -283,7 +319,6 @@ def _read_joints(urdf: yourdf.Robot, drives: dict[str, Any], folder: Path) -> tu
             raise ValueError(f"{folder}: joint {name!r} needs a limit with lower, upper, velocity and effort")
         if not limit.lower < limit.upper:
             raise ValueError(f"{folder}: joint {name!r} has lower limit {limit.lower} not below upper {limit.upper}")
-        viscous = joint.dynamics.damping if joint.dynamics else None
         joints.append(
             Joint(
                 name=name,
@@ -292,7 +327,8 @@ def _read_joints(urdf: yourdf.Robot, drives: dict[str, Any], folder: Path) -> tu
                 upper=float(limit.upper),
                 velocity=float(limit.velocity),
                 effort=float(limit.effort),
-                viscous=float(viscous or 0.0),
+                viscous=float((joint.dynamics and joint.dynamics.damping) or 0.0),
+                coulomb=float((joint.dynamics and joint.dynamics.friction) or 0.0),
                 leader=leader,
                 multiplier=float(_or(joint.mimic and joint.mimic.multiplier, 1.0)),
                 offset=float(_or(joint.mimic and joint.mimic.offset, 0.0)),

@@ -48,6 +48,10 @@ def build_spec(arm: Arm, control: str) -> mujoco.MjSpec:
                 _add_joint(body, joints[element.name], element.axis)
             _add_link(body, links[element.child], colors)
     bodies[arm.tool_tip].add_site(name="tool_tip", size=[0.001] * 3, group=4)
+    if arm.camera is not None:
+        for name, side in (("left", -0.5), ("right", 0.5)):
+            eye = [side * arm.camera.baseline, 0, 0]
+            bodies[arm.camera.link].add_camera(name=name, pos=eye, fovy=arm.camera.fovy)
     for joint in arm.joints:
         _add_actuator(spec, joint, control)
     return spec
@@ -62,6 +66,7 @@ def _add_joint(body: Any, joint: Joint, axis: np.ndarray) -> None:
         limited=mujoco.mjtLimited.mjLIMITED_TRUE,
         damping=[joint.viscous, 0, 0],
         armature=joint.drive.armature,
+        frictionloss=joint.coulomb,
     )
 
 
