@@ -18,6 +18,7 @@ from gymnasium import spaces
 
 from surgical_marl.engines.mjx import MjxEngine
 from surgical_marl.env import Carry, Env
+from surgical_marl.physics import Contacts
 
 ENGINES = ("auto", "mjx")
 ARRAYS = ("numpy", "torch", "jax")
@@ -39,7 +40,10 @@ class BatchStep(NamedTuple):
     """[N, d], of this step's episode even where it ended."""
     final_state: Any
     infos: dict[str, dict[str, Any]]
-    """agent -> tip_error [N] (m), success, collision [N] (bool), min_distance [N] (m); of this step's episode."""
+    """agent -> tip_error (m), success, collision (bool), min_distance (m), contact_force (N), [N] each; of this step's
+    episode."""
+    contacts: Contacts
+    """Distance and penetration (m) and force (N) of every pair in `scene.pairs`, [N, P] each; likewise."""
 
 
 class BatchedEnv:

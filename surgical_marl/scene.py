@@ -4,15 +4,15 @@
     scene.agents                                # ("psm_0", "psm_1")
     scene.model                                 # mujoco.MjModel; names of an arm start with "psm_0/"
 
-A scene file names each agent's arm, where its base frame stands, and the point its targets are drawn around.
+A scene file names each agent's arm, where its base frame stands, and the point its targets are drawn around. Which
+geoms can touch is found by a sweep (`surgical_marl/contacts.py`).
 """
 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +20,8 @@ import mujoco
 import numpy as np
 
 from surgical_marl.arm import Arm, check_keys, load_arm, read_yaml
-from surgical_marl.arm_spec import COLLISION_GROUP
+from surgical_marl.contacts import Capsule, capsule_distance, collision_geoms, contact_pairs
 from surgical_marl.content import find
-from surgical_marl.geometry import segment_distance
 
 TIMESTEP = 0.005
 """Physics step in s. docs/physics.md has the stability test that chose it."""
@@ -85,34 +84,42 @@ class Scene:
                 qpos[..., address] = joint.multiplier * q[agent][..., names.index(joint.leader)] + joint.offset
         return qpos
 
-    def clearance(self, q: dict[str, np.ndarray]) -> np.ndarray:
-        """Least distance in m between any two arms, from each agent's joints [..., n] -> [...]; inf for one arm."""
-        capsules = {agent: self._capsules(agent, q[agent]) for agent in self.agents}
-        least: Any = np.inf
-        for one, other in combinations(self.agents, 2):
-            for a, b, radius in capsules[one]:
-                for c, d, thickness in capsules[other]:
-                    least = np.minimum(least, segment_distance(a, b, c, d) - radius - thickness)
+    @cached_property
+    def pairs(self) -> tuple[tuple[str, str], ...]:
+        """Geoms that can touch, by their names `<agent>/<geom>`, in the order of `State.contacts`."""
+        geom = self.model.geom
+        ids = zip(self.model.pair_geom1, self.model.pair_geom2, strict=True)
+        return tuple((geom(int(a)).name, geom(int(b)).name) for a, b in ids)
+
+    def clearance(self, q: dict[str, np.ndarray], within: bool = False) -> np.ndarray:
+        """Least distance in m of any two arms, or of parts within one arm; inf if there is no such pair.
+
+        `q` holds each agent's joints [..., n]; the result is [...].
+        """
+        capsules = self.capsules(q)
+        least: Any = np.full(np.broadcast_shapes(*(np.shape(value)[:-1] for value in q.values())), np.inf)
+        ids = zip(self.model.pair_geom1, self.model.pair_geom2, strict=True)
+        for (one, other), (a, b) in zip(self.pairs, ids, strict=True):
+            if (one.split("/")[0] == other.split("/")[0]) == within:
+                least = np.minimum(least, capsule_distance(capsules[a], capsules[b]))
         return np.asarray(least)
 
-    def _capsules(self, agent: str, q: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, float]]:
-        """End points [..., 3] in the world and radius of every collision geom of an agent."""
-        model, mount = self.model, self.mounts[agent]
-        geoms = collision_geoms(model, agent)
-        links = {geom: model.body(model.geom_bodyid[geom]).name.removeprefix(f"{agent}/") for geom in geoms}
-        poses = mount.arm.link_poses(q, tuple(dict.fromkeys(links.values())))
-        capsules = []
-        for geom in geoms:
-            rotation = np.zeros(9)
-            mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
-            half = rotation.reshape(3, 3)[:, 2] * model.geom_size[geom, 1]
-            pose = poses[links[geom]]
-            a, b = (
-                (pose[..., :3, :3] @ (model.geom_pos[geom] + end) + pose[..., :3, 3]) @ mount.rotation.T
-                + mount.position
-                for end in (-half, half)
-            )
-            capsules.append((a, b, float(model.geom_size[geom, 0])))
+    def capsules(self, q: dict[str, np.ndarray]) -> dict[int, Capsule]:
+        """Axis ends in the world and radius of every collision geom, by geom id; joints of each agent [..., n]."""
+        model, capsules = self.model, {}
+        for agent, mount in self.mounts.items():
+            geoms = collision_geoms(model, agent)
+            links = {geom: model.body(model.geom_bodyid[geom]).name.removeprefix(f"{agent}/") for geom in geoms}
+            poses = mount.arm.link_poses(q[agent], tuple(dict.fromkeys(links.values())))
+            for geom in geoms:
+                rotation = np.zeros(9)
+                mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
+                # a sphere has no half length: MuJoCo leaves zero there
+                half = rotation.reshape(3, 3)[:, 2] * model.geom_size[geom, 1]
+                pose = poses[links[geom]] @ _transform(model.geom_pos[geom])
+                a, b = ((pose[..., :3, :3] @ end + pose[..., :3, 3]) @ mount.rotation.T + mount.position
+                        for end in (-half, half))  # fmt: skip
+                capsules[geom] = (a, b, float(model.geom_size[geom, 0]))
         return capsules
 
 
@@ -124,24 +131,18 @@ def load_scene(name: str | Path, control: str = "position") -> Scene:
     """
     path = find("scenes", name)
     settings = read_yaml(path)
-    check_keys(settings, ("description", "arms"), path)
+    check_keys(settings, ("description", "arms", "view"), path)
     arms = settings.get("arms")
     if not isinstance(arms, dict) or not arms:
         raise ValueError(f"{path}: arms must map agent names such as psm_0 to arms")
     mounts = {agent: _read_mount(agent, mount, path) for agent, mount in arms.items()}
-    return Scene(
-        name=path.stem,
-        description=str(settings.get("description", "")),
-        control=control,
-        mounts=mounts,
-        model=_compile(path.stem, mounts, control),
-    )
-
-
-def collision_geoms(model: mujoco.MjModel, agent: str) -> list[int]:
-    """Ids of the geoms of one agent that can touch another arm."""
-    ids = np.flatnonzero(model.geom_group == COLLISION_GROUP)
-    return [int(i) for i in ids if model.geom(int(i)).name.startswith(f"{agent}/")]
+    spec = _build(path.stem, mounts, control)
+    _add_surroundings(spec, mounts, settings.get("view"), path)
+    model = _compile(spec)
+    scene = Scene(path.stem, str(settings.get("description", "")), control, mounts, model)
+    for one, other in contact_pairs(scene):
+        spec.add_pair(geomname1=one, geomname2=other, condim=1)
+    return replace(scene, model=_compile(spec))
 
 
 def _read_mount(agent: str, settings: Any, path: Path) -> Mount:
@@ -177,7 +178,13 @@ def _rotation(tilt: np.ndarray) -> np.ndarray:
     return matrix.reshape(3, 3)
 
 
-def _compile(name: str, mounts: dict[str, Mount], control: str) -> mujoco.MjModel:
+def _transform(position: np.ndarray) -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[:3, 3] = position
+    return matrix
+
+
+def _build(name: str, mounts: dict[str, Mount], control: str) -> mujoco.MjSpec:
     spec = mujoco.MjSpec()
     spec.modelname = name
     spec.compiler.degree = False
@@ -192,30 +199,49 @@ def _compile(name: str, mounts: dict[str, Mount], control: str) -> mujoco.MjMode
     option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
     # dVRK arms are balanced by counterweights (identified gravity torque under 0.4 N m), so gravity is off.
     option.gravity = [0.0, 0.0, 0.0]
-    _add_field(spec)
     for agent, mount in mounts.items():
         quat = np.zeros(4)
         mujoco.mju_mat2Quat(quat, mount.rotation.ravel())
         frame = spec.worldbody.add_frame(pos=mount.position, quat=quat)
         spec.attach(mount.arm.spec(control), prefix=f"{agent}/", frame=frame)
-    for one, other in combinations(mounts, 2):
-        geoms = [[g.name for g in spec.geoms if g.group == COLLISION_GROUP and g.name.startswith(f"{agent}/")]
-                 for agent in (one, other)]  # fmt: skip
-        for first in geoms[0]:
-            for second in geoms[1]:
-                spec.add_pair(geomname1=first, geomname2=second, condim=1)
+    return spec
+
+
+def _compile(spec: mujoco.MjSpec) -> mujoco.MjModel:
     try:
         return spec.compile()
     except (ValueError, mujoco.FatalError) as error:
-        raise ValueError(f"scene {name!r} does not compile: {' '.join(str(error).split())}") from None
+        raise ValueError(f"scene {spec.modelname!r} does not compile: {' '.join(str(error).split())}") from None
 
 
-def _add_field(spec: mujoco.MjSpec) -> None:
-    """What a picture needs: the operating field under the arms, light, a camera. Nothing here collides."""
+def _add_surroundings(spec: mujoco.MjSpec, mounts: dict[str, Mount], view: Any, path: Path) -> None:
+    """What a picture needs: the operating field, a trocar at each remote center, light, a camera. Nothing collides."""
     still = {"contype": 0, "conaffinity": 0, "group": 1}
     spec.worldbody.add_geom(
         name="field", type=mujoco.mjtGeom.mjGEOM_ELLIPSOID, size=[0.22, 0.16, 0.04], pos=[0, 0, -0.075],
         rgba=[0.72, 0.34, 0.31, 1], **still,
     )  # fmt: skip
+    for agent, mount in mounts.items():
+        if mount.arm.remote_center is not None:
+            quat = np.zeros(4)
+            mujoco.mju_mat2Quat(quat, mount.rotation.ravel())
+            spec.worldbody.add_geom(
+                name=f"{agent}_trocar", type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=[0.011, 0.002, 0],
+                pos=mount.position, quat=quat, rgba=[0.95, 0.78, 0.20, 1], **still,
+            )  # fmt: skip
     spec.worldbody.add_light(pos=[0.2, -0.4, 0.9], dir=[-0.2, 0.4, -0.9])
-    spec.worldbody.add_camera(name="overview", pos=[0, -0.52, 0.30], xyaxes=[1, 0, 0, 0, 0.45, 0.893], fovy=42)
+    view = {"position": [0.0, -0.52, 0.30], "target": [0.0, 0.0, 0.038], **_mapping(view, f"{path}, view")}
+    check_keys(view, ("position", "target"), f"{path}, view")
+    position, target = (_vector(view[key], f"{path}, view, {key}") for key in ("position", "target"))
+    back = position - target
+    right = np.cross([0.0, 0.0, 1.0], back)
+    if not np.linalg.norm(right) > 1e-6:
+        raise ValueError(f"{path}, view: position {position} must not be straight above or at the target {target}")
+    axes = np.concatenate([right, np.cross(back, right)])
+    spec.worldbody.add_camera(name="overview", pos=position, xyaxes=axes, fovy=42)
+
+
+def _mapping(value: Any, where: str) -> dict[str, Any]:
+    if value is not None and not isinstance(value, dict):
+        raise ValueError(f"{where}: {value!r} must be a mapping")
+    return value or {}

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from surgical_marl.batch import BatchedEnv
-from surgical_marl.env import Physics
 from surgical_marl.scene import DECIMATION, TIMESTEP
 
 SCENES = ("psm", "bimanual_psm")
@@ -191,8 +190,8 @@ def test_jaw_opens_and_closes_on_one_command() -> None:
 def rollout(scene: str, steps: int, model: Any = None, start: dict[str, np.ndarray] | None = None) -> tuple[Any, ...]:
     """The same random commands through `Env` (MJX, float32) and C MuJoCo: qpos of both after each control step."""
     env = batched(scene).env
-    advance = jax.jit(env._advance)
-    command = jax.jit(env._command)
+    advance = jax.jit(env.simulator.advance)
+    command = jax.jit(env.simulator.command)
     rng = np.random.default_rng(0)
     physics = env.reset(jax.random.PRNGKey(0)).carry.physics
     if start is not None:
@@ -205,9 +204,9 @@ def rollout(scene: str, steps: int, model: Any = None, start: dict[str, np.ndarr
         actions = {agent: rng.uniform(-1, 1, env.num_actions(agent)).astype(np.float32) for agent in env.agents}
         if start is not None:
             actions = {agent: np.zeros_like(action) for agent, action in actions.items()}
-        ctrl = command(physics.ctrl, actions)
-        physics, _ = advance(Physics(*physics)._replace(ctrl=ctrl))
-        data.ctrl[:] = np.asarray(ctrl)
+        physics = command(physics, actions)
+        data.ctrl[:] = np.asarray(physics.ctrl)
+        physics, _, _ = advance(physics)
         for _ in range(DECIMATION):
             mujoco.mj_step(env.scene.model, data)
         ours.append(np.asarray(physics.qpos))
@@ -230,6 +229,40 @@ def test_mjx_agrees_with_c_mujoco_in_contact() -> None:
     ours, theirs, touched = rollout("bimanual_psm", 50, start=start)
     assert touched.min() > 0
     assert np.abs(ours - theirs).max() < 1e-3
+
+
+def test_every_pair_shows_its_distance_penetration_and_force() -> None:
+    """Against C MuJoCo: forces and depths of its physics steps, distances where the control step ends. Two control
+    steps pass first, until the force of the made-up overlap has settled."""
+    env = batched().env
+    start = {"psm_0": np.array([0.03, 0.02, 0.16, 0, 0, 0, 0.0]), "psm_1": np.array([-0.03, 0.0, 0.16, 0, 0, 0, 0.0])}
+    qpos = env.scene.full_qpos(start).astype(np.float32)
+    advance, physics = jax.jit(env.simulator.advance), env.simulator.home._replace(qpos=qpos, ctrl=qpos)
+    for _ in range(3):
+        physics, contacts, views = advance(physics)
+    model, data = env.scene.model, mujoco.MjData(env.scene.model)
+    data.qpos[:], data.ctrl[:] = qpos, qpos
+    mujoco.mj_step(model, data, 2 * DECIMATION)
+    ids = [set(pair) for pair in zip(model.pair_geom1, model.pair_geom2, strict=True)]
+    assert [{model.geom(n).id for n in pair} for pair in env.scene.pairs] == ids
+    depth, force, wrench = np.zeros(len(ids)), np.zeros(len(ids)), np.zeros(6)
+    for step in range(DECIMATION + 1):
+        mujoco.mj_step(model, data) if step < DECIMATION else mujoco.mj_forward(model, data)
+        for i, contact in enumerate(data.contact):  # of the state that the step began with
+            pair = ids.index({int(g) for g in contact.geom})
+            depth[pair] = max(depth[pair], -contact.dist)
+            if step < DECIMATION:
+                mujoco.mj_contactForce(model, data, i, wrench)
+                force[pair] = max(force[pair], wrench[0])
+    assert depth.max() > 1e-3 and force.max() > 1
+    np.testing.assert_allclose(contacts.penetration, depth, atol=2e-5)
+    np.testing.assert_allclose(contacts.force, force, rtol=0.02, atol=0.02)
+    distance = [mujoco.mj_geomDistance(model, data, a, b, 1.0, None) for a, b in zip(
+        model.pair_geom1, model.pair_geom2, strict=True)]  # fmt: skip
+    np.testing.assert_allclose(contacts.distance, distance, atol=2e-5)
+    for agent, view in views.items():
+        own = [agent in "".join(pair) for pair in env.scene.pairs]
+        assert view.collision and view.contact_force == pytest.approx(force[own].max(), rel=0.02)
 
 
 @pytest.mark.parametrize("scene", SCENES)

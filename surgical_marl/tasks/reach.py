@@ -27,7 +27,7 @@ from jax import Array
 from surgical_marl.workspace import CLEARANCE, target_table
 
 if TYPE_CHECKING:
-    from surgical_marl.env import ArmView
+    from surgical_marl.physics import ArmView
     from surgical_marl.scene import Scene
 
 SPREAD = 0.05

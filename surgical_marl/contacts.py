@@ -1,0 +1,87 @@
+"""Which collision geoms of a scene can touch: found by a sweep over the joint ranges, not by hand.
+
+MJX computes every pair it is given at every step, so a scene names only those that can meet. Geoms of two arms are a
+pair if any posture of the two arms brings them close; geoms of one arm likewise, unless a joint holds them next to each
+other or they overlap at home, as neighbours in a chain do by design.
+"""
+
+from __future__ import annotations
+
+from itertools import combinations, product
+from typing import TYPE_CHECKING
+
+import mujoco
+import numpy as np
+
+from surgical_marl.arm_spec import COLLISION_GROUP
+from surgical_marl.cache import cached
+from surgical_marl.geometry import segment_distance
+
+if TYPE_CHECKING:
+    from surgical_marl.scene import Scene
+
+SAMPLES = 20_000
+NEAR, NEAR_WITHIN = 0.01, 0.001
+"""Geoms of two arms, and of one arm, that come this close in the sweep, in m, are a pair: it can't try every posture,
+and two arms have more joints between two geoms than one."""
+
+
+def collision_geoms(model: mujoco.MjModel, agent: str) -> list[int]:
+    """Ids of the collision geoms of one agent."""
+    ids = np.flatnonzero(model.geom_group == COLLISION_GROUP)
+    return [int(i) for i in ids if model.geom(int(i)).name.startswith(f"{agent}/")]
+
+
+def contact_pairs(scene: Scene) -> list[tuple[str, str]]:
+    """Names of the geoms that can touch, by pairs. Kept on disk by content, so a second call is quick."""
+    model = scene.model
+    numbers = (model.geom_size, model.geom_pos, model.geom_quat, model.body_pos, model.body_quat, model.jnt_range,
+               model.jnt_axis, model.geom_bodyid, scene.home)  # fmt: skip
+    names = [model.geom(i).name for agent in scene.agents for i in collision_geoms(model, agent)]
+    settings = repr((SAMPLES, NEAR, NEAR_WITHIN, names)).encode()
+    sources = [settings, *(np.ascontiguousarray(number).tobytes() for number in numbers)]
+    candidates = _candidates(scene)
+    near = cached("pairs", sources, lambda: _sweep(scene, candidates))
+    return [(model.geom(a).name, model.geom(b).name) for (a, b), kept in zip(candidates, near, strict=True) if kept]
+
+
+def _candidates(scene: Scene) -> list[tuple[int, int]]:
+    """Pairs of geom ids that are neither on one body nor next to each other in a chain."""
+    model = scene.model
+    geoms = {agent: collision_geoms(model, agent) for agent in scene.agents}
+    between = [pair for one, other in combinations(scene.agents, 2) for pair in product(geoms[one], geoms[other])]
+    within = [pair for own in geoms.values() for pair in combinations(own, 2) if not _neighbours(model, *pair)]
+    return between + within
+
+
+def _neighbours(model: mujoco.MjModel, a: int, b: int) -> bool:
+    one, other = (int(model.body_weldid[model.geom_bodyid[geom]]) for geom in (a, b))
+    parents = [int(model.body_weldid[model.body_parentid[body]]) for body in (one, other)]
+    return one == other or one == parents[1] or other == parents[0]
+
+
+def _sweep(scene: Scene, candidates: list[tuple[int, int]]) -> np.ndarray:
+    """Which candidates come near each other, [candidates] bool."""
+    rng = np.random.default_rng(0)
+    arms = {agent: mount.arm for agent, mount in scene.mounts.items()}
+    postures = {agent: rng.uniform(arm.lower, arm.upper, (SAMPLES, len(arm.lower))) for agent, arm in arms.items()}
+    swept = scene.capsules(postures)
+    home = scene.capsules({agent: arm.home[None] for agent, arm in arms.items()})
+    owner = {geom: agent for agent in scene.agents for geom in collision_geoms(scene.model, agent)}
+    near = []
+    for a, b in candidates:
+        least = capsule_distance(swept[a], swept[b]).min()
+        if owner[a] != owner[b]:
+            near.append(least < NEAR)
+        else:
+            near.append(least < NEAR_WITHIN and capsule_distance(home[a], home[b])[0] > 0)
+    return np.array(near, dtype=bool)
+
+
+def capsule_distance(one: Capsule, other: Capsule) -> np.ndarray:
+    """Distance in m of two capsules over a batch [...], negative where they overlap."""
+    return segment_distance(*one[:2], *other[:2]) - one[2] - other[2]
+
+
+Capsule = tuple[np.ndarray, np.ndarray, float]
+"""End points [..., 3] of the axis in the world and radius, m."""
