@@ -9,23 +9,23 @@ Every number of a shipped arm and its source stands in `arms/<name>/README.md`.
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, field, fields
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import yaml
 
 from surgical_marl.content import find
+from surgical_marl.urdf import MOVING, Faults, read_urdf, resolve_meshes, urdf_faults
+from surgical_marl.yaml_file import build, check_keys, read_yaml
 
 if TYPE_CHECKING:
     import mujoco
     from yourdfpy import urdf as yourdf
 
 CONTROL_MODES = ("position", "velocity", "torque")
-MOVING = ("revolute", "prismatic")
 KEYS = ("description", "urdf", "tool_tip", "remote_center", "camera", "joints", "jaw")
 
 
@@ -213,133 +213,89 @@ def load_arm(name: str | Path) -> Arm:
     """Reads an arm by a shipped name (`list_arms()`) or the path of a folder that holds `arm.yaml`.
 
     Raises:
-        ValueError: unknown name, or a URDF or `arm.yaml` that does not hold what it must.
+        ValueError: unknown name, or a URDF or `arm.yaml` that does not hold what it must; `Faults`, which lists them
+            all, where what is wrong does not hide what else is.
     """
-    folder = find("arms", name)
-    settings = read_yaml(folder / "arm.yaml")
-    check_keys(settings, KEYS, folder / "arm.yaml")
-    urdf = _read_urdf(folder / str(settings.get("urdf", "")))
-    joints = _read_joints(urdf, settings.get("joints") or {}, folder)
-    links = [link.name for link in urdf.links]
-    camera = settings.get("camera")
-    if camera is not None:
-        camera = _build(Camera, camera, folder / "arm.yaml")
-    remote_center = settings.get("remote_center")
-    named = {"tool_tip": settings.get("tool_tip"), "remote_center": remote_center, "camera": camera and camera.link}
+    folder = find("arms", name).resolve()
+    where = folder / "arm.yaml"
+    settings = read_yaml(where)
+    faults: list[str] = []
+
+    def keep(read: Callable[..., Any], *arguments: Any) -> Any:
+        try:
+            return read(*arguments)
+        except ValueError as error:
+            faults.append(str(error))
+
+    keep(check_keys, settings, KEYS, where)
+    path = _urdf_path(folder, settings.get("urdf"))
+    robot = read_urdf(path)
+    faults += urdf_faults(robot, path) + resolve_meshes(robot, path, folder)
+    drives = _read_drives(robot, settings.get("joints") or {}, where, keep)
+    camera, jaw = (
+        None if settings.get(key) is None else keep(build, cls, settings[key], where)
+        for key, cls in (("camera", Camera), ("jaw", Jaw))
+    )
+    links = [link.name for link in robot.links]
+    named = {key: settings.get(key) for key in ("tool_tip", "remote_center")} | {"camera": camera and camera.link}
     for key, link in named.items():
         if link not in links and (key == "tool_tip" or link is not None):
-            raise ValueError(f"{folder / 'arm.yaml'}: {key} {link!r} is not a link of the URDF ({', '.join(links)})")
-    jaw = settings.get("jaw")
-    if jaw is not None:
-        jaw = _build(Jaw, jaw, folder / "arm.yaml")
-        leaders = [joint.name for joint in joints if joint.leader == joint.name]
-        if jaw.joint not in leaders:
-            raise ValueError(f"{folder / 'arm.yaml'}: jaw joint {jaw.joint!r} is not one of {', '.join(leaders)}")
+            faults.append(f"{where}: {key} {link!r} is not a link of the URDF ({', '.join(links)})")
+    leaders = [joint.name for joint in robot.joints if joint.type in MOVING and not joint.mimic]
+    if jaw is not None and jaw.joint not in leaders:
+        faults.append(f"{where}: jaw joint {jaw.joint!r} is not one of {', '.join(leaders)}")
+    if not leaders:
+        faults.append(f"{path}: no joint moves; an arm needs one that is revolute or prismatic")
+    if faults:
+        raise Faults(faults)
     return Arm(
         name=folder.name,
         folder=folder,
         description=str(settings.get("description", "")),
         tool_tip=str(settings["tool_tip"]),
-        remote_center=remote_center,
+        remote_center=settings.get("remote_center"),
         jaw=jaw,
         camera=camera,
-        joints=joints,
-        urdf=urdf,
+        joints=tuple(_joint(joint, drives) for joint in robot.joints if joint.type in MOVING),
+        urdf=robot,
     )
 
 
-def read_yaml(path: Path) -> dict[str, Any]:
-    """Reads a YAML mapping; ValueError with the line if it does not parse."""
-    try:
-        content = yaml.safe_load(path.read_text())
-    except (OSError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} cannot be read: {error}") from None
-    except yaml.YAMLError as error:
-        raise ValueError(f"{path} is not valid YAML: {' '.join(str(error).split())}") from None
-    if not isinstance(content, dict):
-        raise ValueError(f"{path} must hold a YAML mapping, not {type(content).__name__}")
-    return content
+def _urdf_path(folder: Path, name: Any) -> Path:
+    if not isinstance(name, str) or not name:
+        raise ValueError(f"{folder / 'arm.yaml'}: urdf must name the URDF file in the folder, not {name!r}")
+    path = folder / name
+    if not path.resolve().is_relative_to(folder):
+        raise ValueError(f"{folder / 'arm.yaml'}: urdf {name!r} leaves the arm's folder; copy it into the folder")
+    return path
 
 
-def check_keys(mapping: dict[str, Any], known: tuple[str, ...], where: Path | str) -> None:
-    """ValueError if the mapping has a key that nobody reads."""
-    for key in mapping:
-        if key not in known:
-            raise ValueError(f"{where}: unknown key {key!r}; the keys are {', '.join(known)}")
-
-
-def _build(cls: type, mapping: Any, where: Path | str) -> Any:
-    if not isinstance(mapping, dict):
-        raise ValueError(f"{where}: {mapping!r} must be a mapping with the keys of {cls.__name__.lower()}")
-    names = tuple(f.name for f in fields(cls))
-    check_keys(mapping, names, where)
-    values: dict[str, Any] = {}
-    for key, value in mapping.items():
-        if cls.__annotations__[key] == "float":
-            if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-                raise ValueError(f"{where}: {key} must be a finite number, not {value!r}")
-            value = float(value)
-        values[key] = value
-    try:
-        return cls(**values)
-    except TypeError:
-        missing = [name for name in names if name not in values]
-        raise ValueError(f"{where}: a {cls.__name__.lower()} lacks {', '.join(missing)}") from None
-
-
-def _read_urdf(path: Path) -> yourdf.Robot:
-    import yourdfpy
-
-    if not path.is_file():
-        raise ValueError(f"there is no URDF file {path}")
-    try:
-        return yourdfpy.URDF.load(str(path), build_scene_graph=False, load_meshes=False).robot
-    except Exception as error:  # yourdfpy lets through whatever lxml, float() or its own code raises
-        raise ValueError(f"{path} is not a URDF that can be read: {' '.join(str(error).split())}") from None
-
-
-def _read_joints(urdf: yourdf.Robot, drives: dict[str, Any], folder: Path) -> tuple[Joint, ...]:
-    where = folder / "arm.yaml"
-    moving = {joint.name: joint for joint in urdf.joints if joint.type in MOVING}
+def _read_drives(robot: yourdf.Robot, drives: Any, where: Path, keep: Callable[..., Any]) -> dict[str, Drive]:
+    """The drive of every joint that mimics none; what is wrong is kept."""
     if not isinstance(drives, dict):
         raise ValueError(f"{where}: joints must be a mapping from joint name to drive")
-    check_keys(drives, tuple(moving), f"{where}, joints")
-    for joint in urdf.joints:
-        if joint.type not in (*MOVING, "fixed"):
-            raise ValueError(f"{folder}: joint {joint.name!r} is {joint.type}; revolute, prismatic and fixed work")
-    joints = []
-    for name, joint in moving.items():
-        leader = joint.mimic.joint if joint.mimic else name
-        if leader not in moving:
-            raise ValueError(f"{folder}: joint {name!r} mimics {leader!r}, which is not a moving joint of the URDF")
-        if leader not in drives:
-            raise ValueError(f"{where}: joint {leader!r} has no drive; give its stiffness, damping and speed")
-        limit = joint.limit
-        if limit is None or None in (limit.lower, limit.upper, limit.velocity, limit.effort):
-            raise ValueError(f"{folder}: joint {name!r} needs a limit with lower, upper, velocity and effort")
-        if not limit.lower < limit.upper:
-            raise ValueError(f"{folder}: joint {name!r} has lower limit {limit.lower} not below upper {limit.upper}")
-        joints.append(
-            Joint(
-                name=name,
-                slides=joint.type == "prismatic",
-                lower=float(limit.lower),
-                upper=float(limit.upper),
-                velocity=float(limit.velocity),
-                effort=float(limit.effort),
-                viscous=float((joint.dynamics and joint.dynamics.damping) or 0.0),
-                coulomb=float((joint.dynamics and joint.dynamics.friction) or 0.0),
-                leader=leader,
-                multiplier=float(_or(joint.mimic and joint.mimic.multiplier, 1.0)),
-                offset=float(_or(joint.mimic and joint.mimic.offset, 0.0)),
-                drive=_build(Drive, drives[leader], f"{where}, joint {leader!r}"),
-            )
-        )
-    return tuple(joints)
+    leaders = [joint.name for joint in robot.joints if joint.type in MOVING and not joint.mimic]
+    keep(check_keys, drives, tuple(leaders), f"{where}, joints")
+    return {name: keep(build, Drive, drives.get(name, {}), f"{where}, joint {name!r}") for name in leaders}
 
 
-def _or(value: Any, default: float) -> Any:
-    return default if value is None else value
+def _joint(joint: yourdf.Joint, drives: dict[str, Drive]) -> Joint:
+    limit, dynamics, mimic = joint.limit, joint.dynamics, joint.mimic
+    leader = mimic.joint if mimic else joint.name
+    return Joint(
+        name=joint.name,
+        slides=joint.type == "prismatic",
+        lower=limit.lower,
+        upper=limit.upper,
+        velocity=limit.velocity,
+        effort=limit.effort,
+        viscous=float((dynamics and dynamics.damping) or 0.0),  # yourdfpy leaves these two as text
+        coulomb=float((dynamics and dynamics.friction) or 0.0),
+        leader=leader,
+        multiplier=mimic.multiplier if mimic else 1.0,
+        offset=mimic.offset if mimic else 0.0,
+        drive=drives[leader],
+    )
 
 
 def _matrix(origin: np.ndarray | None) -> np.ndarray:
