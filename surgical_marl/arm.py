@@ -213,10 +213,9 @@ def load_arm(name: str | Path) -> Arm:
     """Reads an arm by a shipped name (`list_arms()`) or the path of a folder that holds `arm.yaml`.
 
     Raises:
-        ValueError: unknown name, or a URDF or `arm.yaml` that does not hold what it must; `Faults`, which lists them
-            all, where what is wrong does not hide what else is.
+        ValueError: unknown name, or a URDF or `arm.yaml` that does not hold what it must; mostly `Faults`, a list.
     """
-    folder = find("arms", name).resolve()
+    folder = find("arms", name)
     where = folder / "arm.yaml"
     settings = read_yaml(where)
     faults: list[str] = []
@@ -265,7 +264,7 @@ def _urdf_path(folder: Path, name: Any) -> Path:
     if not isinstance(name, str) or not name:
         raise ValueError(f"{folder / 'arm.yaml'}: urdf must name the URDF file in the folder, not {name!r}")
     path = folder / name
-    if not path.resolve().is_relative_to(folder):
+    if not path.resolve().is_relative_to(folder.resolve()):
         raise ValueError(f"{folder / 'arm.yaml'}: urdf {name!r} leaves the arm's folder; copy it into the folder")
     return path
 
@@ -276,7 +275,17 @@ def _read_drives(robot: yourdf.Robot, drives: Any, where: Path, keep: Callable[.
         raise ValueError(f"{where}: joints must be a mapping from joint name to drive")
     leaders = [joint.name for joint in robot.joints if joint.type in MOVING and not joint.mimic]
     keep(check_keys, drives, tuple(leaders), f"{where}, joints")
-    return {name: keep(build, Drive, drives.get(name, {}), f"{where}, joint {name!r}") for name in leaders}
+    return {name: keep(_drive, drives.get(name, {}), f"{where}, joint {name!r}") for name in leaders}
+
+
+def _drive(mapping: Any, where: str) -> Drive:
+    drive: Drive = build(Drive, mapping, where)
+    for key in ("stiffness", "damping", "armature"):
+        if getattr(drive, key) < 0:
+            raise ValueError(f"{where}: {key} must be 0 or more, not {getattr(drive, key):g}")
+    if not drive.speed > 0:
+        raise ValueError(f"{where}: speed must be above 0, not {drive.speed:g}")
+    return drive
 
 
 def _joint(joint: yourdf.Joint, drives: dict[str, Drive]) -> Joint:

@@ -1,4 +1,4 @@
-"""The command `surgical-marl`: train, eval, list, doctor."""
+"""The command `surgical-marl`: train, eval, list, check, doctor."""
 
 from __future__ import annotations
 
@@ -35,10 +35,12 @@ _SETTINGS: tuple[tuple[str, str | tuple[str, ...], str], ...] = (
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command; returns 0, 1 if training diverged, 2 for bad input, 130 if interrupted."""
+    """Run a command; returns 0, 1 if training diverged or `check` found something, 2 for bad input, 130 if
+    interrupted."""
+    code = 0
     try:
         arguments = _parse(argv)
-        arguments.command(arguments)
+        code = arguments.command(arguments) or 0
         sys.stdout.flush()
     except ValueError as error:
         print(f"surgical-marl: {' '.join(str(error).split())}", file=sys.stderr)
@@ -52,7 +54,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         # The reader (`| head`) has left. Point stdout away so that Python's exit does not complain.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    return 0
+    return code
 
 
 class _Parser(argparse.ArgumentParser):
@@ -80,7 +82,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(prog="surgical-marl", description="Surgical robot arms that learn together.")
     parser.add_argument("--version", action="version", version=f"%(prog)s {_version()}")
-    commands = parser.add_subparsers(required=True, metavar="{train,eval,list,doctor}")
+    commands = parser.add_subparsers(required=True, metavar="{train,eval,list,check,doctor}")
 
     train = commands.add_parser(
         "train",
@@ -107,7 +109,12 @@ def _parser() -> argparse.ArgumentParser:
 
     names = commands.add_parser("list", help="list tasks, scenes, arms and policies")
     names.add_argument("kind", nargs="?", type=_one_of(tuple(_LISTS)), metavar="|".join(_LISTS))
+    names.add_argument("-v", "--verbose", action="store_true", help="what each one is")
     names.set_defaults(command=_list, name="list")
+
+    audit = commands.add_parser("check", help="say what is wrong with an arm or a scene")
+    audit.add_argument("source", metavar="ARM_OR_SCENE", help="a name, an arm's folder or a scene's .yaml file")
+    audit.set_defaults(command=_check, name="check")
 
     doctor = commands.add_parser("doctor", help="check this machine and this installation")
     doctor.set_defaults(command=_doctor, name="doctor")
@@ -115,11 +122,27 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _list(arguments: argparse.Namespace) -> None:
+    if arguments.verbose:
+        from surgical_marl.describe import describe
+
+        print("\n".join(describe(kind) for kind in ([arguments.kind] if arguments.kind else _LISTS)))
+        return
     if arguments.kind:
         print("\n".join(_LISTS[arguments.kind]()))
         return
     for kind, names in _LISTS.items():
         print(f"{kind:9} {', '.join(names()) or '-'}")
+
+
+def _check(arguments: argparse.Namespace) -> int:
+    from surgical_marl.check import check, summary
+
+    findings = check(arguments.source)
+    for finding in findings:
+        print(" ".join(finding.split()))
+    if not findings:
+        print(f"{arguments.source}: nothing wrong found ({summary(arguments.source)})")
+    return 1 if findings else 0
 
 
 def _doctor(arguments: argparse.Namespace) -> None:

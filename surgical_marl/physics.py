@@ -9,6 +9,7 @@ This is the one module that knows MJX. docs/physics.md says how a step is comput
 
 from __future__ import annotations
 
+import copy
 from typing import Any, NamedTuple
 
 import jax
@@ -19,6 +20,10 @@ from jax import Array
 
 from surgical_marl.runtime import prepare_jax
 from surgical_marl.scene import DECIMATION, Scene
+
+SOLVER_ITERATIONS, LINE_SEARCH_ITERATIONS = 3, 4
+"""What limits, friction and contacts take to be solved nearly as well as by C MuJoCo, which goes on until they are:
+docs/physics.md compares."""
 
 
 class Physics(NamedTuple):
@@ -70,7 +75,10 @@ class Simulator:
         from mujoco import mjx
 
         self.scene, self._mjx = scene, mjx
-        self._model, self._data = mjx.put_model(scene.model), mjx.make_data(scene.model)
+        single = copy.copy(scene.model)
+        single.opt.ls_iterations = LINE_SEARCH_ITERATIONS
+        single.opt.iterations = 1  # MJX then makes no loop of unknown length of it: `_forward` repeats it
+        self._model, self._data = mjx.put_model(single), mjx.make_data(scene.model)
         self.control_dt = DECIMATION * scene.model.opt.timestep
         self._index_joints()
         self._index_pairs()
@@ -86,14 +94,19 @@ class Simulator:
         return Physics(qpos, still, still, ctrl)
 
     def command(self, physics: Physics, actions: dict[str, Array]) -> Physics:
-        """The next command of every actuator. A jaw moves to open or closed at its speed, whatever the mode."""
+        """The next command of every actuator. A jaw moves to open or closed at its speed, whatever the mode.
+
+        A position target leads its joint by no more than full effort at full speed takes: one that is held up would
+        wind up its target, and race after it once free.
+        """
         ctrl, own = physics.ctrl, jnp.zeros(self.scene.model.nu, jnp.float32)
         for agent in self.scene.agents:
             own = own.at[self._actuators[agent]].set(jnp.clip(actions[agent], -1.0, 1.0))
         action = own[self._leaders]
         reach = self._speed * np.float32(self.control_dt)
         if self.scene.control == "position":
-            command = jnp.clip(ctrl + action * reach, self._low, self._high)
+            lead = jnp.clip(ctrl + action * reach - physics.qpos, -self._lead, self._lead)
+            command = jnp.clip(physics.qpos + lead, self._low, self._high)
         else:
             command = action * (self._speed if self.scene.control == "velocity" else self._effort)
         jaw = ctrl + jnp.clip(jnp.where(action > 0, self._open, self._closed) - ctrl, -reach, reach)
@@ -104,7 +117,7 @@ class Simulator:
         behind its `qpos`, so they are computed anew."""
 
         def substep(now: Physics, _: None) -> tuple[Physics, tuple[Array, Array]]:
-            data = self._mjx.forward(self._model, self._data.replace(**now._asdict()))
+            data = self._forward(self._data.replace(**now._asdict()))
             contact = self._distances(data), self._forces(data)
             data = self._integrate(data)
             return Physics(data.qpos, data.qvel, data.qacc_warmstart, now.ctrl), contact
@@ -154,6 +167,8 @@ class Simulator:
         self._leaders, self._jaws = np.array([row[0] for row in rows]), np.array([row[1] for row in rows])
         self._speed = np.array([joint.drive.speed for _, _, joint, _ in rows], single)
         self._effort = np.array([joint.effort for _, _, joint, _ in rows], single)
+        pd = [(joint.effort, joint.drive) for _, _, joint, _ in rows]
+        self._lead = np.array([(effort + d.damping * d.speed) / d.stiffness for effort, d in pd], single)
         self._low = np.array([joint.lower for _, _, joint, _ in rows], single)
         self._high = np.array([joint.upper for _, _, joint, _ in rows], single)
         self._open = np.array([jaw.open if is_jaw and jaw else 0.0 for _, is_jaw, _, jaw in rows], single)
@@ -191,7 +206,9 @@ class Simulator:
         contacts: Any = Contacts(distance, np.maximum(-distance, 0.0), 0.0 * distance)  # type: ignore[arg-type]
         physics: Any = Physics(self.scene.home, still, still, self._home[1])  # type: ignore[arg-type]
         views = self._view(np, physics, data.site_xpos[list(self._sites.values())], contacts)
-        return jax.tree.map(lambda x: jnp.asarray(x, jnp.bool_ if x.dtype == bool else jnp.float32), (contacts, views))
+        single = lambda x: jnp.asarray(x, jnp.bool_ if x.dtype == bool else jnp.float32)  # noqa: E731
+        # one by one: JAX would sort the agents by name
+        return jax.tree.map(single, contacts), {agent: jax.tree.map(single, view) for agent, view in views.items()}
 
     def _distances(self, data: Any) -> Array:
         return data._impl.contact.dist[self._order] if self.scene.model.npair else jnp.zeros(0, jnp.float32)
@@ -200,14 +217,30 @@ class Simulator:
         # pairs have condim 1: one row each, the normal force
         return data._impl.efc_force[self._rows] if self.scene.model.npair else jnp.zeros(0, jnp.float32)
 
+    def _forward(self, data: Any) -> Any:
+        """`mjx.forward`, but with a fixed number of solver iterations, each from where the last one ended."""
+        for stage in ("fwd_position", "fwd_velocity", "fwd_actuation", "fwd_acceleration"):
+            data = getattr(self._mjx, stage)(self._model, data)
+
+        def iterate(found: Any, _: None) -> tuple[Any, None]:
+            solved = self._mjx.solve(self._model, data.replace(qacc_warmstart=found[0]))
+            return (solved.qacc, solved.qfrc_constraint, solved._impl.efc_force), None
+
+        start = (data.qacc_warmstart, data.qfrc_constraint, data._impl.efc_force)
+        (qacc, constraint, force), _ = jax.lax.scan(iterate, start, None, length=SOLVER_ITERATIONS)
+        return data.tree_replace({"qacc": qacc, "qfrc_constraint": constraint, "_impl.efc_force": force})
+
     def _integrate(self, data: Any) -> Any:
         """The implicitfast step. An actuator at its effort limit can't damp any more, so its damping leaves the
         implicit matrix, as in C MuJoCo; `mjx.step` would keep it there and brake each joint that moves at full effort.
         """
         from mujoco.mjx._src.forward import implicit
+        from mujoco.mjx._src.support import mul_m
 
         model = self._model
         low, high = model.actuator_forcerange[:, 0], model.actuator_forcerange[:, 1]
         saturated = (data.actuator_force <= low) | (data.actuator_force >= high)
         biasprm = jnp.where(saturated[:, None], 0.0, model.actuator_biasprm)
+        # what the solver found, as a force: `qfrc_constraint` equals it only once the solver has converged
+        data = data.replace(qfrc_smooth=mul_m(model, data, data.qacc), qfrc_constraint=jnp.zeros_like(data.qacc))
         return implicit(model.replace(actuator_biasprm=biasprm), data)

@@ -20,6 +20,7 @@ import mujoco
 import numpy as np
 
 from surgical_marl.arm import Arm, check_keys, load_arm, read_yaml
+from surgical_marl.arm_spec import COLLISION_GROUP, SOLREF
 from surgical_marl.contacts import Capsule, capsule_distance, collision_geoms, contact_pairs
 from surgical_marl.content import find
 
@@ -141,15 +142,15 @@ def load_scene(name: str | Path, control: str = "position") -> Scene:
     model = _compile(spec)
     scene = Scene(path.stem, str(settings.get("description", "")), control, mounts, model)
     for one, other in contact_pairs(scene):
-        spec.add_pair(geomname1=one, geomname2=other, condim=1)
-    return replace(scene, model=_compile(spec))
+        spec.add_pair(geomname1=one, geomname2=other, condim=1, solref=SOLREF)
+    return replace(scene, model=_weigh_shapes(_compile(spec), scene.home))
 
 
 def _read_mount(agent: str, settings: Any, path: Path) -> Mount:
     where = f"{path}, agent {agent!r}"
     if not isinstance(settings, dict) or "arm" not in settings:
         raise ValueError(f"{where}: must be a mapping that names its arm")
-    check_keys(settings, ("arm", "position", "tilt", "workspace"), where)
+    check_keys(settings, ("arm", "position", "turn", "tilt", "workspace"), where)
     source = str(settings["arm"])
     local = path.parent / source  # a user's own arm may be named relative to the scene file
     arm = load_arm(local if (local / "arm.yaml").is_file() else source)
@@ -157,7 +158,9 @@ def _read_mount(agent: str, settings: Any, path: Path) -> Mount:
         raise ValueError(f"{where}: an agent of arm {arm.name!r} is called {arm.name}_0, {arm.name}_1 and so on")
     vectors = {key: _vector(settings.get(key, [0.0, 0.0, 0.0]), f"{where}, {key}") for key in
                ("position", "tilt", "workspace")}  # fmt: skip
-    return Mount(arm, vectors["position"], _rotation(vectors["tilt"]), vectors["workspace"])
+    turn = _vector([0.0, 0.0, settings.get("turn", 0.0)], f"{where}, turn")
+    rotation = _rotation(vectors["tilt"]) @ _rotation(turn)
+    return Mount(arm, vectors["position"], rotation, vectors["workspace"])
 
 
 def _vector(value: Any, where: str) -> np.ndarray:
@@ -191,11 +194,8 @@ def _build(name: str, mounts: dict[str, Mount], control: str) -> mujoco.MjSpec:
     spec.copy_during_attach = True
     option = spec.option
     option.timestep = TIMESTEP
-    # Implicit in velocity: the stiff wrist controllers stay stable at 5 ms. One Newton iteration with a warm start is
-    # enough for limits and tool contacts, and lets MJX skip its loop. docs/physics.md compares.
+    # Implicit in velocity: the stiff wrist controllers stay stable at 5 ms. docs/physics.md compares.
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    option.iterations = 1
-    option.ls_iterations = 4
     option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
     # dVRK arms are balanced by counterweights (identified gravity torque under 0.4 N m), so gravity is off.
     option.gravity = [0.0, 0.0, 0.0]
@@ -214,6 +214,26 @@ def _compile(spec: mujoco.MjSpec) -> mujoco.MjModel:
         raise ValueError(f"scene {spec.modelname!r} does not compile: {' '.join(str(error).split())}") from None
 
 
+def _weigh_shapes(model: mujoco.MjModel, home: np.ndarray) -> mujoco.MjModel:
+    """Sets what a body weighs in a contact (`body_invweight0`, 1/kg) to what it weighs where its shapes are.
+
+    MuJoCo takes the centre of mass. A balanced link has it at the pivot, where nothing can move it: its contacts would
+    be infinitely stiff, and throw the arms about.
+    """
+    data = mujoco.MjData(model)
+    data.qpos[:] = home
+    mujoco.mj_forward(model, data)
+    for body in np.unique(model.geom_bodyid[model.geom_group == COLLISION_GROUP]):
+        weights = []
+        for geom in np.flatnonzero((model.geom_bodyid == body) & (model.geom_group == COLLISION_GROUP)):
+            jacobian, moved = np.zeros((3, model.nv)), np.zeros((3, model.nv))
+            mujoco.mj_jac(model, data, jacobian, None, data.geom_xpos[geom], body)
+            mujoco.mj_solveM(model, data, moved, jacobian)
+            weights.append(np.sum(jacobian * moved) / 3)
+        model.body_invweight0[body, 0] = np.mean(weights)
+    return model
+
+
 def _add_surroundings(spec: mujoco.MjSpec, mounts: dict[str, Mount], view: Any, path: Path) -> None:
     """What a picture needs: the operating field, a trocar at each remote center, light, a camera. Nothing collides."""
     still = {"contype": 0, "conaffinity": 0, "group": 1}
@@ -229,8 +249,8 @@ def _add_surroundings(spec: mujoco.MjSpec, mounts: dict[str, Mount], view: Any, 
                 name=f"{agent}_trocar", type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=[0.011, 0.002, 0],
                 pos=mount.position, quat=quat, rgba=[0.95, 0.78, 0.20, 1], **still,
             )  # fmt: skip
-    spec.worldbody.add_light(pos=[0.2, -0.4, 0.9], dir=[-0.2, 0.4, -0.9])
-    view = {"position": [0.0, -0.52, 0.30], "target": [0.0, 0.0, 0.038], **_mapping(view, f"{path}, view")}
+    spec.worldbody.add_light(pos=[0.2, 0.4, 0.9], dir=[-0.2, -0.4, -0.9])
+    view = {"position": [0.0, 0.75, 0.40], "target": [0.0, 0.0, 0.07], **_mapping(view, f"{path}, view")}
     check_keys(view, ("position", "target"), f"{path}, view")
     position, target = (_vector(view[key], f"{path}, view, {key}") for key in ("position", "target"))
     back = position - target

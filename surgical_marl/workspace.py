@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from surgical_marl.arm import Arm
+from surgical_marl.inverse_kinematics import inverse_kinematics
 from surgical_marl.runtime import cache_dir
 from surgical_marl.scene import Scene
 
@@ -51,25 +51,6 @@ def target_table(scene: Scene, spread: float, seed: int = 0) -> np.ndarray:
     return table
 
 
-def inverse_kinematics(arm: Arm, tips: np.ndarray, q: np.ndarray, iterations: int = 24) -> np.ndarray:
-    """Joint positions [N, n] that bring the tool tip to `tips` [N, 3] (base frame, m), from a first guess `q` [n].
-
-    Damped least squares on position, within the joint limits, that prefers joints near the first guess (S. Buss,
-    Introduction to inverse kinematics, 2004). Rows that can't be reached end as near as they come.
-    """
-    start, q = q, np.broadcast_to(q, (len(tips), len(q))).copy()
-    scale = arm.upper - arm.lower  # joints of different kinds on one footing: a share of their range
-    for _ in range(iterations):
-        error = tips - arm.forward_kinematics(q)[:, :3, 3]
-        jacobian = arm.jacobian(q)[:, :3, :] * scale
-        square = jacobian @ jacobian.transpose(0, 2, 1) + 1e-6 * np.eye(3)
-        pull = 0.2 * (start - q) / scale
-        rest = error - (jacobian @ pull[..., None])[..., 0]
-        step = pull + (jacobian.transpose(0, 2, 1) @ np.linalg.solve(square, rest[..., None]))[..., 0]
-        q = np.clip(q + np.clip(step, -0.2, 0.2) * scale, arm.lower, arm.upper)
-    return q
-
-
 def _draw(scene: Scene, spread: float, seed: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
     kept: list[np.ndarray] = []
@@ -93,7 +74,7 @@ def _fits(scene: Scene, targets: np.ndarray) -> np.ndarray:
     goals: dict[str, np.ndarray] = {}
     for i, agent in enumerate(scene.agents):
         arm = scene.mounts[agent].arm
-        goals[agent] = inverse_kinematics(arm, targets[:, i], arm.home)
+        goals[agent] = inverse_kinematics(arm, targets[:, i], starts=1)
         reached = arm.forward_kinematics(goals[agent])[:, :3, 3]
         good &= np.linalg.norm(reached - targets[:, i], axis=-1) < TOLERANCE
     for share in np.linspace(0.0, 1.0, PATH_POINTS + 1)[1:]:
@@ -103,7 +84,9 @@ def _fits(scene: Scene, targets: np.ndarray) -> np.ndarray:
 
 
 def _digest(scene: Scene, spread: float, seed: int) -> str:
-    content = hashlib.sha256(Path(__file__).read_bytes())
+    content = hashlib.sha256()
+    for name in ("workspace.py", "inverse_kinematics.py"):
+        content.update(Path(__file__).with_name(name).read_bytes())
     content.update(repr((TABLE_SIZE, spread, seed)).encode())
     for agent, mount in scene.mounts.items():
         content.update(agent.encode())

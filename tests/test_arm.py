@@ -1,4 +1,4 @@
-"""The PSM against its published kinematics, against yourdfpy and against MuJoCo."""
+"""The PSMs, Classic and Si, against their published numbers, against yourdfpy and against MuJoCo."""
 
 from __future__ import annotations
 
@@ -13,19 +13,23 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from surgical_marl import list_arms, load_arm
+from surgical_marl.arm import Arm
 
 PSM = load_arm("psm")
 HALF = np.pi / 2
-# dVRK PSM.json and LARGE_NEEDLE_DRIVER_400006.json, modified (Craig) convention: alpha, a, theta offset, d, slides
-DH = [(HALF, 0, HALF, 0, 0), (-HALF, 0, -HALF, 0, 0), (HALF, 0, 0, -0.4318, 1),
-      (0, 0, 0, 0.4162, 0), (-HALF, 0, -HALF, 0, 0), (-HALF, 0.0091, -HALF, 0, 0)]  # fmt: skip
+# d3 and d4 of the DH tables: dVRK PSM.json with LARGE_NEEDLE_DRIVER_400006.json, PSM_Si.json with ..._420006.json
+LENGTHS = {"psm": (-0.4318, 0.4162), "psm_si": (-0.4826, 0.4670)}
 TIP = np.array([[0, -1, 0, 0], [0, 0, 1, 0], [-1, 0, 0, 0], [0, 0, 0, 1.0]])
 
 
-def published_tip(q: np.ndarray) -> np.ndarray:
+def published_tip(name: str, q: np.ndarray) -> np.ndarray:
     """Tool tip from the table alone, moved to the jaw control point 10.2 mm past the wrist yaw axis."""
+    offset, shaft = LENGTHS[name]
+    # modified (Craig) convention: alpha, a, theta offset, d, slides
+    table = [(HALF, 0, HALF, 0, 0), (-HALF, 0, -HALF, 0, 0), (HALF, 0, 0, offset, 1),
+             (0, 0, 0, shaft, 0), (-HALF, 0, -HALF, 0, 0), (-HALF, 0.0091, -HALF, 0, 0)]  # fmt: skip
     pose = np.eye(4)
-    for (alpha, a, theta, d, slides), value in zip(DH, q, strict=True):
+    for (alpha, a, theta, d, slides), value in zip(table, q, strict=True):
         theta, d = (theta, d + value) if slides else (theta + value, d)
         ca, sa, ct, stheta = np.cos(alpha), np.sin(alpha), np.cos(theta), np.sin(theta)
         pose = pose @ np.array([[ct, -stheta, 0, a], [stheta * ca, ct * ca, -sa, -sa * d],
@@ -35,37 +39,86 @@ def published_tip(q: np.ndarray) -> np.ndarray:
     return pose
 
 
-def configurations(count: int) -> np.ndarray:
-    return np.random.default_rng(0).uniform(PSM.lower, PSM.upper, (count, len(PSM.actuated)))
+def configurations(count: int, arm: Arm = PSM) -> np.ndarray:
+    return np.random.default_rng(0).uniform(arm.lower, arm.upper, (count, len(arm.actuated)))
 
 
-def test_tip_equals_published_kinematics() -> None:
-    q = configurations(1000)
-    expected = np.stack([published_tip(row[:6]) for row in q])
-    assert np.abs(PSM.forward_kinematics(q) - expected).max() < 1e-12
+@pytest.mark.parametrize("name", LENGTHS)
+def test_tip_equals_published_kinematics(name: str) -> None:
+    arm = load_arm(name)
+    q = configurations(1000, arm)
+    expected = np.stack([published_tip(name, row[:6]) for row in q])
+    assert np.abs(arm.forward_kinematics(q) - expected).max() < 1e-12
 
 
-def test_tip_equals_yourdfpy_and_mujoco() -> None:
-    urdf = yourdfpy.URDF.load(str(PSM.folder / "psm.urdf"), load_meshes=False)
-    model = PSM.spec().compile()
+@pytest.mark.parametrize("name", LENGTHS)
+def test_tip_equals_yourdfpy_and_mujoco(name: str) -> None:
+    arm = load_arm(name)
+    urdf = yourdfpy.URDF.load(str(arm.folder / f"{name}.urdf"), load_meshes=False)
+    model = arm.spec().compile()
     data = mujoco.MjData(model)
-    names = [joint.name for joint in PSM.actuated]
-    for q in configurations(50):
+    names = [joint.name for joint in arm.actuated]
+    for q in configurations(50, arm):
         urdf.update_cfg(dict(zip(names, q, strict=True)))
         for name, value in zip(names, q, strict=True):
             data.joint(name).qpos = value
         mujoco.mj_kinematics(model, data)
-        pose = PSM.forward_kinematics(q)
+        pose = arm.forward_kinematics(q)
         assert np.abs(urdf.get_transform("tool_tip", "remote_center") - pose).max() < 1e-9
         assert np.abs(data.site("tool_tip").xpos - pose[:3, 3]).max() < 1e-9
 
 
+@pytest.mark.parametrize("name", LENGTHS)
 @settings(max_examples=50, deadline=None)
 @given(st.lists(st.floats(0, 1), min_size=7, max_size=7))
-def test_shaft_passes_through_the_remote_center(shares: list[float]) -> None:
+def test_shaft_passes_through_the_remote_center(name: str, shares: list[float]) -> None:
     """The remote center is on the shaft's axis wherever the arm is."""
-    q = PSM.lower + np.array(shares) * (PSM.upper - PSM.lower)
-    assert PSM.remote_center_error(q) < 1e-12
+    arm = load_arm(name)
+    q = arm.lower + np.array(shares) * (arm.upper - arm.lower)
+    assert arm.remote_center_error(q) < 1e-12
+
+
+# dVRK PSM.json, PSM_Si.json, the tools' files and pid/; wrist and jaw are the same tool but for the motor's D.
+TOOL = [(-4.53786, 4.53786, 0.22), (-1.39626, 1.39626, 0.25), (-1.39626, 1.39626, 0.20), (0, 0.69813, 0.16)]
+LIMITS = {
+    "psm": [(-1.588, 1.588, 3.316101), (-0.925025, 0.925025, 3.316101), (0, 0.24, 9.877926), *TOOL],
+    "psm_si": [(-2.964, 2.964, 17.0845), (-1.265, 1.301, 17.0845), (0, 0.29, 40.9063), *TOOL],
+}
+GAINS = {"psm": [(120, 6), (120, 5), (6000, 200)], "psm_si": [(600, 30), (600, 30), (6000, 200)]}
+DISC_GAINS = {"psm": (6, 0.09), "psm_si": (6, 0.08)}
+COUPLING = [[-1.5632, 0, 0, 0], [0, 1.0186, 0, 0], [0, -0.8306, 0.6089, 0.6089], [0, 0, -1.2177, 1.2177]]
+
+
+@pytest.mark.parametrize("name", LENGTHS)
+def test_limits_gains_and_friction_are_the_published_ones(name: str) -> None:
+    """Wrist gains are the motor discs' through the cable coupling, a finger's twice the jaw's, and so its friction."""
+    joints = load_arm(name).actuated
+    assert [(joint.lower, joint.upper, joint.effort) for joint in joints] == LIMITS[name]
+    assert [(joint.drive.stiffness, joint.drive.damping) for joint in joints[:3]] == GAINS[name]
+    inverse = np.linalg.inv(COUPLING)
+    share = np.diag(inverse.T @ inverse) * [1, 1, 1, 2]
+    for joint, part in zip(joints[3:], share, strict=True):
+        stiffness, damping = np.array(DISC_GAINS[name]) * part
+        assert joint.drive.stiffness == pytest.approx(stiffness, rel=2e-3)
+        assert joint.drive.damping == pytest.approx(damping, rel=2e-2)
+    assert [joint.coulomb for joint in joints] == [0.05, 0.0668, 0.4476, 0.00247, 0.0070, 0.0008, 2 * 0.0022]
+    assert [joint.viscous for joint in joints] == [0.0905, 0.2181, 1.2036, 0.00111, 0.0122, 0.0020, 2 * 0.0022]
+
+
+@pytest.mark.parametrize("name", LENGTHS)
+def test_shaft_is_drawn_whole_and_clear_of_the_column(name: str) -> None:
+    """The tube reaches d4 above the wrist; column, carriage, shaft, wrist and both fingers are there to collide."""
+    arm = load_arm(name)
+    tube = next(link for link in arm.urdf.links if link.name == "roll_link").visuals[0]
+    low, high = tube.origin[2, 3] + np.array([-0.5, 0.5]) * tube.geometry.cylinder.length
+    assert low == pytest.approx(0) and high == pytest.approx(LENGTHS[name][1])
+    assert all(len(link.visuals) <= 12 for link in arm.urdf.links)
+    model = arm.spec().compile()
+    names = {model.geom(int(i)).name for i in np.flatnonzero(model.geom_group == 3)}
+    assert names == {"column", "carriage", "shaft", "wrist", "jaw_left", "jaw_right"}
+    # The column stands beside the shaft on the side of the base, -y, and never so near that the two could be a pair.
+    column, shaft = model.geom("column"), model.geom("shaft")
+    assert 0.01 < -column.pos[1] - column.size[0] - shaft.size[0] < 0.03
 
 
 def test_jacobian_equals_differences() -> None:
@@ -128,7 +181,7 @@ def test_jaw_fingers_open_together_and_meet_at_the_tip(name: str) -> None:
     [
         ("<robot", "<robot <", "not a URDF"),
         ('<mimic joint="jaw_left"', '<mimic joint="nothing"', "'nothing', which is not a moving joint"),
-        ('<limit lower="0" upper="0.24" velocity="0.2" effort="9.877926"/>', "", "'insertion' needs a limit"),
+        ('<limit lower="0" upper="0.24" velocity="0.2" effort="9.877926" />', "", "'insertion' needs a limit"),
         ('lower="0" upper="0.24"', 'lower="0.3" upper="0.24"', "not below upper"),
         ('name="tool_tip"', 'name="tip"', "tool_tip 'tool_tip' is not a link"),
     ],

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
@@ -15,6 +17,8 @@ from jax import Array
 from surgical_marl.env import Carry, Env, State
 
 DEVICES = ("auto", "cpu", "cuda")
+LEAST_SHARE = 32
+"""Environments that are worth a thread."""
 
 
 class MjxEngine:
@@ -28,6 +32,12 @@ class MjxEngine:
         self._first_keys = jax.jit(jax.vmap(jax.random.fold_in, (None, 0)))
         self._reset = jax.jit(jax.vmap(env.reset))
         self._step = jax.jit(jax.vmap(env.step), donate_argnums=0)
+        # XLA runs a step on one CPU core: every core takes a share of the environments
+        shares = min(os.cpu_count() or 1, num_envs // LEAST_SHARE) if self.device.platform == "cpu" else 1
+        self._shares = next(n for n in range(max(shares, 1), 0, -1) if num_envs % n == 0)
+        self._pool = ThreadPoolExecutor(self._shares, "surgical_marl")
+        self._split = jax.jit(lambda tree: [jax.tree.map(share, tree) for share in self._slices()])
+        self._join = jax.jit(lambda *parts: jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts))
         self._announced = False
         self._traced = False
 
@@ -45,9 +55,24 @@ class MjxEngine:
 
     def step(self, carry: Carry, actions: dict[str, Array]) -> State:
         """One control step of all environments; `carry` may not be used again."""
-        with jax.default_device(self.device), contextlib.nullcontext() if self._traced else _no_collection():
+        with contextlib.nullcontext() if self._traced else _no_collection():
+            if self._shares == 1:
+                state = self._step_share((carry, actions))
+            else:
+                shares = self._split((carry, actions))
+                first = [] if self._traced else [self._step_share(shares.pop(0))]  # compiles once, not in every thread
+                state = self._join(*first, *self._pool.map(self._step_share, shares))
             self._traced = True
-            return self._step(carry, actions)
+        return state
+
+    def _step_share(self, share: tuple[Carry, dict[str, Array]]) -> State:
+        with jax.default_device(self.device):  # of this thread
+            state: State = jax.block_until_ready(self._step(*share)) if self._shares > 1 else self._step(*share)
+            return state
+
+    def _slices(self) -> list[Callable[[Array], Array]]:
+        size = self.num_envs // self._shares
+        return [lambda x, i=i: x[i * size : (i + 1) * size] for i in range(self._shares)]  # type: ignore[misc]
 
     def to_device(self, value: Any) -> Array:
         """Any array on the engine's device."""

@@ -1,0 +1,79 @@
+"""What `surgical-marl list -v` says of scenes, arms and tasks."""
+
+from __future__ import annotations
+
+import importlib
+from itertools import permutations
+
+import numpy as np
+
+from surgical_marl.arm import load_arm
+from surgical_marl.cache import cached
+from surgical_marl.content import list_arms, list_policies, list_scenes, list_tasks
+from surgical_marl.scene import Scene, load_scene
+
+SAMPLES = 500
+REACHED = 1e-3
+"""A point counts as reached when inverse kinematics comes this close, m."""
+
+
+def describe(kind: str) -> str:
+    """The names of one kind, with what one wants to know of each."""
+    lines = {
+        "tasks": lambda: [_task(name) for name in list_tasks()],
+        "scenes": lambda: [_scene(load_scene(name)) for name in list_scenes()],
+        "arms": lambda: [_arm(name) for name in list_arms()],
+        "policies": list_policies,
+    }[kind]()
+    return "\n".join(lines)
+
+
+def shared_workspace(scene: Scene) -> float:
+    """Share of the points that one arm reaches which another one reaches too: the mean over all pairs of arms.
+
+    Points are tool tips at random joint positions. NaN for a single arm.
+    """
+    mounts = scene.mounts.values()
+    numbers = [np.concatenate([m.position, m.rotation.ravel(), m.arm.lower, m.arm.upper, m.arm.home]) for m in mounts]
+    urdfs = [file.read_bytes() for mount in mounts for file in sorted(mount.arm.folder.glob("*.urdf"))]
+    sources = [repr((SAMPLES, REACHED)).encode(), *(number.tobytes() for number in numbers), *urdfs]
+    return float(cached("shared", sources, lambda: np.array(_shared(scene))))
+
+
+def _shared(scene: Scene) -> float:
+    from surgical_marl.inverse_kinematics import inverse_kinematics
+
+    rng, shares = np.random.default_rng(0), []
+    for one, other in permutations(scene.mounts.values(), 2):
+        q = rng.uniform(one.arm.lower, one.arm.upper, (SAMPLES, len(one.arm.lower)))
+        world = one.arm.forward_kinematics(q)[:, :3, 3] @ one.rotation.T + one.position
+        target = (world - other.position) @ other.rotation
+        tip = other.arm.forward_kinematics(inverse_kinematics(other.arm, target, starts=4))[:, :3, 3]
+        shares.append(np.mean(np.linalg.norm(tip - target, axis=-1) < REACHED))
+    return float(np.mean(shares)) if shares else np.nan
+
+
+def _scene(scene: Scene) -> str:
+    lines = [f"{scene.name:18} {scene.description}"]
+    for agent, mount in scene.mounts.items():
+        x, y, z = mount.position
+        shaft = mount.rotation @ [0, 0, -1]
+        way = f"shaft along ({shaft[0]:.2f}, {shaft[1]:.2f}, {shaft[2]:.2f}) at zero" if mount.arm.remote_center else ""
+        point = "remote center" if mount.arm.remote_center else "base"
+        lines.append(f"    {agent:14} {point} at ({x:.3f}, {y:.3f}, {z:.3f}) m {way}".rstrip())
+    pairs = f"{len(scene.pairs)} pairs of shapes can touch"
+    if len(scene.agents) > 1:
+        home = {agent: mount.arm.home for agent, mount in scene.mounts.items()}
+        pairs += f", {1000 * float(scene.clearance(home)):.0f} mm apart at home"
+        pairs += f", {shared_workspace(scene):.0%} of an arm's workspace shared"
+    return "\n".join([*lines, f"    {pairs}"])
+
+
+def _arm(name: str) -> str:
+    arm = load_arm(name)
+    return f"{name:14} {arm.description}\n    {', '.join(joint.name for joint in arm.actuated)}"
+
+
+def _task(name: str) -> str:
+    documentation = importlib.import_module(f"surgical_marl.tasks.{name}").__doc__ or ""
+    return f"{name:14} {documentation.splitlines()[0]}"

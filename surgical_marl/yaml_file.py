@@ -1,0 +1,54 @@
+"""YAML files that people write: one mapping, only keys that somebody reads, numbers that are finite."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """Reads a YAML mapping; ValueError with the line if it does not parse."""
+    try:
+        text = path.read_text()
+    except (OSError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path} cannot be read: {error}") from None
+    try:
+        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text)):
+            raise ValueError("an alias (*name) can stand for more than fits in memory; write the value out")
+        content = yaml.safe_load(text)
+    except (yaml.YAMLError, RecursionError, ValueError) as error:
+        raise ValueError(f"{path} is not valid YAML: {' '.join(str(error).split())}") from None
+    if not isinstance(content, dict):
+        raise ValueError(f"{path} must hold a YAML mapping, not {type(content).__name__}")
+    return content
+
+
+def check_keys(mapping: dict[str, Any], known: tuple[str, ...], where: Path | str) -> None:
+    """ValueError if the mapping has a key that nobody reads."""
+    for key in mapping:
+        if key not in known:
+            raise ValueError(f"{where}: unknown key {key!r}; the keys are {', '.join(known)}")
+
+
+def build(cls: type, mapping: Any, where: Path | str) -> Any:
+    """A dataclass of floats and strings from a mapping; ValueError for keys or numbers that are wrong or missing."""
+    if not isinstance(mapping, dict):
+        raise ValueError(f"{where}: {mapping!r} must be a mapping with the keys of {cls.__name__.lower()}")
+    names = tuple(f.name for f in fields(cls))
+    check_keys(mapping, names, where)
+    values: dict[str, Any] = {}
+    for key, value in mapping.items():
+        if cls.__annotations__[key] == "float":
+            if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+                raise ValueError(f"{where}: {key} must be a finite number, not {value!r}")
+            value = float(value)
+        values[key] = value
+    try:
+        return cls(**values)
+    except TypeError:
+        missing = [name for name in names if name not in values]
+        raise ValueError(f"{where}: a {cls.__name__.lower()} lacks {', '.join(missing)}") from None

@@ -1,0 +1,147 @@
+"""All scenes, in all control modes: limits hold, nothing breaks, no contact goes unseen, energy stays."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+
+from surgical_marl import list_scenes, load_scene
+from surgical_marl.arm import CONTROL_MODES
+from surgical_marl.contacts import collision_geoms
+from surgical_marl.physics import Simulator
+from surgical_marl.scene import DECIMATION, Scene
+
+SCENES = list_scenes()
+STEPS = 10_000
+
+
+def play(scene: Scene, data: mujoco.MjData, steps: int, seed: int = 0) -> Iterator[mujoco.MjData]:
+    """C MuJoCo under full actions one way and the other, each held until joints rest at their limits; yields each
+    control step."""
+    simulator, rng = Simulator(scene), np.random.default_rng(seed)
+    actions = {}
+    for agent, mount in scene.mounts.items():
+        columns = []
+        for _ in mount.arm.actuated:
+            holds = rng.integers(20, 250, steps // 20)
+            columns.append(np.repeat(rng.choice([-1.0, 1.0], len(holds)), holds)[:steps])
+        actions[agent] = np.stack(columns, -1).astype(np.float32)
+    command, physics = jax.jit(simulator.command), simulator.home
+    data.qpos[:] = scene.home
+    for step in range(steps):
+        physics = command(physics._replace(qpos=data.qpos), {agent: action[step] for agent, action in actions.items()})
+        data.ctrl[:] = physics.ctrl
+        mujoco.mj_step(scene.model, data, DECIMATION)
+        yield data
+
+
+@pytest.mark.parametrize("control", CONTROL_MODES)
+@pytest.mark.parametrize("name", SCENES)
+def test_limits_hold_at_full_effort(name: str, control: str) -> None:
+    """10,000 control steps without NaN or warning; joints come to both limits, none passes one by 1 % of its range.
+
+    Only what another arm strikes at a tip's end, a finger or a needle that weighs next to nothing, may go further: at
+    7 rad/s a physics step alone is 5 % of a finger's range.
+    """
+    scene = load_scene(name, control)
+    model, data = scene.model, mujoco.MjData(scene.model)
+    low, high = model.jnt_range.T
+    lowest, highest = high.copy(), low.copy()
+    for now in play(scene, data, STEPS):
+        assert np.isfinite(now.qpos).all() and np.isfinite(now.qvel).all()
+        lowest, highest = np.minimum(lowest, now.qpos), np.maximum(highest, now.qpos)
+    assert not [str(mujoco.mjtWarning(i)) for i, warning in enumerate(data.warning) if warning.number]
+    names = [model.joint(i).name for i in range(model.njnt)]
+    ends = np.array([name.split("/")[1].startswith(("jaw", "needle")) for name in names])
+    alone = len(scene.agents) == 1
+    passed = np.maximum(highest - high, low - lowest) / (high - low)
+    assert (passed < np.where(ends & (not alone), 0.06, 0.01)).all(), dict(zip(names, passed.round(4), strict=True))
+    if alone:  # several arms keep each other from some limits
+        near = np.maximum(lowest - low, high - highest) / (high - low)
+        jaws = np.array(["jaw" in name for name in names])  # these stop where they are told to
+        assert near[~jaws].max() < 0.02, dict(zip(names, near.round(4), strict=True))
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_no_joint_is_faster_than_its_limit(name: str) -> None:
+    """Without contacts, within the overshoot of the dVRK's gains: commands and the leads of targets are bounded, and
+    under torque no effort is left at full speed."""
+    for control in CONTROL_MODES:
+        scene = load_scene(name, control)
+        model, data = scene.model, mujoco.MjData(scene.model)
+        limit = np.concatenate([[j.velocity for j in mount.arm.joints] for mount in scene.mounts.values()])
+        fastest = np.zeros(model.nv)
+        for now in play(scene, data, 500, seed=1):
+            model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+            fastest = np.maximum(fastest, np.abs(now.qvel))
+        assert (fastest <= 1.15 * limit).all(), dict(enumerate((fastest / limit).round(3)))
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_no_overlap_goes_unseen(name: str) -> None:
+    """C MuJoCo with all geoms colliding, at 100,000 random configurations: what it finds is among the scene's pairs, or
+    overlaps at home by design."""
+    scene = load_scene(name)
+    model = scene.model
+    known = {frozenset(pair) for pair in scene.pairs}
+    for agent in scene.agents:
+        geoms = collision_geoms(model, agent)
+        model.geom_contype[geoms], model.geom_conaffinity[geoms] = 1, 1
+    data = mujoco.MjData(model)
+    data.qpos[:] = scene.home
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_collision(model, data)
+    known |= {frozenset(model.geom(int(g)).name for g in contact.geom) for contact in data.contact}
+    rng = np.random.default_rng(1)
+    q = {a: rng.uniform(m.arm.lower, m.arm.upper, (100_000, len(m.arm.lower))) for a, m in scene.mounts.items()}
+    found = set()
+    for qpos in scene.full_qpos(q):
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_collision(model, data)
+        if data.ncon:
+            found |= {tuple(pair) for pair in data.contact.geom.tolist()}
+    unseen = {frozenset(model.geom(g).name for g in pair) for pair in found} - known
+    assert not unseen
+    assert found or not scene.pairs
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_energy_stays(name: str) -> None:
+    """Kinetic energy of arms that coast without actuators, friction and limits drifts by less than 1 % in 2 s."""
+    scene = load_scene(name)
+    model = scene.model
+    model.dof_damping[:], model.dof_frictionloss[:] = 0, 0
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY
+    data = mujoco.MjData(model)
+    data.qpos[:] = scene.home
+    for agent, mount in scene.mounts.items():
+        for joint in mount.arm.actuated[:3]:
+            data.joint(f"{agent}/{joint.name}").qvel = 0.15 * joint.velocity
+    mujoco.mj_forward(model, data)
+    start = data.energy[1]
+    energy = []
+    while data.time < 2.0:
+        mujoco.mj_step(model, data)
+        energy.append(data.energy[1])
+    assert start > 0 and np.abs(np.array(energy) / start - 1).max() < 0.01
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_shafts_stay_in_their_remote_centers(name: str) -> None:
+    """At every step of a random rollout: 1e-6 m between the shaft's axis and the remote center, in C MuJoCo's poses."""
+    scene = load_scene(name)
+    for data in play(scene, mujoco.MjData(scene.model), 300, seed=2):
+        mujoco.mj_kinematics(scene.model, data)
+        for agent, mount in scene.mounts.items():
+            if mount.arm.remote_center is not None:
+                shaft = data.body(f"{agent}/{mount.arm.remote_center}")
+                off = np.cross(shaft.xmat.reshape(3, 3)[:, 2], shaft.xpos - mount.position)
+                assert np.linalg.norm(off) < 1e-6
+                assert mount.arm.remote_center_error(data.qpos[scene.qpos_index(agent)]) < 1e-6
