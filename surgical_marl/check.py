@@ -19,9 +19,10 @@ import numpy as np
 
 from surgical_marl.arm import Arm, load_arm
 from surgical_marl.arm_spec import COLLISION_GROUP
+from surgical_marl.contacts import collision_geoms, neighbours
 from surgical_marl.content import find, list_arms, list_scenes, unknown
 from surgical_marl.inverse_kinematics import inverse_kinematics
-from surgical_marl.scene import TIMESTEP, Scene, load_scene
+from surgical_marl.scene import TIMESTEP, Scene, load_scene, set_physics
 from surgical_marl.urdf import Faults
 
 REACH = 0.001
@@ -147,9 +148,7 @@ def _remote_center_findings(arm: Arm) -> Iterator[str]:
 def _model(arm: Arm) -> mujoco.MjModel:
     """The arm alone, under the physics of a scene."""
     spec = arm.spec("position")
-    spec.option.timestep = TIMESTEP
-    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    spec.option.gravity = [0.0, 0.0, 0.0]
+    set_physics(spec)
     try:
         return spec.compile()
     except (ValueError, mujoco.FatalError) as error:
@@ -174,25 +173,12 @@ def _collision_findings(arm: Arm, model: mujoco.MjModel) -> Iterator[str]:
 
 def _meet_by_design(arm: Arm, model: mujoco.MjModel, a: int, b: int) -> bool:
     """Whether two geoms are on one body, are neighbours with no collision geom between them, or are jaw fingers."""
-    one, other = (int(model.body_weldid[model.geom_bodyid[geom]]) for geom in (a, b))
-    if one == other or _neighbours(model, one, other):
+    if neighbours(model, a, b):
         return True
+    one, other = (int(model.body_weldid[model.geom_bodyid[geom]]) for geom in (a, b))
     leaders = {joint.name: joint.leader for joint in arm.joints}
     moved_by = [leaders[model.joint(int(model.body_jntadr[body])).name] for body in (one, other) if body != 0]
     return len(moved_by) == 2 and moved_by[0] == moved_by[1]
-
-
-def _neighbours(model: mujoco.MjModel, one: int, other: int) -> bool:
-    """Whether the way up the tree from one body leads to the other with nothing between that collides."""
-    solid = {int(model.body_weldid[model.geom_bodyid[g]]) for g in np.flatnonzero(model.geom_group == COLLISION_GROUP)}
-    for body, target in ((one, other), (other, one)):
-        while body != 0:
-            body = int(model.body_weldid[model.body_parentid[body]])
-            if body == target:
-                return True
-            if body in solid:
-                break
-    return False
 
 
 def _at(arm: Arm, model: mujoco.MjModel, q: np.ndarray) -> mujoco.MjData:
@@ -249,13 +235,7 @@ def _scene_findings(scene: Scene) -> Iterator[str]:
     model, data = scene.model, mujoco.MjData(scene.model)
     data.qpos[:] = scene.home
     mujoco.mj_kinematics(model, data)
-    geoms = {
-        agent: [
-            int(geom) for geom in np.flatnonzero(model.geom_group == COLLISION_GROUP)
-            if model.geom(int(geom)).name.startswith(f"{agent}/")
-        ]
-        for agent in scene.agents
-    }  # fmt: skip
+    geoms = {agent: collision_geoms(model, agent) for agent in scene.agents}
     for one, other in combinations(scene.agents, 2):
         pairs = [(a, b) for a in geoms[one] for b in geoms[other]]
         depths = {pair: -mujoco.mj_geomDistance(model, data, *pair, 1.0, None) for pair in pairs}

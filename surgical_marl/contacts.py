@@ -35,13 +35,9 @@ def collision_geoms(model: mujoco.MjModel, agent: str) -> list[int]:
 def contact_pairs(scene: Scene) -> list[tuple[str, str]]:
     """Names of the geoms that can touch, by pairs. Kept on disk by content, so a second call is quick."""
     model = scene.model
-    numbers = (model.geom_size, model.geom_pos, model.geom_quat, model.body_pos, model.body_quat, model.jnt_range,
-               model.jnt_axis, model.geom_bodyid, scene.home)  # fmt: skip
-    names = [model.geom(i).name for agent in scene.agents for i in collision_geoms(model, agent)]
-    settings = repr((SAMPLES, NEAR, NEAR_WITHIN, names)).encode()
-    sources = [settings, *(np.ascontiguousarray(number).tobytes() for number in numbers)]
     candidates = _candidates(scene)
-    near = cached("pairs", sources, lambda: _sweep(scene, candidates))
+    settings = repr((SAMPLES, NEAR, NEAR_WITHIN, candidates))
+    near = cached("pairs", settings, scene.fingerprint, lambda: _sweep(scene, candidates))
     return [(model.geom(a).name, model.geom(b).name) for (a, b), kept in zip(candidates, near, strict=True) if kept]
 
 
@@ -50,14 +46,22 @@ def _candidates(scene: Scene) -> list[tuple[int, int]]:
     model = scene.model
     geoms = {agent: collision_geoms(model, agent) for agent in scene.agents}
     between = [pair for one, other in combinations(scene.agents, 2) for pair in product(geoms[one], geoms[other])]
-    within = [pair for own in geoms.values() for pair in combinations(own, 2) if not _neighbours(model, *pair)]
+    within = [pair for own in geoms.values() for pair in combinations(own, 2) if not neighbours(model, *pair)]
     return between + within
 
 
-def _neighbours(model: mujoco.MjModel, a: int, b: int) -> bool:
+def neighbours(model: mujoco.MjModel, a: int, b: int) -> bool:
+    """Whether two geoms are on one body, or the way up the tree from one to the other passes nothing that collides."""
+    solid = {int(model.body_weldid[model.geom_bodyid[g]]) for g in np.flatnonzero(model.geom_group == COLLISION_GROUP)}
     one, other = (int(model.body_weldid[model.geom_bodyid[geom]]) for geom in (a, b))
-    parents = [int(model.body_weldid[model.body_parentid[body]]) for body in (one, other)]
-    return one == other or one == parents[1] or other == parents[0]
+    for body, target in ((one, other), (other, one)):
+        while body not in (0, target):
+            body = int(model.body_weldid[model.body_parentid[body]])
+            if body in solid:
+                break
+        if body == target:
+            return True
+    return False
 
 
 def _sweep(scene: Scene, candidates: list[tuple[int, int]]) -> np.ndarray:

@@ -33,11 +33,7 @@ def shared_workspace(scene: Scene) -> float:
 
     Points are tool tips at random joint positions. NaN for a single arm.
     """
-    mounts = scene.mounts.values()
-    numbers = [np.concatenate([m.position, m.rotation.ravel(), m.arm.lower, m.arm.upper, m.arm.home]) for m in mounts]
-    urdfs = [file.read_bytes() for mount in mounts for file in sorted(mount.arm.folder.glob("*.urdf"))]
-    sources = [repr((SAMPLES, REACHED)).encode(), *(number.tobytes() for number in numbers), *urdfs]
-    return float(cached("shared", sources, lambda: np.array(_shared(scene))))
+    return float(cached("shared", repr((SAMPLES, REACHED)), scene.fingerprint, lambda: np.array(_shared(scene))))
 
 
 def _shared(scene: Scene) -> float:

@@ -82,7 +82,8 @@ class Simulator:
         self.control_dt = DECIMATION * scene.model.opt.timestep
         self._index_joints()
         self._index_pairs()
-        start = scene.home if scene.control == "position" else np.where(self._jaws, scene.home, 0.0)
+        start = scene.home[self._address]
+        start = start if scene.control == "position" else np.where(self._jaws, start, 0.0)
         self._home = np.asarray(scene.home, np.float32), np.asarray(start, np.float32)
         self.home_contacts, self.home_views = self._measure_home()
 
@@ -105,8 +106,9 @@ class Simulator:
         action = own[self._leaders]
         reach = self._speed * np.float32(self.control_dt)
         if self.scene.control == "position":
-            lead = jnp.clip(ctrl + action * reach - physics.qpos, -self._lead, self._lead)
-            command = jnp.clip(physics.qpos + lead, self._low, self._high)
+            now = physics.qpos[self._address]
+            lead = jnp.clip(ctrl + action * reach - now, -self._lead, self._lead)
+            command = jnp.clip(now + lead, self._low, self._high)
         else:
             command = action * (self._speed if self.scene.control == "velocity" else self._effort)
         jaw = ctrl + jnp.clip(jnp.where(action > 0, self._open, self._closed) - ctrl, -reach, reach)
@@ -173,6 +175,8 @@ class Simulator:
         self._high = np.array([joint.upper for _, _, joint, _ in rows], single)
         self._open = np.array([jaw.open if is_jaw and jaw else 0.0 for _, is_jaw, _, jaw in rows], single)
         self._closed = np.array([jaw.closed if is_jaw and jaw else 0.0 for _, is_jaw, _, jaw in rows], single)
+        # actuators stand in the URDF's order of joints, `qpos` in that of the tree
+        self._address = model.jnt_qposadr[model.actuator_trnid[:, 0]]
         self._joints = {agent: scene.qpos_index(agent) for agent in scene.agents}
         self._actuators = {
             agent: np.array([names.index(f"{agent}/{joint.name}") for joint in mount.arm.actuated])

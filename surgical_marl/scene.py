@@ -19,10 +19,11 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from surgical_marl.arm import Arm, check_keys, load_arm, read_yaml
+from surgical_marl.arm import Arm, load_arm
 from surgical_marl.arm_spec import COLLISION_GROUP, SOLREF
 from surgical_marl.contacts import Capsule, capsule_distance, collision_geoms, contact_pairs
 from surgical_marl.content import find
+from surgical_marl.yaml_file import check_keys, read_yaml
 
 TIMESTEP = 0.005
 """Physics step in s. docs/physics.md has the stability test that chose it."""
@@ -91,6 +92,15 @@ class Scene:
         geom = self.model.geom
         ids = zip(self.model.pair_geom1, self.model.pair_geom2, strict=True)
         return tuple((geom(int(a)).name, geom(int(b)).name) for a, b in ids)
+
+    @property
+    def fingerprint(self) -> bytes:
+        """What kinematics and shapes come from: equal for scenes that move and touch alike."""
+        m = self.model
+        numbers = (m.body_parentid, m.body_pos, m.body_quat, m.jnt_axis, m.jnt_pos, m.jnt_range, m.jnt_type, m.site_pos,
+                   m.geom_bodyid, m.geom_group, m.geom_type, m.geom_size, m.geom_pos, m.geom_quat, self.home,
+                   *(mount.workspace for mount in self.mounts.values()))  # fmt: skip
+        return repr(self.agents).encode() + b"".join(np.ascontiguousarray(number).tobytes() for number in numbers)
 
     def clearance(self, q: dict[str, np.ndarray], within: bool = False) -> np.ndarray:
         """Least distance in m of any two arms, or of parts within one arm; inf if there is no such pair.
@@ -187,11 +197,8 @@ def _transform(position: np.ndarray) -> np.ndarray:
     return matrix
 
 
-def _build(name: str, mounts: dict[str, Mount], control: str) -> mujoco.MjSpec:
-    spec = mujoco.MjSpec()
-    spec.modelname = name
-    spec.compiler.degree = False
-    spec.copy_during_attach = True
+def set_physics(spec: mujoco.MjSpec) -> None:
+    """The physics options of every scene."""
     option = spec.option
     option.timestep = TIMESTEP
     # Implicit in velocity: the stiff wrist controllers stay stable at 5 ms. docs/physics.md compares.
@@ -199,6 +206,14 @@ def _build(name: str, mounts: dict[str, Mount], control: str) -> mujoco.MjSpec:
     option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
     # dVRK arms are balanced by counterweights (identified gravity torque under 0.4 N m), so gravity is off.
     option.gravity = [0.0, 0.0, 0.0]
+
+
+def _build(name: str, mounts: dict[str, Mount], control: str) -> mujoco.MjSpec:
+    spec = mujoco.MjSpec()
+    spec.modelname = name
+    spec.compiler.degree = False
+    spec.copy_during_attach = True
+    set_physics(spec)
     for agent, mount in mounts.items():
         quat = np.zeros(4)
         mujoco.mju_mat2Quat(quat, mount.rotation.ravel())

@@ -7,15 +7,10 @@ from home. An environment then picks rows of the table, so a reset costs one loo
 
 from __future__ import annotations
 
-import hashlib
-import os
-import tempfile
-from pathlib import Path
-
 import numpy as np
 
+from surgical_marl.cache import cached
 from surgical_marl.inverse_kinematics import inverse_kinematics
-from surgical_marl.runtime import cache_dir
 from surgical_marl.scene import Scene
 
 TABLE_SIZE = 4096
@@ -39,16 +34,8 @@ def target_table(scene: Scene, spread: float, seed: int = 0) -> np.ndarray:
     Raises:
         ValueError: if fewer than one draw in a hundred can be kept.
     """
-    path = cache_dir() / "targets" / f"{_digest(scene, spread, seed)}.npy"
-    try:
-        table = np.load(path)
-        if table.shape == (TABLE_SIZE, len(scene.agents), 3):
-            return table
-    except (OSError, ValueError, EOFError):
-        pass  # not there yet, or damaged: draw it again
-    table = _draw(scene, spread, seed)
-    _save(path, table)
-    return table
+    settings = repr((TABLE_SIZE, CLEARANCE, PATH_POINTS, TOLERANCE, spread, seed))
+    return cached("targets", settings, scene.fingerprint, lambda: _draw(scene, spread, seed))
 
 
 def _draw(scene: Scene, spread: float, seed: int) -> np.ndarray:
@@ -81,29 +68,3 @@ def _fits(scene: Scene, targets: np.ndarray) -> np.ndarray:
         way = {agent: (1 - share) * scene.mounts[agent].arm.home + share * goals[agent] for agent in scene.agents}
         good &= scene.clearance(way) > CLEARANCE
     return good
-
-
-def _digest(scene: Scene, spread: float, seed: int) -> str:
-    content = hashlib.sha256()
-    for name in ("workspace.py", "inverse_kinematics.py"):
-        content.update(Path(__file__).with_name(name).read_bytes())
-    content.update(repr((TABLE_SIZE, spread, seed)).encode())
-    for agent, mount in scene.mounts.items():
-        content.update(agent.encode())
-        for values in (mount.position, mount.rotation, mount.workspace):
-            content.update(values.tobytes())
-        for file in sorted(mount.arm.folder.glob("*")):
-            if file.suffix in (".urdf", ".yaml"):
-                content.update(file.read_bytes())
-    return content.hexdigest()[:32]
-
-
-def _save(path: Path, table: np.ndarray) -> None:
-    """Writes the table at once or not at all; a cache that can't be written is no error."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
-            np.save(file, table)
-        os.replace(file.name, path)
-    except OSError:
-        return

@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
+import shutil
+import sys
 from collections.abc import Iterator
+from pathlib import Path
+from xml.etree import ElementTree
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 
-from surgical_marl import list_scenes, load_scene
+from surgical_marl import list_scenes, load_arm, load_scene
 from surgical_marl.arm import CONTROL_MODES
 from surgical_marl.contacts import collision_geoms
 from surgical_marl.physics import Simulator
 from surgical_marl.scene import DECIMATION, Scene
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "docs"))
+from energy import energy_drift
 
 SCENES = list_scenes()
 STEPS = 10_000
@@ -114,23 +122,51 @@ def test_no_overlap_goes_unseen(name: str) -> None:
 @pytest.mark.parametrize("name", SCENES)
 def test_energy_stays(name: str) -> None:
     """Kinetic energy of arms that coast without actuators, friction and limits drifts by less than 1 % in 2 s."""
-    scene = load_scene(name)
-    model = scene.model
-    model.dof_damping[:], model.dof_frictionloss[:] = 0, 0
-    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
-    model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY
-    data = mujoco.MjData(model)
-    data.qpos[:] = scene.home
-    for agent, mount in scene.mounts.items():
-        for joint in mount.arm.actuated[:3]:
-            data.joint(f"{agent}/{joint.name}").qvel = 0.15 * joint.velocity
-    mujoco.mj_forward(model, data)
-    start = data.energy[1]
-    energy = []
-    while data.time < 2.0:
-        mujoco.mj_step(model, data)
-        energy.append(data.energy[1])
-    assert start > 0 and np.abs(np.array(energy) / start - 1).max() < 0.01
+    _, drift = energy_drift(load_scene(name))
+    assert 0 < np.abs(drift).max() < 0.01
+
+
+@pytest.mark.parametrize("name", ["psm", "ecm", "star"])
+def test_a_commanded_velocity_is_reached_and_held(name: str) -> None:
+    scene = load_scene(name, "velocity")
+    agent, arm = scene.agents[0], scene.mounts[scene.agents[0]].arm
+    simulator = Simulator(scene)
+    command, physics = jax.jit(simulator.command), simulator.home
+    for i, joint in enumerate(arm.actuated):
+        if arm.jaw and joint.name == arm.jaw.joint:
+            continue
+        data = mujoco.MjData(scene.model)
+        data.qpos[:] = scene.home
+        action = np.zeros(len(arm.actuated), np.float32)
+        action[i] = 0.5
+        data.ctrl[:] = command(physics, {agent: action}).ctrl
+        mujoco.mj_step(scene.model, data, 60)
+        speed = float(data.joint(f"{agent}/{joint.name}").qvel[0])
+        # the law is proportional: friction costs some of the speed
+        lost = (joint.coulomb + joint.viscous * 0.5 * joint.drive.speed) / joint.drive.damping
+        assert 0.5 * joint.drive.speed - 1.3 * lost - 0.002 < speed < 0.52 * joint.drive.speed, joint.name
+
+
+@pytest.mark.parametrize("name", ["psm", "ecm", "star"])
+def test_a_commanded_torque_accelerates_as_newton_says(name: str) -> None:
+    scene = load_scene(name, "torque")
+    model, agent, arm = scene.model, scene.agents[0], scene.mounts[scene.agents[0]].arm
+    simulator = Simulator(scene)
+    model.dof_frictionloss[:] = 0
+    for i, joint in enumerate(arm.actuated):
+        if arm.jaw and joint.name == arm.jaw.joint:
+            continue
+        data = mujoco.MjData(model)
+        data.qpos[:] = scene.home
+        action = np.zeros(len(arm.actuated), np.float32)
+        action[i] = -0.3
+        data.ctrl[:] = simulator.command(simulator.home, {agent: action}).ctrl
+        mujoco.mj_forward(model, data)
+        mass = np.zeros((model.nv, model.nv))
+        mujoco.mj_fullM(model, data, mass)
+        force = mass @ data.qacc
+        own = model.joint(f"{agent}/{joint.name}").dofadr[0]
+        assert force[own] == pytest.approx(-0.3 * joint.effort, rel=1e-5)
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -145,3 +181,34 @@ def test_shafts_stay_in_their_remote_centers(name: str) -> None:
                 off = np.cross(shaft.xmat.reshape(3, 3)[:, 2], shaft.xpos - mount.position)
                 assert np.linalg.norm(off) < 1e-6
                 assert mount.arm.remote_center_error(data.qpos[scene.qpos_index(agent)]) < 1e-6
+
+
+def test_a_urdf_may_list_its_joints_in_any_order(tmp_path: Path) -> None:
+    """The PSM with its joints listed backwards moves as the PSM does."""
+    folder = tmp_path / "backwards"
+    shutil.copytree(load_arm("psm").folder, folder)
+    tree = ElementTree.parse(folder / "psm.urdf")
+    joints = tree.getroot().findall("joint")
+    for joint in joints:
+        tree.getroot().remove(joint)
+    tree.getroot().extend(joints[::-1])
+    tree.write(folder / "psm.urdf")
+    (tmp_path / "one.yaml").write_text("arms: {backwards_0: {arm: backwards}}")
+    action = {"yaw": 1.0, "insertion": -0.5, "roll": 0.7, "jaw_left": 1.0}
+    tips = []
+    for source in ("psm", tmp_path / "one.yaml"):
+        scene = load_scene(source)
+        agent, arm = scene.agents[0], scene.mounts[scene.agents[0]].arm
+        simulator, data = Simulator(scene), mujoco.MjData(scene.model)
+        data.qpos[:] = scene.home
+        physics = simulator.home
+        np.testing.assert_allclose(arm.home[[j.name for j in arm.actuated].index("insertion")], 0.1)
+        for _ in range(20):
+            values = np.array([action.get(joint.name, 0.0) for joint in arm.actuated], np.float32)
+            physics = simulator.command(physics._replace(qpos=jnp.asarray(data.qpos, jnp.float32)), {agent: values})
+            data.ctrl[:] = physics.ctrl
+            mujoco.mj_step(scene.model, data, DECIMATION)
+        mujoco.mj_kinematics(scene.model, data)
+        tips.append(data.site(f"{agent}/tool_tip").xpos - scene.mounts[agent].position)
+    np.testing.assert_allclose(tips[0], tips[1], atol=1e-6)
+    assert np.linalg.norm(tips[0]) > 0.05

@@ -1,0 +1,59 @@
+"""Draw every arm into its folder (preview.png) and every scene into docs/scenes.png. Run: python docs/previews.py"""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import imageio.v3 as imageio
+import mujoco
+import numpy as np
+
+from surgical_marl import list_arms, list_scenes, load_arm, load_scene
+from surgical_marl.scene import Scene
+from surgical_marl.view.render import Renderer
+
+DIRECTION = np.array([0.75, 0.60, 0.30])
+"""From an arm to the camera."""
+
+
+def picture(scene: Scene, width: int, height: int) -> np.ndarray:
+    """The scene at home, [height, width, 3] uint8."""
+    data = mujoco.MjData(scene.model)
+    data.qpos[:] = scene.home
+    mujoco.mj_forward(scene.model, data)
+    return Renderer(scene.model, width, height).render(data)
+
+
+def portrait(name: str, folder: Path) -> np.ndarray:
+    """One arm above the field, the camera so far that all of it is seen."""
+    path = folder / f"{name}.yaml"
+    position = [0.0, 0.0, 0.15] if load_arm(name).remote_center else [-0.52, 0.0, -0.03]
+    lines = [f"arms: {{{name}_0: {{arm: {name}, position: {position}}}}}"]
+    path.write_text("\n".join(lines))
+    scene = load_scene(path)
+    data = mujoco.MjData(scene.model)
+    data.qpos[:] = scene.home
+    mujoco.mj_forward(scene.model, data)
+    parts = data.geom_xpos[scene.model.geom_group != 1]
+    centre, size = (parts.min(0) + parts.max(0)) / 2, np.linalg.norm(np.ptp(parts, axis=0))
+    at = centre + 1.4 * size * DIRECTION / np.linalg.norm(DIRECTION)
+    path.write_text("\n".join([*lines, f"view: {{position: {at.tolist()}, target: {centre.tolist()}}}"]))
+    return picture(load_scene(path), 480, 480)
+
+
+def main() -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        for name in list_arms():
+            path = load_arm(name).folder / "preview.png"
+            imageio.imwrite(path, portrait(name, Path(folder)))
+            print(path)
+    pictures = [picture(load_scene(name), 480, 360) for name in list_scenes()]
+    rows = [np.concatenate(pictures[i : i + 3], axis=1) for i in range(0, len(pictures), 3)]
+    path = Path(__file__).with_name("scenes.png")
+    imageio.imwrite(path, np.concatenate(rows))
+    print(path)
+
+
+if __name__ == "__main__":
+    main()
