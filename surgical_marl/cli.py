@@ -125,7 +125,11 @@ def _list(arguments: argparse.Namespace) -> None:
     if arguments.verbose:
         from surgical_marl.describe import describe
 
-        print("\n".join(describe(kind) for kind in ([arguments.kind] if arguments.kind else _LISTS)))
+        print(
+            "\n\n".join(
+                [describe(arguments.kind)] if arguments.kind else [f"{k}\n{describe(k) or '-'}" for k in _LISTS]
+            )
+        )
         return
     if arguments.kind:
         print("\n".join(_LISTS[arguments.kind]()))

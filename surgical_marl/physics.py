@@ -75,10 +75,9 @@ class Simulator:
         from mujoco import mjx
 
         self.scene, self._mjx = scene, mjx
-        single = copy.copy(scene.model)
-        single.opt.ls_iterations = LINE_SEARCH_ITERATIONS
-        single.opt.iterations = 1  # MJX then makes no loop of unknown length of it: `_forward` repeats it
-        self._model, self._data = mjx.put_model(single), mjx.make_data(scene.model)
+        model = copy.copy(scene.model)
+        model.opt.ls_iterations = LINE_SEARCH_ITERATIONS
+        self._model, self._data = mjx.put_model(model), mjx.make_data(scene.model)
         self.control_dt = DECIMATION * scene.model.opt.timestep
         self._index_joints()
         self._index_pairs()
@@ -222,17 +221,24 @@ class Simulator:
         return data._impl.efc_force[self._rows] if self.scene.model.npair else jnp.zeros(0, jnp.float32)
 
     def _forward(self, data: Any) -> Any:
-        """`mjx.forward`, but with a fixed number of solver iterations, each from where the last one ended."""
+        """`mjx.forward`, but with a fixed number of Newton iterations: `mjx.solve` would loop until all environments
+        have converged, which a GPU waits for, and factorises the Hessian once more than it needs to."""
+        from mujoco.mjx._src import solver
+
         for stage in ("fwd_position", "fwd_velocity", "fwd_actuation", "fwd_acceleration"):
             data = getattr(self._mjx, stage)(self._model, data)
 
-        def iterate(found: Any, _: None) -> tuple[Any, None]:
-            solved = self._mjx.solve(self._model, data.replace(qacc_warmstart=found[0]))
-            return (solved.qacc, solved.qfrc_constraint, solved._impl.efc_force), None
+        def at(qacc: Array, grad: bool = False) -> Any:
+            return solver.Context.create(self._model, data.replace(qacc=qacc), grad=grad)
 
-        start = (data.qacc_warmstart, data.qfrc_constraint, data._impl.efc_force)
-        (qacc, constraint, force), _ = jax.lax.scan(iterate, start, None, length=SOLVER_ITERATIONS)
-        return data.tree_replace({"qacc": qacc, "qfrc_constraint": constraint, "_impl.efc_force": force})
+        def iterate(qacc: Array, _: None) -> tuple[Array, None]:
+            return solver._linesearch(self._model, data, at(qacc, grad=True)).qacc, None
+
+        warm, smooth = data.qacc_warmstart, data.qacc_smooth
+        start = jnp.where(at(warm).cost < at(smooth).cost, warm, smooth)
+        qacc, _ = jax.lax.scan(iterate, start, None, length=SOLVER_ITERATIONS)
+        found = {"qfrc_constraint": at(qacc).qfrc_constraint, "_impl.efc_force": at(qacc).efc_force}
+        return data.tree_replace({"qacc": qacc, **found})
 
     def _integrate(self, data: Any) -> Any:
         """The implicitfast step. An actuator at its effort limit can't damp any more, so its damping leaves the
