@@ -125,11 +125,10 @@ def _list(arguments: argparse.Namespace) -> None:
     if arguments.verbose:
         from surgical_marl.describe import describe
 
-        print(
-            "\n\n".join(
-                [describe(arguments.kind)] if arguments.kind else [f"{k}\n{describe(k) or '-'}" for k in _LISTS]
-            )
-        )
+        if arguments.kind:
+            print(describe(arguments.kind))
+        else:
+            print("\n\n".join(f"{kind}\n{describe(kind) or '-'}" for kind in _LISTS))
         return
     if arguments.kind:
         print("\n".join(_LISTS[arguments.kind]()))

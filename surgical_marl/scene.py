@@ -100,7 +100,10 @@ class Scene:
         numbers = (m.body_parentid, m.body_pos, m.body_quat, m.jnt_axis, m.jnt_pos, m.jnt_range, m.jnt_type, m.site_pos,
                    m.geom_bodyid, m.geom_group, m.geom_type, m.geom_size, m.geom_pos, m.geom_quat, self.home,
                    *(mount.workspace for mount in self.mounts.values()))  # fmt: skip
-        return repr(self.agents).encode() + b"".join(np.ascontiguousarray(number).tobytes() for number in numbers)
+        joints = {
+            agent: mount.arm.joints for agent, mount in self.mounts.items()
+        }  # what mimics what is not in the model
+        return repr(joints).encode() + b"".join(np.ascontiguousarray(number).tobytes() for number in numbers)
 
     def clearance(self, q: dict[str, np.ndarray], within: bool = False) -> np.ndarray:
         """Least distance in m of any two arms, or of parts within one arm; inf if there is no such pair.

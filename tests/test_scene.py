@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import mujoco
@@ -114,3 +115,16 @@ def test_a_wrong_file_is_one_sentence(tmp_path: Path, text: str, words: str) -> 
     with pytest.raises(ValueError, match=words) as caught:
         load_scene(path)
     assert "\n" not in str(caught.value)
+
+
+def test_a_change_of_what_a_joint_mimics_changes_the_fingerprint(tmp_path: Path) -> None:
+    """Or else target tables and contact pairs of the old arm would come from the cache."""
+    folder, path = tmp_path / "psm", tmp_path / "one.yaml"
+    shutil.copytree(load_scene("psm").mounts["psm_0"].arm.folder, folder)
+    path.write_text("arms: {psm_0: {arm: psm}}")
+    before = load_scene(path).fingerprint
+    assert load_scene(path).fingerprint == before
+    text = (folder / "psm.urdf").read_text()
+    assert 'multiplier="1"' in text
+    (folder / "psm.urdf").write_text(text.replace('multiplier="1"', 'multiplier="0.5"'))
+    assert load_scene(path).fingerprint != before
