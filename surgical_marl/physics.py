@@ -237,8 +237,10 @@ class Simulator:
         warm, smooth = data.qacc_warmstart, data.qacc_smooth
         start = jnp.where(at(warm).cost < at(smooth).cost, warm, smooth)
         qacc, _ = jax.lax.scan(iterate, start, None, length=SOLVER_ITERATIONS)
-        found = {"qfrc_constraint": at(qacc).qfrc_constraint, "_impl.efc_force": at(qacc).efc_force}
-        return data.tree_replace({"qacc": qacc, **found})
+        end = at(qacc)
+        return data.tree_replace(
+            {"qacc": qacc, "qfrc_constraint": end.qfrc_constraint, "_impl.efc_force": end.efc_force}
+        )
 
     def _integrate(self, data: Any) -> Any:
         """The implicitfast step. An actuator at its effort limit can't damp any more, so its damping leaves the
