@@ -30,13 +30,13 @@ def targets(scene: Scene, seed: int = 0) -> np.ndarray:
     """Random walks of all position targets at full speed, and minutes pressed against limits: [steps, nu]."""
     rng = np.random.default_rng(seed)
     speed = np.array([j.drive.speed for mount in scene.mounts.values() for j in mount.arm.joints])
-    low, high = scene.model.actuator_ctrlrange.T
+    low, high = scene.model.jnt_range.T
     now, walk = scene.home.copy(), []
     for step in range(round(SECONDS / CONTROL)):
         if step % 25 == 0:  # half a second one way, so that limits are reached
             way = rng.uniform(-1, 1, len(speed))
         now = np.clip(now + way * speed * CONTROL, low, high)
-        walk.append(now)
+        walk.append(scene.moment @ now)
     return np.array(walk)
 
 

@@ -1,4 +1,4 @@
-"""Each joint's answer to a small step of its target, beside that of the identified second-order model.
+"""Each joint's answer to a small step of its target, beside that of the identified linear model.
 
 Run: python docs/step_response.py; writes docs/step_response.png.
 """
@@ -6,6 +6,7 @@ Run: python docs/step_response.py; writes docs/step_response.png.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -17,45 +18,68 @@ SHARE = 0.5
 """Of the step that takes full effort: below it the law is linear."""
 SECONDS = 0.4
 
-# Natural frequency in rad/s and damping ratio of the dVRK's gains on the identified Classic PSM at insertion 0.12 m
-# (inertia 0.210 and 0.208 kg m2, 0.713 kg; dvrk_dynamics_identification).
-IDENTIFIED = {"yaw": (23.9, 0.61), "pitch": (24.0, 0.52), "insertion": (91.7, 1.54)}
+# The identified Classic PSM at insertion 0.12 m, kg m2 and kg (dvrk_dynamics_identification).
+INERTIA = {"yaw": 0.210, "pitch": 0.208, "insertion": 0.713}
+# From the motor discs to roll, wrist pitch, wrist yaw and jaw (dVRK, tool/LARGE_NEEDLE_DRIVER_400006.json).
+COUPLING = [[-1.5632, 0, 0, 0], [0, 1.0186, 0, 0], [0, -0.8306, 0.6089, 0.6089], [0, 0, -1.2177, 1.2177]]
+DISC_STIFFNESS, DISC_DAMPING, DISC_INERTIA = 6.0, 0.09, 3.3e-6 * 11.71**2
+WRIST = ("roll", "wrist_pitch", "wrist_yaw")
 
 
-def model_response(time: np.ndarray, natural: float, damping: float) -> np.ndarray:
-    """A second-order system's answer to a step from 0 to 1, [T]: natural frequency in rad/s, damping ratio."""
-    roots = natural * (-damping + np.sqrt(complex(damping**2 - 1)) * np.array([1, -1]))
-    if abs(roots[0] - roots[1]) < 1e-9:
-        return 1 - (1 + natural * time) * np.exp(-natural * time)
-    weights = np.array([roots[1], -roots[0]]) / (roots[0] - roots[1])
-    return np.real(1 + weights @ np.exp(np.outer(roots, time)))
+class Linear(NamedTuple):
+    """Inertia x'' + damping x' + stiffness (x - target) = 0 of joints that belong together, [n, n] each."""
+
+    joints: tuple[str, ...]
+    inertia: np.ndarray
+    damping: np.ndarray
+    stiffness: np.ndarray
+
+    def modes(self) -> tuple[np.ndarray, np.ndarray]:
+        """Natural frequency in rad/s and damping ratio of each joint if the others stood still, [n]."""
+        inertia, damping, stiffness = (np.diag(part) for part in self[1:])
+        return np.sqrt(stiffness / inertia), damping / (2 * np.sqrt(stiffness * inertia))
+
+    def response(self, time: np.ndarray, joint: str) -> np.ndarray:
+        """The joints' ways [T, n] when the target of one goes from 0 to 1."""
+        n = len(self.joints)
+        inverse, target = np.linalg.inv(self.inertia), np.eye(n)[self.joints.index(joint)]
+        system = np.block([[np.zeros((n, n)), np.eye(n)], [-inverse @ self.stiffness, -inverse @ self.damping]])
+        rates, shapes = np.linalg.eig(system)
+        weights = np.linalg.solve(shapes, np.concatenate([-target, np.zeros(n)]))
+        return target + np.real(np.exp(np.outer(time, rates)) * weights @ shapes.T)[:, :n]
+
+
+def identified(joint: Joint) -> Linear:
+    """The dVRK's gains on the identified arm; at the wrist on its motors, through the cable coupling."""
+    if joint.name in INERTIA:
+        parts = INERTIA[joint.name], joint.drive.damping + joint.viscous, joint.drive.stiffness
+        return Linear((joint.name,), *(np.array([[part]]) for part in parts))
+    wrist = load_scene("psm").mounts["psm_0"].arm.actuated[3:6]
+    discs = np.linalg.inv(COUPLING)[:, :3]
+    share = discs.T @ discs
+    friction = np.diag([joint.viscous for joint in wrist])
+    return Linear(WRIST, DISC_INERTIA * share, DISC_DAMPING * share + friction, DISC_STIFFNESS * share)
 
 
 def simulated_response(joint: Joint, timestep: float | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Time [T] in s and the PSM joint's way to a new target, from 0 to 1, [T]."""
-    scene = load_scene("psm")
+    """Time [T] in s and the ways [T, n], as shares of the step, of the PSM joint whose target steps and of those that
+    belong with it."""
+    scene, linear = load_scene("psm"), identified(joint)
     model, data = scene.model, mujoco.MjData(scene.model)
     model.opt.timestep = timestep or model.opt.timestep
-    data.qpos[:], data.ctrl[:] = scene.home, scene.home
-    for name, value in {"insertion": 0.12, "roll": 0.0}.items():
-        data.joint(f"psm_0/{name}").qpos = value
-        data.actuator(f"psm_0/{name}").ctrl = value
-    start = data.joint(f"psm_0/{joint.name}").qpos[0]
-    step = SHARE * joint.effort / joint.drive.stiffness
-    data.actuator(f"psm_0/{joint.name}").ctrl = start + step
+    data.qpos[:] = scene.home
+    data.joint("psm_0/insertion").qpos = 0.12
+    start, target = data.qpos.copy(), data.qpos.copy()
+    address = [model.joint(f"psm_0/{name}").qposadr[0] for name in linear.joints]
+    own = linear.joints.index(joint.name)
+    step = SHARE * joint.effort / linear.stiffness[own, own]
+    target[address[own]] += step
+    data.ctrl[:] = scene.moment @ target
     way = []
     for _ in range(round(SECONDS / model.opt.timestep)):
         mujoco.mj_step(model, data)
-        way.append((data.joint(f"psm_0/{joint.name}").qpos[0] - start) / step)
+        way.append((data.qpos - start)[address] / step)
     return model.opt.timestep * (1 + np.arange(len(way))), np.array(way)
-
-
-def expected(joint: Joint) -> tuple[float, float]:
-    """Natural frequency and damping ratio: of the identified arm, or of the motors that the wrist's joints are."""
-    if joint.name in IDENTIFIED:
-        return IDENTIFIED[joint.name]
-    natural = np.sqrt(joint.drive.stiffness / joint.drive.armature)
-    return natural, (joint.drive.damping + joint.viscous) / (2 * joint.drive.armature * natural)
 
 
 def main() -> None:
@@ -67,16 +91,20 @@ def main() -> None:
     joints = load_scene("psm").mounts["psm_0"].arm.actuated[:6]
     figure, axes = plt.subplots(2, 3, figsize=(12, 6), constrained_layout=True)
     for axis, joint in zip(axes.flat, joints, strict=True):
-        time, way = simulated_response(joint)
-        fine = np.linspace(0, SECONDS, 400)
-        natural, damping = expected(joint)
-        source = "identified" if joint.name in IDENTIFIED else "motor alone"
-        axis.plot(
-            fine, model_response(fine, natural, damping), "k--", label=f"{source}: {natural:.0f} rad/s, {damping:.2f}"
-        )
-        axis.plot(time, way, color="#1b7a8c", label="simulated, 5 ms")
+        time, ways = simulated_response(joint)
+        fine, linear = np.linspace(0, SECONDS, 400), identified(joint)
+        natural, damping = (mode[linear.joints.index(joint.name)] for mode in linear.modes())
+        source = "identified" if joint.name in INERTIA else "motors and cables"
+        answers = linear.response(fine, joint.name)
+        for name, answer, way in zip(linear.joints, answers.T, ways.T, strict=True):
+            if name == joint.name:
+                axis.plot(fine, answer, "k--", label=f"{source}: {natural:.0f} rad/s, {damping:.2f}")
+                axis.plot(time, way, color="#1b7a8c", label="simulated, 5 ms")
+            elif "roll" not in (name, joint.name):
+                axis.plot(fine, answer, "k:")
+                axis.plot(time, way, color="#c8792b", label=f"meanwhile {name}")
         axis.set(title=joint.name, xlabel="time (s)", ylabel="share of the step")
-        axis.legend(loc="lower right")
+        axis.legend(loc="center right")
     path = Path(__file__).with_suffix(".png")
     figure.savefig(path, dpi=110)
     print(path)

@@ -9,6 +9,7 @@ Every number of a shipped arm and its source stands in `arms/<name>/README.md`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     from yourdfpy import urdf as yourdf
 
 CONTROL_MODES = ("position", "velocity", "torque")
-KEYS = ("description", "urdf", "tool_tip", "remote_center", "camera", "joints", "jaw")
+KEYS = ("description", "urdf", "tool_tip", "remote_center", "camera", "joints", "cables", "jaw")
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,19 @@ class Drive:
     speed: float
     armature: float = 0.0
     home: float = 0.0
+
+
+@dataclass(frozen=True)
+class Cable:
+    """A cable that several joints wind up. Its own drive acts on its length, the sum of coefficient times position of
+    its joints, beside the drives of the joints. Units as of a `Drive`, per unit of that length."""
+
+    joints: dict[str, float]
+    """Coefficient of each joint."""
+    stiffness: float
+    damping: float
+    effort: float
+    armature: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -70,6 +84,7 @@ class Joint:
     upper: float
     velocity: float
     effort: float
+    """All that drives the joint, cables too, puts no more than this on it."""
     viscous: float
     """Viscous friction, effort per velocity."""
     coulomb: float
@@ -94,6 +109,7 @@ class Arm:
     camera: Camera | None
     joints: tuple[Joint, ...]
     """All moving joints in the order of the chain, those that mimic another included."""
+    cables: tuple[Cable, ...]
     urdf: Any = field(repr=False)
 
     @cached_property
@@ -235,6 +251,8 @@ def load_arm(name: str | Path) -> Arm:
         None if settings.get(key) is None else keep(build, cls, settings[key], where)
         for key, cls in (("camera", Camera), ("jaw", Jaw))
     )
+    pulled = [name for name in drives if jaw is None or name != jaw.joint]
+    cables = _read_cables(settings.get("cables") or [], pulled, where, keep)
     links = [link.name for link in robot.links]
     named = {key: settings.get(key) for key in ("tool_tip", "remote_center")} | {"camera": camera and camera.link}
     for key, link in named.items():
@@ -256,6 +274,7 @@ def load_arm(name: str | Path) -> Arm:
         jaw=jaw,
         camera=camera,
         joints=tuple(_joint(joint, drives) for joint in robot.joints if joint.type in MOVING),
+        cables=cables,
         urdf=robot,
     )
 
@@ -280,12 +299,36 @@ def _read_drives(robot: yourdf.Robot, drives: Any, where: Path, keep: Callable[.
 
 def _drive(mapping: Any, where: str) -> Drive:
     drive: Drive = build(Drive, mapping, where)
+    _check_signs(drive, "speed", where)
+    return drive
+
+
+def _check_signs(drive: Drive | Cable, positive: str, where: str) -> None:
     for key in ("stiffness", "damping", "armature"):
         if getattr(drive, key) < 0:
             raise ValueError(f"{where}: {key} must be 0 or more, not {getattr(drive, key):g}")
-    if not drive.speed > 0:
-        raise ValueError(f"{where}: speed must be above 0, not {drive.speed:g}")
-    return drive
+    if not getattr(drive, positive) > 0:
+        raise ValueError(f"{where}: {positive} must be above 0, not {getattr(drive, positive):g}")
+
+
+def _read_cables(cables: Any, joints: list[str], where: Path, keep: Callable[..., Any]) -> tuple[Cable, ...]:
+    """The cables, which may wind on `joints`; what is wrong is kept."""
+    if not isinstance(cables, list):
+        raise ValueError(f"{where}: cables must be a list, not {cables!r}")
+    return tuple(keep(_cable, cable, joints, f"{where}, cable {number}") for number, cable in enumerate(cables))
+
+
+def _cable(mapping: Any, joints: list[str], where: str) -> Cable:
+    cable: Cable = build(Cable, mapping, where)
+    if not isinstance(cable.joints, dict) or len(cable.joints) < 2:
+        raise ValueError(f"{where}: joints must map two joints or more to coefficients, not {cable.joints!r}")
+    for name, value in cable.joints.items():
+        if name not in joints:  # a jaw is told where to be in every mode, so no cable pulls it
+            raise ValueError(f"{where}: joint {name!r} is not one of {', '.join(joints)}")
+        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or value == 0:
+            raise ValueError(f"{where}: the coefficient of {name!r} must be a finite number but 0, not {value!r}")
+    _check_signs(cable, "effort", where)
+    return cable
 
 
 def _joint(joint: yourdf.Joint, drives: dict[str, Drive]) -> Joint:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 import numpy as np
 
-from surgical_marl.arm import CONTROL_MODES, Joint
+from surgical_marl.arm import CONTROL_MODES, Cable, Drive, Joint
 from surgical_marl.urdf import read_mesh
 
 if TYPE_CHECKING:
@@ -60,7 +60,10 @@ def build_spec(arm: Arm, control: str) -> mujoco.MjSpec:
             eye = [side * arm.camera.baseline, 0, 0]
             bodies[arm.camera.link].add_camera(name=name, pos=eye, fovy=arm.camera.fovy)
     for joint in arm.joints:
-        _add_actuator(spec, joint, _mode(arm, joint, control))
+        mode = _mode(arm, joint, control)
+        _add_actuator(spec, joint.name, joint.drive, joint.effort, mode, _commands(joint, mode))
+    for number, cable in enumerate(arm.cables):
+        _add_cable(spec, f"cable_{number}", cable, joints, control)
     return spec
 
 
@@ -82,33 +85,63 @@ def _add_joint(body: Any, joint: Joint, axis: np.ndarray, control: str) -> None:
         solref_limit=SOLREF,
         armature=joint.drive.armature,
         frictionloss=joint.coulomb,
+        # its own actuator and all cables together
+        actfrcrange=[-joint.effort, joint.effort],
+        actfrclimited=mujoco.mjtLimited.mjLIMITED_TRUE,
     )
 
 
-def _add_actuator(spec: mujoco.MjSpec, joint: Joint, control: str) -> None:
-    """One actuator a joint: force = gain * command + bias, clamped to the joint's effort.
+def _add_cable(spec: mujoco.MjSpec, name: str, cable: Cable, joints: dict[str, Joint], control: str) -> None:
+    """A fixed tendon with an actuator of its own.
+
+    Under torque control it only carries inertia: a commanded torque is that of all the motors together, which share it
+    among them as the cables have it.
+    """
+    tendon = spec.add_tendon(name=name, armature=cable.armature)
+    for joint, coefficient in cable.joints.items():
+        tendon.wrap_joint(joint, coefficient)
+    if control != "torque":
+        ends = [coefficient * _commands(joints[joint], control) for joint, coefficient in cable.joints.items()]
+        _add_actuator(spec, name, cable, cable.effort, control, np.sort(ends).sum(0), mujoco.mjtTrn.mjTRN_TENDON)
+
+
+def _commands(joint: Joint, control: str) -> np.ndarray:
+    """The least and the greatest command of a joint."""
+    high = joint.drive.speed if control == "velocity" else joint.effort
+    return np.array([joint.lower, joint.upper] if control == "position" else [-high, high])
+
+
+def _add_actuator(
+    spec: mujoco.MjSpec,
+    name: str,
+    drive: Drive | Cable,
+    effort: float,
+    control: str,
+    commands: np.ndarray,
+    transmission: mujoco.mjtTrn = mujoco.mjtTrn.mjTRN_JOINT,
+) -> None:
+    """The actuator of a joint, or of a cable: force = gain * command + bias, clamped to the effort.
 
     Position: the dVRK's PD law, stiffness * (target - q) - damping * qd. Velocity: damping * (command - qd). Torque:
     the command itself.
     """
-    stiffness, damping, speed = joint.drive.stiffness, joint.drive.damping, joint.drive.speed
-    laws: dict[str, tuple[float, list[float], float, float]] = {
-        "position": (stiffness, [0, -stiffness, -damping], joint.lower, joint.upper),
-        "velocity": (damping, [0, 0, -damping], -speed, speed),
-        "torque": (1.0, [0, 0, 0], -joint.effort, joint.effort),
+    laws: dict[str, tuple[float, list[float]]] = {
+        "position": (drive.stiffness, [0, -drive.stiffness, -drive.damping]),
+        "velocity": (drive.damping, [0, 0, -drive.damping]),
+        "torque": (1.0, [0, 0, 0]),
     }
-    gain, bias, low, high = laws[control]
+    gain, bias = laws[control]
     spec.add_actuator(
-        name=joint.name,
-        target=joint.name,
-        trntype=mujoco.mjtTrn.mjTRN_JOINT,
+        name=name,
+        target=name,
+        trntype=transmission,
         gaintype=mujoco.mjtGain.mjGAIN_FIXED,
         biastype=mujoco.mjtBias.mjBIAS_AFFINE,
         gainprm=[gain] + [0] * 9,
         biasprm=bias + [0] * 7,
-        ctrlrange=[low, high],
+        ctrlrange=commands,
         ctrllimited=mujoco.mjtLimited.mjLIMITED_TRUE,
-        forcerange=[-joint.effort, joint.effort],
+        forcerange=[-effort, effort],
         forcelimited=mujoco.mjtLimited.mjLIMITED_TRUE,
     )
 

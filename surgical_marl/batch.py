@@ -12,15 +12,13 @@ from __future__ import annotations
 import secrets
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 from gymnasium import spaces
 
-from surgical_marl.engines.mjx import MjxEngine
-from surgical_marl.env import Carry, Env
+from surgical_marl.engines.choose import ENGINES, make_engine
+from surgical_marl.env import Env
 from surgical_marl.physics import Contacts
 
-ENGINES = ("auto", "mjx")
 ARRAYS = ("numpy", "torch", "jax")
 
 
@@ -52,10 +50,10 @@ class BatchedEnv:
     Args:
         task, scene, control, max_steps: as for `surgical_marl.env.Env`.
         num_envs: how many environments.
-        engine: "mjx", or "auto" for the fastest that works.
+        engine: "fused", "mjx" (the reference), or "auto" for the fastest that works.
         device: "cpu", "cuda" or "auto".
-        arrays: library of the arrays that come back, "numpy", "torch" or "jax". Torch shares memory with the engine:
-            don't write into what you get.
+        arrays: library of the arrays that come back, "numpy", "torch" or "jax". Don't write into what you get: it may
+            share memory with the engine.
 
     Raises:
         ValueError: naming what is unknown or out of range.
@@ -80,18 +78,17 @@ class BatchedEnv:
         if arrays not in ARRAYS:
             raise ValueError(f"unknown arrays {arrays!r}; the libraries are {', '.join(ARRAYS)}")
         self.env = Env(task, scene, control, max_steps)
-        self.engine = MjxEngine(self.env, num_envs, device)
+        self.engine = make_engine(self.env, num_envs, engine, device)
         self.num_envs, self.arrays = num_envs, arrays
         self.agents = list(self.env.agents)
         self.types = {name: list(agents) for name, agents in self.env.scene.types.items()}
         self.max_steps, self.control_dt = self.env.max_steps, self.env.control_dt
         self.task_name, self.scene, self.control = task, self.env.scene, control
-        self.device = {"cpu": "cpu"}.get(self.engine.device.platform, "cuda")
+        self.device = self.engine.device
         self._observation_spaces = {agent: self.env.observation_space(agent) for agent in self.agents}
         self._action_spaces = {agent: self.env.action_space(agent) for agent in self.agents}
         self.state_space = self.env.state_space
-        self._carry: Carry | None = None
-        self._stepped = False
+        self._started = False
 
     def observation_space(self, agent: str) -> spaces.Box:
         """Of one environment."""
@@ -110,14 +107,13 @@ class BatchedEnv:
         """
         if seed is not None and (isinstance(seed, bool) or not 0 <= seed < 2**63):
             raise ValueError(f"seed must be a whole number from 0 to 2**63 - 1, not {seed!r}")
-        if seed is None and self._carry is not None:
-            # an environment that ended has begun its next episode already, in the step that ended it
-            begun = (self._carry.steps == 0) & self._stepped
-            state = self.engine.restart(self._carry.key, self._carry.episode + ~begun)
+        if seed is None and self._started:
+            self.engine.restart()
         else:
-            state = self.engine.reset(secrets.randbits(63) if seed is None else int(seed))
-        self._carry, self._stepped = state.carry, False
-        return self._convert(state.observations), self._convert(state.state), self._convert(state.infos)
+            self.engine.reset(secrets.randbits(63) if seed is None else int(seed))
+        self._started = True
+        found = self.engine.outcome(self.arrays)
+        return found["observations"], found["state"], found["infos"]
 
     def step(self, actions: dict[str, Any]) -> BatchStep:
         """One control step of all environments.
@@ -128,58 +124,58 @@ class BatchedEnv:
         Raises:
             ValueError: an agent is missing or unknown, a shape is wrong, or a value is not finite (numpy only).
         """
-        if self._carry is None:
+        if not self._started:
             raise ValueError("step before reset: call reset() first")
-        state = self.engine.step(self._carry, self._check(actions))
-        self._carry, self._stepped = state.carry, True
-        return BatchStep(**{name: self._convert(getattr(state, name)) for name in BatchStep._fields})
+        self.engine.step(self._check(actions))
+        found = self.engine.outcome(self.arrays)
+        return BatchStep(**{**found, "contacts": Contacts(**found["contacts"])})
 
     @property
     def qpos(self) -> np.ndarray:
         """Joint positions of the whole scene, [N, nq], for pictures; `goals` beside it."""
-        return np.asarray(self._running().physics.qpos)
+        return np.asarray(self._part(".physics.qpos", "numpy"))
 
     @property
     def goal(self) -> Any:
         """The task's goal of every environment, numpy."""
-        return jax.tree.map(np.asarray, self._running().goal)
+        return self._part(".goal", "numpy")
 
     @property
     def steps(self) -> Any:
         """Steps since reset in each environment, [N] int32. Set it to let episodes end at different times."""
-        return self._convert(self._running().steps)
+        return self._part(".steps", self.arrays)
 
     @steps.setter
     def steps(self, steps: Any) -> None:
-        value = self._take(steps).astype(np.int32)
-        if value.shape != (self.num_envs,):
-            raise ValueError(f"steps of shape {value.shape} must be [{self.num_envs}]")
-        self._carry = self._running()._replace(steps=value)
+        if tuple(np.shape(steps)) != (self.num_envs,):
+            raise ValueError(f"steps of shape {tuple(np.shape(steps))} must be [{self.num_envs}]")
+        self.engine.write(".steps", steps)
 
     def carry(self) -> dict[str, np.ndarray]:
         """All that the next step depends on, as copies, for checkpoints."""
-        leaves = jax.tree_util.tree_flatten_with_path(self._running())[0]
-        return {jax.tree_util.keystr(path): np.array(leaf) for path, leaf in leaves}
+        self._part(".steps", "numpy")
+        return {name: np.array(self.engine.read(name, "numpy")) for name in self.engine.carry_shapes}
 
     def set_carry(self, carry: dict[str, Any]) -> None:
         """Goes on from what `carry()` returned. ValueError if it is of another scene, task or `num_envs`."""
-        shapes = jax.eval_shape(self.engine.reset, 0).carry
-        paths, tree = jax.tree_util.tree_flatten_with_path(shapes)
-        leaves = []
-        for path, shape in paths:
-            name = jax.tree_util.keystr(path)
-            value = np.asarray(carry.get(name))
-            if value.shape != shape.shape:
-                raise ValueError(f"environment state {name} of shape {value.shape} does not fit {shape.shape}")
-            leaves.append(self.engine.to_device(value.astype(shape.dtype)))
-        self._carry, self._stepped = jax.tree_util.tree_unflatten(tree, leaves), True
+        values = {name: np.asarray(carry.get(name)) for name in self.engine.carry_shapes}
+        for name, shape in self.engine.carry_shapes.items():
+            if values[name].shape != (self.num_envs, *shape):
+                raise ValueError(
+                    f"environment state {name} of shape {values[name].shape} does not fit {(self.num_envs, *shape)}"
+                )
+        if not self._started:
+            self.engine.reset(0)
+        for name, value in values.items():
+            self.engine.write(name, value)
+        self._started = True
 
-    def _running(self) -> Carry:
-        if self._carry is None:
+    def _part(self, name: str, library: str) -> Any:
+        if not self._started:
             raise ValueError("no episode yet: call reset() first")
-        return self._carry
+        return self.engine.read(name, library)
 
-    def _check(self, actions: dict[str, Any]) -> dict[str, jax.Array]:
+    def _check(self, actions: dict[str, Any]) -> dict[str, Any]:
         for agent in actions:
             if agent not in self._action_spaces:
                 raise ValueError(f"action for {agent!r}, which is not an agent of the scene ({', '.join(self.agents)})")
@@ -194,20 +190,5 @@ class BatchedEnv:
                 action = np.asarray(action, np.float32)
                 if not np.isfinite(action).all():
                     raise ValueError(f"action of {agent!r} holds a value that is not finite")
-            checked[agent] = self._take(action).astype(np.float32)
+            checked[agent] = action
         return checked
-
-    def _take(self, values: Any) -> jax.Array:
-        """Values of any array library, on the engine's device."""
-        if type(values).__module__.startswith("torch"):
-            values = jax.dlpack.from_dlpack(values.detach().contiguous())
-        return self.engine.to_device(values)
-
-    def _convert(self, tree: Any) -> Any:
-        if self.arrays == "jax":
-            return tree
-        if self.arrays == "torch":
-            import torch
-
-            return jax.tree.map(torch.from_dlpack, tree)
-        return jax.tree.map(np.asarray, tree)

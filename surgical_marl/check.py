@@ -187,7 +187,9 @@ def _at(arm: Arm, model: mujoco.MjModel, q: np.ndarray) -> mujoco.MjData:
     values = dict(zip((joint.name for joint in arm.actuated), q, strict=True))
     for joint in arm.joints:
         value = joint.multiplier * values[joint.leader] + joint.offset
-        data.joint(joint.name).qpos = data.actuator(joint.name).ctrl = value
+        data.joint(joint.name).qpos = value
+    mujoco.mj_fwdPosition(model, data)
+    data.ctrl[:] = data.actuator_length
     mujoco.mj_forward(model, data)
     return data
 
@@ -198,7 +200,7 @@ def _controller_findings(arm: Arm, model: mujoco.MjModel) -> Iterator[str]:
     Joint limits, dry friction and effort limits only bound a disturbance that grows, as chatter, so they are left out.
     """
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
-    model.actuator_forcelimited[:] = 0
+    model.actuator_forcelimited[:], model.jnt_actfrclimited[:] = 0, 0
     shares = np.random.default_rng(0).uniform(size=(POSTURES, len(arm.actuated)))
     for q in (arm.home, *(arm.lower + shares * (arm.upper - arm.lower))):
         data, step = _at(arm, model, q), np.zeros((2 * model.nv, 2 * model.nv))

@@ -1,4 +1,4 @@
-"""The command `surgical-marl`: train, eval, list, check, doctor."""
+"""The command `surgical-marl`: train, eval, list, check, export, doctor."""
 
 from __future__ import annotations
 
@@ -22,6 +22,8 @@ _LISTS = {
     "policies": list_policies,
 }
 
+_CONTROL = ("position", "velocity", "torque")
+
 # Flags of `train` that are short for `key=value`: key, good values or a placeholder, help.
 _SETTINGS: tuple[tuple[str, str | tuple[str, ...], str], ...] = (
     ("algo", ("mappo", "ippo", "joint"), "who learns from what"),
@@ -30,7 +32,7 @@ _SETTINGS: tuple[tuple[str, str | tuple[str, ...], str], ...] = (
     ("seed", "S", "seed of everything random"),
     ("engine", ("auto", "mjx"), "what runs the physics"),
     ("device", ("auto", "cpu", "cuda"), "where it runs"),
-    ("control", ("position", "velocity", "torque"), "what an action commands"),
+    ("control", _CONTROL, "what an action commands"),
 )
 
 
@@ -82,7 +84,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(prog="surgical-marl", description="Surgical robot arms that learn together.")
     parser.add_argument("--version", action="version", version=f"%(prog)s {_version()}")
-    commands = parser.add_subparsers(required=True, metavar="{train,eval,list,check,doctor}")
+    commands = parser.add_subparsers(required=True, metavar="{train,eval,list,check,export,doctor}")
 
     train = commands.add_parser(
         "train",
@@ -116,6 +118,14 @@ def _parser() -> argparse.ArgumentParser:
     audit.add_argument("source", metavar="ARM_OR_SCENE", help="a name, an arm's folder or a scene's .yaml file")
     audit.set_defaults(command=_check, name="check")
 
+    export = commands.add_parser("export", help="write a scene for other programs")
+    export.add_argument("kind", type=_one_of(("scene",)), metavar="scene")
+    export.add_argument("source", metavar="NAME_OR_PATH", help="a scene's name or .yaml file")
+    export.add_argument("--format", type=_one_of(("mjcf",)), default="mjcf", metavar="mjcf", help="MuJoCo's XML")
+    export.add_argument("--out", type=Path, metavar="FILE", help="default: <scene>.xml in the current folder")
+    export.add_argument("--control", type=_one_of(_CONTROL), default=_CONTROL[0], metavar="|".join(_CONTROL))
+    export.set_defaults(command=_export, name="export")
+
     doctor = commands.add_parser("doctor", help="check this machine and this installation")
     doctor.set_defaults(command=_doctor, name="doctor")
     return parser
@@ -148,6 +158,24 @@ def _check(arguments: argparse.Namespace) -> int:
     return 1 if findings else 0
 
 
+def _export(arguments: argparse.Namespace) -> None:
+    source = find("scenes", arguments.source)
+    out = arguments.out or Path(f"{source.stem}.xml")
+    if out.exists():
+        raise ValueError(f"{out} exists already: name another file with --out")
+
+    from surgical_marl.export import mjcf
+    from surgical_marl.files import write_atomic
+    from surgical_marl.scene import load_scene
+
+    text = mjcf(load_scene(source, arguments.control))
+    try:
+        write_atomic(out, lambda path: path.write_text(text))
+    except OSError as error:
+        raise ValueError(f"cannot write {out}: {error.strerror}") from None
+    print(out)
+
+
 def _doctor(arguments: argparse.Namespace) -> None:
     from surgical_marl.doctor import report
 
@@ -178,7 +206,7 @@ def _train(arguments: argparse.Namespace) -> None:
         settings = load_config(arguments.task, arguments.scene, overrides)
     out = arguments.out or arguments.resume or _run_folder(settings)
 
-    from surgical_marl.learning.run import write_atomic
+    from surgical_marl.files import write_atomic
     from surgical_marl.learning.train import train
 
     run = train(settings, out=out, resume=arguments.resume)

@@ -12,6 +12,7 @@ environment that ends is reset within the same step: `observations` then belong 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import jax
@@ -22,7 +23,8 @@ from jax import Array
 
 from surgical_marl.content import list_tasks, unknown
 from surgical_marl.physics import ArmView, Contacts, Physics, Simulator
-from surgical_marl.scene import load_scene
+from surgical_marl.runtime import prepare_jax
+from surgical_marl.scene import DECIMATION, load_scene
 
 
 class Carry(NamedTuple):
@@ -82,14 +84,20 @@ class Env:
             raise ValueError(f"max_steps must be a whole number of at least 1, not {max_steps!r}")
         from importlib import import_module
 
+        prepare_jax()
         self.scene = load_scene(scene, control)
-        self.simulator = Simulator(self.scene)
         self.task_name = task
         self.task = import_module(f"surgical_marl.tasks.{task}").Task(self.scene)
         self.max_steps = max_steps or self.task.max_steps
         self.agents = self.scene.agents
-        self.control_dt = self.simulator.control_dt
+        self.control_dt = DECIMATION * self.scene.model.opt.timestep
         self._bounds = {agent: self.task.bounds(agent) for agent in self.agents}
+
+    @cached_property
+    def simulator(self) -> Simulator:
+        """The physics, set up when first needed, even while JAX traces a step."""
+        with jax.ensure_compile_time_eval():
+            return Simulator(self.scene)
 
     def num_actions(self, agent: str) -> int:
         """Length of an agent's action: one number a joint, the jaw's open (> 0) or closed command last in joint
@@ -137,15 +145,18 @@ class Env:
         steps = carry.steps + 1
         truncated = (steps >= self.max_steps) & ~terminated
         final_observations, final_state = self._observe(views, carry.goal)
-        going = carry._replace(physics=physics, steps=steps)
-        fresh = self._start(carry.key, carry.episode + 1)
-        fresh_observations, fresh_state = self._observe(self.simulator.home_views, fresh.goal)
+        going = carry._replace(physics=physics, steps=steps), final_observations, final_state
+
+        def begin(_: Any) -> Any:
+            fresh = self._start(carry.key, carry.episode + 1)
+            return fresh, *self._observe(self.simulator.home_views, fresh.goal)
+
         done = terminated | truncated
-        pick = lambda new, old: jnp.where(done, new, old)  # noqa: E731
+        next_carry, observations, state = jax.lax.cond(done, begin, lambda going: going, going)
         return State(
-            carry=jax.tree.map(pick, fresh, going),
-            observations=jax.tree.map(pick, fresh_observations, final_observations),
-            state=pick(fresh_state, final_state),
+            carry=next_carry,
+            observations=observations,
+            state=state,
             rewards=rewards,
             terminated=terminated,
             truncated=truncated,

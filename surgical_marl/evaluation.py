@@ -24,13 +24,15 @@ class Outcome(NamedTuple):
 
     error: tip error at the last step (m). held: largest error of the last `HOLD` seconds (m).
     collided: whether the agent was in collision at any step. squared: mean over the episode of the
-    squared error (m^2).
+    squared error (m^2). center: largest distance of the shaft from the remote center of motion (m, NaN
+    for an arm without one), at the start of every step.
     """
 
     error: Tensor
     held: Tensor
     collided: Tensor
     squared: Tensor
+    center: Tensor
 
 
 def evaluate(
@@ -53,7 +55,8 @@ def evaluate(
 
     Returns:
         The object that `surgical-marl eval --json` prints: errors in mm, rates from 0 to 1, over
-        all agents and for each.
+        all agents and for each. `remote_center_error_mm` is the largest of all steps, None without a
+        remote center.
     """
     if episodes < 1:
         raise ValueError(f"episodes must be 1 or more, not {episodes}")
@@ -94,9 +97,11 @@ def _first_episodes(env: BatchedEnv, policy: Callable[..., Mapping[str, Any]], s
     error = torch.zeros(env.num_envs, len(agents), device=env.device)
     squared, length = torch.zeros_like(error), torch.zeros_like(error)
     collided = torch.zeros_like(error, dtype=torch.bool)
+    center = torch.zeros_like(error, dtype=torch.float64)
     # The last errors, one slot a step; -inf where an episode is shorter than the window.
     recent = torch.full((hold, *error.shape), -torch.inf, device=env.device)
     for index in range(env.max_steps):
+        center = torch.maximum(center, torch.where(running, _center_errors(env), 0.0))
         step = env.step(dict(policy(observations)))
         observations = step.observations
         now = _stack([step.infos[agent]["tip_error"] for agent in agents], env.device)
@@ -108,17 +113,32 @@ def _first_episodes(env: BatchedEnv, policy: Callable[..., Mapping[str, Any]], s
         done = _stack([step.terminated, step.truncated], env.device).any(-1, keepdim=True)
         running = running & ~done
         if not running.any():
-            return Outcome(error, recent.amax(0), collided, squared / length)
+            return Outcome(error, recent.amax(0), collided, squared / length, center)
     raise RuntimeError(f"{int(running.sum())} episodes did not end within max_steps = {env.max_steps}")
 
 
-def _metrics(outcome: Outcome, following: bool) -> dict[str, float]:
+def _center_errors(env: BatchedEnv) -> Tensor:
+    """Distance of each shaft from its remote center (m) `[E, A]`, in float64; NaN for an arm without one."""
+    arms = {agent: env.scene.mounts[agent].arm for agent in env.agents}
+    errors = np.full((env.num_envs, len(arms)), np.nan)
+    for index, (agent, arm) in enumerate(arms.items()):
+        if arm.remote_center is not None:
+            errors[:, index] = arm.remote_center_error(env.qpos[:, env.scene.qpos_index(agent)].astype(float))
+    return torch.from_numpy(errors).to(env.device)
+
+
+def _metrics(outcome: Outcome, following: bool) -> dict[str, float | None]:
     error = 1000 * outcome.error.double().numpy()
     held = 1000 * outcome.held.double().numpy()
-    metrics = {"median_error_mm": float(np.median(error)), "mean_error_mm": float(np.mean(error))}
+    center = 1000 * outcome.center.numpy()
+    metrics: dict[str, float | None] = {
+        "median_error_mm": float(np.median(error)),
+        "mean_error_mm": float(np.mean(error)),
+    }
     for threshold in THRESHOLDS_MM:
         metrics[f"success_{threshold}mm"] = float(np.mean(held < threshold))
     metrics["collision_rate"] = float(outcome.collided.any(-1).double().mean())
+    metrics["remote_center_error_mm"] = None if np.isnan(center).all() else float(np.nanmax(center))
     if following:
         metrics["rmse_mm"] = 1000 * float(outcome.squared.double().mean().sqrt())
     return metrics
@@ -137,5 +157,7 @@ def _title(name: str) -> str:
     return name.removesuffix("_mm").replace("_", " ") + (" (mm)" if name.endswith("_mm") else "")
 
 
-def _cell(name: str, value: float) -> str:
+def _cell(name: str, value: float | None) -> str:
+    if value is None:
+        return "-"
     return f"{value:.2f}" if name.endswith("_mm") else f"{value:.1%}"

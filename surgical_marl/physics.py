@@ -18,12 +18,14 @@ import mujoco
 import numpy as np
 from jax import Array
 
+from surgical_marl.collision import Pairs, Touching
 from surgical_marl.runtime import prepare_jax
 from surgical_marl.scene import DECIMATION, Scene
+from surgical_marl.solver import JointRows, Rows, relax, solve, solve_positive
 
-SOLVER_ITERATIONS, LINE_SEARCH_ITERATIONS = 3, 4
-"""What limits, friction and contacts take to be solved nearly as well as by C MuJoCo, which goes on until they are:
-docs/physics.md compares."""
+ARM_ITERATIONS, TOUCHING_ITERATIONS = (1, 2), (4, 4)
+"""Newton steps, and line search steps in each, for an arm that touches nothing and for arms that touch: what it takes to
+solve limits, friction and contacts nearly as well as C MuJoCo, which goes on until they are: docs/physics.md compares."""
 
 
 class Physics(NamedTuple):
@@ -75,15 +77,17 @@ class Simulator:
         from mujoco import mjx
 
         self.scene, self._mjx = scene, mjx
-        model = copy.copy(scene.model)
-        model.opt.ls_iterations = LINE_SEARCH_ITERATIONS
-        self._model, self._data = mjx.put_model(model), mjx.make_data(scene.model)
+        self._pairs = Pairs(scene.model)
+        smooth = copy.copy(scene.model)
+        smooth.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT  # that is for `collision.py`
+        self._model, self._data = mjx.put_model(smooth), mjx.make_data(smooth)
+        self._dt = np.float32(scene.model.opt.timestep)
         self.control_dt = DECIMATION * scene.model.opt.timestep
         self._index_joints()
         self._index_pairs()
         start = scene.home[self._address]
         start = start if scene.control == "position" else np.where(self._jaws, start, 0.0)
-        self._home = np.asarray(scene.home, np.float32), np.asarray(start, np.float32)
+        self._home = np.asarray(scene.home, np.float32), np.asarray(self._moment @ start, np.float32)
         self.home_contacts, self.home_views = self._measure_home()
 
     @property
@@ -94,12 +98,13 @@ class Simulator:
         return Physics(qpos, still, still, ctrl)
 
     def command(self, physics: Physics, actions: dict[str, Array]) -> Physics:
-        """The next command of every actuator. A jaw moves to open or closed at its speed, whatever the mode.
+        """The next command of every actuator. A jaw moves to open or closed at its speed, whatever the mode; a cable
+        follows its joints' commands.
 
         A position target leads its joint by no more than full effort at full speed takes: one that is held up would
         wind up its target, and race after it once free.
         """
-        ctrl, own = physics.ctrl, jnp.zeros(self.scene.model.nu, jnp.float32)
+        ctrl, own = physics.ctrl[self._drives], jnp.zeros(self.scene.model.nu, jnp.float32)
         for agent in self.scene.agents:
             own = own.at[self._actuators[agent]].set(jnp.clip(actions[agent], -1.0, 1.0))
         action = own[self._leaders]
@@ -111,27 +116,115 @@ class Simulator:
         else:
             command = action * (self._speed if self.scene.control == "velocity" else self._effort)
         jaw = ctrl + jnp.clip(jnp.where(action > 0, self._open, self._closed) - ctrl, -reach, reach)
-        return physics._replace(ctrl=jnp.where(self._jaws, jaw, command))
+        return physics._replace(ctrl=jnp.matmul(self._moment, jnp.where(self._jaws, jaw, command)))
 
     def advance(self, physics: Physics) -> tuple[Physics, Contacts, dict[str, ArmView]]:
         """A control step of physics, and what is seen where it ends. MuJoCo leaves tips and distances one physics step
         behind its `qpos`, so they are computed anew."""
 
-        def substep(now: Physics, _: None) -> tuple[Physics, tuple[Array, Array]]:
-            data = self._forward(self._data.replace(**now._asdict()))
-            contact = self._distances(data), self._forces(data)
-            data = self._integrate(data)
-            return Physics(data.qpos, data.qvel, data.qacc_warmstart, now.ctrl), contact
+        def substep(state: tuple[Physics, Array, Array], _: None) -> tuple[tuple[Physics, Array, Array], None]:
+            physics, nearest, strongest = state
+            _, distance = self._look(physics.qpos)
+            physics, force = self._step(physics, distance)
+            return (physics, jnp.minimum(nearest, distance), jnp.maximum(strongest, force)), None
 
-        physics, (distances, forces) = jax.lax.scan(substep, physics, None, length=DECIMATION)
-        data = self._mjx.kinematics(self._model, self._data.replace(qpos=physics.qpos))
-        if self.scene.model.npair:
-            data = self._mjx.collision(self._model, data)
-        distance = self._distances(data)
-        deepest = jnp.minimum(distances.min(axis=0), distance)
-        contacts = Contacts(distance, jnp.maximum(-deepest, 0.0), forces.max(axis=0))
-        tips = data.site_xpos[np.array(list(self._sites.values()))]
+        none = jnp.zeros(self._pairs.count, jnp.float32)
+        start = physics, none, none
+        (physics, nearest, strongest), _ = jax.lax.scan(substep, start, None, length=DECIMATION)
+        tips, distance = self._look(physics.qpos)
+        contacts = Contacts(distance, -jnp.minimum(nearest, distance), strongest)
         return physics, contacts, self._view(jnp, physics, tips, contacts)
+
+    def _look(self, qpos: Array) -> tuple[Array, Array]:
+        """Tool tips [arms, 3] in the world and the distance of every pair, at a posture."""
+        data = self._mjx.kinematics(self._model, self._data.replace(qpos=qpos))
+        tips = data.site_xpos[np.array(list(self._sites.values()))]
+        return tips, self._pairs.closest(data.geom_xpos, data.geom_xmat).distance
+
+    def _step(self, physics: Physics, distance: Array) -> tuple[Physics, Array]:
+        """A physics step, and the normal force of every pair during it. Arms that don't touch anything don't know of
+        each other: each is solved on its own."""
+        if not self._pairs.count:
+            return self._apart(physics)
+        return jax.lax.cond((distance < 0).any(), self._touching_step, self._apart, physics)
+
+    def _apart(self, physics: Physics) -> tuple[Physics, Array]:
+        data = self._forward(physics)
+        rows = self._constraints(data)
+        qvel, qacc = physics.qvel, physics.qacc_warmstart
+        for agent, dofs in self._dofs.items():
+            own = self._own_rows[agent]
+            block = Rows(rows.jacobian[own][:, dofs], *(column[own] for column in rows[1:]))
+            mass, damping = data._impl.M[dofs][:, dofs], self._damping(data)[dofs][:, dofs]
+            smooth = data.qfrc_smooth[dofs]
+            start = relax(mass, smooth, self._joint_rows(agent, block), physics.qacc_warmstart[dofs])
+            found, _ = solve(mass, smooth, block, start, *ARM_ITERATIONS)
+            qacc = qacc.at[dofs].set(found)
+            qvel = qvel.at[dofs].add(self._dt * solve_positive(mass + self._dt * damping, mass @ found))
+        return self._moved(physics, qvel, qacc), jnp.zeros(self._pairs.count, jnp.float32)
+
+    def _joint_rows(self, agent: str, rows: Rows) -> JointRows:
+        """An arm's rows, each of which concerns one joint, by joint."""
+        n, (rubbing, limited) = len(self._dofs[agent]), self._own_joints[agent]
+        friction, limit = (jnp.zeros(n).at[where].set for where in (rubbing, limited))
+        k = len(rubbing)
+        side = rows.jacobian[np.arange(k, k + len(limited)), limited]
+        return JointRows(
+            *(friction(column[:k]) for column in (rows.high, rows.impedance, rows.reference)),
+            *(limit(column) for column in (side, rows.impedance[k:], rows.reference[k:])),
+        )
+
+    def _touching_step(self, physics: Physics) -> tuple[Physics, Array]:
+        data = self._forward(physics)
+        mass, rows = data._impl.M, self._constraints(data)
+        touching = self._pairs.deepest(data, self._pairs.closest(data.geom_xpos, data.geom_xmat))
+        contacts = self._contact_rows(touching, physics.qvel)
+        joined = Rows(*(jnp.concatenate(parts) for parts in zip(rows, contacts, strict=True)))
+        qacc, force = solve(mass, data.qfrc_smooth, joined, physics.qacc_warmstart, *TOUCHING_ITERATIONS)
+        qvel = physics.qvel + self._dt * solve_positive(mass + self._dt * self._damping(data), mass @ qacc)
+        its_own = touching.pair == np.arange(self._pairs.count)[:, None]
+        return self._moved(physics, qvel, qacc), jnp.where(its_own, force[len(rows.low) :], 0.0).sum(-1)
+
+    def _contact_rows(self, touching: Touching, qvel: Array) -> Rows:
+        """Frictionless contacts (condim 1): one row each, along the normal."""
+        from mujoco.mjx._src.constraint import _kbi
+
+        model = self.scene.model
+        solref, solimp = jnp.asarray(model.pair_solref[0], jnp.float32), jnp.asarray(model.pair_solimp[0], jnp.float32)
+        stiffness, damping, impedance = jax.vmap(lambda d: _kbi(self._model, solref, solimp, d))(touching.distance)
+        resistance = jnp.maximum(touching.weight * (1 - impedance) / impedance, mujoco.mjMINVAL)
+        depth = jnp.minimum(touching.distance, 0.0)
+        reference = -damping * (touching.jacobian @ qvel) - stiffness * impedance * depth
+        none = jnp.zeros_like(depth)
+        return Rows(touching.jacobian, 1 / resistance, reference, none, none + np.inf)
+
+    def _moved(self, physics: Physics, qvel: Array, qacc: Array) -> Physics:
+        return Physics(physics.qpos + self._dt * qvel, qvel, qacc, physics.ctrl)
+
+    def _forward(self, physics: Physics) -> Any:
+        """All of `mjx.forward` but collision and solver: mass matrix, smooth forces, rows of friction and limits."""
+        data = self._data.replace(**physics._asdict())
+        for stage in ("fwd_position", "fwd_velocity", "fwd_actuation"):
+            data = getattr(self._mjx, stage)(self._model, data)
+        return data.replace(qfrc_smooth=data.qfrc_passive - data.qfrc_bias + data.qfrc_actuator)
+
+    def _constraints(self, data: Any) -> Rows:
+        rows = data._impl
+        friction = rows.efc_frictionloss
+        rubs = np.arange(len(friction)) < self._model._impl.dof_hasfrictionloss.sum()  # these rows come first
+        low, high = jnp.where(rubs, -friction, 0.0), jnp.where(rubs, friction, np.inf)
+        return Rows(rows.efc_J, rows.efc_D, rows.efc_aref, low, high)
+
+    def _damping(self, data: Any) -> Array:
+        """What velocity costs, [nv, nv]: the implicit part of the step. An actuator at its effort limit can't damp
+        any more, so its damping is not in it, as in C MuJoCo; `mjx.step` would brake each joint that moves at full
+        effort."""
+        model = self._model
+        low, high = model.actuator_forcerange[:, 0], model.actuator_forcerange[:, 1]
+        saturated = (data.actuator_force <= low) | (data.actuator_force >= high)
+        own = jnp.where(saturated, 0.0, -model.actuator_biasprm[:, 2])
+        moment = data._impl.actuator_moment
+        return moment.T @ (own[:, None] * moment) + jnp.diag(model.dof_damping)
 
     def _view(self, xp: Any, physics: Physics, tips: Any, contacts: Contacts) -> dict[str, ArmView]:
         """Views by the array library `xp` from tool tips [arms, 3] in the world."""
@@ -159,6 +252,10 @@ class Simulator:
         """Where each agent's joints and sites stand in the model's arrays, and what an action does to a command."""
         scene, model = self.scene, self.scene.model
         names = [model.actuator(i).name for i in range(model.nu)]
+        # actuators of joints: they stand in the URDF's order, `qpos` in that of the tree
+        self._drives = np.flatnonzero(model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT)
+        self._address = model.jnt_qposadr[model.actuator_trnid[self._drives, 0]]
+        self._moment = np.asarray(scene.moment[:, self._address], np.float32)
         rows = [
             (names.index(f"{agent}/{joint.leader}"), bool(arm.jaw and joint.leader == arm.jaw.joint), joint, arm.jaw)
             for agent, arm in ((agent, mount.arm) for agent, mount in scene.mounts.items())
@@ -168,34 +265,34 @@ class Simulator:
         self._leaders, self._jaws = np.array([row[0] for row in rows]), np.array([row[1] for row in rows])
         self._speed = np.array([joint.drive.speed for _, _, joint, _ in rows], single)
         self._effort = np.array([joint.effort for _, _, joint, _ in rows], single)
-        pd = [(joint.effort, joint.drive) for _, _, joint, _ in rows]
-        self._lead = np.array([(effort + d.damping * d.speed) / d.stiffness for effort, d in pd], single)
+        # what a joint feels that moves alone: its own gains and its cables'
+        gains = np.array([model.actuator_gainprm[:, 0], -model.actuator_biasprm[:, 2]], single)
+        stiffness, damping = gains @ self._moment**2
+        self._lead = (self._effort + damping * self._speed) / stiffness
         self._low = np.array([joint.lower for _, _, joint, _ in rows], single)
         self._high = np.array([joint.upper for _, _, joint, _ in rows], single)
         self._open = np.array([jaw.open if is_jaw and jaw else 0.0 for _, is_jaw, _, jaw in rows], single)
         self._closed = np.array([jaw.closed if is_jaw and jaw else 0.0 for _, is_jaw, _, jaw in rows], single)
-        # actuators stand in the URDF's order of joints, `qpos` in that of the tree
-        self._address = model.jnt_qposadr[model.actuator_trnid[:, 0]]
         self._joints = {agent: scene.qpos_index(agent) for agent in scene.agents}
         self._actuators = {
             agent: np.array([names.index(f"{agent}/{joint.name}") for joint in mount.arm.actuated])
             for agent, mount in scene.mounts.items()
         }
+        # constraint rows without contacts: friction of some joints, then limits of all
+        kinds = np.flatnonzero(model.dof_frictionloss), model.jnt_dofadr[model.jnt_limited > 0]
+        owners = np.array([model.joint(i).name.split("/")[0] for i in range(model.njnt)])
+        self._dofs = {agent: model.jnt_dofadr[owners == agent] for agent in scene.agents}
+        self._own_rows = {a: np.flatnonzero(np.isin(np.concatenate(kinds), own)) for a, own in self._dofs.items()}
+        self._own_joints = {a: [np.flatnonzero(np.isin(own, kind)) for kind in kinds] for a, own in self._dofs.items()}
         self._sites = {agent: model.site(f"{agent}/tool_tip").id for agent in scene.agents}
 
     def _index_pairs(self) -> None:
-        """Where MJX keeps each pair of `Scene.pairs`: it sorts contacts in an order of its own."""
-        scene = self.scene
-        self._order, self._rows = np.zeros(0, int), np.zeros(0, int)
-        if scene.model.npair:
-            contact = jax.jit(lambda data: self._mjx.collision(self._model, data)._impl.contact)(self._data)
-            found = [tuple(sorted(pair)) for pair in np.asarray(contact.geom).tolist()]
-            ids = zip(scene.model.pair_geom1.tolist(), scene.model.pair_geom2.tolist(), strict=True)
-            self._order = np.array([found.index(tuple(sorted(pair))) for pair in ids])
-            self._rows = np.asarray(contact.efc_address)[self._order]
-        owners = [tuple(name.split("/")[0] for name in pair) for pair in scene.pairs]
-        self._touching = {a: np.flatnonzero([a in pair for pair in owners]) for a in scene.agents}
-        self._between = {a: np.flatnonzero([a in pair and len(set(pair)) > 1 for pair in owners]) for a in scene.agents}
+        """Which pairs concern each agent."""
+        owners = [tuple(name.split("/")[0] for name in pair) for pair in self.scene.pairs]
+        self._touching = {a: np.flatnonzero([a in pair for pair in owners]) for a in self.scene.agents}
+        self._between = {
+            a: np.flatnonzero([a in pair and len(set(pair)) > 1 for pair in owners]) for a in self.scene.agents
+        }
 
     def _measure_home(self) -> tuple[Contacts, dict[str, ArmView]]:
         """Contacts and views at home, by C MuJoCo: constants, so that a reset within a step computes no second pose."""
@@ -212,47 +309,3 @@ class Simulator:
         single = lambda x: jnp.asarray(x, jnp.bool_ if x.dtype == bool else jnp.float32)  # noqa: E731
         # one by one: JAX would sort the agents by name
         return jax.tree.map(single, contacts), {agent: jax.tree.map(single, view) for agent, view in views.items()}
-
-    def _distances(self, data: Any) -> Array:
-        return data._impl.contact.dist[self._order] if self.scene.model.npair else jnp.zeros(0, jnp.float32)
-
-    def _forces(self, data: Any) -> Array:
-        # pairs have condim 1: one row each, the normal force
-        return data._impl.efc_force[self._rows] if self.scene.model.npair else jnp.zeros(0, jnp.float32)
-
-    def _forward(self, data: Any) -> Any:
-        """`mjx.forward`, but with a fixed number of Newton iterations: `mjx.solve` would loop until all environments
-        have converged, which a GPU waits for, and factorises the Hessian once more than it needs to."""
-        from mujoco.mjx._src import solver
-
-        for stage in ("fwd_position", "fwd_velocity", "fwd_actuation", "fwd_acceleration"):
-            data = getattr(self._mjx, stage)(self._model, data)
-
-        def at(qacc: Array, grad: bool = False) -> Any:
-            return solver.Context.create(self._model, data.replace(qacc=qacc), grad=grad)
-
-        def iterate(qacc: Array, _: None) -> tuple[Array, None]:
-            return solver._linesearch(self._model, data, at(qacc, grad=True)).qacc, None
-
-        warm, smooth = data.qacc_warmstart, data.qacc_smooth
-        start = jnp.where(at(warm).cost < at(smooth).cost, warm, smooth)
-        qacc, _ = jax.lax.scan(iterate, start, None, length=SOLVER_ITERATIONS)
-        end = at(qacc)
-        return data.tree_replace(
-            {"qacc": qacc, "qfrc_constraint": end.qfrc_constraint, "_impl.efc_force": end.efc_force}
-        )
-
-    def _integrate(self, data: Any) -> Any:
-        """The implicitfast step. An actuator at its effort limit can't damp any more, so its damping leaves the
-        implicit matrix, as in C MuJoCo; `mjx.step` would keep it there and brake each joint that moves at full effort.
-        """
-        from mujoco.mjx._src.forward import implicit
-        from mujoco.mjx._src.support import mul_m
-
-        model = self._model
-        low, high = model.actuator_forcerange[:, 0], model.actuator_forcerange[:, 1]
-        saturated = (data.actuator_force <= low) | (data.actuator_force >= high)
-        biasprm = jnp.where(saturated[:, None], 0.0, model.actuator_biasprm)
-        # what the solver found, as a force: `qfrc_constraint` equals it only once the solver has converged
-        data = data.replace(qfrc_smooth=mul_m(model, data, data.qacc), qfrc_constraint=jnp.zeros_like(data.qacc))
-        return implicit(model.replace(actuator_biasprm=biasprm), data)

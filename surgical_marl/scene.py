@@ -87,6 +87,18 @@ class Scene:
         return qpos
 
     @cached_property
+    def moment(self) -> np.ndarray:
+        """What the actuators act on, [nu, nv]: 1 at a joint's own, the coefficients of a cable's joints at a cable's.
+
+        `moment @ qpos` commands a posture to position control, `moment @ qvel` velocities to velocity control.
+        """
+        data, moment = mujoco.MjData(self.model), np.zeros((self.model.nu, self.model.nv))
+        mujoco.mj_fwdPosition(self.model, data)
+        rows = data.moment_rownnz, data.moment_rowadr, data.moment_colind
+        mujoco.mju_sparse2dense(moment, data.actuator_moment, *rows)
+        return moment
+
+    @cached_property
     def pairs(self) -> tuple[tuple[str, str], ...]:
         """Geoms that can touch, by their names `<agent>/<geom>`, in the order of `State.contacts`."""
         geom = self.model.geom

@@ -24,7 +24,8 @@ class FakeEnv:
             0.05,
             "cpu",
         )
-        self.task_name, self.scene = "reach", SimpleNamespace(name="fake")
+        mount = SimpleNamespace(arm=SimpleNamespace(remote_center=None))
+        self.task_name, self.scene = "reach", SimpleNamespace(name="fake", mounts=dict.fromkeys(self.agents, mount))
         self.state_space = self._box(2 * sum(self.sizes.values()))
         self.generator = torch.Generator()
         self.poison = False  # return NaN observations

@@ -87,6 +87,9 @@ LIMITS = {
 GAINS = {"psm": [(120, 6), (120, 5), (6000, 200)], "psm_si": [(600, 30), (600, 30), (6000, 200)]}
 DISC_GAINS = {"psm": (6, 0.09), "psm_si": (6, 0.08)}
 COUPLING = [[-1.5632, 0, 0, 0], [0, 1.0186, 0, 0], [0, -0.8306, 0.6089, 0.6089], [0, 0, -1.2177, 1.2177]]
+SHARE = np.linalg.inv(COUPLING).T @ np.linalg.inv(COUPLING)
+"""A^-T A^-1: what equal motor discs are at roll, wrist pitch, wrist yaw and jaw."""
+DISC_INERTIA = {"psm": 3.3e-6 * 11.71**2, "psm_si": 3.3e-6 * 13.813**2}
 
 
 @pytest.mark.parametrize("name", LENGTHS)
@@ -95,14 +98,56 @@ def test_limits_gains_and_friction_are_the_published_ones(name: str) -> None:
     joints = load_arm(name).actuated
     assert [(joint.lower, joint.upper, joint.effort) for joint in joints] == LIMITS[name]
     assert [(joint.drive.stiffness, joint.drive.damping) for joint in joints[:3]] == GAINS[name]
-    inverse = np.linalg.inv(COUPLING)
-    share = np.diag(inverse.T @ inverse) * [1, 1, 1, 2]
-    for joint, part in zip(joints[3:], share, strict=True):
+    cables = {joint.name: load_arm(name).cables if "wrist" in joint.name else () for joint in joints}
+    for joint, part in zip(joints[3:], np.diag(SHARE) * [1, 1, 1, 2], strict=True):
         stiffness, damping = np.array(DISC_GAINS[name]) * part
-        assert joint.drive.stiffness == pytest.approx(stiffness, rel=2e-3)
-        assert joint.drive.damping == pytest.approx(damping, rel=2e-2)
+        drives = [joint.drive, *cables[joint.name]]
+        assert sum(drive.stiffness for drive in drives) == pytest.approx(stiffness, rel=2e-3)
+        assert sum(drive.damping for drive in drives) == pytest.approx(damping, rel=2e-2)
     assert [joint.coulomb for joint in joints] == [0.05, 0.0668, 0.4476, 0.00247, 0.0070, 0.0008, 2 * 0.0022]
     assert [joint.viscous for joint in joints] == [0.0905, 0.2181, 1.2036, 0.00111, 0.0122, 0.0020, 2 * 0.0022]
+
+
+@pytest.mark.parametrize("name", LENGTHS)
+def test_the_wrist_feels_its_motors_through_the_cables(name: str) -> None:
+    """Stiffness and damping at roll, wrist pitch and wrist yaw, as differences of C MuJoCo's actuator forces, and the
+    mass matrix, all with the entry that pitch and yaw share."""
+    model = load_arm(name).spec().compile()
+    data = mujoco.MjData(model)
+    dofs = [int(model.joint(joint).dofadr[0]) for joint in ("roll", "wrist_pitch", "wrist_yaw")]
+
+    def force(qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
+        data.qpos[dofs], data.qvel[dofs] = qpos, qvel
+        mujoco.mj_forward(model, data)
+        return data.qfrc_actuator[dofs].copy()
+
+    small, still = 1e-4 * np.eye(3), np.zeros(3)
+    stiffness, damping = DISC_GAINS[name]
+    matrices = [
+        (stiffness, np.array([force(-step, still) for step in small]) / 1e-4),
+        (damping, np.array([force(still, -step) for step in small]) / 1e-4),
+    ]
+    mass = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, mass)
+    matrices.append((DISC_INERTIA[name], mass[np.ix_(dofs, dofs)]))
+    for scale, matrix in matrices:
+        assert np.abs(matrix - scale * SHARE[:3, :3]).max() < 0.01 * scale * SHARE.max()
+        assert matrix[1, 2] == pytest.approx(scale * SHARE[1, 2], rel=0.01)
+
+
+@pytest.mark.parametrize("name", LENGTHS)
+def test_a_wrist_joint_never_carries_more_than_its_effort(name: str) -> None:
+    """Its own actuator and the cable's together, though each alone may put as much on it."""
+    arm = load_arm(name)
+    model = arm.spec().compile()
+    data = mujoco.MjData(model)
+    for pitch, yaw in ((1, 1), (-1, -0.1), (-0.1, -1)):
+        for joint, sign in (("wrist_pitch", pitch), ("wrist_yaw", yaw)):
+            data.actuator(joint).ctrl = sign
+        data.actuator("cable_0").ctrl = pitch + yaw
+        mujoco.mj_forward(model, data)
+        carried = [data.joint(joint).qfrc_actuator[0] for joint in ("wrist_pitch", "wrist_yaw")]
+        assert carried == pytest.approx([0.25 * np.sign(pitch), 0.20 * np.sign(yaw)], rel=1e-9)
 
 
 @pytest.mark.parametrize("name", LENGTHS)
@@ -204,6 +249,17 @@ def test_bad_urdf_is_one_sentence(tmp_path: Path, old: str, new: str, words: str
         ("stiffness: 120.0", "stifness: 120.0", "unknown key 'stifness'"),
         ("stiffness: 120.0", "stiffness: .nan", "must be a finite number"),
         ("  roll: ", "  rol: ", "unknown key 'rol'"),
+        ("wrist_yaw: 1}", "wrist: 1}", "cable 0: joint 'wrist' is not one of yaw, pitch"),
+        ("wrist_yaw: 1}", "jaw_left: 1}", "cable 0: joint 'jaw_left' is not one of"),
+        ("wrist_yaw: 1}", "wrist_yaw: .inf}", "coefficient of 'wrist_yaw' must be a finite number but 0, not inf"),
+        ("wrist_yaw: 1}", "wrist_yaw: one}", "coefficient of 'wrist_yaw' must be a finite number but 0, not 'one'"),
+        ("wrist_yaw: 1}", "wrist_yaw: 0}", "coefficient of 'wrist_yaw' must be a finite number but 0, not 0"),
+        (", wrist_yaw: 1}", "}", "joints must map two joints or more to coefficients, not {'wrist_pitch': 1}"),
+        ("stiffness: 6.598", "stiffness: -6.598", "cable 0: stiffness must be 0 or more, not -6.598"),
+        ("effort: 0.20", "effort: 0", "cable 0: effort must be above 0, not 0"),
+        (", effort: 0.20", "", "cable 0: a cable lacks effort"),
+        ("armature: 4.976e-4", "inertia: 4.976e-4", "cable 0: unknown key 'inertia'"),
+        ("  - {joints", "  a: {joints", "cables must be a list"),
         ("urdf: psm.urdf", "urdf: other.urdf", "no URDF file"),
         ("jaw: {joint: jaw_left", "jaw: {joint: jaw_right", "jaw joint 'jaw_right'"),
         ("joints:", "joints: [", "not valid YAML"),

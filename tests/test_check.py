@@ -14,6 +14,7 @@ from pettingzoo import ParallelEnv
 import surgical_marl as sm
 from surgical_marl.check import check
 from surgical_marl.cli import main
+from surgical_marl.export import mjcf
 from surgical_marl.view.render import Renderer, View
 
 PAGE = (Path(__file__).parents[1] / "docs" / "your_own_arm.md").read_text()
@@ -66,6 +67,26 @@ def test_the_page_makes_a_urdf_and_a_few_lines_an_agent_beside_a_psm(
         assert not any(terminations.values()) and not any(truncations.values())
     assert env.action_space("lab_arm_0").shape == (6,)
     assert all(np.isfinite(observation).all() for observation in observations.values())
+
+
+def test_a_scene_with_meshes_opens_in_plain_mujoco(own: Path) -> None:
+    """Exported, with the meshes in the file itself: every vertex where it was."""
+    scene, corners = sm.load_scene(own / "beside_psm.yaml"), []
+    (own / "scene.xml").write_text(mjcf(scene))
+    shutil.rmtree(own / "lab_arm")
+    for model in (scene.model, mujoco.MjModel.from_xml_path(str(own / "scene.xml"))):
+        data = mujoco.MjData(model)
+        data.qpos[:] = scene.home
+        mujoco.mj_kinematics(model, data)
+        found = []
+        for geom in np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_MESH):
+            start, count = (part[model.geom_dataid[geom]] for part in (model.mesh_vertadr, model.mesh_vertnum))
+            vertices = model.mesh_vert[start : start + count]
+            found.append(vertices @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom])
+        corners.append(found)
+    assert len(corners[0]) == 2
+    for before, after in zip(*corners, strict=True):
+        np.testing.assert_allclose(after, before, atol=1e-6)  # vertices are float32
 
 
 def test_a_mesh_is_seen(own: Path) -> None:

@@ -193,7 +193,8 @@ def settle(env: Any, data: mujoco.MjData, start: dict[str, np.ndarray]) -> Any:
     """Two arms pressed against each other by their controllers, once the force of the made-up overlap has settled in C
     MuJoCo; the same state for `Simulator`."""
     data.qpos[:] = env.scene.full_qpos(start)
-    data.ctrl[:] = env.scene.full_qpos({**start, "psm_0": start["psm_0"] - [0, 0.04, 0, 0, 0, 0, 0]})
+    pressed = env.scene.full_qpos({**start, "psm_0": start["psm_0"] - [0, 0.04, 0, 0, 0, 0, 0]})
+    data.ctrl[:] = env.scene.moment @ pressed
     mujoco.mj_step(env.scene.model, data, 3 * DECIMATION)
     return Physics(*(np.float32(a) for a in (data.qpos, data.qvel, data.qacc_warmstart, data.ctrl)))
 

@@ -14,6 +14,7 @@ import torch
 from fake_env import FakeEnv
 
 from surgical_marl.evaluation import evaluate
+from surgical_marl.files import write_atomic
 from surgical_marl.learning import config, train
 from surgical_marl.learning.config import NetworkSettings, PPOSettings, Settings, load_config
 from surgical_marl.learning.episodes import Episodes
@@ -28,7 +29,6 @@ from surgical_marl.learning.run import (
     read_checkpoint,
     read_metrics,
     read_settings,
-    write_atomic,
 )
 
 COUNTS, SIZES = {"psm": 2, "ecm": 1}, {"psm": 3, "ecm": 2}

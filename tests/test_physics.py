@@ -52,8 +52,9 @@ def play(scene: Scene, data: mujoco.MjData, steps: int, seed: int = 0) -> Iterat
 def test_limits_hold_at_full_effort(name: str, control: str) -> None:
     """10,000 control steps without NaN or warning; joints come to both limits, none passes one by 1 % of its range.
 
-    Only what another arm strikes at a tip's end, a finger or a needle that weighs next to nothing, may go further: at
-    7 rad/s a physics step alone is 5 % of a finger's range.
+    Only what is thrown at its limit may go further: what another arm strikes at a tip's end, a finger or a needle that
+    weighs next to nothing (at 7 rad/s a physics step alone is 5 % of a finger's range), and a wrist whose motors are
+    shared (one joint stopped at its limit throws the other on at 6 rad/s, 1 % of its range in a physics step).
     """
     scene = load_scene(name, control)
     model, data = scene.model, mujoco.MjData(scene.model)
@@ -65,9 +66,11 @@ def test_limits_hold_at_full_effort(name: str, control: str) -> None:
     assert not [str(mujoco.mjtWarning(i)) for i, warning in enumerate(data.warning) if warning.number]
     names = [model.joint(i).name for i in range(model.njnt)]
     ends = np.array([name.split("/")[1].startswith(("jaw", "needle")) for name in names])
+    wrists = np.array(["/wrist" in name for name in names])
     alone = len(scene.agents) == 1
     passed = np.maximum(highest - high, low - lowest) / (high - low)
-    assert (passed < np.where(ends & (not alone), 0.06, 0.01)).all(), dict(zip(names, passed.round(4), strict=True))
+    bound = np.where(ends & (not alone), 0.06, np.where(wrists, 0.02, 0.01))
+    assert (passed < bound).all(), dict(zip(names, passed.round(4), strict=True))
     if alone:  # several arms keep each other from some limits
         near = np.maximum(lowest - low, high - highest) / (high - low)
         jaws = np.array(["jaw" in name for name in names])  # these stop where they are told to
@@ -131,6 +134,8 @@ def test_a_commanded_velocity_is_reached_and_held(name: str) -> None:
     scene = load_scene(name, "velocity")
     agent, arm = scene.agents[0], scene.mounts[scene.agents[0]].arm
     simulator = Simulator(scene)
+    damping = -scene.model.actuator_biasprm[:, 2]
+    yields = np.linalg.inv(scene.moment.T * damping @ scene.moment)
     command, physics = jax.jit(simulator.command), simulator.home
     for i, joint in enumerate(arm.actuated):
         if arm.jaw and joint.name == arm.jaw.joint:
@@ -143,7 +148,8 @@ def test_a_commanded_velocity_is_reached_and_held(name: str) -> None:
         mujoco.mj_step(scene.model, data, 60)
         speed = float(data.joint(f"{agent}/{joint.name}").qvel[0])
         # the law is proportional: friction costs some of the speed
-        lost = (joint.coulomb + joint.viscous * 0.5 * joint.drive.speed) / joint.drive.damping
+        own = scene.model.joint(f"{agent}/{joint.name}").dofadr[0]
+        lost = (joint.coulomb + joint.viscous * 0.5 * joint.drive.speed) * yields[own, own]
         assert 0.5 * joint.drive.speed - 1.3 * lost - 0.002 < speed < 0.52 * joint.drive.speed, joint.name
 
 

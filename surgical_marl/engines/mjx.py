@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import contextlib
 import gc
-import os
-import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import fields, replace
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
+from surgical_marl.engines.common import announce, cores
 from surgical_marl.env import Carry, Env, State
 
-DEVICES = ("auto", "cpu", "cuda")
+RESULTS = tuple(field.name for field in fields(State) if field.name != "carry")
 LEAST_SHARE = 32
 """Environments that are worth a thread."""
 
@@ -28,45 +29,76 @@ class MjxEngine:
 
     def __init__(self, env: Env, num_envs: int, device: str = "auto") -> None:
         self.env, self.num_envs = env, num_envs
-        self.device = find_device(device)
+        self._on = find_device(device)
+        self.device = "cpu" if self._on.platform == "cpu" else "cuda"
         self._first_keys = jax.jit(jax.vmap(jax.random.fold_in, (None, 0)))
         self._reset = jax.jit(jax.vmap(env.reset))
         self._step = jax.jit(jax.vmap(env.step), donate_argnums=0)
         # XLA runs a step on one CPU core: every core takes a share of the environments
-        shares = min(os.cpu_count() or 1, num_envs // LEAST_SHARE) if self.device.platform == "cpu" else 1
+        shares = min(cores(), num_envs // LEAST_SHARE) if self.device == "cpu" else 1
         self._shares = next(n for n in range(max(shares, 1), 0, -1) if num_envs % n == 0)
         self._pool = ThreadPoolExecutor(self._shares, "surgical_marl")
         self._split = jax.jit(lambda tree: [jax.tree.map(share, tree) for share in self._slices()])
         self._join = jax.jit(lambda *parts: jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts))
-        self._announced = False
-        self._traced = False
+        self._state: Any = None
+        self._announced = self._traced = self._stepped = False
+        shapes = jax.eval_shape(env.reset, jax.ShapeDtypeStruct((2,), jnp.uint32), 0).carry
+        paths, self._tree = jax.tree_util.tree_flatten_with_path(shapes)
+        self.carry_shapes = {jax.tree_util.keystr(path): leaf.shape for path, leaf in paths}
 
-    def reset(self, seed: int) -> State:
+    def reset(self, seed: int) -> None:
         """First episodes. Environment i depends on `seed` and i alone, not on how many there are."""
-        with jax.default_device(self.device):
+        with jax.default_device(self._on):
             keys = self._first_keys(jax.random.PRNGKey(seed), jnp.arange(self.num_envs))
-            return self.restart(keys, jnp.zeros(self.num_envs, jnp.int32))
+            self._begin(keys, jnp.zeros(self.num_envs, jnp.int32))
 
-    def restart(self, keys: Array, episodes: Array) -> State:
-        """The start of given episodes: keys [N, 2], episode numbers [N]."""
-        self._announce()
-        with jax.default_device(self.device):
-            return self._reset(keys, episodes)
+    def restart(self) -> None:
+        """The next episode of every environment that has not just begun one, in the step that ended the last."""
+        carry = self._state.carry
+        begun = (carry.steps == 0) & self._stepped
+        self._begin(carry.key, carry.episode + ~begun)
 
-    def step(self, carry: Carry, actions: dict[str, Array]) -> State:
-        """One control step of all environments; `carry` may not be used again."""
+    def _begin(self, keys: Array, episodes: Array) -> None:
+        if not self._announced:
+            announce(self.env, self.num_envs, self.name, self.device)
+            self._announced = True
+        with jax.default_device(self._on):
+            self._state, self._stepped = self._reset(keys, episodes), False
+
+    def step(self, actions: dict[str, Any]) -> None:
+        """One control step of all environments; actions [N, n] by agent, of any array library."""
+        given = self._state.carry, {agent: self._take(action).astype(jnp.float32) for agent, action in actions.items()}
         with contextlib.nullcontext() if self._traced else _no_collection():
             if self._shares == 1:
-                state = self._step_share((carry, actions))
+                self._state = self._step_share(given)
             else:
-                shares = self._split((carry, actions))
+                shares = self._split(given)
                 first = [] if self._traced else [self._step_share(shares.pop(0))]  # compiles once, not in every thread
-                state = self._join(*first, *self._pool.map(self._step_share, shares))
-            self._traced = True
-        return state
+                self._state = self._join(*first, *self._pool.map(self._step_share, shares))
+        self._traced = self._stepped = True
+
+    def outcome(self, library: str) -> dict[str, Any]:
+        """What the last step or reset led to, as arrays [N, ...] of "numpy", "torch" or "jax": fields of
+        `surgical_marl.env.State`."""
+        state = self._state
+        found = {name: self._present(getattr(state, name), library) for name in RESULTS}
+        return {**found, "contacts": found["contacts"]._asdict()}
+
+    def read(self, name: str, library: str) -> Any:
+        """A part of the `Carry`, one of `carry_shapes`, [N, ...]."""
+        return self._present(
+            dict(zip(self.carry_shapes, jax.tree.leaves(self._state.carry), strict=True))[name], library
+        )
+
+    def write(self, name: str, values: Any) -> None:
+        """Sets a part of the `Carry`."""
+        parts = dict(zip(self.carry_shapes, jax.tree.leaves(self._state.carry), strict=True))
+        parts[name] = self._take(values).astype(parts[name].dtype)
+        carry = jax.tree.unflatten(self._tree, list(parts.values()))
+        self._state, self._stepped = replace(self._state, carry=carry), True
 
     def _step_share(self, share: tuple[Carry, dict[str, Array]]) -> State:
-        with jax.default_device(self.device):  # of this thread
+        with jax.default_device(self._on):  # of this thread
             state: State = jax.block_until_ready(self._step(*share)) if self._shares > 1 else self._step(*share)
             return state
 
@@ -74,20 +106,20 @@ class MjxEngine:
         size = self.num_envs // self._shares
         return [lambda x, i=i: x[i * size : (i + 1) * size] for i in range(self._shares)]  # type: ignore[misc]
 
-    def to_device(self, value: Any) -> Array:
-        """Any array on the engine's device."""
-        return jax.device_put(value, self.device)
+    def _take(self, values: Any) -> Array:
+        """Values of any array library, on the engine's device."""
+        if type(values).__module__.startswith("torch"):
+            values = jax.dlpack.from_dlpack(values.detach().contiguous())
+        return jax.device_put(values, self._on)
 
-    def _announce(self) -> None:
-        if not self._announced:
-            envs = "1 environment" if self.num_envs == 1 else f"{self.num_envs} environments"
-            print(
-                f"surgical-marl: compiling {self.env.task_name} on {self.env.scene.name} for {envs} "
-                f"({self.name}, {self.device.platform}); a second start takes it from the cache",
-                file=sys.stderr,
-                flush=True,
-            )
-            self._announced = True
+    def _present(self, tree: Any, library: str) -> Any:
+        if library == "jax":
+            return tree
+        if library == "torch":
+            import torch
+
+            return jax.tree.map(torch.from_dlpack, tree)
+        return jax.tree.map(np.asarray, tree)
 
 
 @contextlib.contextmanager
@@ -104,8 +136,6 @@ def _no_collection() -> Iterator[None]:
 
 def find_device(device: str) -> Any:
     """The JAX device for "auto", "cpu" or "cuda". ValueError if it is not there."""
-    if device not in DEVICES:
-        raise ValueError(f"unknown device {device!r}; the devices are {', '.join(DEVICES)}")
     if device == "auto":
         return jax.devices()[0]
     try:

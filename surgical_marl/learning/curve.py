@@ -9,7 +9,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, FuncFormatter, NullFormatter, PercentFormatter
 
-from surgical_marl.learning.run import CURVE, read_metrics, write_atomic
+from surgical_marl.files import write_atomic
+from surgical_marl.learning.run import CURVE, read_metrics
 
 PANELS = (
     ("tip_error_mm", "tip error at the end (mm)", "#1f6f8b"),

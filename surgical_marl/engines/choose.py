@@ -1,0 +1,68 @@
+"""Which engine runs an environment."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from typing import Any, Protocol
+
+from surgical_marl.env import Env
+
+ENGINES = ("auto", "fused", "mjx")
+DEVICES = ("auto", "cpu", "cuda")
+
+
+class Engine(Protocol):
+    """`num_envs` copies of an environment and their state. Arrays are of "numpy", "torch" or "jax", as `library` says."""
+
+    name: str
+    device: str
+    """"cpu" or "cuda"."""
+    carry_shapes: dict[str, tuple[int, ...]]
+    """The parts of an environment's `Carry` by path, as in ".physics.qpos", and their shapes."""
+
+    def reset(self, seed: int) -> None: ...
+
+    def restart(self) -> None: ...
+
+    def step(self, actions: dict[str, Any]) -> None: ...
+
+    def outcome(self, library: str) -> dict[str, Any]: ...
+
+    def read(self, name: str, library: str) -> Any: ...
+
+    def write(self, name: str, values: Any) -> None: ...
+
+
+def make_engine(env: Env, num_envs: int, engine: str = "auto", device: str = "auto") -> Engine:
+    """The engine of that name, or the fastest that can run the environment.
+
+    Raises:
+        ValueError: an unknown engine or device, one that is not there, or an environment that the engine can't run.
+    """
+    if engine not in ENGINES:
+        raise ValueError(f"unknown engine {engine!r}; the engines are {', '.join(ENGINES)}")
+    if device not in DEVICES:
+        raise ValueError(f"unknown device {device!r}; the devices are {', '.join(DEVICES)}")
+    if engine != "mjx":
+        if importlib.util.find_spec("warp") is None:
+            if engine == "fused":
+                raise ValueError("engine 'fused' needs the package warp-lang, which is not installed")
+            _say("warp-lang is not installed")
+        else:
+            from surgical_marl.engines.fused.engine import FusedEngine
+            from surgical_marl.engines.fused.primitives import Unsupported
+
+            try:
+                return FusedEngine(env, num_envs, device)
+            except Unsupported as error:
+                if engine == "fused":
+                    raise ValueError(f"engine 'fused' can't run {env.task_name} on {env.scene.name}: {error}") from None
+                _say(f"{env.task_name} on {env.scene.name} uses {error}")
+    from surgical_marl.engines.mjx import MjxEngine
+
+    return MjxEngine(env, num_envs, device)
+
+
+def _say(why: str) -> None:
+    print(f"surgical-marl: engine mjx instead of fused: {why}", file=sys.stderr, flush=True)

@@ -1,0 +1,145 @@
+"""The arrays that kernels work on, on a CPU or a GPU, and views of their fields for numpy, torch and JAX."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from surgical_marl.engines.fused.program import Leaf, Source
+
+_TYPES = {"state": np.float32, "counts": np.int32, "actions": np.float32, "outs": np.float32, "flags": np.uint8}
+
+
+def make_arrays(device: str, source: Source, stride: int, num_envs: int) -> Arrays:
+    """Arrays for a program, zero. ValueError if a GPU has no room for them."""
+    return (CudaArrays if device == "cuda" else CpuArrays)(source, stride, num_envs)
+
+
+class Arrays:
+    """`all` is what `Kernel.launch` takes; columns from `num_envs` on are padding."""
+
+    def __init__(self, source: Source, stride: int, num_envs: int) -> None:
+        self.num_envs, self.stride = num_envs, stride
+        self._buffers = {name: self._zeros(max(source.sizes[name], 1), stride, dtype) for name, dtype in _TYPES.items()}
+        tables = [self._constant(table) for table in source.tables.values()]
+        self.all = [*(self._warp(buffer) for buffer in self._buffers.values()), *(self._warp(t) for t in tables)]
+
+    def rows(self, leaf: Leaf) -> Any:
+        """The fields of a leaf, [size, N], of the device's own library: a view."""
+        return self._buffers[leaf.buffer][leaf.first : leaf.first + leaf.size, : self.num_envs]
+
+
+class CpuArrays(Arrays):
+    """numpy arrays."""
+
+    def _zeros(self, fields: int, stride: int, dtype: Any) -> Any:
+        return np.zeros((fields, stride), dtype)
+
+    def _constant(self, table: np.ndarray) -> Any:
+        return table
+
+    def _warp(self, array: Any) -> Any:
+        return wp.array(array.reshape(-1), copy=False, device="cpu")
+
+    def write(self, leaf: Leaf, values: Any) -> None:
+        """Sets a leaf to [N, *shape] of any library."""
+        if type(values).__module__.startswith("torch"):
+            values = values.detach().cpu().numpy()
+        values = np.asarray(values, leaf.dtype).reshape(self.num_envs, leaf.size)
+        self.rows(leaf)[:] = values.T.view(np.int32) if leaf.dtype == "uint32" else values.T
+
+    def read(self, leaf: Leaf, library: str) -> Any:
+        """A leaf as [N, *shape] of "numpy", "torch" or "jax"; a copy."""
+        return self._present(leaf, self.rows(leaf).copy(), library)
+
+    def read_tree(self, tree: dict[str, Any], library: str) -> dict[str, Any]:
+        """Leaves of a dict of dicts, of one copy of the whole."""
+        copies = {name: self._buffers[name][:, : self.num_envs].copy() for name in ("outs", "flags", "counts")}
+
+        def visit(node: Any) -> Any:
+            if isinstance(node, dict):
+                return {name: visit(child) for name, child in node.items()}
+            return self._present(node, copies[node.buffer][node.first : node.first + node.size], library)
+
+        return visit(tree)
+
+    def _present(self, leaf: Leaf, rows: np.ndarray, library: str) -> Any:
+        rows = rows.view(bool) if leaf.dtype == "bool" else rows.view(leaf.dtype)
+        array = rows.T.reshape(self.num_envs, *leaf.shape)
+        if library == "torch":
+            import torch
+
+            return torch.from_numpy(array)
+        if library == "jax":
+            import jax
+
+            return jax.numpy.asarray(array)
+        return array
+
+
+class CudaArrays(Arrays):
+    """torch tensors on the GPU."""
+
+    def _zeros(self, fields: int, stride: int, dtype: Any) -> Any:
+        import torch
+
+        try:
+            return torch.zeros((fields, stride), dtype=torch.from_numpy(np.zeros(1, dtype)).dtype, device="cuda")
+        except torch.cuda.OutOfMemoryError:
+            free, _ = torch.cuda.mem_get_info()
+            raise ValueError(
+                f"the GPU has no room for {self.num_envs} environments; some {_fitting(free, fields)} fit"
+            ) from None
+
+    def _constant(self, table: np.ndarray) -> Any:
+        import torch
+
+        return torch.from_numpy(table).cuda()
+
+    def _warp(self, array: Any) -> Any:
+        return wp.from_torch(array.reshape(-1))
+
+    def write(self, leaf: Leaf, values: Any) -> None:
+        import torch
+
+        if not isinstance(values, torch.Tensor):
+            values = torch.from_numpy(
+                np.array(values, leaf.dtype).view(np.int32 if leaf.dtype == "uint32" else leaf.dtype)
+            )
+        self.rows(leaf).copy_(values.detach().reshape(self.num_envs, leaf.size).t())
+
+    def read(self, leaf: Leaf, library: str) -> Any:
+        return self._present(leaf, self.rows(leaf).clone(), library)
+
+    def read_tree(self, tree: dict[str, Any], library: str) -> dict[str, Any]:
+        copies = {name: self._buffers[name].clone() for name in ("outs", "flags", "counts")}
+
+        def visit(node: Any) -> Any:
+            if isinstance(node, dict):
+                return {name: visit(child) for name, child in node.items()}
+            rows = copies[node.buffer][node.first : node.first + node.size, : self.num_envs]
+            return self._present(node, rows, library)
+
+        return visit(tree)
+
+    def _present(self, leaf: Leaf, rows: Any, library: str) -> Any:
+        import torch
+
+        array = rows.t().reshape(self.num_envs, *leaf.shape) if len(leaf.shape) != 1 else rows.t()
+        if leaf.dtype == "bool":
+            array = array.view(torch.bool)
+        if library == "torch":
+            return array
+        host = array.cpu().numpy()
+        host = np.ascontiguousarray(host).view(np.uint32) if leaf.dtype == "uint32" else host
+        if library == "numpy":
+            return host
+        import jax
+
+        return jax.numpy.asarray(host) if leaf.dtype == "uint32" else jax.dlpack.from_dlpack(array.contiguous())
+
+
+def _fitting(free: int, fields: int) -> int:
+    return free // (4 * fields) // 1024 * 1024

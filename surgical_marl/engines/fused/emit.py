@@ -1,0 +1,181 @@
+"""From a scheduled graph to C that CUDA and Clang both take: one environment a thread, or a vector of them.
+
+`F I U B` are float, int, unsigned and bool: scalars in CUDA, vectors of environments on a CPU, where a branch is taken if
+any of them takes it, and its results are blended. What differs is in two short preludes of macros.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+
+from surgical_marl.engines.fused.graph import Branch, Graph, Loop, Value
+from surgical_marl.engines.fused.schedule import Schedule, Scheduler
+
+LARGE = 500
+"""Operations in a branch from which on it is kept apart."""
+
+TYPES = {"f": "F", "i": "I", "u": "U", "b": "B"}
+
+_CODE = {
+    "add": "{}+{}", "sub": "{}-{}", "mul": "{}*{}", "neg": "-{}", "lt": "{}<{}", "le": "{}<={}", "gt": "{}>{}",
+    "ge": "{}>={}", "eq": "{}=={}", "ne": "{}!={}", "and": "{}&{}", "or": "{}|{}", "xor": "{}^{}", "shl": "{}<<{}",
+    "shr": "{}>>{}", "sar": "{}>>{}", "div": "DIV{1}({0},{2})", "abs": "ABS{1}({0})", "rem": "REM{1}({0},{2})",
+    "sqrt": "SQRT({})", "floor": "FLOOR({})", "ceil": "CEIL({})", "rint": "RINT({})", "pow": "POW({},{})",
+    "log": "LOG({})", "tan": "TAN({})", "acos": "ACOS({})", "asin": "ASIN({})", "atan2": "ATAN2({},{})",
+    "tanh": "TANH({})", "max": "MAX{1}({0},{2})", "min": "MIN{1}({0},{2})", "isfinite": "FINITE({})", "f2i": "F2I({})",
+    "i2f": "I2F({})", "u2f": "U2F({})", "f2u": "F2U({})", "i2u": "I2U({})", "u2i": "U2I({})", "bits": "BITS({})",
+    "float": "FLOAT({})", "select": "SELECT({0},{2},{1})",
+}  # fmt: skip
+
+
+class Emitter:
+    """Writes the body of a function.
+
+    `stores` are (buffer, field, value) in the order in which they should happen. A load is a node "load" of (buffer,
+    field). Buffers are names of parameters.
+    """
+
+    def __init__(self, graph: Graph, stores: list[tuple[str, int, Value]], vector: bool) -> None:
+        self.graph, self.stores, self.vector = graph, stores, vector
+        self.schedule: Schedule = Scheduler(graph, [value for _, _, value in stores]).run()
+        self.offsets = table_offsets(graph)
+        self.lines: list[str] = []
+        self.names: dict[Value, str] = {}
+
+    def body(self) -> str:
+        self._region(0, self._store)
+        return "\n".join(self.lines)
+
+    def _region(self, number: int, result: Any) -> None:
+        for kind, index in self.schedule.regions[number].items:
+            if kind == "node":
+                self.lines.append(self._node(index))
+            elif kind == "result":
+                result(index)
+            else:
+                group = self.graph.groups[index]
+                (self._branch if isinstance(group, Branch) else self._loop)(index, group)  # type: ignore[arg-type]
+
+    def _store(self, k: int) -> None:
+        buffer, field, value = self.stores[k]
+        self.lines.append(f"ST{self.graph.kind(value).upper()}({buffer},{field},{self._name(value)});")
+
+    def _branch(self, number: int, branch: Branch) -> None:
+        wanted, condition = self.schedule.alive[number], self._name(branch.condition)
+        outs = [branch.outs[k] for k in wanted]
+        for out in outs:
+            self.names[out] = f"v{out}"
+            kind = TYPES[self.graph.kind(out)]
+            self.lines.append(f"{kind} v{out}={kind}{{}};" if self.vector else f"{kind} v{out};")
+        chosen, other = self.schedule.inside[number]
+
+        def take(values: list[Value], first: bool) -> Any:
+            def result(k: int) -> None:
+                value = self._name(values[wanted[k]])
+                blend = f"SELECT({condition},v{outs[k]},{value})" if self.vector and not first else value
+                self.lines.append(f"v{outs[k]}={blend};")
+
+            return result
+
+        self.lines.append(f"if(ANY({condition})){{")
+        with self._hidden(number):
+            self._region(chosen, take(branch.chosen, True))
+        self.lines.append(f"}}\nif(ANY(NOT({condition}))){{" if self.vector else "}else{")
+        with self._hidden(number):
+            self._region(other, take(branch.others, False))
+        self.lines.append("}")
+
+    @contextmanager
+    def _hidden(self, number: int) -> Iterator[None]:
+        """Within a side of a large branch, names for values from around it that the compiler takes for new ones. It
+        would otherwise compute what both sides need before the branch, and keep it in registers that are not there."""
+        names, size = dict(self.names), sum(len(self.schedule.regions[r].items) for r in self.schedule.inside[number])
+        if size > LARGE and not self.vector:
+            for value in self.schedule.outside[number]:
+                if self.graph.kind(value) != "b":
+                    kind = TYPES[self.graph.kind(value)]
+                    self.lines.append(f"{kind} h{value}={self._name(value)};HIDE{kind}(h{value})")
+                    self.names[value] = f"h{value}"
+        yield
+        self.names = names
+
+    def _loop(self, number: int, loop: Loop) -> None:
+        wanted = self.schedule.alive[number]
+        phis = [loop.phis[k] for k in wanted]
+        for k in wanted:
+            phi = loop.phis[k]
+            self.names[phi] = self.names[loop.outs[k]] = f"v{phi}"
+            self.lines.append(f"{TYPES[self.graph.kind(phi)]} v{phi}={self._name(loop.starts[k])};")
+        counter = f"r{number}"
+        tested = loop.condition is not None
+        if tested and self.vector:
+            self.lines.append(f"B m{number}=~SPLATI(0);")
+        self.lines.append("for(;;){" if tested else f"for(int {counter}=0;{counter}<{loop.length};++{counter}){{")
+
+        def result(k: int) -> None:
+            if tested and k == 0:
+                condition = self._name(loop.condition)  # type: ignore[arg-type]
+                if self.vector:
+                    self.lines.append(f"m{number}=m{number}&{condition};")
+                    condition = f"m{number}"
+                self.lines.append(f"if(!ANY({condition}))break;")
+
+        self._region(self.schedule.inside[number][0], result)
+        for k, phi in zip(wanted, phis, strict=True):
+            self.lines.append(f"{TYPES[self.graph.kind(phi)]} n{phi}={self._name(loop.nexts[k])};")
+        for phi in phis:
+            next_value = f"SELECT(m{number},n{phi},v{phi})" if tested and self.vector else f"n{phi}"
+            self.lines.append(f"v{phi}={next_value};")
+        self.lines.append("}")
+
+    def _node(self, value: Value) -> str:
+        g, op, args = self.graph, self.graph.ops[value], self.graph.args[value]
+        kind = g.kinds[value]
+        self.names[value] = f"v{value}"
+        if op == "load":
+            code = f"LD{kind.upper()}({args[0]},{args[1]})"
+        elif op == "lookup":
+            code = f"TABLE{kind.upper()}({self.offsets[args[0]]},{self._name(args[1])})"
+        elif op == "not":
+            code = f"NOT({self._name(args[0])})" if kind == "b" else f"~{self._name(args[0])}"
+        elif op in ("div", "rem", "max", "min"):
+            code = _CODE[op].format(self._name(args[0]), kind.upper(), self._name(args[1]))
+        elif op == "abs":
+            code = _CODE[op].format(self._name(args[0]), kind.upper())
+        else:
+            code = _CODE[op].format(*(self._name(a) for a in args))
+        return f"{TYPES[kind]} v{value}={code};"
+
+    def _name(self, value: Value) -> str:
+        return self.names[value] if value >= 0 else literal(self.graph.constants[~value])
+
+
+def literal(value: Any) -> str:
+    """A numpy scalar as C of its type."""
+    kind = value.dtype.kind
+    if kind == "b":
+        return "SPLATB(1)" if value else "SPLATB(0)"
+    if kind == "f":
+        if np.isnan(value):
+            return "SPLAT(SM_NAN)"
+        if np.isinf(value):
+            return "SPLAT(SM_INF)" if value > 0 else "SPLAT(-SM_INF)"
+        text = repr(float(value))
+        return f"SPLAT({text if '.' in text or 'e' in text else text + '.0'}f)"
+    if kind == "u":
+        return f"SPLATU({int(value)}u)"
+    return f"SPLATI({int(value)})" if value > -(2**31) else "SPLATI(-2147483647-1)"
+
+
+def table_offsets(graph: Graph) -> list[int]:
+    """Where each table starts in the array of all tables of its dtype."""
+    ends: dict[str, int] = {}
+    offsets = []
+    for table in graph.tables:
+        offsets.append(ends.get(table.dtype.name, 0))
+        ends[table.dtype.name] = offsets[-1] + table.size
+    return offsets

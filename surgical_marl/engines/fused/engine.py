@@ -1,0 +1,113 @@
+"""The fused engine: a control step of an environment is one kernel.
+
+    engine = FusedEngine(env, num_envs=4096, device="cuda")
+    engine.reset(seed=0)
+    engine.step(actions)
+    engine.outcome("torch")["rewards"]
+
+The state of all environments stays in four arrays on the device, [field, environment], between steps.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+
+from surgical_marl.engines.common import announce, cores
+from surgical_marl.engines.fused.arrays import make_arrays
+from surgical_marl.engines.fused.kernel import compile_kernels, has_cuda
+from surgical_marl.engines.fused.preludes import LANES
+from surgical_marl.engines.fused.program import Source, load_source
+from surgical_marl.env import Env
+
+LEAST_SHARE = 32
+"""Environments that are worth a thread."""
+
+
+class FusedEngine:
+    """`num_envs` copies of an environment.
+
+    Raises:
+        Unsupported: the environment uses something that has no kernel code.
+        ValueError: the device is not there, or has no room for so many environments.
+    """
+
+    name = "fused"
+
+    def __init__(self, env: Env, num_envs: int, device: str = "auto") -> None:
+        if device == "cuda" and not has_cuda():
+            raise ValueError("device 'cuda' is not there: Warp finds no CUDA device; the other is cpu")
+        self.env, self.num_envs = env, num_envs
+        self.device = ("cuda" if has_cuda() else "cpu") if device == "auto" else device
+        announce(env, num_envs, self.name, self.device)
+        self.source: Source = load_source(env, vector=self.device == "cpu")
+        self._leaves = flatten(self.source.carry)
+        self.carry_shapes = {name: leaf.shape for name, leaf in self._leaves.items()}
+        self._stride = -(-num_envs // LANES) * LANES
+        self._arrays = make_arrays(self.device, self.source, self._stride, num_envs)
+        self._kernels = compile_kernels({"step": self.source.step, "reset": self.source.reset}, self.device)
+        vectors = self._stride // LANES
+        shares = min(cores(), max(1, num_envs // LEAST_SHARE)) if self.device == "cpu" else 1
+        edges = [round(vectors * k / shares) * LANES for k in range(shares + 1)]
+        self._shares = [(a, b - a) for a, b in zip(edges, edges[1:], strict=False)]
+        if shares == 1:
+            self._shares = [(0, num_envs if self.device == "cuda" else self._stride)]
+        self._pool = ThreadPoolExecutor(shares, "surgical_marl") if shares > 1 else None
+        self._stepped = False
+
+    def reset(self, seed: int) -> None:
+        """First episodes. Environment i depends on `seed` and i alone, not on how many there are."""
+        import jax
+
+        # the same keys as the MJX engine's
+        keys = jax.jit(jax.vmap(jax.random.fold_in, (None, 0)))(jax.random.PRNGKey(seed), np.arange(self.num_envs))
+        self.write(".key", np.asarray(keys))
+        self.write(".episode", np.zeros(self.num_envs, np.int32))
+        self._launch("reset")
+        self._stepped = False
+
+    def restart(self) -> None:
+        """The next episode of every environment that has not just begun one."""
+        begun = (self.read(".steps", "numpy") == 0) & self._stepped
+        self.write(".episode", (self.read(".episode", "numpy") + ~begun).astype(np.int32))
+        self._launch("reset")
+        self._stepped = False
+
+    def step(self, actions: dict[str, Any]) -> None:
+        """One control step of all environments; actions [N, n] by agent, of any array library."""
+        for agent, action in actions.items():
+            self._arrays.write(self.source.actions[agent], action)
+        self._launch("step")
+        self._stepped = True
+
+    def outcome(self, library: str) -> dict[str, Any]:
+        """What the last step or reset led to, as arrays [N, ...] of "numpy", "torch" or "jax": fields of
+        `surgical_marl.env.State` as dicts of dicts. Copies, but on a GPU for "torch" the next step overwrites them."""
+        return self._arrays.read_tree(self.source.results, library)
+
+    def read(self, name: str, library: str) -> Any:
+        """A part of the `Carry`, one of `carry_shapes`, [N, ...]; a copy."""
+        return self._arrays.read(self._leaves[name], library)
+
+    def write(self, name: str, values: Any) -> None:
+        """Sets a part of the `Carry`."""
+        self._arrays.write(self._leaves[name], values)
+        self._stepped = True
+
+    def _launch(self, name: str) -> None:
+        launch = lambda share: self._kernels[name].launch(self._arrays.all, self._stride, *share)  # noqa: E731
+        if self._pool is None:
+            launch(self._shares[0])
+        else:
+            list(self._pool.map(launch, self._shares))
+
+
+def flatten(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Leaves of a dict of dicts by their path, as in ".physics.qpos"."""
+    found: dict[str, Any] = {}
+    for name, value in tree.items():
+        path = f"{prefix}.{name}"
+        found.update(flatten(value, path) if isinstance(value, dict) else {path: value})
+    return found

@@ -1,0 +1,87 @@
+"""Compiles C with Warp and launches it, on a GPU or on a CPU.
+
+A kernel works on five arrays whose columns are environments: `state` (float32) and `counts` (int32; uint32 by their bits)
+are read and written, `actions` (float32) read, `outs` (float32) and `flags` (uint8) written; and on two arrays of
+constants.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Any
+
+import warp as wp
+
+from surgical_marl.engines.fused.preludes import CPU, CUDA, LANES, UNDEFINE
+
+BLOCK = 64
+"""Threads in a CUDA block."""
+
+_reals = wp.array(dtype=wp.float32)
+_wholes = wp.array(dtype=wp.int32)
+_bytes = wp.array(dtype=wp.uint8)
+
+
+def compile_kernels(bodies: dict[str, str], device: str, max_registers: int | None = None) -> dict[str, Kernel]:
+    """Kernels of C function bodies by name, in one module. What was compiled before comes from Warp's cache on disk."""
+    prelude = CUDA if device == "cuda" else CPU
+    sources = {name: f"{prelude}\n{body}\n{UNDEFINE}\n" for name, body in bodies.items()}
+    digest = hashlib.sha256("\0".join(sources.values()).encode()).hexdigest()[:16]
+    module = wp.get_module(f"surgical_marl_{digest}")
+    # contraction: a * b + c is one operation, as on a GPU
+    module.options.update(enable_backward=False, cpu_compiler_flags="-march=native -ffp-contract=fast")
+    made = {name: _make(f"{name}_{digest}", source, module, max_registers) for name, source in sources.items()}
+    module.load(wp.get_device(device), block_dim=BLOCK if device == "cuda" else 1)
+    return {name: Kernel(kernel, device) for name, kernel in made.items()}
+
+
+def _make(name: str, source: str, module: Any, max_registers: int | None) -> Any:
+    def body(
+        state: _reals, counts: _wholes, actions: _reals, outs: _reals, flags: _bytes, reals: _reals, wholes: _wholes,
+        stride: int, t: int,
+    ): ...  # fmt: skip
+
+    body.__qualname__ = body.__name__ = f"body_{name}"
+    body = wp.func_native(source)(body)
+
+    def kernel(
+        state: _reals, counts: _wholes, actions: _reals, outs: _reals, flags: _bytes, reals: _reals, wholes: _wholes,
+        stride: int, start: int, lanes: int,
+    ):  # fmt: skip
+        body(state, counts, actions, outs, flags, reals, wholes, stride, start + wp.tid() * lanes)
+
+    return wp.kernel(
+        kernel, name=name, module=module, enable_backward=False, grid_stride=False, cuda_max_registers=max_registers
+    )
+
+
+class Kernel:
+    """One compiled function."""
+
+    def __init__(self, kernel: Any, device: str) -> None:
+        self._kernel, self._device = kernel, device
+
+    def launch(self, arrays: list[Any], stride: int, start: int, count: int) -> None:
+        """Runs environments `start` to `start + count`, of arrays that have a column for `stride` of them. On a GPU it
+        goes to torch's current stream, and can be captured in a CUDA graph."""
+        cuda = self._device == "cuda"
+        lanes = 1 if cuda else LANES
+        wp.launch(
+            self._kernel,
+            dim=-(-count // lanes),
+            inputs=[*arrays, stride, start, lanes],
+            device=self._device,
+            block_dim=BLOCK if cuda else 1,
+            stream=_torch_stream() if cuda else None,
+        )
+
+
+def _torch_stream() -> Any:
+    import torch
+
+    return wp.stream_from_torch(torch.cuda.current_stream())
+
+
+def has_cuda() -> bool:
+    """Whether Warp finds a CUDA device."""
+    return bool(wp.is_cuda_available())

@@ -1,0 +1,145 @@
+"""The macros under the code that `emit.py` writes: scalars for CUDA, vectors of environments for Clang.
+
+Division and square root are CUDA's approximate ones, right to two units in the last place.
+"""
+
+from __future__ import annotations
+
+LANES = 8
+"""Environments in a vector on a CPU: 32 bytes of float32, an AVX register."""
+
+CUDA = """
+typedef float F; typedef int I; typedef unsigned int U; typedef bool B;
+#define SM_INF __int_as_float(0x7f800000)
+#define SM_NAN __int_as_float(0x7fffffff)
+#define ANY(c) (c)
+#define NOT(c) (!(c))
+#define SELECT(c,a,b) ((c)?(a):(b))
+#define SPLAT(x) (x)
+#define SPLATI(x) (x)
+#define SPLATU(x) (x)
+#define SPLATB(x) ((x)!=0)
+#define LDF(p,i) p.data[(size_t)(i)*stride+t]
+#define LDI(p,i) p.data[(size_t)(i)*stride+t]
+#define LDU(p,i) ((U)p.data[(size_t)(i)*stride+t])
+#define LDB(p,i) (p.data[(size_t)(i)*stride+t]!=0)
+#define STF(p,i,x) p.data[(size_t)(i)*stride+t]=(x);
+#define STI(p,i,x) p.data[(size_t)(i)*stride+t]=(x);
+#define STU(p,i,x) p.data[(size_t)(i)*stride+t]=(I)(x);
+#define STB(p,i,x) p.data[(size_t)(i)*stride+t]=(x);
+#define TABLEF(k,i) reals.data[k+(i)]
+#define TABLEI(k,i) wholes.data[k+(i)]
+#define DIVF(a,b) __fdividef(a,b)
+#define DIVI(a,b) ((a)/(b))
+#define DIVU(a,b) ((a)/(b))
+#define REMF(a,b) fmodf(a,b)
+#define REMI(a,b) ((a)%(b))
+#define REMU(a,b) ((a)%(b))
+#define ABSF(x) fabsf(x)
+#define ABSI(x) abs(x)
+#define SQRT(x) ([](float a){float r;asm("sqrt.approx.ftz.f32 %0, %1;":"=f"(r):"f"(a));return r;}(x))
+#define MAXF(a,b) fmaxf(a,b)
+#define MINF(a,b) fminf(a,b)
+#define MAXI(a,b) max(a,b)
+#define MINI(a,b) min(a,b)
+#define MAXU(a,b) max(a,b)
+#define MINU(a,b) min(a,b)
+#define FLOOR floorf
+#define CEIL ceilf
+#define RINT rintf
+#define POW powf
+#define LOG logf
+#define TAN tanf
+#define ACOS acosf
+#define ASIN asinf
+#define ATAN2 atan2f
+#define TANH tanhf
+#define FINITE(x) isfinite(x)
+#define F2I(x) ((I)(x))
+#define F2U(x) ((U)(x))
+#define I2F(x) ((F)(x))
+#define U2F(x) ((F)(x))
+#define I2U(x) ((U)(x))
+#define U2I(x) ((I)(x))
+#define HIDEF(x) asm volatile("":"+f"(x));
+#define HIDEI(x) asm volatile("":"+r"(x));
+#define HIDEU(x) asm volatile("":"+r"(x));
+#define BITS(x) __float_as_uint(x)
+#define FLOAT(x) __uint_as_float(x)
+"""
+
+CPU = (
+    f"""
+enum {{ SM_W = {LANES} }};
+typedef float F __attribute__((ext_vector_type(SM_W)));
+typedef int I __attribute__((ext_vector_type(SM_W)));
+typedef unsigned int U __attribute__((ext_vector_type(SM_W)));
+typedef int B __attribute__((ext_vector_type(SM_W)));
+typedef unsigned char C __attribute__((ext_vector_type(SM_W)));
+"""
+    + """
+#define SM_INF __builtin_inff()
+#define SM_NAN __builtin_nanf("")
+#define ANY(c) (__builtin_reduce_or(c)!=0)
+#define NOT(c) (~(c))
+#define SELECT(c,a,b) ((c)?(a):(b))
+#define SPLAT(x) ((F)(x))
+#define SPLATI(x) ((I)(x))
+#define SPLATU(x) ((U)(x))
+#define SPLATB(x) ((B)(-(x)))
+#define SM_AT(p,i) (p.data+(size_t)(i)*stride+t)
+#define LDF(p,i) ({F r_;__builtin_memcpy(&r_,SM_AT(p,i),sizeof(F));r_;})
+#define LDI(p,i) ({I r_;__builtin_memcpy(&r_,SM_AT(p,i),sizeof(I));r_;})
+#define LDU(p,i) ({U r_;__builtin_memcpy(&r_,SM_AT(p,i),sizeof(U));r_;})
+#define LDB(p,i) ({C r_;__builtin_memcpy(&r_,SM_AT(p,i),sizeof(C));__builtin_convertvector(r_,B)!=0;})
+#define STF(p,i,x) {F r_=(x);__builtin_memcpy(SM_AT(p,i),&r_,sizeof(F));}
+#define STI(p,i,x) {I r_=(x);__builtin_memcpy(SM_AT(p,i),&r_,sizeof(I));}
+#define STU(p,i,x) {U r_=(x);__builtin_memcpy(SM_AT(p,i),&r_,sizeof(U));}
+#define STB(p,i,x) {C r_=__builtin_convertvector((x)&1,C);__builtin_memcpy(SM_AT(p,i),&r_,sizeof(C));}
+#define LANEWISE(T,e) ({T r_;for(int l=0;l<SM_W;++l)r_[l]=(e);r_;})
+#define TABLEF(k,i) ({I i_=(i);LANEWISE(F,reals.data[k+i_[l]]);})
+#define TABLEI(k,i) ({I i_=(i);LANEWISE(I,wholes.data[k+i_[l]]);})
+#define DIVF(a,b) ((a)/(b))
+#define DIVI(a,b) ((a)/(b))
+#define DIVU(a,b) ((a)/(b))
+#define REMF(a,b) ({F a_=(a),b_=(b);LANEWISE(F,wp::mod(a_[l],b_[l]));})
+#define REMI(a,b) ((a)%(b))
+#define REMU(a,b) ((a)%(b))
+#define ABSF(x) __builtin_elementwise_abs(x)
+#define ABSI(x) __builtin_elementwise_abs(x)
+#define SQRT(x) __builtin_elementwise_sqrt(x)
+#define MAXF(a,b) ({F a_=(a),b_=(b);a_>b_?a_:b_;})
+#define MINF(a,b) ({F a_=(a),b_=(b);a_<b_?a_:b_;})
+#define MAXI(a,b) __builtin_elementwise_max(a,b)
+#define MINI(a,b) __builtin_elementwise_min(a,b)
+#define MAXU(a,b) __builtin_elementwise_max(a,b)
+#define MINU(a,b) __builtin_elementwise_min(a,b)
+#define FLOOR(x) __builtin_elementwise_floor(x)
+#define CEIL(x) __builtin_elementwise_ceil(x)
+#define RINT(x) __builtin_elementwise_roundeven(x)
+#define ONE(f,x) ({F a_=(x);LANEWISE(F,wp::f(a_[l]));})
+#define TWO(f,x,y) ({F a_=(x),b_=(y);LANEWISE(F,wp::f(a_[l],b_[l]));})
+#define POW(a,b) TWO(pow,a,b)
+#define LOG(x) ONE(log,x)
+#define TAN(x) ONE(tan,x)
+#define ACOS(x) ONE(acos,x)
+#define ASIN(x) ONE(asin,x)
+#define ATAN2(a,b) TWO(atan2,a,b)
+#define TANH(x) ONE(tanh,x)
+#define FINITE(x) (__builtin_elementwise_abs(x)<(F)SM_INF)
+#define F2I(x) __builtin_convertvector(x,I)
+#define F2U(x) __builtin_convertvector(x,U)
+#define I2F(x) __builtin_convertvector(x,F)
+#define U2F(x) __builtin_convertvector(x,F)
+#define I2U(x) ((U)(x))
+#define U2I(x) ((I)(x))
+#define BITS(x) ((U)(x))
+#define FLOAT(x) ((F)(x))
+"""
+)
+
+MACROS = sorted(
+    {line.split("(")[0].split()[1] for code in (CUDA, CPU) for line in code.splitlines() if "#define" in line}
+)
+UNDEFINE = "\n".join(f"#undef {name}" for name in MACROS)
+"""They end with the function: the rest of the program has names of its own."""

@@ -1,0 +1,282 @@
+"""Where and in what order a graph's values are computed.
+
+A value belongs to the innermost region (the body of a loop, a side of a branch, or the whole program) that holds all its
+uses, moved out of each loop that it does not depend on: Click, "Global code motion, global value numbering", 1995. Within a
+region values are computed depth first from the results, the part that needs more room first (Sethi and Ullman, 1970), so
+that few of them are alive at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+from surgical_marl.engines.fused.graph import Branch, Graph, Loop, Value
+
+
+@dataclass
+class Region:
+    """A straight stretch of program. `items` are what it computes, in order: ("node", value), ("group", number), or
+    ("result", k), the k-th result of the region, known from there on."""
+
+    parent: int
+    depth: int
+    loop: int
+    """The innermost loop around it, -1 if there is none."""
+    items: list[tuple[str, int]] = field(default_factory=list)
+
+
+@dataclass
+class Schedule:
+    """Region 0 is the program; its results are the stores."""
+
+    regions: list[Region]
+    inside: dict[int, tuple[int, ...]]
+    """Group -> the regions in it: of a loop its body, of a branch the chosen and the other side."""
+    alive: dict[int, list[int]]
+    """Group -> which of its outs (or phis) are needed."""
+    outside: dict[int, list[Value]]
+    """Group -> the values from around it that it reads."""
+
+
+class Scheduler:
+    """Makes a `Schedule` of the values `results`."""
+
+    def __init__(self, graph: Graph, results: list[Value]) -> None:
+        self.graph, self.results = graph, results
+        self.regions = [Region(-1, 0, -1)]
+        self.inside: dict[int, tuple[int, ...]] = {}
+        self.place: dict[Value, int] = {}
+        self.group_place: dict[int, int] = {}
+        self.alive = self._find_alive()
+        self._depend()
+
+    def run(self) -> Schedule:
+        self._place_all()
+        self._measure()
+        self._outside: dict[int, list[Value]] = {}
+        self._members: dict[int, list[Value]] = {}
+        for value in self.needed:
+            if self.graph.ops[value] != "phi":
+                self._members.setdefault(self.place[value], []).append(value)
+        for number in range(len(self.regions)):
+            self._order(number)
+        return Schedule(self.regions, self.inside, self.alive, {n: self._all_reads(n) for n in self.inside})
+
+    # -- what is needed
+
+    def _find_alive(self) -> dict[int, list[int]]:
+        g, seen = self.graph, set()
+        alive: dict[int, set[int]] = {}
+        stack = [value for value in self.results if value >= 0]
+
+        def group_result(number: int, k: int) -> None:
+            group, wanted = g.groups[number], alive.setdefault(number, set())
+            if k in wanted:
+                return
+            wanted.add(k)
+            if isinstance(group, Branch):
+                needs = [group.condition, group.chosen[k], group.others[k]]
+            else:
+                needs = [group.starts[k], group.nexts[k]] + ([] if group.condition is None else [group.condition])
+            stack.extend(value for value in needs if value >= 0)
+
+        while stack:
+            value = stack.pop()
+            if value in seen:
+                continue
+            seen.add(value)
+            if g.ops[value] in ("out", "phi"):
+                group_result(*g.args[value])
+            else:
+                stack.extend(g.reads(value))
+        self.needed = sorted(seen)
+        return {number: sorted(wanted) for number, wanted in alive.items()}
+
+    def _group_reads(self, number: int) -> Iterable[Value]:
+        """All that a group is given, from before it or within it."""
+        group, wanted = self.graph.groups[number], self.alive[number]
+        sides = (group.chosen, group.others) if isinstance(group, Branch) else (group.starts, group.nexts)
+        for values in sides:
+            yield from (values[k] for k in wanted if values[k] >= 0)
+        if group.condition is not None and group.condition >= 0:
+            yield group.condition
+
+    def _depend(self) -> None:
+        """Which loops each value depends on, as bits."""
+        g = self.graph
+        self.loops: dict[Value, int] = {}
+        self.group_loops: dict[int, int] = {}
+        for value in self.needed:
+            op = g.ops[value]
+            if op == "phi":
+                self.loops[value] = 1 << g.args[value][0]
+                continue
+            if op == "out":
+                number = g.args[value][0]
+                if number not in self.group_loops:
+                    bits = 0
+                    for read in self._group_reads(number):
+                        bits |= self.loops[read]
+                    self.group_loops[number] = bits & ~(1 << number)
+                self.loops[value] = self.group_loops[number]
+                continue
+            bits = 0
+            for read in g.reads(value):
+                bits |= self.loops[read]
+            self.loops[value] = bits
+
+    # -- where
+
+    def _place_all(self) -> None:
+        g = self.graph
+        for value in self.results:
+            self._use(value, 0)
+        for value in reversed(self.needed):
+            op = g.ops[value]
+            if op == "phi":
+                continue
+            if op == "out":
+                number = g.args[value][0]
+                if number not in self.group_place:
+                    self._place_group(number)
+                continue
+            region = self._hoist(self.place[value], self.loops[value])
+            self.place[value] = region
+            for read in g.reads(value):
+                self._use(read, region)
+
+    def _place_group(self, number: int) -> None:
+        g, group = self.graph, self.graph.groups[number]
+        outs = [group.outs[k] for k in self.alive[number] if group.outs[k] in self.place]
+        region = self.place[outs[0]]
+        for out in outs[1:]:
+            region = self._common(region, self.place[out])
+        region = self._hoist(region, self.group_loops[number])
+        self.group_place[number] = region
+        for k in self.alive[number]:
+            self.place[group.outs[k]] = region
+        inner = [len(self.regions) + k for k in range(2 if isinstance(group, Branch) else 1)]
+        self.inside[number] = tuple(inner)
+        depth = self.regions[region].depth + 1
+        for _ in inner:
+            loop = number if isinstance(group, Loop) else self.regions[region].loop
+            self.regions.append(Region(region, depth, loop))
+        for k in self.alive[number]:
+            if isinstance(group, Branch):
+                self._use(group.chosen[k], inner[0])
+                self._use(group.others[k], inner[1])
+            else:
+                self._use(group.starts[k], region)
+                self._use(group.nexts[k], inner[0])
+                self.place[group.phis[k]] = inner[0]
+        if group.condition is not None:
+            self._use(group.condition, region if isinstance(group, Branch) else inner[0])
+        assert g is self.graph
+
+    def _use(self, value: Value, region: int) -> None:
+        if value >= 0 and self.graph.ops[value] != "phi":
+            self.place[value] = self._common(self.place[value], region) if value in self.place else region
+
+    def _common(self, a: int, b: int) -> int:
+        regions = self.regions
+        while a != b:
+            if regions[a].depth >= regions[b].depth:
+                a = regions[a].parent
+            else:
+                b = regions[b].parent
+        return a
+
+    def _hoist(self, region: int, loops: int) -> int:
+        """Out of the loops that are not depended on."""
+        while True:
+            loop = self.regions[region].loop
+            if loop < 0 or loops >> loop & 1:
+                return region
+            if any(loops >> inner & 1 for inner in self._loops_between(region, loop)):
+                return region
+            region = self.group_place[loop]
+
+    def _loops_between(self, region: int, loop: int) -> Iterable[int]:
+        while region != self.inside[loop][0]:
+            yield self.regions[region].loop
+            region = self.regions[region].parent
+
+    # -- in what order
+
+    def _measure(self) -> None:
+        """How many values must be alive at once to compute each, if nothing were shared."""
+        g = self.graph
+        self.room: dict[Value, int] = {}
+        for value in self.needed:
+            op = g.ops[value]
+            if op == "out":
+                reads = [read for read in self._group_reads(g.args[value][0]) if read < value]
+            else:
+                reads = g.reads(value)
+            needs = sorted((self.room.get(read, 1) for read in reads[:8]), reverse=True)
+            self.room[value] = max([need + k for k, need in enumerate(needs)], default=1)
+
+    def _order(self, number: int) -> None:
+        region = self.regions[number]
+        done: set[tuple[str, int]] = set()
+        for k, result in enumerate(self._region_results(number)):
+            if result >= 0 and self._here(result, number):
+                self._visit(number, result, done)
+            region.items.append(("result", k))
+
+    def _region_results(self, number: int) -> list[Value]:
+        if number == 0:
+            return self.results
+        for group_number, inner in self.inside.items():
+            if number in inner:
+                group, wanted = self.graph.groups[group_number], self.alive[group_number]
+                if isinstance(group, Branch):
+                    side = group.chosen if number == inner[0] else group.others
+                    return [side[k] for k in wanted]
+                condition = [] if group.condition is None else [group.condition]
+                return condition + [group.nexts[k] for k in wanted]
+        raise AssertionError(number)
+
+    def _visit(self, region: int, value: Value, done: set[tuple[str, int]]) -> None:
+        items, stack = self.regions[region].items, [(self._item(value), False)]
+        while stack:
+            item, ready = stack.pop()
+            if item in done:
+                continue
+            if ready:
+                done.add(item)
+                items.append(item)
+                continue
+            stack.append((item, True))
+            reads = [read for read in self._item_reads(item) if self._here(read, region)]
+            reads.sort(key=lambda read: self.room[read])  # the roomiest is popped, and so computed, first
+            stack.extend((self._item(read), False) for read in reads if self._item(read) not in done)
+
+    def _here(self, value: Value, region: int) -> bool:
+        return self.graph.ops[value] != "phi" and self.place[value] == region
+
+    def _item(self, value: Value) -> tuple[str, int]:
+        return ("group", self.graph.args[value][0]) if self.graph.ops[value] == "out" else ("node", value)
+
+    def _item_reads(self, item: tuple[str, int]) -> list[Value]:
+        kind, number = item
+        return self.graph.reads(number) if kind == "node" else self._all_reads(number)
+
+    def _all_reads(self, number: int) -> list[Value]:
+        """What a group and everything in it reads from outside it."""
+        if number in self._outside:
+            return self._outside[number]
+        found: dict[Value, None] = dict.fromkeys(self._group_reads(number))
+        depth = self.regions[self.group_place[number]].depth
+        for inner in self.inside[number]:
+            for value in self._members.get(inner, []):
+                reads = self._all_reads(self.graph.args[value][0]) if self.graph.ops[value] == "out" else None
+                found.update(dict.fromkeys(self.graph.reads(value) if reads is None else reads))
+        outside = [
+            value
+            for value in found
+            if self.graph.ops[value] != "phi" and self.regions[self.place[value]].depth <= depth
+        ]
+        self._outside[number] = outside
+        return outside

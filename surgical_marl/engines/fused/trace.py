@@ -1,0 +1,266 @@
+"""From a JAX function to a `Graph`: its jaxpr is run on arrays of values.
+
+Functions within functions are opened up. A branch (`lax.cond`, `lax.switch`) stays a branch: what it computes it does not
+share with what is around it, so that nothing but its operands has to be kept for it. A loop (`lax.scan` without arrays
+that it reads or writes row by row, `lax.while_loop`) stays a loop, unless it is to be unrolled (`unroll=True`, or one
+round). Other scans are unrolled.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+from jax.extend import core
+
+from surgical_marl.engines.fused.graph import DTYPES, Branch, Graph, Loop, Value
+from surgical_marl.engines.fused.primitives import Symbolic, Traced, Unsupported, apply, convert, lift, lower
+
+_INSIDE = {
+    "jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr", "remat": "jaxpr",
+    "remat2": "jaxpr", "checkpoint": "jaxpr", "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr",
+    "custom_vjp_call_jaxpr": "fun_jaxpr", "custom_vmap_call": "call",
+}  # fmt: skip
+"""Primitives that call a function, and the parameter that holds it."""
+
+
+class Tracer:
+    """Runs jaxprs on traced arrays; nodes go into `graph`."""
+
+    def __init__(self, graph: Graph) -> None:
+        self.graph = graph
+
+    def run(self, closed: Any, args: list[Traced]) -> list[Traced]:
+        """The results of a closed jaxpr. Unsupported, naming the line of the source, if there is no rule for
+        something in it."""
+        jaxpr, consts = getattr(closed, "jaxpr", closed), getattr(closed, "consts", ())
+        known: dict[Any, Traced] = dict(zip(jaxpr.constvars, map(np.asarray, consts), strict=True))
+        known.update(zip(jaxpr.invars, args, strict=True))
+
+        def read(variable: Any) -> Traced:
+            if isinstance(variable, core.Literal):
+                return np.asarray(variable.val, variable.aval.dtype)
+            return known[variable]
+
+        for equation in jaxpr.eqns:
+            try:
+                results = self._equation(equation, [read(variable) for variable in equation.invars])
+            except Unsupported as error:
+                if " at " in str(error):
+                    raise
+                from jax._src import source_info_util
+
+                place = source_info_util.summarize(equation.source_info)
+                raise Unsupported(f"{error} at {place}") from None
+            known.update(zip(equation.outvars, results, strict=True))
+        return [read(variable) for variable in jaxpr.outvars]
+
+    def _equation(self, equation: Any, xs: list[Traced]) -> list[Traced]:
+        name, params = equation.primitive.name, equation.params
+        if name in _INSIDE:
+            return self.run(params[_INSIDE[name]], xs)
+        if name == "cond":
+            return self._cond(params["branches"], xs[0], xs[1:])
+        if name == "scan":
+            return self._scan(params, xs)
+        if name == "while":
+            return self._while(params, xs)
+        if name == "platform_index":  # the code for any platform, else the first
+            platforms = params["platforms"]
+            return [np.int32(platforms.index(None) if None in platforms else 0)[()]]
+        if name.startswith("random_"):
+            return [self._random(name, equation, xs)]
+        avals = [variable.aval for variable in equation.outvars]
+        if name in ("sort", "argsort") and not any(isinstance(x, Symbolic) for x in xs):
+            found = equation.primitive.bind(*xs, **params)
+            return [np.asarray(x) for x in (found if equation.primitive.multiple_results else [found])]
+        if any(jax.dtypes.issubdtype(aval.dtype, jax.dtypes.prng_key) for aval in avals):
+            return self._keys(name, avals, params, xs)
+        return apply(self.graph, name, avals, params, xs)
+
+    def _keys(self, name: str, avals: list[Any], params: Any, xs: list[Traced]) -> list[Traced]:
+        """Moves random keys, whose words are the last axis of their arrays."""
+        raw = [jax.ShapeDtypeStruct(aval.shape, np.uint32) for aval in avals]
+        keys = [lift(self.graph, x) for x in xs]
+        words = range(keys[0].shape[-1])
+        moved = [apply(self.graph, name, raw, params, [Symbolic(key[..., word]) for key in keys]) for word in words]
+        return [Symbolic(np.stack([lift(self.graph, x) for x in parts], -1)) for parts in zip(*moved, strict=True)]
+
+    # -- branches
+
+    def _cond(self, branches: Any, which: Traced, xs: list[Traced]) -> list[Traced]:
+        g = self.graph
+        if not isinstance(which, Symbolic):
+            return self.run(branches[min(max(int(which), 0), len(branches) - 1)], xs)
+        index = int(which.ids)
+        if len(branches) > 2:  # one against the rest, and so on
+            first = g.compare("le", index, g.constant(np.int32(0)))
+            rest = Symbolic(np.array(g.sub(index, g.constant(np.int32(1))), np.int32))
+            return self._branch(first, lambda: self._cond(branches[1:], rest, xs), lambda: self.run(branches[0], xs))
+        condition = convert(g, index, "b")
+        if condition < 0:
+            return self.run(branches[int(g.constants[~condition])], xs)
+        return self._branch(condition, *(lambda b=b: self.run(b, xs) for b in branches))
+
+    def _branch(
+        self, condition: Value, other: Callable[[], list[Traced]], chosen: Callable[[], list[Traced]]
+    ) -> list[Traced]:
+        g = self.graph
+        if condition < 0:
+            return chosen() if g.constants[~condition] else other()
+        results = []
+        for side in (other, chosen):
+            g.open_scope()
+            results.append(side())
+            g.close_scope()
+        branch = Branch(condition)
+        g.groups.append(branch)
+        merged: list[Traced] = []
+        for a, b in zip(*results, strict=True):
+            pairs = zip(lift(g, a).ravel().tolist(), lift(g, b).ravel().tolist(), strict=True)
+            ids = np.array([self._merge(branch, *pair) for pair in pairs], np.int32)
+            merged.append(lower(g, ids.reshape(a.shape), _dtype(g, a)))
+        return merged
+
+    def _merge(self, branch: Branch, other: Value, chosen: Value) -> Value:
+        if other == chosen:
+            return other
+        branch.others.append(other)
+        branch.chosen.append(chosen)
+        g = self.graph
+        branch.outs.append(g.fresh("out", len(g.groups) - 1, len(branch.outs), kind=g.kind(other)))
+        return branch.outs[-1]
+
+    # -- loops
+
+    def _scan(self, params: Any, xs: list[Traced]) -> list[Traced]:
+        body, length = params["jaxpr"], params["length"]
+        if "ft_in" in params:  # from JAX 0.11 on
+            constants, carry, rows = map(list, params["ft_in"].update(xs).unpack())
+        else:
+            fixed, number = params["num_consts"], params["num_carry"]
+            constants, carry, rows = xs[:fixed], xs[fixed : fixed + number], xs[fixed + number :]
+        carried, outvars = len(carry), getattr(body, "jaxpr", body).outvars
+        written = len(outvars) - carried
+        if not rows and not written and length > params["unroll"]:
+            return self._loop(carry, lambda c: self.run(body, constants + c), None, length)
+        collected: list[list[Traced]] = [[] for _ in range(written)]
+        for i in range(length)[:: -1 if params["reverse"] else 1]:
+            out = self.run(body, [*constants, *carry, *(_row(x, i) for x in rows)])
+            carry = out[:carried]
+            for column, value in zip(collected, out[carried:], strict=True):
+                column.append(value)
+        shapes = [variable.aval for variable in outvars[carried:]]
+        stacks = [
+            self._stack(column[:: -1 if params["reverse"] else 1], aval)
+            for column, aval in zip(collected, shapes, strict=True)
+        ]
+        return [*carry, *stacks]
+
+    def _stack(self, column: list[Traced], aval: Any) -> Traced:
+        if not column:
+            return np.zeros((0, *aval.shape), aval.dtype)
+        if any(isinstance(value, Symbolic) for value in column):
+            return Symbolic(np.stack([lift(self.graph, value) for value in column]))
+        return np.stack(column)  # type: ignore[arg-type]
+
+    def _while(self, params: Any, xs: list[Traced]) -> list[Traced]:
+        tested, used = params["cond_nconsts"], params["body_nconsts"]
+        test_constants, constants, carry = xs[:tested], xs[tested : tested + used], xs[tested + used :]
+        test, body = params["cond_jaxpr"], params["body_jaxpr"]
+
+        def condition(c: list[Traced]) -> Traced:
+            return self.run(test, test_constants + c)[0]
+
+        return self._loop(carry, lambda c: self.run(body, constants + c), condition, 0)
+
+    def _loop(
+        self,
+        carry: list[Traced],
+        body: Callable[[list[Traced]], list[Traced]],
+        condition: Callable[[list[Traced]], Traced] | None,
+        length: int,
+    ) -> list[Traced]:
+        g = self.graph
+        shapes, dtypes = [x.shape for x in carry], [_dtype(g, x) for x in carry]
+        starts = [value for x in carry for value in lift(g, x).ravel().tolist()]
+        varying = [False] * len(starts)  # until a round is seen to change it
+        while True:
+            # unknown while the loop is tried: how many rounds
+            loop, number = Loop([], length=length), len(g.groups)
+            g.groups.append(loop)
+            values = list(starts)
+            for k, start in enumerate(starts):
+                if varying[k]:
+                    values[k] = g.fresh("phi", number, len(loop.phis), kind=g.kind(start))
+                    loop.phis.append(values[k])
+                    loop.starts.append(start)
+            arrays = _unflatten(g, values, shapes, dtypes)
+            going = condition(arrays) if condition else None
+            nexts = [value for x in body(arrays) for value in lift(g, x).ravel().tolist()]
+            changed = [k for k, value in enumerate(nexts) if not varying[k] and value != values[k]]
+            if not changed:
+                break
+            for k in changed:
+                varying[k] = True
+        loop.nexts = [value for k, value in enumerate(nexts) if varying[k]]
+        if going is not None:
+            loop.condition = int(lift(g, going))
+            if loop.condition < 0 and g.constants[~loop.condition]:
+                raise Unsupported("a loop that never ends")
+        outs = list(values)
+        for k, start in enumerate(starts):
+            if varying[k]:
+                outs[k] = g.fresh("out", number, len(loop.outs), kind=g.kind(start))
+                loop.outs.append(outs[k])
+        return _unflatten(g, outs, shapes, dtypes)
+
+    # -- random numbers
+
+    def _random(self, name: str, equation: Any, xs: list[Traced]) -> Traced:
+        """JAX's own definition of the operation on raw keys, traced. Keys are their raw words."""
+        params, out = equation.params, equation.outvars[0].aval
+        if name in ("random_wrap", "random_unwrap"):
+            return xs[0]
+        source = out if name == "random_seed" else equation.invars[0].aval
+        implementation, words = source.dtype._impl, source.dtype._impl.key_shape
+        if name != "random_seed" and source.shape:
+            raise Unsupported(f"{name} of many keys at once")
+        if name == "random_fold_in":
+            function = implementation.fold_in
+            shapes = [jax.ShapeDtypeStruct(words, np.uint32), jax.ShapeDtypeStruct((), np.uint32)]
+            xs = [xs[0], self._unsigned(xs[1])]
+        elif name == "random_split":
+            function = lambda key: implementation.split(key, params["shape"])  # noqa: E731
+            shapes = [jax.ShapeDtypeStruct(words, np.uint32)]
+        elif name == "random_bits":
+            function = lambda key: implementation.random_bits(key, params["bit_width"], params["shape"])  # noqa: E731
+            shapes = [jax.ShapeDtypeStruct(words, np.uint32)]
+        else:
+            raise Unsupported(f"the primitive {name}")
+        return self.run(jax.make_jaxpr(function)(*shapes), xs)[0]
+
+    def _unsigned(self, x: Traced) -> Traced:
+        aval = jax.ShapeDtypeStruct(x.shape, np.uint32)
+        return apply(self.graph, "convert_element_type", [aval], {"new_dtype": np.uint32}, [x])[0]
+
+
+def _row(x: Traced, i: int) -> Traced:
+    return Symbolic(x.ids[i]) if isinstance(x, Symbolic) else x[i]
+
+
+def _dtype(g: Graph, x: Traced) -> Any:
+    if isinstance(x, np.ndarray):
+        return x.dtype
+    return DTYPES[g.kind(int(x.ids.flat[0]))] if x.ids.size else np.float32
+
+
+def _unflatten(g: Graph, values: list[Value], shapes: list[Any], dtypes: list[Any]) -> list[Traced]:
+    arrays, at = [], 0
+    for shape, dtype in zip(shapes, dtypes, strict=True):
+        size = int(np.prod(shape, dtype=int))
+        arrays.append(lower(g, np.array(values[at : at + size], np.int32).reshape(shape), dtype))
+        at += size
+    return arrays

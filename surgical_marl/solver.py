@@ -1,0 +1,145 @@
+"""MuJoCo's constraint problem, solved in a fixed number of steps.
+
+The acceleration of a system with limits, friction and contacts minimises a convex function: half the square of its
+distance to the smooth acceleration in the metric of the mass matrix, plus a piecewise quadratic cost of each constraint row
+(https://mujoco.readthedocs.io/en/stable/computation/index.html#the-optimization-problem). Rows without an elliptic cone
+all have one form: the force is `clip(impedance * (reference - J qacc), low, high)`, with bounds (0, inf) for a limit or a
+contact and (-f, f) for friction f. `solve` is Newton's method with a line search, as in MuJoCo, but it never asks whether
+it has converged, so that many environments take it in step. Where every row concerns one joint alone, `relax` comes first:
+it solves one joint after the other, exactly, and so finds nearly always which rows hold and which slip or are free. Newton's
+method alone goes astray among them: friction and limits are stiff, and a row that changes sides changes the whole step.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jax.scipy.linalg import cho_solve
+
+SWEEPS = 4
+"""Rounds of `relax` over all joints of an arm."""
+
+
+class Rows(NamedTuple):
+    """Constraints on n degrees of freedom, [r] each."""
+
+    jacobian: Array
+    """[r, n]"""
+    impedance: Array
+    """MuJoCo's efc_D."""
+    reference: Array
+    """Acceleration that the row asks for, efc_aref."""
+    low: Array
+    """Least force."""
+    high: Array
+
+
+class JointRows(NamedTuple):
+    """Friction and limit of each of n joints, [n] each; zeros where a joint has none. As in `Rows`, but signed: a limit
+    pushes towards `side`, -1, 0 or 1."""
+
+    friction: Array
+    """The largest friction force."""
+    friction_impedance: Array
+    friction_reference: Array
+    side: Array
+    limit_impedance: Array
+    limit_reference: Array
+
+
+def relax(mass: Array, smooth: Array, joints: JointRows, qacc: Array) -> Array:
+    """Acceleration [n] nearer to the solution: `SWEEPS` times, each joint's is set to what solves its own equation.
+
+    That equation has one unknown, and a sum of forces that falls with it, piecewise linearly. The sign of what is left
+    over at each corner says on which piece the root lies.
+    """
+    n = len(qacc)
+    slack = joints.friction / jnp.where(joints.friction > 0, joints.friction_impedance, 1.0)
+    corners = joints.friction_reference - slack, joints.friction_reference + slack, joints.side * joints.limit_reference
+    inverse = {
+        (sticks, held): 1 / (jnp.diag(mass) + sticks * joints.friction_impedance + held * joints.limit_impedance)
+        for sticks in (0, 1)
+        for held in (0, 1)
+    }
+
+    def limit_force(i: int, x: Array) -> Array:
+        side = joints.side[i]
+        return side * jnp.maximum(joints.limit_impedance[i] * (joints.limit_reference[i] - side * x), 0.0)
+
+    def joint(i: int, qacc: list[Array]) -> Array:
+        own, friction = mass[i, i], joints.friction[i]
+        others = sum((mass[i, j] * qacc[j] for j in range(n) if j != i), -smooth[i])
+        low, high, end = (corner[i] for corner in corners)
+        ahead = own * low + others - friction - limit_force(i, low) > 0  # the root is below: friction pushes ahead
+        back = own * high + others + friction - limit_force(i, high) < 0
+        sticking = joints.friction_impedance[i] * (joints.friction_reference[i] - end)
+        held = joints.side[i] * (own * end + others - jnp.clip(sticking, -friction, friction)) > 0
+        sticks = ~(ahead | back)
+        push = jnp.where(
+            ahead, friction, jnp.where(back, -friction, joints.friction_impedance[i] * joints.friction_reference[i])
+        )
+        push = (
+            push - others + jnp.where(held, joints.side[i] * joints.limit_impedance[i] * joints.limit_reference[i], 0.0)
+        )
+        free, stuck = (jnp.where(held, inverse[k, 1][i], inverse[k, 0][i]) for k in (0, 1))
+        return push * jnp.where(sticks, stuck, free)
+
+    def sweep(qacc: list[Array], _: None) -> tuple[list[Array], None]:
+        qacc = list(qacc)
+        for i in range(n):
+            qacc[i] = joint(i, qacc)
+        return qacc, None
+
+    found, _ = jax.lax.scan(sweep, [qacc[i] for i in range(n)], None, length=SWEEPS)
+    return jnp.stack(found)
+
+
+def solve(
+    mass: Array, smooth: Array, rows: Rows, start: Array, iterations: int, line_search: int
+) -> tuple[Array, Array]:
+    """Acceleration [n] and the force of each row [r], for a mass matrix [n, n] and the sum of all other forces [n], by
+    so many Newton steps from `start`, each with so many steps of line search."""
+
+    def iterate(qacc: Array, _: None) -> tuple[Array, None]:
+        unbounded = rows.impedance * (rows.reference - rows.jacobian @ qacc)
+        force = jnp.clip(unbounded, rows.low, rows.high)
+        free = (unbounded > rows.low) & (unbounded < rows.high)
+        rest = mass @ qacc - smooth
+        weighted = jnp.where(free, rows.impedance, 0.0)[:, None] * rows.jacobian
+        hessian = mass + rows.jacobian.T @ weighted
+        search = solve_positive(hessian, rows.jacobian.T @ force - rest)
+        return qacc + _line_search(mass, rows, unbounded, rest, search, line_search) * search, None
+
+    qacc, _ = jax.lax.scan(iterate, start, None, length=iterations)
+    return qacc, jnp.clip(rows.impedance * (rows.reference - rows.jacobian @ qacc), rows.low, rows.high)
+
+
+def _line_search(mass: Array, rows: Rows, unbounded: Array, rest: Array, search: Array, iterations: int) -> Array:
+    """How far to go along `search`: the root of the cost's slope, which grows piecewise linearly, by Newton's method
+    within a bracket."""
+    along = rows.jacobian @ search
+    fall = rows.impedance * along
+    slope_0, slope_1 = search @ rest, search @ (mass @ search)
+
+    def iterate(state: tuple[Array, Array, Array], _: None) -> tuple[tuple[Array, Array, Array], None]:
+        step, low, high = state
+        at = unbounded - step * fall
+        slope = slope_0 + step * slope_1 - along @ jnp.clip(at, rows.low, rows.high)
+        growth = slope_1 + along @ jnp.where((at > rows.low) & (at < rows.high), fall, 0.0)
+        low, high = jnp.where(slope < 0, step, low), jnp.where(slope < 0, high, step)
+        step = step - slope / jnp.maximum(growth, 1e-20)
+        inside = (step >= low) & (step <= high)
+        return (jnp.where(inside, step, jnp.where(high < jnp.inf, (low + high) / 2, 2 * low)), low, high), None
+
+    whole, none = jnp.float32(1.0), jnp.float32(0.0)
+    start = (whole, none, jnp.float32(jnp.inf))
+    (step, _, _), _ = jax.lax.scan(iterate, start, None, length=iterations, unroll=True)
+    return step
+
+
+def solve_positive(matrix: Array, right: Array) -> Array:
+    """x with matrix @ x = right, for a symmetric positive definite matrix [n, n]."""
+    return cho_solve((jax.lax.linalg.cholesky(matrix, symmetrize_input=False), True), right)
