@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from surgical_marl.arm import Arm
 
 VISUAL_GROUP, COLLISION_GROUP = 2, 3
-SOLREF = (0.01, 1.0)
-"""Time constant in s and damping ratio of joint stops and contacts: as stiff as a physics step of 5 ms lets them be."""
+SOLREF = (0.005, 1.0)
+"""Time constant in s and damping ratio of joint stops and contacts: as stiff as a physics step of 2.5 ms lets them be."""
 DEFAULT_RGBA = (0.7, 0.7, 0.72, 1.0)
 
 

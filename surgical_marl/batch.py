@@ -18,6 +18,7 @@ from gymnasium import spaces
 from surgical_marl.engines.choose import ENGINES, make_engine
 from surgical_marl.env import Env
 from surgical_marl.physics import Contacts
+from surgical_marl.scene import DECIMATION
 
 ARRAYS = ("numpy", "torch", "jax")
 
@@ -48,7 +49,7 @@ class BatchedEnv:
     """N environments of one task on one scene.
 
     Args:
-        task, scene, control, max_steps: as for `surgical_marl.env.Env`.
+        task, scene, control, max_steps, decimation: as for `surgical_marl.env.Env`.
         num_envs: how many environments.
         engine: "fused", "mjx" (the reference), or "auto" for the fastest that works.
         device: "cpu", "cuda" or "auto".
@@ -69,6 +70,7 @@ class BatchedEnv:
         engine: str = "auto",
         device: str = "auto",
         max_steps: int | None = None,
+        decimation: int = DECIMATION,
         arrays: str = "numpy",
     ) -> None:
         if isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1:
@@ -77,7 +79,7 @@ class BatchedEnv:
             raise ValueError(f"unknown engine {engine!r}; the engines are {', '.join(ENGINES)}")
         if arrays not in ARRAYS:
             raise ValueError(f"unknown arrays {arrays!r}; the libraries are {', '.join(ARRAYS)}")
-        self.env = Env(task, scene, control, max_steps)
+        self.env = Env(task, scene, control, max_steps, decimation)
         self.engine = make_engine(self.env, num_envs, engine, device)
         self.num_envs, self.arrays = num_envs, arrays
         self.agents = list(self.env.agents)

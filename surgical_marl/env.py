@@ -70,18 +70,26 @@ class Env:
         control: how actions drive the joints: "position" moves position targets, "velocity" and "torque" command
             those. Actions are in [-1, 1]; 1 is the joint's `speed`, or its effort limit for torque.
         max_steps: control steps until truncation; the task's own number if None.
+        decimation: physics steps a control step.
 
     Raises:
         ValueError: naming what is unknown or out of range.
     """
 
     def __init__(
-        self, task: str = "reach", scene: str = "bimanual_psm", control: str = "position", max_steps: int | None = None
+        self,
+        task: str = "reach",
+        scene: str = "bimanual_psm",
+        control: str = "position",
+        max_steps: int | None = None,
+        decimation: int = DECIMATION,
     ) -> None:
         if task not in list_tasks():
             raise unknown("task", task, list_tasks())
         if max_steps is not None and (isinstance(max_steps, bool) or not isinstance(max_steps, int) or max_steps < 1):
             raise ValueError(f"max_steps must be a whole number of at least 1, not {max_steps!r}")
+        if isinstance(decimation, bool) or not isinstance(decimation, int) or decimation < 1:
+            raise ValueError(f"decimation must be a whole number of at least 1, not {decimation!r}")
         from importlib import import_module
 
         prepare_jax()
@@ -90,14 +98,14 @@ class Env:
         self.task = import_module(f"surgical_marl.tasks.{task}").Task(self.scene)
         self.max_steps = max_steps or self.task.max_steps
         self.agents = self.scene.agents
-        self.control_dt = DECIMATION * self.scene.model.opt.timestep
+        self.decimation, self.control_dt = decimation, decimation * self.scene.model.opt.timestep
         self._bounds = {agent: self.task.bounds(agent) for agent in self.agents}
 
     @cached_property
     def simulator(self) -> Simulator:
         """The physics, set up when first needed, even while JAX traces a step."""
         with jax.ensure_compile_time_eval():
-            return Simulator(self.scene)
+            return Simulator(self.scene, self.decimation)
 
     def num_actions(self, agent: str) -> int:
         """Length of an agent's action: one number a joint, the jaw's open (> 0) or closed command last in joint

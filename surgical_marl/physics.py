@@ -70,9 +70,10 @@ class ArmView(NamedTuple):
 
 
 class Simulator:
-    """MJX on one scene. `home` is the physics that every episode starts with, `home_views` what tasks see there."""
+    """MJX on one scene, `decimation` physics steps a control step. `home` is the physics that every episode starts with,
+    `home_views` what tasks see there."""
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: Scene, decimation: int = DECIMATION) -> None:
         prepare_jax()
         from mujoco import mjx
 
@@ -82,7 +83,7 @@ class Simulator:
         smooth.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT  # that is for `collision.py`
         self._model, self._data = mjx.put_model(smooth), mjx.make_data(smooth)
         self._dt = np.float32(scene.model.opt.timestep)
-        self.control_dt = DECIMATION * scene.model.opt.timestep
+        self.decimation, self.control_dt = decimation, decimation * scene.model.opt.timestep
         self._index_joints()
         self._index_pairs()
         start = scene.home[self._address]
@@ -130,7 +131,7 @@ class Simulator:
 
         none = jnp.zeros(self._pairs.count, jnp.float32)
         start = physics, none, none
-        (physics, nearest, strongest), _ = jax.lax.scan(substep, start, None, length=DECIMATION)
+        (physics, nearest, strongest), _ = jax.lax.scan(substep, start, None, length=self.decimation)
         tips, distance = self._look(physics.qpos)
         contacts = Contacts(distance, -jnp.minimum(nearest, distance), strongest)
         return physics, contacts, self._view(jnp, physics, tips, contacts)

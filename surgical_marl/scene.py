@@ -25,9 +25,9 @@ from surgical_marl.contacts import Capsule, capsule_distance, collision_geoms, c
 from surgical_marl.content import find
 from surgical_marl.yaml_file import check_keys, read_yaml
 
-TIMESTEP = 0.005
+TIMESTEP = 0.0025
 """Physics step in s. docs/physics.md has the stability test that chose it."""
-DECIMATION = 4
+DECIMATION = 8
 """Physics steps a control step: control at 50 Hz."""
 
 

@@ -86,7 +86,7 @@ def load_source(env: Env, vector: bool) -> Source:
         Unsupported: the environment can't be traced.
     """
     versions = {name: version(name) for name in ("jax", "mujoco", "mujoco-mjx")}
-    settings = f"{env.task_name} {env.scene.control} {env.max_steps} vector={vector} {versions}"
+    settings = f"{env.task_name} {env.scene.control} {env.max_steps} {env.decimation} vector={vector} {versions}"
 
     def compute() -> np.ndarray:
         return np.frombuffer(json.dumps(asdict(make_source(env, vector)), default=np.ndarray.tolist).encode(), np.uint8)
