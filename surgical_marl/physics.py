@@ -23,7 +23,7 @@ from surgical_marl.runtime import prepare_jax
 from surgical_marl.scene import DECIMATION, Scene
 from surgical_marl.solver import JointRows, Rows, relax, solve, solve_positive
 
-ARM_ITERATIONS, TOUCHING_ITERATIONS = (1, 2), (4, 4)
+ARM_ITERATIONS, TOUCHING_ITERATIONS = (1, 1), (5, 4)
 """Newton steps, and line search steps in each, for an arm that touches nothing and for arms that touch: what it takes to
 solve limits, friction and contacts nearly as well as C MuJoCo, which goes on until they are: docs/physics.md compares."""
 
