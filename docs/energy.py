@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from surgical_marl import list_scenes, load_scene
-from surgical_marl.scene import Scene
+from surgical_marl.scene import TIMESTEP, Scene
 
 
 def energy_drift(scene: Scene, seconds: float = 2.0, timestep: float | None = None) -> tuple[np.ndarray, np.ndarray]:
@@ -47,7 +47,8 @@ def main() -> None:
     for name in list_scenes():
         time, drift = energy_drift(load_scene(name))
         axis.plot(time, 100 * drift, label=f"{name}: at most {100 * np.abs(drift).max():.2f} %")
-    axis.set(xlabel="time (s)", ylabel="change of kinetic energy (%)", title="coasting, physics step 5 ms")
+    title = f"coasting, physics step {1000 * TIMESTEP:g} ms"
+    axis.set(xlabel="time (s)", ylabel="change of kinetic energy (%)", title=title)
     axis.legend()
     path = Path(__file__).with_suffix(".png")
     figure.savefig(path, dpi=110)

@@ -1,4 +1,4 @@
-"""How many solver iterations MJX needs: one physics step from states in contact, against C MuJoCo's converged one.
+"""How many solver iterations a physics step needs: one step of `Simulator`, against C MuJoCo's converged one.
 
 Run: python docs/solver.py
 """
@@ -9,15 +9,20 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from jax import Array
 
-from surgical_marl import load_scene, physics
+from surgical_marl import load_scene, physics, solver
 from surgical_marl.physics import Physics, Simulator
 from surgical_marl.scene import DECIMATION, Scene
 
 STEPS, SAMPLES = 5000, 2000
+SETTINGS = ((2, 4), (3, 4), (4, 4), (5, 4), (6, 4), (10, 20))
+"""Newton steps and line search steps, for arms that touch."""
+ALONE, SWEEPS = ((0, 0), (1, 1), (2, 2), (4, 4)), (0, 3, 6, 9)
+"""The same for an arm that touches nothing, and sweeps before them."""
 
 
-def states_in_contact(scene: Scene) -> tuple[list[Physics], np.ndarray, np.ndarray]:
+def states_in_contact(scene: Scene) -> tuple[Physics, np.ndarray, np.ndarray]:
     """States of two arms driven into each other, and C MuJoCo's next velocity [S, nv] and contact forces [S, P]."""
     model, data, rng = scene.model, mujoco.MjData(scene.model), np.random.default_rng(0)
     pairs = zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)
@@ -43,29 +48,85 @@ def states_in_contact(scene: Scene) -> tuple[list[Physics], np.ndarray, np.ndarr
                 velocities.append(data.qvel.copy())
                 forces.append(force)
     picked = rng.choice(len(before), min(SAMPLES, len(before)), replace=False)
-    return [before[i] for i in picked], np.array(velocities)[picked], np.array(forces)[picked]
+    return _batch([before[i] for i in picked]), np.array(velocities)[picked], np.array(forces)[picked]
+
+
+def random_states(scene: Scene) -> tuple[Physics, np.ndarray]:
+    """States of arms that touch nothing: anywhere, a third of the joints past a limit, a third at rest, any command,
+    and no acceleration to start from; and C MuJoCo's next velocity [S, nv]."""
+    model, rng = scene.model, np.random.default_rng(0)
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+    low, high = model.jnt_range.T
+    before, velocities = [], []
+    for _ in range(SAMPLES):
+        data = mujoco.MjData(model)
+        past = np.where(rng.random(model.nv) < 0.5, low - 0.005 * (high - low), high + 0.005 * (high - low))
+        data.qpos[:] = np.where(rng.random(model.nv) < 1 / 3, past, rng.uniform(low, high))
+        data.qvel[:] = rng.uniform(-0.5, 0.5, model.nv) * _speeds(scene) * (rng.random(model.nv) > 1 / 3)
+        data.ctrl[:] = rng.uniform(*model.actuator_ctrlrange.T)
+        before.append(Physics(*(np.array(a) for a in (data.qpos, data.qvel, data.qacc_warmstart, data.ctrl))))
+        mujoco.mj_step(model, data)
+        velocities.append(data.qvel.copy())
+    return _batch(before), np.array(velocities)
+
+
+def _batch(states: list[Physics]) -> Physics:
+    return Physics(*(jnp.asarray(np.stack(part), jnp.float32) for part in zip(*states, strict=True)))
+
+
+def _speeds(scene: Scene) -> np.ndarray:
+    """Velocity limit of every joint, [nv]."""
+    return np.concatenate([[joint.velocity for joint in m.arm.joints] for m in scene.mounts.values()])
+
+
+def step(scene: Scene, states: Physics) -> tuple[np.ndarray, np.ndarray]:
+    """Velocity [S, nv] and contact forces [S, P] of one physics step here."""
+    simulator = Simulator(scene)
+
+    def one(now: Physics) -> tuple[Array, Array]:
+        after, force = simulator._step(now, simulator._look(now.qpos)[1])
+        return after.qvel, force
+
+    velocity, force = jax.jit(jax.vmap(one))(states)
+    return np.asarray(velocity), np.asarray(force)
+
+
+def shares(off: np.ndarray) -> str:
+    return f"{np.percentile(off, 99):.2%} | {off.max():.2%}"
+
+
+def touching() -> None:
+    scene = load_scene("bimanual_psm")
+    states, velocities, forces = states_in_contact(scene)
+    print("| iterations | line search | velocity off: 99 % | worst | largest force off: 99 % | worst |")
+    print("|---|---|---|---|---|---|")
+    for setting in SETTINGS:
+        physics.TOUCHING_ITERATIONS = setting
+        velocity, force = step(scene, states)
+        off = (np.abs(velocity - velocities) / _speeds(scene)).max(1)
+        force_off = np.abs(force - forces).max(1) / np.maximum(forces.max(1), 1.0)
+        print(f"| {setting[0]} | {setting[1]} | {shares(off)} | {shares(force_off)} |")
+
+
+def alone() -> None:
+    print("| arm | sweeps | iterations | line search | velocity off: 99 % | worst | more than 1 % |")
+    print("|---|---|---|---|---|---|---|")
+    for name in ("psm", "star", "ecm"):
+        scene = load_scene(name)
+        states, velocities = random_states(scene)
+        for solver.SWEEPS in SWEEPS:
+            for physics.ARM_ITERATIONS in ALONE:
+                velocity, _ = step(scene, states)
+                off = (np.abs(velocity - velocities) / _speeds(scene)).max(1)
+                iterations, line_search = physics.ARM_ITERATIONS
+                row = f"| {name} | {solver.SWEEPS} | {iterations} | {line_search} |"
+                print(row, f"{shares(off)} | {(off > 0.01).mean():.2%} |")
 
 
 def main() -> None:
-    scene = load_scene("bimanual_psm")
-    limits = np.concatenate([[joint.velocity for joint in m.arm.joints] for m in scene.mounts.values()])
-    states, velocities, forces = states_in_contact(scene)
-    batch = Physics(*(jnp.asarray(np.stack(part), jnp.float32) for part in zip(*states, strict=True)))
-    print("| iterations | line search | velocity off: 99 % | worst | largest force off: 99 % | worst |")
-    print("|---|---|---|---|---|---|")
-    for iterations, line_search in ((1, 4), (2, 4), (3, 4), (4, 4), (3, 8), (10, 20)):
-        physics.SOLVER_ITERATIONS, physics.LINE_SEARCH_ITERATIONS = iterations, line_search
-        simulator = Simulator(scene)
-
-        def step(now: Physics, simulator: Simulator = simulator) -> tuple[jax.Array, jax.Array]:
-            data = simulator._forward(simulator._data.replace(**now._asdict()))
-            return simulator._integrate(data).qvel, simulator._forces(data)
-
-        velocity, force = jax.jit(jax.vmap(step))(batch)
-        off = (np.abs(velocity - velocities) / limits).max(1)
-        force_off = np.abs(force - forces).max(1) / np.maximum(forces.max(1), 1.0)
-        shares = [np.percentile(off, 99), off.max(), np.percentile(force_off, 99), force_off.max()]
-        print(f"| {iterations} | {line_search} | " + " | ".join(f"{share:.2%}" for share in shares) + " |")
+    touching()
+    print()
+    alone()
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ import numpy as np
 
 from surgical_marl import load_scene
 from surgical_marl.arm import Joint
+from surgical_marl.scene import TIMESTEP
 
 SHARE = 0.5
 """Of the step that takes full effort: below it the law is linear."""
@@ -99,7 +100,7 @@ def main() -> None:
         for name, answer, way in zip(linear.joints, answers.T, ways.T, strict=True):
             if name == joint.name:
                 axis.plot(fine, answer, "k--", label=f"{source}: {natural:.0f} rad/s, {damping:.2f}")
-                axis.plot(time, way, color="#1b7a8c", label="simulated, 5 ms")
+                axis.plot(time, way, color="#1b7a8c", label=f"simulated, {1000 * TIMESTEP:g} ms")
             elif "roll" not in (name, joint.name):
                 axis.plot(fine, answer, "k:")
                 axis.plot(time, way, color="#c8792b", label=f"meanwhile {name}")

@@ -1,15 +1,17 @@
-"""The command `surgical-marl`: train, eval, list, check, export, doctor."""
+"""The command `surgical-marl`: train, eval, list, check, export, bench, doctor."""
 
 from __future__ import annotations
 
 # Only light imports up here: `list` and a typing error should answer at once. What needs torch or
 # JAX is imported by the command that needs it.
 import argparse
+import contextlib
 import json
 import os
 import sys
+import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -23,6 +25,8 @@ _LISTS = {
 }
 
 _CONTROL = ("position", "velocity", "torque")
+_DEVICES = ("auto", "cpu", "cuda")
+_BENCHED = ("all", "fused", "mjx", "mujoco")
 
 # Flags of `train` that are short for `key=value`: key, good values or a placeholder, help.
 _SETTINGS: tuple[tuple[str, str | tuple[str, ...], str], ...] = (
@@ -30,8 +34,8 @@ _SETTINGS: tuple[tuple[str, str | tuple[str, ...], str], ...] = (
     ("num_envs", "N", "environments that run side by side"),
     ("iterations", "K", "rounds of acting and learning"),
     ("seed", "S", "seed of everything random"),
-    ("engine", ("auto", "mjx"), "what runs the physics"),
-    ("device", ("auto", "cpu", "cuda"), "where it runs"),
+    ("engine", ("auto", "fused", "mjx"), "what runs the physics"),
+    ("device", _DEVICES, "where it runs"),
     ("control", _CONTROL, "what an action commands"),
 )
 
@@ -84,7 +88,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(prog="surgical-marl", description="Surgical robot arms that learn together.")
     parser.add_argument("--version", action="version", version=f"%(prog)s {_version()}")
-    commands = parser.add_subparsers(required=True, metavar="{train,eval,list,check,export,doctor}")
+    commands = parser.add_subparsers(required=True, metavar="{train,eval,list,check,export,bench,doctor}")
 
     train = commands.add_parser(
         "train",
@@ -125,6 +129,20 @@ def _parser() -> argparse.ArgumentParser:
     export.add_argument("--out", type=Path, metavar="FILE", help="default: <scene>.xml in the current folder")
     export.add_argument("--control", type=_one_of(_CONTROL), default=_CONTROL[0], metavar="|".join(_CONTROL))
     export.set_defaults(command=_export, name="export")
+
+    bench = commands.add_parser("bench", help="measure how fast this machine simulates")
+    bench.add_argument("kind", type=_one_of(("sim",)), metavar="sim")
+    bench.add_argument("--task", default="reach", help=f"one of: {', '.join(list_tasks())}")
+    bench.add_argument("--scene", default="psm", help="a name (see `list scenes`) or a .yaml file")
+    bench.add_argument("--num-envs", type=_whole(1), metavar="N", help="default: 4096 on a CPU, 131072 on a GPU")
+    bench.add_argument("--engine", type=_one_of(_BENCHED), default="all", metavar="|".join(_BENCHED))
+    bench.add_argument("--device", type=_one_of(_DEVICES), default="auto", metavar="|".join(_DEVICES))
+    bench.add_argument("--decimation", type=_whole(1), default=1, metavar="K", help="physics steps an environment step")
+    bench.add_argument("--sweep", action="store_true", help="from 1 to 4 million environments, as far as memory goes")
+    bench.add_argument("--cold", action="store_true", help="start without caches, for compile_s")
+    bench.add_argument("--json", action="store_true", help="one JSON object instead of a table")
+    bench.add_argument("--out", type=Path, metavar="FILE.png", help="picture of a sweep")
+    bench.set_defaults(command=_bench, name="bench")
 
     doctor = commands.add_parser("doctor", help="check this machine and this installation")
     doctor.set_defaults(command=_doctor, name="doctor")
@@ -174,6 +192,36 @@ def _export(arguments: argparse.Namespace) -> None:
     except OSError as error:
         raise ValueError(f"cannot write {out}: {error.strerror}") from None
     print(out)
+
+
+def _bench(arguments: argparse.Namespace) -> None:
+    if arguments.task not in list_tasks():
+        raise unknown("task", arguments.task, list_tasks())
+    find("scenes", arguments.scene)
+    if arguments.sweep and arguments.num_envs:
+        raise ValueError(f"--sweep takes every number of environments: leave --num-envs {arguments.num_envs} out")
+    if arguments.out and not arguments.sweep:
+        raise ValueError(f"--out {arguments.out} is for the picture of a sweep: add --sweep")
+    if arguments.out and not (arguments.out.suffix == ".png" and arguments.out.parent.is_dir()):
+        raise ValueError(f"cannot write {arguments.out}: name a .png file in a folder that exists")
+    if arguments.engine == "mujoco" and arguments.device == "cuda":
+        raise ValueError("engine 'mujoco' has no device 'cuda': it runs on a CPU")
+    with _no_caches() if arguments.cold else contextlib.nullcontext():
+        from surgical_marl.bench.report import run
+
+        engines = _BENCHED[1:] if arguments.engine == "all" else (arguments.engine,)
+        keys = ("task", "scene", "num_envs", "device", "decimation")
+        print(run({k: getattr(arguments, k) for k in keys}, engines, arguments.sweep, arguments.json, arguments.out))
+
+
+@contextlib.contextmanager
+def _no_caches() -> Iterator[None]:
+    """Compilers find their caches empty, and what they leave there is gone afterwards."""
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ["XDG_CACHE_HOME"] = folder
+        for name in ("WARP_CACHE_PATH", "JAX_COMPILATION_CACHE_DIR"):
+            os.environ.pop(name, None)
+        yield
 
 
 def _doctor(arguments: argparse.Namespace) -> None:

@@ -10,6 +10,7 @@ import io
 import os
 import sys
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -68,6 +69,35 @@ def prepare_jax() -> None:
     _import_mjx_quietly()
 
 
+@functools.cache
+def prepare_warp() -> Any:
+    """Imports Warp, and starts it without its banner and without a warning that there is no GPU."""
+    import warp
+
+    warp.config.log_level = max(warp.config.log_level, warp.LOG_WARNING)
+    with contextlib.nullcontext() if _has_gpu() else _silence():
+        warp.init()
+    return warp
+
+
+def _has_gpu() -> bool:
+    return Path("/dev/nvidiactl").exists()
+
+
+@contextlib.contextmanager
+def _silence() -> Iterator[None]:
+    """Nothing on stderr, not even from compiled code."""
+    sys.stderr.flush()
+    kept = os.dup(2)
+    with open(os.devnull, "w") as nowhere:
+        os.dup2(nowhere.fileno(), 2)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+
+
 def _set_option(name: str, value: Any) -> None:
     """Set a JAX option by its environment variable and, where JAX is imported, in its config."""
     if os.environ.get(name.upper()):
@@ -89,16 +119,14 @@ def _on_cpu() -> bool:
 def _import_mjx_quietly() -> None:
     """`import mujoco.mjx` prints two lines to stdout without Warp, and a banner with it. Warp needs an NVIDIA GPU and
     takes a second to import: without one MJX does not get to see it."""
-    hidden = "warp" not in sys.modules and not Path("/dev/nvidiactl").exists()
+    hidden = "warp" not in sys.modules and not _has_gpu()
     if hidden:
         sys.modules["warp"] = None  # type: ignore[assignment]
     try:
         with contextlib.redirect_stdout(io.StringIO()):
             if not hidden and importlib.util.find_spec("warp"):
                 with contextlib.suppress(ImportError, RuntimeError):
-                    import warp
-
-                    warp.config.log_level = warp.LOG_WARNING
+                    prepare_warp()
             import mujoco.mjx  # noqa: F401
     finally:
         if hidden:

@@ -216,7 +216,7 @@ def set_physics(spec: mujoco.MjSpec) -> None:
     """The physics options of every scene."""
     option = spec.option
     option.timestep = TIMESTEP
-    # Implicit in velocity: the stiff wrist controllers stay stable at 5 ms. docs/physics.md compares.
+    # Implicit in velocity: the stiff wrist controllers stay stable even at 5 ms. docs/physics.md compares.
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
     # dVRK arms are balanced by counterweights (identified gravity torque under 0.4 N m), so gravity is off.

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from surgical_marl import load_arm
 from surgical_marl.arm import Arm
+from surgical_marl.scene import TIMESTEP, set_physics
 
 HALF = np.pi / 2
 # dVRK ECM.json, modified (Craig) convention: alpha, a, theta offset, d, slides
@@ -18,7 +19,6 @@ DH = [(HALF, 0, HALF, 0, 0), (-HALF, 0, -HALF, 0, 0), (HALF, 0, 0, -0.3822, 1), 
 TOOL = np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]])
 # dVRK mtsIntuitiveResearchKitECM.cpp: degrees about x of the tip frame
 SCOPES = {"ecm": 0.0, "ecm_30_up": -30.0, "ecm_30_down": 30.0}
-STEP = 0.005
 
 
 def published_tip(q: np.ndarray, degrees: float) -> np.ndarray:
@@ -39,11 +39,9 @@ def configurations(arm: Arm, count: int) -> np.ndarray:
 
 
 def state(arm: Arm, q: np.ndarray) -> tuple[mujoco.MjModel, mujoco.MjData]:
-    """A MuJoCo model of the arm at q."""
+    """A MuJoCo model of the arm at q, under the physics of a scene."""
     spec = arm.spec()
-    spec.option.timestep = STEP
-    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    spec.option.gravity = [0, 0, 0]
+    set_physics(spec)
     model = spec.compile()
     data = mujoco.MjData(model)
     data.qpos[:] = q
@@ -146,12 +144,12 @@ def test_joints_are_as_stiff_and_as_damped_as_the_readme_says() -> None:
 
 
 def test_step_response_settles_without_ringing() -> None:
-    """From home to a near target at 5 ms: no joint overshoots by more than a tenth, all stop where they should."""
+    """From home to a near target within 2 s: no joint overshoots by more than a tenth, all stop where they should."""
     arm = load_arm("ecm")
     model, data = state(arm, arm.home)
     step = np.array([0.02, 0.02, 0.002, 0.02])
     data.ctrl[:] = arm.home + step
-    path = np.empty((400, 4))
+    path = np.empty((round(2 / TIMESTEP), 4))
     for moment in path:
         mujoco.mj_step(model, data)
         moment[:] = (data.qpos - arm.home) / step

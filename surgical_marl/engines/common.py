@@ -8,11 +8,10 @@ import sys
 from surgical_marl.env import Env
 
 
-def announce(env: Env, num_envs: int, engine: str, device: str) -> None:
+def announce(env: Env, engine: str, device: str) -> None:
     """Says on stderr why nothing happens for a while."""
-    envs = "1 environment" if num_envs == 1 else f"{num_envs} environments"
     print(
-        f"surgical-marl: compiling {env.task_name} on {env.scene.name} for {envs} "
+        f"surgical-marl: compiling {env.task_name} on {env.scene.name} "
         f"({engine}, {device}); a second start takes it from the cache",
         file=sys.stderr,
         flush=True,

@@ -60,7 +60,7 @@ class MjxEngine:
 
     def _begin(self, keys: Array, episodes: Array) -> None:
         if not self._announced:
-            announce(self.env, self.num_envs, self.name, self.device)
+            announce(self.env, self.name, self.device)
             self._announced = True
         with jax.default_device(self._on):
             self._state, self._stepped = self._reset(keys, episodes), False

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import os
 from typing import Any
 
 import numpy as np
-import warp as wp
-
 from surgical_marl.engines.fused.program import Leaf, Source
+from surgical_marl.runtime import prepare_warp
+
+wp = prepare_warp()
 
 _TYPES = {"state": np.float32, "counts": np.int32, "actions": np.float32, "outs": np.float32, "flags": np.uint8}
 
 
 def make_arrays(device: str, source: Source, stride: int, num_envs: int) -> Arrays:
-    """Arrays for a program, zero. ValueError if a GPU has no room for them."""
+    """Arrays for a program, zero. ValueError if there is no room for them."""
     return (CudaArrays if device == "cuda" else CpuArrays)(source, stride, num_envs)
 
 
@@ -22,6 +24,13 @@ class Arrays:
 
     def __init__(self, source: Source, stride: int, num_envs: int) -> None:
         self.num_envs, self.stride = num_envs, stride
+        each = sum(np.dtype(dtype).itemsize * max(source.sizes[name], 1) for name, dtype in _TYPES.items())
+        room = self._room()
+        if room is not None and 2 * each * stride > room:  # what is read is copied
+            raise ValueError(
+                f"num_envs {num_envs} does not fit into memory: one environment takes {2 * each} bytes, so that "
+                f"{room // (2 * each)} fit"
+            )
         self._buffers = {name: self._zeros(max(source.sizes[name], 1), stride, dtype) for name, dtype in _TYPES.items()}
         tables = [self._constant(table) for table in source.tables.values()]
         self.all = [*(self._warp(buffer) for buffer in self._buffers.values()), *(self._warp(t) for t in tables)]
@@ -36,6 +45,11 @@ class CpuArrays(Arrays):
 
     def _zeros(self, fields: int, stride: int, dtype: Any) -> Any:
         return np.zeros((fields, stride), dtype)
+
+    def _room(self) -> int | None:
+        if not hasattr(os, "sysconf") or "SC_AVPHYS_PAGES" not in os.sysconf_names:
+            return None
+        return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
     def _constant(self, table: np.ndarray) -> Any:
         return table
@@ -85,13 +99,12 @@ class CudaArrays(Arrays):
     def _zeros(self, fields: int, stride: int, dtype: Any) -> Any:
         import torch
 
-        try:
-            return torch.zeros((fields, stride), dtype=torch.from_numpy(np.zeros(1, dtype)).dtype, device="cuda")
-        except torch.cuda.OutOfMemoryError:
-            free, _ = torch.cuda.mem_get_info()
-            raise ValueError(
-                f"the GPU has no room for {self.num_envs} environments; some {_fitting(free, fields)} fit"
-            ) from None
+        return torch.zeros((fields, stride), dtype=torch.from_numpy(np.zeros(1, dtype)).dtype, device="cuda")
+
+    def _room(self) -> int | None:
+        import torch
+
+        return int(torch.cuda.mem_get_info()[0])
 
     def _constant(self, table: np.ndarray) -> Any:
         import torch
@@ -139,7 +152,3 @@ class CudaArrays(Arrays):
         import jax
 
         return jax.numpy.asarray(host) if leaf.dtype == "uint32" else jax.dlpack.from_dlpack(array.contiguous())
-
-
-def _fitting(free: int, fields: int) -> int:
-    return free // (4 * fields) // 1024 * 1024

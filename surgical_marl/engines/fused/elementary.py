@@ -1,7 +1,7 @@
-"""Functions made of a graph's operations: sine, cosine, exponential and others, accurate to a few units in the last place.
+"""Functions made of a graph's operations: sine, cosine, exponential and others, right to a few units in the last place.
 
-They cost the same on all devices, need no library, and what two of them have in common is shared: a sine and a cosine of
-one angle reduce it once. Polynomials are those of Cephes (S. L. Moshier, single precision) and of M. Giles,
+They cost the same on all devices, need no library, and what two of them have in common is shared: a sine and a cosine
+of one angle reduce it once. Polynomials are those of Cephes (S. L. Moshier, single precision) and of M. Giles,
 "Approximating the erfinv function", 2010.
 """
 
@@ -59,8 +59,9 @@ def exponential(g: Graph, x: Value) -> Value:
     """e to the x; 0 and infinity beyond what float32 holds."""
     if x < 0:
         return g.constant(np.exp(g.constants[~x]))
-    bounded = g.extreme("max", g.extreme("min", x, _real(g, 88.0)), _real(g, -87.0))
+    bounded = g.extreme("max", g.extreme("min", x, _real(g, 88.72)), _real(g, -87.0))
     power = g.unary("rint", g.mul(_real(g, 1 / np.log(2)), bounded))
+    power = g.extreme("min", power, _real(g, 127.0))  # the largest that a float32's exponent holds
     rest = bounded
     for part in _LOG_2:
         rest = g.sub(rest, g.mul(_real(g, part), power))
@@ -70,6 +71,15 @@ def exponential(g: Graph, x: Value) -> Value:
     value = g.mul(value, scale)
     value = g.select(g.compare("lt", x, _real(g, -87.0)), value, g.zero)
     return g.select(g.compare("gt", x, _real(g, 88.72)), value, _real(g, np.inf))
+
+
+def logarithm_of_more(g: Graph, x: Value) -> Value:
+    """log(1 + x). What 1 + x rounds away of a small x is made up for: W. Kahan's way, as Goldberg, "What every computer
+    scientist should know about floating-point arithmetic", 1991, has it."""
+    more = g.add(g.one, x)
+    kept = g.sub(more, g.one)
+    scaled = g.mul(g.unary("log", more), g.div(x, kept))
+    return g.select(g.compare("eq", kept, g.zero), scaled, x)
 
 
 def inverse_error(g: Graph, x: Value) -> Value:

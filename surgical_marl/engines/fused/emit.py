@@ -1,7 +1,7 @@
 """From a scheduled graph to C that CUDA and Clang both take: one environment a thread, or a vector of them.
 
-`F I U B` are float, int, unsigned and bool: scalars in CUDA, vectors of environments on a CPU, where a branch is taken if
-any of them takes it, and its results are blended. What differs is in two short preludes of macros.
+`F I U B` are float, int, unsigned and bool: scalars in CUDA, vectors of environments on a CPU, where a branch is taken
+if any of them takes it, and its results are blended. What differs is in two short preludes of macros.
 """
 
 from __future__ import annotations
@@ -45,10 +45,30 @@ class Emitter:
         self.offsets = table_offsets(graph)
         self.lines: list[str] = []
         self.names: dict[Value, str] = {}
+        self.active: list[str] = []
+        """Of a vector, the environments that the code is for: those for which all of this holds."""
 
     def body(self) -> str:
+        self._postpone_stores()
         self._region(0, self._store)
         return "\n".join(self.lines)
+
+    def _postpone_stores(self) -> None:
+        """Puts each store after the last load of the same field."""
+        items = self.schedule.regions[0].items
+        last = {field: at for at, item in enumerate(items) for field in self._loads(*item)}
+        places = [
+            max(at, last.get(self.stores[k][:2], 0)) if kind == "result" else at for at, (kind, k) in enumerate(items)
+        ]
+        items[:] = [items[at] for at in sorted(range(len(items)), key=places.__getitem__)]
+
+    def _loads(self, kind: str, index: int) -> Iterator[tuple[str, int]]:
+        if kind == "node" and self.graph.ops[index] == "load":
+            yield self.graph.args[index]
+        elif kind == "group":
+            for region in self.schedule.inside[index]:
+                for item in self.schedule.regions[region].items:
+                    yield from self._loads(*item)
 
     def _region(self, number: int, result: Any) -> None:
         for kind, index in self.schedule.regions[number].items:
@@ -82,17 +102,18 @@ class Emitter:
             return result
 
         self.lines.append(f"if(ANY({condition})){{")
-        with self._hidden(number):
+        with self._side(number, condition):
             self._region(chosen, take(branch.chosen, True))
         self.lines.append(f"}}\nif(ANY(NOT({condition}))){{" if self.vector else "}else{")
-        with self._hidden(number):
+        with self._side(number, f"NOT({condition})"):
             self._region(other, take(branch.others, False))
         self.lines.append("}")
 
     @contextmanager
-    def _hidden(self, number: int) -> Iterator[None]:
+    def _side(self, number: int, condition: str) -> Iterator[None]:
         """Within a side of a large branch, names for values from around it that the compiler takes for new ones. It
         would otherwise compute what both sides need before the branch, and keep it in registers that are not there."""
+        self.active.append(condition)
         names, size = dict(self.names), sum(len(self.schedule.regions[r].items) for r in self.schedule.inside[number])
         if size > LARGE and not self.vector:
             for value in self.schedule.outside[number]:
@@ -102,6 +123,7 @@ class Emitter:
                     self.names[value] = f"h{value}"
         yield
         self.names = names
+        self.active.pop()
 
     def _loop(self, number: int, loop: Loop) -> None:
         wanted = self.schedule.alive[number]
@@ -113,7 +135,7 @@ class Emitter:
         counter = f"r{number}"
         tested = loop.condition is not None
         if tested and self.vector:
-            self.lines.append(f"B m{number}=~SPLATI(0);")
+            self.lines.append(f"B m{number}={'&'.join(self.active) or 'SPLATB(1)'};")
         self.lines.append("for(;;){" if tested else f"for(int {counter}=0;{counter}<{loop.length};++{counter}){{")
 
         def result(k: int) -> None:
@@ -124,7 +146,10 @@ class Emitter:
                     condition = f"m{number}"
                 self.lines.append(f"if(!ANY({condition}))break;")
 
+        active = self.active
+        self.active = [f"m{number}"] if tested else active
         self._region(self.schedule.inside[number][0], result)
+        self.active = active
         for k, phi in zip(wanted, phis, strict=True):
             self.lines.append(f"{TYPES[self.graph.kind(phi)]} n{phi}={self._name(loop.nexts[k])};")
         for phi in phis:

@@ -41,8 +41,7 @@ class FusedEngine:
             raise ValueError("device 'cuda' is not there: Warp finds no CUDA device; the other is cpu")
         self.env, self.num_envs = env, num_envs
         self.device = ("cuda" if has_cuda() else "cpu") if device == "auto" else device
-        announce(env, num_envs, self.name, self.device)
-        self.source: Source = load_source(env, vector=self.device == "cpu")
+        self.source: Source = load_source(env, vector=self.device == "cpu", announce=lambda: announce(env, self.name, self.device))
         self._leaves = flatten(self.source.carry)
         self.carry_shapes = {name: leaf.shape for name, leaf in self._leaves.items()}
         self._stride = -(-num_envs // LANES) * LANES

@@ -1,10 +1,12 @@
 """The scalar program of the fused engine: a graph of values, folded and shared while it is built.
 
-A value is an int. A negative one is a constant, `constants[~value]`; others are nodes: an operation, the values it reads
-and a kind, one of "f" (float32), "i" (int32), "u" (uint32), "b" (bool). Equal nodes are made once. Branches and loops are
-groups: what comes out of them are nodes that name the group. Nodes have no place of their own; `schedule.py` finds it.
+A value is an int. A negative one is a constant, `constants[~value]`; others are nodes: an operation, the values it
+reads and a kind, one of "f" (float32), "i" (int32), "u" (uint32), "b" (bool). Equal nodes are made once. Branches and
+loops are groups: what comes out of them are nodes that name the group. Nodes have no place of their own; `schedule.py`
+finds it.
 
-Algebra is that of finite numbers: 0 * x is 0 even where x might be infinite.
+Algebra is that of finite numbers: 0 * x is 0 even where x might be infinite, zero has no sign, and of NaN only `x != x`
+and `isfinite` tell.
 """
 
 from __future__ import annotations
@@ -44,10 +46,11 @@ class Loop:
     outs: list[Value] = field(default_factory=list)
     condition: Value | None = None
     length: int = 0
+    around: int = 0
+    """The loops that it stands in, as bits."""
 
 
 COMMUTATIVE = {"add", "mul", "min", "max", "and", "or", "xor", "eq", "ne"}
-FLIPPED = {"lt": "ge", "ge": "lt", "gt": "le", "le": "gt", "eq": "ne", "ne": "eq"}
 
 
 def _divide(a: Any, b: Any) -> Any:
@@ -84,6 +87,7 @@ class Graph:
         self.groups: list[Branch | Loop] = []
         self.tables: list[np.ndarray] = []
         self._constant_ids: dict[tuple[str, Any], Value] = {}
+        self._table_numbers: dict[tuple[str, bytes], int] = {}
         self._known: dict[tuple[Any, ...], Value] = {}
         self._scopes: list[dict[tuple[Any, ...], Value]] = []
         self.zero, self.one = self.constant(np.float32(0)), self.constant(np.float32(1))
@@ -94,10 +98,7 @@ class Graph:
     def constant(self, value: Any) -> Value:
         """The constant of a numpy scalar."""
         kind = KINDS[value.dtype.name]
-        if value != value:
-            key = (kind, "nan")
-        else:
-            key = (kind, value.item()) if value != 0 else (kind, 0)  # -0 is 0
+        key = (kind, "nan" if value != value else value.item() if value != 0 else 0)  # -0 is 0
         found = self._constant_ids.get(key)
         if found is None:
             found = self._constant_ids[key] = ~len(self.constants)
@@ -214,7 +215,7 @@ class Graph:
         return self.neg(product) if negative else product
 
     def div(self, a: Value, b: Value) -> Value:
-        if self.kind(a) == "f":
+        if self.kind(a) == "f" and not (a < 0 and b < 0):
             if self.is_constant(a, 0):
                 return a
             if b < 0 and self.constants[~b] != 0:
@@ -223,7 +224,9 @@ class Graph:
         return self.binary("div", a, b)
 
     def compare(self, op: str, a: Value, b: Value) -> Value:
-        if a == b and a >= 0:
+        if self.kind(a) == "b":
+            return self._compare_truths(op, a, b)
+        if a == b and a >= 0 and not (self.kinds[a] == "f" and op in ("eq", "ne")):  # these ask for NaN
             return self.true if op in ("le", "ge", "eq") else self.false
         for x, y, flipped in ((a, b, False), (b, a, True)):
             # a choice between constants, compared with a constant: the choice itself
@@ -232,6 +235,13 @@ class Graph:
                 pick = [self._fold(op, *((y, k) if flipped else (k, y))) for k in (other, chosen)]
                 return self.select(condition, *pick)
         return self.binary(op, a, b)
+
+    def _compare_truths(self, op: str, a: Value, b: Value) -> Value:
+        if op in ("lt", "le"):
+            a, b, op = b, a, "gt" if op == "lt" else "ge"
+        if op == "ne":
+            return self.logic("xor", a, b)
+        return self.logic({"gt": "and", "ge": "or", "eq": "xor"}[op], a, self.invert(b))
 
     def logic(self, op: str, a: Value, b: Value) -> Value:
         if self.kind(a) == "b":
@@ -245,10 +255,9 @@ class Graph:
                     return self.invert(y) if value else y
             if a == b:
                 return self.false if op == "xor" else a
-        elif a < 0 or b < 0:
-            if self.is_constant(a, 0) or self.is_constant(b, 0):
-                other = b if self.is_constant(a, 0) else a
-                return self.constant(DTYPES[self.kind(a)](0)) if op == "and" else other
+        elif self.is_constant(a, 0) or self.is_constant(b, 0):
+            zero, other = (a, b) if self.is_constant(a, 0) else (b, a)
+            return zero if op == "and" else other
         return self.binary(op, a, b)
 
     def invert(self, a: Value) -> Value:
@@ -260,6 +269,8 @@ class Graph:
         """max or min"""
         if a == b:
             return a
+        if self.kind(a) == "b":
+            return self.logic("or" if op == "max" else "and", a, b)
         for x, y in ((a, b), (b, a)):
             if x < 0 and self.kind(x) == "f" and np.isinf(self.constants[~x]):
                 return y if (self.constants[~x] < 0) == (op == "max") else x
@@ -284,16 +295,18 @@ class Graph:
             )
         return self.node("select", condition, other, chosen, kind=kind)
 
-    def lookup(self, table: np.ndarray, index: Value) -> Value:
-        """`table[index]` of a constant float32 or int32 table, [n]; the index must be in range."""
+    def table(self, table: np.ndarray) -> int:
+        """The number of a constant float32 or int32 table, [n]; equal ones are kept once."""
+        number = self._table_numbers.setdefault((table.dtype.name, table.tobytes()), len(self.tables))
+        if number == len(self.tables):
+            self.tables.append(table)
+        return number
+
+    def lookup(self, number: int, index: Value) -> Value:
+        """`tables[number][index]`; the index must be in range."""
+        table = self.tables[number]
         if index < 0:
             return self.constant(table[int(self.constants[~index])])
-        for number, known in enumerate(self.tables):  # noqa: B007
-            if known is table or (known.dtype == table.dtype and np.array_equal(known, table)):
-                break
-        else:
-            number = len(self.tables)
-            self.tables.append(table)
         return self.node("lookup", number, index, kind=KINDS[table.dtype.name])
 
     def dtype(self, value: Value) -> type:

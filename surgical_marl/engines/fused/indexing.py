@@ -6,91 +6,69 @@ is a table of constants, or a choice among the elements it may point to.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import product
 from typing import Any
 
 import numpy as np
 
-from surgical_marl.engines.fused.graph import Graph, Value
+from surgical_marl.engines.fused.graph import KINDS, Graph, Value
+from surgical_marl.engines.fused.scalars import convert
+from surgical_marl.engines.fused.traced import Symbolic, Traced, Unsupported, lift
 
 LEAST_TABLE = 16
 """Constants from this many on are looked up in memory rather than chosen one by one."""
 
+Places = list[np.ndarray]
+"""For each axis of an array, where on it each element of a result comes from."""
 
-def gather(g: Graph, shape: Any, params: Any, raw: Any, known: Any, lift: Callable[..., np.ndarray]) -> np.ndarray:
-    """`lax.gather`; results as values."""
-    operand, indices = raw
+
+def gather(g: Graph, shape: Any, params: Any, operand: Traced, indices: Traced) -> Traced:
+    """`lax.gather`"""
     numbers, sizes = params["dimension_numbers"], params["slice_sizes"]
-    batch_axes = [axis for axis in range(len(shape)) if axis not in numbers.offset_dims]
     grid = np.indices(shape)
-    batch = [grid[axis] for axis in batch_axes]
-    place: list[Any] = [np.zeros(shape, int) for _ in operand.shape]  # within the slice
-    free = [
-        axis
-        for axis in range(operand.ndim)
-        if axis not in numbers.collapsed_slice_dims and axis not in numbers.operand_batching_dims
-    ]
-    for axis, out in zip(free, numbers.offset_dims, strict=True):
-        place[axis] = grid[out]
+    batch = [grid[axis] for axis in range(len(shape)) if axis not in numbers.offset_dims]
+    windows = [grid[axis] for axis in numbers.offset_dims]
+    place = _windows(shape, operand, numbers.collapsed_slice_dims, numbers.operand_batching_dims, windows)
     for axis, start in zip(numbers.operand_batching_dims, numbers.start_indices_batching_dims, strict=True):
         place[axis] = place[axis] + batch[start]
-    starts = {axis: indices[(*batch, k)] for k, axis in enumerate(numbers.start_index_map)}
-    mode = str(params["mode"]).lower()
-    if known[1]:
-        inside = np.ones(shape, bool)
-        for axis, start in starts.items():
-            last = operand.shape[axis] - sizes[axis]
-            inside &= (start >= 0) & (start <= last)
-            place[axis] = place[axis] + np.clip(start.astype(int), 0, last)
-        found = lift(operand[tuple(place)]) if known[0] else operand[tuple(place)]
-        if "fill" in mode and not inside.all():
-            found = np.where(inside, found, _fill(g, params, operand, known[0]))
-        return found
-    return _choose(g, operand, known[0], sizes, place, starts, mode, lift, params)
+    raw = indices.ids if isinstance(indices, Symbolic) else indices
+    starts = {axis: raw[(*batch, k)] for k, axis in enumerate(numbers.start_index_map)}
+    fill = _fill(g, params, operand) if "fill" in str(params["mode"]).lower() else None
+    if isinstance(indices, Symbolic):
+        return _choose(g, operand, sizes, place, starts, fill)
+    inside = np.ones(shape, bool)
+    for axis, start in starts.items():
+        last = operand.shape[axis] - sizes[axis]
+        inside &= (start >= 0) & (start <= last)
+        place[axis] = place[axis] + np.clip(start.astype(int), 0, last)
+    found = _take(operand, place)
+    return found if fill is None or inside.all() else Symbolic(np.where(inside, lift(g, found), fill))
 
 
-def dynamic_slice(
-    g: Graph, shape: Any, params: Any, raw: Any, known: Any, lift: Callable[..., np.ndarray]
-) -> np.ndarray:
-    """`lax.dynamic_slice`; results as values."""
-    operand, starts = raw[0], raw[1:]
-    place = [np.asarray(axis) for axis in np.indices(shape)]
-    if all(known[1:]):
-        for axis, start in enumerate(starts):
-            place[axis] = place[axis] + int(np.clip(int(start), 0, operand.shape[axis] - shape[axis]))
-        found = operand[tuple(place)]
-        return lift(found) if known[0] else found
-    traced = {}
+def dynamic_slice(g: Graph, shape: Any, params: Any, operand: Traced, *starts: Traced) -> Traced:
+    """`lax.dynamic_slice`"""
+    place, moving = list(np.indices(shape)), {}
     for axis, start in enumerate(starts):
-        if known[axis + 1]:
-            place[axis] = place[axis] + int(np.clip(int(start), 0, operand.shape[axis] - shape[axis]))
+        if isinstance(start, Symbolic):
+            moving[axis] = np.broadcast_to(start.ids, shape)
         else:
-            traced[axis] = np.broadcast_to(start, shape)
-    return _choose(g, operand, known[0], shape, place, traced, "clip", lift, params)
+            place[axis] = place[axis] + int(np.clip(int(start), 0, operand.shape[axis] - shape[axis]))
+    return _choose(g, operand, shape, place, moving, None) if moving else _take(operand, place)
 
 
-def dynamic_update_slice(
-    g: Graph, shape: Any, params: Any, raw: Any, known: Any, lift: Callable[..., np.ndarray]
-) -> np.ndarray:
-    """`lax.dynamic_update_slice`; results as values."""
-    operand = lift(raw[0]) if known[0] else raw[0]
-    update = lift(raw[1]) if known[1] else raw[1]
-    out = operand.copy()
-    starts = [
-        _bounded(g, start, operand.shape[axis] - update.shape[axis], lift, known[axis + 2])
-        for axis, start in enumerate(raw[2:])
-    ]
-    ranges = [
-        [int(g.constants[~start])] if start < 0 else range(size - length + 1)
-        for start, size, length in zip(starts, operand.shape, update.shape, strict=True)
-    ]
-    for corner in product(*ranges):
-        here = _all_equal(g, starts, corner)
-        window = tuple(slice(a, a + n) for a, n in zip(corner, update.shape, strict=True))
-        pairs = zip(out[window].ravel().tolist(), update.ravel().tolist(), strict=True)
-        out[window] = np.array([g.select(here, old, new) for old, new in pairs], np.int32).reshape(update.shape)
-    return out
+def dynamic_update_slice(g: Graph, shape: Any, params: Any, operand: Traced, update: Traced, *starts: Traced) -> Traced:
+    """`lax.dynamic_update_slice`"""
+    out, new = lift(g, operand).copy(), lift(g, update)
+    lasts = [size - length for size, length in zip(shape, new.shape, strict=True)]
+    corner = [_bounded(g, int(lift(g, start)), last) for start, last in zip(starts, lasts, strict=True)]
+    for at in _corners(g, corner, lasts):
+        here = _all_equal(g, corner, at)
+        window = tuple(slice(a, a + n) for a, n in zip(at, new.shape, strict=True))
+        pairs = zip(out[window].ravel().tolist(), new.ravel().tolist(), strict=True)
+        out[window] = np.array([g.select(here, *pair) for pair in pairs], np.int32).reshape(new.shape)
+    return Symbolic(out)
 
 
 def scatter(
@@ -98,136 +76,130 @@ def scatter(
     g: Graph,
     shape: Any,
     params: Any,
-    raw: Any,
-    known: Any,
-    lift: Callable[..., np.ndarray],
-) -> np.ndarray:
-    """`lax.scatter` and its kin at known places; results as values."""
-    if not known[1]:
-        from surgical_marl.engines.fused.primitives import Unsupported
-
+    operand: Traced,
+    indices: Traced,
+    updates: Traced,
+) -> Traced:
+    """`lax.scatter` and its kin, at known places. A window that is not all inside is left out, or moved there."""
+    if isinstance(indices, Symbolic):
         raise Unsupported("a scatter to places that are not known while tracing")
-    operand = lift(raw[0]) if known[0] else raw[0]
-    indices = raw[1]
-    updates = lift(raw[2]) if known[2] else raw[2]
-    numbers = params["dimension_numbers"]
-    grid = np.indices(updates.shape)
-    batch = [grid[axis] for axis in range(updates.ndim) if axis not in numbers.update_window_dims]
-    place: list[Any] = [np.zeros(updates.shape, int) for _ in shape]
-    free = [
-        axis
-        for axis in range(len(shape))
-        if axis not in numbers.inserted_window_dims and axis not in numbers.operand_batching_dims
-    ]
-    for axis, window in zip(free, numbers.update_window_dims, strict=True):
-        place[axis] = grid[window]
+    numbers, new = params["dimension_numbers"], lift(g, updates)
+    grid = np.indices(new.shape)
+    batch = [grid[axis] for axis in range(new.ndim) if axis not in numbers.update_window_dims]
+    windows = [grid[axis] for axis in numbers.update_window_dims]
+    place = _windows(new.shape, operand, numbers.inserted_window_dims, numbers.operand_batching_dims, windows)
     for axis, start in zip(numbers.operand_batching_dims, numbers.scatter_indices_batching_dims, strict=True):
         place[axis] = place[axis] + batch[start]
+    inside = np.ones(new.shape, bool)
     for k, axis in enumerate(numbers.scatter_dims_to_operand_dims):
-        place[axis] = place[axis] + indices[(*batch, k)].astype(int)
-    inside = np.ones(updates.shape, bool)
-    for axis, size in zip(place, shape, strict=True):
-        inside &= (axis >= 0) & (axis < size)  # others are dropped
-    flat = operand.ravel().tolist()
-    targets = np.ravel_multi_index([axis[inside] for axis in place], shape) if len(shape) else np.zeros(1, int)
-    for target, update in zip(targets.tolist(), updates[inside].ravel().tolist(), strict=True):
-        flat[target] = combine(g, flat[target], update)
-    return np.array(flat, np.int32).reshape(shape)
+        start, last = indices[(*batch, k)].astype(int), shape[axis] - 1 - place[axis].max(initial=0)
+        if "clip" in str(params["mode"]).lower():
+            start = np.clip(start, 0, last)
+        inside &= (start >= 0) & (start <= last)
+        place[axis] = place[axis] + start
+    out = lift(g, operand).copy()
+    for element in zip(*np.nonzero(inside), strict=True) if new.ndim else [()] * int(inside):
+        target = tuple(axis[element] for axis in place)
+        out[target] = combine(g, int(out[target]), int(new[element]))
+    return Symbolic(out)
+
+
+def _windows(shape: Any, operand: Traced, dropped: Any, batched: Any, windows: Places) -> Places:
+    """Places within the window of each element; its axes are those that are neither dropped nor batched."""
+    kept = [axis for axis in range(len(operand.shape)) if axis not in dropped and axis not in batched]
+    place = [np.zeros(shape, int) for _ in operand.shape]
+    for axis, window in zip(kept, windows, strict=True):
+        place[axis] = window
+    return place
+
+
+def _take(operand: Traced, place: Places) -> Traced:
+    if isinstance(operand, Symbolic):
+        return Symbolic(np.asarray(operand.ids[tuple(place)]))
+    return np.asarray(operand[tuple(place)])
+
+
+# -- at places that are not known
 
 
 def _choose(
-    g: Graph,
-    operand: np.ndarray,
-    constant: bool,
-    sizes: Any,
-    place: list[np.ndarray],
-    starts: dict[int, np.ndarray],
-    mode: str,
-    lift: Callable[..., np.ndarray],
-    params: Any,
-) -> np.ndarray:
-    """Elements of `operand` at `place + starts`, where some starts are nodes."""
-    shape = place[0].shape if place else ()
-    strides = np.cumprod([1, *operand.shape[:0:-1]])[::-1]
-    table = np.ascontiguousarray(operand).ravel() if constant else None
-    ids = None if constant else operand
+    g: Graph, operand: Traced, sizes: Any, place: Places, starts: dict[int, np.ndarray], fill: Value | None
+) -> Symbolic:
+    """Elements of `operand` at `place + starts`. The starts are values; a window, of `sizes`, that is not inside is
+    `fill`, or moved there."""
+    shape, lasts = place[0].shape, {axis: operand.shape[axis] - sizes[axis] for axis in starts}
+    find: Callable[[list[int], dict[int, Value]], Value]
+    if isinstance(operand, np.ndarray) and operand.size >= LEAST_TABLE:
+        find = partial(_look_up, g, operand)
+    else:
+        find = partial(_choose_one, g, lift(g, operand), lasts)
     out = []
     for element in np.ndindex(shape):
-        fixed = [int(axis[element]) for axis in place]
         moving, valid = {}, g.true
         for axis, start in starts.items():
-            last = operand.shape[axis] - sizes[axis]
-            raw = int(start[element])
-            if "fill" in mode:
-                fits = g.logic("and", _at_least(g, raw, 0), g.compare("le", raw, _like(g, raw, last)))
-                valid = g.logic("and", valid, fits)
-            moving[axis] = _bounded(g, raw, last, lift, False)
-        if table is not None and operand.size >= LEAST_TABLE and operand.dtype.name in ("float32", "int32"):
-            flat = g.constant(np.int32(sum(f * s for f, s in zip(fixed, strides, strict=True))))
-            for axis, start in moving.items():
-                step = g.constant(np.int32(strides[axis]))
-                flat = g.add(flat, g.mul(step, g.unary("u2i", start) if g.kind(start) == "u" else start))
-            value = g.lookup(table, flat)
-        else:
-            value = _choose_one(g, operand if ids is None else ids, ids is None, sizes, fixed, moving, lift)
-        if valid != g.true:
-            value = g.select(valid, _fill(g, params, operand, constant), value)
-        out.append(value)
-    return np.array(out, np.int32).reshape(shape)
+            moving[axis] = _bounded(g, int(start[element]), lasts[axis])
+            if fill is not None:
+                valid = g.logic("and", valid, g.compare("eq", int(start[element]), moving[axis]))
+        value = find([int(axis[element]) for axis in place], moving)
+        out.append(value if fill is None else g.select(valid, fill, value))
+    return Symbolic(np.array(out, np.int32).reshape(shape))
+
+
+def _look_up(g: Graph, operand: np.ndarray, fixed: list[int], moving: dict[int, Value]) -> Value:
+    kind, real = KINDS[operand.dtype.name], operand.dtype.kind == "f"
+    number = g.table(operand.ravel() if real else operand.ravel().astype(np.int32))
+    strides = np.cumprod([1, *operand.shape[:0:-1]])[::-1]
+    flat = g.constant(np.int32(np.dot(fixed, strides)))
+    for axis, start in moving.items():
+        flat = g.add(flat, g.mul(g.constant(np.int32(strides[axis])), convert(g, start, "i")))
+    return convert(g, g.lookup(number, flat), kind)
 
 
 def _choose_one(
-    g: Graph, operand: np.ndarray, constant: bool, sizes: Any, fixed: list[int], moving: dict[int, Value], lift: Any
+    g: Graph, ids: np.ndarray, lasts: dict[int, int], fixed: list[int], moving: dict[int, Value]
 ) -> Value:
-    axes = list(moving)
-    ranges = [
-        [int(g.constants[~moving[axis]])] if moving[axis] < 0 else range(operand.shape[axis] - sizes[axis] + 1)
-        for axis in axes
-    ]
-    value: Value | None = None
-    for corner in product(*ranges):
+    axes, value = list(moving), None
+    for corner in _corners(g, list(moving.values()), list(lasts.values())):
         place = list(fixed)
         for axis, start in zip(axes, corner, strict=True):
             place[axis] += start
-        element = operand[tuple(place)]
-        element = int(lift(np.asarray(element))) if constant else int(element)
-        here = _all_equal(g, [moving[axis] for axis in axes], corner)
-        value = element if value is None else g.select(here, value, element)
+        element = int(ids[tuple(place)])
+        value = element if value is None else g.select(_all_equal(g, list(moving.values()), corner), value, element)
     assert value is not None
     return value
 
 
-def _all_equal(g: Graph, starts: list[Value], corner: tuple[int, ...]) -> Value:
+def _corners(g: Graph, starts: Sequence[Value], lasts: Sequence[int]) -> product[tuple[int, ...]]:
+    """All that the starts of a window may be."""
+    return product(
+        *(
+            [int(g.constants[~start])] if start < 0 else range(last + 1)
+            for start, last in zip(starts, lasts, strict=True)
+        )
+    )
+
+
+def _all_equal(g: Graph, starts: Sequence[Value], corner: tuple[int, ...]) -> Value:
     here = g.true
     for start, at in zip(starts, corner, strict=True):
         here = g.logic("and", here, g.compare("eq", start, _like(g, start, at)))
     return here
 
 
-def _bounded(g: Graph, start: Any, last: int, lift: Callable[..., np.ndarray], known: bool) -> Value:
+def _bounded(g: Graph, start: Value, last: int) -> Value:
     """A start moved into 0 ... last."""
-    value = int(lift(start)) if known else int(start)
-    value = value if g.kind(value) == "u" else g.extreme("max", value, _like(g, value, 0))
-    return g.extreme("min", value, _like(g, value, last))
-
-
-def _at_least(g: Graph, value: Value, low: int) -> Value:
-    return g.true if g.kind(value) == "u" else g.compare("ge", value, _like(g, value, low))
+    return g.extreme("min", g.extreme("max", start, _like(g, start, 0)), _like(g, start, last))
 
 
 def _like(g: Graph, value: Value, number: int) -> Value:
     return g.constant(g.dtype(value)(number))
 
 
-def _fill(g: Graph, params: Any, operand: np.ndarray, constant: bool) -> Value:
+def _fill(g: Graph, params: Any, operand: Traced) -> Value:
     """What stands for elements outside."""
+    dtype = np.dtype(g.dtype(int(operand.ids.flat[0])) if isinstance(operand, Symbolic) else operand.dtype)
     given = params.get("fill_value")
-    dtype = operand.dtype.type if constant else (g.dtype(int(operand.flat[0])) if operand.size else np.float32)
-    if given is not None:
-        return g.constant(dtype(given))
-    if np.dtype(dtype).kind == "f":
-        return g.constant(dtype(np.nan))
-    if np.dtype(dtype).kind == "b":
-        return g.true
-    limits = np.iinfo(dtype)
-    return g.constant(dtype(limits.max if np.dtype(dtype).kind == "u" else limits.min))
+    if given is None:
+        limits = np.iinfo(dtype) if dtype.kind in "iu" else None
+        given = {"f": np.nan, "b": True}.get(dtype.kind) if limits is None else limits.min or limits.max
+    return g.constant(dtype.type(given))

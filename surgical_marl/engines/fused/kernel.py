@@ -7,12 +7,19 @@ constants.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
-import warp as wp
-
 from surgical_marl.engines.fused.preludes import CPU, CUDA, LANES, UNDEFINE
+from surgical_marl.files import write_atomic
+from surgical_marl.runtime import cache_dir, prepare_warp
+
+wp = prepare_warp()
 
 BLOCK = 64
 """Threads in a CUDA block."""
@@ -31,8 +38,33 @@ def compile_kernels(bodies: dict[str, str], device: str, max_registers: int | No
     # contraction: a * b + c is one operation, as on a GPU
     module.options.update(enable_backward=False, cpu_compiler_flags="-march=native -ffp-contract=fast")
     made = {name: _make(f"{name}_{digest}", source, module, max_registers) for name, source in sources.items()}
-    module.load(wp.get_device(device), block_dim=BLOCK if device == "cuda" else 1)
+    with _checked(module.name):
+        module.load(wp.get_device(device), block_dim=BLOCK if device == "cuda" else 1)
     return {name: Kernel(kernel, device) for name, kernel in made.items()}
+
+
+@contextmanager
+def _checked(module: str) -> Iterator[None]:
+    """Around the loading of a module: what Warp has of it on disk is removed if it is not what was stored there.
+    Warp itself would load a damaged file, whatever that leads to."""
+    record = cache_dir() / "kernels" / f"{module}.sha256"
+    folders = list(Path(wp.config.kernel_cache_dir).glob(f"wp_{module}_*"))
+    with contextlib.suppress(OSError):
+        if record.read_text() != _digest(folders):
+            for folder in folders:
+                shutil.rmtree(folder, ignore_errors=True)
+    yield
+    with contextlib.suppress(OSError):
+        digest = _digest(list(Path(wp.config.kernel_cache_dir).glob(f"wp_{module}_*")))
+        if not record.exists() or record.read_text() != digest:
+            record.parent.mkdir(parents=True, exist_ok=True)
+            write_atomic(record, lambda path: path.write_text(digest))
+
+
+def _digest(folders: list[Path]) -> str:
+    """Of the compiled files in folders."""
+    files = sorted(file for folder in folders for file in folder.glob("*") if file.suffix in (".o", ".cubin", ".ptx"))
+    return "\n".join(f"{file.name} {hashlib.sha256(file.read_bytes()).hexdigest()}" for file in files)
 
 
 def _make(name: str, source: str, module: Any, max_registers: int | None) -> Any:

@@ -79,7 +79,7 @@ class Source:
 _CODE = ("physics", "solver", "env", "scene", "arm", "arm_spec", "workspace", "tasks/*", "engines/fused/*")
 
 
-def load_source(env: Env, vector: bool) -> Source:
+def load_source(env: Env, vector: bool, announce: Callable[[], None] = lambda: None) -> Source:
     """The source of an environment's kernels: for a CPU, with vectors, or for CUDA. From the cache if it was made before.
 
     Raises:
@@ -89,6 +89,7 @@ def load_source(env: Env, vector: bool) -> Source:
     settings = f"{env.task_name} {env.scene.control} {env.max_steps} {env.decimation} vector={vector} {versions}"
 
     def compute() -> np.ndarray:
+        announce()
         return np.frombuffer(json.dumps(asdict(make_source(env, vector)), default=np.ndarray.tolist).encode(), np.uint8)
 
     found = json.loads(cached("fused", settings, env.scene.fingerprint, compute, _CODE).tobytes())

@@ -1,9 +1,9 @@
 """Where and in what order a graph's values are computed.
 
-A value belongs to the innermost region (the body of a loop, a side of a branch, or the whole program) that holds all its
-uses, moved out of each loop that it does not depend on: Click, "Global code motion, global value numbering", 1995. Within a
-region values are computed depth first from the results, the part that needs more room first (Sethi and Ullman, 1970), so
-that few of them are alive at once.
+A value belongs to the innermost region (the body of a loop, a side of a branch, or the whole program) that holds all
+its uses, moved out of each loop that it does not depend on: Click, "Global code motion, global value numbering", 1995.
+Within a region values are computed depth first from the results, the part that needs more room first (Sethi and Ullman,
+1970), so that few of them are alive at once.
 """
 
 from __future__ import annotations
@@ -115,7 +115,9 @@ class Scheduler:
             if op == "out":
                 number = g.args[value][0]
                 if number not in self.group_loops:
-                    bits = 0
+                    group = g.groups[number]
+                    # a loop that is moved to where it runs for what it was not meant for might never end
+                    bits = group.around if isinstance(group, Loop) and group.condition is not None else 0
                     for read in self._group_reads(number):
                         bits |= self.loops[read]
                     self.group_loops[number] = bits & ~(1 << number)
@@ -147,7 +149,7 @@ class Scheduler:
                 self._use(read, region)
 
     def _place_group(self, number: int) -> None:
-        g, group = self.graph, self.graph.groups[number]
+        group = self.graph.groups[number]
         outs = [group.outs[k] for k in self.alive[number] if group.outs[k] in self.place]
         region = self.place[outs[0]]
         for out in outs[1:]:
@@ -172,7 +174,6 @@ class Scheduler:
                 self.place[group.phis[k]] = inner[0]
         if group.condition is not None:
             self._use(group.condition, region if isinstance(group, Branch) else inner[0])
-        assert g is self.graph
 
     def _use(self, value: Value, region: int) -> None:
         if value >= 0 and self.graph.ops[value] != "phi":
@@ -193,14 +194,7 @@ class Scheduler:
             loop = self.regions[region].loop
             if loop < 0 or loops >> loop & 1:
                 return region
-            if any(loops >> inner & 1 for inner in self._loops_between(region, loop)):
-                return region
             region = self.group_place[loop]
-
-    def _loops_between(self, region: int, loop: int) -> Iterable[int]:
-        while region != self.inside[loop][0]:
-            yield self.regions[region].loop
-            region = self.regions[region].parent
 
     # -- in what order
 

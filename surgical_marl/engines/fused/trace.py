@@ -1,9 +1,9 @@
 """From a JAX function to a `Graph`: its jaxpr is run on arrays of values.
 
-Functions within functions are opened up. A branch (`lax.cond`, `lax.switch`) stays a branch: what it computes it does not
-share with what is around it, so that nothing but its operands has to be kept for it. A loop (`lax.scan` without arrays
-that it reads or writes row by row, `lax.while_loop`) stays a loop, unless it is to be unrolled (`unroll=True`, or one
-round). Other scans are unrolled.
+Functions within functions are opened up. A branch (`lax.cond`, `lax.switch`) stays a branch: what it computes it does
+not share with what is around it, so that nothing but its operands has to be kept for it. A loop (`lax.scan` without
+arrays that it reads or writes row by row, `lax.while_loop`) stays a loop, unless it is to be unrolled (`unroll=True`, or
+one round). Other scans are unrolled.
 """
 
 from __future__ import annotations
@@ -16,7 +16,9 @@ import numpy as np
 from jax.extend import core
 
 from surgical_marl.engines.fused.graph import DTYPES, Branch, Graph, Loop, Value
-from surgical_marl.engines.fused.primitives import Symbolic, Traced, Unsupported, apply, convert, lift, lower
+from surgical_marl.engines.fused.primitives import apply
+from surgical_marl.engines.fused.scalars import convert
+from surgical_marl.engines.fused.traced import Symbolic, Traced, Unsupported, lift, lower
 
 _INSIDE = {
     "jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr", "remat": "jaxpr",
@@ -31,6 +33,7 @@ class Tracer:
 
     def __init__(self, graph: Graph) -> None:
         self.graph = graph
+        self._around = 0  # the loops that are being traced, as bits
 
     def run(self, closed: Any, args: list[Traced]) -> list[Traced]:
         """The results of a closed jaxpr. Unsupported, naming the line of the source, if there is no rule for
@@ -41,19 +44,19 @@ class Tracer:
 
         def read(variable: Any) -> Traced:
             if isinstance(variable, core.Literal):
-                return np.asarray(variable.val, variable.aval.dtype)
+                aval: Any = variable.aval
+                return np.asarray(variable.val, aval.dtype)
             return known[variable]
 
         for equation in jaxpr.eqns:
             try:
                 results = self._equation(equation, [read(variable) for variable in equation.invars])
             except Unsupported as error:
-                if " at " in str(error):
+                if error.place:
                     raise
                 from jax._src import source_info_util
 
-                place = source_info_util.summarize(equation.source_info)
-                raise Unsupported(f"{error} at {place}") from None
+                raise Unsupported(error.what, source_info_util.summarize(equation.source_info)) from None
             known.update(zip(equation.outvars, results, strict=True))
         return [read(variable) for variable in jaxpr.outvars]
 
@@ -69,23 +72,26 @@ class Tracer:
             return self._while(params, xs)
         if name == "platform_index":  # the code for any platform, else the first
             platforms = params["platforms"]
-            return [np.int32(platforms.index(None) if None in platforms else 0)[()]]
+            return [np.asarray(platforms.index(None) if None in platforms else 0, np.int32)]
         if name.startswith("random_"):
             return [self._random(name, equation, xs)]
         avals = [variable.aval for variable in equation.outvars]
         if name in ("sort", "argsort") and not any(isinstance(x, Symbolic) for x in xs):
             found = equation.primitive.bind(*xs, **params)
             return [np.asarray(x) for x in (found if equation.primitive.multiple_results else [found])]
-        if any(jax.dtypes.issubdtype(aval.dtype, jax.dtypes.prng_key) for aval in avals):
-            return self._keys(name, avals, params, xs)
+        if any(map(_is_key, avals)):
+            return self._keys(name, avals, params, xs, [_is_key(variable.aval) for variable in equation.invars])
         return apply(self.graph, name, avals, params, xs)
 
-    def _keys(self, name: str, avals: list[Any], params: Any, xs: list[Traced]) -> list[Traced]:
+    def _keys(self, name: str, avals: list[Any], params: Any, xs: list[Traced], are_keys: list[bool]) -> list[Traced]:
         """Moves random keys, whose words are the last axis of their arrays."""
         raw = [jax.ShapeDtypeStruct(aval.shape, np.uint32) for aval in avals]
-        keys = [lift(self.graph, x) for x in xs]
-        words = range(keys[0].shape[-1])
-        moved = [apply(self.graph, name, raw, params, [Symbolic(key[..., word]) for key in keys]) for word in words]
+        keys = [lift(self.graph, x) for x, is_key in zip(xs, are_keys, strict=True) if is_key]
+        moved = []
+        for word in range(keys[0].shape[-1]):
+            parts = iter([Symbolic(key[..., word]) for key in keys])
+            inputs = [next(parts) if is_key else x for x, is_key in zip(xs, are_keys, strict=True)]
+            moved.append(apply(self.graph, name, raw, params, inputs))
         return [Symbolic(np.stack([lift(self.graph, x) for x in parts], -1)) for parts in zip(*moved, strict=True)]
 
     # -- branches
@@ -189,8 +195,9 @@ class Tracer:
         varying = [False] * len(starts)  # until a round is seen to change it
         while True:
             # unknown while the loop is tried: how many rounds
-            loop, number = Loop([], length=length), len(g.groups)
+            loop, number, around = Loop([], length=length, around=self._around), len(g.groups), self._around
             g.groups.append(loop)
+            self._around |= 1 << number
             values = list(starts)
             for k, start in enumerate(starts):
                 if varying[k]:
@@ -200,6 +207,7 @@ class Tracer:
             arrays = _unflatten(g, values, shapes, dtypes)
             going = condition(arrays) if condition else None
             nexts = [value for x in body(arrays) for value in lift(g, x).ravel().tolist()]
+            self._around = around
             changed = [k for k, value in enumerate(nexts) if not varying[k] and value != values[k]]
             if not changed:
                 break
@@ -245,6 +253,10 @@ class Tracer:
     def _unsigned(self, x: Traced) -> Traced:
         aval = jax.ShapeDtypeStruct(x.shape, np.uint32)
         return apply(self.graph, "convert_element_type", [aval], {"new_dtype": np.uint32}, [x])[0]
+
+
+def _is_key(aval: Any) -> bool:
+    return bool(jax.dtypes.issubdtype(aval.dtype, jax.dtypes.prng_key))
 
 
 def _row(x: Traced, i: int) -> Traced:

@@ -1,0 +1,76 @@
+"""Seconds a step takes: on a CPU by the clock, on a GPU by CUDA's events."""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+Clock = Callable[[int], float]
+"""Seconds that so many steps take."""
+
+SECONDS = 0.5
+"""What a repeat takes at least."""
+REPEATS = 5
+
+
+def race(clocks: dict[str, Clock], seconds: float = SECONDS, repeats: int = REPEATS) -> dict[str, float]:
+    """Seconds a step, by each clock: the best of the repeats, since other work on a machine only ever makes one slower.
+
+    The clocks take turns, so that such work meets all of them alike.
+    """
+    counts, best = {}, dict.fromkeys(clocks, math.inf)
+    for key, clock in clocks.items():
+        clock(1)  # the first steps of anything are slow
+        count, took = 1, clock(1)
+        while took < seconds / 4:
+            count = math.ceil(count * min(8.0, seconds / 2 / max(took, 1e-9)))
+            took = clock(count)
+        counts[key] = math.ceil(count * seconds / max(took, 1e-9))
+    for repeat in range(repeats):
+        for key, clock in clocks.items():
+            best[key] = min(best[key], clock(counts[key]) / counts[key])
+        print(f"surgical-marl: timed {repeat + 1} of {repeats}", file=sys.stderr, flush=True)
+    return best
+
+
+def cpu_clock(step: Callable[[], object], wait: Callable[[], object] = lambda: None) -> Clock:
+    """Times `step`; `wait` returns when all steps so far are done."""
+
+    def seconds(count: int) -> float:
+        start = time.perf_counter()
+        for _ in range(count):
+            step()
+        wait()
+        return time.perf_counter() - start
+
+    return seconds
+
+
+def cuda_clock(step: Callable[[], object], cycle: int) -> Clock:
+    """Times `step` within a CUDA graph of `cycle` steps: without the time that Python takes to launch kernels."""
+    import torch
+
+    stream: Any = torch.cuda.Stream()
+    with torch.cuda.stream(stream):
+        for _ in range(cycle):
+            step()
+    torch.cuda.synchronize()
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph, stream=stream):
+        for _ in range(cycle):
+            step()
+
+    def seconds(count: int) -> float:
+        replays = math.ceil(count / cycle)
+        start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+        start.record()
+        for _ in range(replays):
+            graph.replay()
+        end.record()
+        end.synchronize()
+        return float(start.elapsed_time(end)) / 1e3 * count / (replays * cycle)
+
+    return seconds

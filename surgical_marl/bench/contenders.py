@@ -1,0 +1,139 @@
+"""Engines, ready to be timed."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+from mujoco import rollout
+
+from surgical_marl.batch import BatchedEnv
+from surgical_marl.bench.clock import Clock, cpu_clock, cuda_clock
+from surgical_marl.bench.course import HOLD, LAPS, Course, full_state, tile
+from surgical_marl.bench.physics import PhysicsAlone
+from surgical_marl.bench.workload import Workload
+from surgical_marl.engines.choose import Engine, make_engine
+from surgical_marl.engines.common import cores
+from surgical_marl.scene import load_scene
+
+MOST_ROLLED = 4096
+"""Environments for which C MuJoCo gets memory. It steps one after the other on each core: more make it no faster."""
+
+
+@dataclass(frozen=True)
+class Contender:
+    """Clocks of an engine."""
+
+    num_envs: int
+    device: str
+    compile_s: float
+    """From nothing but imported packages to the end of the first step, s."""
+    physics: Clock
+    env: Clock | None
+    """Of environment steps; C MuJoCo has none."""
+    stride: int = 1
+    """Physics steps that the clock of physics counts as one."""
+    bytes_per_env: int | None = None
+    """Of the arrays that the fused engine's kernel works on."""
+
+
+def prepare(engine: str, workload: Workload, course: Course) -> Contender:
+    """An engine, compiled, on the start of a course.
+
+    Raises:
+        ValueError: the engine can't run here.
+        MemoryError: there is no room for so many environments.
+    """
+    try:
+        return _mujoco(workload, course) if engine == "mujoco" else _batched(engine, workload, course)
+    except (ValueError, RuntimeError) as error:
+        text = str(error)
+        if any(sign in text.lower() for sign in ("no room", "out of memory", "resource_exhausted")):
+            raise MemoryError(f"{engine} has no room for {workload.count} environments") from None
+        raise
+
+
+def _batched(name: str, workload: Workload, course: Course) -> Contender:
+    """One of this package's engines: a `BatchedEnv`, as a user would step it, and its physics alone."""
+    count, cuda = workload.count, workload.where == "cuda"
+    library = "jax" if name == "mjx" else "torch" if cuda else "numpy"
+    give = {"jax": _jax if cuda else np.asarray, "torch": _torch, "numpy": np.asarray}[library]
+    actions = [{agent: give(tile(rows, count)) for agent, rows in lap.items()} for lap in course.actions]
+    commands = [give(tile(rows, count)) for rows in course.commands]
+
+    start = time.perf_counter()
+    batch = BatchedEnv(workload.task, workload.scene, num_envs=count, engine=name, device=workload.where,
+                       decimation=workload.decimation, arrays=library)  # fmt: skip
+    batch.reset(seed=0)
+    batch.step(actions[0])
+    _wait(batch.engine)
+    compile_s = time.perf_counter() - start
+    # or all episodes would end in the same step
+    batch.steps = give(np.random.default_rng(0).integers(0, batch.max_steps, count, dtype=np.int32))
+
+    physics = make_engine(PhysicsAlone(batch.env), count, name, workload.where)
+    physics.reset(0)
+    physics.write(".physics.qpos", give(tile(course.qpos, count)))
+    physics.write(".physics.qvel", give(tile(course.qvel, count)))
+    hold, turns = max(1, HOLD // workload.decimation), (itertools.count(), itertools.count())
+
+    def step_env() -> None:
+        batch.step(actions[next(turns[0]) // hold % LAPS])
+
+    def step_physics() -> None:
+        turn = next(turns[1])
+        if turn % HOLD == 0:
+            physics.write(".physics.ctrl", commands[turn // HOLD % LAPS])
+        physics.step({})
+
+    step_physics()  # compiles
+    _wait(physics)
+    if cuda and name == "fused":
+        clocks = cuda_clock(step_physics, HOLD * LAPS), cuda_clock(step_env, hold * LAPS)
+    else:
+        clocks = cpu_clock(step_physics, lambda: _wait(physics)), cpu_clock(step_env, lambda: _wait(batch.engine))
+    return Contender(count, workload.where, compile_s, *clocks, bytes_per_env=_bytes_per_env(batch.engine))
+
+
+def _mujoco(workload: Workload, course: Course) -> Contender:
+    """C MuJoCo's own way to step many: `mujoco.rollout`, with a thread on every core."""
+    count, threads = min(workload.count, MOST_ROLLED), cores()
+    state = full_state(tile(course.qpos, count), tile(course.qvel, count))
+    control = tile(course.commands.astype(float).repeat(HOLD, 0).swapaxes(0, 1), count)
+    start = time.perf_counter()
+    model = load_scene(workload.scene).model
+    data, pool = [mujoco.MjData(model) for _ in range(threads)], rollout.Rollout(nthread=threads)
+    pool.rollout(model, data, state[:1], control[:1, :1])
+    compile_s = time.perf_counter() - start
+    out = np.empty((count, HOLD * LAPS, state.shape[1]))
+
+    def lap() -> None:
+        pool.rollout(model, data, state, control, state=out)
+
+    return Contender(count, "cpu", compile_s, cpu_clock(lap), None, stride=HOLD * LAPS)
+
+
+def _wait(engine: Engine) -> None:
+    engine.read(".physics.qpos", "numpy")
+
+
+def _torch(values: np.ndarray) -> Any:
+    import torch
+
+    return torch.from_numpy(values).cuda()
+
+
+def _jax(values: np.ndarray) -> Any:
+    import jax
+
+    return jax.numpy.asarray(values)
+
+
+def _bytes_per_env(engine: Any) -> int | None:
+    if engine.name != "fused":
+        return None
+    return sum(fields * (1 if name == "flags" else 4) for name, fields in engine.source.sizes.items())

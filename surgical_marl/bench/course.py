@@ -1,0 +1,88 @@
+"""What the arms do while they are timed."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+from mujoco import rollout
+
+from surgical_marl.physics import Simulator
+from surgical_marl.scene import DECIMATION, Scene
+
+HOLD = DECIMATION
+"""Physics steps for which an action is held: a control step of training, whatever is timed."""
+LAPS = 4
+"""Actions after which a course begins again. The last half takes back what the first did, so nothing drifts away."""
+DISTINCT = 256
+"""Environments that differ; more of them repeat these, fewer are the first of these."""
+_AWAY = 25  # control steps before the start, half a second
+
+
+class Course(NamedTuple):
+    """Random actions, and where they lead, for n = DISTINCT environments."""
+
+    qpos: np.ndarray
+    """[n, nq], in the middle of a motion; `qvel` [n, nv] beside it."""
+    qvel: np.ndarray
+    commands: np.ndarray
+    """What the actions command, [LAPS, n, nu]."""
+    actions: list[dict[str, np.ndarray]]
+    """Agent -> [n, its actions], LAPS of them."""
+    touching: float
+    """Share of the environments in which something touches at the start, from 0 to 1."""
+
+
+def make_course(scene: Scene, seed: int = 0) -> Course:
+    """Every environment heads half a second for a side of its own, then to and fro. C MuJoCo moves the arms, so that
+    the states are no engine's own."""
+    import jax
+
+    rng, n = np.random.default_rng(seed), DISTINCT
+    simulator, model = Simulator(scene, HOLD), scene.model
+    command = jax.jit(jax.vmap(simulator.command))
+
+    def draw() -> dict[str, np.ndarray]:
+        return {a: rng.uniform(-1, 1, (n, len(m.arm.actuated))).astype(np.float32) for a, m in scene.mounts.items()}
+
+    away, half = draw(), [draw() for _ in range(LAPS // 2)]
+    actions = [*half, *({agent: -action for agent, action in drawn.items()} for drawn in half[::-1])]
+    now = jax.tree.map(lambda x: np.repeat(np.asarray(x)[None], n, 0), simulator.home)
+    for _ in range(_AWAY):
+        now = _roll(model, command(now, away))
+    start, commands = now, []
+    for action in actions:
+        now = command(now, action)
+        commands.append(np.asarray(now.ctrl))
+        now = _roll(model, now)
+    qpos, qvel = np.asarray(start.qpos), np.asarray(start.qvel)
+    return Course(qpos, qvel, np.array(commands), actions, _touching(model, qpos))
+
+
+def tile(values: np.ndarray, num_envs: int) -> np.ndarray:
+    """Rows over and over: [n, ...] -> [num_envs, ...]."""
+    return np.ascontiguousarray(values[np.arange(num_envs) % len(values)])
+
+
+def full_state(qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
+    """C MuJoCo's state [n, 1 + nq + nv], at time 0."""
+    return np.concatenate([np.zeros((len(qpos), 1)), qpos, qvel], 1)
+
+
+def _roll(model: Any, now: Any) -> Any:
+    """HOLD physics steps of C MuJoCo."""
+    state = full_state(now.qpos, now.qvel)
+    data = mujoco.MjData(model)
+    found, _ = rollout.rollout(model, data, state, np.asarray(now.ctrl, float)[:, None], nstep=HOLD)
+    end = np.asarray(found[:, -1], np.float32)
+    return now._replace(qpos=end[:, 1 : 1 + model.nq], qvel=end[:, 1 + model.nq :])
+
+
+def _touching(model: Any, qpos: np.ndarray) -> float:
+    data, count = mujoco.MjData(model), 0
+    for posture in qpos:
+        data.qpos[:] = posture
+        mujoco.mj_fwdPosition(model, data)
+        count += data.ncon > 0
+    return count / len(qpos)

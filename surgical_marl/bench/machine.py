@@ -1,0 +1,57 @@
+"""What this machine is called, and its memory. Where a system does not tell, nothing is used and all is free."""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import math
+import platform
+import sys
+from pathlib import Path
+from typing import Any
+
+from surgical_marl.engines.common import cores
+
+
+def machine() -> dict[str, Any]:
+    """`cpu`, `threads` and `gpu`, None without one, by name."""
+    names = _values("/proc/cpuinfo", "model name")
+    return {"cpu": names[0] if names else platform.processor() or platform.machine(), "threads": cores(), "gpu": _gpu()}
+
+
+def restart_peak() -> float:
+    """Forgets the most that this process ever had; returns what it has now, bytes."""
+    gc.collect()
+    if "torch" in sys.modules and sys.modules["torch"].cuda.is_available():
+        sys.modules["torch"].cuda.empty_cache()
+    with contextlib.suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")
+    return peak()
+
+
+def peak() -> float:
+    """The most that this process had since then, bytes."""
+    return _bytes("/proc/self/status", "VmHWM", 0.0)
+
+
+def free() -> float:
+    """What this machine has left, bytes."""
+    return _bytes("/proc/meminfo", "MemAvailable", math.inf)
+
+
+def _gpu() -> str | None:
+    import torch
+
+    return str(torch.cuda.get_device_name(0)) if torch.cuda.is_available() else None
+
+
+def _bytes(file: str, name: str, otherwise: float) -> float:
+    return next((1024.0 * int(value.split()[0]) for value in _values(file, name)), otherwise)
+
+
+def _values(file: str, name: str) -> list[str]:
+    """Of the lines `name: value`."""
+    with contextlib.suppress(OSError):
+        lines = [line.split(":", 1) for line in Path(file).read_text().splitlines() if ":" in line]
+        return [value.strip() for key, value in lines if key.strip() == name]
+    return []

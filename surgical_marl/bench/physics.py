@@ -1,0 +1,47 @@
+"""A physics step and nothing else, as an environment, so that any engine can run it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax.numpy as jnp
+from jax import Array
+
+from surgical_marl.env import Carry, Env, State
+from surgical_marl.physics import Contacts, Physics
+
+
+class PhysicsAlone(Env):
+    """A step takes a state and gives the next one and the distances of all pairs that can touch. No agent, no reward,
+    no reset; commands are set by `engine.write(".physics.ctrl", ...)`."""
+
+    def __init__(self, env: Env) -> None:
+        vars(self).update(vars(env))
+        self.simulator = env.simulator
+        self.task_name, self.agents, self.decimation = "physics alone", (), 1
+
+    def reset(self, key: Array, episode: Array | int = 0) -> State:
+        """At home."""
+        carry = Carry(self.simulator.home, (), key, jnp.int32(episode), jnp.int32(0))
+        return self._state(carry, carry.physics, self.simulator.home_contacts.distance)
+
+    def step(self, carry: Carry, actions: dict[str, Array]) -> State:
+        """One physics step; there are no actions."""
+        _, distance = self.simulator._look(carry.physics.qpos)
+        physics, _ = self.simulator._step(carry.physics, distance)
+        return self._state(carry, physics, distance)
+
+    def _state(self, carry: Carry, physics: Physics, distance: Array) -> State:
+        nothing: Any = {}
+        return State(
+            carry=carry._replace(physics=physics),
+            observations=nothing,
+            state=nothing,
+            rewards=nothing,
+            terminated=nothing,
+            truncated=nothing,
+            final_observations=nothing,
+            final_state=nothing,
+            infos=nothing,
+            contacts=Contacts(distance, nothing, nothing),
+        )

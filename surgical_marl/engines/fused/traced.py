@@ -1,0 +1,71 @@
+"""The arrays that a function is traced with: known ones, and ones whose elements are values of a graph."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from surgical_marl.engines.fused.graph import KINDS, Graph, Value
+
+
+class Symbolic:
+    """An array whose elements are values of a graph: `ids` int32 of its shape."""
+
+    __slots__ = ("ids",)
+
+    def __init__(self, ids: np.ndarray) -> None:
+        self.ids = ids
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return self.ids.shape
+
+
+Traced = np.ndarray | Symbolic
+"""A numpy array if all its elements are known."""
+
+Rule = Callable[..., Traced | list[Traced]]
+"""What a primitive does: rule(graph, shape of the result, parameters, *operands)."""
+
+
+class Unsupported(ValueError):
+    """The function uses what the fused engine has no kernel code for, at `place` in the source."""
+
+    def __init__(self, what: str, place: str = "") -> None:
+        super().__init__(f"{what} at {place}" if place else what)
+        self.what, self.place = what, place
+
+
+def kind_of(dtype: Any) -> str:
+    """The kind of values of a dtype. Unsupported if there is none."""
+    name = np.dtype(dtype).name
+    if name not in KINDS:
+        raise Unsupported(f"arrays of {name}")
+    return KINDS[name]
+
+
+def lift(graph: Graph, array: Traced) -> np.ndarray:
+    """The values of a traced array, known or not."""
+    if isinstance(array, Symbolic):
+        return array.ids
+    array = np.asarray(array)
+    kind_of(array.dtype)
+    flat = [graph.constant(element) for element in array.ravel()]
+    return np.array(flat, np.int32).reshape(array.shape)
+
+
+def lower(graph: Graph, ids: np.ndarray, dtype: Any) -> Traced:
+    """A numpy array if all values are constants."""
+    if ids.size and ids.max() >= 0:
+        return Symbolic(ids)
+    flat = [graph.constants[~i] for i in ids.ravel().tolist()]
+    return np.array(flat, np.dtype(dtype)).reshape(ids.shape)
+
+
+def each(function: Callable[..., Value], g: Graph, shape: tuple[int, ...], *arrays: Traced) -> Symbolic:
+    """`function(graph, *values)` of the elements, which are broadcast to `shape`."""
+    columns = [np.broadcast_to(lift(g, array), shape).ravel().tolist() for array in arrays]
+    flat = [function(g, *elements) for elements in zip(*columns, strict=True)]
+    return Symbolic(np.array(flat, np.int32).reshape(shape))

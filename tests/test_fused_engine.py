@@ -1,0 +1,212 @@
+"""The fused engine against the MJX engine: the same step, one kernel instead of some hundred."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from surgical_marl.arm import CONTROL_MODES
+from surgical_marl.batch import BatchedEnv
+from surgical_marl.content import list_scenes, list_tasks
+from surgical_marl.engines.choose import make_engine
+from surgical_marl.engines.fused.engine import FusedEngine, flatten
+from surgical_marl.engines.mjx import MjxEngine
+from surgical_marl.env import Env
+
+STATES = 1024
+TOLERANCE = 1e-5
+ULPS = 10
+"""How many times what a change of the state by one unit in the last place makes, where that is more."""
+
+# MJX takes a minute to compile for some: `make test` takes each scene and each mode once, `pytest -m slow` the rest
+ALL = [(task, scene, control) for task in list_tasks() for scene in list_scenes() for control in CONTROL_MODES]
+QUICK = [*((scene, "position") for scene in list_scenes()), ("psm", "velocity"), ("star", "torque")]
+CASES = [case if case[1:] in QUICK else pytest.param(*case, marks=pytest.mark.slow) for case in ALL]
+
+
+def random_state(env: Env, seed: int = 0) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Parts of the carry and actions: joints up to 5 % of their range beyond their limits, some arms in each other,
+    any speed and command, time-outs among them."""
+    model, rng = env.scene.model, np.random.default_rng(seed)
+    low, high = model.jnt_range.T
+    slack = 0.05 * (high - low)
+    fastest = np.concatenate([[joint.velocity for joint in m.arm.joints] for m in env.scene.mounts.values()])
+    carry = {
+        ".physics.qpos": rng.uniform(low - slack, high + slack, (STATES, model.nq)),
+        ".physics.qvel": rng.uniform(-fastest, fastest, (STATES, model.nv)),
+        ".physics.qacc_warmstart": rng.normal(0, 10, (STATES, model.nv)),
+        ".physics.ctrl": rng.uniform(*model.actuator_ctrlrange.T, (STATES, model.nu)),
+        ".episode": rng.integers(0, 1000, STATES),
+        ".steps": rng.integers(0, env.max_steps, STATES),
+    }
+    actions = {agent: rng.uniform(-1, 1, (STATES, env.num_actions(agent))) for agent in env.agents}
+    single = lambda x: x.astype(np.int32 if x.dtype.kind == "i" else np.float32)  # noqa: E731
+    return {name: single(x) for name, x in carry.items()}, {agent: single(x) for agent, x in actions.items()}
+
+
+def play(engine: Any, carry: dict[str, np.ndarray], actions: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """All that a step from these states leads to, by name."""
+    engine.reset(3)
+    for name, value in carry.items():
+        engine.write(name, value)
+    engine.step(actions)
+    found = flatten(engine.outcome("numpy")) | {name: engine.read(name, "numpy") for name in engine.carry_shapes}
+    return {name: np.array(value).reshape(STATES, -1) for name, value in found.items()}
+
+
+def off(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """The largest difference of each environment, as a share of the largest value of each column."""
+    scale = np.maximum(np.abs(np.where(np.isfinite(one), one, 0)).max(0, initial=0), 1e-6)
+    with np.errstate(invalid="ignore"):
+        return np.where(one == other, 0, np.abs(one - other) / scale).max(1, initial=0)
+
+
+@pytest.mark.parametrize(("task", "scene", "control"), CASES)
+def test_a_step_is_the_mjx_engines(task: str, scene: str, control: str) -> None:
+    """Numbers to 1e-5 of their scale; flags, counters and random goals exactly. Overlapping arms are stiff, and so are
+    violated limits: where the state's last digit alone makes more of a difference, the engines may differ so too."""
+    env = Env(task, scene, control, decimation=1)
+    carry, actions = random_state(env)
+    mjx = MjxEngine(env, STATES, "cpu")
+    expected, found = play(mjx, carry, actions), play(FusedEngine(env, STATES, "cpu"), carry, actions)
+    qpos = carry[".physics.qpos"]
+    moved = [play(mjx, carry | {".physics.qpos": np.nextafter(qpos, np.float32(way))}, actions) for way in (-9, 9)]
+    assert expected.keys() == found.keys()
+    touching = expected[".contacts.penetration"].max(1, initial=0) > 0
+    if len(env.agents) > 1:
+        assert touching.sum() >= 5
+    for name, value in expected.items():
+        if value.dtype.kind == "f":
+            worst = off(value, found[name])
+            allowed = np.maximum(TOLERANCE, ULPS * np.maximum(*(off(value, other[name]) for other in moved)))
+            assert (worst <= allowed).mean() >= 1 - 2 / STATES, (name, np.sort(worst / allowed)[-5:])
+            if name.startswith(".physics"):
+                assert np.percentile(worst[~touching], 99.8) < TOLERANCE, name
+        else:
+            np.testing.assert_array_equal(value, found[name], name)
+    assert found[".truncated"].any() and not found[".truncated"].all()
+
+
+@pytest.mark.parametrize("scene", ["psm", pytest.param("bimanual_psm", marks=pytest.mark.slow)])
+def test_episodes_stay_as_near_as_a_changed_last_digit(scene: str) -> None:
+    """Over 200 control steps the engines part no more than MJX parts from itself when the first state changes by one
+    unit in the last place: the median and the 99th percentile of environments, at the end and at the worst moment."""
+    env, rng, count = Env("reach", scene, max_steps=1000), np.random.default_rng(0), 128
+    engines = [MjxEngine(env, count, "cpu"), MjxEngine(env, count, "cpu"), FusedEngine(env, count, "cpu")]
+    for engine in engines:
+        engine.reset(0)
+    qpos = engines[0].read(".physics.qpos", "numpy")
+    engines[1].write(".physics.qpos", np.nextafter(qpos, np.float32(9)))
+    apart = np.zeros((2, 200, count))
+    hold = {agent: np.zeros((count, env.num_actions(agent)), np.float32) for agent in env.agents}
+    for step in range(200):
+        if step % 10 == 0:
+            hold = {agent: rng.uniform(-1, 1, action.shape).astype(np.float32) for agent, action in hold.items()}
+        for engine in engines:
+            engine.step(hold)
+        first, *others = (engine.read(".physics.qpos", "numpy") for engine in engines)
+        apart[:, step] = [np.abs(other - first).max(1) for other in others]
+    for share in (50, 99):
+        itself, fused = (np.percentile(apart[k].max(0), share) for k in (0, 1))
+        assert fused <= 10 * itself + 1e-6, (share, itself, fused)
+    assert apart[1].max() < 1e-2
+
+
+def test_an_environment_does_not_depend_on_the_others() -> None:
+    """Whatever their number: neither on the vector it is in, nor on the thread."""
+    env = Env("reach", "psm")
+    rng = np.random.default_rng(0)
+    actions = [rng.uniform(-1, 1, (100, 7)).astype(np.float32) for _ in range(5)]
+    found = []
+    for count in (100, 3):
+        engine = FusedEngine(env, count, "cpu")
+        engine.reset(0)
+        for action in actions:
+            engine.step({"psm_0": action[:count]})
+        found.append(engine.read(".physics.qpos", "numpy")[:3])
+    np.testing.assert_array_equal(*found)
+
+
+def test_what_was_read_stays() -> None:
+    """Arrays of one step are not overwritten by the next."""
+    for arrays in ("numpy", "torch", "jax"):
+        env = BatchedEnv("reach", "psm", num_envs=3, arrays=arrays, engine="fused")
+        env.reset(seed=0)
+        action = {"psm_0": np.ones((3, 7), np.float32)}
+        step = env.step(action)
+        before = np.asarray(step.observations["psm_0"]).copy()
+        env.step(action)
+        np.testing.assert_array_equal(before, np.asarray(step.observations["psm_0"]))
+
+
+def unsupported(monkeypatch: pytest.MonkeyPatch) -> Env:
+    env = Env("reach", "ecm")
+    terminated = env.task.terminated
+    monkeypatch.setattr(
+        env.task,
+        "terminated",
+        lambda views, goal: terminated(views, goal) | (jax.lax.sort(goal[0])[0] > 9),
+        raising=True,
+    )
+    return env
+
+
+def test_what_it_cannot_take_is_named(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """With the line that uses it; `auto` then runs MJX, and says so."""
+    monkeypatch.setattr("surgical_marl.engines.fused.program.cached", lambda *args, **_: args[3]())
+    env = unsupported(monkeypatch)
+    with pytest.raises(ValueError, match=r"engine 'fused' can't run reach on ecm: .*sort.*test_fused_engine\.py:\d+"):
+        make_engine(env, 1, "fused", "cpu")
+    assert make_engine(env, 1, "auto", "cpu").name == "mjx"
+    assert "engine mjx instead of fused: reach on ecm uses" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"num_envs": 10**11}, r"num_envs 100000000000 does not fit into memory: .* so that \d+ fit"),
+        ({"device": "tpu"}, "unknown device 'tpu'"),
+        ({"decimation": 0}, "decimation must be a whole number of at least 1, not 0"),
+    ],
+)
+def test_bad_input(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        BatchedEnv("reach", "psm", engine="fused", **options)
+
+
+START = """
+from surgical_marl.batch import BatchedEnv
+env = BatchedEnv("reach", "psm", num_envs=2, engine="fused", device="cpu")
+print(float(env.reset(seed=0)[1].sum()))
+"""
+
+
+def test_caches_may_be_shared_and_damaged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two processes that start at once, then one that finds every file of the caches cut short: all agree."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setenv("WARP_CACHE_PATH", str(tmp_path / "warp"))
+
+    def start() -> subprocess.Popen[str]:
+        return subprocess.Popen(
+            [sys.executable, "-c", START], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+
+    def finish(process: subprocess.Popen[str]) -> tuple[str, str]:
+        out, err = process.communicate()
+        assert process.returncode == 0, err
+        return out, err
+
+    first = [finish(process) for process in [start(), start()]]
+    again = finish(start())
+    assert "compiling" in first[0][1] and "compiling" not in again[1]
+    damaged = [*(tmp_path / "warp").rglob("*.o"), *(tmp_path / "cache" / "surgical-marl" / "fused").glob("*.npz")]
+    assert len(damaged) == 2
+    for file in damaged:
+        file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    assert {out for out, _ in (*first, again, finish(start()))} == {again[0]}
