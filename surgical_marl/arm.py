@@ -9,7 +9,6 @@ Every number of a shipped arm and its source stands in `arms/<name>/README.md`.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -19,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from surgical_marl.content import find
+from surgical_marl.drive import Cable, Drive, read_cables, read_drives
 from surgical_marl.urdf import MOVING, Faults, read_urdf, resolve_meshes, urdf_faults
 from surgical_marl.yaml_file import build, check_keys, read_yaml
 
@@ -28,30 +28,6 @@ if TYPE_CHECKING:
 
 CONTROL_MODES = ("position", "velocity", "torque")
 KEYS = ("description", "urdf", "tool_tip", "remote_center", "camera", "joints", "cables", "jaw")
-
-
-@dataclass(frozen=True)
-class Drive:
-    """How one joint is driven. SI units: N m/rad, N m s/rad, kg m2, rad/s, rad (or N/m, N s/m, kg, m/s, m)."""
-
-    stiffness: float
-    damping: float
-    speed: float
-    armature: float = 0.0
-    home: float = 0.0
-
-
-@dataclass(frozen=True)
-class Cable:
-    """A cable that several joints wind up. Its own drive acts on its length, the sum of coefficient times position of
-    its joints, beside the drives of the joints. Units as of a `Drive`, per unit of that length."""
-
-    joints: dict[str, float]
-    """Coefficient of each joint."""
-    stiffness: float
-    damping: float
-    effort: float
-    armature: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -246,19 +222,19 @@ def load_arm(name: str | Path) -> Arm:
     path = _urdf_path(folder, settings.get("urdf"))
     robot = read_urdf(path)
     faults += urdf_faults(robot, path) + resolve_meshes(robot, path, folder)
-    drives = _read_drives(robot, settings.get("joints") or {}, where, keep)
+    leaders = [joint.name for joint in robot.joints if joint.type in MOVING and not joint.mimic]
+    drives = read_drives(settings.get("joints") or {}, leaders, where, keep)
     camera, jaw = (
         None if settings.get(key) is None else keep(build, cls, settings[key], where)
         for key, cls in (("camera", Camera), ("jaw", Jaw))
     )
     pulled = [name for name in drives if jaw is None or name != jaw.joint]
-    cables = _read_cables(settings.get("cables") or [], pulled, where, keep)
+    cables = read_cables(settings.get("cables") or [], pulled, where, keep)
     links = [link.name for link in robot.links]
     named = {key: settings.get(key) for key in ("tool_tip", "remote_center")} | {"camera": camera and camera.link}
     for key, link in named.items():
         if link not in links and (key == "tool_tip" or link is not None):
             faults.append(f"{where}: {key} {link!r} is not a link of the URDF ({', '.join(links)})")
-    leaders = [joint.name for joint in robot.joints if joint.type in MOVING and not joint.mimic]
     if jaw is not None and jaw.joint not in leaders:
         faults.append(f"{where}: jaw joint {jaw.joint!r} is not one of {', '.join(leaders)}")
     if not leaders:
@@ -286,49 +262,6 @@ def _urdf_path(folder: Path, name: Any) -> Path:
     if not path.resolve().is_relative_to(folder.resolve()):
         raise ValueError(f"{folder / 'arm.yaml'}: urdf {name!r} leaves the arm's folder; copy it into the folder")
     return path
-
-
-def _read_drives(robot: yourdf.Robot, drives: Any, where: Path, keep: Callable[..., Any]) -> dict[str, Drive]:
-    """The drive of every joint that mimics none; what is wrong is kept."""
-    if not isinstance(drives, dict):
-        raise ValueError(f"{where}: joints must be a mapping from joint name to drive")
-    leaders = [joint.name for joint in robot.joints if joint.type in MOVING and not joint.mimic]
-    keep(check_keys, drives, tuple(leaders), f"{where}, joints")
-    return {name: keep(_drive, drives.get(name, {}), f"{where}, joint {name!r}") for name in leaders}
-
-
-def _drive(mapping: Any, where: str) -> Drive:
-    drive: Drive = build(Drive, mapping, where)
-    _check_signs(drive, "speed", where)
-    return drive
-
-
-def _check_signs(drive: Drive | Cable, positive: str, where: str) -> None:
-    for key in ("stiffness", "damping", "armature"):
-        if getattr(drive, key) < 0:
-            raise ValueError(f"{where}: {key} must be 0 or more, not {getattr(drive, key):g}")
-    if not getattr(drive, positive) > 0:
-        raise ValueError(f"{where}: {positive} must be above 0, not {getattr(drive, positive):g}")
-
-
-def _read_cables(cables: Any, joints: list[str], where: Path, keep: Callable[..., Any]) -> tuple[Cable, ...]:
-    """The cables, which may wind on `joints`; what is wrong is kept."""
-    if not isinstance(cables, list):
-        raise ValueError(f"{where}: cables must be a list, not {cables!r}")
-    return tuple(keep(_cable, cable, joints, f"{where}, cable {number}") for number, cable in enumerate(cables))
-
-
-def _cable(mapping: Any, joints: list[str], where: str) -> Cable:
-    cable: Cable = build(Cable, mapping, where)
-    if not isinstance(cable.joints, dict) or len(cable.joints) < 2:
-        raise ValueError(f"{where}: joints must map two joints or more to coefficients, not {cable.joints!r}")
-    for name, value in cable.joints.items():
-        if name not in joints:  # a jaw is told where to be in every mode, so no cable pulls it
-            raise ValueError(f"{where}: joint {name!r} is not one of {', '.join(joints)}")
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or value == 0:
-            raise ValueError(f"{where}: the coefficient of {name!r} must be a finite number but 0, not {value!r}")
-    _check_signs(cable, "effort", where)
-    return cable
 
 
 def _joint(joint: yourdf.Joint, drives: dict[str, Drive]) -> Joint:

@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 import numpy as np
 
-from surgical_marl.arm import CONTROL_MODES, Cable, Drive, Joint
+from surgical_marl.arm import CONTROL_MODES, Joint
+from surgical_marl.drive import Cable, Drive
 from surgical_marl.urdf import read_mesh
 
 if TYPE_CHECKING:
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 
 VISUAL_GROUP, COLLISION_GROUP = 2, 3
 SOLREF = (0.005, 1.0)
-"""Time constant in s and damping ratio of joint stops and contacts: as stiff as a physics step of 2.5 ms lets them be."""
+"""Time constant in s and damping ratio of joint stops and contacts: as stiff as a step of 2.5 ms lets them be."""
 DEFAULT_RGBA = (0.7, 0.7, 0.72, 1.0)
 
 

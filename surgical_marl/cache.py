@@ -33,7 +33,7 @@ def cached(
         settings: all that the result depends on besides the scene.
         fingerprint: the scene's.
         compute: the work. Its array appears on disk whole or not at all; a cache that fails is no error.
-        code: the modules of this package that it comes from, or patterns of them: when one changes, it is computed anew.
+        code: the modules of this package that it comes from, or patterns of them: if one changes, it is computed anew.
     """
     digest = hashlib.sha256("\0".join([kind, settings, _digest(code)]).encode() + fingerprint)
     path = cache_dir() / kind / f"{digest.hexdigest()[:32]}.npz"

@@ -1,7 +1,7 @@
 """Distance and contact of capsules in pure JAX, for the pairs of geoms of a scene that can touch.
 
-All collision geoms are capsules or spheres, so that a pair is two line segments with a radius each: their distance is exact,
-and the same as C MuJoCo's. Few pairs touch at a time: only the `SLOTS` deepest become constraint rows.
+All collision geoms are capsules or spheres, so that a pair is two line segments with a radius each: their distance is
+exact, and the same as C MuJoCo's. Few pairs touch at a time: only the `SLOTS` deepest become constraint rows.
 """
 
 from __future__ import annotations

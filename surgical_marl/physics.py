@@ -24,8 +24,9 @@ from surgical_marl.scene import DECIMATION, Scene
 from surgical_marl.solver import JointRows, Rows, relax, solve, solve_positive
 
 ARM_ITERATIONS, TOUCHING_ITERATIONS = (1, 1), (5, 4)
-"""Newton steps, and line search steps in each, for an arm that touches nothing and for arms that touch: what it takes to
-solve limits, friction and contacts nearly as well as C MuJoCo, which goes on until they are: docs/physics.md compares."""
+"""Newton steps, and line search steps in each, for an arm that touches nothing and for arms that touch: what it takes
+to solve limits, friction and contacts nearly as well as C MuJoCo, which goes on until they are: see docs/physics.md.
+"""
 
 
 class Physics(NamedTuple):
@@ -70,8 +71,8 @@ class ArmView(NamedTuple):
 
 
 class Simulator:
-    """MJX on one scene, `decimation` physics steps a control step. `home` is the physics that every episode starts with,
-    `home_views` what tasks see there."""
+    """MJX on one scene, `decimation` physics steps a control step. `home` is the physics that every episode starts
+    with, `home_views` what tasks see there."""
 
     def __init__(self, scene: Scene, decimation: int = DECIMATION) -> None:
         prepare_jax()
@@ -125,7 +126,7 @@ class Simulator:
 
         def substep(state: tuple[Physics, Array, Array], _: None) -> tuple[tuple[Physics, Array, Array], None]:
             physics, nearest, strongest = state
-            _, distance = self._look(physics.qpos)
+            distance = self._look(physics.qpos)[1]
             physics, force = self._step(physics, distance)
             return (physics, jnp.minimum(nearest, distance), jnp.maximum(strongest, force)), None
 

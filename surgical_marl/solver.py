@@ -1,13 +1,14 @@
 """MuJoCo's constraint problem, solved in a fixed number of steps.
 
 The acceleration of a system with limits, friction and contacts minimises a convex function: half the square of its
-distance to the smooth acceleration in the metric of the mass matrix, plus a piecewise quadratic cost of each constraint row
-(https://mujoco.readthedocs.io/en/stable/computation/index.html#the-optimization-problem). Rows without an elliptic cone
-all have one form: the force is `clip(impedance * (reference - J qacc), low, high)`, with bounds (0, inf) for a limit or a
-contact and (-f, f) for friction f. `solve` is Newton's method with a line search, as in MuJoCo, but it never asks whether
-it has converged, so that many environments take it in step. Where every row concerns one joint alone, `relax` comes first:
-it solves one joint after the other, exactly, and so finds nearly always which rows hold and which slip or are free. Newton's
-method alone goes astray among them: friction and limits are stiff, and a row that changes sides changes the whole step.
+distance to the smooth acceleration in the metric of the mass matrix, plus a piecewise quadratic cost of each constraint
+row (https://mujoco.readthedocs.io/en/stable/computation/index.html#the-optimization-problem). Rows without an elliptic
+cone all have one form: the force is `clip(impedance * (reference - J qacc), low, high)`, with bounds (0, inf) for a
+limit or a contact and (-f, f) for friction f. `solve` is Newton's method with a line search, as in MuJoCo, but it never
+asks whether it has converged, so that many environments take it in step. Where every row concerns one joint alone,
+`relax` comes first: it solves one joint after the other, exactly, and so finds nearly always which rows hold and which
+slip or are free. Newton's method alone goes astray among them: friction and limits are stiff, and a row that changes
+sides changes the whole step.
 """
 
 from __future__ import annotations
@@ -20,8 +21,8 @@ from jax import Array
 from jax.scipy.linalg import cho_solve
 
 RELAXATION = 1.15
-"""How far each joint goes, of the way to the root of its equation: a little beyond it is where coupled joints meet soonest
-(successive over-relaxation, Young, 1950)."""
+"""How far each joint goes, of the way to the root of its equation: a little beyond it is where coupled joints meet
+soonest (successive over-relaxation, Young, 1950)."""
 SWEEPS = 6
 """Rounds of `relax` over all joints of an arm."""
 

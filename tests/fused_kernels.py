@@ -7,7 +7,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import jax
-import numpy as np
 
 from surgical_marl.engines.fused.arrays import make_arrays
 from surgical_marl.engines.fused.emit import Emitter
@@ -24,20 +23,23 @@ def shapes_of(columns: Any) -> Any:
     return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), columns)
 
 
-def make_stores(function: Callable[..., Any], columns: Any) -> tuple[Graph, Stores, Layout, Any, Any]:
-    """A function's graph, what is to be stored where, and the leaves of its arguments and results."""
+def make_stores(
+    function: Callable[..., Any], columns: Any, in_place: bool = False
+) -> tuple[Graph, Stores, Layout, Any, Any]:
+    """A function's graph, what is to be stored where, and the leaves of its arguments and results: if `in_place`, the
+    same ones."""
     layout, graph = Layout(), Graph()
     inputs = layout.place(shapes_of(columns), "state")
     values, shapes = trace(graph, function, inputs)
-    outputs = layout.place(shapes, "outs")
+    outputs = inputs if in_place else layout.place(shapes, "outs")
     pairs = zip(jax.tree.leaves(outputs), values, strict=True)
     stores = [(leaf.buffer, leaf.first + k, value) for leaf, row in pairs for k, value in enumerate(row)]
     return graph, stores, layout, inputs, outputs
 
 
-def run(function: Callable[..., Any], *columns: Any) -> Any:
+def run(function: Callable[..., Any], *columns: Any, in_place: bool = False) -> Any:
     """What a kernel of `function`, which is of one environment's arrays, makes of columns [N, ...]."""
-    graph, stores, layout, inputs, outputs = make_stores(function, columns)
+    graph, stores, layout, inputs, outputs = make_stores(function, columns, in_place)
     kernel = compile_kernels({"run": Emitter(graph, stores, vector=True).body()}, "cpu")["run"]
     count = len(jax.tree.leaves(columns)[0])
     stride = -(-count // LANES) * LANES

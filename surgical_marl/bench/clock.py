@@ -28,7 +28,7 @@ def race(clocks: dict[str, Clock], seconds: float = SECONDS, repeats: int = REPE
         while took < seconds / 4:
             count = math.ceil(count * min(8.0, seconds / 2 / max(took, 1e-9)))
             took = clock(count)
-        counts[key] = math.ceil(count * seconds / max(took, 1e-9))
+        counts[key] = max(1, math.ceil(count * seconds / max(took, 1e-9)))
     for repeat in range(repeats):
         for key, clock in clocks.items():
             best[key] = min(best[key], clock(counts[key]) / counts[key])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,10 +17,12 @@ from surgical_marl.bench.clock import Clock, cpu_clock, cuda_clock
 from surgical_marl.bench.course import HOLD, LAPS, Course, full_state, tile
 from surgical_marl.bench.physics import PhysicsAlone
 from surgical_marl.bench.workload import Workload
+from surgical_marl.content import unknown
 from surgical_marl.engines.choose import Engine, make_engine
 from surgical_marl.engines.common import cores
 from surgical_marl.scene import load_scene
 
+ENGINES = ("fused", "mjx", "mujoco")
 MOST_ROLLED = 4096
 """Environments for which C MuJoCo gets memory. It steps one after the other on each core: more make it no faster."""
 
@@ -45,9 +48,11 @@ def prepare(engine: str, workload: Workload, course: Course) -> Contender:
     """An engine, compiled, on the start of a course.
 
     Raises:
-        ValueError: the engine can't run here.
+        ValueError: an unknown engine, or one that can't run here.
         MemoryError: there is no room for so many environments.
     """
+    if engine not in ENGINES:
+        raise unknown("engine", engine, ENGINES)
     try:
         return _mujoco(workload, course) if engine == "mujoco" else _batched(engine, workload, course)
     except (ValueError, RuntimeError) as error:
@@ -63,7 +68,6 @@ def _batched(name: str, workload: Workload, course: Course) -> Contender:
     library = "jax" if name == "mjx" else "torch" if cuda else "numpy"
     give = {"jax": _jax if cuda else np.asarray, "torch": _torch, "numpy": np.asarray}[library]
     actions = [{agent: give(tile(rows, count)) for agent, rows in lap.items()} for lap in course.actions]
-    commands = [give(tile(rows, count)) for rows in course.commands]
 
     start = time.perf_counter()
     batch = BatchedEnv(workload.task, workload.scene, num_envs=count, engine=name, device=workload.where,
@@ -75,21 +79,16 @@ def _batched(name: str, workload: Workload, course: Course) -> Contender:
     # or all episodes would end in the same step
     batch.steps = give(np.random.default_rng(0).integers(0, batch.max_steps, count, dtype=np.int32))
 
+    hold, turn = max(1, HOLD // workload.decimation), itertools.count()
+
+    def step_env() -> None:
+        batch.step(actions[next(turn) // hold % LAPS])
+
     physics = make_engine(PhysicsAlone(batch.env), count, name, workload.where)
     physics.reset(0)
     physics.write(".physics.qpos", give(tile(course.qpos, count)))
     physics.write(".physics.qvel", give(tile(course.qvel, count)))
-    hold, turns = max(1, HOLD // workload.decimation), (itertools.count(), itertools.count())
-
-    def step_env() -> None:
-        batch.step(actions[next(turns[0]) // hold % LAPS])
-
-    def step_physics() -> None:
-        turn = next(turns[1])
-        if turn % HOLD == 0:
-            physics.write(".physics.ctrl", commands[turn // HOLD % LAPS])
-        physics.step({})
-
+    step_physics = _along(physics, [give(tile(rows, count)) for rows in course.commands])
     step_physics()  # compiles
     _wait(physics)
     if cuda and name == "fused":
@@ -97,6 +96,19 @@ def _batched(name: str, workload: Workload, course: Course) -> Contender:
     else:
         clocks = cpu_clock(step_physics, lambda: _wait(physics)), cpu_clock(step_env, lambda: _wait(batch.engine))
     return Contender(count, workload.where, compile_s, *clocks, bytes_per_env=_bytes_per_env(batch.engine))
+
+
+def _along(physics: Engine, commands: list[Any]) -> Callable[[], None]:
+    """A physics step under the commands of a course."""
+    turn = itertools.count()
+
+    def step() -> None:
+        now = next(turn)
+        if now % HOLD == 0:
+            physics.write(".physics.ctrl", commands[now // HOLD % LAPS])
+        physics.step({})
+
+    return step
 
 
 def _mujoco(workload: Workload, course: Course) -> Contender:

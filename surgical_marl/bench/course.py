@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from typing import Any, NamedTuple
 
 import mujoco
@@ -37,6 +38,8 @@ class Course(NamedTuple):
 def make_course(scene: Scene, seed: int = 0) -> Course:
     """Every environment heads half a second for a side of its own, then to and fro. C MuJoCo moves the arms, so that
     the states are no engine's own."""
+    # or JAX would take most of a GPU's memory when it starts, and leave too little for the fused engine
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     import jax
 
     rng, n = np.random.default_rng(seed), DISTINCT

@@ -96,7 +96,7 @@ def table(found: Mapping[str, Any]) -> str:
     """`summary` for people, in the form of the paper's Table I."""
     rows = [(name, "a step of its own", speed, "quoted") for name, speed in found["quoted"].items()]
     for speed in found["engines"]:
-        where = f"{speed['num_envs']} envs, {speed['device']}, compiled in {speed['compile_s']:.1f} s"
+        where = f"{speed['num_envs']} envs, {speed['device']}, first step after {speed['compile_s']:.1f} s"
         kinds = (("physics step", "physics_steps_per_s"), ("environment step", "env_steps_per_s"))
         rows += [(NAMES[speed["engine"]], kind, speed[key], where) for kind, key in kinds if speed[key]]
     head = ("simulator", "what is a step", "1 M steps (s)", "steps/s", "")
@@ -124,7 +124,7 @@ def _machine(found: Mapping[str, Any]) -> str:
 def _ratio_lines(found: Mapping[str, Mapping[str, float]]) -> list[str]:
     names = {"physics": "physics steps", "env": "environment steps"}
     return [
-        f"The fused engine does {times:.1f} times the {names[kind]} of {NAMES[other]}."
+        f"{names[kind]}, fused engine over {NAMES[other]}: {times:.1f}"
         for kind, others in found.items()
         for other, times in others.items()
     ]
@@ -160,16 +160,16 @@ def draw(points: Sequence[Point], title: str, out: Path) -> None:
     axis = figure.subplots()
     for engine, device in dict.fromkeys((p.speed.engine, p.speed.device) for p in points):
         own = [p for p in points if (p.speed.engine, p.speed.device) == (engine, device)]
-        size = f", {own[0].bytes_per_env} bytes an environment" if own[0].bytes_per_env else ""
+        size = f", {own[0].bytes_per_env} bytes each" if own[0].bytes_per_env else ""
         style: dict[str, Any] = {"color": _COLORS[engine], "marker": "o", "markersize": 4}
         style["markerfacecolor"] = _COLORS[engine] if device == "cuda" else "white"
         counts = [p.speed.num_envs for p in own]
         device_name = "GPU" if device == "cuda" else "CPU"
         axis.plot(counts, [p.speed.physics_steps_per_s for p in own],
-                  label=f"{NAMES[engine]}, {device_name}: physics{size}", **style)  # fmt: skip
+                  label=f"{NAMES[engine]}, {device_name}: physics", **style)  # fmt: skip
         steps = [p.speed.env_steps_per_s for p in own if p.speed.env_steps_per_s]
         if steps:
-            axis.plot(counts, steps, "--", label=f"{NAMES[engine]}, {device_name}: environment", **style)
+            axis.plot(counts, steps, "--", label=f"{NAMES[engine]}, {device_name}: environment{size}", **style)
     axis.set(xscale="log", yscale="log", xlabel="environments", ylabel="steps/s")
     axis.set_title(title, fontsize=10)
     for side in (axis.xaxis, axis.yaxis):

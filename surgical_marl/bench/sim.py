@@ -1,24 +1,24 @@
 """Throughput of the engines and of C MuJoCo, in physics steps and in environment steps.
 
-speeds, left_out = measure(Workload("reach", "psm", num_envs=4096), ("fused", "mjx", "mujoco"))
-speeds["fused"].physics_steps_per_s / speeds["mujoco"].physics_steps_per_s
+    speeds, left_out = measure(Workload("reach", "psm", num_envs=4096), ("fused", "mjx", "mujoco"))
+    speeds["fused"].physics_steps_per_s / speeds["mujoco"].physics_steps_per_s
+
+docs/benchmarks.md says what is timed, and how.
 """
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 from surgical_marl.bench import clock, machine
-from surgical_marl.bench.contenders import MOST_ROLLED, Contender, prepare
+from surgical_marl.bench.contenders import ENGINES, MOST_ROLLED, Contender, prepare
 from surgical_marl.bench.course import Course, make_course
 from surgical_marl.bench.workload import Workload
 from surgical_marl.scene import TIMESTEP, load_scene
 
-ENGINES = ("fused", "mjx", "mujoco")
 SWEEP = tuple(4**k for k in range(12))
 """Environments of a sweep: 1 to 4 million."""
 LONGEST = 10.0
@@ -69,8 +69,6 @@ def measure(
 def _contenders(
     workload: Workload, engines: Sequence[str], course: Course
 ) -> tuple[dict[str, Contender], dict[str, str]]:
-    # XLA would take most of the GPU's memory before anyone else has some
-    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     contenders, left_out = {}, {}
     for name in engines:
         try:

@@ -13,7 +13,7 @@ DEVICES = ("auto", "cpu", "cuda")
 
 
 class Engine(Protocol):
-    """`num_envs` copies of an environment and their state. Arrays are of "numpy", "torch" or "jax", as `library` says."""
+    """`num_envs` copies of an environment and their state. Arrays are of "numpy", "torch" or "jax" by `library`."""
 
     name: str
     device: str

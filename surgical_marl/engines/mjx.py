@@ -93,7 +93,7 @@ class MjxEngine:
     def write(self, name: str, values: Any) -> None:
         """Sets a part of the `Carry`."""
         parts = dict(zip(self.carry_shapes, jax.tree.leaves(self._state.carry), strict=True))
-        parts[name] = self._take(values).astype(parts[name].dtype)
+        parts[name] = jnp.array(self._take(values), parts[name].dtype)  # a copy: a step gives its carry away
         carry = jax.tree.unflatten(self._tree, list(parts.values()))
         self._state, self._stepped = replace(self._state, carry=carry), True
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+from abc import ABC, abstractmethod
 from typing import Any
 
 import numpy as np
+
 from surgical_marl.engines.fused.program import Leaf, Source
 from surgical_marl.runtime import prepare_warp
 
@@ -19,7 +21,7 @@ def make_arrays(device: str, source: Source, stride: int, num_envs: int) -> Arra
     return (CudaArrays if device == "cuda" else CpuArrays)(source, stride, num_envs)
 
 
-class Arrays:
+class Arrays(ABC):
     """`all` is what `Kernel.launch` takes; columns from `num_envs` on are padding."""
 
     def __init__(self, source: Source, stride: int, num_envs: int) -> None:
@@ -34,6 +36,31 @@ class Arrays:
         self._buffers = {name: self._zeros(max(source.sizes[name], 1), stride, dtype) for name, dtype in _TYPES.items()}
         tables = [self._constant(table) for table in source.tables.values()]
         self.all = [*(self._warp(buffer) for buffer in self._buffers.values()), *(self._warp(t) for t in tables)]
+
+    @abstractmethod
+    def write(self, leaf: Leaf, values: Any) -> None:
+        """Sets a leaf to [N, *shape] of any library."""
+
+    @abstractmethod
+    def read(self, leaf: Leaf, library: str) -> Any:
+        """A leaf as [N, *shape] of "numpy", "torch" or "jax"; a copy."""
+
+    @abstractmethod
+    def read_tree(self, tree: dict[str, Any], library: str) -> dict[str, Any]:
+        """Leaves of a dict of dicts, of one copy of the whole."""
+
+    @abstractmethod
+    def _zeros(self, fields: int, stride: int, dtype: Any) -> Any: ...
+
+    @abstractmethod
+    def _constant(self, table: np.ndarray) -> Any: ...
+
+    @abstractmethod
+    def _warp(self, array: Any) -> Any: ...
+
+    @abstractmethod
+    def _room(self) -> int | None:
+        """Bytes of memory that are free, None if nobody knows."""
 
     def rows(self, leaf: Leaf) -> Any:
         """The fields of a leaf, [size, N], of the device's own library: a view."""
@@ -58,18 +85,15 @@ class CpuArrays(Arrays):
         return wp.array(array.reshape(-1), copy=False, device="cpu")
 
     def write(self, leaf: Leaf, values: Any) -> None:
-        """Sets a leaf to [N, *shape] of any library."""
         if type(values).__module__.startswith("torch"):
             values = values.detach().cpu().numpy()
         values = np.asarray(values, leaf.dtype).reshape(self.num_envs, leaf.size)
         self.rows(leaf)[:] = values.T.view(np.int32) if leaf.dtype == "uint32" else values.T
 
     def read(self, leaf: Leaf, library: str) -> Any:
-        """A leaf as [N, *shape] of "numpy", "torch" or "jax"; a copy."""
         return self._present(leaf, self.rows(leaf).copy(), library)
 
     def read_tree(self, tree: dict[str, Any], library: str) -> dict[str, Any]:
-        """Leaves of a dict of dicts, of one copy of the whole."""
         copies = {name: self._buffers[name][:, : self.num_envs].copy() for name in ("outs", "flags", "counts")}
 
         def visit(node: Any) -> Any:

@@ -56,9 +56,9 @@ class Emitter:
     def _postpone_stores(self) -> None:
         """Puts each store after the last load of the same field."""
         items = self.schedule.regions[0].items
-        last = {field: at for at, item in enumerate(items) for field in self._loads(*item)}
+        after = {field: at + 0.5 for at, item in enumerate(items) for field in self._loads(*item)}
         places = [
-            max(at, last.get(self.stores[k][:2], 0)) if kind == "result" else at for at, (kind, k) in enumerate(items)
+            max(at, after.get(self.stores[k][:2], 0)) if kind == "result" else at for at, (kind, k) in enumerate(items)
         ]
         items[:] = [items[at] for at in sorted(range(len(items)), key=places.__getitem__)]
 

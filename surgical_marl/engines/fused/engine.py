@@ -11,6 +11,7 @@ The state of all environments stays in four arrays on the device, [field, enviro
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -41,7 +42,9 @@ class FusedEngine:
             raise ValueError("device 'cuda' is not there: Warp finds no CUDA device; the other is cpu")
         self.env, self.num_envs = env, num_envs
         self.device = ("cuda" if has_cuda() else "cpu") if device == "auto" else device
-        self.source: Source = load_source(env, vector=self.device == "cpu", announce=lambda: announce(env, self.name, self.device))
+        self.source: Source = load_source(
+            env, vector=self.device == "cpu", announce=lambda: announce(env, self.name, self.device)
+        )
         self._leaves = flatten(self.source.carry)
         self.carry_shapes = {name: leaf.shape for name, leaf in self._leaves.items()}
         self._stride = -(-num_envs // LANES) * LANES
@@ -50,7 +53,7 @@ class FusedEngine:
         vectors = self._stride // LANES
         shares = min(cores(), max(1, num_envs // LEAST_SHARE)) if self.device == "cpu" else 1
         edges = [round(vectors * k / shares) * LANES for k in range(shares + 1)]
-        self._shares = [(a, b - a) for a, b in zip(edges, edges[1:], strict=False)]
+        self._shares = [(a, b - a) for a, b in pairwise(edges)]
         if shares == 1:
             self._shares = [(0, num_envs if self.device == "cuda" else self._stride)]
         self._pool = ThreadPoolExecutor(shares, "surgical_marl") if shares > 1 else None

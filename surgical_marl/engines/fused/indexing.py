@@ -155,9 +155,7 @@ def _look_up(g: Graph, operand: np.ndarray, fixed: list[int], moving: dict[int, 
     return convert(g, g.lookup(number, flat), kind)
 
 
-def _choose_one(
-    g: Graph, ids: np.ndarray, lasts: dict[int, int], fixed: list[int], moving: dict[int, Value]
-) -> Value:
+def _choose_one(g: Graph, ids: np.ndarray, lasts: dict[int, int], fixed: list[int], moving: dict[int, Value]) -> Value:
     axes, value = list(moving), None
     for corner in _corners(g, list(moving.values()), list(lasts.values())):
         place = list(fixed)

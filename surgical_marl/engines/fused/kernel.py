@@ -1,7 +1,7 @@
 """Compiles C with Warp and launches it, on a GPU or on a CPU.
 
-A kernel works on five arrays whose columns are environments: `state` (float32) and `counts` (int32; uint32 by their bits)
-are read and written, `actions` (float32) read, `outs` (float32) and `flags` (uint8) written; and on two arrays of
+A kernel works on five arrays whose columns are environments: `state` (float32) and `counts` (int32; uint32 by their
+bits) are read and written, `actions` (float32) read, `outs` (float32) and `flags` (uint8) written; and on two arrays of
 constants.
 """
 
@@ -24,9 +24,9 @@ wp = prepare_warp()
 BLOCK = 64
 """Threads in a CUDA block."""
 
-_reals = wp.array(dtype=wp.float32)
-_wholes = wp.array(dtype=wp.int32)
-_bytes = wp.array(dtype=wp.uint8)
+_reals: Any = wp.array(dtype=wp.float32)
+_wholes: Any = wp.array(dtype=wp.int32)
+_bytes: Any = wp.array(dtype=wp.uint8)
 
 
 def compile_kernels(bodies: dict[str, str], device: str, max_registers: int | None = None) -> dict[str, Kernel]:
@@ -71,7 +71,7 @@ def _make(name: str, source: str, module: Any, max_registers: int | None) -> Any
     def body(
         state: _reals, counts: _wholes, actions: _reals, outs: _reals, flags: _bytes, reals: _reals, wholes: _wholes,
         stride: int, t: int,
-    ): ...  # fmt: skip
+    ) -> None: ...  # fmt: skip
 
     body.__qualname__ = body.__name__ = f"body_{name}"
     body = wp.func_native(source)(body)
@@ -79,7 +79,7 @@ def _make(name: str, source: str, module: Any, max_registers: int | None) -> Any
     def kernel(
         state: _reals, counts: _wholes, actions: _reals, outs: _reals, flags: _bytes, reals: _reals, wholes: _wholes,
         stride: int, start: int, lanes: int,
-    ):  # fmt: skip
+    ) -> None:  # fmt: skip
         body(state, counts, actions, outs, flags, reals, wholes, stride, start + wp.tid() * lanes)
 
     return wp.kernel(

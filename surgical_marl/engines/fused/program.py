@@ -1,7 +1,7 @@
 """A traced function as C, and which fields of which arrays hold its arguments and results.
 
-Arguments and results are trees of arrays of one environment; a leaf of n elements takes n consecutive fields (rows) of an
-array whose columns are environments.
+Arguments and results are trees of arrays of one environment; a leaf of n elements takes n consecutive fields (rows) of
+an array whose columns are environments.
 """
 
 from __future__ import annotations
@@ -80,7 +80,8 @@ _CODE = ("physics", "solver", "env", "scene", "arm", "arm_spec", "workspace", "t
 
 
 def load_source(env: Env, vector: bool, announce: Callable[[], None] = lambda: None) -> Source:
-    """The source of an environment's kernels: for a CPU, with vectors, or for CUDA. From the cache if it was made before.
+    """The source of an environment's kernels: for a CPU, with vectors, or for CUDA. Kept on disk; `announce` is called
+    before it is made.
 
     Raises:
         Unsupported: the environment can't be traced.

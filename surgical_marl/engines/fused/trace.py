@@ -2,7 +2,7 @@
 
 Functions within functions are opened up. A branch (`lax.cond`, `lax.switch`) stays a branch: what it computes it does
 not share with what is around it, so that nothing but its operands has to be kept for it. A loop (`lax.scan` without
-arrays that it reads or writes row by row, `lax.while_loop`) stays a loop, unless it is to be unrolled (`unroll=True`, or
+arrays that it reads or writes row by row, `lax.while_loop`) stays a loop, unless it is to be unrolled (`unroll=True` or
 one round). Other scans are unrolled.
 """
 

@@ -1,0 +1,77 @@
+"""How the joints of an arm are driven, read from `arm.yaml`: each by a drive of its own, some by a cable they share."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from surgical_marl.yaml_file import build, check_keys
+
+
+@dataclass(frozen=True)
+class Drive:
+    """How one joint is driven. SI units: N m/rad, N m s/rad, kg m2, rad/s, rad (or N/m, N s/m, kg, m/s, m)."""
+
+    stiffness: float
+    damping: float
+    speed: float
+    armature: float = 0.0
+    home: float = 0.0
+
+
+@dataclass(frozen=True)
+class Cable:
+    """A cable that several joints wind up. Its own drive acts on its length, the sum of coefficient times position of
+    its joints, beside the drives of the joints. Units as of a `Drive`, per unit of that length."""
+
+    joints: dict[str, float]
+    """Coefficient of each joint."""
+    stiffness: float
+    damping: float
+    effort: float
+    armature: float = 0.0
+
+
+def read_drives(drives: Any, joints: list[str], where: Path, keep: Callable[..., Any]) -> dict[str, Drive]:
+    """The drive of each of `joints`; what is wrong is kept."""
+    if not isinstance(drives, dict):
+        raise ValueError(f"{where}: joints must be a mapping from joint name to drive")
+    keep(check_keys, drives, tuple(joints), f"{where}, joints")
+    return {name: keep(_drive, drives.get(name, {}), f"{where}, joint {name!r}") for name in joints}
+
+
+def _drive(mapping: Any, where: str) -> Drive:
+    drive: Drive = build(Drive, mapping, where)
+    _check_signs(drive, "speed", where)
+    return drive
+
+
+def _check_signs(drive: Drive | Cable, positive: str, where: str) -> None:
+    for key in ("stiffness", "damping", "armature"):
+        if getattr(drive, key) < 0:
+            raise ValueError(f"{where}: {key} must be 0 or more, not {getattr(drive, key):g}")
+    if not getattr(drive, positive) > 0:
+        raise ValueError(f"{where}: {positive} must be above 0, not {getattr(drive, positive):g}")
+
+
+def read_cables(cables: Any, joints: list[str], where: Path, keep: Callable[..., Any]) -> tuple[Cable, ...]:
+    """The cables, which may wind on `joints`; what is wrong is kept."""
+    if not isinstance(cables, list):
+        raise ValueError(f"{where}: cables must be a list, not {cables!r}")
+    return tuple(keep(_cable, cable, joints, f"{where}, cable {number}") for number, cable in enumerate(cables))
+
+
+def _cable(mapping: Any, joints: list[str], where: str) -> Cable:
+    cable: Cable = build(Cable, mapping, where)
+    if not isinstance(cable.joints, dict) or len(cable.joints) < 2:
+        raise ValueError(f"{where}: joints must map two joints or more to coefficients, not {cable.joints!r}")
+    for name, value in cable.joints.items():
+        if name not in joints:  # a jaw is told where to be in every mode, so no cable pulls it
+            raise ValueError(f"{where}: joint {name!r} is not one of {', '.join(joints)}")
+        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or value == 0:
+            raise ValueError(f"{where}: the coefficient of {name!r} must be a finite number but 0, not {value!r}")
+    _check_signs(cable, "effort", where)
+    return cable

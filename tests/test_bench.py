@@ -1,0 +1,228 @@
+"""Benchmarks: what they report and when they stop. How fast anything is, no test says."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mujoco import rollout
+
+from surgical_marl.bench import contenders, machine, sim
+from surgical_marl.bench.clock import race
+from surgical_marl.bench.contenders import Contender
+from surgical_marl.bench.course import HOLD, LAPS, full_state, make_course
+from surgical_marl.bench.physics import PhysicsAlone
+from surgical_marl.bench.report import QUOTED, draw, ratios, sweep_table
+from surgical_marl.bench.sim import Point, Speed, measure, sweep
+from surgical_marl.bench.workload import Workload
+from surgical_marl.cli import main
+from surgical_marl.engines.choose import make_engine
+from surgical_marl.env import Env
+from surgical_marl.scene import TIMESTEP, load_scene
+
+CONTRACT = [
+    "physics_steps_per_s", "env_steps_per_s", "simulated_s_per_s", "num_envs", "engine", "device", "dt", "decimation",
+    "compile_s",
+]  # fmt: skip
+FUSED = Speed(4e6, 2e6, 5e3, 64, "fused", "cpu", 0.0025, 1, 3.0)
+MJX = replace(FUSED, engine="mjx", physics_steps_per_s=2e5, env_steps_per_s=1e5)
+MUJOCO = replace(FUSED, engine="mujoco", physics_steps_per_s=1e6, env_steps_per_s=None)
+
+
+@pytest.fixture
+def brief(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One repeat of a step or two."""
+    monkeypatch.setattr(sim, "_time", _brief(sim._time))
+
+
+def _brief(time: Any) -> Any:
+    return lambda workload, found, seconds, repeats: time(workload, found, 0.0, 1)
+
+
+@pytest.fixture
+def made_up(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Engines that take 64 us a step and 1 us an environment, and have room for 64 environments."""
+
+    def prepare(engine: str, workload: Workload, course: Any) -> Contender:
+        if workload.count > 64:
+            raise MemoryError(f"{engine} has no room for {workload.count} environments")
+        tick = lambda count: 1e-6 * (64 + workload.count) * count  # noqa: E731
+        return Contender(workload.count, "cpu", 1.0, tick, None if engine == "mujoco" else tick, bytes_per_env=100)
+
+    monkeypatch.setattr(sim, "prepare", prepare)
+    monkeypatch.setattr(sim, "make_course", lambda scene: None)
+    yield
+
+
+def test_one_engine_as_json_has_the_keys_of_the_contract(brief: None, capsys: pytest.CaptureFixture[str]) -> None:
+    argv = ["bench", "sim", "--scene", "ecm", "--num-envs", "8", "--device", "cpu", "--json"]
+    assert main([*argv, "--engine", "fused", "--decimation", "2"]) == 0
+    out, err = capsys.readouterr()
+    found = json.loads(out)
+    assert list(found) == CONTRACT
+    assert (found["engine"], found["device"], found["num_envs"], found["decimation"]) == ("fused", "cpu", 8, 2)
+    assert found["dt"] == TIMESTEP
+    assert found["simulated_s_per_s"] == pytest.approx(2 * TIMESTEP * found["env_steps_per_s"])
+    assert "timed" in err
+    assert main([*argv, "--engine", "mujoco"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert list(found) == CONTRACT
+    assert found["env_steps_per_s"] is None
+    assert found["simulated_s_per_s"] == pytest.approx(TIMESTEP * found["physics_steps_per_s"])
+
+
+def test_all_engines_stand_beside_what_is_quoted(made_up: None, capsys: pytest.CaptureFixture[str]) -> None:
+    argv = ["bench", "sim", "--num-envs", "64", "--device", "cpu"]
+    assert main([*argv, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert [list(speed) for speed in found["engines"]] == [CONTRACT] * 3
+    assert [speed["engine"] for speed in found["engines"]] == ["fused", "mjx", "mujoco"]
+    assert found["ratios"]["physics"] == {"mjx": pytest.approx(1), "mujoco": pytest.approx(1)}
+    assert main(argv) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert all(any(line.startswith(name) and line.endswith("quoted") for line in lines) for name in QUOTED)
+    measured = [line for line in lines if line.startswith(("fused engine", "MJX engine", "C MuJoCo"))]
+    assert len(measured) == 5 and not any("quoted" in line for line in measured)
+    assert "500,000" in measured[0]
+
+
+@pytest.mark.usefixtures("made_up")
+def test_an_engine_without_room_is_left_out() -> None:
+    with pytest.raises(ValueError, match="no room for 65"):
+        measure(Workload(num_envs=65), ("fused",))
+
+
+def test_ratios() -> None:
+    found = ratios({"fused": FUSED, "mjx": MJX, "mujoco": MUJOCO})
+    assert found == {"physics": {"mjx": 20.0, "mujoco": 4.0}, "env": {"mjx": 20.0}}
+    assert ratios({"mjx": MJX, "mujoco": MUJOCO}) == {"physics": {}, "env": {}}
+
+
+def test_the_best_repeat_counts() -> None:
+    times = {"a": iter([9.0, 1.0, 3.0, 2.0, 4.0]), "b": iter([9.0, 1.0, 7.0, 8.0, 6.0])}
+    clocks = {key: (lambda count, key=key: count * next(times[key])) for key in times}
+    assert race(clocks, seconds=1.0, repeats=3) == {"a": 2.0, "b": 6.0}
+
+
+@pytest.mark.parametrize(
+    "engine, limits, counts, why",
+    [
+        ("fused", {}, [1, 4, 16, 64], "no room for 256"),
+        ("fused", {"free": 0.0}, [1], "no memory for 4"),
+        ("fused", {"longest": 3e-4}, [1, 4, 16], "would take more than"),
+        ("mujoco", {"most": 16}, [1, 4, 16], "no faster"),
+    ],
+)
+def test_a_sweep_stops_and_says_why(
+    engine: str,
+    limits: dict[str, float],
+    counts: list[int],
+    why: str,
+    made_up: None,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(machine, "free", lambda: limits.get("free", np.inf))
+    monkeypatch.setattr(machine, "peak", iter(range(100)).__next__)  # a byte more each time it is looked at
+    monkeypatch.setattr(sim, "LONGEST", limits.get("longest", 10.0))
+    monkeypatch.setattr(sim, "MOST_ROLLED", limits.get("most", 4096))
+    points = list(sweep(Workload(device="cpu"), (engine,)))
+    assert [point.speed.num_envs for point in points] == counts
+    assert why in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_a_sweep_as_table_json_and_picture(made_up: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "sweep.png"
+    assert main(["bench", "sim", "--sweep", "--device", "cpu", "--json", "--out", str(out)]) == 0
+    points = json.loads(capsys.readouterr().out)["points"]
+    assert len(points) == 12
+    assert list(points[0]) == [*CONTRACT, "bytes_per_env"]
+    assert out.read_bytes().startswith(b"\x89PNG")
+    assert "4,000,000" in sweep_table([Point(FUSED, 567), Point(MUJOCO, None)])
+
+
+def test_a_picture_of_one_point(tmp_path: Path) -> None:
+    draw([Point(MUJOCO, None)], "title", tmp_path / "one.png")
+    assert (tmp_path / "one.png").exists()
+
+
+def test_what_is_timed_is_what_c_mujoco_steps() -> None:
+    """Half a lap of a course, from a state in motion: the fused engine's physics alone ends where C MuJoCo does."""
+    scene = load_scene("ecm")
+    course = make_course(scene)
+    assert np.abs(course.qvel).max() > 0.1, "nothing moves at the start"
+    assert 0 <= course.touching <= 1
+    rows, steps = 8, HOLD * LAPS // 2
+    engine = make_engine(PhysicsAlone(Env("reach", "ecm")), rows, "fused", "cpu")
+    engine.reset(0)
+    engine.write(".physics.qpos", course.qpos[:rows])
+    engine.write(".physics.qvel", course.qvel[:rows])
+    step = contenders._along(engine, [command[:rows] for command in course.commands])
+    for _ in range(steps):
+        step()
+    control = course.commands[:, :rows].astype(float).repeat(HOLD, 0).swapaxes(0, 1)[:, :steps]
+    state = full_state(course.qpos[:rows], course.qvel[:rows])
+    import mujoco
+
+    found, _ = rollout.rollout(scene.model, mujoco.MjData(scene.model), state, control)
+    np.testing.assert_allclose(engine.read(".physics.qpos", "numpy"), found[:, -1, 1 : 1 + scene.model.nq], atol=1e-3)
+    assert np.abs(found[:, -1, 1 : 1 + scene.model.nq] - course.qpos[:rows]).max() > 1e-2, "nothing moved"
+
+
+def test_a_course_takes_back_what_it_did() -> None:
+    course = make_course(load_scene("ecm"))
+    total = sum(actions["ecm_0"] for actions in course.actions)
+    np.testing.assert_allclose(total, 0, atol=1e-6)
+    assert len(course.commands) == len(course.actions) == LAPS
+
+
+@pytest.mark.parametrize(
+    "argv, words",
+    [
+        ([], ["sim"]),
+        (["sin"], ["'sin'", "sim"]),
+        (["sim", "--engine", "fuzed"], ["'fuzed'", "did you mean 'fused'", "mjx", "mujoco", "all"]),
+        (["sim", "--scene", "psmm"], ["'psmm'", "did you mean 'psm'", "bimanual_psm"]),
+        (["sim", "--task", "reech"], ["'reech'", "did you mean 'reach'"]),
+        (["sim", "--num-envs", "0"], ["--num-envs", "'0'"]),
+        (["sim", "--decimation", "0"], ["--decimation", "'0'"]),
+        (["sim", "--device", "gpu"], ["'gpu'", "auto, cpu, cuda"]),
+        (["sim", "--engine", "mujoco", "--device", "cuda"], ["'mujoco'", "'cuda'", "CPU"]),
+        (["sim", "--out", "a.png"], ["a.png", "--sweep"]),
+        (["sim", "--sweep", "--num-envs", "4"], ["--sweep", "--num-envs 4"]),
+        (["sim", "--sweep", "--out", "a.pdf"], ["a.pdf", ".png"]),
+        (["sim", "--sweep", "--out", "none/a.png"], ["none/a.png", "folder"]),
+    ],
+)
+def test_bad_input(argv: list[str], words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["bench", *argv]) == 2
+    out, err = capsys.readouterr()
+    assert not out
+    assert err.startswith("surgical-marl: ") and err.count("\n") == 1
+    for word in words:
+        assert word in err
+
+
+def test_no_cuda_is_bad_input(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("surgical_marl.bench.workload.has_cuda", lambda: False)
+    assert main(["bench", "sim", "--device", "cuda"]) == 2
+    assert "device 'cuda' is not there" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"num_envs": 0}, {"num_envs": True}, {"decimation": 0}, {"device": "tpu"}, {"task": ""}]
+)
+def test_a_workload_that_is_none(wrong: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        Workload(**wrong)
+    with pytest.raises(ValueError, match="unknown engine 'bullet'"):
+        measure(Workload(scene="ecm"), ("bullet",))
+
+
+def test_a_speed_is_the_contract() -> None:
+    assert list(asdict(FUSED)) == CONTRACT
