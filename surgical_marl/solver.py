@@ -135,7 +135,7 @@ def _line_search(mass: Array, rows: Rows, unbounded: Array, rest: Array, search:
         growth = slope_1 + along @ jnp.where((at > rows.low) & (at < rows.high), fall, 0.0)
         low, high = jnp.where(slope < 0, step, low), jnp.where(slope < 0, high, step)
         step = step - slope / jnp.maximum(growth, 1e-20)
-        inside = (step >= low) & (step <= high)
+        inside = jnp.where(slope < 0, step < high, step > low)  # to the other end and back, it would go on forever
         return (jnp.where(inside, step, jnp.where(high < jnp.inf, (low + high) / 2, 2 * low)), low, high), None
 
     whole, none = jnp.float32(1.0), jnp.float32(0.0)

@@ -170,7 +170,7 @@ def test_what_is_timed_is_what_c_mujoco_steps() -> None:
     import mujoco
 
     found, _ = rollout.rollout(scene.model, mujoco.MjData(scene.model), state, control)
-    np.testing.assert_allclose(engine.read(".physics.qpos", "numpy"), found[:, -1, 1 : 1 + scene.model.nq], atol=1e-3)
+    np.testing.assert_allclose(engine.read(".physics.qpos", "numpy"), found[:, -1, 1 : 1 + scene.model.nq], atol=1e-5)
     assert np.abs(found[:, -1, 1 : 1 + scene.model.nq] - course.qpos[:rows]).max() > 1e-2, "nothing moved"
 
 

@@ -1,0 +1,376 @@
+"""The constraint solver and the collision of capsules: properties at random, and C MuJoCo as the reference.
+
+Both work in float32: a number is right to about 1e-7 of the largest that it was summed from. Tolerances are a hundred
+times that or more, because a solution also magnifies by how unlike the masses are.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+from unittest.mock import patch
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from surgical_marl import collision, load_scene, solver
+from surgical_marl.collision import SLOTS, Pairs
+from surgical_marl.physics import ARM_ITERATIONS
+from surgical_marl.solver import JointRows, Rows, relax, solve
+
+SEEDS = st.integers(0, 2**32 - 1)
+JOINTS, CONTACTS = 5, 2
+TYPES = mujoco.mjtConstraint
+FRICTION, LIMIT = int(TYPES.mjCNSTR_FRICTION_DOF), int(TYPES.mjCNSTR_LIMIT_JOINT)
+CONTACT = int(TYPES.mjCNSTR_CONTACT_FRICTIONLESS)
+
+
+class Problem(SimpleNamespace):
+    """Mass [n, n], smooth force [n], rows of n joints and of contacts, and where to start [n]; in float32."""
+
+    mass: np.ndarray
+    smooth: np.ndarray
+    joints: JointRows
+    rows: Rows
+    start: np.ndarray
+
+
+def problem(seed: int, n: int = JOINTS, contacts: int = 0) -> Problem:
+    """Masses from a gram to a kilogram, coupled; impedances as MuJoCo has them, a few times the mass; some joints have
+    friction, some are at a limit, and all is of a size to matter."""
+    rng = np.random.default_rng(seed)
+    size = 10.0 ** rng.uniform(-3, 0, n)
+    mix = np.eye(n) + 0.4 * rng.uniform(-1, 1, (n, n)) / np.sqrt(n)
+    mass = np.sqrt(size)[:, None] * (mix @ mix.T) * np.sqrt(size)
+    acceleration = 10.0 ** rng.uniform(0, 3)
+    rubs, side = rng.random(n) < 0.6, rng.choice([-1.0, 0.0, 1.0], n)
+    joints = JointRows(
+        friction=rubs * size * acceleration * rng.uniform(0.01, 1, n),
+        friction_impedance=rubs * size * rng.uniform(1, 20, n),
+        friction_reference=rubs * acceleration * rng.uniform(-1, 1, n),
+        side=side,
+        limit_impedance=np.abs(side) * size * rng.uniform(1, 20, n),
+        limit_reference=np.abs(side) * acceleration * rng.uniform(-1, 2, n),
+    )
+    none, touching, presses = np.zeros(n), np.ones(contacts), acceleration * rng.uniform(-1, 2, contacts)
+    jacobian = rng.uniform(-1, 1, (contacts, n))
+    weight = np.einsum("ri,ij,rj->r", jacobian, np.linalg.inv(mass), jacobian)
+    rows = Rows(
+        np.concatenate([np.eye(n), np.diag(joints.side), jacobian]),
+        np.concatenate([joints.friction_impedance, joints.limit_impedance, rng.uniform(1, 20, contacts) / weight]),
+        np.concatenate([joints.friction_reference, joints.limit_reference, presses]),
+        np.concatenate([-joints.friction, none, 0 * touching]),
+        np.concatenate([joints.friction, none + np.inf, np.inf * touching]),
+    )
+    smooth, start = size * acceleration * rng.uniform(-2, 2, n), acceleration * rng.uniform(-2, 2, n)
+    parts = {"mass": mass, "smooth": smooth, "joints": joints, "rows": rows, "start": start}
+    return Problem(**jax.tree.map(np.float32, parts))
+
+
+def forces(p: Problem, qacc: np.ndarray) -> np.ndarray:
+    rows = jax.tree.map(np.float64, p.rows)
+    return np.clip(rows.impedance * (rows.reference - rows.jacobian @ qacc), rows.low, rows.high)
+
+
+def cost(p: Problem, qacc: np.ndarray) -> float:
+    """What MuJoCo minimises, in float64."""
+    rows, qacc = jax.tree.map(np.float64, p.rows), np.float64(qacc)
+    force = forces(p, qacc)
+    off = rows.reference - rows.jacobian @ qacc
+    # quadratic where the force is not at its bound, and goes on straight from there
+    bent = np.divide(force, rows.impedance, out=np.zeros_like(force), where=rows.impedance > 0)
+    return float(0.5 * qacc @ p.mass @ qacc - p.smooth @ qacc + (force * off - 0.5 * force * bent).sum())
+
+
+def unbalanced(p: Problem, qacc: np.ndarray) -> float:
+    """The cost's gradient, of which the minimum has none, as a share of the forces that it was summed from."""
+    rows, qacc = jax.tree.map(np.float64, p.rows), np.float64(qacc)
+    gradient = p.mass @ qacc - p.smooth - rows.jacobian.T @ forces(p, qacc)
+    summed = np.abs(p.mass) @ np.abs(qacc) + np.abs(p.smooth)
+    jacobian = np.abs(rows.jacobian)
+    summed += jacobian.T @ (rows.impedance * (np.abs(rows.reference) + jacobian @ np.abs(qacc)))
+    return float((np.abs(gradient) / summed).max())
+
+
+@functools.cache
+def compiled_relax(sweeps: int, relaxation: float) -> Callable[..., jax.Array]:
+    compiled = jax.jit(lambda *arguments: relax(*arguments))
+
+    def run(p: Problem, start: np.ndarray) -> np.ndarray:
+        with patch.object(solver, "SWEEPS", sweeps), patch.object(solver, "RELAXATION", relaxation):
+            return np.asarray(compiled(p.mass, p.smooth, p.joints, start))
+
+    return run
+
+
+compiled_solve = jax.jit(solve, static_argnums=(4, 5))
+
+
+@settings(max_examples=200, deadline=None)
+@given(SEEDS)
+def test_an_exact_sweep_never_raises_the_cost(seed: int) -> None:
+    p = problem(seed)
+    qacc, before = p.start, cost(p, p.start)
+    for _ in range(5):
+        qacc = compiled_relax(1, 1.0)(p, qacc)
+        after = cost(p, qacc)
+        assert after <= before + 1e-6 * abs(before)  # at the minimum it may differ by rounding
+        before = after
+
+
+@settings(max_examples=200, deadline=None)
+@given(SEEDS)
+def test_the_sweeps_that_ship_come_nearer_to_the_minimum(seed: int) -> None:
+    p = problem(seed)
+    found = compiled_relax(solver.SWEEPS, solver.RELAXATION)(p, p.start)
+    least = cost(p, compiled_relax(500, 1.0)(p, p.start))
+    assert cost(p, found) - least <= 0.01 * (cost(p, p.start) - least) + 1e-5 * abs(least)
+
+
+@pytest.mark.parametrize("relaxation", [1.0, solver.RELAXATION])
+@settings(max_examples=100, deadline=None)
+@given(seed=SEEDS)
+def test_many_sweeps_end_at_the_minimum(relaxation: float, seed: int) -> None:
+    p = problem(seed)
+    assert unbalanced(p, p.start) > 1e-3
+    assert unbalanced(p, compiled_relax(500, relaxation)(p, p.start)) < 1e-5
+
+
+@settings(max_examples=200, deadline=None)
+@given(SEEDS)
+def test_one_joint_alone_is_solved_exactly(seed: int) -> None:
+    """In one sweep, wherever it starts: the root of a force that falls with the acceleration, found by bisection."""
+    p = problem(seed, n=1)
+    low, high = -1e7, 1e7
+    for _ in range(100):
+        middle = (low + high) / 2
+        left = p.smooth[0] + (p.rows.jacobian.T @ forces(p, np.array([middle])))[0] - np.float64(p.mass[0, 0]) * middle
+        low, high = (middle, high) if left > 0 else (low, middle)
+    found = compiled_relax(1, 1.0)(p, p.start)
+    assert float(found[0]) == pytest.approx(low, rel=1e-5, abs=1e-5 * float(abs(p.start[0])))
+
+
+@settings(max_examples=200, deadline=None)
+@given(SEEDS)
+def test_newton_s_method_ends_at_the_minimum(seed: int) -> None:
+    """Friction, limits and contacts together: no force is left over, each is what its row says, within its bounds."""
+    p = problem(seed, contacts=CONTACTS)
+    qacc, force = map(np.asarray, compiled_solve(p.mass, p.smooth, p.rows, p.start, 30, 20))
+    assert unbalanced(p, p.start) > 1e-3
+    assert unbalanced(p, qacc) < 1e-5
+    size = p.rows.impedance * (np.abs(p.rows.reference) + np.abs(p.rows.jacobian) @ np.abs(qacc))
+    assert (np.abs(force - forces(p, qacc)) <= 1e-5 * size).all()
+    assert (force >= p.rows.low).all() and (force <= p.rows.high).all()
+
+
+def mujoco_problem(model: mujoco.MjModel, data: mujoco.MjData, count: int) -> Problem:
+    """What C MuJoCo has to solve, with its own rows; empty ones up to `count`."""
+    mass = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, mass)
+    kinds = data.efc_type
+    assert set(kinds.tolist()) <= {FRICTION, LIMIT, CONTACT}
+    rubs = kinds == FRICTION
+    rows = Rows(
+        data.efc_J.reshape(-1, model.nv),
+        data.efc_D,
+        data.efc_aref,
+        np.where(rubs, -data.efc_frictionloss, 0.0),
+        np.where(rubs, data.efc_frictionloss, np.inf),
+    )
+    rows = Rows(*(np.concatenate([part, np.zeros((count - len(part), *part.shape[1:]))]) for part in rows))
+    own = np.zeros((6, model.nv))
+    for row, (kind, joint) in enumerate(zip(kinds, data.efc_id, strict=True)):
+        if kind == FRICTION:
+            own[:3, joint] = data.efc_frictionloss[row], data.efc_D[row], data.efc_aref[row]
+        elif kind == LIMIT:
+            own[3:, joint] = rows.jacobian[row, joint], data.efc_D[row], data.efc_aref[row]
+    parts = {"mass": mass, "smooth": data.qfrc_smooth, "joints": JointRows(*own), "rows": rows}
+    return Problem(**jax.tree.map(np.float32, parts), start=np.zeros(model.nv, np.float32))
+
+
+@functools.cache
+def a_scene(name: str) -> tuple[Any, mujoco.MjModel, np.ndarray]:
+    scene = load_scene(name)
+    velocity = np.concatenate([[joint.velocity for joint in mount.arm.joints] for mount in scene.mounts.values()])
+    return scene, scene.model, velocity
+
+
+def far_off(model: mujoco.MjModel, velocity: np.ndarray, qacc: np.ndarray, expected: np.ndarray) -> float:
+    """Largest difference after a physics step, as a share of a joint's velocity limit."""
+    return float((np.abs(qacc - expected) * model.opt.timestep / velocity).max())
+
+
+@pytest.mark.parametrize("name", ["psm", "star"])
+@settings(max_examples=50, deadline=None)
+@given(seed=SEEDS)
+def test_an_arm_accelerates_as_in_c_mujoco(name: str, seed: int) -> None:
+    """Anywhere, some joints past a limit, some at rest: by many Newton steps, and by what a physics step affords."""
+    _, model, velocity = a_scene(name)
+    rng, data = np.random.default_rng(seed), mujoco.MjData(model)
+    low, high = model.jnt_range.T
+    where = rng.choice([-0.005, 1.005, 0.5], model.nv) + rng.uniform(0, 0.004, model.nv)
+    data.qpos[:] = low + where * (high - low)
+    data.qvel[:] = 0.5 * velocity * rng.uniform(-1, 1, model.nv) * (rng.random(model.nv) < 0.6)
+    data.ctrl[:] = rng.uniform(*model.actuator_ctrlrange.T)
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+    mujoco.mj_forward(model, data)
+    p = mujoco_problem(model, data, 2 * model.nv)
+    exact, _ = compiled_solve(p.mass, p.smooth, p.rows, p.start, 30, 20)
+    assert far_off(model, velocity, np.asarray(exact), data.qacc) < 1e-4
+    start = compiled_relax(solver.SWEEPS, solver.RELAXATION)(p, p.start)
+    quick, _ = compiled_solve(p.mass, p.smooth, p.rows, start, *ARM_ITERATIONS)
+    assert far_off(model, velocity, np.asarray(quick), data.qacc) < 1e-3
+
+
+@settings(max_examples=50, deadline=None)
+@given(SEEDS)
+def test_two_arms_in_contact_accelerate_as_in_c_mujoco(seed: int) -> None:
+    scene, model, velocity = a_scene("bimanual_psm")
+    rng, data = np.random.default_rng(seed), mujoco.MjData(model)
+    crossed = {"psm_0": np.array([0.03, 0.02, 0.16, 0, 0, 0, 0.0]), "psm_1": np.array([-0.03, 0, 0.16, 0, 0, 0, 0.0])}
+    data.qpos[:] = scene.full_qpos({agent: q + 1e-4 * rng.uniform(-1, 1, 7) for agent, q in crossed.items()})
+    data.qvel[:] = 0.02 * velocity * rng.uniform(-1, 1, model.nv)
+    data.ctrl[:] = scene.moment @ data.qpos
+    mujoco.mj_forward(model, data)
+    assert data.ncon
+    p = mujoco_problem(model, data, 3 * model.nv)
+    qacc, force = map(np.asarray, compiled_solve(p.mass, p.smooth, p.rows, p.start, 30, 20))
+    assert far_off(model, velocity, qacc, data.qacc) < 1e-4
+    touching = data.efc_type == CONTACT
+    expected = data.efc_force[touching]
+    assert force[: len(touching)][touching] == pytest.approx(expected, rel=1e-3, abs=1e-3 * (1 + expected.max()))
+
+
+SHAPES = [("capsule", 0.010, 0.15), ("capsule", 0.004, 0.05), ("sphere", 0.02, 0.0), ("sphere", 0.005, 0.0)]
+
+
+def shapes_model() -> mujoco.MjModel:
+    """Four shapes that float, and all pairs of them."""
+    bodies = "".join(
+        f'<body><freejoint/><geom name="{i}" type="{kind}" size="{radius} {half}" mass="1"/></body>'
+        for i, (kind, radius, half) in enumerate(SHAPES)
+    )
+    pairs = "".join(f'<pair geom1="{i}" geom2="{j}"/>' for i in range(4) for j in range(i))
+    return mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{bodies}</worldbody><contact>{pairs}</contact></mujoco>")
+
+
+MODEL = shapes_model()
+PAIRS = Pairs(MODEL)
+compiled_closest = jax.jit(PAIRS.closest)
+
+
+def check_closest(poses: np.ndarray, tolerance: float) -> None:
+    """At poses [4, 7] of the shapes: distances as C MuJoCo's; a point and a normal that lead to both surfaces."""
+    data = mujoco.MjData(MODEL)
+    data.qpos[:] = poses.ravel()
+    mujoco.mj_kinematics(MODEL, data)
+    found = compiled_closest(np.float32(data.geom_xpos), np.float32(data.geom_xmat.reshape(-1, 3, 3)))
+    distance, point, normal = (np.asarray(part, np.float64) for part in found)
+    for pair, geoms in enumerate(zip(MODEL.pair_geom1, MODEL.pair_geom2, strict=True)):
+        expected = mujoco.mj_geomDistance(MODEL, data, *geoms, 10.0, None)
+        assert abs(distance[pair] - expected) < tolerance
+        radii = MODEL.geom_size[list(geoms), 0]
+        if distance[pair] + radii.sum() < 1e-4:
+            continue  # axes that meet have no normal that float32 could tell
+        assert np.linalg.norm(normal[pair]) == pytest.approx(1, abs=1e-5)
+        for geom, radius, sign in zip(geoms, radii, (1, -1), strict=True):
+            axis = data.geom_xmat[geom].reshape(3, 3)[:, 2]
+            half = MODEL.geom_size[geom, 1] if MODEL.geom_type[geom] == mujoco.mjtGeom.mjGEOM_CAPSULE else 0.0
+            inner = point[pair] - sign * (distance[pair] / 2 + radius) * normal[pair]  # on the axis
+            along = np.clip((inner - data.geom_xpos[geom]) @ axis, -half, half)
+            assert np.linalg.norm(data.geom_xpos[geom] + along * axis - inner) < tolerance + 1e-6
+
+
+def random_poses(rng: np.random.Generator, spread: float) -> np.ndarray:
+    poses = np.concatenate([rng.uniform(-spread, spread, (4, 3)), rng.normal(size=(4, 4))], axis=1)
+    poses[:, 3:] /= np.linalg.norm(poses[:, 3:], axis=1, keepdims=True)
+    return poses
+
+
+@settings(max_examples=300, deadline=None)
+@given(SEEDS, st.sampled_from([0.003, 0.03, 0.3]))
+def test_distances_are_c_mujoco_s(seed: int, spread: float) -> None:
+    """Wherever the shapes are, far apart or overlapping."""
+    check_closest(random_poses(np.random.default_rng(seed), spread), 5e-6)
+
+
+@settings(max_examples=300, deadline=None)
+@given(SEEDS, st.sampled_from([0.0, 1e-6, 1e-5, 1e-4, 3e-4, 1e-3, 3e-3]))
+def test_distances_of_parallel_capsules_are_c_mujoco_s(seed: int, angle: float) -> None:
+    """And of nearly parallel ones. Where they come closest can't be told in float32, only how close they come."""
+    rng = np.random.default_rng(seed)
+    poses = random_poses(rng, 0.1)
+    turn = np.array([np.cos(angle / 2), *(np.sin(angle / 2) * np.array([0.6, 0.8, 0.0]))])
+    mujoco.mju_mulQuat(poses[1, 3:], poses[0, 3:], turn)
+    check_closest(poses, 1e-4 if angle else 5e-6)
+
+
+@settings(max_examples=300, deadline=None)
+@given(SEEDS, st.floats(0.0, 0.03))
+def test_distances_of_crossing_capsules_are_c_mujoco_s(seed: int, gap: float) -> None:
+    """Axes that cross at right angles or aslant, a gap apart, 0 included."""
+    rng = np.random.default_rng(seed)
+    poses, axes, matrix = random_poses(rng, 0.1), [], np.zeros(9)
+    for pose in poses[:2]:
+        mujoco.mju_quat2Mat(matrix, pose[3:])
+        axes.append(matrix.reshape(3, 3)[:, 2].copy())
+    across = np.cross(*axes)
+    across /= np.linalg.norm(across)
+    halves = [half for _, _, half in SHAPES[:2]]
+    offsets = [rng.uniform(-half, half) * axis for half, axis in zip(halves, axes, strict=True)]
+    poses[1, :3] = poses[0, :3] + offsets[0] + gap * across - offsets[1]
+    check_closest(poses, 5e-6)
+
+
+def cluster(count: int) -> mujoco.MjModel:
+    """Capsules close to each other, each on a slide and a hinge, and all pairs of them."""
+    rng = np.random.default_rng(0)
+    bodies = ""
+    for i in range(count):
+        place, axes = rng.uniform(-0.02, 0.02, 3), rng.normal(size=(2, 3))
+        slide, hinge = (" ".join(map(str, axis)) for axis in axes)
+        bodies += (
+            f'<body pos="{place[0]} {place[1]} {place[2]}" euler="{37 * i} {61 * i} 0">'
+            f'<joint type="slide" axis="{slide}"/><joint axis="{hinge}"/>'
+            f'<geom name="{i}" type="capsule" size="0.004 0.02" mass="{0.1 + 0.1 * i}"/></body>'
+        )
+    pairs = "".join(f'<pair geom1="{i}" geom2="{j}"/>' for i in range(count) for j in range(i))
+    return mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{bodies}</worldbody><contact>{pairs}</contact></mujoco>")
+
+
+CLUSTER = cluster(8)
+CLUSTER_PAIRS = Pairs(CLUSTER)
+
+
+@jax.jit
+def compiled_deepest(xpos: Any, xmat: Any, cdof: Any, com: Any) -> tuple[collision.Closest, collision.Touching]:
+    closest = CLUSTER_PAIRS.closest(xpos, xmat)
+    return closest, CLUSTER_PAIRS.deepest(SimpleNamespace(cdof=cdof, subtree_com=com), closest)
+
+
+@settings(max_examples=100, deadline=None)
+@given(SEEDS)
+def test_the_deepest_contacts_become_rows(seed: int) -> None:
+    """The deepest of 28 pairs, each with the speed at which its two bodies part, and nothing where none touch."""
+    rng, data = np.random.default_rng(seed), mujoco.MjData(CLUSTER)
+    data.qpos[:] = rng.uniform(-1, 1, CLUSTER.nq) * np.where(CLUSTER.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE, 0.03, 2.0)
+    mujoco.mj_fwdPosition(CLUSTER, data)
+    arrays = data.geom_xpos, data.geom_xmat.reshape(-1, 3, 3), data.cdof, data.subtree_com
+    closest, touching = jax.tree.map(np.asarray, compiled_deepest(*(np.float32(array) for array in arrays)))
+    assert len(set(touching.pair)) == SLOTS
+    np.testing.assert_array_equal(touching.distance, np.sort(closest.distance)[:SLOTS])
+    np.testing.assert_array_equal(touching.distance, closest.distance[touching.pair])
+    for slot, pair in enumerate(touching.pair):
+        bodies = CLUSTER.geom_bodyid[[CLUSTER.pair_geom1[pair], CLUSTER.pair_geom2[pair]]]
+        assert touching.weight[slot] == pytest.approx(CLUSTER.body_invweight0[bodies, 0].sum(), rel=1e-6)
+        speeds = np.zeros((2, 3, CLUSTER.nv))
+        for speed, body in zip(speeds, bodies, strict=True):
+            mujoco.mj_jac(CLUSTER, data, speed, None, np.float64(closest.point[pair]), body)
+        expected = closest.normal[pair] @ (speeds[1] - speeds[0]) * (touching.distance[slot] < 0)
+        np.testing.assert_allclose(touching.jacobian[slot], expected, atol=1e-5)
