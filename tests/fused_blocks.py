@@ -128,6 +128,8 @@ FUNCTIONS: dict[str, Block] = {
     "pow constants": ("s", "s", lambda x: lax.pow(1.5 + x / 2, np.float32([3, -0.3, 0.5])) / 8),
     "relu": ("s", "s", jax.nn.relu),
     "gradient": ("s", "s", lambda x: jax.grad(lambda x: (jnp.sin(x) * x + jnp.cos(x)).sum())(x) / 2),
+    "gradient of one's own": ("s", "s", lambda x: own_gradient(x)),
+    "batching of one's own": ("s", "s", lambda x: jax.custom_batching.custom_vmap(jnp.sin)(x)),
     "stop_gradient": ("s", "s", lax.stop_gradient),
     "copy": ("e", "e", jnp.copy),
     "optimization_barrier": ("eu", "e", lambda x, y: lax.optimization_barrier((x, y))[0]),
@@ -147,6 +149,14 @@ FUNCTIONS: dict[str, Block] = {
     "float of whole": ("i", "e", lambda x: lax.bitcast_convert_type((x & 0x7FFFFF) | 0x3F800000, jnp.float32)),
     "cast words": ("u", "i", lambda x: lax.bitcast_convert_type(x, jnp.int32)),
 }
+
+
+@jax.custom_vjp
+def own_gradient(x: Arrays) -> Arrays:
+    return jnp.cos(x)
+
+
+own_gradient.defvjp(lambda x: (own_gradient(x), None), lambda _, y: (y,))
 
 
 def outer(x: Arrays, y: Arrays) -> Arrays:

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from fused_blocks import all_blocks, programs, random_arrays, several
+from fused_blocks import STRUCTURES, all_blocks, programs, random_arrays, several
 from fused_kernels import make_stores, run
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -46,6 +46,17 @@ def test_blocks(group: str) -> None:
     compare(partial(all_blocks, group), random_arrays(0))
 
 
+def nested(pool: Any) -> Any:
+    """Each sort of branch or loop in each."""
+    names = ("a: add", "m: cumsum back", "a: lt", "f: mean", "a: mul words")  # one of each sort
+    blocks = [("block", name, (2, 1, 0, 0)) for name in names]
+    return several([[(a, 4, [[(b, 5, [blocks] * 3)]] * 3)] for a in STRUCTURES for b in STRUCTURES], pool)
+
+
+def test_branches_and_loops_within_each_other() -> None:
+    compare(nested, random_arrays(0), rtol=1e-5, atol=2e-5)
+
+
 @settings(max_examples=5, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
 @given(st.lists(programs(2), min_size=3, max_size=3))
 def test_programs(written: list[list[Any]]) -> None:
@@ -71,10 +82,12 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> set[str]:
 
 
 def test_every_primitive_has_a_block(seen: set[str]) -> None:
-    make_stores(partial(all_blocks, ""), (random_arrays(0),))
+    make_stores(lambda pool: (all_blocks("", pool), nested(pool)), (random_arrays(0),))
     known = [value for module in (lax, lax.linalg, primitives) for value in vars(module).values()]
     there = {primitive.name for primitive in known if isinstance(primitive, Primitive)}  # in this version of JAX
-    assert not ((ELEMENTWISE.keys() | RULES.keys()) & there) - seen
+    control = {"cond", "while", "scan", "custom_jvp_call", "custom_vjp_call", "custom_vmap_call", "random_bits",
+               "random_fold_in", "random_split", "random_wrap", "random_unwrap"}  # fmt: skip
+    assert not ((ELEMENTWISE.keys() | RULES.keys()) & there | control) - seen
 
 
 # -- special values

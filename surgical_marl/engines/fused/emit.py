@@ -171,6 +171,8 @@ class Emitter:
             code = _CODE[op].format(self._name(args[0]), kind.upper(), self._name(args[1]))
         elif op == "abs":
             code = _CODE[op].format(self._name(args[0]), kind.upper())
+        elif kind == "i" and op in ("add", "sub", "mul", "neg", "shl"):  # wraps around, which C leaves undefined for I
+            code = f"(I)({_CODE[op].format(*(f'(U){self._name(a)}' for a in args))})"
         else:
             code = _CODE[op].format(*(self._name(a) for a in args))
         return f"{TYPES[kind]} v{value}={code};"

@@ -28,7 +28,7 @@ def _convert(g: Graph, shape: Any, params: Any, x: Traced) -> Traced:
 
 def _bitcast(g: Graph, shape: Any, params: Any, x: Traced) -> Traced:
     if isinstance(x, np.ndarray):
-        return x.view(params["new_dtype"])
+        return np.asarray(x.view(params["new_dtype"]))
     return each(partial(bitcast, to=kind_of(params["new_dtype"])), g, shape, x)
 
 
