@@ -195,7 +195,7 @@ def settle(env: Any, data: mujoco.MjData, start: dict[str, np.ndarray]) -> Any:
     data.qpos[:] = env.scene.full_qpos(start)
     pressed = env.scene.full_qpos({**start, "psm_0": start["psm_0"] - [0, 0.04, 0, 0, 0, 0, 0]})
     data.ctrl[:] = env.scene.moment @ pressed
-    mujoco.mj_step(env.scene.model, data, 3 * DECIMATION)
+    mujoco.mj_step(env.scene.model, data, 10 * DECIMATION)
     return Physics(*(np.float32(a) for a in (data.qpos, data.qvel, data.qacc_warmstart, data.ctrl)))
 
 
