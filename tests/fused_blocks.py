@@ -129,7 +129,7 @@ FUNCTIONS: dict[str, Block] = {
     "relu": ("s", "s", jax.nn.relu),
     "gradient": ("s", "s", lambda x: jax.grad(lambda x: (jnp.sin(x) * x + jnp.cos(x)).sum())(x) / 2),
     "gradient of one's own": ("s", "s", lambda x: own_gradient(x)),
-    "batching of one's own": ("s", "s", lambda x: jax.custom_batching.custom_vmap(jnp.sin)(x)),
+    "batching of one's own": ("s", "s", lambda x: own_batching(x)),
     "stop_gradient": ("s", "s", lax.stop_gradient),
     "copy": ("e", "e", jnp.copy),
     "optimization_barrier": ("eu", "e", lambda x, y: lax.optimization_barrier((x, y))[0]),
@@ -156,6 +156,12 @@ def own_gradient(x: Arrays) -> Arrays:
     return jnp.cos(x)
 
 
+@jax.custom_batching.custom_vmap
+def own_batching(x: Arrays) -> Arrays:
+    return jnp.sin(x)
+
+
+own_batching.def_vmap(lambda size, batched, x: (jnp.sin(x), True))
 own_gradient.defvjp(lambda x: (own_gradient(x), None), lambda _, y: (y,))
 
 

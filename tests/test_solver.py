@@ -99,7 +99,7 @@ def unbalanced(p: Problem, qacc: np.ndarray) -> float:
 
 
 @functools.cache
-def compiled_relax(sweeps: int, relaxation: float) -> Callable[..., jax.Array]:
+def compiled_relax(sweeps: int, relaxation: float) -> Callable[..., np.ndarray]:
     compiled = jax.jit(lambda *arguments: relax(*arguments))
 
     def run(p: Problem, start: np.ndarray) -> np.ndarray:
@@ -167,6 +167,24 @@ def test_newton_s_method_ends_at_the_minimum(seed: int) -> None:
     size = p.rows.impedance * (np.abs(p.rows.reference) + np.abs(p.rows.jacobian) @ np.abs(qacc))
     assert (np.abs(force - forces(p, qacc)) <= 1e-5 * size).all()
     assert (force >= p.rows.low).all() and (force <= p.rows.high).all()
+
+
+@settings(max_examples=50, deadline=None)
+@given(SEEDS)
+def test_one_newton_step_solves_rows_without_bounds(seed: int) -> None:
+    p = problem(seed, contacts=CONTACTS)
+    p.rows = p.rows._replace(low=np.full_like(p.rows.low, -np.inf), high=np.full_like(p.rows.high, np.inf))
+    qacc, _ = compiled_solve(p.mass, p.smooth, p.rows, p.start, 1, 1)
+    assert unbalanced(p, np.asarray(qacc)) < 1e-5
+
+
+@pytest.mark.parametrize("line_search", [4, 5, 20])
+def test_the_line_search_does_not_run_to_and_fro(line_search: int) -> None:
+    """From -1, Newton's step leads to 1 and from there back: friction alone is between them, and holds at 0."""
+    one = np.ones(1, np.float32)
+    rows = Rows(np.float32([[1]]), 1000 * one, 0 * one, -one, one)
+    qacc, force = compiled_solve(np.float32([[1]]), 0 * one, rows, -one, 6, line_search)
+    assert np.abs(qacc).max() < 1e-6 and np.abs(force).max() < 1e-3
 
 
 def mujoco_problem(model: mujoco.MjModel, data: mujoco.MjData, count: int) -> Problem:
