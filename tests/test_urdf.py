@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import time
 from pathlib import Path
 
 import mujoco
@@ -49,12 +48,10 @@ def folder(tmp_path: Path) -> Path:
 
 
 def refused(folder: Path) -> str:
-    """The one sentence with which loading and building fails, quickly and without a trace."""
+    """The one sentence with which loading and building fails, without a trace."""
     before = {path: path.read_bytes() for path in folder.parent.rglob("*") if path.is_file() and not path.is_symlink()}
-    start = time.perf_counter()
     with pytest.raises(ValueError) as caught:
         load_arm(folder).spec()
-    assert time.perf_counter() - start < 2
     sentence = str(caught.value)
     assert "\n" not in sentence and len(sentence) < 500
     assert {p: p.read_bytes() for p in folder.parent.rglob("*") if p.is_file() and not p.is_symlink()} == before
