@@ -20,7 +20,7 @@ from jax import Array
 
 from surgical_marl.collision import Pairs, Touching
 from surgical_marl.runtime import prepare_jax
-from surgical_marl.scene import DECIMATION, Scene
+from surgical_marl.scene import DECIMATION, PAYLOAD, Scene
 from surgical_marl.solver import JointRows, Rows, relax, solve, solve_positive
 
 ARM_ITERATIONS, TOUCHING_ITERATIONS = (1, 1), (6, 4)
@@ -87,9 +87,9 @@ class Simulator:
         self.decimation, self.control_dt = decimation, decimation * scene.model.opt.timestep
         self._index_joints()
         self._index_pairs()
-        start = scene.home[self._address]
-        start = start if scene.control == "position" else np.where(self._jaws, start, 0.0)
-        self._home = np.asarray(scene.home, np.float32), np.asarray(self._moment @ start, np.float32)
+        start = scene.home[self.address]
+        start = start if scene.control == "position" else np.where(self.jaws, start, 0.0)
+        self._home = np.asarray(scene.home, np.float32), np.asarray(self.moment @ start, np.float32)
         self.home_contacts, self.home_views = self._measure_home()
 
     @property
@@ -99,26 +99,26 @@ class Simulator:
         still = jnp.zeros(self.scene.model.nv, jnp.float32)
         return Physics(qpos, still, still, ctrl)
 
-    def command(self, physics: Physics, actions: dict[str, Array]) -> Physics:
-        """The next command of every actuator. A jaw moves to open or closed at its speed, whatever the mode; a cable
-        follows its joints' commands.
+    def command(self, physics: Physics, actions: dict[str, Array], measured: Array | None = None) -> Physics:
+        """The next command of every actuator, from the joints' positions, or from what is `measured` of them, [nq]. A
+        jaw moves to open or closed at its speed, whatever the mode; a cable follows its joints' commands.
 
         A position target leads its joint by no more than full effort at full speed takes: one that is held up would
         wind up its target, and race after it once free.
         """
-        ctrl, own = physics.ctrl[self._drives], jnp.zeros(self.scene.model.nu, jnp.float32)
+        ctrl, own = physics.ctrl[self.drives], jnp.zeros(self.scene.model.nu, jnp.float32)
         for agent in self.scene.agents:
             own = own.at[self._actuators[agent]].set(jnp.clip(actions[agent], -1.0, 1.0))
         action = own[self._leaders]
         reach = self._speed * np.float32(self.control_dt)
         if self.scene.control == "position":
-            now = physics.qpos[self._address]
+            now = (physics.qpos if measured is None else measured)[self.address]
             lead = jnp.clip(ctrl + action * reach - now, -self._lead, self._lead)
             command = jnp.clip(now + lead, self._low, self._high)
         else:
             command = action * (self._speed if self.scene.control == "velocity" else self._effort)
         jaw = ctrl + jnp.clip(jnp.where(action > 0, self._open, self._closed) - ctrl, -reach, reach)
-        return physics._replace(ctrl=jnp.matmul(self._moment, jnp.where(self._jaws, jaw, command)))
+        return physics._replace(ctrl=jnp.matmul(self.moment, jnp.where(self.jaws, jaw, command)))
 
     def advance(self, physics: Physics) -> tuple[Physics, Contacts, dict[str, ArmView]]:
         """A control step of physics, and what is seen where it ends. MuJoCo leaves tips and distances one physics step
@@ -136,6 +136,34 @@ class Simulator:
         tips, distance = self._look(physics.qpos)
         contacts = Contacts(distance, -jnp.minimum(nearest, distance), strongest)
         return physics, contacts, self._view(jnp, physics, tips, contacts)
+
+    def varied(self, stiffness: Array, damping: Array, friction: Array, payload: Array, offset: Array) -> Simulator:
+        """Other arms of this kind: factors of every actuator's gains [nu] and of every joint's friction [nv], masses
+        [arms] at their tool tips if the scene has room for them, and by how much the controllers of joints misread
+        them, [nq]."""
+        model, varied, nominal = self._model, copy.copy(self), self.scene.model
+        by_position = nominal.actuator_biasprm[:, 1] != 0
+        by_velocity = ~by_position & (nominal.actuator_biasprm[:, 2] != 0)
+        gain = jnp.where(by_position, stiffness, jnp.where(by_velocity, damping, 1.0))
+        pull = model.actuator_biasprm[:, 1] * stiffness
+        misread = pull * (self.moment @ offset[self.address])
+        bias = jnp.stack([misread, pull, model.actuator_biasprm[:, 2] * damping], -1)
+        loaded = self.scene.agents if self.scene.randomisation.payload else ()
+        bodies = [nominal.body(f"{agent}/{PAYLOAD}").id for agent in loaded]
+        changes = {
+            "actuator_gainprm": model.actuator_gainprm.at[:, 0].set(model.actuator_gainprm[:, 0] * gain),
+            "actuator_biasprm": model.actuator_biasprm.at[:, :3].set(bias),
+            "dof_frictionloss": model.dof_frictionloss * friction,
+            "dof_damping": model.dof_damping * friction,
+            "body_mass": model.body_mass.at[np.array(bodies, int)].set(payload[: len(bodies)]),
+        }
+        varied._model = model.tree_replace(changes)
+        return varied
+
+    def view(self, physics: Physics, contacts: Contacts) -> dict[str, ArmView]:
+        """What tasks see at a posture, apart from contacts, which are those of the step before."""
+        tips, distance = self._look(physics.qpos)
+        return self._view(jnp, physics, tips, contacts._replace(distance=distance))
 
     def _look(self, qpos: Array) -> tuple[Array, Array]:
         """Tool tips [arms, 3] in the world and the distance of every pair, at a posture."""
@@ -262,21 +290,21 @@ class Simulator:
         scene, model = self.scene, self.scene.model
         names = [model.actuator(i).name for i in range(model.nu)]
         # actuators of joints: they stand in the URDF's order, `qpos` in that of the tree
-        self._drives = np.flatnonzero(model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT)
-        self._address = model.jnt_qposadr[model.actuator_trnid[self._drives, 0]]
-        self._moment = np.asarray(scene.moment[:, self._address], np.float32)
+        self.drives = np.flatnonzero(model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT)
+        self.address = model.jnt_qposadr[model.actuator_trnid[self.drives, 0]]
+        self.moment = np.asarray(scene.moment[:, self.address], np.float32)
         rows = [
             (names.index(f"{agent}/{joint.leader}"), bool(arm.jaw and joint.leader == arm.jaw.joint), joint, arm.jaw)
             for agent, arm in ((agent, mount.arm) for agent, mount in scene.mounts.items())
             for joint in arm.joints
         ]
         single = np.float32
-        self._leaders, self._jaws = np.array([row[0] for row in rows]), np.array([row[1] for row in rows])
+        self._leaders, self.jaws = np.array([row[0] for row in rows]), np.array([row[1] for row in rows])
         self._speed = np.array([joint.drive.speed for _, _, joint, _ in rows], single)
         self._effort = np.array([joint.effort for _, _, joint, _ in rows], single)
         # what a joint feels that moves alone: its own gains and its cables'
         gains = np.array([model.actuator_gainprm[:, 0], -model.actuator_biasprm[:, 2]], single)
-        stiffness, damping = gains @ self._moment**2
+        stiffness, damping = gains @ self.moment**2
         self._lead = (self._effort + damping * self._speed) / stiffness
         self._low = np.array([joint.lower for _, _, joint, _ in rows], single)
         self._high = np.array([joint.upper for _, _, joint, _ in rows], single)

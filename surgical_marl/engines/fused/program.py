@@ -77,7 +77,7 @@ class Source:
 
 
 _CODE = ("physics", "collision", "solver", "env", "safety", "scene", "arm", "arm_spec", "workspace", "paths", "spline",
-         "task", "path_task", "tasks/*", "engines/fused/*")  # fmt: skip
+         "task", "path_task", "tasks/*", "plant", "randomisation", "engines/fused/*")  # fmt: skip
 
 
 def load_source(env: Env, vector: bool, announce: Callable[[], None] = lambda: None) -> Source:
