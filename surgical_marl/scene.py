@@ -70,6 +70,11 @@ class Scene:
         names = dict.fromkeys(mount.arm.name for mount in self.mounts.values())
         return {name: tuple(a for a in self.agents if self.mounts[a].arm.name == name) for name in names}
 
+    def alone(self, agent: str) -> mujoco.MjModel:
+        """The model of one arm of the scene, its base frame at the origin."""
+        mount = replace(self.mounts[agent], position=np.zeros(3), rotation=np.eye(3))
+        return _compile(_build(self.name, {agent: mount}, self.control, self.randomisation))
+
     @property
     def home(self) -> np.ndarray:
         """`qpos` with every arm at its home, shape [nq]."""
@@ -168,10 +173,7 @@ def load_scene(name: str | Path, control: str = "position") -> Scene:
         raise ValueError(f"{path}: arms must map agent names such as psm_0 to arms")
     mounts = {agent: _read_mount(agent, mount, path) for agent, mount in arms.items()}
     randomisation = read_randomisation(settings.get("randomisation"), path)
-    spec = _build(path.stem, mounts, control)
-    if randomisation.payload:
-        for agent, mount in mounts.items():
-            spec.body(f"{agent}/{mount.arm.tool_tip}").add_body(name=f"{agent}/{PAYLOAD}")
+    spec = _build(path.stem, mounts, control, randomisation)
     _add_surroundings(spec, mounts, settings.get("view"), path)
     model = _compile(spec)
     scene = Scene(path.stem, str(settings.get("description", "")), control, mounts, model, randomisation)
@@ -232,7 +234,7 @@ def set_physics(spec: mujoco.MjSpec) -> None:
     option.gravity = [0.0, 0.0, 0.0]
 
 
-def _build(name: str, mounts: dict[str, Mount], control: str) -> mujoco.MjSpec:
+def _build(name: str, mounts: dict[str, Mount], control: str, randomisation: Randomisation) -> mujoco.MjSpec:
     spec = mujoco.MjSpec()
     spec.modelname = name
     spec.compiler.degree = False
@@ -243,6 +245,8 @@ def _build(name: str, mounts: dict[str, Mount], control: str) -> mujoco.MjSpec:
         mujoco.mju_mat2Quat(quat, mount.rotation.ravel())
         frame = spec.worldbody.add_frame(pos=mount.position, quat=quat)
         spec.attach(mount.arm.spec(control), prefix=f"{agent}/", frame=frame)
+        if randomisation.payload:
+            spec.body(f"{agent}/{mount.arm.tool_tip}").add_body(name=f"{agent}/{PAYLOAD}")
     return spec
 
 

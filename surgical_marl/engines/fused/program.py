@@ -76,7 +76,7 @@ class Source:
     """Leaves of the rest of the `State`."""
 
 
-_CODE = ("physics", "collision", "solver", "env", "safety", "scene", "arm", "arm_spec", "workspace", "paths", "spline",
+_CODE = ("physics", "dynamics", "collision", "solver", "env", "safety", "scene", "arm", "arm_spec", "workspace", "paths", "spline",
          "task", "path_task", "tasks/*", "plant", "randomisation", "engines/fused/*")  # fmt: skip
 
 
