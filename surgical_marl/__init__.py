@@ -16,7 +16,7 @@ from surgical_marl.content import list_arms, list_policies, list_scenes, list_ta
 from surgical_marl.registration import gymnasium_ids, pettingzoo_ids
 
 if TYPE_CHECKING:
-    from surgical_marl import reach_v0
+    from surgical_marl import follow_path_v0, reach_v0, track_v0
     from surgical_marl.arm import load_arm
     from surgical_marl.batch import BatchedEnv
     from surgical_marl.interfaces.pettingzoo import parallel_env
@@ -33,6 +33,7 @@ _LAZY = {
 
 __all__ = [
     "BatchedEnv",
+    "follow_path_v0",
     "list_arms",
     "list_policies",
     "list_scenes",
@@ -41,6 +42,7 @@ __all__ = [
     "load_scene",
     "parallel_env",
     "reach_v0",
+    "track_v0",
 ]
 
 gymnasium_ids()
@@ -50,8 +52,8 @@ pettingzoo_ids()
 def __getattr__(name: str) -> Any:
     if name in _LAZY:
         return getattr(import_module(_LAZY[name]), name)
-    if name == "reach_v0":
-        return import_module("surgical_marl.reach_v0")
+    if name in ("reach_v0", "track_v0", "follow_path_v0"):
+        return import_module(f"surgical_marl.{name}")
     raise AttributeError(f"module 'surgical_marl' has no attribute {name!r}")
 
 

@@ -10,6 +10,7 @@ An environment that ends starts its next episode within the same step.
 from __future__ import annotations
 
 import secrets
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -39,8 +40,8 @@ class BatchStep(NamedTuple):
     """[N, d], of this step's episode even where it ended."""
     final_state: Any
     infos: dict[str, dict[str, Any]]
-    """agent -> tip_error (m), success, collision (bool), min_distance (m), contact_force (N), [N] each; of this step's
-    episode."""
+    """agent -> tip_error (m), success, collision (bool), min_distance (m), contact_force (N), reward_<term> (weighted),
+    cost, cost_<name> (bool), [N] each; of this step's episode."""
     contacts: Contacts
     """Distance and penetration (m) and force (N) of every pair in `scene.pairs`, [N, P] each; likewise."""
 
@@ -49,7 +50,7 @@ class BatchedEnv:
     """N environments of one task on one scene.
 
     Args:
-        task, scene, control, max_steps, decimation: as for `surgical_marl.env.Env`.
+        task, scene, control, max_steps, decimation, difficulty, reward: as for `surgical_marl.env.Env`.
         num_envs: how many environments.
         engine: "fused", "mjx" (the reference), or "auto" for the fastest that works.
         device: "cpu", "cuda" or "auto".
@@ -71,6 +72,8 @@ class BatchedEnv:
         device: str = "auto",
         max_steps: int | None = None,
         decimation: int = DECIMATION,
+        difficulty: str = "default",
+        reward: Mapping[str, float] | None = None,
         arrays: str = "numpy",
     ) -> None:
         if isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1:
@@ -79,7 +82,7 @@ class BatchedEnv:
             raise ValueError(f"unknown engine {engine!r}; the engines are {', '.join(ENGINES)}")
         if arrays not in ARRAYS:
             raise ValueError(f"unknown arrays {arrays!r}; the libraries are {', '.join(ARRAYS)}")
-        self.env = Env(task, scene, control, max_steps, decimation)
+        self.env = Env(task, scene, control, max_steps, decimation, difficulty, reward)
         self.engine = make_engine(self.env, num_envs, engine, device)
         self.num_envs, self.arrays = num_envs, arrays
         self.agents = list(self.env.agents)
@@ -139,8 +142,8 @@ class BatchedEnv:
 
     @property
     def goal(self) -> Any:
-        """The task's goal of every environment, numpy."""
-        return self._part(".goal", "numpy")
+        """Where the tool tips should be now, [N, arms, 3], numpy; each in its arm's base frame, m."""
+        return self._part(".goal.targets", "numpy")
 
     @property
     def steps(self) -> Any:

@@ -16,7 +16,7 @@ import numpy as np
 
 from surgical_marl.runtime import cache_dir
 
-_GEOMETRY = ("arm", "contacts", "describe", "geometry", "inverse_kinematics", "scene", "workspace")
+_GEOMETRY = ("arm", "contacts", "describe", "geometry", "inverse_kinematics", "paths", "scene", "spline", "workspace")
 
 
 def cached(

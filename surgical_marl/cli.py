@@ -37,6 +37,7 @@ _SETTINGS: tuple[tuple[str, str | tuple[str, ...], str], ...] = (
     ("engine", ("auto", "fused", "mjx"), "what runs the physics"),
     ("device", _DEVICES, "where it runs"),
     ("control", _CONTROL, "what an action commands"),
+    ("difficulty", ("easy", "default", "hard"), "how far, how fast, how crowded"),
 )
 
 

@@ -11,6 +11,7 @@ environment that ends is reset within the same step: `observations` then belong 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -24,6 +25,7 @@ from jax import Array
 from surgical_marl.content import list_tasks, unknown
 from surgical_marl.physics import ArmView, Contacts, Physics, Simulator
 from surgical_marl.runtime import prepare_jax
+from surgical_marl.safety import costs
 from surgical_marl.scene import DECIMATION, load_scene
 
 
@@ -35,6 +37,8 @@ class Carry(NamedTuple):
     key: Array
     episode: Array
     steps: Array
+    tips: Any = ()
+    """Tool tips [arms, 3], each in its arm's base frame, m: the next step has their speed from it."""
 
 
 @jax.tree_util.register_dataclass
@@ -55,8 +59,9 @@ class State:
     """Of this step's episode, even if it ended."""
     final_state: Array
     infos: dict[str, dict[str, Array]]
-    """tip_error (m), success, collision, min_distance (m), contact_force (N) of this step's episode, even if it
-    ended."""
+    """tip_error (m), success, collision, min_distance (m), contact_force (N); `reward_<term>`, the weighted terms that
+    the reward is the sum of; `cost_<name>`, the limits broken (`surgical_marl/safety.py`), and their number `cost`. Of
+    this step's episode, even if it ended."""
     contacts: Contacts
     """Every pair of geoms that can touch, likewise."""
 
@@ -71,6 +76,8 @@ class Env:
             those. Actions are in [-1, 1]; 1 is the joint's `speed`, or its effort limit for torque.
         max_steps: control steps until truncation; the task's own number if None.
         decimation: physics steps a control step.
+        difficulty: "easy", "default" or "hard"; the task's module says what each is.
+        reward: weights of reward terms that replace the task's own, as in {"collision": -5}.
 
     Raises:
         ValueError: naming what is unknown or out of range.
@@ -83,6 +90,8 @@ class Env:
         control: str = "position",
         max_steps: int | None = None,
         decimation: int = DECIMATION,
+        difficulty: str = "default",
+        reward: Mapping[str, float] | None = None,
     ) -> None:
         if task not in list_tasks():
             raise unknown("task", task, list_tasks())
@@ -95,11 +104,18 @@ class Env:
         prepare_jax()
         self.scene = load_scene(scene, control)
         self.task_name = task
-        self.task = import_module(f"surgical_marl.tasks.{task}").Task(self.scene)
+        self.task = import_module(f"surgical_marl.tasks.{task}").Task(self.scene, difficulty, reward)
         self.max_steps = max_steps or self.task.max_steps
         self.agents = self.scene.agents
         self.decimation, self.control_dt = decimation, decimation * self.scene.model.opt.timestep
+        self.difficulty = difficulty
         self._bounds = {agent: self.task.bounds(agent) for agent in self.agents}
+
+    @property
+    def settings(self) -> str:
+        """All that a step depends on besides the scene and the code."""
+        weights = sorted(self.task.weights.items())
+        return f"{self.task_name} {self.difficulty} {weights} {self.scene.control} {self.max_steps} {self.decimation}"
 
     @cached_property
     def simulator(self) -> Simulator:
@@ -132,6 +148,7 @@ class Env:
         carry = self._start(key, jnp.int32(episode))
         views = self.simulator.home_views
         observations, state = self._observe(views, carry.goal)
+        nothing = jax.tree.map(jnp.zeros_like, self.task.rewards(views, carry.goal))
         return State(
             carry=carry,
             observations=observations,
@@ -141,19 +158,22 @@ class Env:
             truncated=jnp.bool_(False),
             final_observations=observations,
             final_state=state,
-            infos=self._infos(views, carry.goal),
+            infos=self._infos(views, carry, carry, nothing),
             contacts=self.simulator.home_contacts,
         )
 
     def step(self, carry: Carry, actions: dict[str, Array]) -> State:
         """One control step, and a reset if it ends the episode."""
         physics, contacts, views = self.simulator.advance(self.simulator.command(carry.physics, actions))
-        rewards = self.task.rewards(views, carry.goal)
-        terminated = self.task.terminated(views, carry.goal)
+        goal = self.task.advance(carry.goal, self.control_dt)
+        tips = jnp.stack([view.tool_tip for view in views.values()])
+        terms = self.task.rewards(views, goal)
+        terminated = self.task.terminated(views, goal)
         steps = carry.steps + 1
         truncated = (steps >= self.max_steps) & ~terminated
-        final_observations, final_state = self._observe(views, carry.goal)
-        going = carry._replace(physics=physics, steps=steps), final_observations, final_state
+        final_observations, final_state = self._observe(views, goal)
+        moved = carry._replace(physics=physics, goal=goal, tips=tips, steps=steps)
+        going = moved, final_observations, final_state
 
         def begin(_: Any) -> Any:
             fresh = self._start(carry.key, carry.episode + 1)
@@ -165,19 +185,20 @@ class Env:
             carry=next_carry,
             observations=observations,
             state=state,
-            rewards=rewards,
+            rewards={agent: sum(values.values()) for agent, values in terms.items()},
             terminated=terminated,
             truncated=truncated,
             final_observations=final_observations,
             final_state=final_state,
-            infos=self._infos(views, carry.goal),
+            infos=self._infos(views, carry, moved, terms),
             contacts=contacts,
         )
 
     def _start(self, key: Array, episode: Array) -> Carry:
         return Carry(
             physics=self.simulator.home,
-            goal=self.task.goal(jax.random.fold_in(key, episode)),
+            goal=self.task.start(jax.random.fold_in(key, episode)),
+            tips=jnp.stack([view.tool_tip for view in self.simulator.home_views.values()]),
             key=key,
             episode=episode,
             steps=jnp.int32(0),
@@ -190,15 +211,21 @@ class Env:
         }
         return observations, jnp.concatenate([observations[agent] for agent in self.agents])
 
-    def _infos(self, views: dict[str, ArmView], goal: Any) -> dict[str, dict[str, Array]]:
-        errors = self.task.tip_errors(views, goal)
-        return {
-            agent: {
+    def _infos(
+        self, views: dict[str, ArmView], before: Carry, after: Carry, terms: dict[str, dict[str, Array]]
+    ) -> dict[str, dict[str, Array]]:
+        errors, infos = self.task.tip_errors(views, after.goal), {}
+        speeds = jnp.linalg.norm(after.tips - before.tips, axis=-1) / np.float32(self.control_dt)
+        for i, (agent, view) in enumerate(views.items()):
+            broken = costs(self.scene.mounts[agent].arm, view, speeds[i])
+            infos[agent] = {
                 "tip_error": errors[agent],
                 "success": errors[agent] < self.task.success,
                 "collision": view.collision,
                 "min_distance": view.min_distance,
                 "contact_force": view.contact_force,
+                **{f"reward_{name}": value for name, value in terms[agent].items()},
+                "cost": sum(cost.astype(jnp.float32) for cost in broken.values()),
+                **{f"cost_{name}": cost for name, cost in broken.items()},
             }
-            for agent, view in views.items()
-        }
+        return infos

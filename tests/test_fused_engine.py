@@ -153,7 +153,7 @@ def unsupported(monkeypatch: pytest.MonkeyPatch) -> Env:
     monkeypatch.setattr(
         env.task,
         "terminated",
-        lambda views, goal: terminated(views, goal) | (jax.lax.sort(goal[0])[0] > 9),
+        lambda views, goal: terminated(views, goal) | (jax.lax.sort(goal.targets[0])[0] > 9),
         raising=True,
     )
     return env

@@ -23,12 +23,14 @@ from surgical_marl.interfaces.pettingzoo import RENDER_MODES
 
 class SurgicalEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     """One environment. `info` holds tip_error (m, the worst arm's), success (of all), collision (of any), min_distance
-    (m), and for several arms also "agents": the same for each."""
+    (m), the sums of `reward_<term>`, `cost` and `cost_<name>`, and for several arms also "agents": the same for
+    each."""
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012 (Gymnasium's own convention)
 
     def __init__(self, task: str = "reach", scene: str = "psm", render_mode: str | None = None, **options: Any) -> None:
-        """`options` are those of `surgical_marl.batch.BatchedEnv`: control, engine, device, max_steps."""
+        """`options` are those of `surgical_marl.batch.BatchedEnv`: control, engine, device, max_steps, difficulty,
+        reward."""
         if render_mode not in RENDER_MODES:
             raise ValueError(f"unknown render_mode {render_mode!r}; the modes are None and 'rgb_array'")
         self.render_mode = render_mode
@@ -127,6 +129,7 @@ def _joint_info(infos: dict[str, dict[str, Any]], index: int | None = None) -> d
         "success": stacked["success"].all(0),
         "collision": stacked["collision"].any(0),
         "min_distance": stacked["min_distance"].min(0),
+        **{key: stacked[key].sum(0) for key in stacked if key.startswith(("reward_", "cost"))},
     }
     if index is not None:
         team = {key: value[index].item() for key, value in team.items()}

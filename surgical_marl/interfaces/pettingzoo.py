@@ -12,6 +12,7 @@ empties.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -176,6 +177,8 @@ def parallel_env(
     num_envs: int | None = None,
     max_steps: int | None = None,
     max_cycles: int | None = None,
+    difficulty: str = "default",
+    reward: Mapping[str, float] | None = None,
     arrays: str = "numpy",
     render_mode: str | None = None,
 ) -> SurgicalParallelEnv | SurgicalBatchedParallelEnv:
@@ -185,10 +188,12 @@ def parallel_env(
         task: a name of `list_tasks()`.
         scene: a name of `list_scenes()` or the path of a scene file.
         control: "position" (targets moved by increments), "velocity" or "torque".
-        engine: "auto" or "mjx".
+        engine: "auto", "fused" or "mjx".
         device: "auto", "cpu" or "cuda".
         num_envs: None for one environment, N for the same dicts with a leading N.
         max_steps: control steps until truncation; the task's own if None. `max_cycles` is PettingZoo's name for it.
+        difficulty: "easy", "default" or "hard".
+        reward: weights of reward terms that replace the task's own, as in {"collision": -5}.
         arrays: with `num_envs`, the library of the arrays: "numpy", "torch" or "jax".
         render_mode: None or "rgb_array" (one environment).
 
@@ -209,6 +214,8 @@ def parallel_env(
         engine=engine,
         device=device,
         max_steps=max_cycles if max_steps is None else max_steps,
+        difficulty=difficulty,
+        reward=reward,
         arrays=arrays,
     )
     return SurgicalParallelEnv(batch, render_mode) if num_envs is None else SurgicalBatchedParallelEnv(batch)

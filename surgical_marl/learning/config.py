@@ -67,8 +67,8 @@ class NetworkSettings(_Checked):
 
 @dataclass(frozen=True)
 class Settings(_Checked):
-    """One training run. `task`, `scene`, `control`, `engine`, `device` and `max_steps` are those of
-    `BatchedEnv`.
+    """One training run. `task`, `scene`, `control`, `difficulty`, `reward`, `engine`, `device` and `max_steps` are
+    those of `BatchedEnv`.
 
     algo: "mappo" (a critic of the whole state), "ippo" (each critic sees what its agent sees) or
     "joint" (one agent moves all arms). team_reward: every agent gets the sum of all rewards,
@@ -78,6 +78,7 @@ class Settings(_Checked):
     task: str = "reach"
     scene: str = "bimanual_psm"
     control: Literal["position", "velocity", "torque"] = "position"
+    difficulty: Literal["easy", "default", "hard"] = "default"
     algo: Literal["mappo", "ippo", "joint"] = "mappo"
     engine: Literal["auto", "mjx", "fused"] = "auto"
     device: Literal["auto", "cpu", "cuda"] = "auto"
@@ -88,6 +89,7 @@ class Settings(_Checked):
     steps_per_iteration: int = _number(24, 1, 100_000)
     checkpoint_every: int = _number(50, 1, 10_000_000)
     team_reward: bool = False
+    reward: dict[str, float] = field(default_factory=dict)
     ppo: PPOSettings = field(default_factory=PPOSettings)
     network: NetworkSettings = field(default_factory=NetworkSettings)
 
@@ -217,6 +219,9 @@ def _check(name: str, value: Any, kind: Any, limits: tuple[float, float] | None)
         if value not in get_args(kind):
             raise ValueError(f"{name} must be one of {', '.join(get_args(kind))}, not {value!r}")
         return value
+    if get_origin(kind) is dict:
+        weights = _mapping(name, {} if value is None else value)
+        return {str(key): _check(f"{name}.{key}", weight, float, (-1e6, 1e6)) for key, weight in weights.items()}
     if get_origin(kind) is tuple:
         if not isinstance(value, (list, tuple)) or not value:
             raise ValueError(f"{name} must be a list of whole numbers such as [256, 128, 64], not {value!r}")

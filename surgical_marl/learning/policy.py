@@ -29,6 +29,7 @@ from surgical_marl.learning.run import (
     read_settings,
     write_checkpoint,
 )
+from surgical_marl.oracle import oracle
 
 if TYPE_CHECKING:
     from surgical_marl.batch import BatchedEnv
@@ -40,7 +41,7 @@ def load_policy(run: str | Path, env: BatchedEnv) -> Policy:
     """The deterministic policy of a run for the agents of an environment.
 
     Args:
-        run: a run folder, or the name of a policy that ships, or "zero" or "random".
+        run: a run folder, or the name of a policy that ships, or "zero", "random" or "oracle".
         env: the environment that the policy will act in.
 
     Raises:
@@ -51,6 +52,8 @@ def load_policy(run: str | Path, env: BatchedEnv) -> Policy:
         return zero_policy(env)
     if run == "random":
         return random_policy(env)
+    if run == "oracle":
+        return oracle(env)
     folder = find_run(run)
     settings, checkpoint = read_settings(folder), read_checkpoint(folder)
     layout = Layout(env, joint=settings.algo == "joint")
@@ -97,7 +100,7 @@ def find_run(run: str | Path) -> Path:
         if (folder / CONFIG).is_file():
             return folder
     shipped = ", ".join(list_policies()) or "none yet"
-    raise ValueError(f"{str(run)!r} is not a run folder, nor zero, random or a policy that ships ({shipped})")
+    raise ValueError(f"{str(run)!r} is not a run folder, nor zero, random, oracle or a policy that ships ({shipped})")
 
 
 def export_policy(run: str | Path, out: Path) -> Path:

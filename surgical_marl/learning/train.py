@@ -70,6 +70,8 @@ def make_env(settings: Settings, num_envs: int | None = None) -> BatchedEnv:
         engine=settings.engine,
         device=settings.device,
         max_steps=settings.max_steps,
+        difficulty=settings.difficulty,
+        reward=settings.reward,
         arrays="torch",
     )
 

@@ -76,7 +76,8 @@ class Source:
     """Leaves of the rest of the `State`."""
 
 
-_CODE = ("physics", "solver", "env", "scene", "arm", "arm_spec", "workspace", "tasks/*", "engines/fused/*")
+_CODE = ("physics", "collision", "solver", "env", "safety", "scene", "arm", "arm_spec", "workspace", "paths", "spline",
+         "task", "path_task", "tasks/*", "engines/fused/*")  # fmt: skip
 
 
 def load_source(env: Env, vector: bool, announce: Callable[[], None] = lambda: None) -> Source:
@@ -87,7 +88,7 @@ def load_source(env: Env, vector: bool, announce: Callable[[], None] = lambda: N
         Unsupported: the environment can't be traced.
     """
     versions = {name: version(name) for name in ("jax", "mujoco", "mujoco-mjx")}
-    settings = f"{env.task_name} {env.scene.control} {env.max_steps} {env.decimation} vector={vector} {versions}"
+    settings = f"{env.settings} vector={vector} {versions}"
 
     def compute() -> np.ndarray:
         announce()

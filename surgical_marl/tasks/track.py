@@ -1,0 +1,46 @@
+"""Active tracking: every arm keeps its tool tip on a target that wanders, and no two arms touch.
+
+Agents        every arm of the scene.
+Observation   as in `reach`, with the target's place now for the goal, and the target's velocity. Base frame, SI units.
+Action        one number in [-1, 1] for every joint; the jaw opens above 0 and closes otherwise.
+Reward        per agent, each step, the terms and weights of `reach`.
+Success       tip within 2 mm of the target.
+Termination   none; an episode is truncated after 250 control steps (5 s).
+Randomisation targets rest at the tool tips at first. Then their velocities walk at random, as in the paper, but never
+              faster than a greatest speed, and never further than a greatest distance from where they began. Walks are
+              kept only if all arms can follow them together (`surgical_marl/paths.py`). Arms start at home.
+Difficulty    greatest speed and distance: easy 10 mm/s, 50 mm; default 20 mm/s, 50 mm; hard 40 mm/s, 70 mm. The ways of
+              two arms' targets come within 20 mm of each other, at different times, in no episode if easy, in a tenth
+              by default, in half if hard (where arms can meet at all).
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from surgical_marl.path_task import PathGoal, PathTask
+from surgical_marl.paths import walks
+from surgical_marl.task import Level, Views
+
+
+class Task(PathTask):
+    """Targets on random walks."""
+
+    draw = staticmethod(walks)
+    levels = {  # noqa: RUF012
+        "easy": Level(0.05, 0.0, 0.01),
+        "default": Level(0.05, 0.1, 0.02),
+        "hard": Level(0.07, 0.5, 0.04),
+    }
+
+    def observations(self, views: Views, goal: PathGoal) -> dict[str, Array]:
+        """[d] each; the velocity comes last."""
+        known, velocities = super().observations(views, goal), self.velocities(goal)
+        return {agent: jnp.concatenate([known[agent], velocities[i]]) for i, agent in enumerate(views)}
+
+    def bounds(self, agent: str) -> tuple[np.ndarray, np.ndarray]:
+        """Least and greatest observation of an agent, [d] each."""
+        low, high = super().bounds(agent)
+        return np.append(low, np.full(3, -2 * self.level.speed)), np.append(high, np.full(3, 2 * self.level.speed))
