@@ -25,6 +25,7 @@ _LISTS = {
 }
 
 _CONTROL = ("position", "velocity", "torque")
+_DIFFICULTY = ("easy", "default", "hard")
 _DEVICES = ("auto", "cpu", "cuda")
 _BENCHED = ("all", "fused", "mjx", "mujoco")
 
@@ -37,7 +38,7 @@ _SETTINGS: tuple[tuple[str, str | tuple[str, ...], str], ...] = (
     ("engine", ("auto", "fused", "mjx"), "what runs the physics"),
     ("device", _DEVICES, "where it runs"),
     ("control", _CONTROL, "what an action commands"),
-    ("difficulty", ("easy", "default", "hard"), "how far, how fast, how crowded"),
+    ("difficulty", _DIFFICULTY, "how far, how fast, how crowded"),
 )
 
 
@@ -117,7 +118,8 @@ def _parser() -> argparse.ArgumentParser:
     )
     evaluate.add_argument("--task", help="of a policy that is not trained")
     evaluate.add_argument("--scene", help="likewise: a name (see `list scenes`) or a .yaml file")
-    evaluate.add_argument("--control", type=_one_of(_CONTROL), metavar="|".join(_CONTROL), help="likewise")
+    for key, good in (("control", _CONTROL), ("difficulty", _DIFFICULTY)):
+        evaluate.add_argument(f"--{key}", type=_one_of(good), metavar="|".join(good), help="likewise")
     evaluate.add_argument("--episodes", type=_whole(1), default=200, metavar="N")
     evaluate.add_argument("--seed", type=_whole(0), default=0, metavar="S")
     evaluate.add_argument("--against", type=Path, metavar="FILE.json", help="an older result to compare with")
@@ -311,7 +313,7 @@ def _eval(arguments: argparse.Namespace) -> None:
     from surgical_marl.evaluation.command import play_all, read_result, report
 
     older = None if arguments.against is None else (str(arguments.against), read_result(arguments.against))
-    asked = {key: getattr(arguments, key) for key in ("task", "scene", "control")}
+    asked = {key: getattr(arguments, key) for key in ("task", "scene", "control", "difficulty")}
     played = play_all(policies, asked, arguments.episodes, arguments.seed)
     print(report(played, older, arguments.json, arguments.csv, arguments.figure))
 

@@ -38,7 +38,7 @@ class FakeEnv:
         mounts = dict.fromkeys(self.agents, SimpleNamespace(arm=Point()))
         ends = np.cumsum(list(self.sizes.values()))
         joints = {a: np.arange(end - self.sizes[a], end) for a, end in zip(self.agents, ends, strict=True)}
-        self.task_name, self.control = "reach", "position"
+        self.task_name, self.control, self.env = "reach", "position", SimpleNamespace(difficulty="default")
         self.scene = SimpleNamespace(name="fake", mounts=mounts, qpos_index=joints.__getitem__)
         self.state_space = self._box(2 * sum(self.sizes.values()))
         self.generator = torch.Generator()

@@ -71,7 +71,7 @@ TRAIN = ["train", "reach", "--scene", "psm"]
         (["eval", ".", "--episodes", "0"], ["--episodes", "'0'"]),
         (["eval", ".", "--seed", "-1"], ["--seed"]),
         (["eval", "zer"], ["'zer'", "did you mean 'zero'", "oracle"]),
-        (["eval", "zero"], ["--task (reach", "--scene (bimanual_psm"]),
+        (["eval", "zero"], ["--task (", "reach", "--scene (bimanual_psm"]),
         (["eval", "zero", "--task", "reach"], ["--scene"]),
         (["eval", "zero", "--task", "reech", "--scene", "psm"], ["'reech'", "did you mean 'reach'"]),
         (["eval", "zero", "--task", "reach", "--scene", "psmm"], ["'psmm'", "did you mean 'psm'"]),

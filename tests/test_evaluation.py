@@ -53,6 +53,7 @@ class Script:
         self.lengths = np.array([len(episode) for episode in errors[self.agents[0]]])
         self.num_envs, self.max_steps = len(self.lengths), int(self.lengths.max())
         self.control_dt, self.control = 0.1, "position"  # success is judged over two steps
+        self.env = SimpleNamespace(difficulty="default")
         arms = {agent: Needle() if agent.startswith("star") else Shaft() for agent in self.agents}
         mounts = {agent: SimpleNamespace(arm=arm) for agent, arm in arms.items()}
         index = {agent: np.array([i]) for i, agent in enumerate(self.agents)}
@@ -90,8 +91,9 @@ class Script:
                 self.errors[agent][i][step] / 1000 if self.episode[i] == 0 else 1.0 for i, step in enumerate(self.steps)
             ]
             hit = [(agent, i, step) in self.hits or self.episode[i] > 0 for i, step in enumerate(self.steps)]
-            infos[agent] = {"tip_error": np.array(error, np.float32), "collision": np.array(hit)}
-            infos[agent]["min_distance"] = infos[agent]["tip_error"] + 0.001
+            tip_error = np.array(error, np.float32)
+            infos[agent] = {"tip_error": tip_error, "collision": np.array(hit), "min_distance": tip_error + 0.001}
+            infos[agent] |= {"reward_distance": -tip_error, "cost_near": tip_error < 0.002}
         self.steps = self.steps + 1
         done = self.steps == self.lengths
         self.episode, self.steps = self.episode + done, np.where(done, 0, self.steps)
@@ -144,6 +146,9 @@ def test_metrics_equal_hand_computed_numbers() -> None:
     assert result["min_distance_mm"] == second["min_distance_mm"]
     # Of the six last errors, between the fifth (3) and the sixth (4): at 4.75 of the 5 gaps.
     assert result["p95_error_mm"] == pytest.approx(3.75)
+    # Means over the steps of each episode, then over the episodes.
+    assert first["reward_distance"] == pytest.approx(-(27.5 / 4 + 1 / 2 + 11 / 3) / 3000)
+    assert first["cost_near"] == pytest.approx((1 / 4 + 1 + 2 / 3) / 3)
     assert json.loads(json.dumps(result)) == result
 
 
@@ -209,7 +214,7 @@ def test_the_table_shows_every_number() -> None:
     result = evaluate(env, still, episodes=3, seed=11)
     head, titles, *lines = format_table(result).splitlines()
     assert head.startswith(
-        f"reach in script, position control: 3 episodes, seed 11, goal set {result['goal_set'][:12]}"
+        f"reach in script, default, position control: 3 episodes, seed 11, goal set {result['goal_set'][:12]}"
     )
     assert titles.split() == ["all", "95", "%", "interval", "psm_0", "psm_1"]
     assert len(lines) == len(result["intervals"]) and len({len(line) for line in lines}) == 1

@@ -31,6 +31,7 @@ def random_trajectory(seed: int, lengths: list[int], arms: int) -> Trajectory:
         distance=rng.normal(0.05, 0.05, shape),
         tip=rng.normal(0.0, 0.01, (*shape, 3)),
         center=center,
+        terms={"cost": rng.random(shape)},
     )
 
 
@@ -53,6 +54,7 @@ def expected(trajectory: Trajectory, episode: int, arm: int) -> dict[str, float]
         "collided": any(trajectory.collision[:count, episode, arm]),
         "time": DT * (first_good + 1) if held < 0.002 else math.nan,
         "path": DT * math.fsum(speed),
+        "cost": math.fsum(trajectory.terms["cost"][:count, episode, arm]) / count,
         "smoothness": arc_length(speed) if DT * math.fsum(speed) >= 0.001 else math.nan,
     }
 

@@ -24,7 +24,7 @@ def play_all(policies: Sequence[str], asked: Mapping[str, str | None], episodes:
 
     Args:
         policies: runs or shipped policies of one task and scene, or one of `BASELINES` alone.
-        asked: `task`, `scene` and `control`; a run's own where None, and no others than its own.
+        asked: `task`, `scene`, `control` and `difficulty`; a run's own where None, and no others than its own.
 
     Raises:
         ValueError: naming what is unknown, or does not go together.
@@ -34,7 +34,7 @@ def play_all(policies: Sequence[str], asked: Mapping[str, str | None], episodes:
     settings = {policy: _settings(policy, asked) for policy in policies}
     first = settings[policies[0]]
     for policy, other in settings.items():
-        for key in ("task", "scene", "control", "max_steps"):
+        for key in (*asked, "max_steps"):
             if (theirs := getattr(other, key)) != (ours := getattr(first, key)):
                 raise ValueError(
                     f"{policy} has {key} {theirs!r} and {policies[0]} has {ours!r}: evaluate them one at a time"

@@ -15,20 +15,21 @@ import torch
 
 from surgical_marl.evaluation.goal_set import check_same, describe_goals, episode_seed, goal_hash, read_goals
 from surgical_marl.evaluation.interval import interval
-from surgical_marl.evaluation.metrics import FOLLOWING, Metric, Trajectory, measure, metrics
+from surgical_marl.evaluation.metrics import FOLLOWING, TERMS, Metric, Trajectory, measure, metrics
 
 if TYPE_CHECKING:
     from surgical_marl.batch import BatchedEnv
 
 MAX_BATCH = 1024
 """Episodes run at once; make the environment with num_envs=min(episodes, MAX_BATCH)."""
+INFOS = ("tip_error", "collision", "min_distance")
 
 
 class Played(NamedTuple):
     """What a policy did."""
 
     about: dict[str, Any]
-    """task, scene, control, episodes, seed, max_steps, control_dt (s), protocol and goal_set (its hash)."""
+    """task, scene, control, difficulty, episodes, seed, max_steps, control_dt (s), protocol and goal_set (its hash)."""
     agents: list[str]
     measures: dict[str, np.ndarray]
     """[E, A] each, see `surgical_marl.evaluation.metrics.measure`."""
@@ -128,17 +129,19 @@ def _first_episodes(
         starts.append(np.array(env.qpos[:count], float))
         step = env.step(dict(policy(observations)))
         observations = step.observations
-        told = [[step.infos[agent][key] for agent in env.agents] for key in ("tip_error", "collision", "min_distance")]
-        infos.append([np.stack([_numpy(part, count) for part in parts], -1) for parts in told])
+        names = [name for name in step.infos[env.agents[0]] if name in INFOS or name.startswith(TERMS)]
+        told = {name: [_numpy(step.infos[agent][name], count) for agent in env.agents] for name in names}
+        infos.append({name: np.stack(parts, -1) for name, parts in told.items()})
         done = _numpy(step.terminated, count) | _numpy(step.truncated, count)
         lengths[done & (lengths == 0)] = number
         if lengths.all():
             break
     else:
         raise RuntimeError(f"{int((lengths == 0).sum())} episodes did not end within max_steps = {env.max_steps}")
-    error, collision, distance = (np.stack(parts) for parts in zip(*infos, strict=True))
+    series = {name: np.stack([info[name] for info in infos]).astype(float) for name in infos[0]}
+    error, collision, distance = (series.pop(name) for name in INFOS)
     tip, center = _kinematics(env, np.stack(starts))
-    return Trajectory(lengths, error.astype(float), collision, distance.astype(float), tip, center)
+    return Trajectory(lengths, error, collision > 0, distance, tip, center, series)
 
 
 def _kinematics(env: BatchedEnv, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

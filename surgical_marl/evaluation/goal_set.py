@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 PROTOCOL = 1
 """Raised when the goals are drawn or a metric is computed in another way: older results don't compare then."""
 ROUNDING = 1e-6
-"""Goals are hashed in whole multiples of this, m: the same on every machine, whatever the type of the numbers."""
+"""Goals are hashed as whole multiples of this, m: digits that another machine may compute otherwise are left out."""
 _FILE = Path(__file__).with_name("goal_sets.yaml")
 
 
@@ -33,6 +33,7 @@ def describe_goals(env: BatchedEnv, episodes: int) -> dict[str, Any]:
         "task": env.task_name,
         "scene": env.scene.name,
         "control": env.control,
+        "difficulty": env.env.difficulty,
         "episodes": episodes,
         "max_steps": env.max_steps,
         "control_dt": round(float(env.control_dt), 9),
@@ -41,19 +42,23 @@ def describe_goals(env: BatchedEnv, episodes: int) -> dict[str, Any]:
 
 
 def read_goals(env: BatchedEnv, count: int) -> list[np.ndarray]:
-    """What the next episodes of the first `count` environments depend on: goals, and keys for what moves them."""
+    """The goals of the episodes that the first `count` environments have just begun, [count, ...] each, m.
+
+    Where goals move this is the path, from the task's table: what comes from it is computed on the device, with another
+    last digit on each.
+    """
     carry = env.carry()
-    names = sorted(name for name in carry if name.startswith((".goal", ".key")))
-    return [carry[name][:count] for name in names]
+    if ".goal.row" in carry:
+        return [np.asarray(env.env.task.table)[carry[".goal.row"][:count]]]
+    return [carry[name][:count] for name in sorted(carry) if name.startswith(".goal")]
 
 
 def goal_hash(about: Mapping[str, Any], goals: Iterable[np.ndarray]) -> str:
     """SHA-256 of `describe_goals` and of the goals of all episodes, in hexadecimal."""
     digest = hashlib.sha256(json.dumps(about, sort_keys=True).encode())
     for part in goals:
-        if np.issubdtype(part.dtype, np.floating):
-            part = np.rint(part.astype(np.float64) / ROUNDING)
-        digest.update(repr(part.shape).encode() + part.astype("<i8").tobytes())
+        whole = np.rint(part.astype(np.float64) / ROUNDING).astype("<i8")
+        digest.update(repr(part.shape).encode() + whole.tobytes())
     return digest.hexdigest()
 
 
@@ -82,4 +87,5 @@ def check_same(result: Mapping[str, Any], other: Mapping[str, Any], name: str) -
 
 
 def _describe(result: Mapping[str, Any]) -> str:
-    return "{goal_set:.12} ({task} in {scene}, {control}, {episodes} episodes, seed {seed})".format(**result)
+    what = "{task} in {scene}, {difficulty}, {control} control, {episodes} episodes, seed {seed}".format(**result)
+    return f"{result['goal_set']:.12} ({what})"

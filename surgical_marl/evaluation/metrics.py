@@ -15,6 +15,8 @@ SUCCESS_MM = 2
 """The threshold of team success and of the time to success."""
 FOLLOWING = ("track", "follow_path")
 """Tasks whose goal moves: the error of every step counts."""
+TERMS = ("reward_", "cost")
+"""How names of reward terms and costs begin in `infos`."""
 STILL = 1e-3
 """A tip that moved less than this, in m, has no smoothness: what is left is noise."""
 
@@ -34,6 +36,8 @@ class Trajectory(NamedTuple):
     """[T, E, A, 3], in the base frame at the start of each step, m."""
     center: np.ndarray
     """[T, E, A], distance of the shaft from its remote center at the start of each step, m; NaN without one."""
+    terms: Mapping[str, np.ndarray]
+    """Reward terms and costs of each step, by their names in `infos`, [T, E, A]."""
 
 
 class Metric(NamedTuple):
@@ -56,7 +60,7 @@ def measure(trajectory: Trajectory, dt: float) -> dict[str, np.ndarray]:
     Returns:
         [E, A] each: `error` at the last step and the largest `held` in the last `HOLD` seconds, `squared` (mean over
         the steps), least `distance`, largest `center`, `path` of the tip (m, m^2); `collided`; `time` from which on the
-        error stays below `SUCCESS_MM`, s, and `smoothness`, both NaN where undefined.
+        error stays below `SUCCESS_MM`, s, and `smoothness`, both NaN where undefined; the mean of each of the `terms`.
     """
     lengths, error = trajectory.lengths[:, None], trajectory.error
     step = np.arange(1, len(error) + 1)[:, None, None]
@@ -75,6 +79,7 @@ def measure(trajectory: Trajectory, dt: float) -> dict[str, np.ndarray]:
         "time": np.where(held < SUCCESS_MM / 1000, dt * (np.maximum(last_miss, 0) + 1), np.nan),
         "path": moves.sum(0),
         "smoothness": _smoothness(moves / dt, trajectory.lengths - 1, dt),
+        **{name: np.where(going, values, 0.0).sum(0) / lengths for name, values in trajectory.terms.items()},
     }
 
 
@@ -102,7 +107,7 @@ def metrics(measures: Mapping[str, np.ndarray], following: bool) -> dict[str, Me
     }
     if following:
         found["rmse_mm"] = Metric(1e6 * measures["squared"], lambda values: np.sqrt(values.mean(-1)))
-    return found
+    return found | {name: Metric(values, _mean) for name, values in measures.items() if name.startswith(TERMS)}
 
 
 def success(held: np.ndarray, threshold: float) -> Metric:

@@ -10,7 +10,10 @@ from typing import Any
 from surgical_marl.evaluation.goal_set import is_standard
 from surgical_marl.files import write_atomic
 
-ABOUT = ("policy", "task", "scene", "control", "episodes", "seed", "max_steps", "control_dt", "protocol", "goal_set")
+ABOUT = (
+    *("policy", "task", "scene", "control", "difficulty", "episodes", "seed", "max_steps", "control_dt", "protocol"),
+    "goal_set",
+)
 
 
 def format_table(result: Mapping[str, Any], others: Mapping[str, Mapping[str, Any]] | None = None) -> str:
@@ -20,8 +23,8 @@ def format_table(result: Mapping[str, Any], others: Mapping[str, Mapping[str, An
         others: columns to stand beside it, metrics by title; the agents if None.
     """
     columns = result["agents"] if others is None else others
-    head = "{task} in {scene}, {control} control: {episodes} episodes, seed {seed}, goal set {goal_set:.12}"
-    kind = "standard" if is_standard(result) else "not a standard one"
+    what = "{task} in {scene}, {difficulty}, {control} control: {episodes} episodes, seed {seed}".format(**result)
+    goals = f"goal set {result['goal_set']:.12} ({'standard' if is_standard(result) else 'not a standard one'})"
     rows = [["", "all", "95 % interval", *columns]]
     for name, bounds in result["intervals"].items():
         span = "-" if bounds is None else " to ".join(_number(name, bound) for bound in bounds)
@@ -29,7 +32,7 @@ def format_table(result: Mapping[str, Any], others: Mapping[str, Mapping[str, An
         rows[-1] += [_number(name, values.get(name)) for values in columns.values()]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = ("  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]).rstrip() for row in rows)
-    return "\n".join([f"{head.format(**result)} ({kind})", *lines])
+    return "\n".join([f"{what}, {goals}", *lines])
 
 
 def write_csv(path: Path, results: Sequence[Mapping[str, Any]]) -> None:
@@ -70,5 +73,5 @@ def _title(name: str) -> str:
 def _number(name: str, value: float | None) -> str:
     if value is None:
         return "-"
-    rate = name.endswith("_rate") or name.startswith(("success_", "team_success_"))
+    rate = name.endswith("_rate") or name.startswith(("success_", "team_success_", "cost_"))
     return f"{value:z.1%}" if rate else f"{value:z.2f}"
