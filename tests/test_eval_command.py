@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import csv
+import hashlib
 import json
 import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 from fake_env import FakeEnv
@@ -16,6 +18,7 @@ from fake_env import FakeEnv
 from surgical_marl.batch import BatchedEnv
 from surgical_marl.cli import main
 from surgical_marl.content import list_scenes, list_tasks
+from surgical_marl.env import Env
 from surgical_marl.evaluation import command
 from surgical_marl.evaluation.goal_set import (
     describe_goals,
@@ -51,6 +54,19 @@ def test_the_standard_goals_are_those_that_were_published(task: str, scene: str)
     assert goal_hash(about, noisy) == goal_hash(about, goals)
     noisy[0][17] += 1e-5
     assert goal_hash(about, noisy) != goal_hash(about, goals)
+
+
+def test_the_page_is_enough_to_compute_a_hash() -> None:
+    """As docs/evaluation.md has it, without the code of the evaluation."""
+    env = Env("reach", "bimanual_psm")
+    first = jax.random.PRNGKey(int(np.random.SeedSequence([0, 0]).generate_state(1)[0] >> 1))
+    keys = [jax.random.fold_in(jax.random.fold_in(first, i), 0) for i in range(200)]
+    goals = np.stack([np.asarray(env.task.start(key).targets, np.float64) for key in keys])
+    about = {"task": "reach", "scene": "bimanual_psm", "control": "position", "difficulty": "default", "episodes": 200}
+    about |= {"max_steps": 100, "control_dt": 0.02, "protocol": 1}
+    digest = hashlib.sha256(json.dumps(about, sort_keys=True).encode())
+    digest.update(b"(200, 2, 3)" + np.round(goals * 1e6).astype("<i8").tobytes())
+    assert digest.hexdigest() == standard_hashes()["reach"]["bimanual_psm"]
 
 
 def test_every_scene_has_a_standard_goal_set() -> None:
