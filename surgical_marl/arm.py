@@ -108,6 +108,11 @@ class Arm:
         """Upper joint limits, shape [n]."""
         return np.array([joint.upper for joint in self.actuated])
 
+    @property
+    def speed(self) -> np.ndarray:
+        """How fast a full action moves each joint's target, shape [n], rad/s (m/s for joints that slide)."""
+        return np.array([joint.drive.speed for joint in self.actuated])
+
     def forward_kinematics(self, q: Any) -> Any:
         """Pose of the tool tip in the base frame.
 

@@ -56,7 +56,7 @@ class _Guide:
     def __init__(self, env: BatchedEnv, agent: str, index: int) -> None:
         self.index, self.arm, joints = index, env.scene.mounts[agent].arm, env.scene.mounts[agent].arm.actuated
         self.dt = env.control_dt
-        self.reach = self.dt * np.array([joint.drive.speed for joint in joints])
+        self.reach = self.dt * self.arm.speed
         self.lead = self.dt + np.array([joint.drive.damping / joint.drive.stiffness for joint in joints])
         self.moves = np.array([self.arm.jaw is None or joint.name != self.arm.jaw.joint for joint in joints])
         self.q = np.tile(self.arm.home, (env.num_envs, 1))

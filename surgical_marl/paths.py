@@ -91,8 +91,8 @@ def loops_and_lines(rng: np.random.Generator, count: int, start: np.ndarray, lev
             shape, length = spline.equal_steps(spline.through(waypoints(rng, count), closed), SEGMENTS)
             wanted = rng.uniform(SLOWEST, 1, count) * level.speed * DURATION
             path = spline.through(shape * (wanted / length)[:, None, None], closed)
-            inside = (_length(path)[..., 0] <= level.extent).all(-1)
-            kept = np.concatenate([kept, path[inside & (spline.curvature(path) <= 1 / LEAST_RADIUS)]])
+            path = path[(_length(path)[..., 0] <= level.extent).all(-1)]
+            kept = np.concatenate([kept, path[spline.curvature(path) <= 1 / LEAST_RADIUS]])
             drawn += count
             if len(kept) < drawn / 100:
                 raise ValueError(
@@ -141,19 +141,22 @@ def path_table(scene: Scene, draw: Draw, level: Level, seed: int = 0) -> np.ndar
     """
     numbers = (ROWS, DURATION, SEGMENTS, CHECKS, HEADROOM, CROSSING, WAYPOINTS, WILD, LEAST_RADIUS, SLOWEST, CLEARANCE)
     settings = repr((draw.__name__, level, seed, numbers))
-    speeds = repr([[j.drive.speed for j in mount.arm.actuated] for mount in scene.mounts.values()])
+    speeds = repr([mount.arm.speed.tolist() for mount in scene.mounts.values()])
     return cached("paths", settings + speeds, scene.fingerprint, lambda: _draw(scene, draw, level, seed))
 
 
 def _draw(scene: Scene, draw: Draw, level: Level, seed: int) -> np.ndarray:
     rng, mounts = np.random.default_rng(seed), list(scene.mounts.values())
 
-    def batch() -> tuple[np.ndarray, np.ndarray]:
+    def batch(only_crossing: bool) -> tuple[np.ndarray, np.ndarray]:
         homes = [mount.arm.forward_kinematics(mount.arm.home)[:3, 3] for mount in mounts]
         drawn = [draw(rng, ROWS, home, level) for home in homes]
         table = np.stack(drawn, axis=2)
-        table = table[_can_follow(scene, table)]
-        return table, _cross(scene, table)
+        cross = _cross(scene, table)
+        if only_crossing:
+            table, cross = table[cross], cross[cross]
+        fine = _can_follow(scene, table)
+        return table[fine], cross[fine]
 
     return choose(scene, batch, ROWS, level.crossing if len(mounts) > 1 else 0.0)
 
@@ -173,7 +176,7 @@ def _can_follow(scene: Scene, table: np.ndarray) -> np.ndarray:
             arm, last = mount.arm, q[agent]
             q[agent] = inverse_kinematics(arm, points[:, moment, i], last, starts=1, iterations=6)
             missed = np.linalg.norm(arm.forward_kinematics(q[agent])[:, :3, 3] - points[:, moment, i], axis=-1)
-            fastest = HEADROOM * np.array([joint.drive.speed for joint in arm.actuated])
+            fastest = HEADROOM * arm.speed
             fine &= (missed < TOLERANCE) & (np.abs(q[agent] - last) <= fastest * DURATION / CHECKS).all(-1)
         fine &= (scene.clearance(q) > CLEARANCE) & (scene.clearance(q, within=True) > 0)
     return fine

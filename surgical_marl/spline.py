@@ -65,15 +65,17 @@ def equal_steps(control: np.ndarray, steps: int, fine: int = 24) -> tuple[np.nda
     return evaluate(control, at), passed[..., -1]
 
 
-def curvature(control: np.ndarray, fine: int = 8) -> np.ndarray:
+def curvature(control: np.ndarray, fine: int = 4) -> np.ndarray:
     """The greatest curvature, 1/m, [...], of `fine` points a segment."""
     u = np.arange(0, control.shape[-2] - 3, 1 / fine)
     k, f = np.floor(u).astype(int), (u - np.floor(u))[:, None]
     first = sum(w * control[..., k + j, :] for j, w in enumerate(slopes(f)))
     bend = (1 - f, 3 * f - 2, 1 - 3 * f, f)  # second derivatives of `weights`
     second = sum(w * control[..., k + j, :] for j, w in enumerate(bend))
-    speed = np.linalg.norm(first, axis=-1)
-    return np.asarray((np.linalg.norm(np.cross(first, second), axis=-1) / np.maximum(speed, 1e-9) ** 3).max(-1))
+    dot = lambda a, b: np.einsum("...i,...i", a, b)  # noqa: E731
+    squared = np.maximum(dot(first, first), 1e-18)
+    across = np.maximum(squared * dot(second, second) - dot(first, second) ** 2, 0)  # the cross product's square
+    return np.asarray(np.sqrt(across / squared**3).max(-1))
 
 
 @lru_cache(maxsize=16)

@@ -1,13 +1,14 @@
 """Targets that a scene's arms can reach: drawn on the host once, looked up by the environments.
 
 Targets are drawn from a normal distribution about the point in front of each arm, and a draw is kept only if every arm
-reaches its target within its joint limits, and if the arms stay apart both there and on the straight joint-space path
-from home. An environment then picks rows of the table, so a reset costs one lookup, whatever the arm.
+reaches its target within its joint limits and in time, and if the arms stay apart both there and on the straight
+joint-space path from home. An environment then picks rows of the table, so a reset costs one lookup, whatever the arm.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import combinations
 
 import numpy as np
 
@@ -19,7 +20,12 @@ TABLE_SIZE = 4096
 CLEARANCE = 0.01
 """Arms stay this far apart on the way to their targets, m."""
 PATH_POINTS = 8
-MOST_BATCHES = 40
+CROSSING_POINTS = 6
+TIME = 1.5
+"""Arms get to their targets in this time at their joints' speeds, s: an episode of `reach` leaves them half a second to
+settle."""
+MOST_BATCHES = 8
+"""So many are drawn in search of targets that cross."""
 TOLERANCE = 1e-4
 """A target is reached when inverse kinematics comes this close, m."""
 
@@ -29,8 +35,9 @@ def target_table(scene: Scene, spread: float, crossing: float = 0.0, seed: int =
 
     Args:
         spread: standard deviation of the draws in m, the same along each axis.
-        crossing: share of rows, 0 to 1, in which arms touch on the straight joint-space path from home, though they
-            are apart at their targets.
+        crossing: share of rows, 0 to 1, in which the straight joint-space paths of two arms from home collide, if the
+            one has come far and the other not yet, though all are apart at their targets. These are drawn about the
+            middle between the points in front of an arm and of the next.
         seed: of the draws; the same seed gives the same table.
 
     Returns:
@@ -40,71 +47,94 @@ def target_table(scene: Scene, spread: float, crossing: float = 0.0, seed: int =
         ValueError: if fewer than one draw in a hundred can be kept.
     """
     crossing = crossing if len(scene.agents) > 1 else 0.0
-    settings = repr((TABLE_SIZE, CLEARANCE, PATH_POINTS, TOLERANCE, spread, crossing, seed))
+    speeds = [mount.arm.speed.tolist() for mount in scene.mounts.values()]
+    settings = repr(
+        (TABLE_SIZE, CLEARANCE, PATH_POINTS, CROSSING_POINTS, TOLERANCE, TIME, speeds, spread, crossing, seed)
+    )
     return cached("targets", settings, scene.fingerprint, lambda: _draw(scene, spread, crossing, seed))
 
 
-def choose(scene: Scene, batch: Callable[[], tuple[np.ndarray, np.ndarray]], rows: int, crossing: float) -> np.ndarray:
+def choose(
+    scene: Scene, batch: Callable[[bool], tuple[np.ndarray, np.ndarray]], rows: int, crossing: float
+) -> np.ndarray:
     """So many rows from batches of draws, a share of them crossing.
 
     Args:
         scene: for the message.
-        batch: draws, and gives those that can be kept [n, ...] and which of these cross, [n] bool. Called until there
-            are enough, or until `MOST_BATCHES` show that arms don't meet: then others stand in for those that cross.
+        batch: draws about `rows` of them and gives those that can be kept [n, ...] and which of these cross, [n] bool.
+            If it is called with True, only those that cross are needed. It is called until there are enough, or until
+            `MOST_BATCHES` show that the arms hardly meet: then others stand in for those that cross.
         rows: how many.
         crossing: share of rows that cross, 0 to 1.
 
     Raises:
-        ValueError: if batches are all but empty.
+        ValueError: if fewer than one draw in a hundred can be kept.
     """
-    wanted = round(crossing * rows)
-    kept: dict[bool, list[np.ndarray]] = {False: [], True: []}
-    count = lambda cross: sum(map(len, kept[cross]))  # noqa: E731
-    for drawn in range(1, MOST_BATCHES + 1):
-        found, crosses = batch()
-        for cross in kept:
-            kept[cross].append(found[crosses == cross])
-        if count(False) >= rows - wanted and count(True) >= wanted:
+    wanted, drawn = round(crossing * rows), 0
+    plain: list[np.ndarray] = []
+    crossed: list[np.ndarray] = []
+    while not (enough := sum(map(len, plain)) >= rows) or sum(map(len, crossed)) < wanted:
+        if enough and drawn >= MOST_BATCHES:
             break
-        if drawn >= 4 and count(False) < drawn * rows / 100:
+        found, crosses = batch(enough)
+        plain.append(found[~crosses])
+        crossed.append(found[crosses])
+        drawn += 1
+        if drawn >= 4 and sum(map(len, plain)) < drawn * rows / 100:
             raise ValueError(
                 f"scene {scene.name!r}: fewer than 1 % of targets are within reach without collision; move the arms or "
                 "their workspace points"
             )
-    plain, crossed = np.concatenate(kept[False]), np.concatenate(kept[True])[:wanted]
-    if len(plain) + len(crossed) < rows:
-        raise ValueError(f"scene {scene.name!r}: too few targets are within reach without collision; move the arms or "
-                         "their workspace points")  # fmt: skip
-    return np.concatenate([plain[: rows - len(crossed)], crossed])
+    chosen = np.concatenate(crossed)[:wanted]
+    return np.concatenate([np.concatenate(plain)[: rows - len(chosen)], chosen])
 
 
 def _draw(scene: Scene, spread: float, crossing: float, seed: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
 
-    def batch() -> tuple[np.ndarray, np.ndarray]:
+    def batch(only_crossing: bool) -> tuple[np.ndarray, np.ndarray]:
         targets = rng.normal(0.0, spread, (TABLE_SIZE, len(scene.agents), 3))
-        targets += np.stack([scene.mounts[agent].workspace for agent in scene.agents])
-        reached, on_the_way, there = _clearances(scene, targets)
-        crosses = on_the_way < 0
-        good = reached & (there > CLEARANCE) & (crosses | (on_the_way > CLEARANCE))
-        return targets[good], crosses[good]
+        targets += _between(scene) if only_crossing else [mount.workspace for mount in scene.mounts.values()]
+        goals, good = _reach(scene, targets)
+        if only_crossing:
+            good &= (scene.clearance(goals) > CLEARANCE) & _cross(scene, goals)
+        else:
+            for share in np.linspace(0.0, 1.0, PATH_POINTS + 1)[1:]:
+                way = {a: (1 - share) * scene.mounts[a].arm.home + share * q for a, q in goals.items()}
+                good &= scene.clearance(way) > CLEARANCE
+        return targets[good], np.full(good.sum(), only_crossing)
 
     return choose(scene, batch, TABLE_SIZE, crossing)
 
 
-def _clearances(scene: Scene, targets: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """For rows of targets [N, arms, 3]: whether every arm reaches its own, and the least distance of two arms on the
-    straight joint-space path from home and at its end, m; [N] each."""
-    reached = np.ones(len(targets), dtype=bool)
-    goals: dict[str, np.ndarray] = {}
+def _reach(scene: Scene, targets: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Joint positions [N, n] of each agent at its targets [N, arms, 3], and whether all get there, and in time, [N]."""
+    good, goals = np.ones(len(targets), dtype=bool), {}
     for i, agent in enumerate(scene.agents):
         arm = scene.mounts[agent].arm
         goals[agent] = inverse_kinematics(arm, targets[:, i], starts=1)
         tips = arm.forward_kinematics(goals[agent])[:, :3, 3]
-        reached &= np.linalg.norm(tips - targets[:, i], axis=-1) < TOLERANCE
-    least = there = np.full(len(targets), np.inf)
-    for share in np.linspace(0.0, 1.0, PATH_POINTS + 1)[1:]:
-        way = {agent: (1 - share) * scene.mounts[agent].arm.home + share * goals[agent] for agent in scene.agents}
-        there = scene.clearance(way)
-        least = np.minimum(least, there)
-    return reached, least, there
+        good &= np.linalg.norm(tips - targets[:, i], axis=-1) < TOLERANCE
+        good &= (np.abs(goals[agent] - arm.home) <= TIME * arm.speed).all(-1)
+    return goals, good
+
+
+def _cross(scene: Scene, goals: dict[str, np.ndarray]) -> np.ndarray:
+    """Where two arms collide at any two points of their straight ways from home, the others being there, [N] bool."""
+    least = np.full(len(next(iter(goals.values()))), np.inf)
+    shares = np.linspace(0.0, 1.0, CROSSING_POINTS)[:, None]
+    for one, other in combinations(scene.agents, 2):
+        way = {}
+        for agent, mount in scene.mounts.items():
+            path = mount.arm.home + shares * (goals[agent] - mount.arm.home)[:, None]
+            way[agent] = {one: path[:, :, None], other: path[:, None]}.get(agent, mount.arm.home)
+        least = np.minimum(least, scene.clearance(way).min((1, 2)))
+    return least < 0
+
+
+def _between(scene: Scene) -> np.ndarray:
+    """For each arm, in its base frame, the middle between the points in front of it and of the next arm, [arms, 3]."""
+    mounts = list(scene.mounts.values())
+    world = np.array([mount.rotation @ mount.workspace + mount.position for mount in mounts])
+    middle = (world + np.roll(world, -1, axis=0)) / 2
+    return np.array([(point - mount.position) @ mount.rotation for point, mount in zip(middle, mounts, strict=True)])

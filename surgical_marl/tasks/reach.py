@@ -11,10 +11,10 @@ Reward        per agent, each step, weights in brackets: `distance` of tip and g
               (-2). The sum over the agents is the team's: the paper's summed distance, made dense at the way's end.
 Success       tip within 2 mm of the goal.
 Termination   none; an episode is truncated after 100 control steps (2 s).
-Randomisation goals from a normal distribution about the point in front of each arm, kept only if reachable without
-              collision (`surgical_marl/workspace.py`). Arms start at home.
-Difficulty    standard deviation of the goals: easy 30 mm, default 50 mm (the paper's), hard 70 mm. Hard: in half of the
-              episodes of several arms the straight ways from home, in joint space, collide; the goals never do.
+Randomisation goals from a normal distribution about the point in front of each arm, kept only if reachable in
+              1.5 s without collision (`surgical_marl/workspace.py`). Arms start at home.
+Difficulty    standard deviation of the goals: easy 30 mm, default 50 mm (the paper's), hard 70 mm. Hard: in a quarter
+              of the episodes of several arms the straight ways from home, in joint space, collide unless one arm waits.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 class Task(task.Task):
     """Goals that stay where they are."""
 
-    levels = {"easy": Level(0.03, 0.0), "default": Level(0.05, 0.0), "hard": Level(0.07, 0.5)}  # noqa: RUF012
+    levels = {"easy": Level(0.03, 0.0), "default": Level(0.05, 0.0), "hard": Level(0.07, 0.25)}  # noqa: RUF012
 
     def __init__(self, scene: Scene, difficulty: str = "default", reward: Mapping[str, float] | None = None) -> None:
         super().__init__(scene, difficulty, reward)
