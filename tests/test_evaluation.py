@@ -195,11 +195,14 @@ def test_batches_of_neighbouring_seeds_do_not_overlap() -> None:
 
 
 def test_following_tasks_report_the_error_of_every_step() -> None:
-    env: Any = Script({"psm_0": [[3, 4], [0, 0, 0, 10]]}, task="track")
+    env: Any = Script({"psm_0": [[3, 4], [0, 10, 0, 0]]}, task="track")
     result = evaluate(env, still, episodes=2, seed=0)
-    expected = math.sqrt(((9 + 16) / 2 + 100 / 4) / 2)
-    assert result["rmse_mm"] == pytest.approx(expected)
-    assert result["agents"]["psm_0"]["rmse_mm"] == pytest.approx(expected)
+    squares = [(9 + 16) / 2, 100 / 4]
+    for found in (result, result["agents"]["psm_0"]):
+        assert found["rmse_mm"] == pytest.approx(math.sqrt(sum(squares) / 2))
+        assert found["mean_error_mm"] == pytest.approx((math.sqrt(squares[0]) + math.sqrt(squares[1])) / 2)
+        assert found["success_5mm"] == 0.5  # back at the goal in the end is not enough
+        assert found["time_to_success_s"] is None
 
 
 def test_an_episode_without_end_is_an_error() -> None:

@@ -35,24 +35,25 @@ def random_trajectory(seed: int, lengths: list[int], arms: int) -> Trajectory:
     )
 
 
-def expected(trajectory: Trajectory, episode: int, arm: int) -> dict[str, float]:
+def expected(trajectory: Trajectory, episode: int, arm: int, following: bool) -> dict[str, float]:
     """One episode of one arm, measured step by step."""
     count = int(trajectory.lengths[episode])
     error = [float(trajectory.error[step, episode, arm]) for step in range(count)]
     tip = [trajectory.tip[step, episode, arm] for step in range(count)]
-    held = max(error[-round(HOLD / DT) :])
+    squared = math.fsum(value**2 for value in error) / count
+    held = max(error if following else error[-round(HOLD / DT) :])
     first_good = count
     while first_good > 0 and error[first_good - 1] < 0.002:
         first_good -= 1
     speed = [math.dist(a, b) / DT for a, b in itertools.pairwise(tip)]
     return {
-        "error": error[-1],
+        "error": math.sqrt(squared) if following else error[-1],
         "held": held,
-        "squared": math.fsum(value**2 for value in error) / count,
+        "squared": squared,
         "distance": min(trajectory.distance[:count, episode, arm]),
         "center": max(trajectory.center[:count, episode, arm]),
         "collided": any(trajectory.collision[:count, episode, arm]),
-        "time": DT * (first_good + 1) if held < 0.002 else math.nan,
+        "time": DT * (first_good + 1) if held < 0.002 and not following else math.nan,
         "path": DT * math.fsum(speed),
         "cost": math.fsum(trajectory.terms["cost"][:count, episode, arm]) / count,
         "smoothness": arc_length(speed) if DT * math.fsum(speed) >= 0.001 else math.nan,
@@ -72,23 +73,25 @@ def arc_length(speed: list[float], dt: float = DT) -> float:
 
 
 @settings(deadline=None, max_examples=25)
-@given(st.integers(0, 2**32 - 1), st.lists(st.integers(2, 24), min_size=1, max_size=4), st.integers(1, 3))
-def test_measures_equal_plain_loops(seed: int, lengths: list[int], arms: int) -> None:
+@given(
+    st.integers(0, 2**32 - 1), st.lists(st.integers(2, 24), min_size=1, max_size=4), st.integers(1, 3), st.booleans()
+)
+def test_measures_equal_plain_loops(seed: int, lengths: list[int], arms: int, following: bool) -> None:
     trajectory = random_trajectory(seed, lengths, arms)
-    found = measure(trajectory, DT)
+    found = measure(trajectory, DT, following)
     for episode in range(len(lengths)):
         for arm in range(arms):
-            for name, value in expected(trajectory, episode, arm).items():
+            for name, value in expected(trajectory, episode, arm, following).items():
                 assert found[name][episode, arm] == pytest.approx(value, rel=1e-9, nan_ok=True), name
 
 
 def test_what_an_episode_does_not_have_is_undefined() -> None:
     still = random_trajectory(0, [6, 1], 1)
     still.tip[...], still.error[...], still.distance[...] = 0.01, 0.5, np.inf
-    found = measure(still, DT)
+    found = measure(still, DT, False)
     assert np.isnan(found["smoothness"]).all() and np.isnan(found["time"]).all()
     assert (found["path"] == 0).all() and (found["distance"] == np.inf).all()
-    one_step = measure(random_trajectory(0, [1], 2), DT)
+    one_step = measure(random_trajectory(0, [1], 2), DT, False)
     assert (one_step["path"] == 0).all()
 
 
@@ -171,7 +174,7 @@ def test_the_spread_between_runs_counts() -> None:
 
 def test_no_interval_without_a_sample() -> None:
     assert interval(mean_of(np.ones((1, 1, 2)))) is None
-    measures = measure(random_trajectory(3, [20] * 30, 1), DT)
+    measures = measure(random_trajectory(3, [20] * 30, 1), DT, False)
     measures["time"] = np.where(np.arange(30)[:, None] == 7, 1.5, np.nan)  # one success: many resamples have none
     found = metrics({name: values[None] for name, values in measures.items()}, following=False)
     assert interval(found["time_to_success_s"]) is None

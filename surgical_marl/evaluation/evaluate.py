@@ -73,7 +73,8 @@ def play(
         count = min(env.num_envs, episodes - block * env.num_envs)
         observations, *_ = env.reset(episode_seed(seed, block))
         goals += read_goals(env, count)
-        blocks.append(measure(_first_episodes(env, policy, observations, count), env.control_dt))
+        trajectory = _first_episodes(env, policy, observations, count)
+        blocks.append(measure(trajectory, env.control_dt, env.task_name in FOLLOWING))
     about = describe_goals(env, episodes)
     measures = {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
     return Played({**about, "seed": seed, "goal_set": goal_hash(about, goals)}, list(env.agents), measures)

@@ -13,7 +13,7 @@ from matplotlib.ticker import FuncFormatter, NullFormatter, PercentFormatter
 
 from surgical_marl.evaluation.evaluate import Played
 from surgical_marl.evaluation.interval import interval
-from surgical_marl.evaluation.metrics import HOLD, THRESHOLDS_MM, success
+from surgical_marl.evaluation.metrics import FOLLOWING, HOLD, THRESHOLDS_MM, success
 from surgical_marl.files import write_atomic
 
 COLOR, PALE = "#1f6f8b", "#9fc3cf"
@@ -39,8 +39,11 @@ def draw(path: Path, runs: Mapping[str, Played]) -> None:
         axis.grid(True, color="#dddddd", linewidth=0.6)
         axis.spines[["top", "right"]].set_visible(False)
     parts = {name: held[i : i + 1] for i, name in enumerate(runs)} if len(runs) > 1 else {}
+    following = first.about["task"] in FOLLOWING
     _draw_success(left, held, parts, np.geomspace(low, high, POINTS))
+    left.set_xlabel("threshold (mm), held " + ("all the time" if following else f"for {HOLD} s"))
     _draw_errors(right, error, first.agents)
+    right.set_xlabel(f"{'RMS error' if following else 'error at the end'} (mm): 5, 25, 50, 75, 95 %")
     write_atomic(path, lambda temporary: figure.savefig(temporary, format="png", dpi=150))
 
 
@@ -55,7 +58,7 @@ def _draw_success(axis: Axes, held: np.ndarray, parts: Mapping[str, np.ndarray],
     for threshold in THRESHOLDS_MM:
         axis.vlines(threshold, 0, 1, color="#888888", linewidth=0.8, linestyle=":")
         axis.text(threshold, 1.03, f"{threshold}", color="#666666", fontsize=8, ha="center")
-    axis.set(xlabel=f"threshold (mm), held for {HOLD} s", ylim=(-0.02, 1.08))
+    axis.set_ylim(-0.02, 1.08)
     axis.set_ylabel("arms that succeed")
     axis.yaxis.set_major_formatter(PercentFormatter(1.0))
     axis.legend(frameon=False, fontsize=9, loc="center left", bbox_to_anchor=(0, 0.75))
@@ -76,4 +79,3 @@ def _draw_errors(axis: Axes, error: np.ndarray, agents: list[str]) -> None:
         tick_labels=agents,
     )
     axis.invert_yaxis()
-    axis.set_xlabel("error at the end (mm): 5, 25, 50, 75, 95 %")

@@ -14,7 +14,7 @@ THRESHOLDS_MM = (1, 2, 5)
 SUCCESS_MM = 2
 """The threshold of team success and of the time to success."""
 FOLLOWING = ("track", "follow_path")
-"""Tasks whose goal moves: the error of every step counts."""
+"""Tasks whose goal moves: every step counts, not the last ones. A closed path ends where it began."""
 TERMS = ("reward_", "cost")
 """How names of reward terms and costs begin in `infos`."""
 STILL = 1e-3
@@ -51,32 +51,36 @@ class Metric(NamedTuple):
     """The worst value seen: a bootstrap cannot give an interval for it."""
 
 
-def measure(trajectory: Trajectory, dt: float) -> dict[str, np.ndarray]:
+def measure(trajectory: Trajectory, dt: float, following: bool) -> dict[str, np.ndarray]:
     """One number an episode and arm.
 
     Args:
         dt: time of a step, s.
+        following: whether the goal moves, so that every step counts for `error`, `held` and `time`.
 
     Returns:
-        [E, A] each: `error` at the last step and the largest `held` in the last `HOLD` seconds, `squared` (mean over
-        the steps), least `distance`, largest `center`, `path` of the tip (m, m^2); `collided`; `time` from which on the
-        error stays below `SUCCESS_MM`, s, and `smoothness`, both NaN where undefined; the mean of each of the `terms`.
+        [E, A] each, in m: `error` at the last step (following: root mean square over the steps); the largest, `held`, of
+        the last `HOLD` seconds (of all steps); `squared` (mean over the steps, m^2); least `distance`, largest
+        `center`, `path` of the tip. Also `collided`; `time` from which on the error stays below `SUCCESS_MM`, s, and
+        `smoothness`, NaN where undefined; the mean of each of the `terms`.
     """
     lengths, error = trajectory.lengths[:, None], trajectory.error
     step = np.arange(1, len(error) + 1)[:, None, None]
     going = step <= lengths
-    held = _largest(error, going & (step > lengths - max(1, round(HOLD / dt))))
-    last_miss = _largest(step, going & (error >= SUCCESS_MM / 1000))
+    squared = np.where(going, np.square(error), 0.0).sum(0) / lengths
+    judged = going if following else going & (step > lengths - max(1, round(HOLD / dt)))
+    held = _largest(error, judged)
+    last_miss = np.maximum(_largest(step, going & (error >= SUCCESS_MM / 1000)), 0)
     moves = np.linalg.norm(np.diff(trajectory.tip, axis=0), axis=-1)
     moves = np.where(going[1:], moves, 0.0)
     return {
-        "error": np.take_along_axis(error, lengths[None] - 1, 0)[0],
+        "error": np.sqrt(squared) if following else np.take_along_axis(error, lengths[None] - 1, 0)[0],
         "held": held,
-        "squared": np.where(going, np.square(error), 0.0).sum(0) / lengths,
+        "squared": squared,
         "distance": -_largest(-trajectory.distance, going),
         "center": np.where(np.isnan(trajectory.center[0]), np.nan, _largest(trajectory.center, going)),
         "collided": (trajectory.collision & going).any(0),
-        "time": np.where(held < SUCCESS_MM / 1000, dt * (np.maximum(last_miss, 0) + 1), np.nan),
+        "time": np.where((held < SUCCESS_MM / 1000) & (not following), dt * (last_miss + 1), np.nan),
         "path": moves.sum(0),
         "smoothness": _smoothness(moves / dt, trajectory.lengths - 1, dt),
         **{name: np.where(going, values, 0.0).sum(0) / lengths for name, values in trajectory.terms.items()},
