@@ -109,13 +109,8 @@ def _parser() -> argparse.ArgumentParser:
     train.set_defaults(command=_train, name="train")
 
     evaluate = commands.add_parser("eval", help="measure policies on a fixed set of goals (docs/evaluation.md)")
-    evaluate.add_argument(
-        "policies",
-        nargs="+",
-        metavar="RUN_OR_POLICY",
-        help=f"a run folder, a policy's name or one of: {', '.join(BASELINES)}; several runs of one training, with "
-        "different seeds, give the spread between them",
-    )
+    what = f"a run folder, a policy's name, {', '.join(BASELINES)}; or runs that differ by their seed, for its spread"
+    evaluate.add_argument("policies", nargs="+", metavar="RUN_OR_POLICY", help=what)
     evaluate.add_argument("--task", help="of a policy that is not trained")
     evaluate.add_argument("--scene", help="likewise: a name (see `list scenes`) or a .yaml file")
     for key, good in (("control", _CONTROL), ("difficulty", _DIFFICULTY)):
@@ -297,8 +292,8 @@ def _eval(arguments: argparse.Namespace) -> None:
         if len(policies) > 1:
             raise ValueError(f"{baselines[0]!r} is not a run of the same training: evaluate it alone")
         if None in (arguments.task, arguments.scene):
-            choice = f"--task ({', '.join(list_tasks())}) and --scene ({', '.join(list_scenes())})"
-            raise ValueError(f"eval {baselines[0]} needs {choice}")
+            good = f"--task ({', '.join(list_tasks())}) and --scene ({', '.join(list_scenes())})"
+            raise ValueError(f"eval {baselines[0]} needs {good}")
     if arguments.task not in (None, *list_tasks()):
         raise unknown("task", arguments.task, list_tasks())
     if arguments.scene is not None:

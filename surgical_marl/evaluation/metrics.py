@@ -59,7 +59,7 @@ def measure(trajectory: Trajectory, dt: float, following: bool) -> dict[str, np.
         following: whether the goal moves, so that every step counts for `error`, `held` and `time`.
 
     Returns:
-        [E, A] each, in m: `error` at the last step (following: root mean square over the steps); the largest, `held`, of
+        [E, A] each, in m: `error` at the last step (following: root mean square over the steps); `held`, the largest of
         the last `HOLD` seconds (of all steps); `squared` (mean over the steps, m^2); least `distance`, largest
         `center`, `path` of the tip. Also `collided`; `time` from which on the error stays below `SUCCESS_MM`, s, and
         `smoothness`, NaN where undefined; the mean of each of the `terms`.
