@@ -44,7 +44,8 @@ def evaluate(
     """Run a policy for a number of episodes.
 
     Args:
-        env: the environment, with NumPy or torch arrays, of `min(episodes, MAX_BATCH)` environments.
+        env: the environment, with NumPy or torch arrays, of `min(episodes, MAX_BATCH)` environments; fewer play more
+            blocks, with other goals and so another hash.
         policy: maps the observations of agents to their actions (see `learning.policy`).
         episodes: number of episodes, 1 or more.
         seed: seed of the goals.

@@ -30,7 +30,8 @@ def draw(path: Path, runs: Mapping[str, Played]) -> None:
     of = next(iter(runs)) if len(runs) == 1 else f"{len(runs)} runs"
     figure.suptitle("{}: {task} in {scene}, {episodes} episodes, seed {seed}".format(of, **first.about), fontsize=11)
     left, right = figure.subplots(1, 2, width_ratios=(3, 2))
-    low, high = min(0.1, np.percentile(error, 5) / 1.2), max(10.0, 1.2 * held.max())
+    low = np.clip(np.percentile(error, 5) / 1.2, 1e-3, 0.1)
+    high = max(10.0, 1.2 * held.max())
     for axis in (left, right):
         axis.set_xscale("log")
         axis.set_xlim(low, high)
