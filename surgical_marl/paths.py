@@ -35,8 +35,9 @@ thick may be at one time."""
 WAYPOINTS = 5
 WILD = 0.5
 """How far waypoints stray from a circle or from straight on, as a share of a step."""
-LEAST_RADIUS = 0.005
-"""Paths through waypoints bend no more than a circle of this radius, m."""
+TURNING = 4.0
+"""Paths through waypoints turn no faster, rad/s: their curvature is at most this over their speed. A circle in
+`DURATION` takes 1.3 rad/s."""
 SLOWEST = 0.5
 """Share of the greatest speed that the slowest of these paths has."""
 
@@ -78,8 +79,8 @@ def loops_and_lines(rng: np.random.Generator, count: int, start: np.ndarray, lev
     Waypoints of a closed path lie about a circle through `start` in a random plane, those of an open one follow each
     other from there with random turns. The curve is scaled about its start, so that passing it takes `DURATION` at its
     own speed, between `SLOWEST` and all of `level.speed`, and is sampled anew at equal arc length. Kept are paths that
-    stay in the ball of radius `extent` about the start and bend no more than `LEAST_RADIUS` allows. Arguments and
-    result are those of `walks`.
+    stay in the ball of radius `extent` about the start and turn no faster than `TURNING`. Arguments and result are
+    those of `walks`.
 
     Raises:
         ValueError: no more than one path in a hundred can be kept.
@@ -89,14 +90,14 @@ def loops_and_lines(rng: np.random.Generator, count: int, start: np.ndarray, lev
         rows, kept, drawn = range(first, count, 2), np.empty((0, SEGMENTS + 3, 3)), 0
         while len(kept) < len(rows):
             shape, length = spline.equal_steps(spline.through(waypoints(rng, count), closed), SEGMENTS)
-            wanted = rng.uniform(SLOWEST, 1, count) * level.speed * DURATION
-            path = spline.through(shape * (wanted / length)[:, None, None], closed)
-            path = path[(_length(path)[..., 0] <= level.extent).all(-1)]
-            kept = np.concatenate([kept, path[spline.curvature(path) <= 1 / LEAST_RADIUS]])
+            speed = rng.uniform(SLOWEST, 1, count) * level.speed
+            path = spline.through(shape * (speed * DURATION / length)[:, None, None], closed)
+            inside = (_length(path)[..., 0] <= level.extent).all(-1)
+            kept = np.concatenate([kept, path[inside & (spline.curvature(path) * speed <= TURNING)]])
             drawn += count
             if len(kept) < drawn / 100:
                 raise ValueError(
-                    f"paths of {1000 * level.speed * DURATION:.3g} mm bend too much within {1000 * level.extent:.3g} mm"
+                    f"paths of {1000 * level.speed * DURATION:.3g} mm don't fit within {1000 * level.extent:.3g} mm"
                 )
         control[first::2] = kept[: len(rows)]
     return start + control
@@ -139,7 +140,7 @@ def path_table(scene: Scene, draw: Draw, level: Level, seed: int = 0) -> np.ndar
     Raises:
         ValueError: if fewer than one draw in a hundred can be kept.
     """
-    numbers = (ROWS, DURATION, SEGMENTS, CHECKS, HEADROOM, CROSSING, WAYPOINTS, WILD, LEAST_RADIUS, SLOWEST, CLEARANCE)
+    numbers = (ROWS, DURATION, SEGMENTS, CHECKS, HEADROOM, CROSSING, WAYPOINTS, WILD, TURNING, SLOWEST, CLEARANCE)
     settings = repr((draw.__name__, level, seed, numbers))
     speeds = repr([mount.arm.speed.tolist() for mount in scene.mounts.values()])
     return cached("paths", settings + speeds, scene.fingerprint, lambda: _draw(scene, draw, level, seed))

@@ -62,8 +62,8 @@ def choose(
     Args:
         scene: for the message.
         batch: draws about `rows` of them and gives those that can be kept [n, ...] and which of these cross, [n] bool.
-            If it is called with True, only those that cross are needed. It is called until there are enough, or until
-            `MOST_BATCHES` show that the arms hardly meet: then others stand in for those that cross.
+            If it is called with True, only those that cross are needed. It is called until there are enough. If a
+            batch or `MOST_BATCHES` show that the arms never or hardly meet, others stand in for those that cross.
         rows: how many.
         crossing: share of rows that cross, 0 to 1.
 
@@ -77,6 +77,8 @@ def choose(
         if enough and drawn >= MOST_BATCHES:
             break
         found, crosses = batch(enough)
+        if enough and not len(found):  # arms that never meet
+            break
         plain.append(found[~crosses])
         crossed.append(found[crosses])
         drawn += 1
