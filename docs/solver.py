@@ -11,12 +11,13 @@ import jax
 import mujoco
 import numpy as np
 
-from surgical_marl import load_scene, physics, solver
-from surgical_marl.physics import Physics, Simulator
+from surgical_marl import dynamics, load_scene, physics, solver
+from surgical_marl.dynamics import Physics
+from surgical_marl.physics import Simulator
 from surgical_marl.scene import DECIMATION, Scene
 
 STEPS, SAMPLES = 5000, 2000
-TOUCHING = ((2, 4), (3, 4), (4, 4), (5, 4), (6, 4), (10, 20))
+TOUCHING = ((2, 6), (3, 6), (4, 6), (6, 4), (6, 6), (10, 20))
 """Newton steps and line search steps, for arms that touch."""
 APART = ((0, (4, 4)), (0, (10, 10)), (3, (1, 1)), (4, (1, 1)), (6, (0, 0)), (6, (1, 1)), (8, (1, 1)))
 """Sweeps, then Newton steps and line search steps, for an arm that touches nothing."""
@@ -116,7 +117,7 @@ def apart() -> None:
         scene = load_scene(name)
         states, velocities = random_states(scene)
         for sweeps, (iterations, line_search) in APART:
-            solver.SWEEPS, physics.ARM_ITERATIONS = sweeps, (iterations, line_search)
+            solver.SWEEPS, dynamics.ITERATIONS = sweeps, (iterations, line_search)
             velocity, _ = step(scene, states, touching=False)
             off = (np.abs(velocity - velocities) / speeds(scene)).max(1)
             print(f"| {name} | {sweeps} | {iterations} | {line_search} | {shares(off)} |")

@@ -23,7 +23,7 @@ from surgical_marl.dynamics import Dynamics, Physics
 from surgical_marl.scene import DECIMATION, PAYLOAD, Scene
 from surgical_marl.solver import Rows, solve
 
-TOUCHING_ITERATIONS = (6, 4)
+TOUCHING_ITERATIONS = (6, 6)
 """Most Newton steps, and line search steps in each, for arms that touch: see docs/physics.md."""
 
 

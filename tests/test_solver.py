@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 
 from surgical_marl import collision, load_scene, solver
 from surgical_marl.collision import SLOTS, Pairs
-from surgical_marl.physics import ARM_ITERATIONS
+from surgical_marl.dynamics import ITERATIONS
 from surgical_marl.solver import JointRows, Rows, relax, solve
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -242,7 +242,7 @@ def test_an_arm_accelerates_as_in_c_mujoco(name: str, seed: int) -> None:
     exact, _ = compiled_solve(p.mass, p.smooth, p.rows, p.start, 30, 20)
     assert far_off(model, velocity, np.asarray(exact), data.qacc) < 1e-4
     start = compiled_relax(solver.SWEEPS, solver.RELAXATION)(p, p.start)
-    quick, _ = compiled_solve(p.mass, p.smooth, p.rows, start, *ARM_ITERATIONS)
+    quick, _ = compiled_solve(p.mass, p.smooth, p.rows, start, *ITERATIONS)
     assert far_off(model, velocity, np.asarray(quick), data.qacc) < 1e-3
 
 

@@ -76,8 +76,9 @@ class Source:
     """Leaves of the rest of the `State`."""
 
 
-_CODE = ("physics", "dynamics", "collision", "solver", "env", "safety", "scene", "arm", "arm_spec", "workspace", "paths", "spline",
-         "task", "path_task", "tasks/*", "plant", "randomisation", "engines/fused/*")  # fmt: skip
+_CODE = ("physics", "dynamics", "collision", "solver", "plant", "env", "safety", "scene", "randomisation", "arm",
+         "drive", "arm_spec", "workspace", "paths", "spline", "task", "path_task", "tasks/*",
+         "engines/fused/*")  # fmt: skip
 
 
 def load_source(env: Env, vector: bool, announce: Callable[[], None] = lambda: None) -> Source:
