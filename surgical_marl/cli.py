@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-from surgical_marl.content import find, list_arms, list_policies, list_scenes, list_tasks, unknown
+from surgical_marl.content import BASELINES, find, list_arms, list_policies, list_scenes, list_tasks, unknown
 
 _LISTS = {
     "tasks": list_tasks,
@@ -25,8 +25,10 @@ _LISTS = {
 }
 
 _CONTROL = ("position", "velocity", "torque")
+_DIFFICULTY = ("easy", "default", "hard")
 _DEVICES = ("auto", "cpu", "cuda")
 _BENCHED = ("all", "fused", "mjx", "mujoco")
+_MOTIONS = ("random", "rough")
 
 # Flags of `train` that are short for `key=value`: key, good values or a placeholder, help.
 _SETTINGS: tuple[tuple[str, str | tuple[str, ...], str], ...] = (
@@ -37,7 +39,7 @@ _SETTINGS: tuple[tuple[str, str | tuple[str, ...], str], ...] = (
     ("engine", ("auto", "fused", "mjx"), "what runs the physics"),
     ("device", _DEVICES, "where it runs"),
     ("control", _CONTROL, "what an action commands"),
-    ("difficulty", ("easy", "default", "hard"), "how far, how fast, how crowded"),
+    ("difficulty", _DIFFICULTY, "how far, how fast, how crowded"),
 )
 
 
@@ -107,11 +109,19 @@ def _parser() -> argparse.ArgumentParser:
     train.add_argument("--resume", type=Path, metavar="DIR", help="run folder to go on with")
     train.set_defaults(command=_train, name="train")
 
-    evaluate = commands.add_parser("eval", help="measure a trained policy")
-    evaluate.add_argument("policy", metavar="RUN_OR_POLICY", help="a run folder or a policy's name")
+    evaluate = commands.add_parser("eval", help="measure policies on a fixed set of goals (docs/evaluation.md)")
+    what = f"a run folder, a policy's name, {', '.join(BASELINES)}; or runs that differ by their seed, for its spread"
+    evaluate.add_argument("policies", nargs="+", metavar="RUN_OR_POLICY", help=what)
+    evaluate.add_argument("--task", help="of a policy that is not trained")
+    evaluate.add_argument("--scene", help="likewise: a name (see `list scenes`) or a .yaml file")
+    for key, good in (("control", _CONTROL), ("difficulty", _DIFFICULTY)):
+        evaluate.add_argument(f"--{key}", type=_one_of(good), metavar="|".join(good), help="likewise")
     evaluate.add_argument("--episodes", type=_whole(1), default=200, metavar="N")
     evaluate.add_argument("--seed", type=_whole(0), default=0, metavar="S")
+    evaluate.add_argument("--against", type=Path, metavar="FILE.json", help="an older result to compare with")
     evaluate.add_argument("--json", action="store_true", help="one JSON object instead of a table")
+    evaluate.add_argument("--csv", type=Path, metavar="FILE.csv", help="a row for each run and agent")
+    evaluate.add_argument("--figure", type=Path, metavar="FILE.png", help="success against threshold, and the errors")
     evaluate.set_defaults(command=_eval, name="eval")
 
     names = commands.add_parser("list", help="list tasks, scenes, arms and policies")
@@ -139,6 +149,8 @@ def _parser() -> argparse.ArgumentParser:
     bench.add_argument("--engine", type=_one_of(_BENCHED), default="all", metavar="|".join(_BENCHED))
     bench.add_argument("--device", type=_one_of(_DEVICES), default="auto", metavar="|".join(_DEVICES))
     bench.add_argument("--decimation", type=_whole(1), default=1, metavar="K", help="physics steps an environment step")
+    bench.add_argument("--motion", type=_one_of(_MOTIONS), default=_MOTIONS[0], metavar="|".join(_MOTIONS),
+                       help="random: a new action every control step; rough: arms cross each other's way")  # fmt: skip
     bench.add_argument("--sweep", action="store_true", help="from 1 to 4 million environments, as far as memory goes")
     bench.add_argument("--cold", action="store_true", help="start without caches, for compile_s")
     bench.add_argument("--json", action="store_true", help="one JSON object instead of a table")
@@ -211,7 +223,7 @@ def _bench(arguments: argparse.Namespace) -> None:
         from surgical_marl.bench.report import run
 
         engines = _BENCHED[1:] if arguments.engine == "all" else (arguments.engine,)
-        keys = ("task", "scene", "num_envs", "device", "decimation")
+        keys = ("task", "scene", "num_envs", "device", "decimation", "motion")
         print(run({k: getattr(arguments, k) for k in keys}, engines, arguments.sweep, arguments.json, arguments.out))
 
 
@@ -255,15 +267,20 @@ def _train(arguments: argparse.Namespace) -> None:
         settings = load_config(arguments.task, arguments.scene, overrides)
     out = arguments.out or arguments.resume or _run_folder(settings)
 
+    from surgical_marl.evaluation.evaluate import evaluate
+    from surgical_marl.evaluation.report import format_table
     from surgical_marl.files import write_atomic
-    from surgical_marl.learning.train import train
+    from surgical_marl.learning.policy import load_policy
+    from surgical_marl.learning.train import make_env, train
 
     run = train(settings, out=out, resume=arguments.resume)
-    env, policy = _load(run, num_envs=200)
-    result = _evaluate(env, policy, episodes=200, seed=0)
+    print("evaluating 200 episodes", file=sys.stderr)
+    env = make_env(read_settings(run, ["engine=auto", "device=auto"]), num_envs=200)
+    policy = load_policy(run, env)
+    result = evaluate(env, policy, episodes=200, seed=0)
     text = json.dumps(result, indent=2) + "\n"
     write_atomic(run / "eval.json", lambda path: path.write_text(text))
-    print(_table(result))
+    print(format_table(result))
     print(run, flush=True)
 
     from surgical_marl.view.record import record
@@ -273,35 +290,30 @@ def _train(arguments: argparse.Namespace) -> None:
 
 
 def _eval(arguments: argparse.Namespace) -> None:
-    run = find("policies", arguments.policy)
-    env, policy = _load(run, num_envs=arguments.episodes)
-    result = _evaluate(env, policy, arguments.episodes, arguments.seed)
-    print(json.dumps(result) if arguments.json else _table(result))
+    policies = arguments.policies
+    if baselines := [policy for policy in policies if policy in BASELINES]:
+        if len(policies) > 1:
+            raise ValueError(f"{baselines[0]!r} is not a run of the same training: evaluate it alone")
+        if None in (arguments.task, arguments.scene):
+            good = f"--task ({', '.join(list_tasks())}) and --scene ({', '.join(list_scenes())})"
+            raise ValueError(f"eval {baselines[0]} needs {good}")
+    if arguments.task not in (None, *list_tasks()):
+        raise unknown("task", arguments.task, list_tasks())
+    if arguments.scene is not None:
+        find("scenes", arguments.scene)
+    for policy in policies:
+        if policy not in BASELINES and not Path(policy).is_dir() and policy not in list_policies():
+            raise unknown("run or policy", policy, [*list_policies(), *BASELINES])
+    for flag, path, suffix in (("--csv", arguments.csv, ".csv"), ("--figure", arguments.figure, ".png")):
+        if path and not (path.suffix == suffix and path.parent.is_dir()):
+            raise ValueError(f"cannot write {flag} {path}: name a {suffix} file in a folder that exists")
 
+    from surgical_marl.evaluation.command import play_all, read_result, report
 
-def _load(run: Path, num_envs: int) -> tuple[Any, Any]:
-    """The environment of a run, on whatever this machine has, and its policy."""
-    from surgical_marl.evaluation import MAX_BATCH
-    from surgical_marl.learning.policy import load_policy
-    from surgical_marl.learning.run import read_settings
-    from surgical_marl.learning.train import make_env
-
-    settings = read_settings(run, ["engine=auto", "device=auto"])
-    env = make_env(settings, min(num_envs, MAX_BATCH))
-    return env, load_policy(run, env)
-
-
-def _evaluate(env: Any, policy: Any, episodes: int, seed: int) -> dict[str, Any]:
-    from surgical_marl.evaluation import evaluate
-
-    print(f"evaluating {episodes} episodes", file=sys.stderr)
-    return evaluate(env, policy, episodes=episodes, seed=seed)
-
-
-def _table(result: dict[str, Any]) -> str:
-    from surgical_marl.evaluation import format_table
-
-    return format_table(result)
+    older = None if arguments.against is None else (str(arguments.against), read_result(arguments.against))
+    asked = {key: getattr(arguments, key) for key in ("task", "scene", "control", "difficulty")}
+    played = play_all(policies, asked, arguments.episodes, arguments.seed)
+    print(report(played, older, arguments.json, arguments.csv, arguments.figure))
 
 
 def _run_folder(settings: Any) -> Path:

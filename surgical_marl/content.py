@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 KINDS = ("arms", "scenes", "configs", "policies")
+BASELINES = ("zero", "random", "oracle")
+"""Policies that need no learning, and so have no task and scene of their own."""
 
 _PACKAGE = Path(__file__).resolve().parent
 _NOUNS = {"arms": "arm", "scenes": "scene", "configs": "config", "policies": "run or policy"}

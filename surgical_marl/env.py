@@ -24,9 +24,13 @@ from jax import Array
 
 from surgical_marl.content import list_tasks, unknown
 from surgical_marl.physics import ArmView, Contacts, Physics, Simulator
+from surgical_marl.plant import Hidden, Plant
 from surgical_marl.runtime import prepare_jax
 from surgical_marl.safety import costs
 from surgical_marl.scene import DECIMATION, load_scene
+
+HIDDEN, NOISE = 2**31 - 1, 2**31 - 2
+"""What the episode's key is folded with for what a scene's randomisation draws: far from what tasks take."""
 
 
 class Carry(NamedTuple):
@@ -39,6 +43,8 @@ class Carry(NamedTuple):
     steps: Array
     tips: Any = ()
     """Tool tips [arms, 3], each in its arm's base frame, m: the next step has their speed from it."""
+    hidden: Hidden | None = None
+    """What the episode drew for the arms (`surgical_marl/plant.py`)."""
 
 
 @jax.tree_util.register_dataclass
@@ -115,13 +121,19 @@ class Env:
     def settings(self) -> str:
         """All that a step depends on besides the scene and the code."""
         weights = sorted(self.task.weights.items())
-        return f"{self.task_name} {self.difficulty} {weights} {self.scene.control} {self.max_steps} {self.decimation}"
+        how = f"{self.scene.control} {self.max_steps} {self.decimation} {self.scene.randomisation}"
+        return f"{self.task_name} {self.difficulty} {weights} {how}"
 
     @cached_property
     def simulator(self) -> Simulator:
         """The physics, set up when first needed, even while JAX traces a step."""
         with jax.ensure_compile_time_eval():
             return Simulator(self.scene, self.decimation)
+
+    @property
+    def plant(self) -> Plant:
+        """The physics behind motors and encoders, as good or bad as the scene has them."""
+        return Plant(self.simulator)
 
     def num_actions(self, agent: str) -> int:
         """Length of an agent's action: one number a joint, the jaw's open (> 0) or closed command last in joint
@@ -147,7 +159,7 @@ class Env:
         """The start of an episode. `key` is raw (uint32 [2], as of `jax.random.PRNGKey`) and numbers its episodes."""
         carry = self._start(key, jnp.int32(episode))
         views = self.simulator.home_views
-        observations, state = self._observe(views, carry.goal)
+        observations, state = self._observe(carry, self.simulator.home_contacts, views)
         nothing = jax.tree.map(jnp.zeros_like, self.task.rewards(views, carry.goal))
         return State(
             carry=carry,
@@ -164,20 +176,21 @@ class Env:
 
     def step(self, carry: Carry, actions: dict[str, Array]) -> State:
         """One control step, and a reset if it ends the episode."""
-        physics, contacts, views = self.simulator.advance(self.simulator.command(carry.physics, actions))
+        physics, hidden = self.plant.command(carry.physics, carry.hidden, actions)
+        physics, contacts, views = self.plant.advance(physics, hidden)
         goal = self.task.advance(carry.goal, self.control_dt)
         tips = jnp.stack([view.tool_tip for view in views.values()])
         terms = self.task.rewards(views, goal)
         terminated = self.task.terminated(views, goal)
         steps = carry.steps + 1
         truncated = (steps >= self.max_steps) & ~terminated
-        final_observations, final_state = self._observe(views, goal)
-        moved = carry._replace(physics=physics, goal=goal, tips=tips, steps=steps)
+        moved = carry._replace(physics=physics, hidden=hidden, goal=goal, tips=tips, steps=steps)
+        final_observations, final_state = self._observe(moved, contacts, views)
         going = moved, final_observations, final_state
 
         def begin(_: Any) -> Any:
             fresh = self._start(carry.key, carry.episode + 1)
-            return fresh, *self._observe(self.simulator.home_views, fresh.goal)
+            return fresh, *self._observe(fresh, self.simulator.home_contacts, self.simulator.home_views)
 
         done = terminated | truncated
         next_carry, observations, state = jax.lax.cond(done, begin, lambda going: going, going)
@@ -195,19 +208,25 @@ class Env:
         )
 
     def _start(self, key: Array, episode: Array) -> Carry:
+        own = jax.random.fold_in(key, episode)
+        hidden = self.plant.start(jax.random.fold_in(own, HIDDEN))
         return Carry(
-            physics=self.simulator.home,
-            goal=self.task.start(jax.random.fold_in(key, episode)),
+            physics=self.plant.home(hidden),
+            hidden=hidden,
+            goal=self.task.start(own),
             tips=jnp.stack([view.tool_tip for view in self.simulator.home_views.values()]),
             key=key,
             episode=episode,
             steps=jnp.int32(0),
         )
 
-    def _observe(self, views: dict[str, ArmView], goal: Any) -> tuple[dict[str, Array], Array]:
+    def _observe(self, carry: Carry, contacts: Contacts, views: dict[str, ArmView]) -> tuple[dict[str, Array], Array]:
+        """What policies see of arms that are as in `views`."""
+        noise = jax.random.fold_in(jax.random.fold_in(jax.random.fold_in(carry.key, carry.episode), NOISE), carry.steps)
+        views = self.plant.measure(carry.physics, carry.hidden, contacts, views, noise)
         observations = {
             agent: jnp.clip(observation.astype(jnp.float32), *(b.astype(np.float32) for b in self._bounds[agent]))
-            for agent, observation in self.task.observations(views, goal).items()
+            for agent, observation in self.task.observations(views, carry.goal).items()
         }
         return observations, jnp.concatenate([observations[agent] for agent in self.agents])
 

@@ -4,7 +4,7 @@
     physics = simulator.command(simulator.home, actions)
     physics, contacts, views = simulator.advance(physics)
 
-This is the one module that knows MJX. docs/physics.md says how a step is computed and compares it with C MuJoCo.
+docs/physics.md says how a step is computed and compares it with C MuJoCo.
 """
 
 from __future__ import annotations
@@ -18,25 +18,13 @@ import mujoco
 import numpy as np
 from jax import Array
 
-from surgical_marl.collision import Pairs, Touching
-from surgical_marl.runtime import prepare_jax
-from surgical_marl.scene import DECIMATION, Scene
-from surgical_marl.solver import JointRows, Rows, relax, solve, solve_positive
+from surgical_marl.collision import Pairs
+from surgical_marl.dynamics import Dynamics, Physics
+from surgical_marl.scene import DECIMATION, PAYLOAD, Scene
+from surgical_marl.solver import Rows, solve
 
-ARM_ITERATIONS, TOUCHING_ITERATIONS = (1, 1), (5, 4)
-"""Newton steps, and line search steps in each, for an arm that touches nothing and for arms that touch: what it takes
-to solve limits, friction and contacts nearly as well as C MuJoCo, which goes on until they are: see docs/physics.md.
-"""
-
-
-class Physics(NamedTuple):
-    """What MuJoCo needs to go on. All that lives between two steps: everything else follows from it."""
-
-    qpos: Array
-    qvel: Array
-    qacc_warmstart: Array
-    ctrl: Array
-    """Command of every actuator: position target, velocity or torque."""
+TOUCHING_ITERATIONS = (6, 4)
+"""Most Newton steps, and line search steps in each, for arms that touch: see docs/physics.md."""
 
 
 class Contacts(NamedTuple):
@@ -70,26 +58,55 @@ class ArmView(NamedTuple):
     """The largest normal force on it during the step, N, []."""
 
 
+class Kind:
+    """The arms of one type in a scene, which move alike wherever they stand, as gravity is off: each is stepped in its
+    own base frame, and all by the same code, one after the other. A program that is twice as long runs less than half
+    as fast once it has no room in a GPU's instruction cache."""
+
+    def __init__(self, scene: Scene, agents: tuple[str, ...]) -> None:
+        model = scene.model
+        self._dynamics = Dynamics(scene.alone(agents[0]))
+        owner = lambda name: name.split("/")[0]  # noqa: E731
+        joints, bodies, actuators = (
+            np.array([owner(get(i).name) for i in range(count)])
+            for get, count in ((model.joint, model.njnt), (model.body, model.nbody), (model.actuator, model.nu))
+        )
+        self._dofs, self._bodies, self._actuators = (
+            np.stack([np.flatnonzero(owners == agent) for agent in agents]) for owners in (joints, bodies, actuators)
+        )
+
+    def step(self, physics: Physics, fields: dict[str, Array]) -> Physics:
+        """The physics of the scene after a step of these arms. `fields` of the scene's model may be others."""
+        dofs, actuators = self._dofs, self._actuators
+        own = Physics(physics.qpos[dofs], physics.qvel[dofs], physics.qacc_warmstart[dofs], physics.ctrl[actuators])
+        where = {"actuator": actuators, "dof": dofs, "body": np.insert(self._bodies, 0, 0, axis=1)}
+        others = {name: field[where[name.split("_")[0]]] for name, field in fields.items()}
+
+        def next_arm(queue: tuple[Physics, dict[str, Array]], _: None) -> tuple[tuple[Physics, dict[str, Array]], None]:
+            first = jax.tree.map(lambda x: x[0], queue)
+            moved = self._dynamics.varied(first[1]).step(first[0]), first[1]
+            return jax.tree.map(lambda x, y: jnp.concatenate([x[1:], y[None]]), queue, moved), None
+
+        (own, _), _ = jax.lax.scan(next_arm, (own, others), None, length=len(dofs))
+        qpos, qvel, qacc = (part.at[dofs].set(found) for part, found in zip(physics[:3], own[:3], strict=True))
+        return Physics(qpos, qvel, qacc, physics.ctrl)
+
+
 class Simulator:
-    """MJX on one scene, `decimation` physics steps a control step. `home` is the physics that every episode starts
-    with, `home_views` what tasks see there."""
+    """The physics of one scene, `decimation` physics steps a control step. `home` is what every episode starts with,
+    `home_views` what tasks see there."""
 
     def __init__(self, scene: Scene, decimation: int = DECIMATION) -> None:
-        prepare_jax()
-        from mujoco import mjx
-
-        self.scene, self._mjx = scene, mjx
-        self._pairs = Pairs(scene.model)
-        smooth = copy.copy(scene.model)
-        smooth.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT  # that is for `collision.py`
-        self._model, self._data = mjx.put_model(smooth), mjx.make_data(smooth)
-        self._dt = np.float32(scene.model.opt.timestep)
+        self.scene = scene
+        self._fields: dict[str, Array] = {}
+        self._pairs, self._together = Pairs(scene.model), Dynamics(scene.model)
+        self._kinds = [Kind(scene, agents) for agents in scene.types.values()]
         self.decimation, self.control_dt = decimation, decimation * scene.model.opt.timestep
         self._index_joints()
         self._index_pairs()
-        start = scene.home[self._address]
-        start = start if scene.control == "position" else np.where(self._jaws, start, 0.0)
-        self._home = np.asarray(scene.home, np.float32), np.asarray(self._moment @ start, np.float32)
+        start = scene.home[self.address]
+        start = start if scene.control == "position" else np.where(self.jaws, start, 0.0)
+        self._home = np.asarray(scene.home, np.float32), np.asarray(self.moment @ start, np.float32)
         self.home_contacts, self.home_views = self._measure_home()
 
     @property
@@ -99,26 +116,26 @@ class Simulator:
         still = jnp.zeros(self.scene.model.nv, jnp.float32)
         return Physics(qpos, still, still, ctrl)
 
-    def command(self, physics: Physics, actions: dict[str, Array]) -> Physics:
-        """The next command of every actuator. A jaw moves to open or closed at its speed, whatever the mode; a cable
-        follows its joints' commands.
+    def command(self, physics: Physics, actions: dict[str, Array], measured: Array | None = None) -> Physics:
+        """The next command of every actuator, from the joints' positions, or from what is `measured` of them, [nq]. A
+        jaw moves to open or closed at its speed, whatever the mode; a cable follows its joints' commands.
 
         A position target leads its joint by no more than full effort at full speed takes: one that is held up would
         wind up its target, and race after it once free.
         """
-        ctrl, own = physics.ctrl[self._drives], jnp.zeros(self.scene.model.nu, jnp.float32)
+        ctrl, own = physics.ctrl[self.drives], jnp.zeros(self.scene.model.nu, jnp.float32)
         for agent in self.scene.agents:
             own = own.at[self._actuators[agent]].set(jnp.clip(actions[agent], -1.0, 1.0))
         action = own[self._leaders]
         reach = self._speed * np.float32(self.control_dt)
         if self.scene.control == "position":
-            now = physics.qpos[self._address]
+            now = (physics.qpos if measured is None else measured)[self.address]
             lead = jnp.clip(ctrl + action * reach - now, -self._lead, self._lead)
             command = jnp.clip(now + lead, self._low, self._high)
         else:
             command = action * (self._speed if self.scene.control == "velocity" else self._effort)
         jaw = ctrl + jnp.clip(jnp.where(action > 0, self._open, self._closed) - ctrl, -reach, reach)
-        return physics._replace(ctrl=jnp.matmul(self._moment, jnp.where(self._jaws, jaw, command)))
+        return physics._replace(ctrl=jnp.matmul(self.moment, jnp.where(self.jaws, jaw, command)))
 
     def advance(self, physics: Physics) -> tuple[Physics, Contacts, dict[str, ArmView]]:
         """A control step of physics, and what is seen where it ends. MuJoCo leaves tips and distances one physics step
@@ -137,96 +154,62 @@ class Simulator:
         contacts = Contacts(distance, -jnp.minimum(nearest, distance), strongest)
         return physics, contacts, self._view(jnp, physics, tips, contacts)
 
+    def varied(self, stiffness: Array, damping: Array, friction: Array, payload: Array, offset: Array) -> Simulator:
+        """Other arms of this kind: factors of every actuator's gains [nu] and of every joint's friction [nv], masses
+        [arms] at their tool tips if the scene has room for them, and by how much the controllers of joints misread
+        them, [nq]."""
+        model, varied, nominal = self._together.model, copy.copy(self), self.scene.model
+        by_position = nominal.actuator_biasprm[:, 1] != 0
+        by_velocity = ~by_position & (nominal.actuator_biasprm[:, 2] != 0)
+        gain = jnp.where(by_position, stiffness, jnp.where(by_velocity, damping, 1.0))
+        pull = model.actuator_biasprm[:, 1] * stiffness
+        misread = pull * (self.moment @ offset[self.address])
+        bias = jnp.stack([misread, pull, model.actuator_biasprm[:, 2] * damping], -1)
+        loaded = self.scene.agents if self.scene.randomisation.payload else ()
+        bodies = [nominal.body(f"{agent}/{PAYLOAD}").id for agent in loaded]
+        varied._fields = {
+            "actuator_gainprm": model.actuator_gainprm.at[:, 0].set(model.actuator_gainprm[:, 0] * gain),
+            "actuator_biasprm": model.actuator_biasprm.at[:, :3].set(bias),
+            "dof_frictionloss": model.dof_frictionloss * friction,
+            "dof_damping": model.dof_damping * friction,
+            "body_mass": model.body_mass.at[np.array(bodies, int)].set(payload[: len(bodies)]),
+        }
+        return varied
+
+    def view(self, physics: Physics, contacts: Contacts) -> dict[str, ArmView]:
+        """What tasks see at a posture, apart from contacts, which are those of the step before."""
+        tips, distance = self._look(physics.qpos)
+        return self._view(jnp, physics, tips, contacts._replace(distance=distance))
+
     def _look(self, qpos: Array) -> tuple[Array, Array]:
         """Tool tips [arms, 3] in the world and the distance of every pair, at a posture."""
-        data = self._mjx.kinematics(self._model, self._data.replace(qpos=qpos))
+        data = self._together.pose(qpos)
         tips = data.site_xpos[np.array(list(self._sites.values()))]
         return tips, self._pairs.closest(data.geom_xpos, data.geom_xmat).distance
 
     def _step(self, physics: Physics, distance: Array) -> tuple[Physics, Array]:
         """A physics step, and the normal force of every pair during it. Arms that don't touch anything don't know of
-        each other: each is solved on its own."""
+        each other: each moves on its own."""
         if not self._pairs.count:
             return self._apart(physics)
         return jax.lax.cond((distance < 0).any(), self._touching_step, self._apart, physics)
 
     def _apart(self, physics: Physics) -> tuple[Physics, Array]:
-        data = self._forward(physics)
-        rows = self._constraints(data)
-        qvel, qacc = physics.qvel, physics.qacc_warmstart
-        for agent, dofs in self._dofs.items():
-            own = self._own_rows[agent]
-            block = Rows(rows.jacobian[own][:, dofs], *(column[own] for column in rows[1:]))
-            mass, damping = data._impl.M[dofs][:, dofs], self._damping(data)[dofs][:, dofs]
-            smooth = data.qfrc_smooth[dofs]
-            start = relax(mass, smooth, self._joint_rows(agent, block), physics.qacc_warmstart[dofs])
-            found, _ = solve(mass, smooth, block, start, *ARM_ITERATIONS)
-            qacc = qacc.at[dofs].set(found)
-            qvel = qvel.at[dofs].add(self._dt * solve_positive(mass + self._dt * damping, mass @ found))
-        return self._moved(physics, qvel, qacc), jnp.zeros(self._pairs.count, jnp.float32)
-
-    def _joint_rows(self, agent: str, rows: Rows) -> JointRows:
-        """An arm's rows, each of which concerns one joint, by joint."""
-        n, (rubbing, limited) = len(self._dofs[agent]), self._own_joints[agent]
-        friction, limit = (jnp.zeros(n).at[where].set for where in (rubbing, limited))
-        k = len(rubbing)
-        side = rows.jacobian[np.arange(k, k + len(limited)), limited]
-        return JointRows(
-            *(friction(column[:k]) for column in (rows.high, rows.impedance, rows.reference)),
-            *(limit(column) for column in (side, rows.impedance[k:], rows.reference[k:])),
-        )
+        for kind in self._kinds:
+            physics = kind.step(physics, self._fields)
+        return physics, jnp.zeros(self._pairs.count, jnp.float32)
 
     def _touching_step(self, physics: Physics) -> tuple[Physics, Array]:
-        data = self._forward(physics)
-        mass, rows = data._impl.M, self._constraints(data)
-        touching = self._pairs.deepest(data, self._pairs.closest(data.geom_xpos, data.geom_xmat))
-        contacts = self._contact_rows(touching, physics.qvel)
-        joined = Rows(*(jnp.concatenate(parts) for parts in zip(rows, contacts, strict=True)))
-        qacc, force = solve(mass, data.qfrc_smooth, joined, physics.qacc_warmstart, *TOUCHING_ITERATIONS)
-        qvel = physics.qvel + self._dt * solve_positive(mass + self._dt * self._damping(data), mass @ qacc)
+        dynamics = self._together.varied(self._fields)
+        forces = dynamics.forces(physics)
+        touching = self._pairs.deepest(forces.data, self._pairs.closest(forces.data.geom_xpos, forces.data.geom_xmat))
+        contacts = dynamics.contact_rows(touching.jacobian, touching.distance, touching.weight, physics.qvel)
+        joined = Rows(*(jnp.concatenate(parts) for parts in zip(forces.rows, contacts, strict=True)))
+        start = dynamics.relaxed(forces, physics.qacc_warmstart)
+        qacc, force = solve(forces.mass, forces.smooth, joined, start, *TOUCHING_ITERATIONS)
         its_own = touching.pair == np.arange(self._pairs.count)[:, None]
-        return self._moved(physics, qvel, qacc), jnp.where(its_own, force[len(rows.low) :], 0.0).sum(-1)
-
-    def _contact_rows(self, touching: Touching, qvel: Array) -> Rows:
-        """Frictionless contacts (condim 1): one row each, along the normal."""
-        from mujoco.mjx._src.constraint import _kbi
-
-        model = self.scene.model
-        solref, solimp = jnp.asarray(model.pair_solref[0], jnp.float32), jnp.asarray(model.pair_solimp[0], jnp.float32)
-        stiffness, damping, impedance = jax.vmap(lambda d: _kbi(self._model, solref, solimp, d))(touching.distance)
-        resistance = jnp.maximum(touching.weight * (1 - impedance) / impedance, mujoco.mjMINVAL)
-        depth = jnp.minimum(touching.distance, 0.0)
-        reference = -damping * (touching.jacobian @ qvel) - stiffness * impedance * depth
-        none = jnp.zeros_like(depth)
-        return Rows(touching.jacobian, 1 / resistance, reference, none, none + np.inf)
-
-    def _moved(self, physics: Physics, qvel: Array, qacc: Array) -> Physics:
-        return Physics(physics.qpos + self._dt * qvel, qvel, qacc, physics.ctrl)
-
-    def _forward(self, physics: Physics) -> Any:
-        """All of `mjx.forward` but collision and solver: mass matrix, smooth forces, rows of friction and limits."""
-        data = self._data.replace(**physics._asdict())
-        for stage in ("fwd_position", "fwd_velocity", "fwd_actuation"):
-            data = getattr(self._mjx, stage)(self._model, data)
-        return data.replace(qfrc_smooth=data.qfrc_passive - data.qfrc_bias + data.qfrc_actuator)
-
-    def _constraints(self, data: Any) -> Rows:
-        rows = data._impl
-        friction = rows.efc_frictionloss
-        rubs = np.arange(len(friction)) < self._model._impl.dof_hasfrictionloss.sum()  # these rows come first
-        low, high = jnp.where(rubs, -friction, 0.0), jnp.where(rubs, friction, np.inf)
-        return Rows(rows.efc_J, rows.efc_D, rows.efc_aref, low, high)
-
-    def _damping(self, data: Any) -> Array:
-        """What velocity costs, [nv, nv]: the implicit part of the step. An actuator at its effort limit can't damp
-        any more, so its damping is not in it, as in C MuJoCo; `mjx.step` would brake each joint that moves at full
-        effort."""
-        model = self._model
-        low, high = model.actuator_forcerange[:, 0], model.actuator_forcerange[:, 1]
-        saturated = (data.actuator_force <= low) | (data.actuator_force >= high)
-        own = jnp.where(saturated, 0.0, -model.actuator_biasprm[:, 2])
-        moment = data._impl.actuator_moment
-        return moment.T @ (own[:, None] * moment) + jnp.diag(model.dof_damping)
+        each = jnp.where(its_own, force[len(forces.rows.low) :], 0.0).sum(-1)
+        return dynamics.moved(physics, forces, qacc), each
 
     def _view(self, xp: Any, physics: Physics, tips: Any, contacts: Contacts) -> dict[str, ArmView]:
         """Views by the array library `xp` from tool tips [arms, 3] in the world."""
@@ -255,21 +238,21 @@ class Simulator:
         scene, model = self.scene, self.scene.model
         names = [model.actuator(i).name for i in range(model.nu)]
         # actuators of joints: they stand in the URDF's order, `qpos` in that of the tree
-        self._drives = np.flatnonzero(model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT)
-        self._address = model.jnt_qposadr[model.actuator_trnid[self._drives, 0]]
-        self._moment = np.asarray(scene.moment[:, self._address], np.float32)
+        self.drives = np.flatnonzero(model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT)
+        self.address = model.jnt_qposadr[model.actuator_trnid[self.drives, 0]]
+        self.moment = np.asarray(scene.moment[:, self.address], np.float32)
         rows = [
             (names.index(f"{agent}/{joint.leader}"), bool(arm.jaw and joint.leader == arm.jaw.joint), joint, arm.jaw)
             for agent, arm in ((agent, mount.arm) for agent, mount in scene.mounts.items())
             for joint in arm.joints
         ]
         single = np.float32
-        self._leaders, self._jaws = np.array([row[0] for row in rows]), np.array([row[1] for row in rows])
+        self._leaders, self.jaws = np.array([row[0] for row in rows]), np.array([row[1] for row in rows])
         self._speed = np.array([joint.drive.speed for _, _, joint, _ in rows], single)
         self._effort = np.array([joint.effort for _, _, joint, _ in rows], single)
         # what a joint feels that moves alone: its own gains and its cables'
         gains = np.array([model.actuator_gainprm[:, 0], -model.actuator_biasprm[:, 2]], single)
-        stiffness, damping = gains @ self._moment**2
+        stiffness, damping = gains @ self.moment**2
         self._lead = (self._effort + damping * self._speed) / stiffness
         self._low = np.array([joint.lower for _, _, joint, _ in rows], single)
         self._high = np.array([joint.upper for _, _, joint, _ in rows], single)
@@ -280,12 +263,6 @@ class Simulator:
             agent: np.array([names.index(f"{agent}/{joint.name}") for joint in mount.arm.actuated])
             for agent, mount in scene.mounts.items()
         }
-        # constraint rows without contacts: friction of some joints, then limits of all
-        kinds = np.flatnonzero(model.dof_frictionloss), model.jnt_dofadr[model.jnt_limited > 0]
-        owners = np.array([model.joint(i).name.split("/")[0] for i in range(model.njnt)])
-        self._dofs = {agent: model.jnt_dofadr[owners == agent] for agent in scene.agents}
-        self._own_rows = {a: np.flatnonzero(np.isin(np.concatenate(kinds), own)) for a, own in self._dofs.items()}
-        self._own_joints = {a: [np.flatnonzero(np.isin(own, kind)) for kind in kinds] for a, own in self._dofs.items()}
         self._sites = {agent: model.site(f"{agent}/tool_tip").id for agent in scene.agents}
 
     def _index_pairs(self) -> None:

@@ -23,12 +23,15 @@ from surgical_marl.arm import Arm, load_arm
 from surgical_marl.arm_spec import COLLISION_GROUP, SOLREF
 from surgical_marl.contacts import Capsule, capsule_distance, collision_geoms, contact_pairs
 from surgical_marl.content import find
+from surgical_marl.randomisation import Randomisation, read_randomisation
 from surgical_marl.yaml_file import check_keys, read_yaml
 
 TIMESTEP = 0.0025
 """Physics step in s. docs/physics.md has the stability test that chose it."""
 DECIMATION = 8
 """Physics steps a control step: control at 50 Hz."""
+PAYLOAD = "payload"
+"""The body at an arm's tool tip that stands for what it carries, where that is randomised: `<agent>/payload`."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +56,8 @@ class Scene:
     control: str
     mounts: dict[str, Mount]
     model: mujoco.MjModel = field(repr=False)
+    randomisation: Randomisation
+    """How far arms are from the model and from what is measured; not at all unless the file says so."""
 
     @property
     def agents(self) -> tuple[str, ...]:
@@ -64,6 +69,11 @@ class Scene:
         """Agents by the arm they are: {"psm": ("psm_0", "psm_1")}."""
         names = dict.fromkeys(mount.arm.name for mount in self.mounts.values())
         return {name: tuple(a for a in self.agents if self.mounts[a].arm.name == name) for name in names}
+
+    def alone(self, agent: str) -> mujoco.MjModel:
+        """The model of one arm of the scene, its base frame at the origin."""
+        mount = replace(self.mounts[agent], position=np.zeros(3), rotation=np.eye(3))
+        return _compile(_build(self.name, {agent: mount}, self.control, self.randomisation))
 
     @property
     def home(self) -> np.ndarray:
@@ -157,15 +167,16 @@ def load_scene(name: str | Path, control: str = "position") -> Scene:
     """
     path = find("scenes", name)
     settings = read_yaml(path)
-    check_keys(settings, ("description", "arms", "view"), path)
+    check_keys(settings, ("description", "arms", "view", "randomisation"), path)
     arms = settings.get("arms")
     if not isinstance(arms, dict) or not arms:
         raise ValueError(f"{path}: arms must map agent names such as psm_0 to arms")
     mounts = {agent: _read_mount(agent, mount, path) for agent, mount in arms.items()}
-    spec = _build(path.stem, mounts, control)
+    randomisation = read_randomisation(settings.get("randomisation"), path)
+    spec = _build(path.stem, mounts, control, randomisation)
     _add_surroundings(spec, mounts, settings.get("view"), path)
     model = _compile(spec)
-    scene = Scene(path.stem, str(settings.get("description", "")), control, mounts, model)
+    scene = Scene(path.stem, str(settings.get("description", "")), control, mounts, model, randomisation)
     for one, other in contact_pairs(scene):
         spec.add_pair(geomname1=one, geomname2=other, condim=1, solref=SOLREF)
     return replace(scene, model=_weigh_shapes(_compile(spec), scene.home))
@@ -223,7 +234,7 @@ def set_physics(spec: mujoco.MjSpec) -> None:
     option.gravity = [0.0, 0.0, 0.0]
 
 
-def _build(name: str, mounts: dict[str, Mount], control: str) -> mujoco.MjSpec:
+def _build(name: str, mounts: dict[str, Mount], control: str, randomisation: Randomisation) -> mujoco.MjSpec:
     spec = mujoco.MjSpec()
     spec.modelname = name
     spec.compiler.degree = False
@@ -234,6 +245,8 @@ def _build(name: str, mounts: dict[str, Mount], control: str) -> mujoco.MjSpec:
         mujoco.mju_mat2Quat(quat, mount.rotation.ravel())
         frame = spec.worldbody.add_frame(pos=mount.position, quat=quat)
         spec.attach(mount.arm.spec(control), prefix=f"{agent}/", frame=frame)
+        if randomisation.payload:
+            spec.body(f"{agent}/{mount.arm.tool_tip}").add_body(name=f"{agent}/{PAYLOAD}")
     return spec
 
 

@@ -11,6 +11,17 @@ from gymnasium.spaces import Box
 from torch import Tensor
 
 
+class Point:
+    """An arm whose joints are its tip's coordinates."""
+
+    remote_center = None
+
+    def forward_kinematics(self, q: np.ndarray) -> np.ndarray:
+        pose = np.broadcast_to(np.eye(4), (*q.shape[:-1], 4, 4)).copy()
+        pose[..., : q.shape[-1], 3] = q
+        return pose
+
+
 class FakeEnv:
     """Points in as many dimensions as `sizes` says for each type; actions are velocities."""
 
@@ -24,8 +35,11 @@ class FakeEnv:
             0.05,
             "cpu",
         )
-        mount = SimpleNamespace(arm=SimpleNamespace(remote_center=None))
-        self.task_name, self.scene = "reach", SimpleNamespace(name="fake", mounts=dict.fromkeys(self.agents, mount))
+        mounts = dict.fromkeys(self.agents, SimpleNamespace(arm=Point()))
+        ends = np.cumsum(list(self.sizes.values()))
+        joints = {a: np.arange(end - self.sizes[a], end) for a, end in zip(self.agents, ends, strict=True)}
+        self.task_name, self.control, self.env = "reach", "position", SimpleNamespace(difficulty="default")
+        self.scene = SimpleNamespace(name="fake", mounts=mounts, qpos_index=joints.__getitem__)
         self.state_space = self._box(2 * sum(self.sizes.values()))
         self.generator = torch.Generator()
         self.poison = False  # return NaN observations
@@ -91,9 +105,14 @@ class FakeEnv:
             infos=infos,
         )
 
+    @property
+    def qpos(self) -> np.ndarray:
+        return np.concatenate([self.where[a][:, :size].numpy() for a, size in self.sizes.items()], -1)
+
     def carry(self) -> dict[str, np.ndarray]:
         state = {"steps": self.steps.copy(), "generator": self.generator.get_state().numpy()}
-        return state | {f"where/{agent}": where.numpy() for agent, where in self.where.items()}
+        state |= {f"where/{agent}": where.numpy() for agent, where in self.where.items()}
+        return state | {f".goal/{a}": self.where[a][:, size:].numpy() for a, size in self.sizes.items()}
 
     def set_carry(self, carry: dict[str, np.ndarray]) -> None:
         self.steps = carry["steps"].copy()

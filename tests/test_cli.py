@@ -70,6 +70,16 @@ TRAIN = ["train", "reach", "--scene", "psm"]
         (["eval", "."], ["config.yaml"]),
         (["eval", ".", "--episodes", "0"], ["--episodes", "'0'"]),
         (["eval", ".", "--seed", "-1"], ["--seed"]),
+        (["eval", "zer"], ["'zer'", "did you mean 'zero'", "oracle"]),
+        (["eval", "zero"], ["--task (", "reach", "--scene (bimanual_psm"]),
+        (["eval", "zero", "--task", "reach"], ["--scene"]),
+        (["eval", "zero", "--task", "reech", "--scene", "psm"], ["'reech'", "did you mean 'reach'"]),
+        (["eval", "zero", "--task", "reach", "--scene", "psmm"], ["'psmm'", "did you mean 'psm'"]),
+        (["eval", "zero", "random", "--task", "reach", "--scene", "psm"], ["'zero'", "alone"]),
+        (["eval", ".", "--control", "speed"], ["'speed'", "position, velocity, torque"]),
+        (["eval", ".", "--csv", "table.txt"], ["table.txt", ".csv"]),
+        (["eval", ".", "--figure", "no/such/figure.png"], ["no/such/figure.png", ".png"]),
+        (["eval", ".", "--against", "old.json"], ["old.json"]),
     ],
 )
 def test_bad_input_is_one_sentence_and_code_2(

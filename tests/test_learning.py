@@ -13,7 +13,7 @@ import pytest
 import torch
 from fake_env import FakeEnv
 
-from surgical_marl.evaluation import evaluate
+from surgical_marl.evaluation.evaluate import evaluate
 from surgical_marl.files import write_atomic
 from surgical_marl.learning import config, train
 from surgical_marl.learning.config import NetworkSettings, PPOSettings, Settings, load_config

@@ -51,7 +51,7 @@ def make_engine(env: Env, num_envs: int, engine: str = "auto", device: str = "au
             _say("warp-lang is not installed")
         else:
             from surgical_marl.engines.fused.engine import FusedEngine
-            from surgical_marl.engines.fused.primitives import Unsupported
+            from surgical_marl.engines.fused.traced import Unsupported
 
             try:
                 return FusedEngine(env, num_envs, device)

@@ -1,6 +1,7 @@
 """The macros under the code that `emit.py` writes: scalars for CUDA, vectors of environments for Clang.
 
 Division and square root are CUDA's approximate ones, right to two units in the last place.
+That division gives 0 for a divisor above 2^126.
 """
 
 from __future__ import annotations

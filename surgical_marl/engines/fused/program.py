@@ -18,8 +18,8 @@ import numpy as np
 from surgical_marl.cache import cached
 from surgical_marl.engines.fused.emit import Emitter
 from surgical_marl.engines.fused.graph import KINDS, Graph, Value
-from surgical_marl.engines.fused.primitives import Symbolic, Traced, lift
 from surgical_marl.engines.fused.trace import Tracer
+from surgical_marl.engines.fused.traced import Traced, lift, lower
 
 if TYPE_CHECKING:
     from surgical_marl.env import Env
@@ -76,8 +76,8 @@ class Source:
     """Leaves of the rest of the `State`."""
 
 
-_CODE = ("physics", "collision", "solver", "env", "safety", "scene", "arm", "arm_spec", "workspace", "paths", "spline",
-         "task", "path_task", "tasks/*", "engines/fused/*")  # fmt: skip
+_CODE = ("physics", "dynamics", "collision", "solver", "plant", "randomisation", "env", "safety", "scene", "arm",
+         "arm_spec", "workspace", "paths", "spline", "task", "path_task", "tasks/*", "engines/fused/*")  # fmt: skip
 
 
 def load_source(env: Env, vector: bool, announce: Callable[[], None] = lambda: None) -> Source:
@@ -138,7 +138,7 @@ def trace(graph: Graph, function: Callable[..., Any], arguments: tuple[Any, ...]
     for leaf in jax.tree.leaves(arguments):
         kind = KINDS[leaf.dtype]
         ids = [graph.node("load", leaf.buffer, leaf.first + k, kind=kind) for k in range(leaf.size)]
-        inputs.append(Symbolic(np.array(ids, np.int32).reshape(leaf.shape)))
+        inputs.append(lower(graph, np.array(ids, np.int32).reshape(leaf.shape), np.dtype(leaf.dtype)))
     outputs = Tracer(graph).run(closed, inputs)
     return [lift(graph, x).ravel().tolist() for x in outputs], results
 

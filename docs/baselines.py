@@ -1,0 +1,65 @@
+"""Measure the policies that need no learning on every scene, for the tables in evaluation.md.
+
+    python docs/baselines.py [TASK ...]
+
+It prints a table for each task and writes the hashes of the goals to `surgical_marl/evaluation/goal_sets.yaml`, so what
+is committed must not change without a reason.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+import surgical_marl.evaluation.goal_set
+from surgical_marl.content import BASELINES, list_scenes, list_tasks
+from surgical_marl.evaluation.command import play_all
+from surgical_marl.evaluation.evaluate import summarise
+
+HASHES = Path(surgical_marl.evaluation.goal_set.__file__).with_name("goal_sets.yaml")
+ERRORS = {"median_error_mm": "median error (mm)", "p95_error_mm": "95th percentile (mm)"}
+FIXED = {"success_2mm": "success at 2 mm", "team_success_2mm": "all arms", "time_to_success_s": "time to it (s)"}
+MOVING = {"rmse_mm": "RMSE (mm)", "success_2mm": "success at 2 mm"}
+ALWAYS = {"collision_rate": "collisions", "path_length_mm": "path (mm)", "smoothness": "smoothness",
+          "min_distance_mm": "least distance (mm)"}  # fmt: skip
+
+
+def main(tasks: list[str]) -> None:
+    before = HASHES.read_text()
+    comments = [line for line in before.splitlines() if line.startswith("#")]
+    hashes = yaml.safe_load(before)
+    for task in tasks:
+        rows = []
+        for scene in sorted(list_scenes(), key=lambda name: (name.count("_"), name)):
+            for policy in BASELINES:
+                asked = {"task": task, "scene": scene, "control": None, "difficulty": None}
+                result = summarise([play_all([policy], asked, episodes=200, seed=0)[policy]])
+                rows.append([scene, policy, result])
+            hashes.setdefault(task, {})[scene] = result["goal_set"]
+        print(table(rows), flush=True)
+    HASHES.write_text("\n".join([*comments, yaml.safe_dump(hashes)]))
+
+
+def table(rows: list[list[Any]]) -> str:
+    columns = ERRORS | (MOVING if "rmse_mm" in rows[0][2] else FIXED) | ALWAYS
+    lines = ["| " + " | ".join(["scene", "policy", *columns.values()]) + " |", "|---" * (2 + len(columns)) + "|"]
+    for scene, policy, result in rows:
+        cells = (cell(name, result[name], result["intervals"][name]) for name in columns)
+        lines.append("| " + " | ".join([f"`{scene}`", policy, *cells]) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def cell(name: str, value: float | None, bounds: list[float] | None) -> str:
+    if value is None:
+        return "-"
+    if name.startswith(("success_", "team_", "collision_")):
+        return f"{value:.1%}"
+    span = f" ({bounds[0]:.3g} to {bounds[1]:.3g})" if bounds and name.endswith("error_mm") else ""
+    return f"{value:.3g}{span}"
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:] or list_tasks())

@@ -1,0 +1,114 @@
+"""What `surgical-marl eval` does."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from surgical_marl.content import BASELINES, find
+from surgical_marl.evaluation.evaluate import MAX_BATCH, Played, difference, play, summarise
+from surgical_marl.evaluation.figure import draw
+from surgical_marl.evaluation.report import ABOUT, format_table, write_csv
+from surgical_marl.learning.config import Settings
+from surgical_marl.learning.policy import load_policy
+from surgical_marl.learning.run import read_settings
+from surgical_marl.learning.train import make_env
+
+
+def play_all(policies: Sequence[str], asked: Mapping[str, str | None], episodes: int, seed: int) -> dict[str, Played]:
+    """The episodes of each policy, on the same goals.
+
+    Args:
+        policies: runs or shipped policies of one task and scene, or one of `BASELINES` alone.
+        asked: `task`, `scene`, `control` and `difficulty`; a run's own where None, and no others than its own.
+
+    Raises:
+        ValueError: naming what is unknown, or does not go together.
+    """
+    if len(set(policies)) < len(policies):
+        raise ValueError(f"{max(policies, key=policies.count)!r} is named twice")
+    settings = {policy: _settings(policy, asked) for policy in policies}
+    first = settings[policies[0]]
+    for policy, other in settings.items():
+        for key in (*asked, "max_steps"):
+            if (theirs := getattr(other, key)) != (ours := getattr(first, key)):
+                raise ValueError(
+                    f"{policy} has {key} {theirs!r} and {policies[0]} has {ours!r}: evaluate them one at a time"
+                )
+    env = make_env(first, min(episodes, MAX_BATCH))
+    played = {}
+    for policy in policies:
+        source = policy if policy in BASELINES else find("policies", policy)
+        acting = load_policy(source, env)
+        print(f"evaluating {policy}: {episodes} episodes", file=sys.stderr)
+        played[policy] = play(env, acting, episodes, seed)
+    return played
+
+
+def report(
+    played: Mapping[str, Played],
+    older: tuple[str, Mapping[str, Any]] | None,
+    as_json: bool,
+    csv: Path | None,
+    figure: Path | None,
+) -> str:
+    """Write the files that are asked for, and return what goes to stdout.
+
+    Args:
+        older: name of a result to compare with, and the result.
+
+    Raises:
+        ValueError: that result is of other goals, or a file cannot be written.
+    """
+    runs = [{"policy": name, **summarise([run])} for name, run in played.items()]
+    several = len(runs) > 1
+    whole = {"policy": "aggregate", **summarise(list(played.values()))} if several else runs[0]
+    change = None if older is None else difference(whole, older[1], older[0])
+    try:
+        if csv:
+            write_csv(csv, [*runs, whole] if several else runs)
+        if figure:
+            draw(figure, played)
+    except OSError as error:
+        raise ValueError(f"cannot write {error.filename}: {error.strerror}") from None
+    if as_json:
+        result: dict[str, Any] = {"runs": runs, "aggregate": whole} if several else whole
+        return json.dumps(
+            result if older is None else {**result, "against": {"result": older[0], "difference": change}}
+        )
+    if older is not None and change is not None:
+        return format_table(whole, {older[0]: older[1], "difference": change})
+    return format_table(whole, {run["policy"]: run for run in runs} if several else None)
+
+
+def read_result(path: Path) -> dict[str, Any]:
+    """A result that `surgical-marl eval --json` or a training run wrote; of several runs, all together.
+
+    ValueError if it is none.
+    """
+    try:
+        result = json.loads(path.read_text())
+        result = result.get("aggregate", result)
+        known = {*ABOUT, "intervals"} - {"policy"} <= result.keys()
+    except OSError as error:
+        raise ValueError(f"cannot read {path}: {error.strerror}") from None
+    except (ValueError, AttributeError):
+        known = False
+    if not known:
+        raise ValueError(f"{path} is not a result that `surgical-marl eval --json` of this version wrote")
+    found: dict[str, Any] = result
+    return found
+
+
+def _settings(policy: str, asked: Mapping[str, str | None]) -> Settings:
+    if policy in BASELINES:
+        return Settings(**{key: value for key, value in asked.items() if value is not None})  # type: ignore[arg-type]
+    settings = read_settings(find("policies", policy))
+    for key, value in asked.items():
+        if value not in (None, own := getattr(settings, key)):
+            raise ValueError(f"{policy} is of {key} {own!r}, not {value!r}: leave --{key} out")
+    return replace(settings, engine="auto", device="auto")

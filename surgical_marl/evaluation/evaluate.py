@@ -1,0 +1,161 @@
+"""Playing a policy's episodes and summing them up.
+
+env = BatchedEnv("reach", "psm", num_envs=200)
+result = evaluate(env, load_policy("zero", env), episodes=200, seed=0)
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import torch
+
+from surgical_marl.evaluation.goal_set import check_same, describe_goals, episode_seed, goal_hash, read_goals
+from surgical_marl.evaluation.interval import interval
+from surgical_marl.evaluation.metrics import FOLLOWING, TERMS, Metric, Trajectory, measure, metrics
+
+if TYPE_CHECKING:
+    from surgical_marl.batch import BatchedEnv
+
+MAX_BATCH = 1024
+"""Episodes run at once; make the environment with num_envs=min(episodes, MAX_BATCH)."""
+INFOS = ("tip_error", "collision", "min_distance")
+
+
+class Played(NamedTuple):
+    """What a policy did."""
+
+    about: dict[str, Any]
+    """task, scene, control, difficulty, episodes, seed, max_steps, control_dt (s), protocol and goal_set (its hash)."""
+    agents: list[str]
+    measures: dict[str, np.ndarray]
+    """[E, A] each, see `surgical_marl.evaluation.metrics.measure`."""
+
+
+def evaluate(
+    env: BatchedEnv,
+    policy: Callable[[Mapping[str, Any]], Mapping[str, Any]],
+    episodes: int,
+    seed: int,
+) -> dict[str, Any]:
+    """Run a policy for a number of episodes.
+
+    Args:
+        env: the environment, with NumPy or torch arrays, of `min(episodes, MAX_BATCH)` environments; fewer play more
+            blocks, with other goals and so another hash.
+        policy: maps the observations of agents to their actions (see `learning.policy`).
+        episodes: number of episodes, 1 or more.
+        seed: seed of the goals.
+
+    Returns:
+        The object that `surgical-marl eval --json` prints for one run, see docs/evaluation.md.
+    """
+    return summarise([play(env, policy, episodes, seed)])
+
+
+def play(
+    env: BatchedEnv,
+    policy: Callable[[Mapping[str, Any]], Mapping[str, Any]],
+    episodes: int,
+    seed: int,
+) -> Played:
+    """The episodes of `evaluate`, not summed up yet.
+
+    The first episode of each environment counts, however long it takes, so that short episodes are not
+    over-represented. More episodes than environments are played in blocks, each from its own seed.
+    """
+    if episodes < 1:
+        raise ValueError(f"episodes must be 1 or more, not {episodes}")
+    blocks, goals = [], []
+    for block in range(math.ceil(episodes / env.num_envs)):
+        count = min(env.num_envs, episodes - block * env.num_envs)
+        observations, *_ = env.reset(episode_seed(seed, block))
+        goals += read_goals(env, count)
+        trajectory = _first_episodes(env, policy, observations, count)
+        blocks.append(measure(trajectory, env.control_dt, env.task_name in FOLLOWING))
+    about = describe_goals(env, episodes)
+    measures = {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
+    return Played({**about, "seed": seed, "goal_set": goal_hash(about, goals)}, list(env.agents), measures)
+
+
+def summarise(runs: Sequence[Played]) -> dict[str, Any]:
+    """Metrics of one run, or of the episodes of several together, over all agents and for each.
+
+    ValueError if the runs did not play the same goals.
+    """
+    first = runs[0]
+    for number, run in enumerate(runs[1:], 2):
+        check_same(first.about, run.about, f"run {number}")
+    measures = {name: np.stack([run.measures[name] for run in runs]) for name in first.measures}
+    following = first.about["task"] in FOLLOWING
+    agents = {
+        agent: _numbers(metrics({name: values[..., i : i + 1] for name, values in measures.items()}, following))
+        for i, agent in enumerate(first.agents)
+    }
+    for numbers in agents.values():
+        for name in [name for name in numbers if name.startswith("team_")]:
+            del numbers[name], numbers["intervals"][name]
+    return {**first.about, **_numbers(metrics(measures, following)), "agents": agents}
+
+
+def difference(result: Mapping[str, Any], other: Mapping[str, Any], name: str) -> dict[str, float | None]:
+    """Each metric of a result minus that of another.
+
+    ValueError if the other one, called `name`, was not on the same goals.
+    """
+    check_same(result, other, name)
+    metrics = [key for key in result["intervals"] if key in other]
+    values = {key: (result[key], other[key]) for key in metrics}
+    return {key: None if None in pair else pair[0] - pair[1] for key, pair in values.items()}
+
+
+def _numbers(found: Mapping[str, Metric]) -> dict[str, Any]:
+    """Values of metrics and, under `intervals`, their 95 % intervals; None where there is none."""
+    values = {name: float(metric.reduce(metric.values.ravel())) for name, metric in found.items()}
+    numbers: dict[str, Any] = {name: value if math.isfinite(value) else None for name, value in values.items()}
+    undefined = {name for name, metric in found.items() if metric.extreme or numbers[name] is None}
+    numbers["intervals"] = {n: None if n in undefined else interval(metric) for n, metric in found.items()}
+    return numbers
+
+
+def _first_episodes(
+    env: BatchedEnv, policy: Callable[..., Mapping[str, Any]], observations: Mapping[str, Any], count: int
+) -> Trajectory:
+    """The first episodes of the first `count` environments, which have just been reset."""
+    lengths = np.zeros(count, int)
+    starts, infos = [], []
+    for number in range(1, env.max_steps + 1):
+        starts.append(np.array(env.qpos[:count], float))
+        step = env.step(dict(policy(observations)))
+        observations = step.observations
+        names = [name for name in step.infos[env.agents[0]] if name in INFOS or name.startswith(TERMS)]
+        told = {name: [_numpy(step.infos[agent][name], count) for agent in env.agents] for name in names}
+        infos.append({name: np.stack(parts, -1) for name, parts in told.items()})
+        done = _numpy(step.terminated, count) | _numpy(step.truncated, count)
+        lengths[done & (lengths == 0)] = number
+        if lengths.all():
+            break
+    else:
+        raise RuntimeError(f"{int((lengths == 0).sum())} episodes did not end within max_steps = {env.max_steps}")
+    series = {name: np.stack([info[name] for info in infos]).astype(float) for name in infos[0]}
+    error, collision, distance = (series.pop(name) for name in INFOS)
+    tip, center = _kinematics(env, np.stack(starts))
+    return Trajectory(lengths, error, collision > 0, distance, tip, center, series)
+
+
+def _kinematics(env: BatchedEnv, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Tips [T, E, A, 3] and remote center errors [T, E, A] of joint positions [T, E, nq], in float64."""
+    tips, centers = [], []
+    for agent in env.agents:
+        arm, q = env.scene.mounts[agent].arm, qpos[..., env.scene.qpos_index(agent)]
+        tips.append(arm.forward_kinematics(q)[..., :3, 3])
+        centers.append(np.full(q.shape[:-1], np.nan) if arm.remote_center is None else arm.remote_center_error(q))
+    return np.stack(tips, -2), np.stack(centers, -1)
+
+
+def _numpy(values: Any, count: int) -> np.ndarray:
+    """A copy of the first `count` values: the engine may write into its own again."""
+    return np.array((values.cpu().numpy() if isinstance(values, torch.Tensor) else values)[:count])

@@ -1,0 +1,91 @@
+"""Frozen goal sets: a hash of what an evaluation played, and the hashes of the standard ones."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable, Mapping
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import yaml
+
+if TYPE_CHECKING:
+    from surgical_marl.batch import BatchedEnv
+
+PROTOCOL = 1
+"""Raised when the goals are drawn or a metric is computed in another way: older results don't compare then."""
+ROUNDING = 1e-6
+"""Goals are hashed as whole multiples of this, m: digits that another machine may compute otherwise are left out."""
+_FILE = Path(__file__).with_name("goal_sets.yaml")
+
+
+def episode_seed(seed: int, block: int) -> int:
+    """The environments' seed for one block of episodes, apart from those of other seeds, blocks and of training."""
+    return int(np.random.SeedSequence([seed, block]).generate_state(1)[0] >> 1)
+
+
+def describe_goals(env: BatchedEnv, episodes: int) -> dict[str, Any]:
+    """What a goal set depends on beside its goals; `control_dt` in s."""
+    return {
+        "task": env.task_name,
+        "scene": env.scene.name,
+        "control": env.control,
+        "difficulty": env.env.difficulty,
+        "episodes": episodes,
+        "max_steps": env.max_steps,
+        "control_dt": round(float(env.control_dt), 9),
+        "protocol": PROTOCOL,
+    }
+
+
+def read_goals(env: BatchedEnv, count: int) -> list[np.ndarray]:
+    """The goals of the episodes that the first `count` environments have just begun, [count, ...] each, m.
+
+    Where goals move this is the path, from the task's table: what comes from it is computed on the device, with another
+    last digit on each.
+    """
+    carry = env.carry()
+    if ".goal.row" in carry:
+        return [np.asarray(env.env.task.table)[carry[".goal.row"][:count]]]
+    return [carry[name][:count] for name in sorted(carry) if name.startswith(".goal")]
+
+
+def goal_hash(about: Mapping[str, Any], goals: Iterable[np.ndarray]) -> str:
+    """SHA-256 of `describe_goals` and of the goals of all episodes, in hexadecimal."""
+    digest = hashlib.sha256(json.dumps(about, sort_keys=True).encode())
+    for part in goals:
+        whole = np.rint(part.astype(np.float64) / ROUNDING).astype("<i8")
+        digest.update(repr(part.shape).encode() + whole.tobytes())
+    return digest.hexdigest()
+
+
+def is_standard(result: Mapping[str, Any]) -> bool:
+    """Whether a result is of the goal set that this version publishes for its task and scene."""
+    return bool(result["goal_set"] == standard_hashes().get(result["task"], {}).get(result["scene"]))
+
+
+@cache
+def standard_hashes() -> dict[str, dict[str, str]]:
+    """Hashes of the standard goal sets by task and scene: what `surgical-marl eval` plays if told nothing else."""
+    found: dict[str, dict[str, str]] = yaml.safe_load(_FILE.read_text())
+    return found
+
+
+def check_same(result: Mapping[str, Any], other: Mapping[str, Any], name: str) -> None:
+    """ValueError unless both results are of the same goals.
+
+    Args:
+        name: what to call the other one.
+    """
+    if other["goal_set"] != result["goal_set"]:
+        raise ValueError(
+            f"{name} is of goal set {_describe(other)}, not {_describe(result)}: only results on the same goals compare"
+        )
+
+
+def _describe(result: Mapping[str, Any]) -> str:
+    what = "{task} in {scene}, {difficulty}, {control} control, {episodes} episodes, seed {seed}".format(**result)
+    return f"{result['goal_set']:.12} ({what})"

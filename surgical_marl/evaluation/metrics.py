@@ -1,0 +1,171 @@
+"""Metrics of whole episodes. docs/evaluation.md has each formula with its source."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+HOLD = 0.2
+"""How long before the end of an episode the tip must stay near its goal, s."""
+THRESHOLDS_MM = (1, 2, 5)
+SUCCESS_MM = 2
+"""The threshold of team success and of the time to success."""
+FOLLOWING = ("track", "follow_path")
+"""Tasks whose goal moves: every step counts, not the last ones. A closed path ends where it began."""
+TERMS = ("reward_", "cost")
+"""How names of reward terms and costs begin in `infos`."""
+STILL = 1e-3
+"""A tip that moved less than this, in m, has no smoothness: what is left is noise."""
+
+
+class Trajectory(NamedTuple):
+    """E episodes of A arms, step by step; what comes after an episode's own length is ignored."""
+
+    lengths: np.ndarray
+    """[E], steps of each episode."""
+    error: np.ndarray
+    """[T, E, A], distance of tip and goal after each step, m."""
+    collision: np.ndarray
+    """[T, E, A] bool, during each step."""
+    distance: np.ndarray
+    """[T, E, A], least distance to any other arm after each step, m; inf for an arm alone."""
+    tip: np.ndarray
+    """[T, E, A, 3], in the base frame at the start of each step, m."""
+    center: np.ndarray
+    """[T, E, A], distance of the shaft from its remote center at the start of each step, m; NaN without one."""
+    terms: Mapping[str, np.ndarray]
+    """Reward terms and costs of each step, by their names in `infos`, [T, E, A]."""
+
+
+class Metric(NamedTuple):
+    """A number over R runs of E episodes, reduced from one number an episode and arm."""
+
+    values: np.ndarray
+    """[R, E, A], or [R, E, 1] for what belongs to a whole episode."""
+    reduce: Callable[[np.ndarray], np.ndarray]
+    """[..., n] -> [...]"""
+    extreme: bool = False
+    """The worst value seen: a bootstrap cannot give an interval for it."""
+
+
+def measure(trajectory: Trajectory, dt: float, following: bool) -> dict[str, np.ndarray]:
+    """One number an episode and arm.
+
+    Args:
+        dt: time of a step, s.
+        following: whether the goal moves, so that every step counts for `error`, `held` and `time`.
+
+    Returns:
+        [E, A] each, in m: `error` at the last step (following: root mean square over the steps); `held`, the largest of
+        the last `HOLD` seconds (of all steps); `squared` (mean over the steps, m^2); least `distance`, largest
+        `center`, `path` of the tip. Also `collided`; `time` from which on the error stays below `SUCCESS_MM`, s, and
+        `smoothness`, NaN where undefined; the mean of each of the `terms`.
+    """
+    lengths, error = trajectory.lengths[:, None], trajectory.error
+    step = np.arange(1, len(error) + 1)[:, None, None]
+    going = step <= lengths
+    squared = np.where(going, np.square(error), 0.0).sum(0) / lengths
+    judged = going if following else going & (step > lengths - max(1, round(HOLD / dt)))
+    held = _largest(error, judged)
+    last_miss = np.maximum(_largest(step, going & (error >= SUCCESS_MM / 1000)), 0)
+    moves = np.linalg.norm(np.diff(trajectory.tip, axis=0), axis=-1)
+    moves = np.where(going[1:], moves, 0.0)
+    return {
+        "error": np.sqrt(squared) if following else np.take_along_axis(error, lengths[None] - 1, 0)[0],
+        "held": held,
+        "squared": squared,
+        "distance": -_largest(-trajectory.distance, going),
+        "center": np.where(np.isnan(trajectory.center[0]), np.nan, _largest(trajectory.center, going)),
+        "collided": (trajectory.collision & going).any(0),
+        "time": np.where((held < SUCCESS_MM / 1000) & (not following), dt * (last_miss + 1), np.nan),
+        "path": moves.sum(0),
+        "smoothness": _smoothness(moves / dt, trajectory.lengths - 1, dt),
+        **{name: np.where(going, values, 0.0).sum(0) / lengths for name, values in trajectory.terms.items()},
+    }
+
+
+def metrics(measures: Mapping[str, np.ndarray], following: bool) -> dict[str, Metric]:
+    """What `surgical-marl eval` reports, from `measure` of R runs, [R, E, A] each.
+
+    `following` adds the root mean square error of tasks whose goal moves.
+    """
+    mm = {name: 1000 * measures[name] for name in ("error", "held", "distance", "center", "path")}
+    found = {
+        "median_error_mm": Metric(mm["error"], _median),
+        "mean_error_mm": Metric(mm["error"], _mean),
+        "p95_error_mm": Metric(mm["error"], _percentile_95),
+    }
+    for threshold in THRESHOLDS_MM:
+        found[f"success_{threshold}mm"] = success(mm["held"], threshold)
+    found |= {
+        f"team_success_{SUCCESS_MM}mm": success(mm["held"].max(-1, keepdims=True), SUCCESS_MM),
+        "collision_rate": Metric(measures["collided"].any(-1, keepdims=True).astype(float), _mean),
+        "time_to_success_s": Metric(measures["time"], _mean_of_known),
+        "path_length_mm": Metric(mm["path"], _mean),
+        "smoothness": Metric(measures["smoothness"], _mean_of_known),
+        "min_distance_mm": Metric(mm["distance"], lambda values: values.min(-1), extreme=True),
+        "remote_center_error_mm": Metric(mm["center"], lambda values: np.fmax.reduce(values, -1), extreme=True),
+    }
+    if following:
+        found["rmse_mm"] = Metric(1e6 * measures["squared"], lambda values: np.sqrt(values.mean(-1)))
+    return found | {name: Metric(values, _mean) for name, values in measures.items() if name.startswith(TERMS)}
+
+
+def success(held: np.ndarray, threshold: float) -> Metric:
+    """The share of arms whose held error [R, E, A] is below a threshold of the same unit."""
+    return Metric((held < threshold).astype(float), _mean)
+
+
+def spectral_arc_length(speed: np.ndarray, dt: float) -> float:
+    """Smoothness of a movement: minus the length of its speed's normalised amplitude spectrum, no unit, at most 0.
+
+    A movement in one even stroke has about -1.4; each further stroke, stop or tremor makes it more negative. This is
+    SPARC of Balasubramanian et al., J. NeuroEngineering Rehabil. 12:112 (2015), with its published parameters: the
+    spectrum up to 10 Hz, cut off where the amplitude stays below 5 % of that at 0 Hz, and padded by a factor of 16.
+
+    Args:
+        speed: [n], in any unit, not all zero.
+        dt: time between samples, s.
+    """
+    size = 2 ** (math.ceil(math.log2(len(speed))) + 4)
+    amplitude = np.abs(np.fft.rfft(speed, size))
+    frequency = np.fft.rfftfreq(size, dt)
+    amplitude = amplitude[frequency <= 10.0] / amplitude.max()
+    last = int(np.flatnonzero(amplitude >= 0.05)[-1])
+    if last == 0:
+        return 0.0
+    return -float(np.hypot(1 / last, np.diff(amplitude[: last + 1])).sum())
+
+
+def _smoothness(speeds: np.ndarray, lengths: np.ndarray, dt: float) -> np.ndarray:
+    """[E, A] of the first `lengths` of the speeds [T, E, A] (m/s) of each episode; NaN for a tip that hardly moved."""
+    found = np.full(speeds.shape[1:], np.nan)
+    for episode, arm in np.argwhere(speeds.sum(0) * dt >= STILL):
+        found[episode, arm] = spectral_arc_length(speeds[: lengths[episode], episode, arm], dt)
+    return found
+
+
+def _largest(values: np.ndarray, where: np.ndarray) -> np.ndarray:
+    return np.where(where, values, -np.inf).max(0)
+
+
+def _mean(values: np.ndarray) -> np.ndarray:
+    return values.mean(-1)
+
+
+def _median(values: np.ndarray) -> np.ndarray:
+    return np.median(values, -1)
+
+
+def _percentile_95(values: np.ndarray) -> np.ndarray:
+    return np.percentile(values, 95, axis=-1)
+
+
+def _mean_of_known(values: np.ndarray) -> np.ndarray:
+    """NaN where no value is known."""
+    known = ~np.isnan(values)
+    with np.errstate(invalid="ignore"):
+        return np.where(known, values, 0.0).sum(-1) / known.sum(-1)

@@ -1,0 +1,77 @@
+"""Results as a table for people and as a CSV file for other programs."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from surgical_marl.evaluation.goal_set import is_standard
+from surgical_marl.files import write_atomic
+
+ABOUT = (
+    *("policy", "task", "scene", "control", "difficulty", "episodes", "seed", "max_steps", "control_dt", "protocol"),
+    "goal_set",
+)
+
+
+def format_table(result: Mapping[str, Any], others: Mapping[str, Mapping[str, Any]] | None = None) -> str:
+    """What `evaluate` returned, as plain text: a line a metric, with its 95 % interval.
+
+    Args:
+        others: columns to stand beside it, metrics by title; the agents if None.
+    """
+    columns = result["agents"] if others is None else others
+    what = "{task} in {scene}, {difficulty}, {control} control: {episodes} episodes, seed {seed}".format(**result)
+    goals = f"goal set {result['goal_set']:.12} ({'standard' if is_standard(result) else 'not a standard one'})"
+    rows = [["", "all", "95 % interval", *columns]]
+    for name, bounds in result["intervals"].items():
+        span = "-" if bounds is None else " to ".join(_number(name, bound) for bound in bounds)
+        rows.append([_title(name), _number(name, result[name]), span])
+        rows[-1] += [_number(name, values.get(name)) for values in columns.values()]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ("  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]).rstrip() for row in rows)
+    return "\n".join([f"{what}, {goals}", *lines])
+
+
+def write_csv(path: Path, results: Sequence[Mapping[str, Any]]) -> None:
+    """A row for all agents together and one for each agent of every result; an empty cell is an undefined number.
+
+    A result's `policy` is the name of a run. Columns `<metric>_low` and `<metric>_high` bound its 95 % interval.
+    """
+    rows = [_csv_row(result, agent) for result in results for agent in (None, *result["agents"])]
+
+    def write(temporary: Path) -> None:
+        with temporary.open("w", newline="") as file:
+            writer = csv.DictWriter(file, rows[0].keys())
+            writer.writeheader()
+            writer.writerows(rows)
+
+    write_atomic(path, write)
+
+
+def _csv_row(result: Mapping[str, Any], agent: str | None) -> dict[str, Any]:
+    values = result if agent is None else result["agents"][agent]
+    row = {key: result[key] for key in ABOUT}
+    row["agent"] = agent or "all"
+    for name in result["intervals"]:
+        low, high = values["intervals"].get(name) or (None, None)
+        row |= {name: values.get(name), f"{name}_low": low, f"{name}_high": high}
+    return row
+
+
+def _title(name: str) -> str:
+    name = name.replace("p95_", "95th-percentile_")
+    for end, unit in (("_mm", " (mm)"), ("_s", " (s)")):
+        name = name.removesuffix(end) + unit if name.endswith(end) else name
+    for threshold in ("1mm", "2mm", "5mm"):
+        name = name.replace(f"_{threshold}", f" within {threshold[0]} mm")
+    return name.replace("_", " ")
+
+
+def _number(name: str, value: float | None) -> str:
+    if value is None:
+        return "-"
+    rate = name.endswith("_rate") or name.startswith(("success_", "team_success_", "cost_"))
+    return f"{value:z.1%}" if rate else f"{value:z.2f}"

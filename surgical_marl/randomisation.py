@@ -1,0 +1,53 @@
+"""How much the arms of a scene may differ from their models and from what they measure: `randomisation` in its YAML."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from surgical_marl.yaml_file import build
+
+
+@dataclass(frozen=True)
+class Randomisation:
+    """Ranges, all zero unless given. Everything but noise is drawn once an episode, evenly, for every joint or arm of
+    its own; jaws only get other gains and friction. docs/randomisation.md has the sources of sensible values."""
+
+    offset_angle: float = 0.0
+    """A joint's reading is off by up to this, rad; `offset_slide`, m, for joints that slide."""
+    offset_slide: float = 0.0
+    backlash_angle: float = 0.0
+    """Play between a motor, which holds the encoder, and its joint, up to this, rad. Under position control."""
+    backlash_slide: float = 0.0
+    noise_angle: float = 0.0
+    """Standard deviation of a reading at each step, rad."""
+    noise_slide: float = 0.0
+    stiffness: float = 0.0
+    """Gains of the controllers are off by up to this share of their value."""
+    damping: float = 0.0
+    friction: float = 0.0
+    """So is friction, viscous and Coulomb."""
+    payload: float = 0.0
+    """Mass at the tool tip, up to this, kg."""
+    latency: int = 0
+    """Control steps, up to this many, until an action acts."""
+
+    def __bool__(self) -> bool:
+        return any(getattr(self, item.name) for item in fields(self))
+
+
+def read_randomisation(settings: Any, path: Path) -> Randomisation:
+    """The ranges in a scene file. ValueError for an unknown key or a value out of range."""
+    where = f"{path}, randomisation"
+    found: Randomisation = build(Randomisation, {} if settings is None else settings, where)
+    for item in fields(found):
+        value, relative = getattr(found, item.name), item.name in ("stiffness", "damping", "friction")
+        if value < 0 or (relative and value >= 1):
+            good = "from 0 to less than 1" if relative else "0 or more"
+            raise ValueError(f"{where}: {item.name} must be {good}, not {value:g}")
+    if isinstance(found.latency, bool) or not isinstance(found.latency, int) or found.latency > 50:
+        raise ValueError(
+            f"{where}: latency must be a whole number of control steps from 0 to 50, not {found.latency!r}"
+        )
+    return found

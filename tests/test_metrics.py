@@ -1,0 +1,181 @@
+"""Metrics and intervals against plain loops, known properties and known distributions."""
+
+from __future__ import annotations
+
+import cmath
+import itertools
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from surgical_marl.evaluation.interval import interval
+from surgical_marl.evaluation.metrics import HOLD, Metric, Trajectory, measure, metrics, spectral_arc_length
+
+DT = 0.04  # success is judged over five steps
+
+
+def random_trajectory(seed: int, lengths: list[int], arms: int) -> Trajectory:
+    """Errors around the thresholds; whatever comes after an episode's end is as wild as the rest."""
+    rng = np.random.default_rng(seed)
+    shape = (max(lengths), len(lengths), arms)
+    center = rng.random(shape)
+    center[..., 0] = np.nan  # an arm without a remote center
+    return Trajectory(
+        lengths=np.array(lengths),
+        error=10 ** rng.uniform(-4, -2.3, shape),
+        collision=rng.random(shape) < 0.05,
+        distance=rng.normal(0.05, 0.05, shape),
+        tip=rng.normal(0.0, 0.01, (*shape, 3)),
+        center=center,
+        terms={"cost": rng.random(shape)},
+    )
+
+
+def expected(trajectory: Trajectory, episode: int, arm: int, following: bool) -> dict[str, float]:
+    """One episode of one arm, measured step by step."""
+    count = int(trajectory.lengths[episode])
+    error = [float(trajectory.error[step, episode, arm]) for step in range(count)]
+    tip = [trajectory.tip[step, episode, arm] for step in range(count)]
+    squared = math.fsum(value**2 for value in error) / count
+    held = max(error if following else error[-round(HOLD / DT) :])
+    first_good = count
+    while first_good > 0 and error[first_good - 1] < 0.002:
+        first_good -= 1
+    speed = [math.dist(a, b) / DT for a, b in itertools.pairwise(tip)]
+    return {
+        "error": math.sqrt(squared) if following else error[-1],
+        "held": held,
+        "squared": squared,
+        "distance": min(trajectory.distance[:count, episode, arm]),
+        "center": max(trajectory.center[:count, episode, arm]),
+        "collided": any(trajectory.collision[:count, episode, arm]),
+        "time": DT * (first_good + 1) if held < 0.002 and not following else math.nan,
+        "path": DT * math.fsum(speed),
+        "cost": math.fsum(trajectory.terms["cost"][:count, episode, arm]) / count,
+        "smoothness": arc_length(speed) if DT * math.fsum(speed) >= 0.001 else math.nan,
+    }
+
+
+def arc_length(speed: list[float], dt: float = DT) -> float:
+    """The spectral arc length from its definition: a Fourier sum at each frequency, then the way along the curve."""
+    size = 16 * 2 ** math.ceil(math.log2(len(speed)))
+    highest = min(10.0, 0.5 / dt)
+    frequencies = [k / (size * dt) for k in range(size) if k / (size * dt) <= highest]
+    spectrum = [abs(sum(v * cmath.exp(-2j * math.pi * f * dt * n) for n, v in enumerate(speed))) for f in frequencies]
+    spectrum = [value / sum(speed) for value in spectrum]  # of a speed, the sum at 0 Hz is the largest
+    cut = max(i for i, value in enumerate(spectrum) if value >= 0.05)
+    points = [(f / frequencies[cut], value) for f, value in zip(frequencies, spectrum, strict=True)][: cut + 1]
+    return -math.fsum(math.dist(a, b) for a, b in itertools.pairwise(points))
+
+
+@settings(deadline=None, max_examples=25)
+@given(
+    st.integers(0, 2**32 - 1), st.lists(st.integers(2, 24), min_size=1, max_size=4), st.integers(1, 3), st.booleans()
+)
+def test_measures_equal_plain_loops(seed: int, lengths: list[int], arms: int, following: bool) -> None:
+    trajectory = random_trajectory(seed, lengths, arms)
+    found = measure(trajectory, DT, following)
+    for episode in range(len(lengths)):
+        for arm in range(arms):
+            for name, value in expected(trajectory, episode, arm, following).items():
+                assert found[name][episode, arm] == pytest.approx(value, rel=1e-9, nan_ok=True), name
+
+
+def test_what_an_episode_does_not_have_is_undefined() -> None:
+    still = random_trajectory(0, [6, 1], 1)
+    still.tip[...], still.error[...], still.distance[...] = 0.01, 0.5, np.inf
+    found = measure(still, DT, False)
+    assert np.isnan(found["smoothness"]).all() and np.isnan(found["time"]).all()
+    assert (found["path"] == 0).all() and (found["distance"] == np.inf).all()
+    one_step = measure(random_trajectory(0, [1], 2), DT, False)
+    assert (one_step["path"] == 0).all()
+
+
+@settings(deadline=None, max_examples=25)
+@given(
+    st.lists(st.floats(0.0, 1.0), min_size=2, max_size=40).filter(lambda speed: max(speed) > 0.01),
+    st.sampled_from([0.01, 0.02, 0.04, 0.1]),
+    st.floats(1e-3, 1e3),
+)
+def test_spectral_arc_length(speed: list[float], dt: float, amplitude: float) -> None:
+    found = spectral_arc_length(np.array(speed), dt)
+    assert found == pytest.approx(arc_length(speed, dt), rel=1e-6)
+    assert spectral_arc_length(amplitude * np.array(speed), dt) == pytest.approx(found, rel=1e-6)
+
+
+def stroke(duration: float, dt: float = 0.002) -> np.ndarray:
+    """The speed of the smoothest way from rest to rest, that of least jerk."""
+    t = np.arange(0.0, duration, dt) / duration
+    return t**2 * (1 - t) ** 2
+
+
+def test_smoothness_tells_strokes_apart_and_nothing_else() -> None:
+    one = spectral_arc_length(stroke(1.0), 0.002)
+    assert one < 0
+    for duration in (0.5, 2.0, 3.0):  # neither slow nor fast is smoother
+        assert spectral_arc_length(stroke(duration), 0.002) == pytest.approx(one, rel=0.02)
+    assert spectral_arc_length(stroke(1.0, 0.02), 0.02) == pytest.approx(one, rel=0.02)  # nor how often one looks
+    waits = np.concatenate([stroke(1.0), np.zeros(1000)])
+    assert spectral_arc_length(waits, 0.002) == pytest.approx(one, rel=0.02)  # nor holding still at the goal
+    strokes = [spectral_arc_length(np.tile(stroke(1.0), n), 0.002) for n in (1, 2, 3, 4)]
+    assert strokes == sorted(strokes, reverse=True) and strokes[1] < 1.2 * one
+    tremor = stroke(1.0) * (1 + 0.5 * np.sin(2 * np.pi * 6 * np.arange(500) * 0.002))
+    assert spectral_arc_length(tremor, 0.002) < 1.2 * one
+
+
+def mean_of(values: Any) -> Metric:
+    return Metric(np.asarray(values, float), lambda drawn: drawn.mean(-1))
+
+
+def bounds(metric: Metric) -> tuple[float, float]:
+    found = interval(metric)
+    assert found is not None
+    return found[0], found[1]
+
+
+@settings(deadline=None, max_examples=10)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 4), st.integers(5, 60), st.integers(1, 3))
+def test_an_interval_holds_the_value_and_repeats(seed: int, runs: int, episodes: int, arms: int) -> None:
+    metric = mean_of(np.random.default_rng(seed).normal(size=(runs, episodes, arms)))
+    low, high = bounds(metric)
+    assert low <= metric.values.mean() <= high and low < high
+    assert (low, high) == bounds(metric)
+
+
+def test_an_interval_holds_the_truth_as_often_as_it_says() -> None:
+    rng = np.random.default_rng(0)
+    intervals = [bounds(mean_of(rng.exponential(size=(1, 80, 1)))) for _ in range(300)]
+    covered = np.mean([low <= 1 <= high for low, high in intervals])
+    assert 0.90 < covered < 0.98
+    width = np.mean([high - low for low, high in intervals])
+    assert width == pytest.approx(2 * 1.96 / math.sqrt(80), rel=0.1)  # the normal one, of a deviation of 1
+
+
+def test_more_episodes_narrow_an_interval_and_arms_of_one_episode_do_not() -> None:
+    values = np.random.default_rng(1).normal(size=(1, 400, 1))
+    few, many = (np.ptp(bounds(mean_of(values[:, :count]))) for count in (25, 400))
+    assert many == pytest.approx(few / 4, rel=0.35)
+    assert bounds(mean_of(np.repeat(values, 3, -1))) == pytest.approx(bounds(mean_of(values)))
+
+
+def test_the_spread_between_runs_counts() -> None:
+    """Runs that differ by their seed alone: the interval is as wide as their means are apart, however many episodes."""
+    rng = np.random.default_rng(2)
+    offsets = np.array([-1.0, -0.3, 0.2, 0.4, 0.9])[:, None, None]
+    few, many = (np.ptp(bounds(mean_of(offsets + 0.1 * rng.normal(size=(5, n, 1))))) for n in (50, 500))
+    expected_width = 2 * 1.96 * offsets.std() / math.sqrt(5)
+    assert few == pytest.approx(expected_width, rel=0.15) and many == pytest.approx(expected_width, rel=0.15)
+    assert np.ptp(bounds(mean_of(0.1 * rng.normal(size=(1, 500, 1))))) < many / 20
+
+
+def test_no_interval_without_a_sample() -> None:
+    assert interval(mean_of(np.ones((1, 1, 2)))) is None
+    measures = measure(random_trajectory(3, [20] * 30, 1), DT, False)
+    measures["time"] = np.where(np.arange(30)[:, None] == 7, 1.5, np.nan)  # one success: many resamples have none
+    found = metrics({name: values[None] for name, values in measures.items()}, following=False)
+    assert interval(found["time_to_success_s"]) is None
+    assert found["time_to_success_s"].reduce(found["time_to_success_s"].values.ravel()) == 1.5
