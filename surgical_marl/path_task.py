@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -58,18 +58,20 @@ class PathTask(Task):
     def along(self, row: Array, time: Array) -> Array:
         """Targets [arms, 3] at a time in s, or [..., arms, 3] at times [...]. At the end of a closed path its next
         round begins; targets of an open one rest there."""
-        return self._blend(row, time, spline.weights)
+        near, f = self._near(row, time)
+        return (jnp.stack(spline.weights(f), axis=-1)[..., None, None] * near).sum(-3)
 
     def velocities(self, goal: PathGoal) -> Array:
         """Of the targets, [arms, 3], m/s."""
+        near, f = self._near(goal.row, goal.time)
+        slopes = jnp.stack(spline.slopes(f), axis=-1) / np.float32(KNOT)
         rests = ~jnp.asarray(self.closed)[goal.row] & (goal.time >= np.float32(SEGMENTS * KNOT))
-        return jnp.where(rests, 0.0, self._blend(goal.row, goal.time, spline.slopes) / np.float32(KNOT))
+        return jnp.where(rests, 0.0, (slopes[..., None, None] * (near[1:] - near[:-1])).sum(-3))
 
-    def _blend(self, row: Array, time: Array, weights: Any) -> Array:
+    def _near(self, row: Array, time: Array) -> tuple[Array, Array]:
+        """The four control points [..., 4, arms, 3] of the segment at a time, and the share of it that has passed."""
         u = time * np.float32(1 / KNOT)
         around = u - SEGMENTS * jnp.floor(u / np.float32(SEGMENTS))
         u = jnp.where(jnp.asarray(self.closed)[row], around, jnp.minimum(u, np.float32(SEGMENTS)))
         k = jnp.clip(jnp.floor(u).astype(jnp.int32), 0, SEGMENTS - 1)
-        near = self.table[row, k[..., None] + np.arange(4)]
-        shares = jnp.stack(weights(u - k.astype(jnp.float32)), axis=-1)
-        return (shares[..., None, None] * near).sum(-3)
+        return self.table[row, k[..., None] + np.arange(4)], u - k.astype(jnp.float32)

@@ -19,10 +19,10 @@ def weights(f: Any) -> tuple[Any, Any, Any, Any]:
     return g * g * g / 6, (4 - 6 * f * f + 3 * f * f * f) / 6, (4 - 6 * g * g + 3 * g * g * g) / 6, f * f * f / 6
 
 
-def slopes(f: Any) -> tuple[Any, Any, Any, Any]:
-    """The derivatives of `weights` by u."""
+def slopes(f: Any) -> tuple[Any, Any, Any]:
+    """Of the three differences of a segment's control points in its derivative by u, [...] each."""
     g = 1 - f
-    return -g * g / 2, f * (3 * f - 4) / 2, g * (4 - 3 * g) / 2, f * f / 2
+    return g * g / 2, (1 + 2 * f * g) / 2, f * f / 2
 
 
 def evaluate(control: np.ndarray, u: np.ndarray) -> np.ndarray:
@@ -69,9 +69,9 @@ def curvature(control: np.ndarray, fine: int = 4) -> np.ndarray:
     """The greatest curvature, 1/m, [...], of `fine` points a segment."""
     u = np.arange(0, control.shape[-2] - 3, 1 / fine)
     k, f = np.floor(u).astype(int), (u - np.floor(u))[:, None]
-    first = sum(w * control[..., k + j, :] for j, w in enumerate(slopes(f)))
-    bend = (1 - f, 3 * f - 2, 1 - 3 * f, f)  # second derivatives of `weights`
-    second = sum(w * control[..., k + j, :] for j, w in enumerate(bend))
+    ways, turns = np.diff(control, axis=-2), np.diff(control, 2, axis=-2)
+    first = sum(w * ways[..., k + j, :] for j, w in enumerate(slopes(f)))
+    second = (1 - f) * turns[..., k, :] + f * turns[..., k + 1, :]
     dot = lambda a, b: np.einsum("...i,...i", a, b)  # noqa: E731
     squared = np.maximum(dot(first, first), 1e-18)
     across = np.maximum(squared * dot(second, second) - dot(first, second) ** 2, 0)  # the cross product's square

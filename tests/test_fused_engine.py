@@ -18,6 +18,8 @@ from surgical_marl.engines.choose import make_engine
 from surgical_marl.engines.fused.engine import FusedEngine, flatten
 from surgical_marl.engines.mjx import MjxEngine
 from surgical_marl.env import Env
+from surgical_marl.path_task import PathTask
+from surgical_marl.paths import DURATION
 
 STATES = 1024
 TOLERANCE = 1e-5
@@ -28,7 +30,9 @@ ULPS = 10
 ALL = [(task, scene, control) for task in list_tasks() for scene in list_scenes() for control in CONTROL_MODES]
 QUICK = [("psm", "position"), ("bimanual_psm", "position"), ("ecm", "velocity"), ("star", "torque")]
 CASES = [
-    case if case[1:] in (QUICK if case[0] == "reach" else QUICK[:1]) else pytest.param(*case, marks=pytest.mark.slow)
+    case
+    if (case[1:] in QUICK and case[0] == "reach") or case == ("follow_path", *QUICK[0])
+    else pytest.param(*case, marks=pytest.mark.slow)
     for case in ALL
 ]
 
@@ -48,6 +52,8 @@ def random_state(env: Env, seed: int = 0) -> tuple[dict[str, np.ndarray], dict[s
         ".episode": rng.integers(0, 1000, STATES),
         ".steps": rng.integers(0, env.max_steps, STATES),
     }
+    if isinstance(env.task, PathTask):
+        carry[".goal.time"] = rng.uniform(0, 1.2 * DURATION, STATES)
     actions = {agent: rng.uniform(-1, 1, (STATES, env.num_actions(agent))) for agent in env.agents}
     single = lambda x: x.astype(np.int32 if x.dtype.kind == "i" else np.float32)  # noqa: E731
     return {name: single(x) for name, x in carry.items()}, {agent: single(x) for agent, x in actions.items()}

@@ -47,7 +47,7 @@ def random_actions(env: BatchedEnv, rng: np.random.Generator) -> dict[str, np.nd
 
 @pytest.mark.parametrize(("task", "scene"), CASES)
 def test_pettingzoo_accepts_it(task: str, scene: str) -> None:
-    make = lambda: sm.parallel_env(task, scene=scene, max_steps=12)  # noqa: E731
+    make = lambda: sm.parallel_env(task, scene=scene)  # noqa: E731
     parallel_api_test(make(), num_cycles=30)
     parallel_seed_test(make)
 

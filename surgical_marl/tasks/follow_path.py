@@ -11,7 +11,7 @@ Randomisation cubic splines through random waypoints, half of them closed, sampl
               tool tip is at home. Each has its own speed, from half the greatest to the greatest, and turns by no more
               than 4 rad/s. Paths are kept only if all arms can follow them together (`surgical_marl/paths.py`). Arms
               start at home.
-Difficulty    greatest speed, and distance from the start: easy 10 mm/s, 50 mm; default 20 mm/s, 50 mm; hard 40 mm/s,
+Difficulty    greatest speed, and distance from the start: easy 10 mm/s, 50 mm; default 20 mm/s, 50 mm; hard 30 mm/s,
               70 mm. Two arms' paths come within 20 mm of each other in no episode if easy, in a tenth by default, in
               half if hard (where arms can meet at all); the arms pass there at different times.
 """
@@ -37,7 +37,7 @@ class Task(PathTask):
     levels = {  # noqa: RUF012
         "easy": Level(0.05, 0.0, 0.01),
         "default": Level(0.05, 0.1, 0.02),
-        "hard": Level(0.07, 0.5, 0.04),
+        "hard": Level(0.07, 0.5, 0.03),
     }
 
     def observations(self, views: Views, goal: PathGoal) -> dict[str, Array]:

@@ -9,7 +9,7 @@ Termination   none; an episode is truncated after 250 control steps (5 s).
 Randomisation targets rest at the tool tips at first. Then their velocities walk at random, as in the paper, but never
               faster than a greatest speed, and never further than a greatest distance from where they began. Walks are
               kept only if all arms can follow them together (`surgical_marl/paths.py`). Arms start at home.
-Difficulty    greatest speed and distance: easy 10 mm/s, 50 mm; default 20 mm/s, 50 mm; hard 40 mm/s, 70 mm. The ways of
+Difficulty    greatest speed and distance: easy 10 mm/s, 50 mm; default 20 mm/s, 50 mm; hard 30 mm/s, 70 mm. The ways of
               two arms' targets come within 20 mm of each other, at different times, in no episode if easy, in a tenth
               by default, in half if hard (where arms can meet at all).
 """
@@ -32,7 +32,7 @@ class Task(PathTask):
     levels = {  # noqa: RUF012
         "easy": Level(0.05, 0.0, 0.01),
         "default": Level(0.05, 0.1, 0.02),
-        "hard": Level(0.07, 0.5, 0.04),
+        "hard": Level(0.07, 0.5, 0.03),
     }
 
     def observations(self, views: Views, goal: PathGoal) -> dict[str, Array]:
