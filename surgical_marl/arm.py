@@ -57,6 +57,7 @@ class Joint:
     name: str
     slides: bool
     lower: float
+    """Where its stops stand: the URDF's limits, less the drive's `margin`."""
     upper: float
     velocity: float
     effort: float
@@ -249,7 +250,7 @@ def load_arm(name: str | Path) -> Arm:
         remote_center=settings.get("remote_center"),
         jaw=jaw,
         camera=camera,
-        joints=tuple(_joint(joint, drives) for joint in robot.joints if joint.type in MOVING),
+        joints=tuple(_joint(joint, drives, where) for joint in robot.joints if joint.type in MOVING),
         cables=cables,
         urdf=robot,
     )
@@ -264,14 +265,18 @@ def _urdf_path(folder: Path, name: Any) -> Path:
     return path
 
 
-def _joint(joint: yourdf.Joint, drives: dict[str, Drive]) -> Joint:
+def _joint(joint: yourdf.Joint, drives: dict[str, Drive], where: Path) -> Joint:
     limit, dynamics, mimic = joint.limit, joint.dynamics, joint.mimic
     leader = mimic.joint if mimic else joint.name
+    margin = drives[leader].margin
+    if not 2 * margin < limit.upper - limit.lower:
+        span = f"[{limit.lower:g}, {limit.upper:g}]"
+        raise ValueError(f"{where}, joint {joint.name!r}: a margin of {margin:g} leaves nothing of {span}")
     return Joint(
         name=joint.name,
         slides=joint.type == "prismatic",
-        lower=limit.lower,
-        upper=limit.upper,
+        lower=limit.lower + margin,
+        upper=limit.upper - margin,
         velocity=limit.velocity,
         effort=limit.effort,
         viscous=float((dynamics and dynamics.damping) or 0.0),  # yourdfpy leaves these two as text

@@ -27,6 +27,7 @@ _LISTS = {
 _CONTROL = ("position", "velocity", "torque")
 _DEVICES = ("auto", "cpu", "cuda")
 _BENCHED = ("all", "fused", "mjx", "mujoco")
+_MOTIONS = ("random", "rough")
 
 # Flags of `train` that are short for `key=value`: key, good values or a placeholder, help.
 _SETTINGS: tuple[tuple[str, str | tuple[str, ...], str], ...] = (
@@ -139,6 +140,8 @@ def _parser() -> argparse.ArgumentParser:
     bench.add_argument("--engine", type=_one_of(_BENCHED), default="all", metavar="|".join(_BENCHED))
     bench.add_argument("--device", type=_one_of(_DEVICES), default="auto", metavar="|".join(_DEVICES))
     bench.add_argument("--decimation", type=_whole(1), default=1, metavar="K", help="physics steps an environment step")
+    bench.add_argument("--motion", type=_one_of(_MOTIONS), default=_MOTIONS[0], metavar="|".join(_MOTIONS),
+                       help="random: a new action every control step; rough: arms cross each other's way")  # fmt: skip
     bench.add_argument("--sweep", action="store_true", help="from 1 to 4 million environments, as far as memory goes")
     bench.add_argument("--cold", action="store_true", help="start without caches, for compile_s")
     bench.add_argument("--json", action="store_true", help="one JSON object instead of a table")
@@ -211,7 +214,7 @@ def _bench(arguments: argparse.Namespace) -> None:
         from surgical_marl.bench.report import run
 
         engines = _BENCHED[1:] if arguments.engine == "all" else (arguments.engine,)
-        keys = ("task", "scene", "num_envs", "device", "decimation")
+        keys = ("task", "scene", "num_envs", "device", "decimation", "motion")
         print(run({k: getattr(arguments, k) for k in keys}, engines, arguments.sweep, arguments.json, arguments.out))
 
 

@@ -20,6 +20,8 @@ class Drive:
     speed: float
     armature: float = 0.0
     home: float = 0.0
+    margin: float = 0.0
+    """How far inside the URDF's limits the stops stand. What is light and struck at speed goes a little past a stop."""
 
 
 @dataclass(frozen=True)
@@ -50,8 +52,8 @@ def _drive(mapping: Any, where: str) -> Drive:
 
 
 def _check_signs(drive: Drive | Cable, positive: str, where: str) -> None:
-    for key in ("stiffness", "damping", "armature"):
-        if getattr(drive, key) < 0:
+    for key in ("stiffness", "damping", "armature", "margin"):
+        if getattr(drive, key, 0) < 0:
             raise ValueError(f"{where}: {key} must be 0 or more, not {getattr(drive, key):g}")
     if not getattr(drive, positive) > 0:
         raise ValueError(f"{where}: {positive} must be above 0, not {getattr(drive, positive):g}")

@@ -23,10 +23,10 @@ from surgical_marl.runtime import prepare_jax
 from surgical_marl.scene import DECIMATION, Scene
 from surgical_marl.solver import JointRows, Rows, relax, solve, solve_positive
 
-ARM_ITERATIONS, TOUCHING_ITERATIONS = (1, 1), (5, 4)
-"""Newton steps, and line search steps in each, for an arm that touches nothing and for arms that touch: what it takes
-to solve limits, friction and contacts nearly as well as C MuJoCo, which goes on until they are: see docs/physics.md.
-"""
+ARM_ITERATIONS, TOUCHING_ITERATIONS = (1, 1), (6, 4)
+"""Most Newton steps, and line search steps in each, for an arm that touches nothing and for arms that touch: what it
+takes to solve limits, friction and contacts nearly as well as C MuJoCo, which goes on until they are: see
+docs/physics.md."""
 
 
 class Physics(NamedTuple):
@@ -155,15 +155,19 @@ class Simulator:
         rows = self._constraints(data)
         qvel, qacc = physics.qvel, physics.qacc_warmstart
         for agent, dofs in self._dofs.items():
-            own = self._own_rows[agent]
-            block = Rows(rows.jacobian[own][:, dofs], *(column[own] for column in rows[1:]))
             mass, damping = data._impl.M[dofs][:, dofs], self._damping(data)[dofs][:, dofs]
-            smooth = data.qfrc_smooth[dofs]
-            start = relax(mass, smooth, self._joint_rows(agent, block), physics.qacc_warmstart[dofs])
-            found, _ = solve(mass, smooth, block, start, *ARM_ITERATIONS)
+            block, start = self._relaxed(agent, data, rows, physics.qacc_warmstart)
+            found, _ = solve(mass, data.qfrc_smooth[dofs], block, start, *ARM_ITERATIONS)
             qacc = qacc.at[dofs].set(found)
             qvel = qvel.at[dofs].add(self._dt * solve_positive(mass + self._dt * damping, mass @ found))
         return self._moved(physics, qvel, qacc), jnp.zeros(self._pairs.count, jnp.float32)
+
+    def _relaxed(self, agent: str, data: Any, rows: Rows, qacc: Array) -> tuple[Rows, Array]:
+        """An arm's own rows, and its acceleration near to what they allow."""
+        dofs, own = self._dofs[agent], self._own_rows[agent]
+        block = Rows(rows.jacobian[own][:, dofs], *(column[own] for column in rows[1:]))
+        mass = data._impl.M[dofs][:, dofs]
+        return block, relax(mass, data.qfrc_smooth[dofs], self._joint_rows(agent, block), qacc[dofs])
 
     def _joint_rows(self, agent: str, rows: Rows) -> JointRows:
         """An arm's rows, each of which concerns one joint, by joint."""
@@ -182,7 +186,10 @@ class Simulator:
         touching = self._pairs.deepest(data, self._pairs.closest(data.geom_xpos, data.geom_xmat))
         contacts = self._contact_rows(touching, physics.qvel)
         joined = Rows(*(jnp.concatenate(parts) for parts in zip(rows, contacts, strict=True)))
-        qacc, force = solve(mass, data.qfrc_smooth, joined, physics.qacc_warmstart, *TOUCHING_ITERATIONS)
+        start = physics.qacc_warmstart
+        for agent, dofs in self._dofs.items():
+            start = start.at[dofs].set(self._relaxed(agent, data, rows, start)[1])
+        qacc, force = solve(mass, data.qfrc_smooth, joined, start, *TOUCHING_ITERATIONS)
         qvel = physics.qvel + self._dt * solve_positive(mass + self._dt * self._damping(data), mass @ qacc)
         its_own = touching.pair == np.arange(self._pairs.count)[:, None]
         return self._moved(physics, qvel, qacc), jnp.where(its_own, force[len(rows.low) :], 0.0).sum(-1)

@@ -1,11 +1,11 @@
-"""MuJoCo's constraint problem, solved in a fixed number of steps.
+"""MuJoCo's constraint problem, solved in few steps.
 
 The acceleration of a system with limits, friction and contacts minimises a convex function: half the square of its
 distance to the smooth acceleration in the metric of the mass matrix, plus a piecewise quadratic cost of each constraint
 row (https://mujoco.readthedocs.io/en/stable/computation/index.html#the-optimization-problem). Rows without an elliptic
 cone all have one form: the force is `clip(impedance * (reference - J qacc), low, high)`, with bounds (0, inf) for a
-limit or a contact and (-f, f) for friction f. `solve` is Newton's method with a line search, as in MuJoCo, but it never
-asks whether it has converged, so that many environments take it in step. Where every row concerns one joint alone,
+limit or a contact and (-f, f) for friction f. `solve` is Newton's method with a line search, as in MuJoCo, with the
+search in a fixed number of steps, so that many environments take it together. For rows that concern one joint alone
 `relax` comes first: it solves one joint after the other, exactly, and so finds nearly always which rows hold and which
 slip or are free. Newton's method alone goes astray among them: friction and limits are stiff, and a row that changes
 sides changes the whole step.
@@ -105,25 +105,44 @@ def solve(
     mass: Array, smooth: Array, rows: Rows, start: Array, iterations: int, line_search: int
 ) -> tuple[Array, Array]:
     """Acceleration [n] and the force of each row [r], for a mass matrix [n, n] and the sum of all other forces [n], by
-    so many Newton steps from `start`, each with so many steps of line search."""
+    Newton steps from `start`, each with so many steps of line search.
 
-    def iterate(qacc: Array, _: None) -> tuple[Array, None]:
+    There are at most `iterations` of them. A step over which no row changes sides ends at the solution, and a second
+    one clears its rounding error: then it is settled.
+    """
+
+    def newton(qacc: Array) -> tuple[Array, Array]:
         unbounded = rows.impedance * (rows.reference - rows.jacobian @ qacc)
         force = jnp.clip(unbounded, rows.low, rows.high)
-        free = (unbounded > rows.low) & (unbounded < rows.high)
+        above, below = unbounded > rows.low, unbounded < rows.high
         rest = mass @ qacc - smooth
-        weighted = jnp.where(free, rows.impedance, 0.0)[:, None] * rows.jacobian
+        weighted = jnp.where(above & below, rows.impedance, 0.0)[:, None] * rows.jacobian
         hessian = mass + rows.jacobian.T @ weighted
         search = solve_positive(hessian, rows.jacobian.T @ force - rest)
-        return qacc + _line_search(mass, rows, unbounded, rest, search, line_search) * search, None
+        step, end = _line_search(mass, rows, unbounded, rest, search, line_search)
+        return qacc + step * search, (((end > rows.low) == above) & ((end < rows.high) == below)).all()
 
-    qacc, _ = jax.lax.scan(iterate, start, None, length=iterations)
+    def unsettled(state: tuple[Array, Array, Array]) -> Array:
+        _, settled, count = state
+        return (settled < 2) & (count < iterations)
+
+    def iterate(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        qacc, settled, count = state
+        qacc, kept = newton(qacc)
+        return qacc, jnp.where(kept, settled + 1, 0), count + 1
+
+    if iterations == 1:
+        qacc = newton(start)[0]
+    else:
+        qacc, _, _ = jax.lax.while_loop(unsettled, iterate, (start, jnp.int32(0), jnp.int32(0)))
     return qacc, jnp.clip(rows.impedance * (rows.reference - rows.jacobian @ qacc), rows.low, rows.high)
 
 
-def _line_search(mass: Array, rows: Rows, unbounded: Array, rest: Array, search: Array, iterations: int) -> Array:
-    """How far to go along `search`: the root of the cost's slope, which grows piecewise linearly, by Newton's method
-    within a bracket."""
+def _line_search(
+    mass: Array, rows: Rows, unbounded: Array, rest: Array, search: Array, iterations: int
+) -> tuple[Array, Array]:
+    """How far to go along `search`, and what `unbounded` is there. The end is the root of the cost's slope, which grows
+    piecewise linearly: Newton's method within a bracket."""
     along = rows.jacobian @ search
     fall = rows.impedance * along
     slope_0, slope_1 = search @ rest, search @ (mass @ search)
@@ -141,7 +160,7 @@ def _line_search(mass: Array, rows: Rows, unbounded: Array, rest: Array, search:
     whole, none = jnp.float32(1.0), jnp.float32(0.0)
     start = (whole, none, jnp.float32(jnp.inf))
     (step, _, _), _ = jax.lax.scan(iterate, start, None, length=iterations, unroll=True)
-    return step
+    return step, unbounded - step * fall
 
 
 def solve_positive(matrix: Array, right: Array) -> Array:

@@ -96,7 +96,10 @@ DISC_INERTIA = {"psm": 3.3e-6 * 11.71**2, "psm_si": 3.3e-6 * 13.813**2}
 def test_limits_gains_and_friction_are_the_published_ones(name: str) -> None:
     """Wrist gains are the motor discs' through the cable coupling, a finger's twice the jaw's, and so its friction."""
     joints = load_arm(name).actuated
-    assert [(joint.lower, joint.upper, joint.effort) for joint in joints] == LIMITS[name]
+    margins = [joint.drive.margin for joint in joints]
+    assert margins == [0] * 6 + [0.02]
+    limits = [(joint.lower - m, joint.upper + m, joint.effort) for joint, m in zip(joints, margins, strict=True)]
+    np.testing.assert_allclose(limits, LIMITS[name], rtol=0, atol=1e-15)
     assert [(joint.drive.stiffness, joint.drive.damping) for joint in joints[:3]] == GAINS[name]
     cables = {joint.name: load_arm(name).cables if "wrist" in joint.name else () for joint in joints}
     for joint, part in zip(joints[3:], np.diag(SHARE) * [1, 1, 1, 2], strict=True):
@@ -258,6 +261,8 @@ def test_bad_urdf_is_one_sentence(tmp_path: Path, old: str, new: str, words: str
         ("stiffness: 6.598", "stiffness: -6.598", "cable 0: stiffness must be 0 or more, not -6.598"),
         ("effort: 0.20", "effort: 0", "cable 0: effort must be above 0, not 0"),
         (", effort: 0.20", "", "cable 0: a cable lacks effort"),
+        ("margin: 0.02", "margin: -0.02", "joint 'jaw_left': margin must be 0 or more, not -0.02"),
+        ("margin: 0.02", "margin: 0.35", "joint 'jaw_left': a margin of 0.35 leaves nothing of"),
         ("armature: 4.976e-4", "inertia: 4.976e-4", "cable 0: unknown key 'inertia'"),
         ("  - {joints", "  a: {joints", "cables must be a list"),
         ("urdf: psm.urdf", "urdf: other.urdf", "no URDF file"),

@@ -15,7 +15,7 @@ from mujoco import rollout
 from surgical_marl.bench import contenders, machine, sim
 from surgical_marl.bench.clock import race
 from surgical_marl.bench.contenders import Contender
-from surgical_marl.bench.course import HOLD, LAPS, full_state, make_course
+from surgical_marl.bench.course import HOLD, LAPS, MOTIONS, full_state, make_course
 from surgical_marl.bench.physics import PhysicsAlone
 from surgical_marl.bench.report import QUOTED, draw, ratios, sweep_table
 from surgical_marl.bench.sim import Point, Speed, measure, sweep
@@ -55,7 +55,7 @@ def made_up(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         return Contender(workload.count, "cpu", 1.0, tick, None if engine == "mujoco" else tick, bytes_per_env=100)
 
     monkeypatch.setattr(sim, "prepare", prepare)
-    monkeypatch.setattr(sim, "make_course", lambda scene: None)
+    monkeypatch.setattr(sim, "make_course", lambda scene, motion: None)
     yield
 
 
@@ -174,8 +174,9 @@ def test_what_is_timed_is_what_c_mujoco_steps() -> None:
     assert np.abs(found[:, -1, 1 : 1 + scene.model.nq] - course.qpos[:rows]).max() > 1e-2, "nothing moved"
 
 
-def test_a_course_takes_back_what_it_did() -> None:
-    course = make_course(load_scene("ecm"))
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_a_course_takes_back_what_it_did(motion: str) -> None:
+    course = make_course(load_scene("ecm"), motion)
     total = sum(actions["ecm_0"] for actions in course.actions)
     np.testing.assert_allclose(total, 0, atol=1e-6)
     assert len(course.commands) == len(course.actions) == LAPS
@@ -190,6 +191,7 @@ def test_a_course_takes_back_what_it_did() -> None:
         (["sim", "--scene", "psmm"], ["'psmm'", "did you mean 'psm'", "bimanual_psm"]),
         (["sim", "--task", "reech"], ["'reech'", "did you mean 'reach'"]),
         (["sim", "--num-envs", "0"], ["--num-envs", "'0'"]),
+        (["sim", "--motion", "wild"], ["'wild'", "random, rough"]),
         (["sim", "--decimation", "0"], ["--decimation", "'0'"]),
         (["sim", "--device", "gpu"], ["'gpu'", "auto, cpu, cuda"]),
         (["sim", "--engine", "mujoco", "--device", "cuda"], ["'mujoco'", "'cuda'", "CPU"]),
@@ -215,7 +217,8 @@ def test_no_cuda_is_bad_input(capsys: pytest.CaptureFixture[str], monkeypatch: p
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"num_envs": 0}, {"num_envs": True}, {"decimation": 0}, {"device": "tpu"}, {"task": ""}]
+    "wrong",
+    [{"num_envs": 0}, {"num_envs": True}, {"decimation": 0}, {"device": "tpu"}, {"task": ""}, {"motion": "wild"}],
 )
 def test_a_workload_that_is_none(wrong: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=next(iter(wrong))):

@@ -181,7 +181,7 @@ def test_jaw_opens_and_closes_on_one_command() -> None:
     env = batched("psm", 1)
     env.reset(0)
     action = np.zeros((1, 7), np.float32)
-    for command, width in ((1e-3, 0.5), (0.0, 0.0)):
+    for command, width in ((1e-3, 0.5), (0.0, 0.02)):
         action[0, 6] = command
         for _ in range(24):
             env.step({"psm_0": action})

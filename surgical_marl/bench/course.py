@@ -18,7 +18,10 @@ LAPS = 4
 """Actions after which a course begins again. The last half takes back what the first did, so nothing drifts away."""
 DISTINCT = 256
 """Environments that differ; more of them repeat these, fewer are the first of these."""
-_AWAY = 25  # control steps before the start, half a second
+MOTIONS = ("random", "rough")
+"""What came before the start. random: a new action every control step, as when training begins. rough: one action all
+the time, so that arms cross their ranges, and each other's way."""
+_AWAY = {"random": 50, "rough": 25}  # control steps, 1 and 0.5 s
 
 
 class Course(NamedTuple):
@@ -35,8 +38,8 @@ class Course(NamedTuple):
     """Share of the environments in which something touches at the start, from 0 to 1."""
 
 
-def make_course(scene: Scene, seed: int = 0) -> Course:
-    """Every environment heads half a second for a side of its own, then to and fro. C MuJoCo moves the arms, so that
+def make_course(scene: Scene, motion: str = MOTIONS[0], seed: int = 0) -> Course:
+    """Every environment moves from home by random actions of its own, then to and fro. C MuJoCo moves the arms, so that
     the states are no engine's own."""
     # or JAX would take most of a GPU's memory when it starts, and leave too little for the fused engine
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
@@ -49,11 +52,13 @@ def make_course(scene: Scene, seed: int = 0) -> Course:
     def draw() -> dict[str, np.ndarray]:
         return {a: rng.uniform(-1, 1, (n, len(m.arm.actuated))).astype(np.float32) for a, m in scene.mounts.items()}
 
-    away, half = draw(), [draw() for _ in range(LAPS // 2)]
+    half = [draw() for _ in range(LAPS // 2)]
     actions = [*half, *({agent: -action for agent, action in drawn.items()} for drawn in half[::-1])]
     now = jax.tree.map(lambda x: np.repeat(np.asarray(x)[None], n, 0), simulator.home)
-    for _ in range(_AWAY):
+    away = draw()
+    for _ in range(_AWAY[motion]):
         now = _roll(model, command(now, away))
+        away = draw() if motion == "random" else away
     start, commands = now, []
     for action in actions:
         now = command(now, action)

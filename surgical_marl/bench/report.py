@@ -50,7 +50,7 @@ def run(
         if out:
             draw(points, f"{workload.task} on {workload.scene}; {_machine(machine())}", out)
         return json.dumps(sweep_summary(workload, points)) if as_json else sweep_table(points)
-    course = make_course(load_scene(workload.scene))
+    course = make_course(load_scene(workload.scene), workload.motion)
     speeds, left_out = measure(workload, engines, course)
     if as_json and len(engines) == 1:
         return json.dumps(asdict(speeds[engines[0]]))
@@ -78,6 +78,7 @@ def summary(
         "task": workload.task,
         "scene": workload.scene,
         **machine(),
+        "motion": workload.motion,
         "touching": course.touching,
         "engines": [asdict(speed) for speed in speeds.values()],
         "left_out": dict(left_out),
@@ -105,7 +106,7 @@ def table(found: Mapping[str, Any]) -> str:
     return "\n".join(
         [
             f"{found['task']} on {found['scene']}: physics steps of {1e3 * first['dt']:g} ms, "
-            f"{first['decimation']} to an environment step; {found['touching']:.0%} of environments touch something",
+            f"{first['decimation']} to an environment step; {found['touching']:.1%} of environments touch something",
             _machine(found),
             "",
             *aligned(cells),

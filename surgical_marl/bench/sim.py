@@ -58,7 +58,9 @@ def measure(
     Raises:
         ValueError: the one engine asked for can't run here, or has no room.
     """
-    contenders, left_out = _contenders(workload, engines, course or make_course(load_scene(workload.scene)))
+    contenders, left_out = _contenders(
+        workload, engines, course or make_course(load_scene(workload.scene), workload.motion)
+    )
     if not contenders:
         raise ValueError("; ".join(left_out.values()))
     for name, why in left_out.items():
@@ -119,7 +121,7 @@ def sweep(
 
     An engine ends where the next number has no room or would take too long a step, and says so.
     """
-    course = make_course(load_scene(workload.scene))
+    course = make_course(load_scene(workload.scene), workload.motion)
     devices = ("cuda", "cpu") if workload.device == "auto" and workload.where == "cuda" else (workload.where,)
     for device in devices:
         for name in engines:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from surgical_marl.bench.course import MOTIONS
 from surgical_marl.content import find, list_tasks, unknown
 from surgical_marl.engines.choose import DEVICES
 
@@ -26,6 +27,7 @@ class Workload:
     device: str = "auto"
     decimation: int = 1
     """Physics steps an environment step."""
+    motion: str = MOTIONS[0]
 
     def __post_init__(self) -> None:
         if self.task not in list_tasks():
@@ -33,6 +35,8 @@ class Workload:
         find("scenes", self.scene)
         if self.device not in DEVICES:
             raise unknown("device", self.device, DEVICES)
+        if self.motion not in MOTIONS:
+            raise unknown("motion", self.motion, MOTIONS)
         for name, value in (("num_envs", self.num_envs), ("decimation", self.decimation)):
             if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < 1):
                 raise ValueError(f"{name} must be a whole number of at least 1, not {value!r}")

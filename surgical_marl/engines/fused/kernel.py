@@ -21,7 +21,7 @@ from surgical_marl.runtime import cache_dir, prepare_warp
 
 wp = prepare_warp()
 
-BLOCK = 64
+BLOCK = 32
 """Threads in a CUDA block."""
 
 _reals: Any = wp.array(dtype=wp.float32)
