@@ -98,6 +98,7 @@ class Endoscope:
                 scene.model,
                 num_envs,
                 (width, height),
+                use_textures=False,
                 render_rgb="rgb" in channels,
                 render_depth="depth" in channels,
                 render_seg="segmentation" in channels,

@@ -70,6 +70,9 @@ class Task(task.Task):
     def __init__(self, scene: Scene, difficulty: str = "default", reward: Mapping[str, float] | None = None) -> None:
         super().__init__(scene, difficulty, reward)
         self.camera: str = find_camera(scene)
+        same = scene.types[scene.mounts[self.camera].arm.name]
+        if len(same) > 1:
+            raise ValueError(f"match_image needs a scene with one endoscope; {scene.name!r} has {', '.join(same)}")
         self.postures = hidden_postures(scene, self.camera, self.level.extent)
         """`qpos` of the whole scene when a target picture is taken, [rows, nq]."""
         tips, self._arm = [], scene.mounts[self.camera].arm
