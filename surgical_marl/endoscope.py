@@ -107,6 +107,7 @@ class Endoscope:
                 enable_backface_culling=False,  # as C MuJoCo's rays: who is inside a thing sees it from inside
             )
         self._qpos = self._warp.to_torch(self._data.qpos)
+        self._warp.synchronize_device(device)  # what made the arrays ran on a stream of Warp's own
 
     def render(self, qpos: Any) -> View:
         """What the endoscopes see at joint positions [N, nq] of the whole scene: numpy for numpy, and torch for torch.
@@ -129,7 +130,7 @@ class Endoscope:
     def _stream(self) -> Any:
         if self.device == "cpu":
             return self._warp.ScopedDevice("cpu")
-        return self._warp.ScopedStream(self._warp.stream_from_torch(torch.cuda.current_stream()), sync_enter=False)
+        return self._warp.ScopedStream(self._warp.stream_from_torch(torch.cuda.current_stream()))
 
     def _rgb(self) -> torch.Tensor:
         packed = self._warp.to_torch(self._context.rgb_data.view(self._warp.int32)).view(torch.uint8)

@@ -2,7 +2,7 @@
 
 The camera's agent then observes a dict: "proprioception" [d], what the task itself observes; "image", what the
 endoscope sees now, and "target", what it should see, both uint8 [64, 64, 3]. So does who sees the whole state. Its
-reward term `image` is minus the mean absolute difference of the two, from 0 to 1, times the weight's size.
+reward term `image` is the mean absolute difference of the two, from 0 to 1, times its weight.
 """
 
 from __future__ import annotations
