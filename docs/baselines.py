@@ -25,6 +25,7 @@ FIXED = {"success_2mm": "success at 2 mm", "team_success_2mm": "all arms", "time
 MOVING = {"rmse_mm": "RMSE (mm)", "success_2mm": "success at 2 mm"}
 ALWAYS = {"collision_rate": "collisions", "path_length_mm": "path (mm)", "smoothness": "smoothness",
           "min_distance_mm": "least distance (mm)"}  # fmt: skip
+PICTURES = {"image_error": "image error (grey levels)", "angle_error_deg": "angle error (degrees)"}
 
 
 def main(tasks: list[str]) -> None:
@@ -33,7 +34,7 @@ def main(tasks: list[str]) -> None:
     hashes = yaml.safe_load(before)
     for task in tasks:
         rows = []
-        for scene in sorted(list_scenes(), key=lambda name: (name.count("_"), name)):
+        for scene in sorted(scenes(task), key=lambda name: (name.count("_"), name)):
             for policy in BASELINES:
                 asked = {"task": task, "scene": scene, "control": None, "difficulty": None}
                 result = summarise([play_all([policy], asked, episodes=200, seed=0)[policy]])
@@ -43,8 +44,14 @@ def main(tasks: list[str]) -> None:
     HASHES.write_text("\n".join([*comments, yaml.safe_dump(hashes)]))
 
 
+def scenes(task: str) -> list[str]:
+    """Where a task has a meaning."""
+    return ["ecm", "trimanual_psm_ecm"] if task == "match_image" else list_scenes()
+
+
 def table(rows: list[list[Any]]) -> str:
     columns = ERRORS | (MOVING if "rmse_mm" in rows[0][2] else FIXED) | ALWAYS
+    columns |= {name: title for name, title in PICTURES.items() if name in rows[0][2]}
     lines = ["| " + " | ".join(["scene", "policy", *columns.values()]) + " |", "|---" * (2 + len(columns)) + "|"]
     for scene, policy, result in rows:
         cells = (cell(name, result[name], result["intervals"][name]) for name in columns)

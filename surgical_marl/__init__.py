@@ -16,7 +16,7 @@ from surgical_marl.content import list_arms, list_policies, list_scenes, list_ta
 from surgical_marl.registration import gymnasium_ids, pettingzoo_ids
 
 if TYPE_CHECKING:
-    from surgical_marl import follow_path_v0, reach_v0, track_v0
+    from surgical_marl import follow_path_v0, match_image_v0, reach_v0, track_v0
     from surgical_marl.arm import load_arm
     from surgical_marl.batch import BatchedEnv
     from surgical_marl.interfaces.pettingzoo import parallel_env
@@ -40,6 +40,7 @@ __all__ = [
     "list_tasks",
     "load_arm",
     "load_scene",
+    "match_image_v0",
     "parallel_env",
     "reach_v0",
     "track_v0",
@@ -52,7 +53,7 @@ pettingzoo_ids()
 def __getattr__(name: str) -> Any:
     if name in _LAZY:
         return getattr(import_module(_LAZY[name]), name)
-    if name in ("reach_v0", "track_v0", "follow_path_v0"):
+    if name in ("reach_v0", "track_v0", "follow_path_v0", "match_image_v0"):
         return import_module(f"surgical_marl.{name}")
     raise AttributeError(f"module 'surgical_marl' has no attribute {name!r}")
 

@@ -28,7 +28,8 @@ class BatchStep(NamedTuple):
     """What a step returns. Shapes start with N, the number of environments; dicts are keyed by agent."""
 
     observations: dict[str, Any]
-    """[N, d]; of the next episode where one ended."""
+    """[N, d]; of the next episode where one ended. A dict of them for an agent that sees pictures
+    (`surgical_marl/pictures.py`), and so is `state`."""
     state: Any
     """[N, S], the whole state for a centralised critic, likewise."""
     rewards: dict[str, Any]
@@ -41,7 +42,7 @@ class BatchStep(NamedTuple):
     final_state: Any
     infos: dict[str, dict[str, Any]]
     """agent -> tip_error (m), success, collision (bool), min_distance (m), contact_force (N), reward_<term> (weighted),
-    cost, cost_<name> (bool), [N] each; of this step's episode."""
+    cost, cost_<name> (bool), [N] each, and a task's own metrics; of this step's episode."""
     contacts: Contacts
     """Distance and penetration (m) and force (N) of every pair in `scene.pairs`, [N, P] each; likewise."""
 
@@ -90,13 +91,23 @@ class BatchedEnv:
         self.max_steps, self.control_dt = self.env.max_steps, self.env.control_dt
         self.task_name, self.scene, self.control = task, self.env.scene, control
         self.device = self.engine.device
-        self._observation_spaces = {agent: self.env.observation_space(agent) for agent in self.agents}
+        self._observation_spaces: dict[str, spaces.Space[Any]] = {a: self.env.observation_space(a) for a in self.agents}
         self._action_spaces = {agent: self.env.action_space(agent) for agent in self.agents}
-        self.state_space = self.env.state_space
+        self.state_space: spaces.Space[Any] = self.env.state_space
+        self._pictures: Any = None
+        if self.env.task.camera is not None:
+            self._open_eyes(self.env.task.camera)
         self._started = False
 
-    def observation_space(self, agent: str) -> spaces.Box:
-        """Of one environment."""
+    def _open_eyes(self, agent: str) -> None:
+        from surgical_marl.pictures import Pictures
+
+        self._pictures = Pictures(self.env, self.num_envs, self.device, self.arrays)
+        self._observation_spaces[agent] = Pictures.space(self.env.observation_space(agent))
+        self.state_space = Pictures.space(self.env.state_space)
+
+    def observation_space(self, agent: str) -> spaces.Space[Any]:
+        """Of one environment: a Box, or a Dict for an agent that sees pictures."""
         return self._observation_spaces[agent]
 
     def action_space(self, agent: str) -> spaces.Box:
@@ -117,7 +128,7 @@ class BatchedEnv:
         else:
             self.engine.reset(secrets.randbits(63) if seed is None else int(seed))
         self._started = True
-        found = self.engine.outcome(self.arrays)
+        found = self._outcome(self._target_rows())
         return found["observations"], found["state"], found["infos"]
 
     def step(self, actions: dict[str, Any]) -> BatchStep:
@@ -131,8 +142,9 @@ class BatchedEnv:
         """
         if not self._started:
             raise ValueError("step before reset: call reset() first")
-        self.engine.step(self._check(actions))
-        found = self.engine.outcome(self.arrays)
+        actions, rows = self._check(actions), self._target_rows()
+        self.engine.step(actions)
+        found = self._outcome(rows)
         return BatchStep(**{**found, "contacts": Contacts(**found["contacts"])})
 
     @property
@@ -174,6 +186,17 @@ class BatchedEnv:
         for name, value in values.items():
             self.engine.write(name, value)
         self._started = True
+
+    def _outcome(self, rows: Any) -> dict[str, Any]:
+        """What the engine found, with pictures for a task that has any; `rows` are the targets' before the step."""
+        found = self.engine.outcome(self.arrays)
+        if self._pictures is not None:
+            self._pictures.add(found, rows, self._target_rows())
+        return found
+
+    def _target_rows(self) -> Any:
+        # as int64, a copy: a step gives its carry away
+        return None if self._pictures is None else self.engine.read(".goal.row", "torch").long()
 
     def _part(self, name: str, library: str) -> Any:
         if not self._started:

@@ -70,6 +70,8 @@ class State:
     this step's episode, even if it ended."""
     contacts: Contacts
     """Every pair of geoms that can touch, likewise."""
+    qpos: Any = ()
+    """Joint positions of the whole scene [nq], likewise, for a task with pictures; else nothing."""
 
 
 class Env:
@@ -172,6 +174,7 @@ class Env:
             final_state=state,
             infos=self._infos(views, carry, carry, nothing),
             contacts=self.simulator.home_contacts,
+            qpos=self.simulator.home.qpos if self.task.camera else (),
         )
 
     def step(self, carry: Carry, actions: dict[str, Array]) -> State:
@@ -205,6 +208,7 @@ class Env:
             final_state=final_state,
             infos=self._infos(views, carry, moved, terms),
             contacts=contacts,
+            qpos=physics.qpos if self.task.camera else (),
         )
 
     def _start(self, key: Array, episode: Array) -> Carry:
@@ -234,6 +238,7 @@ class Env:
         self, views: dict[str, ArmView], before: Carry, after: Carry, terms: dict[str, dict[str, Array]]
     ) -> dict[str, dict[str, Array]]:
         errors, infos = self.task.tip_errors(views, after.goal), {}
+        metrics = self.task.metrics(views, after.goal)
         speeds = jnp.linalg.norm(after.tips - before.tips, axis=-1) / np.float32(self.control_dt)
         for i, (agent, view) in enumerate(views.items()):
             broken = costs(self.scene.mounts[agent].arm, view, speeds[i])
@@ -246,5 +251,6 @@ class Env:
                 **{f"reward_{name}": value for name, value in terms[agent].items()},
                 "cost": sum(cost.astype(jnp.float32) for cost in broken.values()),
                 **{f"cost_{name}": cost for name, cost in broken.items()},
+                **metrics[agent],
             }
         return infos

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from surgical_marl.inverse_kinematics import inverse_kinematics
+from surgical_marl.observations import proprioception
 
 if TYPE_CHECKING:
     from surgical_marl.batch import BatchedEnv
@@ -42,10 +43,11 @@ def oracle(env: BatchedEnv) -> Callable[[Mapping[str, Any]], dict[str, Any]]:
 
     def policy(observations: Mapping[str, Any]) -> dict[str, Any]:
         goal, began = env.goal.astype(float), np.asarray(env.steps) == 0
-        moves = {agent: arm.move(goal, began, _numpy(observations[agent])) for agent, arm in arms.items()}
+        seen = {agent: proprioception(observations[agent]) for agent in arms}
+        moves = {agent: arm.move(goal, began, _numpy(seen[agent])) for agent, arm in arms.items()}
         furthest = np.max([np.abs(move).max(-1) for move in moves.values()], axis=0)
         pace = 1 / np.maximum(furthest, 1)[:, None]
-        return {agent: _like(observations[agent], pace * move) for agent, move in moves.items()}
+        return {agent: _like(seen[agent], pace * move) for agent, move in moves.items()}
 
     return policy
 

@@ -26,6 +26,14 @@ from surgical_marl.content import find
 from surgical_marl.randomisation import Randomisation, read_randomisation
 from surgical_marl.yaml_file import check_keys, read_yaml
 
+STILL = {"contype": 0, "conaffinity": 0, "group": 1}
+"""Of geoms for the eye alone: nothing collides with them."""
+TISSUE_SHAPES = {
+    "ellipsoid": (mujoco.mjtGeom.mjGEOM_ELLIPSOID, 3, "three semi-axes"),
+    "box": (mujoco.mjtGeom.mjGEOM_BOX, 3, "three half sides"),
+    "capsule": (mujoco.mjtGeom.mjGEOM_CAPSULE, 2, "radius and half length along z"),
+}
+"""What `size` of a piece of tissue holds: how many lengths in m, and which."""
 TIMESTEP = 0.0025
 """Physics step in s. docs/physics.md has the stability test that chose it."""
 DECIMATION = 8
@@ -167,7 +175,7 @@ def load_scene(name: str | Path, control: str = "position") -> Scene:
     """
     path = find("scenes", name)
     settings = read_yaml(path)
-    check_keys(settings, ("description", "arms", "view", "randomisation"), path)
+    check_keys(settings, ("description", "arms", "view", "tissue", "randomisation"), path)
     arms = settings.get("arms")
     if not isinstance(arms, dict) or not arms:
         raise ValueError(f"{path}: arms must map agent names such as psm_0 to arms")
@@ -175,6 +183,8 @@ def load_scene(name: str | Path, control: str = "position") -> Scene:
     randomisation = read_randomisation(settings.get("randomisation"), path)
     spec = _build(path.stem, mounts, control, randomisation)
     _add_surroundings(spec, mounts, settings.get("view"), path)
+    for piece, what in _mapping(settings.get("tissue"), f"{path}, tissue").items():
+        _add_tissue(spec, f"tissue/{piece}", what, f"{path}, tissue {piece!r}")
     model = _compile(spec)
     scene = Scene(path.stem, str(settings.get("description", "")), control, mounts, model, randomisation)
     for one, other in contact_pairs(scene):
@@ -199,13 +209,13 @@ def _read_mount(agent: str, settings: Any, path: Path) -> Mount:
     return Mount(arm, vectors["position"], rotation, vectors["workspace"])
 
 
-def _vector(value: Any, where: str) -> np.ndarray:
+def _vector(value: Any, where: str, count: int = 3, words: str = "three finite numbers") -> np.ndarray:
     try:
         vector = np.array(value, dtype=float)
     except (TypeError, ValueError):
         vector = np.empty(0)
-    if vector.shape != (3,) or not np.isfinite(vector).all():
-        raise ValueError(f"{where}: {value!r} must be three finite numbers")
+    if vector.shape != (count,) or not np.isfinite(vector).all():
+        raise ValueError(f"{where}: {value!r} must be {words}")
     return vector
 
 
@@ -279,10 +289,9 @@ def _weigh_shapes(model: mujoco.MjModel, home: np.ndarray) -> mujoco.MjModel:
 
 def _add_surroundings(spec: mujoco.MjSpec, mounts: dict[str, Mount], view: Any, path: Path) -> None:
     """What a picture needs: the operating field, a trocar at each remote center, light, a camera. Nothing collides."""
-    still = {"contype": 0, "conaffinity": 0, "group": 1}
     spec.worldbody.add_geom(
         name="field", type=mujoco.mjtGeom.mjGEOM_ELLIPSOID, size=[0.22, 0.16, 0.04], pos=[0, 0, -0.075],
-        rgba=[0.72, 0.34, 0.31, 1], **still,
+        rgba=[0.72, 0.34, 0.31, 1], **STILL,
     )  # fmt: skip
     for agent, mount in mounts.items():
         if mount.arm.remote_center is not None:
@@ -290,7 +299,7 @@ def _add_surroundings(spec: mujoco.MjSpec, mounts: dict[str, Mount], view: Any, 
             mujoco.mju_mat2Quat(quat, mount.rotation.ravel())
             spec.worldbody.add_geom(
                 name=f"{agent}_trocar", type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=[0.011, 0.002, 0],
-                pos=mount.position, quat=quat, rgba=[0.95, 0.78, 0.20, 1], **still,
+                pos=mount.position, quat=quat, rgba=[0.95, 0.78, 0.20, 1], **STILL,
             )  # fmt: skip
     spec.worldbody.add_light(pos=[0.2, 0.4, 0.9], dir=[-0.2, -0.4, -0.9])
     view = {"position": [0.0, 0.75, 0.40], "target": [0.0, 0.0, 0.07], **_mapping(view, f"{path}, view")}
@@ -302,6 +311,25 @@ def _add_surroundings(spec: mujoco.MjSpec, mounts: dict[str, Mount], view: Any, 
         raise ValueError(f"{path}, view: position {position} must not be straight above or at the target {target}")
     axes = np.concatenate([right, np.cross(back, right)])
     spec.worldbody.add_camera(name="overview", pos=position, xyaxes=axes, fovy=42)
+
+
+def _add_tissue(spec: mujoco.MjSpec, name: str, settings: Any, where: str) -> None:
+    """A coloured piece for an endoscope to look at. It belongs to the world and never moves."""
+    settings = _mapping(settings, where)
+    check_keys(settings, ("shape", "size", "position", "tilt", "colour"), where)
+    if settings.get("shape") not in TISSUE_SHAPES:
+        raise ValueError(f"{where}: shape {settings.get('shape')!r} must be one of {', '.join(TISSUE_SHAPES)}")
+    kind, lengths, words = TISSUE_SHAPES[settings["shape"]]
+    size = _vector(settings.get("size"), f"{where}, size", lengths, f"{words} in m")
+    colour = _vector(settings.get("colour"), f"{where}, colour")
+    if not (size > 0).all() or not ((colour >= 0) & (colour <= 1)).all():
+        raise ValueError(f"{where}: size {size.tolist()} must be above 0, and colour {colour.tolist()} from 0 to 1")
+    position, tilt = (_vector(settings.get(key, [0, 0, 0]), f"{where}, {key}") for key in ("position", "tilt"))
+    quat = np.zeros(4)
+    mujoco.mju_mat2Quat(quat, _rotation(tilt).ravel())
+    spec.worldbody.add_geom(
+        name=name, type=kind, size=[*size, 0][:3], pos=position, quat=quat, rgba=[*colour, 1], **STILL
+    )
 
 
 def _mapping(value: Any, where: str) -> dict[str, Any]:

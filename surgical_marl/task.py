@@ -66,6 +66,9 @@ class Task:
     levels: ClassVar[Mapping[str, Level]] = {}
     weights: Mapping[str, float] = {"distance": -10.0, "precision": 1.0, "clearance": -1.0, "collision": -2.0}
     """Of each term of `terms`."""
+    camera: str | None = None
+    """The agent whose endoscope's pictures are part of its observation (`surgical_marl/pictures.py`). Its goal then has
+    a `row` of `table`, `qpos` [rows, nq] that target pictures are taken from, and `weights` a term `image`."""
 
     def __init__(self, scene: Scene, difficulty: str = "default", reward: Mapping[str, float] | None = None) -> None:
         if difficulty not in self.levels:
@@ -133,6 +136,10 @@ class Task:
             }
             for agent, view in views.items()
         }
+
+    def metrics(self, views: Views, goal: Any) -> dict[str, dict[str, Array]]:
+        """agent -> what its `infos` hold besides what those of all tasks do."""
+        return {agent: {} for agent in views}
 
     def rewards(self, views: Views, goal: Any) -> dict[str, dict[str, Array]]:
         """agent -> reward term -> its weighted value. Their sum is the agent's reward."""

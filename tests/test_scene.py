@@ -12,10 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from surgical_marl import list_scenes, load_scene
+from surgical_marl.content import content_dir
 from surgical_marl.geometry import segment_distance
 from surgical_marl.scene import Scene
 
 BIMANUAL = load_scene("bimanual_psm")
+LIVER = "arms: {psm_0: {arm: psm}}\ntissue: {liver: {"
 
 
 def least_distance(scene: Scene, qpos: np.ndarray) -> float:
@@ -107,6 +109,12 @@ def test_a_scene_of_ones_own_is_a_file_anywhere(tmp_path: Path) -> None:
         ("arms: {psm_0: {arm: psm, position: [0, 0]}}", "three finite numbers"),
         ("arms: {psm_0: {arm: psm, tilt: [0, .nan, 0]}}", "three finite numbers"),
         ("arms: {left: {arm: psm}}", "called psm_0, psm_1"),
+        ("arms: {psm_0: {arm: psm}}\ntissue: [liver]", "must be a mapping"),
+        (f"{LIVER} shape: cone}}}}", "shape 'cone' must be one of ellipsoid, box, capsule"),
+        (f"{LIVER} shape: box, color: 1}}}}", "unknown key 'color'"),
+        (f"{LIVER} shape: capsule, size: [0.1, 0.1, 0.1]}}}}", "must be radius and half length along z in m"),
+        (f"{LIVER} shape: box, size: [0.1, 0, 0.1], colour: [1, 0, 0]}}}}", "must be above 0"),
+        (f"{LIVER} shape: box, size: [0.1, 0.1, 0.1], colour: [2, 0, 0]}}}}", "colour .* from 0 to 1"),
     ],
 )
 def test_a_wrong_file_is_one_sentence(tmp_path: Path, text: str, words: str) -> None:
@@ -128,3 +136,25 @@ def test_a_change_of_what_a_joint_mimics_changes_the_fingerprint(tmp_path: Path)
     assert 'multiplier="1"' in text
     (folder / "psm.urdf").write_text(text.replace('multiplier="1"', 'multiplier="0.5"'))
     assert load_scene(path).fingerprint != before
+
+
+@pytest.mark.parametrize("name", ["ecm", "trimanual_psm_ecm"])
+def test_tissue_is_for_the_eye_alone(name: str, tmp_path: Path) -> None:
+    """Without it everything that moves or touches is the same, to the bit, over 100 physics steps."""
+    whole = load_scene(name)
+    text = (content_dir("scenes") / f"{name}.yaml").read_text()
+    (tmp_path / f"{name}.yaml").write_text(text[: text.index("tissue:")])
+    bare = load_scene(tmp_path / f"{name}.yaml")
+    pieces = [i for i in range(whole.model.ngeom) if whole.model.geom(i).name.startswith("tissue/")]
+    assert len(pieces) == whole.model.ngeom - bare.model.ngeom > 5
+    assert not whole.model.geom_contype[pieces].any() and not whole.model.geom_conaffinity[pieces].any()
+    assert not whole.model.geom_bodyid[pieces].any()
+    assert whole.pairs == bare.pairs
+    ends = []
+    for scene in (whole, bare):
+        data = mujoco.MjData(scene.model)
+        data.qpos[:] = scene.home
+        data.ctrl[:] = np.random.default_rng(0).uniform(*scene.model.actuator_ctrlrange.T)
+        mujoco.mj_step(scene.model, data, 100)
+        ends.append(np.concatenate([data.qpos, data.qvel, scene.model.body_invweight0.ravel()]))
+    np.testing.assert_array_equal(*ends)

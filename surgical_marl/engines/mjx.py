@@ -81,7 +81,8 @@ class MjxEngine:
         """What the last step or reset led to, as arrays [N, ...] of "numpy", "torch" or "jax": fields of
         `surgical_marl.env.State`."""
         state = self._state
-        found = {name: self._present(getattr(state, name), library) for name in RESULTS}
+        known = {name: getattr(state, name) for name in RESULTS}
+        found = {name: self._present(value, library) for name, value in known.items() if jax.tree.leaves(value)}
         return {**found, "contacts": found["contacts"]._asdict()}
 
     def read(self, name: str, library: str) -> Any:

@@ -15,7 +15,7 @@ import torch
 
 from surgical_marl.evaluation.goal_set import check_same, describe_goals, episode_seed, goal_hash, read_goals
 from surgical_marl.evaluation.interval import interval
-from surgical_marl.evaluation.metrics import FOLLOWING, TERMS, Metric, Trajectory, measure, metrics
+from surgical_marl.evaluation.metrics import FOLLOWING, LAST, TERMS, Metric, Trajectory, measure, metrics
 
 if TYPE_CHECKING:
     from surgical_marl.batch import BatchedEnv
@@ -126,14 +126,16 @@ def _first_episodes(
 ) -> Trajectory:
     """The first episodes of the first `count` environments, which have just been reset."""
     lengths = np.zeros(count, int)
-    starts, infos = [], []
+    starts, infos, unknown = [], [], np.full(count, np.nan)
     for number in range(1, env.max_steps + 1):
         starts.append(np.array(env.qpos[:count], float))
         step = env.step(dict(policy(observations)))
         observations = step.observations
-        names = [name for name in step.infos[env.agents[0]] if name in INFOS or name.startswith(TERMS)]
-        told = {name: [_numpy(step.infos[agent][name], count) for agent in env.agents] for name in names}
-        infos.append({name: np.stack(parts, -1) for name, parts in told.items()})
+        told = [step.infos[agent] for agent in env.agents]
+        names = dict.fromkeys(
+            name for info in told for name in info if name in (*INFOS, *LAST) or name.startswith(TERMS)
+        )
+        infos.append({name: np.stack([_numpy(info.get(name, unknown), count) for info in told], -1) for name in names})
         done = _numpy(step.terminated, count) | _numpy(step.truncated, count)
         lengths[done & (lengths == 0)] = number
         if lengths.all():

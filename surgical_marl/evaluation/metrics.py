@@ -17,6 +17,8 @@ FOLLOWING = ("track", "follow_path")
 """Tasks whose goal moves: every step counts, not the last ones. A closed path ends where it began."""
 TERMS = ("reward_", "cost")
 """How names of reward terms and costs begin in `infos`."""
+LAST = {"angle_error": ("angle_error_deg", 180 / math.pi), "image_error": ("image_error", 1.0)}
+"""Of infos that only some agents have, the last step counts: how it is reported, and in what unit."""
 STILL = 1e-3
 """A tip that moved less than this, in m, has no smoothness: what is left is noise."""
 
@@ -37,7 +39,8 @@ class Trajectory(NamedTuple):
     center: np.ndarray
     """[T, E, A], distance of the shaft from its remote center at the start of each step, m; NaN without one."""
     terms: Mapping[str, np.ndarray]
-    """Reward terms and costs of each step, by their names in `infos`, [T, E, A]."""
+    """Reward terms, costs and what `LAST` has, of each step, by their names in `infos`, [T, E, A]; NaN for an agent
+    that has none."""
 
 
 class Metric(NamedTuple):
@@ -62,7 +65,7 @@ def measure(trajectory: Trajectory, dt: float, following: bool) -> dict[str, np.
         [E, A] each, in m: `error` at the last step (following: root mean square over the steps); `held`, the largest of
         the last `HOLD` seconds (of all steps); `squared` (mean over the steps, m^2); least `distance`, largest
         `center`, `path` of the tip. Also `collided`; `time` from which on the error stays below `SUCCESS_MM`, s, and
-        `smoothness`, NaN where undefined; the mean of each of the `terms`.
+        `smoothness`, NaN where undefined; the mean of each of the `terms`, at the last step of those in `LAST`.
     """
     lengths, error = trajectory.lengths[:, None], trajectory.error
     step = np.arange(1, len(error) + 1)[:, None, None]
@@ -71,10 +74,11 @@ def measure(trajectory: Trajectory, dt: float, following: bool) -> dict[str, np.
     judged = going if following else going & (step > lengths - max(1, round(HOLD / dt)))
     held = _largest(error, judged)
     last_miss = np.maximum(_largest(step, going & (error >= SUCCESS_MM / 1000)), 0)
+    final = lambda values: np.take_along_axis(values, lengths[None] - 1, 0)[0]  # noqa: E731
     moves = np.linalg.norm(np.diff(trajectory.tip, axis=0), axis=-1)
     moves = np.where(going[1:], moves, 0.0)
     return {
-        "error": np.sqrt(squared) if following else np.take_along_axis(error, lengths[None] - 1, 0)[0],
+        "error": np.sqrt(squared) if following else final(error),
         "held": held,
         "squared": squared,
         "distance": -_largest(-trajectory.distance, going),
@@ -83,7 +87,10 @@ def measure(trajectory: Trajectory, dt: float, following: bool) -> dict[str, np.
         "time": np.where((held < SUCCESS_MM / 1000) & (not following), dt * (last_miss + 1), np.nan),
         "path": moves.sum(0),
         "smoothness": _smoothness(moves / dt, trajectory.lengths - 1, dt),
-        **{name: np.where(going, values, 0.0).sum(0) / lengths for name, values in trajectory.terms.items()},
+        **{
+            name: final(values) if name in LAST else np.where(going, values, 0.0).sum(0) / lengths
+            for name, values in trajectory.terms.items()
+        },
     }
 
 
@@ -111,7 +118,10 @@ def metrics(measures: Mapping[str, np.ndarray], following: bool) -> dict[str, Me
     }
     if following:
         found["rmse_mm"] = Metric(1e6 * measures["squared"], lambda values: np.sqrt(values.mean(-1)))
-    return found | {name: Metric(values, _mean) for name, values in measures.items() if name.startswith(TERMS)}
+    for name, (title, unit) in LAST.items():
+        if name in measures:
+            found[title] = Metric(unit * measures[name], _mean_of_known)
+    return found | {n: Metric(values, _mean_of_known) for n, values in measures.items() if n.startswith(TERMS)}
 
 
 def success(held: np.ndarray, threshold: float) -> Metric:

@@ -19,9 +19,10 @@ from gymnasium.vector.utils import batch_space
 
 from surgical_marl.batch import BatchedEnv
 from surgical_marl.interfaces.pettingzoo import RENDER_MODES
+from surgical_marl.observations import each
 
 
-class SurgicalEnv(gymnasium.Env[np.ndarray, np.ndarray]):
+class SurgicalEnv(gymnasium.Env[Any, np.ndarray]):
     """One environment. `info` holds tip_error (m, the worst arm's), success (of all), collision (of any), min_distance
     (m), the sums of `reward_<term>`, `cost` and `cost_<name>`, and for several arms also "agents": the same for
     each."""
@@ -39,16 +40,14 @@ class SurgicalEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self._picture: Any = None
         self._over = True
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Starts an episode. With a seed the same one each time; without, the next of the last seed's episodes."""
         super().reset(seed=seed)
         _, state, infos = self.batch.reset(seed)
         self._over = False
-        return np.array(state[0]), _joint_info(infos, 0)
+        return each(state, lambda part: np.array(part[0])), _joint_info(infos, 0)
 
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+    def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """One control step. ValueError for a wrong shape, a value that is not finite, or an episode that is over."""
         if self._over:
             raise ValueError("the episode is over: call reset() before step()")
@@ -56,7 +55,8 @@ class SurgicalEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         terminated, truncated = bool(step.terminated[0]), bool(step.truncated[0])
         self._over = terminated or truncated
         reward = float(sum(reward[0] for reward in step.rewards.values()))
-        return np.array(step.final_state[0]), reward, terminated, truncated, _joint_info(step.infos, 0)
+        seen = each(step.final_state, lambda part: np.array(part[0]))
+        return seen, reward, terminated, truncated, _joint_info(step.infos, 0)
 
     def render(self) -> np.ndarray | None:
         """A picture [H, W, 3] uint8 with render_mode="rgb_array", else None."""
@@ -68,7 +68,7 @@ class SurgicalEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return self._picture.draw()
 
 
-class SurgicalVectorEnv(VectorEnv[np.ndarray, np.ndarray, Any]):
+class SurgicalVectorEnv(VectorEnv[Any, np.ndarray, Any]):
     """N environments that restart in the step that ends them; `infos["final_obs"]` then holds their last
     observation."""
 
@@ -89,26 +89,24 @@ class SurgicalVectorEnv(VectorEnv[np.ndarray, np.ndarray, Any]):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Starts all environments anew."""
         _, state, infos = self.batch.reset(seed)
-        return np.array(state), _joint_info(infos)
+        return each(state, np.array), _joint_info(infos)
 
-    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+    def step(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """One control step of all environments: arrays [N, ...]."""
         step = self.batch.step(_split(self.batch, np.asarray(actions)))
         info = _joint_info(step.infos)
         done = step.terminated | step.truncated
         if done.any():
-            info["final_obs"] = np.array(step.final_state)
+            info["final_obs"] = each(step.final_state, np.array)
             info["_final_obs"] = np.array(done)
         rewards = np.sum(list(step.rewards.values()), axis=0)
-        return np.array(step.state), rewards, np.array(step.terminated), np.array(step.truncated), info
+        return each(step.state, np.array), rewards, np.array(step.terminated), np.array(step.truncated), info
 
 
-def _joint_spaces(batch: BatchedEnv) -> tuple[spaces.Box, spaces.Box]:
+def _joint_spaces(batch: BatchedEnv) -> tuple[spaces.Space[Any], spaces.Box]:
     width = sum(batch.action_space(agent).shape[0] for agent in batch.agents)
     return batch.state_space, spaces.Box(-1.0, 1.0, (width,), np.float32)
 

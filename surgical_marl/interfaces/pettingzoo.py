@@ -19,6 +19,8 @@ import numpy as np
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
+from surgical_marl.observations import each
+
 if TYPE_CHECKING:
     from surgical_marl.batch import BatchedEnv, BatchStep
 
@@ -43,11 +45,11 @@ class SurgicalParallelEnv(ParallelEnv[str, Any, Any]):
         self.action_spaces = {agent: batch.action_space(agent) for agent in batch.agents}
         self.state_space = batch.state_space
         self.max_cycles = batch.max_steps
-        self._state: np.ndarray | None = None
+        self._state: Any = None
         self._picture: Any = None
 
-    def observation_space(self, agent: str) -> spaces.Box:
-        """Box of an agent's observations; the same object each time."""
+    def observation_space(self, agent: str) -> spaces.Space[Any]:
+        """Box of an agent's observations, or Dict of one that sees pictures; the same object each time."""
         return self.observation_spaces[agent]
 
     def action_space(self, agent: str) -> spaces.Box:
@@ -60,7 +62,7 @@ class SurgicalParallelEnv(ParallelEnv[str, Any, Any]):
         """Starts an episode. With a seed the same one each time; without, the next of the last seed's episodes."""
         observations, state, infos = self.batch.reset(seed)
         self.agents = list(self.possible_agents)
-        self._state = self._first(state)
+        self._state = each(state, self._first)
         return self._firsts(observations), self._firsts(infos)
 
     def step(self, actions: dict[str, Any]) -> tuple[dict[str, Any], ...]:
@@ -73,7 +75,7 @@ class SurgicalParallelEnv(ParallelEnv[str, Any, Any]):
             raise ValueError("the episode is over: call reset() before step()")
         step = self.batch.step({agent: np.asarray(action)[None] for agent, action in actions.items()})
         terminated, truncated = bool(step.terminated[0]), bool(step.truncated[0])
-        self._state = self._first(step.final_state)
+        self._state = each(step.final_state, self._first)
         outcome = (
             self._firsts(step.final_observations),
             {agent: float(reward[0]) for agent, reward in step.rewards.items()},
@@ -85,8 +87,8 @@ class SurgicalParallelEnv(ParallelEnv[str, Any, Any]):
             self.agents = []
         return outcome
 
-    def state(self) -> np.ndarray:
-        """The whole state [S] that a centralised critic sees."""
+    def state(self) -> Any:
+        """The whole state [S] that a centralised critic sees; with pictures a dict."""
         if self._state is None:
             raise ValueError("no state yet: call reset() first")
         return self._state
@@ -130,8 +132,8 @@ class SurgicalBatchedParallelEnv(ParallelEnv[str, Any, Any]):
         self.state_space = batch.state_space
         self._state: Any = None
 
-    def observation_space(self, agent: str) -> spaces.Box:
-        """Box of one environment's observation."""
+    def observation_space(self, agent: str) -> spaces.Space[Any]:
+        """Box of one environment's observation, or Dict of an agent that sees pictures."""
         return self.batch.observation_space(agent)
 
     def action_space(self, agent: str) -> spaces.Box:

@@ -15,6 +15,8 @@ from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 from torch import Tensor
 
+from surgical_marl.observations import proprioception
+
 if TYPE_CHECKING:
     from surgical_marl.batch import BatchedEnv
 
@@ -55,14 +57,20 @@ class Layout:
         """Width of the flat joint action."""
         return sum(self._widths)
 
-    def stack(self, observations: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Observations of agents `[..., d]` -> groups `[..., n, d]`.
+    def stack(self, observations: Mapping[str, Any]) -> dict[str, Tensor]:
+        """Observations of agents `[..., d]` -> groups `[..., n, d]`, and of an agent that sees pictures also a group
+        "<name>_pictures" `[..., 1, 6, H, W]` uint8: what it sees, and what it should see.
 
         Always a copy: an engine may reuse its buffers.
         """
-        if self.joint:
-            return {"joint": torch.cat([observations[a] for a in self.agents], -1).unsqueeze(-2)}
-        return {name: self._stack_type([observations[a] for a in members]) for name, members in self.types.items()}
+        groups = {}
+        for name, members in ({"joint": self.agents} if self.joint else self.types).items():
+            felt = [proprioception(observations[agent]) for agent in members]
+            groups[name] = torch.cat(felt, -1).unsqueeze(-2) if self.joint else self._stack_type(felt)
+            for agent in members:
+                if isinstance(observations[agent], Mapping):
+                    groups[f"{name}_pictures"] = _picture(observations[agent])
+        return groups
 
     @staticmethod
     def _stack_type(members: list[Tensor]) -> Tensor:
@@ -149,9 +157,14 @@ class RslRlVecEnv(VecEnv):
         groups = {name: value.to(self.device) for name, value in carry["observations"].items()}
         self._observations = TensorDict(groups, batch_size=[self.num_envs])
 
-    def _group(self, observations: Mapping[str, Tensor], state: Tensor) -> TensorDict:
-        groups = {**self.layout.stack(observations), "state": state.clone()}
+    def _group(self, observations: Mapping[str, Any], state: Any) -> TensorDict:
+        groups = {**self.layout.stack(observations), "state": proprioception(state).clone()}
         return TensorDict(groups, batch_size=[self.num_envs])
+
+
+def _picture(observation: Mapping[str, Tensor]) -> Tensor:
+    """Both pictures [..., H, W, 3] one behind the other, channels first: [..., 1, 6, H, W]."""
+    return torch.cat([observation["image"], observation["target"]], -1).movedim(-1, -3).unsqueeze(-4).contiguous()
 
 
 def _tensor(value: Any) -> Tensor:

@@ -12,13 +12,13 @@ from typing import Any
 
 import torch
 from rsl_rl.algorithms import PPO
-from rsl_rl.models import MLPModel
 from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 from torch import Tensor, nn
 
 from surgical_marl.interfaces.rsl_rl import RslRlVecEnv
 from surgical_marl.learning.config import Settings
+from surgical_marl.learning.vision import PICTURES, make_model
 
 LEARNING_RATE_RANGE = (1e-5, 1e-2)  # rsl_rl's limits of the adaptive learning rate
 # A small last layer starts every arm near its rest, which is where exploration is safe and
@@ -27,10 +27,10 @@ OUTPUT_GAIN = 0.01
 
 
 class MultiAgentModel(nn.Module):
-    """One MLP for each agent type, shared by the agents of that type.
+    """One network for each agent type, shared by the agents of that type.
 
     Args:
-        observations: a sample of the groups, `[N, n, d]` each.
+        observations: a sample of the groups, `[N, n, d]` each, and pictures `[N, n, C, H, W]` where there are any.
         outputs: width of the output of one agent, by type.
         model: further arguments of rsl_rl's `MLPModel`.
     """
@@ -41,13 +41,14 @@ class MultiAgentModel(nn.Module):
         super().__init__()
         self.counts = {name: observations[name].shape[-2] for name in outputs}
         self.outputs = dict(outputs)
-        # MLPModel wants to be built from [N, d], and runs with any leading axes.
+        # The networks want to be built from one agent's [N, d], and run with any leading axes.
+        seen = {name: [group for group in (name, name + PICTURES) if group in observations] for name in outputs}
         sample = TensorDict(
-            {name: observations[name][..., 0, :] for name in outputs},
+            {group: observations[group][:, 0] for groups in seen.values() for group in groups},
             batch_size=observations.batch_size,
         )
         self.models = nn.ModuleDict(
-            {name: MLPModel(sample, {name: [name]}, name, width, **model) for name, width in outputs.items()}
+            {name: make_model(sample, seen[name], width, **model) for name, width in outputs.items()}
         )
 
     def forward(self, observations: TensorDict, *, stochastic_output: bool = False, **_: Any) -> Tensor:
@@ -262,7 +263,10 @@ class MAPPO(PPO):
         layout = env.layout
         actor = MultiAgentActor(obs, layout.action_sizes, **cfg["actor"]).to(device)
         if cfg["centralised_critic"]:
-            critic: nn.Module = MLPModel(obs, {"critic": ["state"]}, "critic", layout.num_agents, **cfg["critic"])
+            # in the state's pictures agents are no axis: they are those of the one agent that has any
+            seen = {name: pictures[:, 0] for name, pictures in obs.items() if name.endswith(PICTURES)}
+            sample = TensorDict({"state": obs["state"], **seen}, batch_size=obs.batch_size)
+            critic: nn.Module = make_model(sample, ["state", *seen], layout.num_agents, **cfg["critic"])
         else:
             critic = MultiAgentModel(obs, dict.fromkeys(layout.counts, 1), **cfg["critic"])
         steps = cfg["num_steps_per_env"]

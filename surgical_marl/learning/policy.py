@@ -29,6 +29,7 @@ from surgical_marl.learning.run import (
     read_settings,
     write_checkpoint,
 )
+from surgical_marl.observations import each, proprioception
 from surgical_marl.oracle import oracle
 
 if TYPE_CHECKING:
@@ -122,9 +123,15 @@ def export_policy(run: str | Path, out: Path) -> Path:
 
 
 def _samples(env: BatchedEnv, layout: Layout) -> TensorDict:
-    sizes = {agent: env.observation_space(agent).shape for agent in layout.agents}
-    zeros = {agent: torch.zeros(1, *(shape or ())) for agent, shape in sizes.items()}
+    zeros = {agent: _zeros(env.observation_space(agent)) for agent in layout.agents}
     return TensorDict({**layout.stack(zeros)}, batch_size=[1])
+
+
+def _zeros(space: Any) -> Any:
+    """One observation, of a Box or of a Dict with pictures."""
+    if hasattr(space, "spaces"):
+        return {name: _zeros(part) for name, part in space.spaces.items()}
+    return torch.from_numpy(np.zeros((1, *space.shape), space.dtype))
 
 
 def _groups(env: BatchedEnv, layout: Layout) -> dict[str, list[int]]:
@@ -146,8 +153,11 @@ def _acting(actor: MultiAgentActor, layout: Layout, device: str) -> Policy:
     actor = actor.to(device)
 
     def policy(observations: Mapping[str, Any]) -> dict[str, Any]:
-        tensors = {agent: torch.as_tensor(observations[agent], device=device) for agent in layout.agents}
-        batch = tensors[layout.agents[0]].shape[:-1]
+        tensors = {
+            agent: each(observations[agent], lambda part: torch.as_tensor(part, device=device))
+            for agent in layout.agents
+        }
+        batch = proprioception(tensors[layout.agents[0]]).shape[:-1]
         with torch.inference_mode():
             flat = actor(TensorDict({**layout.stack(tensors)}, batch_size=batch)).clamp(-1.0, 1.0)
         return {agent: _like(observations[agent], action) for agent, action in layout.split(flat).items()}
@@ -162,7 +172,7 @@ def _by_agent(env: BatchedEnv, act: Callable[[tuple[int, ...]], np.ndarray]) -> 
         return {
             agent: _like(
                 observations[agent],
-                torch.from_numpy(act((*observations[agent].shape[:-1], *(width or ())))),
+                torch.from_numpy(act((*proprioception(observations[agent]).shape[:-1], *(width or ())))),
             )
             for agent, width in widths.items()
         }
@@ -171,4 +181,5 @@ def _by_agent(env: BatchedEnv, act: Callable[[tuple[int, ...]], np.ndarray]) -> 
 
 
 def _like(example: Any, action: Tensor) -> Any:
+    example = proprioception(example)
     return action.to(example.device) if isinstance(example, Tensor) else action.cpu().numpy()

@@ -1,0 +1,40 @@
+"""What a network sees of pictures: a small convolutional encoder before the MLP, both rsl_rl's."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from rsl_rl.models import CNNModel, MLPModel
+from tensordict import TensorDict
+from torch import Tensor, nn
+
+PICTURES = "_pictures"
+"""What the group of an agent type's pictures is called after its name."""
+ENCODER = {"output_channels": [16, 32, 32], "kernel_size": [8, 4, 3], "stride": [4, 2, 1], "activation": "elu"}
+"""Of 64 x 64 pixels it makes 512 features."""
+
+
+class PictureModel(CNNModel):
+    """rsl_rl's CNN model, for uint8 pictures [..., C, H, W] beside vectors [..., d], with any leading axes."""
+
+    def get_latent(self, obs: TensorDict, masks: Tensor | None = None, hidden_state: Any = None) -> Tensor:
+        """The normalised vector, then the features of the pictures."""
+        vector = MLPModel.get_latent(self, obs)
+        (group,) = self.obs_groups_2d
+        features = self.cnns[group](obs[group].flatten(0, -4).float() / 255 - 0.5)
+        return torch.cat([vector, features.reshape(*vector.shape[:-1], -1)], dim=-1)
+
+
+def make_model(observations: TensorDict, groups: list[str], width: int, **model: Any) -> nn.Module:
+    """An MLP, or a network with an encoder where there are pictures.
+
+    Args:
+        observations: a sample of the groups, vectors [N, d] and pictures [N, C, H, W].
+        groups: what the network sees of them.
+        width: of its output.
+        model: further arguments of rsl_rl's models.
+    """
+    if any(group.endswith(PICTURES) for group in groups):
+        return PictureModel(observations, {"all": groups}, "all", width, cnn_cfg=ENCODER, **model)
+    return MLPModel(observations, {"all": groups}, "all", width, **model)

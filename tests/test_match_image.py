@@ -1,0 +1,186 @@
+"""The task match_image: hidden poses, and pictures beside what the arms feel."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import gymnasium
+import mujoco
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from gymnasium.utils.env_checker import check_env
+from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test
+
+import surgical_marl as sm
+from surgical_marl.batch import BatchedEnv
+from surgical_marl.endoscope import SIZE, Endoscope
+from surgical_marl.env import Env
+from surgical_marl.task import FAR
+
+SCENES = ("ecm", "trimanual_psm_ecm")
+COUNT, STEPS = 3, 4
+
+
+@cache
+def batched(scene: str = "ecm", arrays: str = "numpy", engine: str = "fused") -> BatchedEnv:
+    return BatchedEnv("match_image", scene, num_envs=COUNT, max_steps=STEPS, arrays=arrays, engine=engine)
+
+
+def random_actions(env: BatchedEnv, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    return {a: rng.uniform(-1, 1, (COUNT, *(env.action_space(a).shape or ()))).astype(np.float32) for a in env.agents}
+
+
+def row(env: BatchedEnv) -> np.ndarray:
+    return np.array(env.engine.read(".goal.row", "numpy"))
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_pictures_are_of_the_arms_and_of_the_hidden_posture(scene: str) -> None:
+    """Over an episode's end: what is seen is the new state, the next episode begins at home with the next target."""
+    env, rng = batched(scene), np.random.default_rng(0)
+    eye = Endoscope(env.scene, COUNT)
+    observations, state, _ = env.reset(5)
+    for step in range(STEPS + 1):
+        seen = observations["ecm_0"]
+        np.testing.assert_array_equal(seen["image"], eye.render(env.qpos).rgb[:, 0])
+        np.testing.assert_array_equal(seen["target"], eye.render(env.env.task.table[row(env)]).rgb[:, 0])
+        for part in ("image", "target"):
+            np.testing.assert_array_equal(state[part], seen[part])
+        before = row(env)
+        outcome = env.step(random_actions(env, rng))
+        final, info = outcome.final_observations["ecm_0"], outcome.infos["ecm_0"]
+        ended = step == STEPS - 1
+        assert outcome.truncated.all() == ended == (not np.array_equal(before, row(env)))
+        np.testing.assert_array_equal(final["target"], seen["target"])
+        assert np.array_equal(final["image"], outcome.observations["ecm_0"]["image"]) != ended
+        difference = np.abs(final["image"].astype(float) - final["target"]).mean((1, 2, 3))
+        np.testing.assert_allclose(info["image_error"], difference, rtol=1e-5)
+        np.testing.assert_allclose(info["reward_image"], -10 / 255 * difference, rtol=1e-5)
+        for agent in env.agents:
+            terms = [value for name, value in outcome.infos[agent].items() if name.startswith("reward_")]
+            np.testing.assert_allclose(outcome.rewards[agent], np.sum(terms, axis=0), rtol=1e-5, atol=1e-6)
+        observations, state = outcome.observations, outcome.state
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_errors_are_of_the_camera_and_zero_at_the_hidden_posture(scene: str) -> None:
+    """Against C MuJoCo's camera: where it is at the state and at the hidden posture."""
+    env = batched(scene)
+    env.reset(1)
+    outcome = env.step(random_actions(env, np.random.default_rng(1)))
+    model, data = env.scene.model, mujoco.MjData(env.scene.model)
+    for i in range(COUNT):
+        poses = []
+        for qpos in (env.qpos[i], env.env.task.table[row(env)[i]]):
+            data.qpos[:] = qpos
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_camlight(model, data)
+            eyes = [data.cam(f"ecm_0/{side}").xpos.copy() for side in ("left", "right")]
+            poses.append((np.mean(eyes, axis=0), data.cam("ecm_0/left").xmat.reshape(3, 3).copy()))
+        (here, turn), (there, wanted) = poses
+        angle = np.arccos((np.trace(turn.T @ wanted) - 1) / 2)
+        assert outcome.infos["ecm_0"]["tip_error"][i] == pytest.approx(np.linalg.norm(here - there), abs=1e-5)
+        assert outcome.infos["ecm_0"]["angle_error"][i] == pytest.approx(angle, abs=1e-4)
+    env.engine.write(".physics.qpos", env.env.task.table[row(env)].astype(np.float32))
+    env.engine.write(".physics.qvel", np.zeros((COUNT, model.nv), np.float32))
+    env.engine.write(".physics.ctrl", (env.env.task.table[row(env)] @ env.scene.moment.T).astype(np.float32))
+    still = {a: np.zeros_like(action) for a, action in random_actions(env, np.random.default_rng(0)).items()}
+    there = env.step(still).infos["ecm_0"]
+    assert there["tip_error"].max() < 1e-4 and there["angle_error"].max() < 2e-3 and there["success"].all()
+    assert there["image_error"].max() < 1
+
+
+def test_nothing_observed_but_the_target_picture_depends_on_the_hidden_pose() -> None:
+    env = batched("trimanual_psm_ecm")
+    env.reset(0)
+    carry, actions = env.carry(), random_actions(env, np.random.default_rng(0))
+    seen = []
+    for shift in (0, 1):
+        rows = (carry[".goal.row"] + shift) % len(env.env.task.table)
+        targets = np.asarray(env.env.task._tips)[rows]
+        env.set_carry({**carry, ".goal.row": rows, ".goal.targets": targets})
+        seen.append(env.step(actions))
+    (one, other) = seen
+    assert (one.infos["ecm_0"]["tip_error"] != other.infos["ecm_0"]["tip_error"]).all()
+    assert not np.array_equal(one.observations["ecm_0"]["target"], other.observations["ecm_0"]["target"])
+    for part in ("image", "proprioception"):
+        np.testing.assert_array_equal(one.observations["ecm_0"][part], other.observations["ecm_0"][part])
+    np.testing.assert_array_equal(one.state["proprioception"], other.state["proprioception"])
+    for agent in ("psm_0", "psm_1"):
+        np.testing.assert_array_equal(one.observations[agent], other.observations[agent])
+
+
+def test_observations_lose_the_targets_and_nothing_else() -> None:
+    env = Env("match_image", "trimanual_psm_ecm")
+    for agent in env.agents:
+        n = env.num_actions(agent)
+        box = env.observation_space(agent)
+        assert box.shape == (3 * n + 3 + 4,)
+        np.testing.assert_allclose(box.high[-4:], 2 * FAR)
+        np.testing.assert_allclose(box.high[2 * n : 2 * n + 3], FAR)
+
+
+@pytest.mark.parametrize("arrays", ["torch", "jax"])
+def test_every_library_and_engine_shows_the_same(arrays: str) -> None:
+    env, other, rng = batched(), batched(arrays=arrays, engine="mjx"), np.random.default_rng(0)
+    one, *_ = env.reset(2)
+    two, *_ = other.reset(2)
+    for _ in range(2):
+        image, same = one["ecm_0"]["image"].astype(int), np.asarray(two["ecm_0"]["image"]).astype(int)
+        assert (np.abs(image - same) <= 1).mean() > 0.999  # physics agrees to 1e-5
+        np.testing.assert_array_equal(one["ecm_0"]["target"], np.asarray(two["ecm_0"]["target"]))
+        assert type(two["ecm_0"]["image"]).__module__.startswith(arrays if arrays == "torch" else "jax")
+        actions = random_actions(env, rng)
+        one = env.step(actions).observations
+        two = other.step({a: torch.from_numpy(v) if arrays == "torch" else v for a, v in actions.items()}).observations
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_pettingzoo_accepts_it(scene: str) -> None:
+    make: Any = lambda: sm.match_image_v0.parallel_env(scene=scene, max_steps=STEPS)  # noqa: E731
+    env = make()
+    space = env.observation_space("ecm_0")
+    assert isinstance(space, spaces.Dict) and space["image"] == spaces.Box(0, 255, (SIZE, SIZE, 3), np.uint8)
+    observations, _ = env.reset(seed=0)
+    while env.agents:
+        assert all(env.observation_space(agent).contains(seen) for agent, seen in observations.items())
+        assert env.state_space.contains(env.state())
+        observations, *_ = env.step({agent: env.action_space(agent).sample() for agent in env.agents})
+    parallel_api_test(env, num_cycles=2 * STEPS)
+    if scene == "ecm":
+        parallel_seed_test(make, num_cycles=2 * STEPS)
+        api_test(sm.match_image_v0.env(scene=scene, max_steps=STEPS), num_cycles=2 * STEPS)
+
+
+def test_gymnasium_accepts_it() -> None:
+    env = gymnasium.make("surgical_marl/MatchImage-v0", scene="ecm", max_steps=STEPS)
+    check_env(env.unwrapped)
+    envs = gymnasium.make_vec("surgical_marl/MatchImage-v0", scene="ecm", num_envs=2, max_steps=STEPS)
+    observations, _ = envs.reset(seed=0)
+    for _ in range(STEPS):
+        assert envs.observation_space.contains(observations)
+        observations, *_, infos = envs.step(envs.action_space.sample())
+    assert infos["final_obs"]["image"].shape == (2, SIZE, SIZE, 3)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"scene": "bimanual_psm"}, "scene 'bimanual_psm' has no endoscope"),
+        ({"scene": "ecm", "difficulty": "harder"}, "unknown difficulty 'harder'"),
+        ({"scene": "ecm", "reward": {"pixels": 1}}, "unknown reward term 'pixels'"),
+    ],
+)
+def test_bad_options_are_one_sentence(options: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValueError, match=words) as caught:
+        BatchedEnv("match_image", **options)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_scene_without_tissue_is_named(tmp_path: Any) -> None:
+    (tmp_path / "bare.yaml").write_text("arms: {ecm_0: {arm: ecm, position: [0, 0, 0.15]}}")
+    with pytest.raises(ValueError, match="scene 'bare' has no tissue for its endoscope to look at"):
+        BatchedEnv("match_image", str(tmp_path / "bare.yaml"))
