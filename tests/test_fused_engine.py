@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -11,11 +13,12 @@ import jax
 import numpy as np
 import pytest
 
-from surgical_marl.arm import CONTROL_MODES
+from surgical_marl.arm import CONTROL_MODES, load_arm
 from surgical_marl.batch import BatchedEnv
 from surgical_marl.content import list_scenes, list_tasks
 from surgical_marl.engines.choose import make_engine
 from surgical_marl.engines.fused.engine import FusedEngine, flatten
+from surgical_marl.engines.fused.program import load_source
 from surgical_marl.engines.mjx import MjxEngine
 from surgical_marl.env import Env
 from surgical_marl.path_task import PathTask
@@ -191,6 +194,26 @@ def test_what_it_cannot_take_is_named(monkeypatch: pytest.MonkeyPatch, capsys: p
 def test_bad_input(options: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         BatchedEnv("reach", "psm", engine="fused", **options)
+
+
+def test_another_mass_is_another_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An arm edited in a number that shapes and joints don't show is not taken for what it was."""
+    keys = []
+    monkeypatch.setattr(
+        "surgical_marl.engines.fused.program.cached", lambda *args, **_: keys.append(args[2]) or args[3]()
+    )
+    for mass in ("0.0005", "0.0006"):
+        folder = tmp_path / mass / "ecm"
+        shutil.copytree(load_arm("ecm").folder, folder)
+        urdf = folder / "ecm.urdf"
+        text = urdf.read_text()
+        value = re.search(r'<mass value="([^"]+)"', text)
+        assert value is not None
+        urdf.write_text(text.replace(value[0], f'<mass value="{float(value[1]) + float(mass)}"', 1))
+        scene = tmp_path / mass / "ecm.yaml"
+        scene.write_text("arms: {ecm_0: {arm: ecm, workspace: [0, 0, -0.1]}}")
+        load_source(Env("reach", str(scene)), vector=True)
+    assert keys[0] != keys[1]
 
 
 START = """

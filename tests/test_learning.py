@@ -235,6 +235,12 @@ def test_folders_that_cannot_be_used(tmp_path: Path, fakes: list[Any]) -> None:
     assert not (tmp_path / "new").exists()
 
 
+def test_a_run_that_cannot_start_leaves_no_folder(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="unknown reward term 'speed'"):
+        train.train(replace(SMALL, reward={"speed": 1.0}), out=tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
 def test_writing_is_atomic(tmp_path: Path) -> None:
     path = tmp_path / "file"
     path.write_text("old")

@@ -91,6 +91,7 @@ def train(settings: Settings, *, out: Path, resume: Path | None = None) -> Path:
         KeyboardInterrupt, SystemExit: after Ctrl-C or SIGTERM, when the checkpoint is written.
     """
     out = Path(out)
+    new = not out.exists()
     state = _read_resumed(settings, Path(resume)) if resume is not None else None
     if resume is not None and out.resolve() == Path(resume).resolve():
         check_writable(out)
@@ -102,7 +103,12 @@ def train(settings: Settings, *, out: Path, resume: Path | None = None) -> Path:
         else []
     )
 
-    training = Training(settings, make_env(settings))
+    try:
+        training = Training(settings, make_env(settings))
+    except ValueError:
+        if new:
+            out.rmdir()  # it is empty yet
+        raise
     if state is not None:
         training.set_state(state)
     write_config(out, settings)

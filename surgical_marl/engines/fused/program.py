@@ -13,6 +13,7 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 import jax
+import mujoco
 import numpy as np
 
 from surgical_marl.cache import cached
@@ -95,7 +96,10 @@ def load_source(env: Env, vector: bool, announce: Callable[[], None] = lambda: N
         announce()
         return np.frombuffer(json.dumps(asdict(make_source(env, vector)), default=np.ndarray.tolist).encode(), np.uint8)
 
-    found = json.loads(cached("fused", settings, env.scene.fingerprint, compute, _CODE).tobytes())
+    model = np.empty(mujoco.mj_sizeModel(env.scene.model), np.uint8)
+    mujoco.mj_saveModel(env.scene.model, None, model)  # masses and gains too
+    content = env.scene.fingerprint + model.tobytes()
+    found = json.loads(cached("fused", settings, content, compute, _CODE).tobytes())
     tables = {dtype: np.array(table, dtype) for dtype, table in found.pop("tables").items()}
     trees = {name: _leaves(found.pop(name)) for name in ("carry", "actions", "results")}
     return Source(tables=tables, **trees, **found)
