@@ -64,6 +64,7 @@ def cell(name: str, value: float | None, bounds: list[float] | None) -> str:
         return "-"
     if name.startswith(("success_", "team_", "collision_")):
         return f"{value:.1%}"
+    value = 0.0 if abs(value) < 1e-6 else value  # rounding
     span = f" ({bounds[0]:.3g} to {bounds[1]:.3g})" if bounds and name.endswith("error_mm") else ""
     return f"{value:.3g}{span}"
 

@@ -226,7 +226,13 @@ def rollout(scene: str, steps: int, model: Any = None, start: dict[str, np.ndarr
     return np.array(ours), np.array(theirs), np.array(touched)
 
 
-@pytest.mark.parametrize("scene", list_scenes())
+# MJX takes up to a minute to compile for the others: `pytest -m slow` takes them
+QUICK = ("psm", "ecm", "bimanual_psm")
+
+
+@pytest.mark.parametrize(
+    "scene", [scene if scene in QUICK else pytest.param(scene, marks=pytest.mark.slow) for scene in list_scenes()]
+)
 def test_mjx_agrees_with_c_mujoco_over_200_random_control_steps(scene: str) -> None:
     ours, theirs, _ = rollout(scene, 200)
     assert np.abs(ours - theirs).max() < 1e-3
