@@ -70,7 +70,8 @@ def test_the_page_is_enough_to_compute_a_hash() -> None:
 
 
 def test_every_scene_has_a_standard_goal_set() -> None:
-    assert set(PUBLISHED) == {(task, scene) for task in list_tasks() for scene in list_scenes()}
+    looks = {"match_image": ["ecm", "trimanual_psm_ecm"]}  # others run on every scene
+    assert set(PUBLISHED) == {(task, scene) for task in list_tasks() for scene in looks.get(task, list_scenes())}
 
 
 def test_a_baseline_twice_gives_the_same_bytes(capsys: pytest.CaptureFixture[str]) -> None:

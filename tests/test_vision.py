@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from surgical_marl.batch import BatchedEnv
-from surgical_marl.evaluation import evaluate
+from surgical_marl.evaluation.evaluate import evaluate
 from surgical_marl.interfaces.rsl_rl import Layout, RslRlVecEnv
 from surgical_marl.learning.config import Settings, load_config
 from surgical_marl.learning.policy import load_policy, random_policy, zero_policy
