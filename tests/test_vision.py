@@ -48,7 +48,14 @@ def test_networks_are_shown_both_pictures_channels_first(joint: bool) -> None:
         np.testing.assert_array_equal(shown.permute(0, 2, 3, 1), observations["ecm_0"][name])
 
 
-@pytest.mark.parametrize(("algo", "scene"), [("mappo", "trimanual_psm_ecm"), ("ippo", "ecm"), ("joint", "ecm")])
+@pytest.mark.parametrize(
+    ("algo", "scene"),
+    [
+        ("ippo", "ecm"),
+        pytest.param("mappo", "trimanual_psm_ecm", marks=pytest.mark.slow),
+        pytest.param("joint", "ecm", marks=pytest.mark.slow),
+    ],
+)
 def test_it_learns_from_pixels(algo: Any, scene: str) -> None:
     """The value loss falls to less than half; the encoder's weights move, and pictures alone change what is done."""
     training = Training(settings(f"algo={algo}", scene=scene), made(scene))
