@@ -84,7 +84,8 @@ def off(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize(("task", "scene", "control"), CASES)
 def test_a_step_is_the_mjx_engines(task: str, scene: str, control: str) -> None:
     """Numbers to 1e-5 of their scale; flags, counters and random goals exactly. Overlapping arms are stiff, and so are
-    violated limits: where the state's last digit alone makes more of a difference, the engines may differ so too."""
+    violated limits: where the state's last digit alone makes more of a difference, the engines may differ so too. Two
+    states of 1,024 an arm may differ more: what is rounded within a step can count for more than the state's digits."""
     env = Env(task, scene, control, decimation=1)
     carry, actions = random_state(env)
     mjx = MjxEngine(env, STATES, "cpu")
@@ -99,7 +100,7 @@ def test_a_step_is_the_mjx_engines(task: str, scene: str, control: str) -> None:
         if value.dtype.kind == "f":
             worst = off(value, found[name])
             allowed = np.maximum(TOLERANCE, ULPS * np.maximum(*(off(value, other[name]) for other in moved)))
-            assert (worst <= allowed).mean() >= 1 - 2 / STATES, (name, np.sort(worst / allowed)[-5:])
+            assert (worst <= allowed).mean() >= 1 - 2 * len(env.agents) / STATES, (name, np.sort(worst / allowed)[-5:])
             if name.startswith(".physics"):
                 assert np.percentile(worst[~touching], 99.8) < TOLERANCE, name
         else:
