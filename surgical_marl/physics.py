@@ -60,8 +60,8 @@ class ArmView(NamedTuple):
 
 class Kind:
     """The arms of one type in a scene, which move alike wherever they stand, as gravity is off: each is stepped in its
-    own base frame, and all by the same code, one after the other. A GPU's instruction cache has no room for a copy of it
-    for every arm."""
+    own base frame, and all by the same code, one after the other: a GPU's instruction cache has no room for a
+    copy for every arm."""
 
     def __init__(self, scene: Scene, agents: tuple[str, ...]) -> None:
         model = scene.model
