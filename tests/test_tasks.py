@@ -121,8 +121,10 @@ def test_targets_move_along_the_paths_of_the_table(task: str) -> None:
     known = env.env.task
     table = np.asarray(known.table, float)[rows, :, 0]
     home = env.scene.mounts["psm_0"].arm
-    np.testing.assert_allclose(env.goal[:, 0], np.tile(home.forward_kinematics(home.home)[:3, 3], (32, 1)), atol=1e-6)
-    still = {"psm_0": np.zeros((32, 7), np.float32)}
+    np.testing.assert_allclose(
+        env.goal[:, 0], np.tile(home.forward_kinematics(home.home)[:3, 3], (env.num_envs, 1)), atol=1e-6
+    )
+    still = {"psm_0": np.zeros((env.num_envs, 7), np.float32)}
     for step in range(1, 61):
         seen = env.step(still).observations["psm_0"]
         expected = spline.evaluate(table, np.array([step * env.control_dt / KNOT]))[:, 0]
@@ -200,7 +202,7 @@ def test_the_tips_speed_is_what_it_moved() -> None:
     seen = []
     for _ in range(8):
         before = env.carry()[".tips"][:, 0]
-        step = env.step({"psm_0": np.tile(np.float32([0, 0, 1, 0, 0, 0, 0]), (32, 1))})
+        step = env.step({"psm_0": np.tile(np.float32([0, 0, 1, 0, 0, 0, 0]), (env.num_envs, 1))})
         tip = step.observations["psm_0"][:, 14:17]
         too_fast = np.linalg.norm(tip - before, axis=-1) / env.control_dt > safety.SPEED
         np.testing.assert_array_equal(step.infos["psm_0"]["cost_speed"], too_fast)
