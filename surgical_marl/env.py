@@ -132,7 +132,7 @@ class Env:
         with jax.ensure_compile_time_eval():
             return Simulator(self.scene, self.decimation)
 
-    @property
+    @cached_property
     def plant(self) -> Plant:
         """The physics behind motors and encoders, as good or bad as the scene has them."""
         return Plant(self.simulator)
