@@ -64,6 +64,8 @@ def prepare_jax() -> None:
         os.environ["PJRT_NPROC"] = str(max(_LEAST_THREADS, os.cpu_count() or 1))
     _set_option("jax_compilation_cache_dir", str(cache_dir() / "xla"))
     _set_option("jax_persistent_cache_min_compile_time_secs", 0)
+    # JAX would take three quarters of a GPU's memory, which torch has more use for.
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     # TF32, the default of newer GPUs, has a 10-bit mantissa: too little for physics.
     _set_option("jax_default_matmul_precision", "highest")
     _import_mjx_quietly()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 from collections.abc import Callable
@@ -15,7 +16,7 @@ from fake_env import FakeEnv
 
 from surgical_marl.evaluation.evaluate import evaluate
 from surgical_marl.files import write_atomic
-from surgical_marl.learning import config, train
+from surgical_marl.learning import config, train, training
 from surgical_marl.learning.config import NetworkSettings, PPOSettings, Settings, load_config
 from surgical_marl.learning.episodes import Episodes
 from surgical_marl.learning.policy import (
@@ -109,7 +110,7 @@ def test_resume_is_bit_for_bit(tmp_path: Path, fakes: list[Any]) -> None:
 
 
 def test_the_state_holds_running_episodes(fakes: list[Any]) -> None:
-    first, second = (train.Training(SMALL, train.make_env(SMALL)) for _ in range(2))
+    first, second = (training.Training(SMALL, train.make_env(SMALL)) for _ in range(2))
     first.iterate()
     first.episodes.collided[::2] = True
     second.set_state(first.state())
@@ -172,13 +173,13 @@ def test_episodes_are_counted_once_each(tmp_path: Path, fakes: list[Any]) -> Non
 def test_nan_stops_and_keeps_the_last_checkpoint(
     tmp_path: Path, fakes: list[Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    original = train.Training.iterate
+    original = training.Training.iterate
 
-    def iterate(self: train.Training) -> dict[str, float]:
+    def iterate(self: training.Training) -> training.Report:
         fakes[0].poison = self.iteration == 3
         return original(self)
 
-    monkeypatch.setattr(train.Training, "iterate", iterate)
+    monkeypatch.setattr(training.Training, "iterate", iterate)
     with pytest.raises(FloatingPointError, match="iteration 4"):
         train.train(replace(SMALL, iterations=9), out=tmp_path / "run")
     checkpoint = read_checkpoint(tmp_path / "run")
@@ -188,8 +189,8 @@ def test_nan_stops_and_keeps_the_last_checkpoint(
 
 
 def test_a_nan_loss_stops(tmp_path: Path, fakes: list[Any], monkeypatch: pytest.MonkeyPatch) -> None:
-    losses = {"value_loss": float("nan")}
-    monkeypatch.setattr(train.MAPPO, "update", lambda self: self.storage.clear() or losses)
+    losses = torch.tensor([math.nan, 0.0, 0.0, 0.0, 0.0])
+    monkeypatch.setattr(training.MAPPO, "learn", lambda self: losses)
     with pytest.raises(FloatingPointError, match="learning_rate"):
         train.train(SMALL, out=tmp_path / "run")
     assert read_checkpoint(tmp_path / "run")["iteration"] == 0
@@ -199,14 +200,14 @@ def test_a_nan_loss_stops(tmp_path: Path, fakes: list[Any], monkeypatch: pytest.
 def test_a_signal_ends_the_iteration_and_saves(
     number: int, tmp_path: Path, fakes: list[Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    original = train.Training.iterate
+    original = training.Training.iterate
 
-    def iterate(self: train.Training) -> dict[str, float]:
+    def iterate(self: training.Training) -> training.Report:
         if self.iteration == 2:
             os.kill(os.getpid(), number)
         return original(self)
 
-    monkeypatch.setattr(train.Training, "iterate", iterate)
+    monkeypatch.setattr(training.Training, "iterate", iterate)
     before = signal.getsignal(number)
     with pytest.raises((KeyboardInterrupt, SystemExit)) as stopped:
         train.train(replace(SMALL, checkpoint_every=50), out=tmp_path / "run")

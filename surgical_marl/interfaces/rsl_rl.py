@@ -111,6 +111,11 @@ class RslRlVecEnv(VecEnv):
         self._observations = self._group(observations, state)
 
     @property
+    def capturable(self) -> bool:
+        """Whether a CUDA graph can hold `step`."""
+        return bool(self.env.device == "cuda" and self.env.engine.name == "fused")
+
+    @property
     def episode_length_buf(self) -> Tensor:
         """Steps since reset, `[N]`. Set it to let episodes end at different times."""
         return torch.as_tensor(self.env.steps)

@@ -12,6 +12,7 @@ from typing import Any
 
 import torch
 from rsl_rl.algorithms import PPO
+from rsl_rl.modules.distribution import GaussianDistribution
 from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 from torch import Tensor, nn
@@ -20,6 +21,7 @@ from surgical_marl.interfaces.rsl_rl import RslRlVecEnv
 from surgical_marl.learning.config import Settings
 from surgical_marl.learning.vision import PICTURES, make_model
 
+LOSSES = ("value_loss", "surrogate_loss", "entropy", "kl", "learning_rate")
 LEARNING_RATE_RANGE = (1e-5, 1e-2)  # rsl_rl's limits of the adaptive learning rate
 # A small last layer starts every arm near its rest, which is where exploration is safe and
 # gradients are largest.
@@ -90,6 +92,11 @@ class MultiAgentActor(MultiAgentModel):
                 policy.mlp[-1].weight.mul_(OUTPUT_GAIN)
                 policy.mlp[-1].bias.zero_()
 
+    def distribute(self, observations: TensorDict) -> None:
+        """A forward pass that draws no actions."""
+        for model in self._models():
+            model.distribution.update(model.mlp(model.get_latent(observations)))
+
     def get_output_log_prob(self, actions: Tensor) -> Tensor:
         """Log-probability of flat actions `[N, sum]` under the last forward pass: `[N, A]`."""
         parts = zip(self._models(), self._split(actions), strict=True)
@@ -117,6 +124,18 @@ class MultiAgentActor(MultiAgentModel):
     def output_std(self) -> Tensor:
         """Standard deviation of the last distribution, flat `[N, sum]`."""
         return self._join(model.output_std for model in self._models())
+
+
+class Gaussian(GaussianDistribution):
+    """rsl_rl's, in float32 whatever the network computed in."""
+
+    def update(self, mlp_output: Tensor) -> None:
+        """Take the mean from the network's output."""
+        super().update(mlp_output.float())
+
+    def sample(self) -> Tensor:
+        """As torch's, which has the host look whether a standard deviation is negative."""
+        return self.mean + self.std * torch.randn_like(self.mean)
 
 
 class MultiAgentStorage(RolloutStorage):
@@ -150,22 +169,26 @@ class MAPPO(PPO):
 
     `act`, `compute_returns` and `save` are rsl_rl's. `update` is written again for two reasons:
     rsl_rl's squeezes are wrong for A = 1, and it waits for the device some hundred times an update
-    where this waits once.
+    where this never waits: a CUDA graph can hold it (see `learn`).
 
     Args:
         team_reward: give every agent the sum of all agents' rewards, instead of its own.
         ppo: arguments of `rsl_rl.algorithms.PPO`.
     """
 
-    learning_rate: float
-
     def __init__(self, actor: Any, critic: Any, storage: Any, *, team_reward: bool = False, **ppo: Any) -> None:
         super().__init__(actor, critic, storage, **ppo)
         self.team_reward = team_reward
         # As a tensor the learning rate adapts without the host having to read the divergence.
         self._rate = torch.tensor(float(self.learning_rate), device=self.device)
+        self._cuda = torch.device(self.device).type == "cuda"
         parameters = [*self.actor.parameters(), *self.critic.parameters()]
-        self.optimizer = torch.optim.Adam(parameters, lr=self._rate, fused=True)
+        self.optimizer = torch.optim.Adam(parameters, lr=self._rate, fused=True, capturable=self._cuda)
+
+    def act(self, obs: TensorDict) -> Tensor:
+        """Sample the flat joint action `[N, sum]`."""
+        with self._precision():
+            return super().act(obs)
 
     def process_env_step(self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: dict[str, Any]) -> None:
         """Store one step.
@@ -175,15 +198,16 @@ class MAPPO(PPO):
         rewards = extras["agent_rewards"]
         if self.team_reward:
             rewards = rewards.sum(-1, keepdim=True).expand_as(rewards)
-        bootstrap = self.critic(extras["final_obs"]) * extras["time_outs"].unsqueeze(-1)
-        self.transition.rewards = rewards + self.gamma * bootstrap
+        with self._precision():
+            final_values = self.critic(extras["final_obs"])
+        self.transition.rewards = rewards + self.gamma * final_values * extras["time_outs"].unsqueeze(-1)
         self.transition.dones = dones
         self.storage.add_transition(self.transition)
         self.transition.clear()
 
     def loss(self, batch: RolloutStorage.Batch) -> tuple[Tensor, Tensor]:
         """Loss of a mini-batch; and value loss, surrogate loss, entropy and KL, detached `[4]`."""
-        self.actor(batch.observations, stochastic_output=True)
+        self.actor.distribute(batch.observations)
         log_prob = self.actor.get_output_log_prob(batch.actions)
         with torch.no_grad():
             params = self.actor.output_distribution_params
@@ -204,11 +228,24 @@ class MAPPO(PPO):
         loss = surrogate + self.value_loss_coef * value - self.entropy_coef * entropy
         return loss, torch.stack([value, surrogate, entropy, divergence]).detach()
 
+    def compute_returns(self, obs: TensorDict) -> None:
+        """Returns and normalised advantages of the stored rollout; `obs` is what comes after it."""
+        with self._precision():
+            super().compute_returns(obs)
+
     def update(self) -> dict[str, float]:
-        """Learn from the stored rollout; returns mean losses, KL and the learning rate."""
+        """Learn from the stored rollout; returns mean losses, KL and the learning rate (see `LOSSES`)."""
+        losses = dict(zip(LOSSES, self.learn().tolist(), strict=True))
+        self.storage.clear()
+        self.learning_rate = losses["learning_rate"]
+        return losses
+
+    def learn(self) -> Tensor:
+        """What `update` does, without waiting for the device: `LOSSES` as a tensor."""
         total = torch.zeros(4, device=self.device)
         for batch in self.storage.mini_batch_generator(self.num_mini_batches, self.num_learning_epochs):
-            loss, parts = self.loss(batch)
+            with self._precision():
+                loss, parts = self.loss(batch)
             if self.schedule == "adaptive":
                 self._adapt_rate(parts[-1])
             self.optimizer.zero_grad()
@@ -220,11 +257,13 @@ class MAPPO(PPO):
         observations = self.storage.observations.flatten(0, 1)
         self.actor.update_normalization(observations)
         self.critic.update_normalization(observations)
-        self.storage.clear()
         count = self.num_mini_batches * self.num_learning_epochs
-        *losses, self.learning_rate = torch.cat([total / count, self._rate[None]]).tolist()
-        names = ("value_loss", "surrogate_loss", "entropy", "kl", "learning_rate")
-        return dict(zip(names, (*losses, self.learning_rate), strict=True))
+        return torch.cat([total / count, self._rate[None]])
+
+    def _precision(self) -> torch.autocast:
+        """bfloat16 for the networks' products if that was asked for; the same when acting and learning, or ratios
+        would not begin at 1."""
+        return torch.autocast("cuda" if self._cuda else "cpu", torch.bfloat16, enabled=self.use_mixed_precision)
 
     def _adapt_rate(self, divergence: Tensor) -> None:
         """rsl_rl's rule: slower above twice the wanted divergence, faster below half of it."""
@@ -247,7 +286,7 @@ class MAPPO(PPO):
         result = super().load(loaded_dict, load_cfg, strict)
         group = self.optimizer.param_groups[0]
         group["lr"] = self._rate = torch.as_tensor(group["lr"], device=self.device)
-        self.learning_rate = float(self._rate)
+        group["capturable"] = self._cuda  # the checkpoint may come from another kind of device
         return result
 
     @staticmethod
@@ -284,7 +323,7 @@ def rsl_rl_config(settings: Settings) -> dict[str, Any]:
         "obs_normalization": network.normalise_observations,
     }
     gaussian = {
-        "class_name": "GaussianDistribution",
+        "class_name": Gaussian,
         "init_std": network.init_std,
         "std_type": "log",
     }
@@ -309,5 +348,6 @@ def rsl_rl_config(settings: Settings) -> dict[str, Any]:
             "value_loss_coef": ppo.value_coefficient,
             "entropy_coef": ppo.entropy_coefficient,
             "max_grad_norm": ppo.max_gradient_norm,
+            "use_mixed_precision": settings.precision == "bfloat16",
         },
     }
