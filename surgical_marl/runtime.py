@@ -68,7 +68,32 @@ def prepare_jax() -> None:
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     # TF32, the default of newer GPUs, has a 10-bit mantissa: too little for physics.
     _set_option("jax_default_matmul_precision", "highest")
-    _import_mjx_quietly()
+
+
+@functools.cache
+def prepare_mjx() -> Any:
+    """Imports MJX, which takes seconds: only what traces physics needs it, and a program in the cache does not.
+
+    `import mujoco.mjx` prints two lines to stdout without Warp, and a banner with it. Where there is no NVIDIA GPU, MJX
+    does not get to see Warp, whose kernels it would register.
+    """
+    prepare_jax()
+    hidden = not _has_gpu()
+    warp = sys.modules.get("warp")
+    if hidden:
+        sys.modules["warp"] = None  # type: ignore[assignment]
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):
+            if not hidden and importlib.util.find_spec("warp"):
+                with contextlib.suppress(ImportError, RuntimeError):
+                    prepare_warp()
+            from mujoco import mjx
+    finally:
+        if hidden:
+            del sys.modules["warp"]
+            if warp is not None:
+                sys.modules["warp"] = warp
+    return mjx
 
 
 @functools.cache
@@ -116,20 +141,3 @@ def _backend_started() -> bool:
 
 def _on_cpu() -> bool:
     return bool(sys.modules["jax"].default_backend() == "cpu")
-
-
-def _import_mjx_quietly() -> None:
-    """`import mujoco.mjx` prints two lines to stdout without Warp, and a banner with it. Warp needs an NVIDIA GPU and
-    takes a second to import: without one MJX does not get to see it."""
-    hidden = "warp" not in sys.modules and not _has_gpu()
-    if hidden:
-        sys.modules["warp"] = None  # type: ignore[assignment]
-    try:
-        with contextlib.redirect_stdout(io.StringIO()):
-            if not hidden and importlib.util.find_spec("warp"):
-                with contextlib.suppress(ImportError, RuntimeError):
-                    prepare_warp()
-            import mujoco.mjx  # noqa: F401
-    finally:
-        if hidden:
-            del sys.modules["warp"]

@@ -65,8 +65,9 @@ def test_every_dependency_is_pinned() -> None:
 
 STARTED = """
 import json, os
-from surgical_marl.runtime import prepare_jax
+from surgical_marl.runtime import prepare_jax, prepare_mjx
 prepare_jax()
+prepare_mjx()
 import jax
 jax.numpy.ones(2).block_until_ready()
 print(json.dumps({

@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Any
 from tqdm import tqdm
 
 from surgical_marl.learning.config import Settings
-from surgical_marl.learning.curve import draw_curve
 from surgical_marl.learning.run import (
     METRICS,
     check_writable,
@@ -119,6 +118,8 @@ def _run(training: Training, out: Path) -> None:
                 write_checkpoint(out, training.state())
         log.catch_up()
         write_checkpoint(out, training.state())
+    from surgical_marl.learning.curve import draw_curve  # matplotlib: not before training has begun
+
     draw_curve(out, f"{settings.task} in {settings.scene}, {settings.algo}, seed {settings.seed}")
     if received:
         raise KeyboardInterrupt if received[0] == signal.SIGINT else SystemExit(128 + received[0])
