@@ -18,8 +18,8 @@ import numpy as np
 
 from surgical_marl.engines.common import announce, cores
 from surgical_marl.engines.fused.arrays import make_arrays
-from surgical_marl.engines.fused.keys import episode_keys
 from surgical_marl.engines.fused.kernel import compile_kernels, has_cuda
+from surgical_marl.engines.fused.keys import episode_keys
 from surgical_marl.engines.fused.preludes import LANES
 from surgical_marl.engines.fused.program import Source, load_source
 from surgical_marl.env import Env
