@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import importlib
 import importlib.metadata
 import importlib.util
 import io
 import os
 import sys
+import types
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -94,6 +96,42 @@ def prepare_mjx() -> Any:
             if warp is not None:
                 sys.modules["warp"] = warp
     return mjx
+
+
+class _Deferred(types.ModuleType):
+    """Stands in for `torch._dynamo` until something asks for more than to be left alone by it."""
+
+    def __getattr__(self, name: str) -> Any:
+        import torch
+
+        if sys.modules.get(self.__name__) is self:
+            del sys.modules[self.__name__], torch._dynamo
+        return getattr(importlib.import_module(self.__name__), name)
+
+    @staticmethod
+    def graph_break(*_: Any, **__: Any) -> None: ...
+
+    @staticmethod
+    def allow_in_graph(function: Any) -> Any:
+        return function
+
+    assume_constant_result = allow_in_graph
+
+    @staticmethod
+    def disable(function: Any = None, *_: Any, **__: Any) -> Any:
+        return function if function is not None else lambda later: later
+
+
+def defer_compiler() -> None:
+    """For programs that never call `torch.compile`: tensordict and torch's optimisers import its compiler, and SymPy,
+    only to mark what it should not compile. On a GPU that takes longer than to learn a task of one arm.
+
+    Does nothing if the compiler has been imported already.
+    """
+    import torch
+
+    if "torch._dynamo" not in sys.modules:
+        sys.modules["torch._dynamo"] = torch._dynamo = _Deferred("torch._dynamo")
 
 
 @functools.cache
