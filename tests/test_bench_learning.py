@@ -16,6 +16,7 @@ from surgical_marl.bench import machine, solve, stopwatch, train
 from surgical_marl.bench.solve import Exam, Goal, Looks
 from surgical_marl.bench.stopwatch import STARTING
 from surgical_marl.cli import main
+from surgical_marl.learning import train as learning_train
 from surgical_marl.learning.config import NetworkSettings, PPOSettings, Settings
 from surgical_marl.learning.training import Training
 
@@ -44,6 +45,7 @@ def fakes(monkeypatch: pytest.MonkeyPatch) -> None:
         return env
 
     monkeypatch.setattr(solve, "make_env", make_env)
+    monkeypatch.setattr(learning_train, "make_env", make_env)
 
 
 def test_training_as_json_has_the_keys_of_the_contract_and_the_split(

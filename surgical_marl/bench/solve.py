@@ -23,8 +23,9 @@ from surgical_marl.evaluation.evaluate import Played, play
 from surgical_marl.evaluation.goal_set import is_standard
 from surgical_marl.evaluation.metrics import FOLLOWING, SUCCESS_MM, metrics
 from surgical_marl.learning.config import Settings
+from surgical_marl.learning.memory import in_memory
 from surgical_marl.learning.policy import acting_policy
-from surgical_marl.learning.train import make_env
+from surgical_marl.learning.train import make_env, make_training
 from surgical_marl.learning.training import Training
 
 NUM_ENVS = {"cuda": 16384}
@@ -124,8 +125,8 @@ def solve(
     """
     entered = time.perf_counter()
     began = entered if began is None else began
-    env, exam_env = make_env(settings), make_env(settings, EPISODES)
-    training = Training(settings, env)
+    training, exam_env = make_training(settings), make_env(settings, EPISODES)
+    env = training.env.env
     watch, looks = Stopwatch(training), Looks(goal)
     made = time.perf_counter()
     exams, examining = [], 0.0
@@ -219,7 +220,8 @@ def run(settings: Settings, goal: Goal, limit: float, as_json: bool = False) -> 
     """All of `surgical-marl bench solve`, from the start of this process: the text of its table or JSON, and whether it
     is solved. It is given up after `limit` seconds."""
     began = time.perf_counter() - machine.age()
-    found = solve(settings, goal, lambda seconds, learning: seconds > limit, began)
+    with in_memory(settings.num_envs):
+        found = solve(settings, goal, lambda seconds, learning: seconds > limit, began)
     return (summary(settings, goal, found) if as_json else table(settings, goal, found)), found.solved
 
 

@@ -20,8 +20,8 @@ from surgical_marl.bench.report import aligned, describe_machine
 from surgical_marl.bench.stopwatch import STARTING, Stopwatch, rows
 from surgical_marl.bench.workload import Workload
 from surgical_marl.learning.config import Settings
-from surgical_marl.learning.train import make_env
-from surgical_marl.learning.training import Training
+from surgical_marl.learning.memory import in_memory
+from surgical_marl.learning.train import make_training
 
 QUOTED = {
     "SurRoL": 1_634,
@@ -64,7 +64,8 @@ def measure(settings: Settings, seconds: float = clock.SECONDS, repeats: int = c
         ValueError: there is no room for so many environments.
         FloatingPointError: training diverged.
     """
-    learning = _learn(settings, seconds, repeats)
+    with in_memory(settings.num_envs):
+        learning = _learn(settings, seconds, repeats)
     machine.restart_peak()  # gives the training's memory back
     workload = Workload(settings.task, settings.scene, settings.num_envs, learning["device"], learning["decimation"])
     found, _ = sim.measure(workload, (learning.pop("engine"),), seconds=seconds, repeats=repeats)
@@ -75,8 +76,8 @@ def measure(settings: Settings, seconds: float = clock.SECONDS, repeats: int = c
 def _learn(settings: Settings, seconds: float, repeats: int) -> dict[str, Any]:
     """What is known of the training: part of a `Speed`."""
     start = time.perf_counter()
-    env = make_env(settings)
-    training = Training(settings, env)
+    training = make_training(settings)
+    env = training.env.env
     watch, going, laps = Stopwatch(training), rows(training), []
     for _ in range(STARTING):
         next(going)
