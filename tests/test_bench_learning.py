@@ -126,12 +126,12 @@ def test_looks_are_worth_their_time() -> None:
     looks = Looks(Goal(0.9, 0.01))
     assert not looks.due(math.nan, 10.0), "no episode ended"
     assert not looks.due(0.2, 10.0) and looks.due(0.3, 10.0), "a quarter of the goal"
-    looks.add(0.4, exam(0.8), took=1.0)
+    looks.add(0.4, exam(0.8), learning=100.0, took=1.0)
     # (0.4, 0.8) and (1, 1): 0.9 is expected at 0.7
-    assert not looks.due(0.69, 39.0) and looks.due(0.69, 41.0), "a twentieth of the time"
-    assert not looks.due(0.71, 9.0) and looks.due(0.71, 11.0), "a fifth of the time"
-    looks.add(0.7, exam(0.95, collisions=0.02), took=1.0)
-    assert looks.due(0.7, 16.0), "only collisions are too many"
+    assert not looks.due(0.69, 119.0) and looks.due(0.69, 121.0), "a twentieth of the time"
+    assert not looks.due(0.71, 104.0) and looks.due(0.71, 106.0), "a fifth of the time"
+    looks.add(0.7, exam(0.95, collisions=0.02), learning=200.0, took=1.0)
+    assert looks.due(0.7, 206.0), "only collisions are too many"
 
 
 def test_a_goal_is_success_without_collisions() -> None:

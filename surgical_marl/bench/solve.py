@@ -13,7 +13,7 @@ import statistics
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 from surgical_marl.bench import machine
@@ -34,7 +34,8 @@ fewer of them."""
 EPISODES, SEED = 200, 0
 """Of the standard goal sets."""
 EAGER, PATIENT = 0.2, 0.05
-"""Shares of the time that evaluations may take: where training's own success promises the goal, and elsewhere."""
+"""Share of the time since the last evaluation that one may take: where training's own success promises the goal, and
+elsewhere."""
 
 
 @dataclass(frozen=True)
@@ -137,29 +138,19 @@ def solve(
             watch.wait()
             now = time.perf_counter()
             exams.append(examine(training, exam_env))
-            took = time.perf_counter() - now
-            examining += took
-            looks.add(row["success_rate"], exams[-1], took)
+            end = time.perf_counter()
+            examining += end - now
+            looks.add(row["success_rate"], exams[-1], end - made, end - now)
             _say(f"{now - began:.1f} s, iteration {training.iteration}", exams[-1])
             if over or exams[-1].passes(goal):
                 break
-    seconds = time.perf_counter() - began
-    parts = {name: watch.seconds(name) for name in ("rollout", "update")}
-    extra = sum(starting(took) for took in parts.values())
-    spent = {
-        "imports_s": entered - began,
-        "compile_s": made - entered + extra,
-        "rollout_s": sum(parts["rollout"]) - starting(parts["rollout"]),
-        "update_s": sum(parts["update"]) - starting(parts["update"]),
-        "evaluation_s": examining,
-    }
-    samples = settings.num_envs * settings.steps_per_iteration
+    times = _times(began, entered, made, watch, examining)
     return Solution(
         solved=exams[-1].passes(goal),
-        seconds=seconds,
-        times=Times(**spent, rest_s=max(0.0, seconds - sum(spent.values()))),
+        seconds=sum(asdict(times).values()),
+        times=times,
         iterations=training.iteration,
-        env_steps=training.iteration * samples,
+        env_steps=training.iteration * settings.num_envs * settings.steps_per_iteration,
         evaluations=len(exams),
         exam=exams[-1],
         num_envs=settings.num_envs,
@@ -168,30 +159,46 @@ def solve(
     )
 
 
+def _times(began: float, entered: float, made: float, watch: Stopwatch, examining: float) -> Times:
+    """Of what went on from `began` until now: imports until `entered`, then environments until `made`."""
+    whole = time.perf_counter() - began
+    rollout, update = (watch.seconds(name) for name in ("rollout", "update"))
+    times = Times(
+        imports_s=entered - began,
+        compile_s=made - entered + starting(rollout) + starting(update),
+        rollout_s=sum(rollout) - starting(rollout),
+        update_s=sum(update) - starting(update),
+        evaluation_s=examining,
+        rest_s=0.0,
+    )
+    return replace(times, rest_s=max(0.0, whole - sum(asdict(times).values())))
+
+
 class Looks:
     """When to evaluate, since that takes time as well.
 
     Training's own success, of actions with noise, is less than what the evaluation will show: at first a quarter of the
     goal is worth a look. Once both are known for some iteration, a line from there to where both are 1 says at what
-    training success the goal may be met. Above that evaluations may take a fifth of the time; below, a twentieth, lest
-    the line be wrong.
+    training success the goal may be met. Above that an evaluation may take a fifth of the time since the last one;
+    below, a twentieth, lest the line be wrong.
     """
 
     def __init__(self, goal: Goal) -> None:
         self._goal, self._promising = goal, goal.success / 4
-        self._spent = self._cost = 0.0
+        self._ended = self._took = 0.0
 
     def due(self, success: float, learning: float) -> bool:
         """Whether to evaluate after an iteration, with its success rate (NaN if no episode ended), `learning` seconds
         after learning began."""
         promising = success >= self._promising
-        if not self._spent:
+        if not self._took:
             return promising
-        return self._spent + self._cost < (EAGER if promising else PATIENT) * learning
+        return self._took < (EAGER if promising else PATIENT) * (learning - self._ended)
 
-    def add(self, success: float, exam: Exam, took: float) -> None:
-        """An evaluation of `took` seconds at that success rate of training."""
-        self._spent, self._cost = self._spent + took, took
+    def add(self, success: float, exam: Exam, learning: float, took: float) -> None:
+        """An evaluation at that success rate of training, which ended `learning` seconds after learning began and took
+        so many."""
+        self._ended, self._took = learning, took
         missing = max(0.0, self._goal.success - exam.success_2mm) / max(1 - exam.success_2mm, 1e-9)
         self._promising = success + (1 - success) * min(missing, 1.0)
 
