@@ -48,7 +48,7 @@ def run(
         if not points:
             raise ValueError(f"nothing to show: {', '.join(engines)} can't run here")
         if out:
-            draw(points, f"{workload.task} on {workload.scene}; {_machine(machine())}", out)
+            draw(points, f"{workload.task} on {workload.scene}; {describe_machine()}", out)
         return json.dumps(sweep_summary(workload, points)) if as_json else sweep_table(points)
     course = make_course(load_scene(workload.scene), workload.motion)
     speeds, left_out = measure(workload, engines, course)
@@ -107,7 +107,7 @@ def table(found: Mapping[str, Any]) -> str:
         [
             f"{found['task']} on {found['scene']}: physics steps of {1e3 * first['dt']:g} ms, "
             f"{first['decimation']} to an environment step; {found['touching']:.1%} of environments touch something",
-            _machine(found),
+            describe_machine(found),
             "",
             *aligned(cells),
             "",
@@ -118,7 +118,9 @@ def table(found: Mapping[str, Any]) -> str:
     )
 
 
-def _machine(found: Mapping[str, Any]) -> str:
+def describe_machine(found: Mapping[str, Any] | None = None) -> str:
+    """This machine, or what `machine` told of another, in a line."""
+    found = found or machine()
     return f"{found['cpu']}, {found['threads']} threads" + (f"; {found['gpu']}" if found["gpu"] else "")
 
 
