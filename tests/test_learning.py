@@ -30,6 +30,7 @@ from surgical_marl.learning.run import (
     read_checkpoint,
     read_metrics,
     read_settings,
+    write_metrics,
 )
 
 COUNTS, SIZES = {"psm": 2, "ecm": 1}, {"psm": 3, "ecm": 2}
@@ -148,14 +149,19 @@ def test_a_run_folder_recreates_the_run(tmp_path: Path, fakes: list[Any]) -> Non
 
 
 def test_episodes_are_counted_once_each(tmp_path: Path, fakes: list[Any]) -> None:
-    episodes = Episodes(["a", "b"], 3, "cpu")
+    episodes = Episodes(["a", "b"], ["reward_near"], 2, 3, "cpu")
     flags = torch.tensor
 
     def infos(error: float, collision: list[bool]) -> dict[str, dict[str, torch.Tensor]]:
         tip = torch.full((3,), error)
         hit, clear = flags(collision), flags([False] * 3)
         return {
-            "a": {"tip_error": tip, "success": flags([True, True, False]), "collision": hit},
+            "a": {
+                "tip_error": tip,
+                "success": flags([True, True, False]),
+                "collision": hit,
+                "reward_near": flags([2.0, 4.0, 6.0]),
+            },
             "b": {"tip_error": 3 * tip, "success": flags([True, False, False]), "collision": clear},
         }
 
@@ -164,10 +170,22 @@ def test_episodes_are_counted_once_each(tmp_path: Path, fakes: list[Any]) -> Non
     episodes.add(reward, flags([True, True, False]), infos(0.25, [False, False, True]))
     episodes.add(reward, flags([True, False, False]), infos(0.5, [False, False, False]))
     # Ended: environment 0 (mean error 0.5, both succeed, collided before), 1 (0.5, half of them),
-    # and 0 again (1.0, both, no collision).
-    assert episodes.take().tolist() == [3.0, 2.0, 2.5, 1.0, 6.0]
+    # and 0 again (1.0, both, no collision). Two agents share a term of mean 4 that one of them has.
+    assert episodes.take().tolist() == [3.0, 2.0, 2.5, 1.0, 6.0, 6.0]
     assert episodes.collided.tolist() == [False, False, True]
-    assert episodes.take().tolist() == [0.0] * 5
+    assert episodes.take().tolist() == [0.0] * 6
+
+
+@pytest.mark.parametrize("algo", ["mappo", "joint"])
+def test_reward_terms_add_up_to_the_reward(algo: Any, tmp_path: Path, fakes: list[Any]) -> None:
+    for row in read_metrics(train.train(replace(SMALL, algo=algo), out=tmp_path / "run")):
+        assert row["reward_late"] < 0
+        assert row["reward_distance"] + row["reward_late"] == pytest.approx(row["reward"], rel=1e-5)
+
+
+def test_metrics_of_an_older_version_lack_columns(tmp_path: Path) -> None:
+    write_metrics(tmp_path, ["a", "b"], [{"a": 1.0, "old": 5.0}, {"b": 2.0, "a": 3.0}])
+    assert (tmp_path / "metrics.csv").read_text().split() == ["a,b", "1,", "3,2"]
 
 
 def test_nan_stops_and_keeps_the_last_checkpoint(

@@ -31,7 +31,7 @@ from surgical_marl.learning.run import (
     write_config,
     write_metrics,
 )
-from surgical_marl.learning.training import COLUMNS, Report, Training
+from surgical_marl.learning.training import Report, Training
 
 if TYPE_CHECKING:
     from surgical_marl.batch import BatchedEnv
@@ -103,7 +103,7 @@ def train(settings: Settings, *, out: Path, resume: Path | None = None) -> Path:
     if state is not None:
         training.set_state(state)
     write_config(out, settings)
-    write_metrics(out, COLUMNS, rows)
+    write_metrics(out, training.columns, rows)
     write_checkpoint(out, training.state())
     _run(training, out)
     return out
@@ -162,7 +162,7 @@ class _Log:
     def _write(self, row: dict[str, float]) -> None:
         csv.writer(self._csv).writerow(format_row(row))
         self._csv.flush()
-        for name in COLUMNS[1:]:
+        for name in self._training.columns[1:]:
             if math.isfinite(row[name]):
                 self._board.add_scalar(name, row[name], row["iteration"])
         self._bar.set_postfix_str(_describe(row), refresh=False)
