@@ -42,6 +42,8 @@ SMALL = Settings(
     network=NetworkSettings(hidden=(16,)),
     ppo=PPOSettings(epochs=2, mini_batches=2),
 )
+# What an algorithm may have beside its networks.
+OPTIONS: list[dict[str, Any]] = [{}, {"ppo": replace(SMALL.ppo, normalise_values=True)}]
 
 
 @pytest.fixture
@@ -89,16 +91,18 @@ def test_the_toy_is_learned(algo: Any, tmp_path: Path, fakes: list[Any]) -> None
     assert rows[-1]["success_rate"] > rows[0]["success_rate"]
 
 
-def test_resume_is_bit_for_bit(tmp_path: Path, fakes: list[Any]) -> None:
-    whole = train.train(SMALL, out=tmp_path / "whole")
-    half = train.train(replace(SMALL, iterations=2), out=tmp_path / "half")
-    same = train.train(SMALL, out=half, resume=half)
-    copy = train.train(replace(SMALL, iterations=2), out=tmp_path / "other")
-    moved = train.train(SMALL, out=tmp_path / "moved", resume=copy)
+@pytest.mark.parametrize("options", OPTIONS)
+def test_resume_is_bit_for_bit(options: dict[str, Any], tmp_path: Path, fakes: list[Any]) -> None:
+    settings = replace(SMALL, **options)
+    whole = train.train(settings, out=tmp_path / "whole")
+    half = train.train(replace(settings, iterations=2), out=tmp_path / "half")
+    same = train.train(settings, out=half, resume=half)
+    copy = train.train(replace(settings, iterations=2), out=tmp_path / "other")
+    moved = train.train(settings, out=tmp_path / "moved", resume=copy)
     first = read_checkpoint(whole)
     for run in (same, moved):
         again = read_checkpoint(run)
-        for part in ("actor_state_dict", "critic_state_dict"):
+        for part in ("actor_state_dict", "critic_state_dict", "options_state_dict"):
             for name, value in first["algorithm"][part].items():
                 assert torch.equal(again["algorithm"][part][name], value), name
         moments = first["algorithm"]["optimizer_state_dict"]["state"]
@@ -246,6 +250,7 @@ def test_folders_that_cannot_be_used(tmp_path: Path, fakes: list[Any]) -> None:
         (SMALL, {"out": tmp_path / "new", "resume": exported}, "exported policy"),
         (replace(SMALL, iterations=1), {"out": run, "resume": run}, "already has 1 iterations"),
         (replace(SMALL, num_envs=8), {"out": run, "resume": run}, "num_envs 32"),
+        (replace(SMALL, **OPTIONS[1]), {"out": run, "resume": run}, "normalise_values False"),
         (replace(SMALL, scene="psm"), {"out": run, "resume": run}, "'bimanual_psm'"),
     ]
     for settings, arguments, message in cases:

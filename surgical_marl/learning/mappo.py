@@ -19,6 +19,7 @@ from surgical_marl.interfaces.rsl_rl import RslRlVecEnv
 from surgical_marl.learning.config import Settings
 from surgical_marl.learning.models import Gaussian, MultiAgentActor, MultiAgentModel
 from surgical_marl.learning.storage import MultiAgentStorage
+from surgical_marl.learning.values import ValueScale
 from surgical_marl.learning.vision import PICTURES, make_model
 
 LOSSES = ("value_loss", "surrogate_loss", "entropy", "kl", "learning_rate")
@@ -28,18 +29,32 @@ LEARNING_RATE_RANGE = (1e-5, 1e-2)  # rsl_rl's limits of the adaptive learning r
 class MAPPO(PPO):
     """PPO with a ratio for each agent, and a critic with a value for each agent.
 
-    `act`, `compute_returns` and `save` are rsl_rl's. `update` is written again for two reasons:
-    rsl_rl's squeezes are wrong for A = 1, and it waits for the device some hundred times an update
-    where this never waits: a CUDA graph can hold it (see `learn`).
+    `update` is not rsl_rl's for two reasons: rsl_rl's squeezes are wrong for A = 1, and it waits
+    for the device some hundred times an update where this never waits: a CUDA graph can hold it
+    (see `learn`).
 
     Args:
         team_reward: give every agent the sum of all agents' rewards, instead of its own.
+        normalise_values: the critic predicts returns of unit variance; all else is in units of reward.
         ppo: arguments of `rsl_rl.algorithms.PPO`.
     """
 
-    def __init__(self, actor: Any, critic: Any, storage: Any, *, team_reward: bool = False, **ppo: Any) -> None:
+    def __init__(
+        self,
+        actor: Any,
+        critic: Any,
+        storage: MultiAgentStorage,
+        *,
+        team_reward: bool = False,
+        normalise_values: bool = False,
+        **ppo: Any,
+    ) -> None:
         super().__init__(actor, critic, storage, **ppo)
+        self.storage: MultiAgentStorage = storage
         self.team_reward = team_reward
+        self.scale = ValueScale(storage.values.shape[-1]).to(self.device)
+        # What learns beside the networks: it stands in checkpoints.
+        self.options = nn.ModuleDict({"scale": self.scale} if normalise_values else {})
         # As a tensor the learning rate adapts without the host having to read the divergence.
         self._rate = torch.tensor(float(self.learning_rate), device=self.device)
         self._cuda = torch.device(self.device).type == "cuda"
@@ -49,7 +64,9 @@ class MAPPO(PPO):
     def act(self, obs: TensorDict) -> Tensor:
         """Sample the flat joint action `[N, sum]`."""
         with self._precision():
-            return super().act(obs)
+            actions = super().act(obs)
+        self.transition.values = self.scale.restore(self.transition.values)
+        return actions
 
     def process_env_step(self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: dict[str, Any]) -> None:
         """Store one step.
@@ -59,8 +76,7 @@ class MAPPO(PPO):
         rewards = extras["agent_rewards"]
         if self.team_reward:
             rewards = rewards.sum(-1, keepdim=True).expand_as(rewards)
-        with self._precision():
-            final_values = self.critic(extras["final_obs"])
+        final_values = self._values(extras["final_obs"])
         self.transition.rewards = rewards + self.gamma * final_values * extras["time_outs"].unsqueeze(-1)
         self.transition.dones = dones
         self.storage.add_transition(self.transition)
@@ -79,11 +95,12 @@ class MAPPO(PPO):
         clipped = ratio.clamp(1 - self.clip_param, 1 + self.clip_param)
         surrogate = -torch.min(batch.advantages * ratio, batch.advantages * clipped).mean()
 
-        values = self.critic(batch.observations)
-        value = (values - batch.returns).square()
+        values, returns = self.critic(batch.observations), self.scale.normalise(batch.returns)
+        value = (values - returns).square()
         if self.use_clipped_value_loss:
-            near = batch.values + (values - batch.values).clamp(-self.clip_param, self.clip_param)
-            value = torch.max(value, (near - batch.returns).square())
+            old = self.scale.normalise(batch.values)
+            near = old + (values - old).clamp(-self.clip_param, self.clip_param)
+            value = torch.max(value, (near - returns).square())
         value = value.mean()
 
         loss = surrogate + self.value_loss_coef * value - self.entropy_coef * entropy
@@ -91,8 +108,12 @@ class MAPPO(PPO):
 
     def compute_returns(self, obs: TensorDict) -> None:
         """Returns and normalised advantages of the stored rollout; `obs` is what comes after it."""
-        with self._precision():
-            super().compute_returns(obs)
+        storage = self.storage
+        storage.compute_returns(self._values(obs), self.gamma, self.lam)
+        if "scale" in self.options:
+            self.scale.learn(storage.returns.flatten(0, 1))
+        advantages = storage.returns - storage.values
+        storage.advantages.copy_((advantages - advantages.mean()) / (advantages.std() + 1e-8))
 
     def update(self) -> dict[str, float]:
         """Learn from the stored rollout; returns mean losses, KL and the learning rate (see `LOSSES`)."""
@@ -121,6 +142,11 @@ class MAPPO(PPO):
         count = self.num_mini_batches * self.num_learning_epochs
         return torch.cat([total / count, self._rate[None]])
 
+    def _values(self, obs: TensorDict) -> Tensor:
+        """Values of observations, in units of reward."""
+        with self._precision():
+            return self.scale.restore(self.critic(obs))
+
     def _precision(self) -> torch.autocast:
         """bfloat16 for the networks' products if that was asked for; the same when acting and learning, or ratios
         would not begin at 1."""
@@ -134,6 +160,10 @@ class MAPPO(PPO):
         rate = torch.where((divergence < self.desired_kl / 2) & (divergence > 0), faster, self._rate)
         self._rate.copy_(torch.where(divergence > self.desired_kl * 2, slower, rate))
 
+    def save(self) -> dict[str, Any]:
+        """All that `load` needs to go on, as tensors and plain values."""
+        return {**super().save(), "options_state_dict": self.options.state_dict()}
+
     def load(
         self,
         loaded_dict: dict[str, Any],
@@ -145,6 +175,7 @@ class MAPPO(PPO):
         The optimizer then holds its own copy of the learning rate: share it again.
         """
         result = super().load(loaded_dict, load_cfg, strict)
+        self.options.load_state_dict(loaded_dict.get("options_state_dict", {}))
         group = self.optimizer.param_groups[0]
         group["lr"] = self._rate = torch.as_tensor(group["lr"], device=self.device)
         group["capturable"] = self._cuda  # the checkpoint may come from another kind of device
@@ -197,6 +228,7 @@ def rsl_rl_config(settings: Settings) -> dict[str, Any]:
         "algorithm": {
             "class_name": MAPPO,
             "team_reward": settings.team_reward,
+            "normalise_values": ppo.normalise_values,
             "learning_rate": ppo.learning_rate,
             "schedule": ppo.schedule,
             "desired_kl": ppo.desired_kl,

@@ -32,3 +32,19 @@ class MultiAgentStorage(RolloutStorage):
         for stored, param in zip(self.distribution_params, params, strict=True):
             stored[self.step].copy_(param)
         self.step += 1
+
+    def compute_returns(self, last_values: Tensor, gamma: float, lam: float) -> None:
+        """Generalised advantage estimation (Schulman et al. 2016, arXiv 1506.02438): `returns` of the full storage.
+
+        Args:
+            last_values: of the observations after the last step, as wide as values.
+            gamma: discount of a step.
+            lam: of the mixture of n-step returns, 0 for one step and 1 for whole episodes.
+        """
+        advantage, next_values = torch.zeros_like(last_values), last_values
+        for step in reversed(range(self.num_transitions_per_env)):
+            goes_on = 1.0 - self.dones[step].float()
+            ahead = self.rewards[step] + goes_on * gamma * next_values - self.values[step]
+            advantage = ahead + goes_on * gamma * lam * advantage
+            next_values = self.values[step]
+            self.returns[step] = advantage + next_values
