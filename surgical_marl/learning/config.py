@@ -51,6 +51,7 @@ class PPOSettings(_Checked):
     value_coefficient: float = _number(1.0, 0.0, 100.0)
     entropy_coefficient: float = _number(0.0, 0.0, 1.0)
     max_gradient_norm: float = _number(1.0, 1e-6, 1e6)
+    normalise_values: bool = False
 
 
 @dataclass(frozen=True)

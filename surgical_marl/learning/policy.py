@@ -19,7 +19,8 @@ from torch import Tensor
 from surgical_marl.content import content_dir, list_policies
 from surgical_marl.interfaces.rsl_rl import Layout
 from surgical_marl.learning.config import Settings
-from surgical_marl.learning.mappo import MultiAgentActor, rsl_rl_config
+from surgical_marl.learning.mappo import rsl_rl_config
+from surgical_marl.learning.models import MultiAgentActor
 from surgical_marl.learning.run import (
     CONFIG,
     CURVE,

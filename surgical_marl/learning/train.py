@@ -31,7 +31,7 @@ from surgical_marl.learning.run import (
     write_config,
     write_metrics,
 )
-from surgical_marl.learning.training import COLUMNS, Report, Training
+from surgical_marl.learning.training import Report, Training
 
 if TYPE_CHECKING:
     from surgical_marl.batch import BatchedEnv
@@ -112,7 +112,7 @@ def train(settings: Settings, *, out: Path, resume: Path | None = None) -> Path:
     if state is not None:
         training.set_state(state)
     write_config(out, settings)
-    write_metrics(out, COLUMNS, rows)
+    write_metrics(out, training.columns, rows)
     write_checkpoint(out, training.state())
     with in_memory(settings.num_envs):
         _run(training, out)
@@ -174,7 +174,7 @@ class _Log:
     def _write(self, row: dict[str, float]) -> None:
         csv.writer(self._csv).writerow(format_row(row))
         self._csv.flush()
-        for name in COLUMNS[1:]:
+        for name in self._training.columns[1:]:
             if math.isfinite(row[name]):
                 self._board.add_scalar(name, row[name], row["iteration"])
         self._bar.set_postfix_str(_describe(row), refresh=False)
@@ -187,6 +187,8 @@ def _read_resumed(settings: Settings, run: Path) -> dict[str, Any]:
         before, now = getattr(old, item.name), getattr(settings, item.name)
         if item.name not in CHANGEABLE and before != now:
             raise ValueError(f"the run in {run} has {item.name} {before!r}, and cannot go on with {now!r}")
+    if (before := old.ppo.normalise_values) != settings.ppo.normalise_values:
+        raise ValueError(f"the run in {run} has ppo.normalise_values {before!r}, and cannot go on with {not before!r}")
     if "env" not in state:
         raise ValueError(f"{run} holds an exported policy, which can be evaluated but not resumed")
     if state["iteration"] >= settings.iterations:

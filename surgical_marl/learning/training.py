@@ -13,20 +13,12 @@ from torch import Tensor
 
 from surgical_marl.interfaces.rsl_rl import RslRlVecEnv
 from surgical_marl.learning.config import Settings
-from surgical_marl.learning.episodes import Episodes
+from surgical_marl.learning.episodes import ENDED, Episodes
 from surgical_marl.learning.graphs import Replayed
 from surgical_marl.learning.mappo import LOSSES, MAPPO, rsl_rl_config
 
 if TYPE_CHECKING:
     from surgical_marl.batch import BatchedEnv
-
-COLUMNS = (
-    *("iteration", "env_steps", "seconds", "steps_per_s"),
-    *("reward", "episodes", "tip_error_mm", "success_rate", "collision_rate"),
-    *LOSSES,
-    "action_std",
-)
-"""What `Training.row` returns."""
 
 
 class Report(NamedTuple):
@@ -67,12 +59,14 @@ class Training:
         self._observations = self.env.get_observations().clone()
         self.algorithm = MAPPO.construct_algorithm(self._observations, self.env, rsl_rl_config(settings), device)
         self.algorithm.train_mode()
-        self.episodes = Episodes(env.agents, env.num_envs, device)
+        terms = self.env.reward_terms
+        self.episodes = Episodes(env.agents, terms, self.env.layout.num_agents, env.num_envs, device)
+        self._names = (*ENDED, *terms, *LOSSES, "action_std", "finite", "weights")
         # All environments start together: let the first episodes end at different times.
         steps = torch.randint(0, max(env.max_steps, 1), (env.num_envs,))
         self.env.episode_length_buf = steps.to(device)
         self._finite = torch.ones((), device=device)
-        self._values = torch.zeros(5 + len(LOSSES) + 3, device=device)
+        self._values = torch.zeros(len(self._names), device=device)
         self._read = 0.0
         self.rollout = Replayed(self._rollout, enabled=self._cuda and self.env.capturable)
         self.update = Replayed(self._update, enabled=self._cuda)
@@ -90,21 +84,32 @@ class Training:
         arrived.record()
         return Report(self.iteration, started, host, arrived)
 
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Names of what `row` returns."""
+        return (
+            *("iteration", "env_steps", "seconds", "steps_per_s"),
+            *("reward", *self.env.reward_terms),
+            *("episodes", "tip_error_mm", "success_rate", "collision_rate"),
+            *LOSSES,
+            "action_std",
+        )
+
     def row(self, report: Report) -> dict[str, float]:
-        """The metrics of an iteration (see `COLUMNS`), when it is done.
+        """The metrics of an iteration (see `columns`), when it is done.
 
         Raises:
             FloatingPointError: an observation, a return, a loss or a weight is not finite.
         """
         if report.arrived is not None:
             report.arrived.synchronize()
-        count, error, success, collision, reward, *losses, std, finite, weights = report.values.tolist()
-        if not finite:
+        found = dict(zip(self._names, report.values.tolist(), strict=True))
+        if not found["finite"]:
             raise FloatingPointError(
                 f"the environment or a value became NaN in iteration {report.iteration}: "
                 "resume the last checkpoint with a lower ppo.learning_rate"
             )
-        if not all(map(math.isfinite, (*losses, weights))):
+        if not all(map(math.isfinite, (*(found[name] for name in LOSSES), found["weights"]))):
             raise FloatingPointError(
                 f"the loss became NaN in iteration {report.iteration}: resume the last checkpoint "
                 f"with a lower ppo.learning_rate than {self.settings.ppo.learning_rate:g}"
@@ -114,21 +119,19 @@ class Training:
         seconds = now - max(report.started, self._read)
         self._read = now
         samples = self.settings.steps_per_iteration * self.env.num_envs
-        share = 1 / count if count else math.nan
+        share = 1 / found["episodes"] if found["episodes"] else math.nan
         row = {
+            **found,
             "iteration": report.iteration,
             "env_steps": report.iteration * samples,
             "seconds": seconds,
             "steps_per_s": samples / seconds,
-            "reward": reward / self.settings.steps_per_iteration,
-            "episodes": count,
-            "tip_error_mm": 1000 * error * share,
-            "success_rate": success * share,
-            "collision_rate": collision * share,
-            **dict(zip(LOSSES, losses, strict=True)),
-            "action_std": std,
+            **{name: found[name] / self.settings.steps_per_iteration for name in ("reward", *self.env.reward_terms)},
+            "tip_error_mm": 1000 * found["error"] * share,
+            "success_rate": found["success"] * share,
+            "collision_rate": found["collision"] * share,
         }
-        return {name: row[name] for name in COLUMNS}
+        return {name: row[name] for name in self.columns}
 
     def _rollout(self) -> None:
         """`steps_per_iteration` steps of all environments, into the storage; then returns and advantages."""
