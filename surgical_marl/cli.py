@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from surgical_marl.content import BASELINES, find, list_arms, list_policies, list_scenes, list_tasks, unknown
+from surgical_marl.runtime import defer_compiler
 
 _LISTS = {
     "tasks": list_tasks,
@@ -49,6 +50,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run a command; returns 0, 1 if training diverged or `check` found something, 2 for bad input, 130 if
     interrupted."""
     code = 0
+    defer_compiler()
     try:
         arguments = _parse(argv)
         code = arguments.command(arguments) or 0

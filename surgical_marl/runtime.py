@@ -102,10 +102,11 @@ class _Deferred(types.ModuleType):
     """Stands in for `torch._dynamo` until something asks for more than to be left alone by it."""
 
     def __getattr__(self, name: str) -> Any:
-        import torch
-
+        if name.startswith("__") and name != "__path__":  # who asks all modules for their `__file__` means no harm
+            raise AttributeError(name)
         if sys.modules.get(self.__name__) is self:
-            del sys.modules[self.__name__], torch._dynamo
+            del sys.modules[self.__name__]
+            vars(sys.modules["torch"]).pop("_dynamo", None)
         return getattr(importlib.import_module(self.__name__), name)
 
     @staticmethod
@@ -126,12 +127,9 @@ def defer_compiler() -> None:
     """For programs that never call `torch.compile`: tensordict and torch's optimisers import its compiler, and SymPy,
     only to mark what it should not compile. On a GPU that takes longer than to learn a task of one arm.
 
-    Does nothing if the compiler has been imported already.
+    Call it before torch is imported; it does nothing if the compiler is there already.
     """
-    import torch
-
-    if "torch._dynamo" not in sys.modules:
-        sys.modules["torch._dynamo"] = torch._dynamo = _Deferred("torch._dynamo")
+    sys.modules.setdefault("torch._dynamo", _Deferred("torch._dynamo"))
 
 
 @functools.cache

@@ -8,10 +8,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter
-
 from surgical_marl.bench.course import Course, make_course
 from surgical_marl.bench.machine import machine
 from surgical_marl.bench.sim import Point, Speed, measure, sweep
@@ -158,6 +154,10 @@ def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
 
 def draw(points: Sequence[Point], title: str, out: Path) -> None:
     """A sweep as a picture: physics steps as lines, environment steps dashed; a GPU's with full dots."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import EngFormatter
+
     figure = Figure(figsize=(8, 4.8), layout="constrained")
     FigureCanvasAgg(figure)
     axis = figure.subplots()
