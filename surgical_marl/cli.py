@@ -141,11 +141,12 @@ def _parser() -> argparse.ArgumentParser:
     export.add_argument("--control", type=_one_of(_CONTROL), default=_CONTROL[0], metavar="|".join(_CONTROL))
     export.set_defaults(command=_export, name="export")
 
-    bench = commands.add_parser("bench", help="measure how fast this machine simulates")
-    bench.add_argument("kind", type=_one_of(("sim",)), metavar="sim")
+    bench = commands.add_parser("bench", help="measure how fast this machine simulates and draws")
+    bench.add_argument("kind", type=_one_of(("sim", "render")), metavar="sim|render")
     bench.add_argument("--task", default="reach", help=f"one of: {', '.join(list_tasks())}")
     bench.add_argument("--scene", default="psm", help="a name (see `list scenes`) or a .yaml file")
-    bench.add_argument("--num-envs", type=_whole(1), metavar="N", help="default: 4096 on a CPU, 131072 on a GPU")
+    bench.add_argument("--num-envs", type=_whole(1), metavar="N", 
+                       help="default: 4096 on a CPU, 131072 on a GPU; of render 64 and 8192")  # fmt: skip
     bench.add_argument("--engine", type=_one_of(_BENCHED), default="all", metavar="|".join(_BENCHED))
     bench.add_argument("--device", type=_one_of(_DEVICES), default="auto", metavar="|".join(_DEVICES))
     bench.add_argument("--decimation", type=_whole(1), default=1, metavar="K", help="physics steps an environment step")
@@ -211,6 +212,8 @@ def _bench(arguments: argparse.Namespace) -> None:
     if arguments.task not in list_tasks():
         raise unknown("task", arguments.task, list_tasks())
     find("scenes", arguments.scene)
+    if arguments.kind == "render":
+        return _bench_render(arguments)
     if arguments.sweep and arguments.num_envs:
         raise ValueError(f"--sweep takes every number of environments: leave --num-envs {arguments.num_envs} out")
     if arguments.out and not arguments.sweep:
@@ -225,6 +228,15 @@ def _bench(arguments: argparse.Namespace) -> None:
         engines = _BENCHED[1:] if arguments.engine == "all" else (arguments.engine,)
         keys = ("task", "scene", "num_envs", "device", "decimation", "motion")
         print(run({k: getattr(arguments, k) for k in keys}, engines, arguments.sweep, arguments.json, arguments.out))
+
+
+def _bench_render(arguments: argparse.Namespace) -> None:
+    if arguments.sweep or arguments.cold or arguments.out:
+        raise ValueError("bench render takes --scene, --num-envs, --device and --json: leave the rest out")
+
+    from surgical_marl.bench.render import run
+
+    print(run(arguments.scene, arguments.num_envs, arguments.device, arguments.json))
 
 
 @contextlib.contextmanager
