@@ -271,8 +271,6 @@ def _read_resumed(settings: Settings, run: Path) -> dict[str, Any]:
         before, now = getattr(old, item.name), getattr(settings, item.name)
         if item.name not in CHANGEABLE and before != now:
             raise ValueError(f"the run in {run} has {item.name} {before!r}, and cannot go on with {now!r}")
-    if "env" not in state:
-        raise ValueError(f"{run} holds an exported policy, which can be evaluated but not resumed")
     if state["iteration"] >= settings.iterations:
         raise ValueError(
             f"the run in {run} already has {state['iteration']} iterations: ask for more than {settings.iterations}"
