@@ -5,8 +5,8 @@
 
 Runs go to `runs/policies/<task>-<scene>/seed<seed>`. It may be stopped at any time and started again: it goes on with
 unfinished runs, and leaves finished runs and exported policies as they are (delete a policy's folder to make it anew).
-What each process says is in a log beside its run. Where git is missing, `GIT_COMMIT` says which commit trains. At the end
-the table in `policies/README.md` is written anew: with all policies there that is all it does.
+What each process says is in a log beside its run. Where git is missing, `GIT_COMMIT` says which commit trains. At the
+end the table in `policies/README.md` is written anew: with all policies there that is all it does.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 What such a file takes, for N agents of its type at once:
 
     observation  [N, d + n] float32, what the agent observes; where n > 1 agents share the type, then a one-hot of the
-                 agent's place among them ("joint": what all agents observe, in the order of the scene)
+                 agent's place among them ("joint": what all agents observe, type by type)
     image, target  [N, H, W, 3] uint8, of an agent that sees pictures
 
 and gives `action` [N, a] float32 in [-1, 1], without exploration noise. Observations are normalised inside.
