@@ -127,7 +127,7 @@ def _with_interval(key: str, result: Mapping[str, Any]) -> str:
 
 def _how_trained(folder: Path, settings: Settings) -> str:
     last, notes = _training(folder), read_origin(folder)
-    device, commit, begun = (notes["origin"].get(key) or "unknown" for key in ("device", "commit", "begun"))
+    device, commit, started = (notes["origin"].get(key) or "unknown" for key in ("device", "commit", "started"))
     command = f"surgical-marl train {settings.task} --scene {settings.scene} --seed {settings.seed}"
     steps = f"{last['env_steps']:,.0f} environment steps in {last['seconds']:,.0f} s of rollouts and updates"
     return f"""## How it was trained
@@ -135,7 +135,7 @@ def _how_trained(folder: Path, settings: Settings) -> str:
 By `{command}` with the settings in `config.yaml`.
 
 - {settings.algo}, {settings.num_envs:,} environments, {last["iteration"]:,.0f} iterations: {steps}.
-- On {device}, begun {begun}, commit `{commit}`.
+- On {device}, started {started}, commit `{commit}`.
 - {", ".join(f"{name} {version}" for name, version in notes["versions"].items())}.
 
 ![learning curve]({CURVE})

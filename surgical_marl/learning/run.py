@@ -47,7 +47,7 @@ def check_writable(out: Path) -> None:
 
 
 def write_config(run: Path, settings: Settings) -> None:
-    """Write the settings, and what will make the run: versions of packages, device, commit and the time now."""
+    """Write the settings, and what makes the run: versions of packages, device, commit, time of this start."""
     versions = {"python": platform.python_version()}
     for name in PACKAGES:
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
@@ -58,7 +58,7 @@ def write_config(run: Path, settings: Settings) -> None:
     origin = {
         "device": names["cpu"] if settings.device == "cpu" else names["gpu"] or names["cpu"],
         "commit": _commit(),
-        "begun": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
+        "started": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
     }
     text = config_text(settings, {"versions": versions, "origin": origin})
     write_atomic(run / CONFIG, lambda path: path.write_text(text))
