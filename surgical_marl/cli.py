@@ -198,9 +198,6 @@ def _check(arguments: argparse.Namespace) -> int:
 
 
 def _export_policy(arguments: argparse.Namespace) -> None:
-    for run in arguments.runs:
-        find("policies", run)
-
     from surgical_marl.learning.export import export_policy
 
     print(export_policy(arguments.runs, arguments.out))
@@ -318,9 +315,8 @@ def _eval(arguments: argparse.Namespace) -> None:
 
 
 def _run_folder(settings: Any) -> Path:
-    scene = Path(settings.scene).stem
-    stamp = time.strftime("%Y%m%d-%H%M%S")
-    return Path("runs") / f"{settings.task}-{scene}-{settings.algo}-seed{settings.seed}-{stamp}"
+    name = f"{settings.task}-{Path(settings.scene).stem}-{settings.algo}-seed{settings.seed}"
+    return Path("runs") / f"{name}-{time.strftime('%Y%m%d-%H%M%S')}"
 
 
 def _one_of(good: Sequence[str]) -> Callable[[str], str]:

@@ -98,8 +98,8 @@ The scene: {scene.description}; agents {", ".join(f"`{agent}`" for agent in scen
 
 def _how_well(result: Mapping[str, Any], name: str) -> str:
     every = result["seeds"]
-    count = len(every["runs"])
-    rows = [f"| | these weights (seed {every['best']}) | {count} training seeds |", "|---|---|---|"]
+    together = f"all training seeds ({len(every['runs'])})"
+    rows = [f"| | these weights (seed {every['best']}) | {together} |", "|---|---|---|"]
     rows += [
         f"| {title(key)} | {_with_interval(key, result)} | {_with_interval(key, every['aggregate'])} |"
         for key in SHOWN
