@@ -189,8 +189,6 @@ def _read_resumed(settings: Settings, run: Path) -> dict[str, Any]:
             raise ValueError(f"the run in {run} has {item.name} {before!r}, and cannot go on with {now!r}")
     if (before := old.ppo.normalise_values) != settings.ppo.normalise_values:
         raise ValueError(f"the run in {run} has ppo.normalise_values {before!r}, and cannot go on with {not before!r}")
-    if "env" not in state:
-        raise ValueError(f"{run} holds an exported policy, which can be evaluated but not resumed")
     if state["iteration"] >= settings.iterations:
         raise ValueError(
             f"the run in {run} already has {state['iteration']} iterations: ask for more than {settings.iterations}"
