@@ -7,6 +7,7 @@ one agent (A = 1) this is PPO, by the same code.
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Any
 
 import torch
@@ -17,6 +18,7 @@ from torch import Tensor, nn
 
 from surgical_marl.interfaces.rsl_rl import RslRlVecEnv
 from surgical_marl.learning.config import Settings
+from surgical_marl.learning.constraint import Constraint
 from surgical_marl.learning.models import Gaussian, MultiAgentActor, MultiAgentModel
 from surgical_marl.learning.storage import MultiAgentStorage
 from surgical_marl.learning.values import ValueScale
@@ -36,6 +38,7 @@ class MAPPO(PPO):
     Args:
         team_reward: give every agent the sum of all agents' rewards, instead of its own.
         normalise_values: the critic predicts returns of unit variance; all else is in units of reward.
+        constraint: on a cost; the critic then has two values for each agent, of rewards and of costs.
         ppo: arguments of `rsl_rl.algorithms.PPO`.
     """
 
@@ -47,6 +50,7 @@ class MAPPO(PPO):
         *,
         team_reward: bool = False,
         normalise_values: bool = False,
+        constraint: Constraint | None = None,
         **ppo: Any,
     ) -> None:
         super().__init__(actor, critic, storage, **ppo)
@@ -55,6 +59,9 @@ class MAPPO(PPO):
         self.scale = ValueScale(storage.values.shape[-1]).to(self.device)
         # What learns beside the networks: it stands in checkpoints.
         self.options = nn.ModuleDict({"scale": self.scale} if normalise_values else {})
+        self.constraint = constraint
+        if constraint is not None:
+            self.options["constraint"] = constraint
         # As a tensor the learning rate adapts without the host having to read the divergence.
         self._rate = torch.tensor(float(self.learning_rate), device=self.device)
         self._cuda = torch.device(self.device).type == "cuda"
@@ -73,9 +80,13 @@ class MAPPO(PPO):
 
         A time-out is worth the value of the state it was cut off in: gamma * V(final state).
         """
-        rewards = extras["agent_rewards"]
+        parts = [extras["agent_rewards"]]
+        if self.constraint is not None:
+            parts.append(self.constraint.add(extras["infos"], dones))
+        rewards = torch.stack(parts, -1)
         if self.team_reward:
-            rewards = rewards.sum(-1, keepdim=True).expand_as(rewards)
+            rewards = rewards.sum(-2, keepdim=True).expand_as(rewards)
+        rewards = rewards.flatten(-2)
         final_values = self._values(extras["final_obs"])
         self.transition.rewards = rewards + self.gamma * final_values * extras["time_outs"].unsqueeze(-1)
         self.transition.dones = dones
@@ -113,6 +124,9 @@ class MAPPO(PPO):
         if "scale" in self.options:
             self.scale.learn(storage.returns.flatten(0, 1))
         advantages = storage.returns - storage.values
+        if self.constraint is not None:
+            self.constraint.update()
+            advantages = self.constraint.weigh(advantages.unflatten(-1, (-1, 2)))
         storage.advantages.copy_((advantages - advantages.mean()) / (advantages.std() + 1e-8))
 
     def update(self) -> dict[str, float]:
@@ -192,18 +206,24 @@ class MAPPO(PPO):
         if cfg.get("multi_gpu"):
             raise ValueError("MAPPO runs on one GPU: start it without torchrun")
         layout = env.layout
+        options, constraint = dict(cfg["algorithm"]), None
+        if bounds := options.pop("constraint"):
+            constraint = Constraint(layout, env.num_envs, **bounds).to(device)
+        per_agent = 1 if constraint is None else 2
+        num_values = per_agent * layout.num_agents
         actor = MultiAgentActor(obs, layout.action_sizes, **cfg["actor"]).to(device)
         if cfg["centralised_critic"]:
             # in the state's pictures agents are no axis: they are those of the one agent that has any
             seen = {name: pictures[:, 0] for name, pictures in obs.items() if name.endswith(PICTURES)}
             sample = TensorDict({"state": obs["state"], **seen}, batch_size=obs.batch_size)
-            critic: nn.Module = make_model(sample, ["state", *seen], layout.num_agents, **cfg["critic"])
+            critic: nn.Module = make_model(sample, ["state", *seen], num_values, **cfg["critic"])
         else:
-            critic = MultiAgentModel(obs, dict.fromkeys(layout.counts, 1), **cfg["critic"])
+            critic = MultiAgentModel(obs, dict.fromkeys(layout.counts, per_agent), **cfg["critic"])
         steps = cfg["num_steps_per_env"]
-        storage = MultiAgentStorage(layout.num_agents, env.num_envs, steps, obs, env.num_actions, device)
-        algorithm = {name: value for name, value in cfg["algorithm"].items() if name != "class_name"}
-        return MAPPO(actor, critic.to(device), storage, device=device, **algorithm)
+        sizes = (layout.num_agents, num_values, env.num_envs, steps)
+        storage = MultiAgentStorage(*sizes, obs, env.num_actions, device)
+        del options["class_name"]
+        return MAPPO(actor, critic.to(device), storage, constraint=constraint, device=device, **options)
 
 
 def rsl_rl_config(settings: Settings) -> dict[str, Any]:
@@ -229,6 +249,7 @@ def rsl_rl_config(settings: Settings) -> dict[str, Any]:
             "class_name": MAPPO,
             "team_reward": settings.team_reward,
             "normalise_values": ppo.normalise_values,
+            "constraint": asdict(settings.constraint) if settings.constraint.cost != "none" else None,
             "learning_rate": ppo.learning_rate,
             "schedule": ppo.schedule,
             "desired_kl": ppo.desired_kl,

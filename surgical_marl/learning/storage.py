@@ -9,14 +9,21 @@ from torch import Tensor
 
 
 class MultiAgentStorage(RolloutStorage):
-    """rsl_rl's rollout storage with log-probabilities, values, rewards and advantages A wide."""
+    """rsl_rl's rollout storage with log-probabilities and advantages A wide, and rewards, values and returns W wide.
+
+    W is A, or 2 A where each agent has a reward and a cost: one after the other, agent by agent.
+    """
 
     distribution_params: tuple[Tensor, ...] | None
 
-    def __init__(self, num_agents: int, num_envs: int, steps: int, obs: TensorDict, actions: int, device: str) -> None:
+    def __init__(
+        self, num_agents: int, num_values: int, num_envs: int, steps: int, obs: TensorDict, actions: int, device: str
+    ) -> None:
         super().__init__("rl", num_envs, steps, obs, [actions], device)
-        for name in ("rewards", "values", "actions_log_prob", "returns", "advantages"):
+        for name in ("actions_log_prob", "advantages"):
             setattr(self, name, torch.zeros(steps, num_envs, num_agents, device=device))
+        for name in ("rewards", "values", "returns"):
+            setattr(self, name, torch.zeros(steps, num_envs, num_values, device=device))
 
     def add_transition(self, transition: RolloutStorage.Transition) -> None:
         """Copy one step of all environments into the storage."""
