@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from tqdm import tqdm
 
 from surgical_marl.learning.config import Settings
-from surgical_marl.learning.curve import draw_curve
+from surgical_marl.learning.memory import check_room, in_memory
 from surgical_marl.learning.run import (
     METRICS,
     check_writable,
@@ -70,6 +70,14 @@ def make_env(settings: Settings, num_envs: int | None = None) -> BatchedEnv:
     )
 
 
+def make_training(settings: Settings) -> Training:
+    """A run in memory. ValueError if it has no room there."""
+    env = make_env(settings)
+    check_room(settings, env)
+    with in_memory(settings.num_envs):
+        return Training(settings, env)
+
+
 def train(settings: Settings, *, out: Path, resume: Path | None = None) -> Path:
     """Train until `settings.iterations`, and return the run folder.
 
@@ -80,7 +88,8 @@ def train(settings: Settings, *, out: Path, resume: Path | None = None) -> Path:
         resume: the run folder to continue from its checkpoint.
 
     Raises:
-        ValueError: the folder cannot be used, or the settings do not fit the run to resume.
+        ValueError: the folder cannot be used, the settings do not fit the run to resume, or so many environments do not
+            fit into memory.
         FloatingPointError: training produced NaN; the last good checkpoint is kept.
         KeyboardInterrupt, SystemExit: after Ctrl-C or SIGTERM, when the checkpoint is written.
     """
@@ -98,7 +107,7 @@ def train(settings: Settings, *, out: Path, resume: Path | None = None) -> Path:
     )
 
     try:
-        training = Training(settings, make_env(settings))
+        training = make_training(settings)
     except ValueError:
         if new:
             out.rmdir()  # it is empty yet
@@ -108,7 +117,8 @@ def train(settings: Settings, *, out: Path, resume: Path | None = None) -> Path:
     write_config(out, settings)
     write_metrics(out, training.columns, rows)
     write_checkpoint(out, training.state())
-    _run(training, out)
+    with in_memory(settings.num_envs):
+        _run(training, out)
     return out
 
 
@@ -122,6 +132,8 @@ def _run(training: Training, out: Path) -> None:
                 write_checkpoint(out, training.state())
         log.catch_up()
         write_checkpoint(out, training.state())
+    from surgical_marl.learning.curve import draw_curve  # matplotlib: not before training has begun
+
     draw_curve(out, f"{settings.task} in {settings.scene}, {settings.algo}, seed {settings.seed}")
     if received:
         raise KeyboardInterrupt if received[0] == signal.SIGINT else SystemExit(128 + received[0])
