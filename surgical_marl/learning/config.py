@@ -69,7 +69,7 @@ class ConstraintSettings(_Checked):
 
 @dataclass(frozen=True)
 class NetworkSettings(_Checked):
-    """Actor and critic: one MLP each of this shape."""
+    """Actor and critic: one MLP each of this shape, which a GRU or LSTM cell may come before."""
 
     prefix: ClassVar[str] = "network."
 
@@ -77,6 +77,7 @@ class NetworkSettings(_Checked):
     activation: Literal["elu", "relu", "tanh", "selu", "gelu"] = "elu"
     normalise_observations: bool = True
     init_std: float = _number(0.5, 0.001, 10.0)
+    recurrent: Literal["none", "gru", "lstm"] = "none"
 
 
 @dataclass(frozen=True)
@@ -116,6 +117,11 @@ class Settings(_Checked):
             raise ValueError(
                 "ppo.mini_batches must be at most num_envs * steps_per_iteration "
                 f"= {samples}, not {self.ppo.mini_batches}"
+            )
+        if self.network.recurrent != "none" and self.ppo.mini_batches > self.num_envs:
+            raise ValueError(
+                f"ppo.mini_batches must be at most num_envs = {self.num_envs} with network.recurrent, "
+                f"not {self.ppo.mini_batches}"
             )
 
 
