@@ -55,8 +55,21 @@ class PPOSettings(_Checked):
 
 
 @dataclass(frozen=True)
+class ConstraintSettings(_Checked):
+    """A cost that few episodes may have, instead of a weight of a reward term (see `learning/constraint.py`)."""
+
+    prefix: ClassVar[str] = "constraint."
+
+    cost: Literal["none", "collision", "distance", "force", "limit", "speed"] = "none"
+    limit: float = _number(0.005, 0.0, 1.0)
+    kp: float = _number(10.0, 0.0, 1e6)
+    ki: float = _number(1.0, 0.0, 1e6)
+    kd: float = _number(10.0, 0.0, 1e6)
+
+
+@dataclass(frozen=True)
 class NetworkSettings(_Checked):
-    """Actor and critic: one MLP each of this shape."""
+    """Actor and critic: one MLP each of this shape, which a GRU or LSTM cell may come before."""
 
     prefix: ClassVar[str] = "network."
 
@@ -64,6 +77,7 @@ class NetworkSettings(_Checked):
     activation: Literal["elu", "relu", "tanh", "selu", "gelu"] = "elu"
     normalise_observations: bool = True
     init_std: float = _number(0.5, 0.001, 10.0)
+    recurrent: Literal["none", "gru", "lstm"] = "none"
 
 
 @dataclass(frozen=True)
@@ -93,6 +107,7 @@ class Settings(_Checked):
     team_reward: bool = False
     reward: dict[str, float] = field(default_factory=dict)
     ppo: PPOSettings = field(default_factory=PPOSettings)
+    constraint: ConstraintSettings = field(default_factory=ConstraintSettings)
     network: NetworkSettings = field(default_factory=NetworkSettings)
 
     def __post_init__(self) -> None:
@@ -102,6 +117,11 @@ class Settings(_Checked):
             raise ValueError(
                 "ppo.mini_batches must be at most num_envs * steps_per_iteration "
                 f"= {samples}, not {self.ppo.mini_batches}"
+            )
+        if self.network.recurrent != "none" and self.ppo.mini_batches > self.num_envs:
+            raise ValueError(
+                f"ppo.mini_batches must be at most num_envs = {self.num_envs} with network.recurrent, "
+                f"not {self.ppo.mini_batches}"
             )
 
 
@@ -132,16 +152,17 @@ def load_config(task: str, scene: str, overrides: Iterable[str] = ()) -> Setting
 def read_config(path: Path, overrides: Iterable[str] = ()) -> Settings:
     """Settings from the `config.yaml` of a run, with overrides as for `load_config`."""
     values = _read_yaml(path)
-    values.pop("versions", None)
+    for note in ("versions", "origin"):
+        values.pop(note, None)
     _reject_unknown(values)
     return _build(_override(values, overrides))
 
 
-def config_text(settings: Settings, versions: Mapping[str, str]) -> str:
-    """The `config.yaml` of a run: what `read_config` reads, and versions of packages."""
+def config_text(settings: Settings, notes: Mapping[str, Mapping[str, Any]]) -> str:
+    """The `config.yaml` of a run: what `read_config` reads, and notes that it passes over."""
     values = asdict(settings)
     values["network"]["hidden"] = list(settings.network.hidden)
-    return yaml.safe_dump({**values, "versions": dict(versions)}, sort_keys=False)
+    return yaml.safe_dump({**values, **notes}, sort_keys=False)
 
 
 def _read_yaml(path: Path) -> dict[str, Any]:
