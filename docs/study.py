@@ -97,11 +97,18 @@ def taken_over(
     """
     import torch
 
+    from surgical_marl.acting import forget
+
     def acting(observations: Mapping[str, Any]) -> dict[str, Any]:
         actions, others = dict(policy(observations)), instead(observations)
         late = torch.as_tensor(env.steps, device=actions[arm].device)[:, None] >= start
         return {**actions, arm: torch.where(late, others[arm], actions[arm])}
 
+    def reset(ended: Any = None) -> None:
+        for each in (policy, instead):
+            forget(each, ended)
+
+    acting.reset = reset  # type: ignore[attr-defined]  # for a policy that remembers
     return acting
 
 

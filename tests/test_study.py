@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 
+from surgical_marl.acting import forget
 from surgical_marl.learning.config import load_config
 from surgical_marl.learning.run import write_config, write_metrics
 
@@ -82,7 +83,12 @@ def test_an_arm_is_taken_over() -> None:
     env = SimpleNamespace(steps=torch.tensor([0, 4, 5, 9]))
     policy = lambda observations: {name: torch.ones(4, 2) for name in ("a", "b")}  # noqa: E731
     instead = lambda observations: {name: -torch.ones(4, 2) for name in ("a", "b")}  # noqa: E731
-    actions = study.taken_over(policy, env, "b", instead, start=5)({})
+    forgotten: list[Any] = []
+    policy.reset = forgotten.append  # type: ignore[attr-defined]
+    acting = study.taken_over(policy, env, "b", instead, start=5)
+    forget(acting, "ended")
+    assert forgotten == ["ended"]
+    actions = acting({})
     assert actions["a"].tolist() == [[1, 1]] * 4
     assert actions["b"].tolist() == [[1, 1]] * 2 + [[-1, -1]] * 2
 

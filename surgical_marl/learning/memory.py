@@ -5,13 +5,13 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-import numpy as np
 import torch
 
 from surgical_marl.interfaces.rsl_rl import Layout
 from surgical_marl.learning.config import Settings
+from surgical_marl.learning.policy import zeros
 from surgical_marl.observations import proprioception
 
 if TYPE_CHECKING:
@@ -25,8 +25,8 @@ def rollout_bytes(settings: Settings, env: BatchedEnv) -> int:
     actions, their means and deviations; and of each agent log-probability and advantage, and of its reward, and cost if
     that is bounded, value and return."""
     layout = Layout(env, joint=settings.algo == "joint")
-    seen = layout.stack({agent: _zeros(env.observation_space(agent)) for agent in layout.agents})
-    parts = [*seen.values(), proprioception(_zeros(env.state_space))]
+    seen = layout.stack({agent: zeros(env.observation_space(agent)) for agent in layout.agents})
+    parts = [*seen.values(), proprioception(zeros(env.state_space))]
     observed = sum(part.numel() * part.element_size() for part in parts)
     each = 5 if settings.constraint.cost == "none" else 8
     return settings.steps_per_iteration * (observed + 4 * (3 * layout.num_actions + each * layout.num_agents) + 1)
@@ -63,10 +63,3 @@ def _free(device: str) -> int | None:
         lines = Path("/proc/meminfo").read_text().splitlines()
         return 1024 * int(next(line.split()[1] for line in lines if line.startswith("MemAvailable:")))
     return None
-
-
-def _zeros(space: Any) -> Any:
-    """One observation, of a Box or of a Dict with pictures."""
-    if hasattr(space, "spaces"):
-        return {name: _zeros(part) for name, part in space.spaces.items()}
-    return torch.from_numpy(np.zeros((1, *space.shape), space.dtype))

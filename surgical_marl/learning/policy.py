@@ -116,14 +116,14 @@ def _read(folder: Path) -> tuple[dict[str, list[int]], dict[str, Tensor]]:
 
 
 def _samples(env: BatchedEnv, layout: Layout) -> TensorDict:
-    zeros = {agent: _zeros(env.observation_space(agent)) for agent in layout.agents}
-    return TensorDict({**layout.stack(zeros)}, batch_size=[1])
+    seen = {agent: zeros(env.observation_space(agent)) for agent in layout.agents}
+    return TensorDict({**layout.stack(seen)}, batch_size=[1])
 
 
-def _zeros(space: Any) -> Any:
+def zeros(space: Any) -> Any:
     """One observation, of a Box or of a Dict with pictures."""
     if hasattr(space, "spaces"):
-        return {name: _zeros(part) for name, part in space.spaces.items()}
+        return {name: zeros(part) for name, part in space.spaces.items()}
     return torch.from_numpy(np.zeros((1, *space.shape), space.dtype))
 
 
