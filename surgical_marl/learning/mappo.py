@@ -185,7 +185,8 @@ class MAPPO(PPO):
     def _precision(self) -> torch.autocast:
         """bfloat16 for the networks' products if that was asked for; the same when acting and learning, or ratios
         would not begin at 1."""
-        return torch.autocast("cuda" if self._cuda else "cpu", torch.bfloat16, enabled=self.use_mixed_precision)
+        enabled = self.use_mixed_precision and self._cuda
+        return torch.autocast("cuda" if self._cuda else "cpu", torch.bfloat16, enabled=enabled)
 
     def _adapt_rate(self, divergence: Tensor) -> None:
         """rsl_rl's rule: slower above twice the wanted divergence, faster below half of it."""
