@@ -20,7 +20,6 @@ from surgical_marl.learning import config, train, training
 from surgical_marl.learning.config import ConstraintSettings, NetworkSettings, PPOSettings, Settings, load_config
 from surgical_marl.learning.episodes import Episodes
 from surgical_marl.learning.policy import (
-    export_policy,
     load_policy,
     random_policy,
     untrained_policy,
@@ -271,12 +270,10 @@ def test_folders_that_cannot_be_used(tmp_path: Path, fakes: list[Any]) -> None:
     run = train.train(replace(SMALL, iterations=1), out=tmp_path / "run")
     (tmp_path / "file").write_text("")
     (tmp_path / "empty").mkdir()
-    exported = export_policy(run, tmp_path / "exported")
     cases: list[tuple[Settings, dict[str, Any], str]] = [
         (SMALL, {"out": run}, "already holds a run"),
         (SMALL, {"out": tmp_path / "file" / "run"}, "cannot write"),
         (SMALL, {"out": tmp_path / "new", "resume": tmp_path / "empty"}, "not a run folder"),
-        (SMALL, {"out": tmp_path / "new", "resume": exported}, "exported policy"),
         (replace(SMALL, iterations=1), {"out": run, "resume": run}, "already has 1 iterations"),
         (replace(SMALL, num_envs=8), {"out": run, "resume": run}, "num_envs 32"),
         (replace(SMALL, **OPTIONS[1]), {"out": run, "resume": run}, "normalise_values False"),
@@ -311,13 +308,12 @@ def test_writing_is_atomic(tmp_path: Path) -> None:
 
 def test_policies_act_alike_on_numpy_and_tensors(tmp_path: Path, fakes: list[Any]) -> None:
     run = train.train(replace(SMALL, iterations=1), out=tmp_path / "run")
-    exported = export_policy(run, tmp_path / "exported")
     env: Any = FakeEnv(COUNTS, SIZES, num_envs=4)
     observations, *_ = env.reset(0)
     arrays = {agent: value.numpy() for agent, value in observations.items()}
     policy = load_policy(run, env)
     actions = policy(observations)
-    for agent, action in load_policy(exported, env)(arrays).items():
+    for agent, action in policy(arrays).items():
         assert action.shape == (4, env.sizes[agent]) and abs(action).max() <= 1
         torch.testing.assert_close(torch.from_numpy(action), actions[agent])
     alone = policy({agent: value[1] for agent, value in arrays.items()})

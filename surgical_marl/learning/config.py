@@ -152,16 +152,17 @@ def load_config(task: str, scene: str, overrides: Iterable[str] = ()) -> Setting
 def read_config(path: Path, overrides: Iterable[str] = ()) -> Settings:
     """Settings from the `config.yaml` of a run, with overrides as for `load_config`."""
     values = _read_yaml(path)
-    values.pop("versions", None)
+    for note in ("versions", "origin"):
+        values.pop(note, None)
     _reject_unknown(values)
     return _build(_override(values, overrides))
 
 
-def config_text(settings: Settings, versions: Mapping[str, str]) -> str:
-    """The `config.yaml` of a run: what `read_config` reads, and versions of packages."""
+def config_text(settings: Settings, notes: Mapping[str, Mapping[str, Any]]) -> str:
+    """The `config.yaml` of a run: what `read_config` reads, and notes that it passes over."""
     values = asdict(settings)
     values["network"]["hidden"] = list(settings.network.hidden)
-    return yaml.safe_dump({**values, "versions": dict(versions)}, sort_keys=False)
+    return yaml.safe_dump({**values, **notes}, sort_keys=False)
 
 
 def _read_yaml(path: Path) -> dict[str, Any]:

@@ -7,7 +7,6 @@ episodes begin (`surgical_marl/acting.py`).
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,15 +23,8 @@ from surgical_marl.learning.config import Settings
 from surgical_marl.learning.mappo import rsl_rl_config
 from surgical_marl.learning.models import MultiAgentActor
 from surgical_marl.learning.recurrent import cleared
-from surgical_marl.learning.run import (
-    CONFIG,
-    CURVE,
-    METRICS,
-    claim_folder,
-    read_checkpoint,
-    read_settings,
-    write_checkpoint,
-)
+from surgical_marl.learning.run import CHECKPOINT, CONFIG, read_checkpoint, read_settings
+from surgical_marl.learning.weights import holds_weights, read_weights
 from surgical_marl.observations import each, proprioception
 from surgical_marl.oracle import oracle
 
@@ -57,21 +49,29 @@ def load_policy(run: str | Path, env: BatchedEnv) -> Policy:
         return random_policy(env)
     if run == "oracle":
         return oracle(env)
+    return acting_policy(*load_actor(run, env), str(env.device))
+
+
+def load_actor(run: str | Path, env: BatchedEnv) -> tuple[MultiAgentActor, Layout]:
+    """The networks of a run or of a policy that ships, on the CPU, and how agents are stacked for them.
+
+    ValueError as for `load_policy`.
+    """
     folder = find_run(run)
-    settings, checkpoint = read_settings(folder), read_checkpoint(folder)
+    settings = read_settings(folder)
+    trained, state = _read(folder)
     layout = Layout(env, joint=settings.algo == "joint")
-    wanted, trained = (
-        _groups(env, layout),
-        {name: list(widths) for name, widths in checkpoint["groups"].items()},
-    )
-    if wanted != trained:
+    if (wanted := _groups(env, layout)) != trained:
         raise ValueError(
             f"the policy in {run} was trained in scene {settings.scene!r}, whose agents "
             f"({_describe(trained)}) are not those of this environment ({_describe(wanted)})"
         )
     actor = _actor(settings, env, layout)
-    actor.load_state_dict(checkpoint["algorithm"]["actor_state_dict"])
-    return acting_policy(actor, layout, str(env.device))
+    try:
+        actor.load_state_dict(state)
+    except RuntimeError:
+        raise ValueError(f"the weights in {run} are not of the network in its {CONFIG}: restore both") from None
+    return actor, layout
 
 
 def untrained_policy(env: BatchedEnv, settings: Settings | None = None) -> Policy:
@@ -106,22 +106,13 @@ def find_run(run: str | Path) -> Path:
     raise ValueError(f"{str(run)!r} is not a run folder, nor zero, random, oracle or a policy that ships ({shipped})")
 
 
-def export_policy(run: str | Path, out: Path) -> Path:
-    """Copy what acting needs of a run to a new folder: not the state of training."""
-    folder, out = find_run(run), Path(out)
+def _read(folder: Path) -> tuple[dict[str, list[int]], dict[str, Tensor]]:
+    """Agents and widths of each group, and the state of the actor: of a policy that ships, or of a run."""
+    if holds_weights(folder) and not (folder / CHECKPOINT).is_file():
+        return read_weights(folder)
     checkpoint = read_checkpoint(folder)
-    claim_folder(out)
-    weights = {"actor_state_dict": checkpoint["algorithm"]["actor_state_dict"]}
-    small = {
-        "iteration": checkpoint["iteration"],
-        "groups": checkpoint["groups"],
-        "algorithm": weights,
-    }
-    write_checkpoint(out, small)
-    for name in (CONFIG, METRICS, CURVE):
-        if (folder / name).is_file():
-            shutil.copyfile(folder / name, out / name)
-    return out
+    groups = {name: list(widths) for name, widths in checkpoint["groups"].items()}
+    return groups, checkpoint["algorithm"]["actor_state_dict"]
 
 
 def _samples(env: BatchedEnv, layout: Layout) -> TensorDict:

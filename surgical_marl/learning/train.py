@@ -191,8 +191,6 @@ def _read_resumed(settings: Settings, run: Path) -> dict[str, Any]:
         fixed = name in FIXED or name.partition(".")[0] not in CHANGEABLE
         if fixed and before != asked[name]:
             raise ValueError(f"the run in {run} has {name} {before!r}, and cannot go on with {asked[name]!r}")
-    if "env" not in state:
-        raise ValueError(f"{run} holds an exported policy, which can be evaluated but not resumed")
     if state["iteration"] >= settings.iterations:
         raise ValueError(
             f"the run in {run} already has {state['iteration']} iterations: ask for more than {settings.iterations}"
