@@ -62,8 +62,6 @@ class MAPPO(PPO):
         # What learns beside the networks: it stands in checkpoints.
         self.options = nn.ModuleDict({"scale": self.scale} if normalise_values else {})
         self.memory = Memory(storage.num_envs, actor, critic, self.device)
-        if actor.is_recurrent:
-            self.options["memory"] = self.memory
         self.constraint = constraint
         if constraint is not None:
             self.options["constraint"] = constraint
