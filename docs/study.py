@@ -14,6 +14,7 @@ import argparse
 import contextlib
 import json
 import multiprocessing
+import signal
 import sys
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -168,6 +169,8 @@ def _parse(argv: list[str] | None) -> argparse.Namespace:
 
 
 if __name__ == "__main__":
+    # what ends this process ends its runs as well: the next call goes on from their checkpoints
+    signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     try:
         sys.exit(main())
     except KeyboardInterrupt:
