@@ -71,4 +71,4 @@ def kept(training: Training) -> list[torch.Tensor]:
     """What a rollout and an update leave for the next ones."""
     algorithm = training.algorithm
     stored = [part for part in vars(algorithm.storage).values() if isinstance(part, torch.Tensor)]
-    return [*algorithm.options.buffers(), *algorithm.memory.begun, *stored]
+    return [*algorithm.options.buffers(), *algorithm.memory.buffers(), *algorithm.memory.begun, *stored]

@@ -134,6 +134,8 @@ def test_resume_is_bit_for_bit(options: dict[str, Any], tmp_path: Path, fakes: l
         moments = first["algorithm"]["optimizer_state_dict"]["state"]
         for index, moment in again["algorithm"]["optimizer_state_dict"]["state"].items():
             assert torch.equal(moment["exp_avg_sq"], moments[index]["exp_avg_sq"])
+        for name, memory in (first["memory"] or {}).items():
+            assert torch.equal(again["memory"][name], memory) and memory.any()
         assert torch.equal(again["random"], first["random"])
         assert torch.equal(again["env"]["observations"]["state"], first["env"]["observations"]["state"])
         assert [row["iteration"] for row in read_metrics(run)] == [1, 2, 3, 4]

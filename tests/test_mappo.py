@@ -194,7 +194,7 @@ def test_one_agent_is_rsl_rls_ppo(schedule: Any, clip_value: bool) -> None:
         setattr(storage, name, copy.deepcopy(getattr(mine, name)))
     storage.observations["actor"] = mine.observations["psm"][:, :, 0].clone()
     storage.observations["critic"] = mine.observations["state"].clone()
-    own = ("class_name", "team_reward", "normalise_values", "constraint")
+    own = ("class_name", "team_reward", "normalise_values", "constraint", "use_mixed_precision")
     arguments = {k: v for k, v in config["algorithm"].items() if k not in own}
     reference = PPO(actor, critic, storage, **arguments)
     reference.train_mode()

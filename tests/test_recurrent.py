@@ -126,7 +126,7 @@ def test_memories_stay_where_they_are() -> None:
     places = [memory.data_ptr() for memory in (*algorithm.memory.buffers(), *algorithm.memory.begun)]
     roll_out(env, algorithm)
     algorithm.update()
-    algorithm.load(algorithm.save())
+    algorithm.memory.load_state_dict(algorithm.memory.state_dict())
     assert [m.data_ptr() for m in (*algorithm.memory.buffers(), *algorithm.memory.begun)] == places
 
 

@@ -87,7 +87,8 @@ class Settings(_Checked):
 
     algo: "mappo" (a critic of the whole state), "ippo" (each critic sees what its agent sees) or
     "joint" (one agent moves all arms). team_reward: every agent gets the sum of all rewards,
-    instead of its own. precision: of the networks' matrix products; "tf32" is float32 on a CPU.
+    instead of its own. precision: of the networks' matrix products on a GPU; on a CPU it is
+    always float32.
     """
 
     task: str = "reach"
@@ -97,7 +98,7 @@ class Settings(_Checked):
     algo: Literal["mappo", "ippo", "joint"] = "mappo"
     engine: Literal["auto", "mjx", "fused"] = "auto"
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    precision: Literal["float32", "tf32", "bfloat16"] = "tf32"
+    precision: Literal["float32", "tf32", "bfloat16"] = "bfloat16"
     seed: int = _number(0, 0, 2**31 - 1)
     num_envs: int = _number(4096, 1, 2**24)
     max_steps: int | None = _number(None, 1, 1_000_000)

@@ -62,8 +62,6 @@ class MAPPO(PPO):
         # What learns beside the networks: it stands in checkpoints.
         self.options = nn.ModuleDict({"scale": self.scale} if normalise_values else {})
         self.memory = Memory(storage.num_envs, actor, critic, self.device)
-        if actor.is_recurrent:
-            self.options["memory"] = self.memory
         self.constraint = constraint
         if constraint is not None:
             self.options["constraint"] = constraint
@@ -185,7 +183,8 @@ class MAPPO(PPO):
     def _precision(self) -> torch.autocast:
         """bfloat16 for the networks' products if that was asked for; the same when acting and learning, or ratios
         would not begin at 1."""
-        return torch.autocast("cuda" if self._cuda else "cpu", torch.bfloat16, enabled=self.use_mixed_precision)
+        enabled = self.use_mixed_precision and self._cuda
+        return torch.autocast("cuda" if self._cuda else "cpu", torch.bfloat16, enabled=enabled)
 
     def _adapt_rate(self, divergence: Tensor) -> None:
         """rsl_rl's rule: slower above twice the wanted divergence, faster below half of it."""

@@ -79,7 +79,7 @@ class RecurrentPictureModel(RecurrentModel, PictureModel):
 
 
 class Memory(nn.Module):
-    """What the networks of N environments remember, at one place for CUDA graphs, and in checkpoints.
+    """What the networks of N environments remember, at one place for CUDA graphs.
 
     Networks without a memory have one of no numbers.
 

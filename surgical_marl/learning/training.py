@@ -175,6 +175,7 @@ class Training:
             "algorithm": self.algorithm.save(),
             "env": {**self.env.carry(), "observations": self._observations.to_dict()},
             "collided": self.episodes.collided,
+            "memory": self.algorithm.memory.state_dict() if self.algorithm.actor.is_recurrent else None,
             "random": torch.get_rng_state(),
             "random_cuda": torch.cuda.get_rng_state() if self._cuda else None,
         }
@@ -187,6 +188,8 @@ class Training:
         for name, kept in self._observations.items():
             kept.copy_(state["env"]["observations"][name])
         self.episodes.collided.copy_(state["collided"])
+        if self.algorithm.actor.is_recurrent:
+            self.algorithm.memory.load_state_dict(state["memory"])
         torch.set_rng_state(state["random"])
         if state["random_cuda"] is not None and self._cuda:
             torch.cuda.set_rng_state(state["random_cuda"])
