@@ -173,9 +173,12 @@ class Training:
             "iteration": self.iteration,
             "groups": {name: _widths(actor, name) for name in actor.counts},
             "algorithm": self.algorithm.save(),
-            "env": {**self.env.carry(), "observations": self._observations.to_dict()},
+            "env": {
+                **self.env.carry(),
+                "observations": self._observations.to_dict(),
+                "memory": self.algorithm.memory.state_dict(),
+            },
             "collided": self.episodes.collided,
-            "memory": self.algorithm.memory.state_dict() if self.algorithm.actor.is_recurrent else None,
             "random": torch.get_rng_state(),
             "random_cuda": torch.cuda.get_rng_state() if self._cuda else None,
         }
@@ -187,9 +190,9 @@ class Training:
         self.env.set_carry(state["env"])
         for name, kept in self._observations.items():
             kept.copy_(state["env"]["observations"][name])
-        self.episodes.collided.copy_(state["collided"])
         if self.algorithm.actor.is_recurrent:
-            self.algorithm.memory.load_state_dict(state["memory"])
+            self.algorithm.memory.load_state_dict(state["env"]["memory"])
+        self.episodes.collided.copy_(state["collided"])
         torch.set_rng_state(state["random"])
         if state["random_cuda"] is not None and self._cuda:
             torch.cuda.set_rng_state(state["random_cuda"])
