@@ -31,7 +31,7 @@ from optuna.storages.journal import JournalFileBackend
 from optuna.trial import FrozenTrial, TrialState
 
 from surgical_marl.bench import machine
-from surgical_marl.bench.solve import NUM_ENVS, Goal, Solution, solve
+from surgical_marl.bench.solve import Goal, Solution, solve
 from surgical_marl.bench.workload import Workload
 from surgical_marl.files import write_atomic
 from surgical_marl.learning.config import Settings, load_config
@@ -85,8 +85,7 @@ class Search:
         self.arguments, self.goal = arguments, Goal(arguments.success)
         self.where = Workload(device=arguments.device).where
         self.name = f"{arguments.task}-{arguments.scene}-{arguments.algo}-{self.where}"
-        envs = [f"num_envs={NUM_ENVS[self.where]}"] if self.where in NUM_ENVS else []
-        self.shipped = self.settings(envs)
+        self.shipped = self.settings([])
         self.knobs = knobs(self.where, arguments.settings)
         arguments.out.mkdir(parents=True, exist_ok=True)
         self.study = optuna.create_study(

@@ -363,6 +363,24 @@ def test_settings_come_from_task_scene_and_overrides(reach: Callable[[str], None
     assert load_config("reach", "ecm", ["num_envs=5", "num_envs=6", "max_steps=null"]).num_envs == 6
 
 
+def test_a_gpu_has_settings_of_its_own(reach: Callable[[str], None], monkeypatch: pytest.MonkeyPatch) -> None:
+    reach("num_envs: 64\ncuda: {num_envs: 128, ppo: {lam: 0.8}}\nscenes: {ecm: {num_envs: 32}}\n")
+
+    def asked(scene: str, *overrides: str) -> tuple[int, float]:
+        settings = load_config("reach", scene, overrides)
+        return settings.num_envs, settings.ppo.lam
+
+    for there in (False, True):
+        monkeypatch.setattr(torch.cuda, "is_available", lambda there=there: there)
+        assert asked("psm") == ((128, 0.8) if there else (64, 0.95))
+        assert asked("psm", "device=cpu") == (64, 0.95)
+        assert asked("psm", "device=cuda", "num_envs=7") == (7, 0.8)
+        assert asked("ecm", "device=cuda") == (32, 0.8)
+    reach("cuda: {speed: 1}\n")
+    with pytest.raises(ValueError, match="unknown setting 'speed'"):
+        load_config("reach", "psm", ["device=cpu"])
+
+
 def test_the_shipped_settings_load() -> None:
     settings = load_config("reach", "bimanual_psm")
     assert settings.network == NetworkSettings()

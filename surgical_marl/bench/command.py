@@ -8,7 +8,7 @@ import math
 import os
 import tempfile
 from argparse import Namespace
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
 from surgical_marl.content import find, list_tasks, unknown
@@ -65,22 +65,27 @@ def _solve(arguments: Namespace) -> int:
         if text.startswith("iterations="):
             raise ValueError(f"solve trains until success or --limit: leave {text} out")
 
-    from surgical_marl.bench.solve import NUM_ENVS, Goal, run
+    from surgical_marl.bench.solve import Goal, run
 
     goal = Goal(arguments.success, arguments.collisions)
-    text, solved = run(_settings(arguments, NUM_ENVS), goal, arguments.limit, arguments.json)
+    text, solved = run(_settings(arguments), goal, arguments.limit, arguments.json)
     print(text)
     return 0 if solved else 1
 
 
-def _settings(arguments: Namespace, num_envs: dict[str, int]) -> Settings:
-    """Settings of a training: those of `configs/`, so many environments by the device, flags, and `key=value`."""
+def _settings(arguments: Namespace, num_envs: Mapping[str, int] | None = None) -> Settings:
+    """Settings of a training: those of `configs/`, so many environments by the device where that is said, flags, and
+    `key=value`."""
     from surgical_marl.bench.workload import Workload
     from surgical_marl.learning.config import load_config
 
     where = Workload(device=arguments.device).where  # says so if there is no such device
     keys = ("num_envs", "algo", "seed", "engine")
-    given = [("num_envs", num_envs.get(where)), ("device", where), *((key, getattr(arguments, key)) for key in keys)]
+    given = [
+        ("num_envs", (num_envs or {}).get(where)),
+        ("device", where),
+        *((key, getattr(arguments, key)) for key in keys),
+    ]
     flags = [f"{key}={value}" for key, value in given if value is not None]
     return load_config(arguments.task, arguments.scene, [*flags, *arguments.overrides])
 

@@ -28,9 +28,6 @@ from surgical_marl.learning.policy import acting_policy
 from surgical_marl.learning.train import make_env, make_training
 from surgical_marl.learning.training import Training
 
-NUM_ENVS = {"cuda": 16384}
-"""Environments by device, unless told; elsewhere those of `configs/`. More make each second's gradients better, but
-fewer of them."""
 EPISODES, SEED = 200, 0
 """Of the standard goal sets."""
 EAGER, PATIENT = 0.2, 0.05

@@ -127,7 +127,8 @@ class Settings(_Checked):
 
 
 def load_config(task: str, scene: str, overrides: Iterable[str] = ()) -> Settings:
-    """Settings for a task in a scene.
+    """Settings for a task in a scene: those of its file, of the file's section `cuda` on a GPU, of the scene's own
+    section, and overrides; what comes later goes first.
 
     Args:
         task: the name of a file in `configs/`, without `.yaml`.
@@ -144,10 +145,15 @@ def load_config(task: str, scene: str, overrides: Iterable[str] = ()) -> Setting
         names = sorted(file.stem for file in folder.glob("*.yaml"))
         raise unknown("task with training settings", task, names)
     values = _read_yaml(path)
-    scenes = values.pop("scenes", None) or {}
-    values = _merge(values, _mapping(f"scenes.{scene}", _mapping("scenes", scenes).get(scene) or {}))
-    _reject_unknown(values, without=("task", "scene"))
-    return _build({**_override(values, overrides), "task": task, "scene": scene})
+    on_gpu = _mapping("cuda", values.pop("cuda", None) or {})
+    scenes = _mapping("scenes", values.pop("scenes", None) or {})
+    for section in (values, on_gpu, own := _mapping(f"scenes.{scene}", scenes.get(scene) or {})):
+        _reject_unknown(section, without=("task", "scene"))
+    overrides = list(overrides)
+    device = _override(_merge(values, own), overrides).get("device", "auto")
+    if on_gpu and (device == "cuda" or (device == "auto" and _has_gpu())):
+        values = _merge(values, on_gpu)
+    return _build({**_override(_merge(values, own), overrides), "task": task, "scene": scene})
 
 
 def read_config(path: Path, overrides: Iterable[str] = ()) -> Settings:
@@ -164,6 +170,12 @@ def config_text(settings: Settings, notes: Mapping[str, Mapping[str, Any]]) -> s
     values = asdict(settings)
     values["network"]["hidden"] = list(settings.network.hidden)
     return yaml.safe_dump({**values, **notes}, sort_keys=False)
+
+
+def _has_gpu() -> bool:
+    import torch
+
+    return torch.cuda.is_available()
 
 
 def _read_yaml(path: Path) -> dict[str, Any]:
