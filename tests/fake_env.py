@@ -64,7 +64,7 @@ class FakeEnv:
             self.generator.manual_seed(seed)
         self.where = self._draw()
         self.steps = np.zeros(self.num_envs, np.int64)
-        return *self._observe(), {}
+        return *self._observe(), {agent: self._info(agent) for agent in self.agents}
 
     def _observe(self) -> tuple[dict[str, Tensor], Tensor]:
         observations = {agent: where.clone() for agent, where in self.where.items()}
@@ -78,15 +78,8 @@ class FakeEnv:
             assert actions[agent].shape == (self.num_envs, size) and not (actions[agent].abs() > 1).any()
             self.where[agent] = self.where[agent].clone()
             self.where[agent][:, :size] += 0.2 * actions[agent]
-            error = (self.where[agent][:, :size] - self.where[agent][:, size:]).norm(dim=-1)
-            rewards[agent] = -error
-            far = self.where[agent][:, 0] > 1.2
-            infos[agent] = {
-                "tip_error": error,
-                "success": error < 0.1,
-                "collision": far,
-                "min_distance": 1.2 - self.where[agent][:, 0],
-            }
+            infos[agent] = self._info(agent)
+            rewards[agent] = -infos[agent]["tip_error"]
         final_observations, final_state = self._observe()
         self.steps = self.steps + 1
         truncated = torch.from_numpy(self.steps >= self.max_steps)
@@ -104,6 +97,19 @@ class FakeEnv:
             final_state=final_state,
             infos=infos,
         )
+
+    def _info(self, agent: str) -> dict[str, Tensor]:
+        size, where = self.sizes[agent], self.where[agent]
+        error = (where[:, :size] - where[:, size:]).norm(dim=-1)
+        return {
+            "tip_error": error,
+            "success": error < 0.1,
+            "collision": where[:, 0] > 1.2,
+            "min_distance": 1.2 - where[:, 0],
+            # a term that the last agent lacks, as a camera's
+            "reward_distance": -error if agent == self.agents[-1] else -0.75 * error,
+            **({} if agent == self.agents[-1] else {"reward_late": -0.25 * error}),
+        }
 
     @property
     def qpos(self) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 from collections.abc import Callable
@@ -15,7 +16,7 @@ from fake_env import FakeEnv
 
 from surgical_marl.evaluation.evaluate import evaluate
 from surgical_marl.files import write_atomic
-from surgical_marl.learning import config, train
+from surgical_marl.learning import config, train, training
 from surgical_marl.learning.config import NetworkSettings, PPOSettings, Settings, load_config
 from surgical_marl.learning.episodes import Episodes
 from surgical_marl.learning.policy import (
@@ -28,6 +29,7 @@ from surgical_marl.learning.run import (
     read_checkpoint,
     read_metrics,
     read_settings,
+    write_metrics,
 )
 
 COUNTS, SIZES = {"psm": 2, "ecm": 1}, {"psm": 3, "ecm": 2}
@@ -39,6 +41,8 @@ SMALL = Settings(
     network=NetworkSettings(hidden=(16,)),
     ppo=PPOSettings(epochs=2, mini_batches=2),
 )
+# What an algorithm may have beside its networks.
+OPTIONS: list[dict[str, Any]] = [{}, {"ppo": replace(SMALL.ppo, normalise_values=True)}]
 
 
 @pytest.fixture
@@ -86,16 +90,18 @@ def test_the_toy_is_learned(algo: Any, tmp_path: Path, fakes: list[Any]) -> None
     assert rows[-1]["success_rate"] > rows[0]["success_rate"]
 
 
-def test_resume_is_bit_for_bit(tmp_path: Path, fakes: list[Any]) -> None:
-    whole = train.train(SMALL, out=tmp_path / "whole")
-    half = train.train(replace(SMALL, iterations=2), out=tmp_path / "half")
-    same = train.train(SMALL, out=half, resume=half)
-    copy = train.train(replace(SMALL, iterations=2), out=tmp_path / "other")
-    moved = train.train(SMALL, out=tmp_path / "moved", resume=copy)
+@pytest.mark.parametrize("options", OPTIONS)
+def test_resume_is_bit_for_bit(options: dict[str, Any], tmp_path: Path, fakes: list[Any]) -> None:
+    settings = replace(SMALL, **options)
+    whole = train.train(settings, out=tmp_path / "whole")
+    half = train.train(replace(settings, iterations=2), out=tmp_path / "half")
+    same = train.train(settings, out=half, resume=half)
+    copy = train.train(replace(settings, iterations=2), out=tmp_path / "other")
+    moved = train.train(settings, out=tmp_path / "moved", resume=copy)
     first = read_checkpoint(whole)
     for run in (same, moved):
         again = read_checkpoint(run)
-        for part in ("actor_state_dict", "critic_state_dict"):
+        for part in ("actor_state_dict", "critic_state_dict", "options_state_dict"):
             for name, value in first["algorithm"][part].items():
                 assert torch.equal(again["algorithm"][part][name], value), name
         moments = first["algorithm"]["optimizer_state_dict"]["state"]
@@ -108,7 +114,7 @@ def test_resume_is_bit_for_bit(tmp_path: Path, fakes: list[Any]) -> None:
 
 
 def test_the_state_holds_running_episodes(fakes: list[Any]) -> None:
-    first, second = (train.Training(SMALL, train.make_env(SMALL)) for _ in range(2))
+    first, second = (training.Training(SMALL, train.make_env(SMALL)) for _ in range(2))
     first.iterate()
     first.episodes.collided[::2] = True
     second.set_state(first.state())
@@ -146,14 +152,19 @@ def test_a_run_folder_recreates_the_run(tmp_path: Path, fakes: list[Any]) -> Non
 
 
 def test_episodes_are_counted_once_each(tmp_path: Path, fakes: list[Any]) -> None:
-    episodes = Episodes(["a", "b"], 3, "cpu")
+    episodes = Episodes(["a", "b"], ["reward_near"], 2, 3, "cpu")
     flags = torch.tensor
 
     def infos(error: float, collision: list[bool]) -> dict[str, dict[str, torch.Tensor]]:
         tip = torch.full((3,), error)
         hit, clear = flags(collision), flags([False] * 3)
         return {
-            "a": {"tip_error": tip, "success": flags([True, True, False]), "collision": hit},
+            "a": {
+                "tip_error": tip,
+                "success": flags([True, True, False]),
+                "collision": hit,
+                "reward_near": flags([2.0, 4.0, 6.0]),
+            },
             "b": {"tip_error": 3 * tip, "success": flags([True, False, False]), "collision": clear},
         }
 
@@ -162,22 +173,34 @@ def test_episodes_are_counted_once_each(tmp_path: Path, fakes: list[Any]) -> Non
     episodes.add(reward, flags([True, True, False]), infos(0.25, [False, False, True]))
     episodes.add(reward, flags([True, False, False]), infos(0.5, [False, False, False]))
     # Ended: environment 0 (mean error 0.5, both succeed, collided before), 1 (0.5, half of them),
-    # and 0 again (1.0, both, no collision).
-    assert episodes.take().tolist() == [3.0, 2.0, 2.5, 1.0, 6.0]
+    # and 0 again (1.0, both, no collision). Two agents share a term of mean 4 that one of them has.
+    assert episodes.take().tolist() == [3.0, 2.0, 2.5, 1.0, 6.0, 6.0]
     assert episodes.collided.tolist() == [False, False, True]
-    assert episodes.take().tolist() == [0.0] * 5
+    assert episodes.take().tolist() == [0.0] * 6
+
+
+@pytest.mark.parametrize("algo", ["mappo", "joint"])
+def test_reward_terms_add_up_to_the_reward(algo: Any, tmp_path: Path, fakes: list[Any]) -> None:
+    for row in read_metrics(train.train(replace(SMALL, algo=algo), out=tmp_path / "run")):
+        assert row["reward_late"] < 0
+        assert row["reward_distance"] + row["reward_late"] == pytest.approx(row["reward"], rel=1e-5)
+
+
+def test_metrics_of_an_older_version_lack_columns(tmp_path: Path) -> None:
+    write_metrics(tmp_path, ["a", "b"], [{"a": 1.0, "old": 5.0}, {"b": 2.0, "a": 3.0}])
+    assert (tmp_path / "metrics.csv").read_text().split() == ["a,b", "1,", "3,2"]
 
 
 def test_nan_stops_and_keeps_the_last_checkpoint(
     tmp_path: Path, fakes: list[Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    original = train.Training.iterate
+    original = training.Training.iterate
 
-    def iterate(self: train.Training) -> dict[str, float]:
+    def iterate(self: training.Training) -> training.Report:
         fakes[0].poison = self.iteration == 3
         return original(self)
 
-    monkeypatch.setattr(train.Training, "iterate", iterate)
+    monkeypatch.setattr(training.Training, "iterate", iterate)
     with pytest.raises(FloatingPointError, match="iteration 4"):
         train.train(replace(SMALL, iterations=9), out=tmp_path / "run")
     checkpoint = read_checkpoint(tmp_path / "run")
@@ -187,8 +210,8 @@ def test_nan_stops_and_keeps_the_last_checkpoint(
 
 
 def test_a_nan_loss_stops(tmp_path: Path, fakes: list[Any], monkeypatch: pytest.MonkeyPatch) -> None:
-    losses = {"value_loss": float("nan")}
-    monkeypatch.setattr(train.MAPPO, "update", lambda self: self.storage.clear() or losses)
+    losses = torch.tensor([math.nan, 0.0, 0.0, 0.0, 0.0])
+    monkeypatch.setattr(training.MAPPO, "learn", lambda self: losses)
     with pytest.raises(FloatingPointError, match="learning_rate"):
         train.train(SMALL, out=tmp_path / "run")
     assert read_checkpoint(tmp_path / "run")["iteration"] == 0
@@ -198,14 +221,14 @@ def test_a_nan_loss_stops(tmp_path: Path, fakes: list[Any], monkeypatch: pytest.
 def test_a_signal_ends_the_iteration_and_saves(
     number: int, tmp_path: Path, fakes: list[Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    original = train.Training.iterate
+    original = training.Training.iterate
 
-    def iterate(self: train.Training) -> dict[str, float]:
+    def iterate(self: training.Training) -> training.Report:
         if self.iteration == 2:
             os.kill(os.getpid(), number)
         return original(self)
 
-    monkeypatch.setattr(train.Training, "iterate", iterate)
+    monkeypatch.setattr(training.Training, "iterate", iterate)
     before = signal.getsignal(number)
     with pytest.raises((KeyboardInterrupt, SystemExit)) as stopped:
         train.train(replace(SMALL, checkpoint_every=50), out=tmp_path / "run")
@@ -224,6 +247,7 @@ def test_folders_that_cannot_be_used(tmp_path: Path, fakes: list[Any]) -> None:
         (SMALL, {"out": tmp_path / "new", "resume": tmp_path / "empty"}, "not a run folder"),
         (replace(SMALL, iterations=1), {"out": run, "resume": run}, "already has 1 iterations"),
         (replace(SMALL, num_envs=8), {"out": run, "resume": run}, "num_envs 32"),
+        (replace(SMALL, **OPTIONS[1]), {"out": run, "resume": run}, "normalise_values False"),
         (replace(SMALL, scene="psm"), {"out": run, "resume": run}, "'bimanual_psm'"),
     ]
     for settings, arguments, message in cases:

@@ -61,7 +61,7 @@ def test_it_learns_from_pixels(algo: Any, scene: str) -> None:
     training = Training(settings(f"algo={algo}", scene=scene), made(scene))
     (model,) = [model for model in training.algorithm.actor.models.values() if hasattr(model, "cnns")]
     before = [weight.detach().clone() for weight in model.cnns.parameters()]
-    losses = [training.iterate()["value_loss"] for _ in range(6)]
+    losses = [training.row(training.iterate())["value_loss"] for _ in range(6)]
     assert losses[-1] < 0.5 * losses[0]
     assert all((old != new).any() for old, new in zip(before, model.cnns.parameters(), strict=True))
     observations = training.env.get_observations()

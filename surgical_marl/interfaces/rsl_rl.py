@@ -97,6 +97,9 @@ class RslRlVecEnv(VecEnv):
     Observations are a TensorDict of batch size [N]: one group `[N, n, d]` for each agent type (see
     `Layout`) and "state" `[N, S]`. The environment is reset once, here; `get_observations` neither
     resets nor steps.
+
+    Attributes:
+        reward_terms: names of the weighted terms in the infos that the rewards are the sum of.
     """
 
     def __init__(self, env: BatchedEnv, *, joint: bool = False, seed: int | None = None) -> None:
@@ -107,8 +110,14 @@ class RslRlVecEnv(VecEnv):
         self.max_episode_length = env.max_steps
         self.device = env.device
         self.cfg: dict[str, Any] = {}
-        observations, state, _ = env.reset(seed)
+        observations, state, infos = env.reset(seed)
+        self.reward_terms = sorted({name for info in infos.values() for name in info if name.startswith("reward_")})
         self._observations = self._group(observations, state)
+
+    @property
+    def capturable(self) -> bool:
+        """Whether a CUDA graph can hold `step`."""
+        return bool(self.env.device == "cuda" and self.env.engine.name == "fused")
 
     @property
     def episode_length_buf(self) -> Tensor:

@@ -51,6 +51,7 @@ class PPOSettings(_Checked):
     value_coefficient: float = _number(1.0, 0.0, 100.0)
     entropy_coefficient: float = _number(0.0, 0.0, 1.0)
     max_gradient_norm: float = _number(1.0, 1e-6, 1e6)
+    normalise_values: bool = False
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,7 @@ class Settings(_Checked):
 
     algo: "mappo" (a critic of the whole state), "ippo" (each critic sees what its agent sees) or
     "joint" (one agent moves all arms). team_reward: every agent gets the sum of all rewards,
-    instead of its own.
+    instead of its own. precision: of the networks' matrix products; "tf32" is float32 on a CPU.
     """
 
     task: str = "reach"
@@ -82,6 +83,7 @@ class Settings(_Checked):
     algo: Literal["mappo", "ippo", "joint"] = "mappo"
     engine: Literal["auto", "mjx", "fused"] = "auto"
     device: Literal["auto", "cpu", "cuda"] = "auto"
+    precision: Literal["float32", "tf32", "bfloat16"] = "tf32"
     seed: int = _number(0, 0, 2**31 - 1)
     num_envs: int = _number(4096, 1, 2**24)
     max_steps: int | None = _number(None, 1, 1_000_000)

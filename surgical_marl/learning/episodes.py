@@ -1,4 +1,4 @@
-"""Statistics of the episodes that end while training."""
+"""Statistics of training: of the episodes that end, and of each step's reward."""
 
 from __future__ import annotations
 
@@ -7,19 +7,27 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
+ENDED = ("episodes", "error", "success", "collision", "reward")
+"""What `Episodes.take` sums up, before the reward terms."""
+
 
 class Episodes:
-    """Statistics of the episodes that end, summed on the device.
+    """Sums over steps and episodes, on the device.
+
+    Args:
+        agents: names of the arms.
+        terms: names of reward terms in the infos, such as "reward_distance".
+        acting: how many agents act, which is what the mean reward of a step is over: one for all arms in `joint`.
 
     Attributes:
         collided: `[N]` bool, whether the running episode of each environment had a collision so
             far.
     """
 
-    def __init__(self, agents: Sequence[str], num_envs: int, device: str) -> None:
-        self.agents = list(agents)
+    def __init__(self, agents: Sequence[str], terms: Sequence[str], acting: int, num_envs: int, device: str) -> None:
+        self.agents, self.terms, self._acting = list(agents), list(terms), acting
         self.collided = torch.zeros(num_envs, dtype=torch.bool, device=device)
-        self._totals = torch.zeros(5, device=device)
+        self._totals = torch.zeros(len(ENDED) + len(self.terms), device=device)
 
     def add(self, rewards: Tensor, dones: Tensor, infos: Mapping[str, Mapping[str, Tensor]]) -> None:
         """Count one step: rewards `[N]`, dones `[N]`, and the infos of each agent."""
@@ -38,11 +46,20 @@ class Episodes:
             ]
         )
         sums = torch.where(dones, ended, 0.0).sum(-1)
-        self._totals += torch.cat([sums, rewards.mean()[None]])
+        self._totals += torch.cat([sums, rewards.mean()[None], self._mean_terms(infos, rewards)])
         self.collided &= ~dones
 
+    def _mean_terms(self, infos: Mapping[str, Mapping[str, Tensor]], rewards: Tensor) -> Tensor:
+        """Each reward term's part of the mean reward, `[T]`; an arm without a term has none of it."""
+        if not self.terms:
+            return rewards.new_zeros(0)
+        nothing = torch.zeros_like(rewards)
+        terms = [infos[agent].get(name, nothing) for name in self.terms for agent in self.agents]
+        return torch.stack(terms).mean(-1).unflatten(0, (len(self.terms), -1)).sum(-1) / self._acting
+
     def take(self) -> Tensor:
-        """Sums since the last call: episodes, errors (m), successes, collisions, rewards."""
+        """Sums since the last call: episodes, errors (m), successes, collisions, rewards, and each term's part of
+        the rewards."""
         totals = self._totals.clone()
         self._totals.zero_()
         return totals

@@ -7,7 +7,6 @@ one agent (A = 1) this is PPO, by the same code.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
 from typing import Any
 
 import torch
@@ -18,154 +17,56 @@ from torch import Tensor, nn
 
 from surgical_marl.interfaces.rsl_rl import RslRlVecEnv
 from surgical_marl.learning.config import Settings
+from surgical_marl.learning.models import Gaussian, MultiAgentActor, MultiAgentModel
+from surgical_marl.learning.storage import MultiAgentStorage
+from surgical_marl.learning.values import ValueScale
 from surgical_marl.learning.vision import PICTURES, make_model
 
+LOSSES = ("value_loss", "surrogate_loss", "entropy", "kl", "learning_rate")
 LEARNING_RATE_RANGE = (1e-5, 1e-2)  # rsl_rl's limits of the adaptive learning rate
-# A small last layer starts every arm near its rest, which is where exploration is safe and
-# gradients are largest.
-OUTPUT_GAIN = 0.01
-
-
-class MultiAgentModel(nn.Module):
-    """One network for each agent type, shared by the agents of that type.
-
-    Args:
-        observations: a sample of the groups, `[N, n, d]` each, and pictures `[N, n, C, H, W]` where there are any.
-        outputs: width of the output of one agent, by type.
-        model: further arguments of rsl_rl's `MLPModel`.
-    """
-
-    is_recurrent = False
-
-    def __init__(self, observations: TensorDict, outputs: Mapping[str, int], **model: Any) -> None:
-        super().__init__()
-        self.counts = {name: observations[name].shape[-2] for name in outputs}
-        self.outputs = dict(outputs)
-        # The networks want to be built from one agent's [N, d], and run with any leading axes.
-        seen = {name: [group for group in (name, name + PICTURES) if group in observations] for name in outputs}
-        sample = TensorDict(
-            {group: observations[group][:, 0] for groups in seen.values() for group in groups},
-            batch_size=observations.batch_size,
-        )
-        self.models = nn.ModuleDict(
-            {name: make_model(sample, seen[name], width, **model) for name, width in outputs.items()}
-        )
-
-    def forward(self, observations: TensorDict, *, stochastic_output: bool = False, **_: Any) -> Tensor:
-        """Outputs of all agents, flat: `[N, sum]`, by type and then by agent."""
-        return self._join(model(observations, stochastic_output=stochastic_output) for model in self._models())
-
-    def update_normalization(self, observations: TensorDict) -> None:
-        """Update the running mean and variance of each type's observations from a batch `[B]`."""
-        for name, model in zip(self.outputs, self._models(), strict=True):
-            model.update_normalization({name: observations[name].flatten(0, -2)})
-
-    def reset(self, dones: Tensor | None = None, hidden_state: Any = None) -> None:
-        """Part of rsl_rl's model interface: an MLP has nothing to reset."""
-
-    def get_hidden_state(self) -> None:
-        """Part of rsl_rl's model interface: an MLP has no hidden state."""
-
-    def _models(self) -> Iterable[Any]:
-        return self.models.values()
-
-    @staticmethod
-    def _join(parts: Iterable[Tensor]) -> Tensor:
-        return torch.cat([part.flatten(-2) for part in parts], -1)
-
-    def _split(self, flat: Tensor) -> list[Tensor]:
-        """Flat `[N, sum]` -> one `[N, n, a]` for each type."""
-        shapes = [(self.counts[name], self.outputs[name]) for name in self.outputs]
-        parts = flat.split([count * width for count, width in shapes], -1)
-        return [part.unflatten(-1, shape) for part, shape in zip(parts, shapes, strict=True)]
-
-
-class MultiAgentActor(MultiAgentModel):
-    """A Gaussian policy for each agent type; log-probabilities and entropies are per agent."""
-
-    def __init__(self, observations: TensorDict, outputs: Mapping[str, int], **model: Any) -> None:
-        super().__init__(observations, outputs, **model)
-        with torch.no_grad():
-            for policy in self._models():
-                policy.mlp[-1].weight.mul_(OUTPUT_GAIN)
-                policy.mlp[-1].bias.zero_()
-
-    def get_output_log_prob(self, actions: Tensor) -> Tensor:
-        """Log-probability of flat actions `[N, sum]` under the last forward pass: `[N, A]`."""
-        parts = zip(self._models(), self._split(actions), strict=True)
-        return torch.cat([model.get_output_log_prob(part) for model, part in parts], -1)
-
-    def get_kl_divergence(self, old: tuple[Tensor, ...], new: tuple[Tensor, ...]) -> Tensor:
-        """KL(old || new) of each agent, `[N, A]`, from two `output_distribution_params`."""
-        old_parts = zip(*map(self._split, old), strict=True)
-        new_parts = zip(*map(self._split, new), strict=True)
-        parts = zip(self._models(), old_parts, new_parts, strict=True)
-        return torch.cat([model.get_kl_divergence(before, after) for model, before, after in parts], -1)
-
-    @property
-    def output_distribution_params(self) -> tuple[Tensor, ...]:
-        """Mean and standard deviation of the last forward pass, flat `[N, sum]` each."""
-        params = (model.output_distribution_params for model in self._models())
-        return tuple(self._join(parts) for parts in zip(*params, strict=True))
-
-    @property
-    def output_entropy(self) -> Tensor:
-        """Entropy of each agent's last distribution, `[N, A]`."""
-        return torch.cat([model.output_entropy for model in self._models()], -1)
-
-    @property
-    def output_std(self) -> Tensor:
-        """Standard deviation of the last distribution, flat `[N, sum]`."""
-        return self._join(model.output_std for model in self._models())
-
-
-class MultiAgentStorage(RolloutStorage):
-    """rsl_rl's rollout storage with log-probabilities, values, rewards and advantages A wide."""
-
-    distribution_params: tuple[Tensor, ...] | None
-
-    def __init__(self, num_agents: int, num_envs: int, steps: int, obs: TensorDict, actions: int, device: str) -> None:
-        super().__init__("rl", num_envs, steps, obs, [actions], device)
-        for name in ("rewards", "values", "actions_log_prob", "returns", "advantages"):
-            setattr(self, name, torch.zeros(steps, num_envs, num_agents, device=device))
-
-    def add_transition(self, transition: RolloutStorage.Transition) -> None:
-        """Copy one step of all environments into the storage."""
-        if self.step >= self.num_transitions_per_env:
-            raise OverflowError(f"the storage holds {self.num_transitions_per_env} steps: clear() it first")
-        for name in ("observations", "actions", "rewards", "values", "actions_log_prob"):
-            getattr(self, name)[self.step].copy_(getattr(transition, name))
-        self.dones[self.step].copy_(transition.dones.unsqueeze(-1))
-        params = transition.distribution_params or ()
-        if self.distribution_params is None:
-            steps = self.num_transitions_per_env
-            self.distribution_params = tuple(param.new_zeros(steps, *param.shape) for param in params)
-        for stored, param in zip(self.distribution_params, params, strict=True):
-            stored[self.step].copy_(param)
-        self.step += 1
 
 
 class MAPPO(PPO):
     """PPO with a ratio for each agent, and a critic with a value for each agent.
 
-    `act`, `compute_returns` and `save` are rsl_rl's. `update` is written again for two reasons:
-    rsl_rl's squeezes are wrong for A = 1, and it waits for the device some hundred times an update
-    where this waits once.
+    `update` is not rsl_rl's for two reasons: rsl_rl's squeezes are wrong for A = 1, and it waits
+    for the device some hundred times an update where this never waits: a CUDA graph can hold it
+    (see `learn`).
 
     Args:
         team_reward: give every agent the sum of all agents' rewards, instead of its own.
+        normalise_values: the critic predicts returns of unit variance; all else is in units of reward.
         ppo: arguments of `rsl_rl.algorithms.PPO`.
     """
 
-    learning_rate: float
-
-    def __init__(self, actor: Any, critic: Any, storage: Any, *, team_reward: bool = False, **ppo: Any) -> None:
+    def __init__(
+        self,
+        actor: Any,
+        critic: Any,
+        storage: MultiAgentStorage,
+        *,
+        team_reward: bool = False,
+        normalise_values: bool = False,
+        **ppo: Any,
+    ) -> None:
         super().__init__(actor, critic, storage, **ppo)
+        self.storage: MultiAgentStorage = storage
         self.team_reward = team_reward
+        self.scale = ValueScale(storage.values.shape[-1]).to(self.device)
+        # What learns beside the networks: it stands in checkpoints.
+        self.options = nn.ModuleDict({"scale": self.scale} if normalise_values else {})
         # As a tensor the learning rate adapts without the host having to read the divergence.
         self._rate = torch.tensor(float(self.learning_rate), device=self.device)
+        self._cuda = torch.device(self.device).type == "cuda"
         parameters = [*self.actor.parameters(), *self.critic.parameters()]
-        self.optimizer = torch.optim.Adam(parameters, lr=self._rate, fused=True)
+        self.optimizer = torch.optim.Adam(parameters, lr=self._rate, fused=True, capturable=self._cuda)
+
+    def act(self, obs: TensorDict) -> Tensor:
+        """Sample the flat joint action `[N, sum]`."""
+        with self._precision():
+            actions = super().act(obs)
+        self.transition.values = self.scale.restore(self.transition.values)
+        return actions
 
     def process_env_step(self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: dict[str, Any]) -> None:
         """Store one step.
@@ -175,15 +76,15 @@ class MAPPO(PPO):
         rewards = extras["agent_rewards"]
         if self.team_reward:
             rewards = rewards.sum(-1, keepdim=True).expand_as(rewards)
-        bootstrap = self.critic(extras["final_obs"]) * extras["time_outs"].unsqueeze(-1)
-        self.transition.rewards = rewards + self.gamma * bootstrap
+        final_values = self._values(extras["final_obs"])
+        self.transition.rewards = rewards + self.gamma * final_values * extras["time_outs"].unsqueeze(-1)
         self.transition.dones = dones
         self.storage.add_transition(self.transition)
         self.transition.clear()
 
     def loss(self, batch: RolloutStorage.Batch) -> tuple[Tensor, Tensor]:
         """Loss of a mini-batch; and value loss, surrogate loss, entropy and KL, detached `[4]`."""
-        self.actor(batch.observations, stochastic_output=True)
+        self.actor.distribute(batch.observations)
         log_prob = self.actor.get_output_log_prob(batch.actions)
         with torch.no_grad():
             params = self.actor.output_distribution_params
@@ -194,21 +95,39 @@ class MAPPO(PPO):
         clipped = ratio.clamp(1 - self.clip_param, 1 + self.clip_param)
         surrogate = -torch.min(batch.advantages * ratio, batch.advantages * clipped).mean()
 
-        values = self.critic(batch.observations)
-        value = (values - batch.returns).square()
+        values, returns = self.critic(batch.observations), self.scale.normalise(batch.returns)
+        value = (values - returns).square()
         if self.use_clipped_value_loss:
-            near = batch.values + (values - batch.values).clamp(-self.clip_param, self.clip_param)
-            value = torch.max(value, (near - batch.returns).square())
+            old = self.scale.normalise(batch.values)
+            near = old + (values - old).clamp(-self.clip_param, self.clip_param)
+            value = torch.max(value, (near - returns).square())
         value = value.mean()
 
         loss = surrogate + self.value_loss_coef * value - self.entropy_coef * entropy
         return loss, torch.stack([value, surrogate, entropy, divergence]).detach()
 
+    def compute_returns(self, obs: TensorDict) -> None:
+        """Returns and normalised advantages of the stored rollout; `obs` is what comes after it."""
+        storage = self.storage
+        storage.compute_returns(self._values(obs), self.gamma, self.lam)
+        if "scale" in self.options:
+            self.scale.learn(storage.returns.flatten(0, 1))
+        advantages = storage.returns - storage.values
+        storage.advantages.copy_((advantages - advantages.mean()) / (advantages.std() + 1e-8))
+
     def update(self) -> dict[str, float]:
-        """Learn from the stored rollout; returns mean losses, KL and the learning rate."""
+        """Learn from the stored rollout; returns mean losses, KL and the learning rate (see `LOSSES`)."""
+        losses = dict(zip(LOSSES, self.learn().tolist(), strict=True))
+        self.storage.clear()
+        self.learning_rate = losses["learning_rate"]
+        return losses
+
+    def learn(self) -> Tensor:
+        """What `update` does, without waiting for the device: `LOSSES` as a tensor."""
         total = torch.zeros(4, device=self.device)
         for batch in self.storage.mini_batch_generator(self.num_mini_batches, self.num_learning_epochs):
-            loss, parts = self.loss(batch)
+            with self._precision():
+                loss, parts = self.loss(batch)
             if self.schedule == "adaptive":
                 self._adapt_rate(parts[-1])
             self.optimizer.zero_grad()
@@ -220,11 +139,18 @@ class MAPPO(PPO):
         observations = self.storage.observations.flatten(0, 1)
         self.actor.update_normalization(observations)
         self.critic.update_normalization(observations)
-        self.storage.clear()
         count = self.num_mini_batches * self.num_learning_epochs
-        *losses, self.learning_rate = torch.cat([total / count, self._rate[None]]).tolist()
-        names = ("value_loss", "surrogate_loss", "entropy", "kl", "learning_rate")
-        return dict(zip(names, (*losses, self.learning_rate), strict=True))
+        return torch.cat([total / count, self._rate[None]])
+
+    def _values(self, obs: TensorDict) -> Tensor:
+        """Values of observations, in units of reward."""
+        with self._precision():
+            return self.scale.restore(self.critic(obs))
+
+    def _precision(self) -> torch.autocast:
+        """bfloat16 for the networks' products if that was asked for; the same when acting and learning, or ratios
+        would not begin at 1."""
+        return torch.autocast("cuda" if self._cuda else "cpu", torch.bfloat16, enabled=self.use_mixed_precision)
 
     def _adapt_rate(self, divergence: Tensor) -> None:
         """rsl_rl's rule: slower above twice the wanted divergence, faster below half of it."""
@@ -233,6 +159,10 @@ class MAPPO(PPO):
         faster = (self._rate * 1.5).clamp(max=high)
         rate = torch.where((divergence < self.desired_kl / 2) & (divergence > 0), faster, self._rate)
         self._rate.copy_(torch.where(divergence > self.desired_kl * 2, slower, rate))
+
+    def save(self) -> dict[str, Any]:
+        """All that `load` needs to go on, as tensors and plain values."""
+        return {**super().save(), "options_state_dict": self.options.state_dict()}
 
     def load(
         self,
@@ -245,9 +175,10 @@ class MAPPO(PPO):
         The optimizer then holds its own copy of the learning rate: share it again.
         """
         result = super().load(loaded_dict, load_cfg, strict)
+        self.options.load_state_dict(loaded_dict.get("options_state_dict", {}))
         group = self.optimizer.param_groups[0]
         group["lr"] = self._rate = torch.as_tensor(group["lr"], device=self.device)
-        self.learning_rate = float(self._rate)
+        group["capturable"] = self._cuda  # the checkpoint may come from another kind of device
         return result
 
     @staticmethod
@@ -284,7 +215,7 @@ def rsl_rl_config(settings: Settings) -> dict[str, Any]:
         "obs_normalization": network.normalise_observations,
     }
     gaussian = {
-        "class_name": "GaussianDistribution",
+        "class_name": Gaussian,
         "init_std": network.init_std,
         "std_type": "log",
     }
@@ -297,6 +228,7 @@ def rsl_rl_config(settings: Settings) -> dict[str, Any]:
         "algorithm": {
             "class_name": MAPPO,
             "team_reward": settings.team_reward,
+            "normalise_values": ppo.normalise_values,
             "learning_rate": ppo.learning_rate,
             "schedule": ppo.schedule,
             "desired_kl": ppo.desired_kl,
@@ -309,5 +241,6 @@ def rsl_rl_config(settings: Settings) -> dict[str, Any]:
             "value_loss_coef": ppo.value_coefficient,
             "entropy_coef": ppo.entropy_coefficient,
             "max_grad_norm": ppo.max_gradient_norm,
+            "use_mixed_precision": settings.precision == "bfloat16",
         },
     }

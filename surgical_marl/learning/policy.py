@@ -18,7 +18,8 @@ from torch import Tensor
 from surgical_marl.content import content_dir, list_policies
 from surgical_marl.interfaces.rsl_rl import Layout
 from surgical_marl.learning.config import Settings
-from surgical_marl.learning.mappo import MultiAgentActor, rsl_rl_config
+from surgical_marl.learning.mappo import rsl_rl_config
+from surgical_marl.learning.models import MultiAgentActor
 from surgical_marl.learning.run import CHECKPOINT, CONFIG, read_checkpoint, read_settings
 from surgical_marl.learning.weights import holds_weights, read_weights
 from surgical_marl.observations import each, proprioception
@@ -47,7 +48,7 @@ def load_policy(run: str | Path, env: BatchedEnv) -> Policy:
         return random_policy(env)
     if run == "oracle":
         return oracle(env)
-    return _acting(*load_actor(run, env), str(env.device))
+    return acting_policy(*load_actor(run, env), str(env.device))
 
 
 def load_actor(run: str | Path, env: BatchedEnv) -> tuple[MultiAgentActor, Layout]:
@@ -78,7 +79,7 @@ def untrained_policy(env: BatchedEnv, settings: Settings | None = None) -> Polic
     layout = Layout(env, joint=settings.algo == "joint")
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.seed)
-        return _acting(_actor(settings, env, layout), layout, str(env.device))
+        return acting_policy(_actor(settings, env, layout), layout, str(env.device))
 
 
 def zero_policy(env: BatchedEnv) -> Policy:
@@ -140,7 +141,8 @@ def _actor(settings: Settings, env: BatchedEnv, layout: Layout) -> MultiAgentAct
     return MultiAgentActor(_samples(env, layout), layout.action_sizes, **model).eval()
 
 
-def _acting(actor: MultiAgentActor, layout: Layout, device: str) -> Policy:
+def acting_policy(actor: MultiAgentActor, layout: Layout, device: str) -> Policy:
+    """The deterministic policy of networks, as they are whenever it acts: they may still learn."""
     actor = actor.to(device)
 
     def policy(observations: Mapping[str, Any]) -> dict[str, Any]:

@@ -116,13 +116,13 @@ def read_metrics(run: Path) -> list[dict[str, float]]:
 
 
 def write_metrics(run: Path, columns: Iterable[str], rows: Iterable[Mapping[str, float]]) -> None:
-    """Replace `metrics.csv`."""
+    """Replace `metrics.csv`. A column that a row lacks is empty there."""
 
     def write(path: Path) -> None:
         with path.open("w", newline="") as file:
             writer = csv.writer(file)
-            writer.writerow(list(columns))
-            writer.writerows(format_row(row) for row in rows)
+            writer.writerow(names := list(columns))
+            writer.writerows(format_row({name: row.get(name, math.nan) for name in names}) for row in rows)
 
     write_atomic(run / METRICS, write)
 

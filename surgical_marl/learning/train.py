@@ -7,23 +7,18 @@ import math
 import signal
 import sys
 import threading
-import time
+from collections import deque
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import fields
-from itertools import chain
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
-import torch
 from tqdm import tqdm
 
-from surgical_marl.interfaces.rsl_rl import RslRlVecEnv
 from surgical_marl.learning.config import Settings
-from surgical_marl.learning.curve import draw_curve
-from surgical_marl.learning.episodes import Episodes
-from surgical_marl.learning.mappo import MAPPO, rsl_rl_config
+from surgical_marl.learning.memory import check_room, in_memory
 from surgical_marl.learning.run import (
     METRICS,
     check_writable,
@@ -36,15 +31,11 @@ from surgical_marl.learning.run import (
     write_config,
     write_metrics,
 )
+from surgical_marl.learning.training import Report, Training
 
 if TYPE_CHECKING:
     from surgical_marl.batch import BatchedEnv
 
-COLUMNS = (
-    *("iteration", "env_steps", "seconds", "steps_per_s"),
-    *("reward", "episodes", "tip_error_mm", "success_rate", "collision_rate"),
-    *("value_loss", "surrogate_loss", "entropy", "kl", "learning_rate", "action_std"),
-)
 # What may change when a run goes on; everything else shapes the checkpoint or the problem.
 CHANGEABLE = {
     "engine",
@@ -76,6 +67,14 @@ def make_env(settings: Settings, num_envs: int | None = None) -> BatchedEnv:
     )
 
 
+def make_training(settings: Settings) -> Training:
+    """A run in memory. ValueError if it has no room there."""
+    env = make_env(settings)
+    check_room(settings, env)
+    with in_memory(settings.num_envs):
+        return Training(settings, env)
+
+
 def train(settings: Settings, *, out: Path, resume: Path | None = None) -> Path:
     """Train until `settings.iterations`, and return the run folder.
 
@@ -86,7 +85,8 @@ def train(settings: Settings, *, out: Path, resume: Path | None = None) -> Path:
         resume: the run folder to continue from its checkpoint.
 
     Raises:
-        ValueError: the folder cannot be used, or the settings do not fit the run to resume.
+        ValueError: the folder cannot be used, the settings do not fit the run to resume, or so many environments do not
+            fit into memory.
         FloatingPointError: training produced NaN; the last good checkpoint is kept.
         KeyboardInterrupt, SystemExit: after Ctrl-C or SIGTERM, when the checkpoint is written.
     """
@@ -104,7 +104,7 @@ def train(settings: Settings, *, out: Path, resume: Path | None = None) -> Path:
     )
 
     try:
-        training = Training(settings, make_env(settings))
+        training = make_training(settings)
     except ValueError:
         if new:
             out.rmdir()  # it is empty yet
@@ -112,157 +112,73 @@ def train(settings: Settings, *, out: Path, resume: Path | None = None) -> Path:
     if state is not None:
         training.set_state(state)
     write_config(out, settings)
-    write_metrics(out, COLUMNS, rows)
+    write_metrics(out, training.columns, rows)
     write_checkpoint(out, training.state())
-    _run(training, out)
+    with in_memory(settings.num_envs):
+        _run(training, out)
     return out
 
 
 def _run(training: Training, out: Path) -> None:
-    from torch.utils.tensorboard import SummaryWriter  # takes a second to import
-
     settings = training.settings
-    board = SummaryWriter(str(out / "tensorboard"), purge_step=training.iteration + 1)
-    bar = tqdm(
-        initial=training.iteration,
-        total=settings.iterations,
-        unit="it",
-        file=sys.stderr,
-        dynamic_ncols=True,
-    )
-    with _signals() as received, (out / METRICS).open("a", newline="") as file, bar, board:
-        writer = csv.writer(file)
+    with _signals() as received, _Log(training, out) as log:
         while training.iteration < settings.iterations and not received:
-            row = training.iterate()
-            writer.writerow(format_row(row))
-            file.flush()
-            for name in COLUMNS[1:]:
-                if math.isfinite(row[name]):
-                    board.add_scalar(name, row[name], training.iteration)
-            bar.set_postfix_str(_describe(row), refresh=False)
-            bar.update()
+            log.add(training.iterate())
             if training.iteration % settings.checkpoint_every == 0:
+                log.catch_up()  # raises if something is not finite: the last good checkpoint stays
                 write_checkpoint(out, training.state())
+        log.catch_up()
         write_checkpoint(out, training.state())
+    from surgical_marl.learning.curve import draw_curve  # matplotlib: not before training has begun
+
     draw_curve(out, f"{settings.task} in {settings.scene}, {settings.algo}, seed {settings.seed}")
     if received:
         raise KeyboardInterrupt if received[0] == signal.SIGINT else SystemExit(128 + received[0])
 
 
-class Training:
-    """A run in memory: the environment, the algorithm and the statistics of episodes.
+class _Log:
+    """`metrics.csv`, tensorboard and the progress bar of a run. It reads an iteration's report when the next one is
+    under way, so that a GPU has always something to do."""
 
-    Args:
-        settings: the run.
-        env: its environment, made with `arrays="torch"`.
-    """
+    def __init__(self, training: Training, out: Path) -> None:
+        from torch.utils.tensorboard import SummaryWriter  # takes a second to import
 
-    def __init__(self, settings: Settings, env: BatchedEnv) -> None:
-        torch.manual_seed(settings.seed)
-        self.settings = settings
-        self.iteration = 0
-        self.env = RslRlVecEnv(env, joint=settings.algo == "joint", seed=settings.seed)
-        device = str(self.env.device)
-        if device.startswith("cuda"):
-            torch.set_float32_matmul_precision("high")  # TF32 nearly doubles the speed of updates
-        observations = self.env.get_observations()
-        self.algorithm = MAPPO.construct_algorithm(observations, self.env, rsl_rl_config(settings), device)
-        self.algorithm.train_mode()
-        self.episodes = Episodes(env.agents, env.num_envs, device)
-        # All environments start together: let the first episodes end at different times.
-        steps = torch.randint(0, max(env.max_steps, 1), (env.num_envs,))
-        self.env.episode_length_buf = steps.to(device)
+        self._training, self._waiting = training, deque[Report]()
+        self._lag = 1 if training.env.device == "cuda" else 0
+        self._files = ExitStack()
+        self._csv = self._files.enter_context((out / METRICS).open("a", newline=""))
+        board = SummaryWriter(str(out / "tensorboard"), purge_step=training.iteration + 1)
+        self._board = self._files.enter_context(board)
+        total, begun = training.settings.iterations, training.iteration
+        self._bar = self._files.enter_context(
+            tqdm(initial=begun, total=total, unit="it", file=sys.stderr, dynamic_ncols=True)
+        )
 
-    def iterate(self) -> dict[str, float]:
-        """One rollout and one update; returns a row of metrics (see `COLUMNS`).
+    def __enter__(self) -> _Log:
+        return self
 
-        Raises:
-            FloatingPointError: an observation, a return, a loss or a weight is not finite.
-        """
-        started = time.perf_counter()
-        episodes = self._rollout()
-        losses = self.algorithm.update()
-        self.iteration += 1
-        weights = torch.cat([w.detach().flatten() for w in self._parameters()])
-        if not all(map(math.isfinite, (*losses.values(), float(weights.sum())))):
-            raise FloatingPointError(
-                f"the loss became NaN in iteration {self.iteration}: resume the last checkpoint "
-                f"with a lower ppo.learning_rate than {self.settings.ppo.learning_rate:g}"
-            )
-        seconds = time.perf_counter() - started
-        samples = self.settings.steps_per_iteration * self.env.num_envs
-        timing = {"seconds": seconds, "steps_per_s": samples / seconds}
-        row = {
-            "iteration": self.iteration,
-            "env_steps": self.iteration * samples,
-            **timing,
-            **episodes,
-            **losses,
-        }
-        return {name: row[name] for name in COLUMNS}
+    def __exit__(self, *_: Any) -> None:
+        self._files.close()
 
-    def _parameters(self) -> Iterator[torch.nn.Parameter]:
-        return chain(self.algorithm.actor.parameters(), self.algorithm.critic.parameters())
+    def add(self, report: Report) -> None:
+        """Take a report; read those whose iteration should be done."""
+        self._waiting.append(report)
+        while len(self._waiting) > self._lag:
+            self._write(self._training.row(self._waiting.popleft()))
 
-    def _rollout(self) -> dict[str, float]:
-        algorithm, steps = self.algorithm, self.settings.steps_per_iteration
-        with torch.inference_mode():
-            observations = self.env.get_observations()
-            for _ in range(steps):
-                actions = algorithm.act(observations)
-                observations, rewards, dones, extras = self.env.step(actions)
-                algorithm.process_env_step(observations, rewards, dones, extras)
-                self.episodes.add(rewards, dones, extras["infos"])
-            algorithm.compute_returns(observations)
-            stored = [*algorithm.storage.observations.values(), algorithm.storage.returns]
-            finite = torch.stack([part.isfinite().all() for part in stored]).all()
-            # The only time in a rollout that the host waits for the device.
-            extra = torch.stack([algorithm.actor.output_std.mean(), finite])
-            *totals, std, finite_flag = torch.cat([self.episodes.take(), extra]).tolist()
-        if not finite_flag:
-            raise FloatingPointError(
-                f"the environment or a value became NaN in iteration {self.iteration + 1}: "
-                "resume the last checkpoint with a lower ppo.learning_rate"
-            )
-        count, error, success, collision, reward = totals
-        share = 1 / count if count else math.nan
-        return {
-            "reward": reward / steps,
-            "episodes": count,
-            "tip_error_mm": 1000 * error * share,
-            "success_rate": success * share,
-            "collision_rate": collision * share,
-            "action_std": std,
-        }
+    def catch_up(self) -> None:
+        """Read all reports."""
+        while self._waiting:
+            self._write(self._training.row(self._waiting.popleft()))
 
-    def state(self) -> dict[str, Any]:
-        """What `set_state` needs to continue bit for bit, as tensors and plain values."""
-        actor = self.algorithm.actor
-        cuda = str(self.env.device).startswith("cuda")
-        return {
-            "iteration": self.iteration,
-            "groups": {name: _widths(actor, name) for name in actor.counts},
-            "algorithm": self.algorithm.save(),
-            "env": self.env.carry(),
-            "collided": self.episodes.collided,
-            "random": torch.get_rng_state(),
-            "random_cuda": torch.cuda.get_rng_state() if cuda else None,
-        }
-
-    def set_state(self, state: Mapping[str, Any]) -> None:
-        """Continue from what `state` returned."""
-        self.iteration = state["iteration"]
-        self.algorithm.load(state["algorithm"])
-        self.env.set_carry(state["env"])
-        self.episodes.collided.copy_(state["collided"])
-        torch.set_rng_state(state["random"])
-        if state["random_cuda"] is not None and str(self.env.device).startswith("cuda"):
-            torch.cuda.set_rng_state(state["random_cuda"])
-
-
-def _widths(actor: Any, group: str) -> list[int]:
-    """Agents of a group, width of their observation and of their action."""
-    return [actor.counts[group], actor.models[group].obs_dim, actor.outputs[group]]
+    def _write(self, row: dict[str, float]) -> None:
+        csv.writer(self._csv).writerow(format_row(row))
+        self._csv.flush()
+        for name in self._training.columns[1:]:
+            if math.isfinite(row[name]):
+                self._board.add_scalar(name, row[name], row["iteration"])
+        self._bar.set_postfix_str(_describe(row), refresh=False)
+        self._bar.update()
 
 
 def _read_resumed(settings: Settings, run: Path) -> dict[str, Any]:
@@ -271,6 +187,8 @@ def _read_resumed(settings: Settings, run: Path) -> dict[str, Any]:
         before, now = getattr(old, item.name), getattr(settings, item.name)
         if item.name not in CHANGEABLE and before != now:
             raise ValueError(f"the run in {run} has {item.name} {before!r}, and cannot go on with {now!r}")
+    if (before := old.ppo.normalise_values) != settings.ppo.normalise_values:
+        raise ValueError(f"the run in {run} has ppo.normalise_values {before!r}, and cannot go on with {not before!r}")
     if state["iteration"] >= settings.iterations:
         raise ValueError(
             f"the run in {run} already has {state['iteration']} iterations: ask for more than {settings.iterations}"

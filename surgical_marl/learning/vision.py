@@ -9,6 +9,8 @@ from rsl_rl.models import CNNModel, MLPModel
 from tensordict import TensorDict
 from torch import Tensor, nn
 
+from surgical_marl.learning.normaliser import Normaliser
+
 PICTURES = "_pictures"
 """What the group of an agent type's pictures is called after its name."""
 ENCODER = {"output_channels": [16, 32, 32], "kernel_size": [8, 4, 3], "stride": [4, 2, 1], "activation": "elu"}
@@ -35,6 +37,11 @@ def make_model(observations: TensorDict, groups: list[str], width: int, **model:
         width: of its output.
         model: further arguments of rsl_rl's models.
     """
+    made: MLPModel
     if any(group.endswith(PICTURES) for group in groups):
-        return PictureModel(observations, {"all": groups}, "all", width, cnn_cfg=ENCODER, **model)
-    return MLPModel(observations, {"all": groups}, "all", width, **model)
+        made = PictureModel(observations, {"all": groups}, "all", width, cnn_cfg=ENCODER, **model)
+    else:
+        made = MLPModel(observations, {"all": groups}, "all", width, **model)
+    if made.obs_normalization:
+        made.obs_normalizer = Normaliser(made.obs_dim)
+    return made

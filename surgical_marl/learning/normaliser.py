@@ -1,0 +1,24 @@
+"""Running mean and variance of observations."""
+
+from __future__ import annotations
+
+import torch
+from rsl_rl.modules import EmpiricalNormalization
+from torch import Tensor
+
+
+class Normaliser(EmpiricalNormalization):
+    """rsl_rl's, whose update stays in place and asks the host for nothing, so that a CUDA graph can repeat it."""
+
+    def update(self, x: Tensor) -> None:
+        """Learn from a batch `[B, d]` while training."""
+        if not self.training:
+            return
+        count = x.shape[0]
+        var, mean = torch.var_mean(x, dim=0, correction=0, keepdim=True)
+        self.count += count
+        rate = count / self.count
+        ahead = mean - self._mean
+        self._mean += rate * ahead
+        self._var += rate * (var - self._var + ahead * (mean - self._mean))
+        self._std.copy_(self._var.sqrt())

@@ -1,0 +1,50 @@
+"""What a rollout leaves for the update to learn from."""
+
+from __future__ import annotations
+
+import torch
+from rsl_rl.storage import RolloutStorage
+from tensordict import TensorDict
+from torch import Tensor
+
+
+class MultiAgentStorage(RolloutStorage):
+    """rsl_rl's rollout storage with log-probabilities, values, rewards and advantages A wide."""
+
+    distribution_params: tuple[Tensor, ...] | None
+
+    def __init__(self, num_agents: int, num_envs: int, steps: int, obs: TensorDict, actions: int, device: str) -> None:
+        super().__init__("rl", num_envs, steps, obs, [actions], device)
+        for name in ("rewards", "values", "actions_log_prob", "returns", "advantages"):
+            setattr(self, name, torch.zeros(steps, num_envs, num_agents, device=device))
+
+    def add_transition(self, transition: RolloutStorage.Transition) -> None:
+        """Copy one step of all environments into the storage."""
+        if self.step >= self.num_transitions_per_env:
+            raise OverflowError(f"the storage holds {self.num_transitions_per_env} steps: clear() it first")
+        for name in ("observations", "actions", "rewards", "values", "actions_log_prob"):
+            getattr(self, name)[self.step].copy_(getattr(transition, name))
+        self.dones[self.step].copy_(transition.dones.unsqueeze(-1))
+        params = transition.distribution_params or ()
+        if self.distribution_params is None:
+            steps = self.num_transitions_per_env
+            self.distribution_params = tuple(param.new_zeros(steps, *param.shape) for param in params)
+        for stored, param in zip(self.distribution_params, params, strict=True):
+            stored[self.step].copy_(param)
+        self.step += 1
+
+    def compute_returns(self, last_values: Tensor, gamma: float, lam: float) -> None:
+        """Generalised advantage estimation (Schulman et al. 2016, arXiv 1506.02438): `returns` of the full storage.
+
+        Args:
+            last_values: of the observations after the last step, as wide as values.
+            gamma: discount of a step.
+            lam: of the mixture of n-step returns, 0 for one step and 1 for whole episodes.
+        """
+        advantage, next_values = torch.zeros_like(last_values), last_values
+        for step in reversed(range(self.num_transitions_per_env)):
+            goes_on = 1.0 - self.dones[step].float()
+            ahead = self.rewards[step] + goes_on * gamma * next_values - self.values[step]
+            advantage = ahead + goes_on * gamma * lam * advantage
+            next_values = self.values[step]
+            self.returns[step] = advantage + next_values
