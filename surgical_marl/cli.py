@@ -153,8 +153,8 @@ def _parser() -> argparse.ArgumentParser:
     )
     policy.set_defaults(command=_export_policy, name="export policy")
 
-    bench = commands.add_parser("bench", help="measure how fast this machine simulates and learns")
-    kinds = bench.add_subparsers(required=True, metavar="{sim,train,solve}")
+    bench = commands.add_parser("bench", help="measure how fast this machine simulates, learns and draws")
+    kinds = bench.add_subparsers(required=True, metavar="{sim,train,solve,render}")
     sim = _bench_parser(kinds, "sim", "steps/s of the engines and of C MuJoCo", _BENCHED)
     sim.add_argument("--decimation", type=_whole(1), default=1, metavar="K", help="physics steps an environment step")
     sim.add_argument("--motion", type=_one_of(_MOTIONS), default=_MOTIONS[0], metavar="|".join(_MOTIONS),
@@ -169,6 +169,13 @@ def _parser() -> argparse.ArgumentParser:
     learns.add_argument("--success", type=float, default=0.95, metavar="SHARE", help="wanted within 2 mm")
     learns.add_argument("--collisions", type=float, default=0.01, metavar="SHARE", help="of episodes, to stay below")
     learns.add_argument("--limit", type=float, default=600.0, metavar="SECONDS", help="then it is given up")
+
+    draws = kinds.add_parser("render", help="pictures/s of the endoscope")
+    draws.add_argument("--scene", default="ecm", help="a scene with an endoscope, or a .yaml file")
+    draws.add_argument("--num-envs", type=_whole(1), metavar="N", help="default: 64 on a CPU, 8192 on a GPU")
+    draws.add_argument("--device", type=_one_of(_DEVICES), default="auto", metavar="|".join(_DEVICES))
+    draws.add_argument("--json", action="store_true", help="one JSON object instead of a table")
+    draws.set_defaults(command=_bench, name="bench render", kind="render")
 
     doctor = commands.add_parser("doctor", help="check this machine and this installation")
     doctor.set_defaults(command=_doctor, name="doctor")

@@ -17,7 +17,7 @@ from fake_env import FakeEnv
 from surgical_marl.evaluation.evaluate import evaluate
 from surgical_marl.files import write_atomic
 from surgical_marl.learning import config, train, training
-from surgical_marl.learning.config import NetworkSettings, PPOSettings, Settings, load_config
+from surgical_marl.learning.config import ConstraintSettings, NetworkSettings, PPOSettings, Settings, load_config
 from surgical_marl.learning.episodes import Episodes
 from surgical_marl.learning.policy import (
     load_policy,
@@ -42,7 +42,18 @@ SMALL = Settings(
     ppo=PPOSettings(epochs=2, mini_batches=2),
 )
 # What an algorithm may have beside its networks.
-OPTIONS: list[dict[str, Any]] = [{}, {"ppo": replace(SMALL.ppo, normalise_values=True)}]
+OPTIONS: list[dict[str, Any]] = [
+    {},
+    {"ppo": replace(SMALL.ppo, normalise_values=True)},
+    {"constraint": ConstraintSettings(cost="collision", limit=0.01)},
+    {"network": replace(SMALL.network, recurrent="gru")},
+]
+ALL: dict[str, Any] = {
+    **OPTIONS[1],
+    **OPTIONS[2],
+    "network": replace(SMALL.network, recurrent="lstm"),
+    "team_reward": True,
+}
 
 
 @pytest.fixture
@@ -90,7 +101,23 @@ def test_the_toy_is_learned(algo: Any, tmp_path: Path, fakes: list[Any]) -> None
     assert rows[-1]["success_rate"] > rows[0]["success_rate"]
 
 
-@pytest.mark.parametrize("options", OPTIONS)
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+@pytest.mark.parametrize("counts", [{"psm": 1}, COUNTS])
+@pytest.mark.parametrize("algo", ["mappo", "ippo", "joint"])
+def test_options_go_together(
+    algo: Any, counts: dict[str, int], precision: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(train, "make_env", lambda settings: FakeEnv(counts, SIZES, settings.num_envs, max_steps=5))
+    settings = replace(SMALL, algo=algo, precision=precision, **ALL, iterations=2)
+    run = train.train(settings, out=tmp_path / "run")
+    assert read_settings(run) == settings
+    last = read_metrics(run)[-1]
+    assert last["cost_rate"] >= 0 and last["lagrange_multiplier"] >= 0 and math.isfinite(last["value_loss"])
+    env: Any = FakeEnv(counts, SIZES, num_envs=4, max_steps=5)
+    assert evaluate(env, load_policy(run, env), episodes=4, seed=0)["mean_error_mm"] > 0
+
+
+@pytest.mark.parametrize("options", [*OPTIONS, ALL])
 def test_resume_is_bit_for_bit(options: dict[str, Any], tmp_path: Path, fakes: list[Any]) -> None:
     settings = replace(SMALL, **options)
     whole = train.train(settings, out=tmp_path / "whole")
@@ -107,6 +134,8 @@ def test_resume_is_bit_for_bit(options: dict[str, Any], tmp_path: Path, fakes: l
         moments = first["algorithm"]["optimizer_state_dict"]["state"]
         for index, moment in again["algorithm"]["optimizer_state_dict"]["state"].items():
             assert torch.equal(moment["exp_avg_sq"], moments[index]["exp_avg_sq"])
+        for name, memory in (first["memory"] or {}).items():
+            assert torch.equal(again["memory"][name], memory) and memory.any()
         assert torch.equal(again["random"], first["random"])
         assert torch.equal(again["env"]["observations"]["state"], first["env"]["observations"]["state"])
         assert [row["iteration"] for row in read_metrics(run)] == [1, 2, 3, 4]
@@ -248,6 +277,8 @@ def test_folders_that_cannot_be_used(tmp_path: Path, fakes: list[Any]) -> None:
         (replace(SMALL, iterations=1), {"out": run, "resume": run}, "already has 1 iterations"),
         (replace(SMALL, num_envs=8), {"out": run, "resume": run}, "num_envs 32"),
         (replace(SMALL, **OPTIONS[1]), {"out": run, "resume": run}, "normalise_values False"),
+        (replace(SMALL, **OPTIONS[2]), {"out": run, "resume": run}, "constraint.cost 'none'"),
+        (replace(SMALL, **OPTIONS[3]), {"out": run, "resume": run}, "network.recurrent 'none'"),
         (replace(SMALL, scene="psm"), {"out": run, "resume": run}, "'bimanual_psm'"),
     ]
     for settings, arguments, message in cases:
@@ -357,6 +388,11 @@ def test_the_shipped_settings_load() -> None:
         ("network.hidden=[]", "network.hidden must be a list of whole numbers"),
         ("network.hidden=[8, x]", "network.hidden must be a whole number"),
         ("ppo=3", "ppo must be a mapping of settings, not 3"),
+        ("constraint.cost=crash", "constraint.cost must be one of none, collision, .*speed, not 'crash'"),
+        ("constraint.limit=2", "constraint.limit must be a number from 0 to 1, not 2"),
+        ("constraint.kp=-1", "constraint.kp must be a number from 0 to"),
+        ("ppo.normalise_values=1", "ppo.normalise_values must be true or false, not 1"),
+        ("network.recurrent=rnn", "network.recurrent must be one of none, gru, lstm, not 'rnn'"),
         ("max_steps=0", "max_steps must be a whole number from 1"),
         ("ppo.mini_batches=999999", "ppo.mini_batches must be at most num_envs"),
     ],
@@ -365,6 +401,11 @@ def test_bad_settings_are_named(override: str, message: str) -> None:
     with pytest.raises(ValueError, match=message) as error:
         load_config("reach", "psm", [override])
     assert "\n" not in str(error.value)
+
+
+def test_whole_rollouts_need_an_environment_each() -> None:
+    with pytest.raises(ValueError, match=r"at most num_envs = 2 with network.recurrent, not 4"):
+        load_config("reach", "psm", ["network.recurrent=gru", "num_envs=2"])
 
 
 def test_bad_files_are_named(reach: Callable[[str], None]) -> None:

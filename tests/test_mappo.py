@@ -176,6 +176,8 @@ def test_one_agent_is_rsl_rls_ppo(schedule: Any, clip_value: bool) -> None:
     )
     groups = {"actor": ["actor"], "critic": ["critic"]}
     config = rsl_rl_config(replace(SETTINGS, ppo=ppo))
+    for network in ("actor", "critic"):
+        del config[network]["recurrent"]
     actor = MLPModel(flat, groups, "actor", 3, **config["actor"])
     critic = MLPModel(flat, groups, "critic", 1, **config["critic"])
     actor.load_state_dict(copy.deepcopy(algorithm.actor.models["psm"].state_dict()))
@@ -192,9 +194,8 @@ def test_one_agent_is_rsl_rls_ppo(schedule: Any, clip_value: bool) -> None:
         setattr(storage, name, copy.deepcopy(getattr(mine, name)))
     storage.observations["actor"] = mine.observations["psm"][:, :, 0].clone()
     storage.observations["critic"] = mine.observations["state"].clone()
-    arguments = {
-        k: v for k, v in config["algorithm"].items() if k not in ("class_name", "team_reward", "normalise_values")
-    }
+    own = ("class_name", "team_reward", "normalise_values", "constraint", "use_mixed_precision")
+    arguments = {k: v for k, v in config["algorithm"].items() if k not in own}
     reference = PPO(actor, critic, storage, **arguments)
     reference.train_mode()
     torch.manual_seed(5)

@@ -55,8 +55,21 @@ class PPOSettings(_Checked):
 
 
 @dataclass(frozen=True)
+class ConstraintSettings(_Checked):
+    """A cost that few episodes may have, instead of a weight of a reward term (see `learning/constraint.py`)."""
+
+    prefix: ClassVar[str] = "constraint."
+
+    cost: Literal["none", "collision", "distance", "force", "limit", "speed"] = "none"
+    limit: float = _number(0.005, 0.0, 1.0)
+    kp: float = _number(10.0, 0.0, 1e6)
+    ki: float = _number(1.0, 0.0, 1e6)
+    kd: float = _number(10.0, 0.0, 1e6)
+
+
+@dataclass(frozen=True)
 class NetworkSettings(_Checked):
-    """Actor and critic: one MLP each of this shape."""
+    """Actor and critic: one MLP each of this shape, which a GRU or LSTM cell may come before."""
 
     prefix: ClassVar[str] = "network."
 
@@ -64,6 +77,7 @@ class NetworkSettings(_Checked):
     activation: Literal["elu", "relu", "tanh", "selu", "gelu"] = "elu"
     normalise_observations: bool = True
     init_std: float = _number(0.5, 0.001, 10.0)
+    recurrent: Literal["none", "gru", "lstm"] = "none"
 
 
 @dataclass(frozen=True)
@@ -73,7 +87,8 @@ class Settings(_Checked):
 
     algo: "mappo" (a critic of the whole state), "ippo" (each critic sees what its agent sees) or
     "joint" (one agent moves all arms). team_reward: every agent gets the sum of all rewards,
-    instead of its own. precision: of the networks' matrix products; "tf32" is float32 on a CPU.
+    instead of its own. precision: of the networks' matrix products on a GPU; on a CPU it is
+    always float32.
     """
 
     task: str = "reach"
@@ -83,7 +98,7 @@ class Settings(_Checked):
     algo: Literal["mappo", "ippo", "joint"] = "mappo"
     engine: Literal["auto", "mjx", "fused"] = "auto"
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    precision: Literal["float32", "tf32", "bfloat16"] = "tf32"
+    precision: Literal["float32", "tf32", "bfloat16"] = "bfloat16"
     seed: int = _number(0, 0, 2**31 - 1)
     num_envs: int = _number(4096, 1, 2**24)
     max_steps: int | None = _number(None, 1, 1_000_000)
@@ -93,6 +108,7 @@ class Settings(_Checked):
     team_reward: bool = False
     reward: dict[str, float] = field(default_factory=dict)
     ppo: PPOSettings = field(default_factory=PPOSettings)
+    constraint: ConstraintSettings = field(default_factory=ConstraintSettings)
     network: NetworkSettings = field(default_factory=NetworkSettings)
 
     def __post_init__(self) -> None:
@@ -102,6 +118,11 @@ class Settings(_Checked):
             raise ValueError(
                 "ppo.mini_batches must be at most num_envs * steps_per_iteration "
                 f"= {samples}, not {self.ppo.mini_batches}"
+            )
+        if self.network.recurrent != "none" and self.ppo.mini_batches > self.num_envs:
+            raise ValueError(
+                f"ppo.mini_batches must be at most num_envs = {self.num_envs} with network.recurrent, "
+                f"not {self.ppo.mini_batches}"
             )
 
 

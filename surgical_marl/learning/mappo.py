@@ -7,6 +7,8 @@ one agent (A = 1) this is PPO, by the same code.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import asdict
 from typing import Any
 
 import torch
@@ -17,10 +19,12 @@ from torch import Tensor, nn
 
 from surgical_marl.interfaces.rsl_rl import RslRlVecEnv
 from surgical_marl.learning.config import Settings
-from surgical_marl.learning.models import Gaussian, MultiAgentActor, MultiAgentModel
+from surgical_marl.learning.constraint import Constraint
+from surgical_marl.learning.models import Gaussian, MultiAgentActor, MultiAgentModel, make_model
+from surgical_marl.learning.recurrent import Memory
 from surgical_marl.learning.storage import MultiAgentStorage
 from surgical_marl.learning.values import ValueScale
-from surgical_marl.learning.vision import PICTURES, make_model
+from surgical_marl.learning.vision import PICTURES
 
 LOSSES = ("value_loss", "surrogate_loss", "entropy", "kl", "learning_rate")
 LEARNING_RATE_RANGE = (1e-5, 1e-2)  # rsl_rl's limits of the adaptive learning rate
@@ -36,6 +40,7 @@ class MAPPO(PPO):
     Args:
         team_reward: give every agent the sum of all agents' rewards, instead of its own.
         normalise_values: the critic predicts returns of unit variance; all else is in units of reward.
+        constraint: on a cost; the critic then has two values for each agent, of rewards and of costs.
         ppo: arguments of `rsl_rl.algorithms.PPO`.
     """
 
@@ -47,6 +52,7 @@ class MAPPO(PPO):
         *,
         team_reward: bool = False,
         normalise_values: bool = False,
+        constraint: Constraint | None = None,
         **ppo: Any,
     ) -> None:
         super().__init__(actor, critic, storage, **ppo)
@@ -55,6 +61,10 @@ class MAPPO(PPO):
         self.scale = ValueScale(storage.values.shape[-1]).to(self.device)
         # What learns beside the networks: it stands in checkpoints.
         self.options = nn.ModuleDict({"scale": self.scale} if normalise_values else {})
+        self.memory = Memory(storage.num_envs, actor, critic, self.device)
+        self.constraint = constraint
+        if constraint is not None:
+            self.options["constraint"] = constraint
         # As a tensor the learning rate adapts without the host having to read the divergence.
         self._rate = torch.tensor(float(self.learning_rate), device=self.device)
         self._cuda = torch.device(self.device).type == "cuda"
@@ -63,28 +73,41 @@ class MAPPO(PPO):
 
     def act(self, obs: TensorDict) -> Tensor:
         """Sample the flat joint action `[N, sum]`."""
+        step, memory = self.transition, self.memory
+        if self.storage.step == 0:
+            memory.begin()
         with self._precision():
-            actions = super().act(obs)
-        self.transition.values = self.scale.restore(self.transition.values)
-        return actions
+            step.actions = self.actor(obs, None, memory.actor, stochastic_output=True)
+            step.actions_log_prob = self.actor.get_output_log_prob(step.actions)
+        step.values = self._values(obs)
+        memory.step()
+        step.distribution_params = self.actor.output_distribution_params
+        step.observations = obs
+        return step.actions
 
     def process_env_step(self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: dict[str, Any]) -> None:
         """Store one step.
 
         A time-out is worth the value of the state it was cut off in: gamma * V(final state).
         """
-        rewards = extras["agent_rewards"]
+        parts = [extras["agent_rewards"]]
+        if self.constraint is not None:
+            parts.append(self.constraint.add(extras["infos"], dones))
+        rewards = torch.stack(parts, -1)
         if self.team_reward:
-            rewards = rewards.sum(-1, keepdim=True).expand_as(rewards)
+            rewards = rewards.sum(-2, keepdim=True).expand_as(rewards)
+        rewards = rewards.flatten(-2)
         final_values = self._values(extras["final_obs"])
         self.transition.rewards = rewards + self.gamma * final_values * extras["time_outs"].unsqueeze(-1)
         self.transition.dones = dones
         self.storage.add_transition(self.transition)
         self.transition.clear()
+        self.memory.clear(dones)
 
     def loss(self, batch: RolloutStorage.Batch) -> tuple[Tensor, Tensor]:
         """Loss of a mini-batch; and value loss, surrogate loss, entropy and KL, detached `[4]`."""
-        self.actor.distribute(batch.observations)
+        actor_memory, critic_memory = batch.hidden_states
+        self.actor.distribute(batch.observations, batch.masks, actor_memory)
         log_prob = self.actor.get_output_log_prob(batch.actions)
         with torch.no_grad():
             params = self.actor.output_distribution_params
@@ -95,7 +118,8 @@ class MAPPO(PPO):
         clipped = ratio.clamp(1 - self.clip_param, 1 + self.clip_param)
         surrogate = -torch.min(batch.advantages * ratio, batch.advantages * clipped).mean()
 
-        values, returns = self.critic(batch.observations), self.scale.normalise(batch.returns)
+        values = self.critic(batch.observations, batch.masks, critic_memory)
+        returns = self.scale.normalise(batch.returns)
         value = (values - returns).square()
         if self.use_clipped_value_loss:
             old = self.scale.normalise(batch.values)
@@ -113,6 +137,9 @@ class MAPPO(PPO):
         if "scale" in self.options:
             self.scale.learn(storage.returns.flatten(0, 1))
         advantages = storage.returns - storage.values
+        if self.constraint is not None:
+            self.constraint.update()
+            advantages = self.constraint.weigh(advantages.unflatten(-1, (-1, 2)))
         storage.advantages.copy_((advantages - advantages.mean()) / (advantages.std() + 1e-8))
 
     def update(self) -> dict[str, float]:
@@ -125,7 +152,7 @@ class MAPPO(PPO):
     def learn(self) -> Tensor:
         """What `update` does, without waiting for the device: `LOSSES` as a tensor."""
         total = torch.zeros(4, device=self.device)
-        for batch in self.storage.mini_batch_generator(self.num_mini_batches, self.num_learning_epochs):
+        for batch in self._batches():
             with self._precision():
                 loss, parts = self.loss(batch)
             if self.schedule == "adaptive":
@@ -142,15 +169,22 @@ class MAPPO(PPO):
         count = self.num_mini_batches * self.num_learning_epochs
         return torch.cat([total / count, self._rate[None]])
 
+    def _batches(self) -> Iterator[RolloutStorage.Batch]:
+        counts = (self.num_mini_batches, self.num_learning_epochs)
+        if self.actor.is_recurrent:
+            return self.storage.sequences(self.memory.begun, *counts)
+        return self.storage.mini_batch_generator(*counts)
+
     def _values(self, obs: TensorDict) -> Tensor:
         """Values of observations, in units of reward."""
         with self._precision():
-            return self.scale.restore(self.critic(obs))
+            return self.scale.restore(self.critic(obs, None, self.memory.critic))
 
     def _precision(self) -> torch.autocast:
         """bfloat16 for the networks' products if that was asked for; the same when acting and learning, or ratios
         would not begin at 1."""
-        return torch.autocast("cuda" if self._cuda else "cpu", torch.bfloat16, enabled=self.use_mixed_precision)
+        enabled = self.use_mixed_precision and self._cuda
+        return torch.autocast("cuda" if self._cuda else "cpu", torch.bfloat16, enabled=enabled)
 
     def _adapt_rate(self, divergence: Tensor) -> None:
         """rsl_rl's rule: slower above twice the wanted divergence, faster below half of it."""
@@ -192,18 +226,24 @@ class MAPPO(PPO):
         if cfg.get("multi_gpu"):
             raise ValueError("MAPPO runs on one GPU: start it without torchrun")
         layout = env.layout
+        options, constraint = dict(cfg["algorithm"]), None
+        if bounds := options.pop("constraint"):
+            constraint = Constraint(layout, env.num_envs, **bounds).to(device)
+        per_agent = 1 if constraint is None else 2
+        num_values = per_agent * layout.num_agents
         actor = MultiAgentActor(obs, layout.action_sizes, **cfg["actor"]).to(device)
         if cfg["centralised_critic"]:
             # in the state's pictures agents are no axis: they are those of the one agent that has any
             seen = {name: pictures[:, 0] for name, pictures in obs.items() if name.endswith(PICTURES)}
             sample = TensorDict({"state": obs["state"], **seen}, batch_size=obs.batch_size)
-            critic: nn.Module = make_model(sample, ["state", *seen], layout.num_agents, **cfg["critic"])
+            critic: nn.Module = make_model(sample, ["state", *seen], num_values, **cfg["critic"])
         else:
-            critic = MultiAgentModel(obs, dict.fromkeys(layout.counts, 1), **cfg["critic"])
+            critic = MultiAgentModel(obs, dict.fromkeys(layout.counts, per_agent), **cfg["critic"])
         steps = cfg["num_steps_per_env"]
-        storage = MultiAgentStorage(layout.num_agents, env.num_envs, steps, obs, env.num_actions, device)
-        algorithm = {name: value for name, value in cfg["algorithm"].items() if name != "class_name"}
-        return MAPPO(actor, critic.to(device), storage, device=device, **algorithm)
+        sizes = (layout.num_agents, num_values, env.num_envs, steps)
+        storage = MultiAgentStorage(*sizes, obs, env.num_actions, device)
+        del options["class_name"]
+        return MAPPO(actor, critic.to(device), storage, constraint=constraint, device=device, **options)
 
 
 def rsl_rl_config(settings: Settings) -> dict[str, Any]:
@@ -213,6 +253,7 @@ def rsl_rl_config(settings: Settings) -> dict[str, Any]:
         "hidden_dims": list(network.hidden),
         "activation": network.activation,
         "obs_normalization": network.normalise_observations,
+        "recurrent": network.recurrent,
     }
     gaussian = {
         "class_name": Gaussian,
@@ -229,6 +270,7 @@ def rsl_rl_config(settings: Settings) -> dict[str, Any]:
             "class_name": MAPPO,
             "team_reward": settings.team_reward,
             "normalise_values": ppo.normalise_values,
+            "constraint": asdict(settings.constraint) if settings.constraint.cost != "none" else None,
             "learning_rate": ppo.learning_rate,
             "schedule": ppo.schedule,
             "desired_kl": ppo.desired_kl,

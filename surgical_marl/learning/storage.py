@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import torch
 from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
@@ -9,14 +11,21 @@ from torch import Tensor
 
 
 class MultiAgentStorage(RolloutStorage):
-    """rsl_rl's rollout storage with log-probabilities, values, rewards and advantages A wide."""
+    """rsl_rl's rollout storage with log-probabilities and advantages A wide, and rewards, values and returns W wide.
+
+    W is A, or 2 A where each agent has a reward and a cost: one after the other, agent by agent.
+    """
 
     distribution_params: tuple[Tensor, ...] | None
 
-    def __init__(self, num_agents: int, num_envs: int, steps: int, obs: TensorDict, actions: int, device: str) -> None:
+    def __init__(
+        self, num_agents: int, num_values: int, num_envs: int, steps: int, obs: TensorDict, actions: int, device: str
+    ) -> None:
         super().__init__("rl", num_envs, steps, obs, [actions], device)
-        for name in ("rewards", "values", "actions_log_prob", "returns", "advantages"):
+        for name in ("actions_log_prob", "advantages"):
             setattr(self, name, torch.zeros(steps, num_envs, num_agents, device=device))
+        for name in ("rewards", "values", "returns"):
+            setattr(self, name, torch.zeros(steps, num_envs, num_values, device=device))
 
     def add_transition(self, transition: RolloutStorage.Transition) -> None:
         """Copy one step of all environments into the storage."""
@@ -32,6 +41,32 @@ class MultiAgentStorage(RolloutStorage):
         for stored, param in zip(self.distribution_params, params, strict=True):
             stored[self.step].copy_(param)
         self.step += 1
+
+    def sequences(
+        self, begun: tuple[Tensor, Tensor], num_mini_batches: int, num_epochs: int
+    ) -> Iterator[RolloutStorage.Batch]:
+        """Mini-batches `[T, B]` for networks that remember: whole rollouts of B environments each.
+
+        Args:
+            begun: memories of actor and critic where the rollout began, `[N, ...]` each.
+            num_mini_batches: in an epoch, each of other environments.
+            num_epochs: with the same mini-batches, as rsl_rl does.
+        """
+        begins = torch.cat([torch.zeros_like(self.dones[:1]), self.dones[:-1]]).squeeze(-1).bool()
+        order = torch.randperm(self.num_envs, device=self.device)
+        for _ in range(num_epochs):
+            for chosen in order.split(self.num_envs // num_mini_batches)[:num_mini_batches]:
+                yield RolloutStorage.Batch(
+                    observations=self.observations[:, chosen],
+                    actions=self.actions[:, chosen],
+                    values=self.values[:, chosen],
+                    advantages=self.advantages[:, chosen],
+                    returns=self.returns[:, chosen],
+                    old_actions_log_prob=self.actions_log_prob[:, chosen],
+                    old_distribution_params=tuple(param[:, chosen] for param in self.distribution_params or ()),
+                    hidden_states=(begun[0][chosen], begun[1][chosen]),
+                    masks=begins[:, chosen],
+                )
 
     def compute_returns(self, last_values: Tensor, gamma: float, lam: float) -> None:
         """Generalised advantage estimation (Schulman et al. 2016, arXiv 1506.02438): `returns` of the full storage.

@@ -10,7 +10,7 @@ import threading
 from collections import deque
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
@@ -45,7 +45,10 @@ CHANGEABLE = {
     "checkpoint_every",
     "team_reward",
     "ppo",
+    "constraint",
 }
+# Except these, which say what stands in a checkpoint.
+FIXED = {"ppo.normalise_values", "constraint.cost"}
 
 
 def make_env(settings: Settings, num_envs: int | None = None) -> BatchedEnv:
@@ -183,17 +186,26 @@ class _Log:
 
 def _read_resumed(settings: Settings, run: Path) -> dict[str, Any]:
     old, state = read_settings(run), read_checkpoint(run)
-    for item in fields(Settings):
-        before, now = getattr(old, item.name), getattr(settings, item.name)
-        if item.name not in CHANGEABLE and before != now:
-            raise ValueError(f"the run in {run} has {item.name} {before!r}, and cannot go on with {now!r}")
-    if (before := old.ppo.normalise_values) != settings.ppo.normalise_values:
-        raise ValueError(f"the run in {run} has ppo.normalise_values {before!r}, and cannot go on with {not before!r}")
+    asked = _dotted(settings)
+    for name, before in _dotted(old).items():
+        fixed = name in FIXED or name.partition(".")[0] not in CHANGEABLE
+        if fixed and before != asked[name]:
+            raise ValueError(f"the run in {run} has {name} {before!r}, and cannot go on with {asked[name]!r}")
     if state["iteration"] >= settings.iterations:
         raise ValueError(
             f"the run in {run} already has {state['iteration']} iterations: ask for more than {settings.iterations}"
         )
     return state
+
+
+def _dotted(settings: Any) -> dict[str, Any]:
+    """Settings by their names, such as "ppo.gamma"."""
+    named: dict[str, Any] = {}
+    for item in fields(settings):
+        value = getattr(settings, item.name)
+        inner = _dotted(value) if is_dataclass(value) else None
+        named |= {item.name: value} if inner is None else {f"{item.name}.{name}": part for name, part in inner.items()}
+    return named
 
 
 def _describe(row: Mapping[str, float]) -> str:

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from surgical_marl.interfaces.rsl_rl import RslRlVecEnv
 from surgical_marl.learning.config import Settings
+from surgical_marl.learning.constraint import METRICS
 from surgical_marl.learning.episodes import ENDED, Episodes
 from surgical_marl.learning.graphs import Replayed
 from surgical_marl.learning.mappo import LOSSES, MAPPO, rsl_rl_config
@@ -61,7 +62,8 @@ class Training:
         self.algorithm.train_mode()
         terms = self.env.reward_terms
         self.episodes = Episodes(env.agents, terms, self.env.layout.num_agents, env.num_envs, device)
-        self._names = (*ENDED, *terms, *LOSSES, "action_std", "finite", "weights")
+        self._bounded = METRICS if self.algorithm.constraint is not None else ()
+        self._names = (*ENDED, *terms, *LOSSES, *self._bounded, "action_std", "finite", "weights")
         # All environments start together: let the first episodes end at different times.
         steps = torch.randint(0, max(env.max_steps, 1), (env.num_envs,))
         self.env.episode_length_buf = steps.to(device)
@@ -91,6 +93,7 @@ class Training:
             *("iteration", "env_steps", "seconds", "steps_per_s"),
             *("reward", *self.env.reward_terms),
             *("episodes", "tip_error_mm", "success_rate", "collision_rate"),
+            *self._bounded,
             *LOSSES,
             "action_std",
         )
@@ -155,7 +158,10 @@ class Training:
         losses = self.algorithm.learn()
         std = self.algorithm.actor.output_std.detach().mean()
         weights = torch.stack([weight.detach().sum() for weight in self._parameters()]).sum()
-        self._values.copy_(torch.cat([self.episodes.take(), losses, torch.stack([std, self._finite, weights])]))
+        parts = [self.episodes.take(), losses]
+        if self.algorithm.constraint is not None:
+            parts.append(self.algorithm.constraint.metrics())
+        self._values.copy_(torch.cat([*parts, torch.stack([std, self._finite, weights])]))
 
     def _parameters(self) -> chain[torch.nn.Parameter]:
         return chain(self.algorithm.actor.parameters(), self.algorithm.critic.parameters())
@@ -169,6 +175,7 @@ class Training:
             "algorithm": self.algorithm.save(),
             "env": {**self.env.carry(), "observations": self._observations.to_dict()},
             "collided": self.episodes.collided,
+            "memory": self.algorithm.memory.state_dict() if self.algorithm.actor.is_recurrent else None,
             "random": torch.get_rng_state(),
             "random_cuda": torch.cuda.get_rng_state() if self._cuda else None,
         }
@@ -181,6 +188,8 @@ class Training:
         for name, kept in self._observations.items():
             kept.copy_(state["env"]["observations"][name])
         self.episodes.collided.copy_(state["collided"])
+        if self.algorithm.actor.is_recurrent:
+            self.algorithm.memory.load_state_dict(state["memory"])
         torch.set_rng_state(state["random"])
         if state["random_cuda"] is not None and self._cuda:
             torch.cuda.set_rng_state(state["random_cuda"])
