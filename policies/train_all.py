@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from surgical_marl.content import content_dir, list_scenes, list_tasks, unknown
+from surgical_marl.runtime import defer_compiler
 
 PICTURES = {"match_image": ("ecm", "trimanual_psm_ecm")}
 """Tasks that need an endoscope, and the scenes that have one."""
@@ -133,6 +134,8 @@ def _work(job: Job) -> None:
 
 def train(task: str, scene: str, run: Path, overrides: Sequence[str]) -> None:
     """Train one run from where it is to its end."""
+    defer_compiler()
+
     from surgical_marl.learning import train as learning
     from surgical_marl.learning.config import load_config
     from surgical_marl.learning.run import CHECKPOINT, read_checkpoint

@@ -164,36 +164,48 @@ def test_weights_that_are_not_data_or_not_of_this_scene_are_refused(runs: list[s
         load_policy(out, env)
 
 
-@pytest.mark.parametrize("algo", ["mappo", "joint"])
 @pytest.mark.parametrize(
-    "env",
-    [FakeEnv({"psm": 1}, SIZES), FakeEnv(COUNTS, SIZES), PictureEnv(COUNTS, SIZES)],
-    ids=["one", "three", "pictures"],
+    ("env", "algo", "recurrent"),
+    [
+        (FakeEnv({"psm": 1}, SIZES), "mappo", "none"),
+        (FakeEnv(COUNTS, SIZES), "mappo", "none"),
+        (FakeEnv(COUNTS, SIZES), "joint", "none"),
+        (FakeEnv(COUNTS, SIZES), "mappo", "lstm"),
+        (PictureEnv(COUNTS, SIZES), "mappo", "none"),
+        (PictureEnv(COUNTS, SIZES), "joint", "gru"),
+    ],
 )
-def test_onnx_acts_as_torch_does(env: Any, algo: Any, tmp_path: Path) -> None:
-    """For random observations, far ones too, of any number of agents at once."""
+def test_onnx_acts_as_torch_does(env: Any, algo: Any, recurrent: Any, tmp_path: Path) -> None:
+    """For random observations, pictures and memories of any number of agents at once."""
     torch.manual_seed(0)
+    network = NetworkSettings(hidden=(16,), recurrent=recurrent)
     layout = Layout(env, joint=algo == "joint")
-    actor = policy._actor(replace(SMALL, algo=algo), env, layout)
+    actor = policy._actor(replace(SMALL, algo=algo, network=network), env, layout)
     with torch.no_grad():
         for model in actor.models.values():  # fresh networks hardly act: so that some actions are beyond 1
             model.mlp[-1].weight.mul_(300)
+    for name, model in actor.models.items():
+        write_onnx(tmp_path / f"{name}.onnx", model)
+    assert len(list(tmp_path.iterdir())) == len(layout.counts)
     for number in (1, 7):
         seen = {agent: _random(env.observation_space(agent), number) for agent in env.agents}
         groups = layout.stack(seen)
+        memory = torch.randn(number, *actor.memory_shape) if actor.is_recurrent else None
         with torch.inference_mode():
-            actions = actor._split(actor(TensorDict({**groups}, batch_size=[number])).clamp(-1, 1))
-        for (name, model), wanted in zip(actor.models.items(), actions, strict=True):
-            if number == 1:
-                write_onnx(tmp_path / f"{name}.onnx", model)
-            session = onnxruntime.InferenceSession(tmp_path / f"{name}.onnx")
-            for place in range(layout.counts[name]):
-                given = {"observation": groups[name][:, place].numpy()}
-                if f"{name}_pictures" in groups:
-                    given |= {key: seen["ecm_0"][key].numpy() for key in ("image", "target")}
-                (action,) = session.run(None, given)
-                np.testing.assert_allclose(action, wanted[:, place], atol=1e-5, rtol=0)
-    assert not list(tmp_path.glob("[!pej]*"))
+            flat = actor(TensorDict({**groups}, batch_size=[number]), None, memory).clamp(-1, 1)
+        left = actor.get_hidden_state()
+        places = [(name, place) for name, count in layout.counts.items() for place in range(count)]
+        for index, (name, place) in enumerate(places):
+            given = {"observation": groups[name][:, place].numpy()}
+            wanted = [actor._split(flat)[list(layout.counts).index(name)][:, place]]
+            if f"{name}_pictures" in groups:
+                given |= {key: seen["ecm_0"][key].numpy() for key in ("image", "target")}
+            if memory is not None and left is not None:
+                given["memory"] = memory[:, index].numpy()
+                wanted.append(left[:, index])
+            got = onnxruntime.InferenceSession(tmp_path / f"{name}.onnx").run(None, given)
+            for one, other in zip(got, wanted, strict=True):
+                np.testing.assert_allclose(one, other, atol=1e-5, rtol=0)
 
 
 def _random(space: Any, number: int) -> Any:

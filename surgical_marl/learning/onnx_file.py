@@ -5,8 +5,10 @@ What such a file takes, for N agents of its type at once:
     observation  [N, d + n] float32, what the agent observes; where n > 1 agents share the type, then a one-hot of the
                  agent's place among them ("joint": what all agents observe, type by type)
     image, target  [N, H, W, 3] uint8, of an agent that sees pictures
+    memory       [N, S] float32, of a network that remembers: zeros when an episode begins, then the last `next_memory`
 
-and gives `action` [N, a] float32 in [-1, 1], without exploration noise. Observations are normalised inside.
+and gives `action` [N, a] float32 in [-1, 1], without exploration noise, and `next_memory` if it remembers. Observations
+are normalised inside.
 """
 
 from __future__ import annotations
@@ -24,47 +26,57 @@ from torch import Tensor, nn
 from surgical_marl.files import write_atomic
 
 SUFFIX = ".onnx"
-INPUTS = ("observation", "image", "target")
 OPSET = 20
 
 
 class Graph(nn.Module):
-    """What an agent of one type does, from the arrays that the environment gives to the action it takes."""
+    """What an agent of one type does, from the arrays that the environment gives to the action it takes.
+
+    Attributes:
+        takes, gives: names of what goes in and comes out.
+    """
 
     def __init__(self, model: Any) -> None:
         super().__init__()
         self.model = model
+        self.sees = hasattr(model, "obs_dims_2d")
+        pictures, memory = ["image", "target"] if self.sees else [], ["memory"] if model.is_recurrent else []
+        self.takes = ["observation", *pictures, *memory]
+        self.gives = ["action", *(f"next_{name}" for name in memory)]
 
-    def forward(self, observation: Tensor, image: Tensor | None = None, target: Tensor | None = None) -> Tensor:
-        """[N, d], and pictures [N, H, W, 3] twice or not at all -> [N, a]."""
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        """All of `takes`, a batch each, to all of `gives`."""
+        given = dict(zip(self.takes, inputs, strict=True))
         (name,) = self.model.obs_groups
-        groups = {name: observation}
-        if image is not None and target is not None:
-            groups[self.model.obs_groups_2d[0]] = torch.cat([image, target], -1).movedim(-1, -3).unsqueeze(1)
-        return self.model(groups).clamp(-1.0, 1.0)
+        groups = {name: given["observation"]}
+        if self.sees:
+            pictures = torch.cat([given["image"], given["target"]], -1).movedim(-1, -3)
+            groups[self.model.obs_groups_2d[0]] = pictures.unsqueeze(1)
+        action = self.model(groups, None, given.get("memory")).clamp(-1.0, 1.0)
+        return (action, self.model.get_hidden_state()) if self.model.is_recurrent else (action,)
 
     def example(self) -> tuple[Tensor, ...]:
-        """Inputs of two agents, all zero."""
-        felt = torch.zeros(2, self.model.obs_dim)
-        if not hasattr(self.model, "obs_dims_2d"):
-            return (felt,)
-        height, width = self.model.obs_dims_2d[0]
-        picture = torch.zeros(2, height, width, 3, dtype=torch.uint8)
-        return felt, picture, picture.clone()
+        """What it takes for two agents, all zero."""
+        zeros = {"observation": torch.zeros(2, self.model.obs_dim)}
+        if self.sees:
+            height, width = self.model.obs_dims_2d[0]
+            zeros |= {name: torch.zeros(2, height, width, 3, dtype=torch.uint8) for name in ("image", "target")}
+        if self.model.is_recurrent:
+            zeros["memory"] = torch.zeros(2, *self.model.memory_shape)
+        return tuple(zeros[name] for name in self.takes)
 
 
 def write_onnx(path: Path, model: Any) -> None:
     """Write the network of one type of arm, of a `MultiAgentActor` on the CPU."""
     graph = Graph(model).eval()
-    example = graph.example()
-    batch = torch.export.Dim("N")
+    batch = {0: torch.export.Dim("N")}
     with _quiet():
         program = torch.onnx.export(
             graph,
-            example,
-            input_names=list(INPUTS[: len(example)]),
-            output_names=["action"],
-            dynamic_shapes=tuple({0: batch} for _ in INPUTS[: len(example)]),
+            graph.example(),
+            input_names=graph.takes,
+            output_names=graph.gives,
+            dynamic_shapes=(tuple(batch for _ in graph.takes),),
             opset_version=OPSET,
             dynamo=True,
             verbose=False,

@@ -14,7 +14,7 @@ from surgical_marl.files import write_atomic
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from surgical_marl.learning.mappo import MultiAgentActor
+    from surgical_marl.learning.models import MultiAgentActor
 
 SUFFIX = ".safetensors"
 WIDTHS = ("agents", "observation", "action")
