@@ -59,12 +59,13 @@ class FusedEngine:
         self._pool = ThreadPoolExecutor(shares, "surgical_marl") if shares > 1 else None
         self._stepped = False
 
-    def reset(self, seed: int) -> None:
-        """First episodes. Environment i depends on `seed` and i alone, not on how many there are."""
+    def reset(self, seed: int, first: int = 0) -> None:
+        """First episodes. Environment i depends on `seed` and `first` + i alone, not on how many there are."""
         import jax
 
         # the same keys as the MJX engine's
-        keys = jax.jit(jax.vmap(jax.random.fold_in, (None, 0)))(jax.random.PRNGKey(seed), np.arange(self.num_envs))
+        numbers = np.arange(first, first + self.num_envs)
+        keys = jax.jit(jax.vmap(jax.random.fold_in, (None, 0)))(jax.random.PRNGKey(seed), numbers)
         self.write(".key", np.asarray(keys))
         self.write(".episode", np.zeros(self.num_envs, np.int32))
         self._launch("reset")
