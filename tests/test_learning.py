@@ -244,7 +244,7 @@ def test_folders_that_cannot_be_used(tmp_path: Path, fakes: list[Any]) -> None:
         (SMALL, {"out": tmp_path / "file" / "run"}, "cannot write"),
         (SMALL, {"out": tmp_path / "new", "resume": tmp_path / "empty"}, "not a run folder"),
         (SMALL, {"out": tmp_path / "new", "resume": exported}, "exported policy"),
-        (replace(SMALL, iterations=1), {"out": run, "resume": run}, "already has 1 iterations"),
+        (replace(SMALL, iterations=1), {"out": tmp_path / "new", "resume": run}, "already has 1 iterations"),
         (replace(SMALL, num_envs=8), {"out": run, "resume": run}, "num_envs 32"),
         (replace(SMALL, scene="psm"), {"out": run, "resume": run}, "'bimanual_psm'"),
     ]
