@@ -5,17 +5,16 @@ from __future__ import annotations
 # Only light imports up here: `list` and a typing error should answer at once. What needs torch or
 # JAX is imported by the command that needs it.
 import argparse
-import contextlib
 import json
 import os
 import sys
-import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
 from surgical_marl.content import BASELINES, find, list_arms, list_policies, list_scenes, list_tasks, unknown
+from surgical_marl.runtime import defer_compiler
 
 _LISTS = {
     "tasks": list_tasks,
@@ -24,29 +23,34 @@ _LISTS = {
     "policies": list_policies,
 }
 
+_ALGOS = ("mappo", "ippo", "joint")
 _CONTROL = ("position", "velocity", "torque")
 _DIFFICULTY = ("easy", "default", "hard")
 _DEVICES = ("auto", "cpu", "cuda")
+_ENGINES = ("auto", "fused", "mjx")
 _BENCHED = ("all", "fused", "mjx", "mujoco")
 _MOTIONS = ("random", "rough")
 
 # Flags of `train` that are short for `key=value`: key, good values or a placeholder, help.
 _SETTINGS: tuple[tuple[str, str | tuple[str, ...], str], ...] = (
-    ("algo", ("mappo", "ippo", "joint"), "who learns from what"),
+    ("algo", _ALGOS, "who learns from what"),
     ("num_envs", "N", "environments that run side by side"),
     ("iterations", "K", "rounds of acting and learning"),
     ("seed", "S", "seed of everything random"),
-    ("engine", ("auto", "fused", "mjx"), "what runs the physics"),
+    ("engine", _ENGINES, "what runs the physics"),
     ("device", _DEVICES, "where it runs"),
     ("control", _CONTROL, "what an action commands"),
     ("difficulty", _DIFFICULTY, "how far, how fast, how crowded"),
 )
+_TAKE_SETTINGS = ("train", "bench train", "bench solve")
+"""Commands that take `key=value`."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command; returns 0, 1 if training diverged or `check` found something, 2 for bad input, 130 if
     interrupted."""
     code = 0
+    defer_compiler()
     try:
         arguments = _parse(argv)
         code = arguments.command(arguments) or 0
@@ -83,7 +87,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
         arguments.task, rest = None, [arguments.task, *rest]
     arguments.overrides = [text for text in rest if "=" in text and not text.startswith("-")]
     for text in rest:
-        if text not in arguments.overrides or arguments.command is not _train:
+        if text not in arguments.overrides or arguments.name not in _TAKE_SETTINGS:
             raise ValueError(f"unknown argument {text!r}, see surgical-marl {arguments.name} --help")
     return arguments
 
@@ -141,24 +145,39 @@ def _parser() -> argparse.ArgumentParser:
     export.add_argument("--control", type=_one_of(_CONTROL), default=_CONTROL[0], metavar="|".join(_CONTROL))
     export.set_defaults(command=_export, name="export")
 
-    bench = commands.add_parser("bench", help="measure how fast this machine simulates")
-    bench.add_argument("kind", type=_one_of(("sim",)), metavar="sim")
-    bench.add_argument("--task", default="reach", help=f"one of: {', '.join(list_tasks())}")
-    bench.add_argument("--scene", default="psm", help="a name (see `list scenes`) or a .yaml file")
-    bench.add_argument("--num-envs", type=_whole(1), metavar="N", help="default: 4096 on a CPU, 131072 on a GPU")
-    bench.add_argument("--engine", type=_one_of(_BENCHED), default="all", metavar="|".join(_BENCHED))
-    bench.add_argument("--device", type=_one_of(_DEVICES), default="auto", metavar="|".join(_DEVICES))
-    bench.add_argument("--decimation", type=_whole(1), default=1, metavar="K", help="physics steps an environment step")
-    bench.add_argument("--motion", type=_one_of(_MOTIONS), default=_MOTIONS[0], metavar="|".join(_MOTIONS),
-                       help="random: a new action every control step; rough: arms cross each other's way")  # fmt: skip
-    bench.add_argument("--sweep", action="store_true", help="from 1 to 4 million environments, as far as memory goes")
-    bench.add_argument("--cold", action="store_true", help="start without caches, for compile_s")
-    bench.add_argument("--json", action="store_true", help="one JSON object instead of a table")
-    bench.add_argument("--out", type=Path, metavar="FILE.png", help="picture of a sweep")
-    bench.set_defaults(command=_bench, name="bench")
+    bench = commands.add_parser("bench", help="measure how fast this machine simulates and learns")
+    kinds = bench.add_subparsers(required=True, metavar="{sim,train,solve}")
+    sim = _bench_parser(kinds, "sim", "steps/s of the engines and of C MuJoCo", _BENCHED)
+    sim.add_argument("--decimation", type=_whole(1), default=1, metavar="K", help="physics steps an environment step")
+    sim.add_argument("--motion", type=_one_of(_MOTIONS), default=_MOTIONS[0], metavar="|".join(_MOTIONS),
+                     help="random: a new action every control step; rough: arms cross each other's way")  # fmt: skip
+    sim.add_argument("--sweep", action="store_true", help="from 1 to 4 million environments, as far as memory goes")
+    sim.add_argument("--out", type=Path, metavar="FILE.png", help="picture of a sweep")
+    for kind, what in (("train", "steps/s with learning"), ("solve", "seconds until a policy is good")):
+        learns = _bench_parser(kinds, kind, what, _ENGINES)
+        learns.usage = "%(prog)s [options] [key=value ...]"
+        learns.add_argument("--algo", type=_one_of(_ALGOS), metavar="|".join(_ALGOS), help="who learns from what")
+        learns.add_argument("--seed", type=_whole(0), metavar="S", help="seed of everything random")
+    learns.add_argument("--success", type=float, default=0.95, metavar="SHARE", help="wanted within 2 mm")
+    learns.add_argument("--collisions", type=float, default=0.01, metavar="SHARE", help="of episodes, to stay below")
+    learns.add_argument("--limit", type=float, default=600.0, metavar="SECONDS", help="then it is given up")
 
     doctor = commands.add_parser("doctor", help="check this machine and this installation")
     doctor.set_defaults(command=_doctor, name="doctor")
+    return parser
+
+
+def _bench_parser(kinds: Any, kind: str, what: str, engines: Sequence[str]) -> argparse.ArgumentParser:
+    """The parser of one benchmark, with what all take."""
+    parser: argparse.ArgumentParser = kinds.add_parser(kind, help=what)
+    parser.add_argument("--task", default="reach", help=f"one of: {', '.join(list_tasks())}")
+    parser.add_argument("--scene", default="psm", help="a name (see `list scenes`) or a .yaml file")
+    parser.add_argument("--num-envs", type=_whole(1), metavar="N", help="default: by the device (docs/benchmarks.md)")
+    parser.add_argument("--engine", type=_one_of(engines), default=engines[0], metavar="|".join(engines))
+    parser.add_argument("--device", type=_one_of(_DEVICES), default="auto", metavar="|".join(_DEVICES))
+    parser.add_argument("--cold", action="store_true", help="start without caches")
+    parser.add_argument("--json", action="store_true", help="one JSON object instead of a table")
+    parser.set_defaults(command=_bench, kind=kind, name=f"bench {kind}")
     return parser
 
 
@@ -207,34 +226,10 @@ def _export(arguments: argparse.Namespace) -> None:
     print(out)
 
 
-def _bench(arguments: argparse.Namespace) -> None:
-    if arguments.task not in list_tasks():
-        raise unknown("task", arguments.task, list_tasks())
-    find("scenes", arguments.scene)
-    if arguments.sweep and arguments.num_envs:
-        raise ValueError(f"--sweep takes every number of environments: leave --num-envs {arguments.num_envs} out")
-    if arguments.out and not arguments.sweep:
-        raise ValueError(f"--out {arguments.out} is for the picture of a sweep: add --sweep")
-    if arguments.out and not (arguments.out.suffix == ".png" and arguments.out.parent.is_dir()):
-        raise ValueError(f"cannot write {arguments.out}: name a .png file in a folder that exists")
-    if arguments.engine == "mujoco" and arguments.device == "cuda":
-        raise ValueError("engine 'mujoco' has no device 'cuda': it runs on a CPU")
-    with _no_caches() if arguments.cold else contextlib.nullcontext():
-        from surgical_marl.bench.report import run
+def _bench(arguments: argparse.Namespace) -> int:
+    from surgical_marl.bench.command import run
 
-        engines = _BENCHED[1:] if arguments.engine == "all" else (arguments.engine,)
-        keys = ("task", "scene", "num_envs", "device", "decimation", "motion")
-        print(run({k: getattr(arguments, k) for k in keys}, engines, arguments.sweep, arguments.json, arguments.out))
-
-
-@contextlib.contextmanager
-def _no_caches() -> Iterator[None]:
-    """Compilers find their caches empty, and what they leave there is gone afterwards."""
-    with tempfile.TemporaryDirectory() as folder:
-        os.environ["XDG_CACHE_HOME"] = folder
-        for name in ("WARP_CACHE_PATH", "JAX_COMPILATION_CACHE_DIR"):
-            os.environ.pop(name, None)
-        yield
+    return run(arguments)
 
 
 def _doctor(arguments: argparse.Namespace) -> None:

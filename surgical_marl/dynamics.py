@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 from jax import Array
 
-from surgical_marl.runtime import prepare_jax
+from surgical_marl.runtime import prepare_mjx
 from surgical_marl.solver import JointRows, Rows, relax, solve, solve_positive
 
 ITERATIONS = (1, 1)
@@ -53,10 +53,7 @@ class Dynamics:
     """MJX on a model of joints that have one degree of freedom each."""
 
     def __init__(self, model: mujoco.MjModel) -> None:
-        prepare_jax()
-        from mujoco import mjx
-
-        self._mjx = mjx
+        mjx = self._mjx = prepare_mjx()
         smooth = copy.copy(model)
         smooth.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT  # that is for `collision.py`
         self.model, self._data = mjx.put_model(smooth), mjx.make_data(smooth)

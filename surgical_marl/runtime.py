@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import importlib
 import importlib.metadata
 import importlib.util
 import io
 import os
 import sys
+import types
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -68,7 +70,66 @@ def prepare_jax() -> None:
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     # TF32, the default of newer GPUs, has a 10-bit mantissa: too little for physics.
     _set_option("jax_default_matmul_precision", "highest")
-    _import_mjx_quietly()
+
+
+@functools.cache
+def prepare_mjx() -> Any:
+    """Imports MJX, which takes seconds: only what traces physics needs it, and a program in the cache does not.
+
+    `import mujoco.mjx` prints two lines to stdout without Warp, and a banner with it. Where there is no NVIDIA GPU, MJX
+    does not get to see Warp, whose kernels it would register.
+    """
+    prepare_jax()
+    hidden = not _has_gpu()
+    warp = sys.modules.get("warp")
+    if hidden:
+        sys.modules["warp"] = None  # type: ignore[assignment]
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):
+            if not hidden and importlib.util.find_spec("warp"):
+                with contextlib.suppress(ImportError, RuntimeError):
+                    prepare_warp()
+            from mujoco import mjx
+    finally:
+        if hidden:
+            del sys.modules["warp"]
+            if warp is not None:
+                sys.modules["warp"] = warp
+    return mjx
+
+
+class _Deferred(types.ModuleType):
+    """Stands in for `torch._dynamo` until something asks for more than to be left alone by it."""
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__") and name != "__path__":  # who asks all modules for their `__file__` means no harm
+            raise AttributeError(name)
+        if sys.modules.get(self.__name__) is self:
+            del sys.modules[self.__name__]
+            vars(sys.modules["torch"]).pop("_dynamo", None)
+        return getattr(importlib.import_module(self.__name__), name)
+
+    @staticmethod
+    def graph_break(*_: Any, **__: Any) -> None: ...
+
+    @staticmethod
+    def allow_in_graph(function: Any) -> Any:
+        return function
+
+    assume_constant_result = allow_in_graph
+
+    @staticmethod
+    def disable(function: Any = None, *_: Any, **__: Any) -> Any:
+        return function if function is not None else lambda later: later
+
+
+def defer_compiler() -> None:
+    """For programs that never call `torch.compile`: tensordict and torch's optimisers import its compiler, and SymPy,
+    only to mark what it should not compile. On a GPU that takes longer than to learn a task of one arm.
+
+    Call it before torch is imported; it does nothing if the compiler is there already.
+    """
+    sys.modules.setdefault("torch._dynamo", _Deferred("torch._dynamo"))
 
 
 @functools.cache
@@ -116,20 +177,3 @@ def _backend_started() -> bool:
 
 def _on_cpu() -> bool:
     return bool(sys.modules["jax"].default_backend() == "cpu")
-
-
-def _import_mjx_quietly() -> None:
-    """`import mujoco.mjx` prints two lines to stdout without Warp, and a banner with it. Warp needs an NVIDIA GPU and
-    takes a second to import: without one MJX does not get to see it."""
-    hidden = "warp" not in sys.modules and not _has_gpu()
-    if hidden:
-        sys.modules["warp"] = None  # type: ignore[assignment]
-    try:
-        with contextlib.redirect_stdout(io.StringIO()):
-            if not hidden and importlib.util.find_spec("warp"):
-                with contextlib.suppress(ImportError, RuntimeError):
-                    prepare_warp()
-            import mujoco.mjx  # noqa: F401
-    finally:
-        if hidden:
-            del sys.modules["warp"]

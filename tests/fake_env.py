@@ -42,6 +42,7 @@ class FakeEnv:
         self.scene = SimpleNamespace(name="fake", mounts=mounts, qpos_index=joints.__getitem__)
         self.state_space = self._box(2 * sum(self.sizes.values()))
         self.generator = torch.Generator()
+        self.line = 1.2  # an arm collides beyond it
         self.poison = False  # return NaN observations
         self.terminate = False  # end episodes by termination as well
 
@@ -104,8 +105,8 @@ class FakeEnv:
         return {
             "tip_error": error,
             "success": error < 0.1,
-            "collision": where[:, 0] > 1.2,
-            "min_distance": 1.2 - where[:, 0],
+            "collision": where[:, 0] > self.line,
+            "min_distance": self.line - where[:, 0],
             # a term that the last agent lacks, as a camera's
             "reward_distance": -error if agent == self.agents[-1] else -0.75 * error,
             **({} if agent == self.agents[-1] else {"reward_late": -0.25 * error}),

@@ -18,6 +18,7 @@ from surgical_marl.batch import BatchedEnv
 from surgical_marl.content import list_scenes, list_tasks
 from surgical_marl.engines.choose import make_engine
 from surgical_marl.engines.fused.engine import FusedEngine, flatten
+from surgical_marl.engines.fused.keys import episode_keys
 from surgical_marl.engines.fused.program import load_source
 from surgical_marl.engines.mjx import MjxEngine
 from surgical_marl.env import Env
@@ -133,6 +134,12 @@ def test_episodes_stay_as_near_as_a_changed_last_digit(scene: str) -> None:
     for share in (50, 99):
         assert np.percentile(fused, share) <= 10 * np.percentile(itself, share) + 1e-6, share
     assert fused.max() < 1e-2
+
+
+@pytest.mark.parametrize("seed", [0, 1, 12345, 2**31, 2**32 + 5, 2**63 - 1])
+def test_keys_are_those_of_jax(seed: int) -> None:
+    expected = jax.vmap(jax.random.fold_in, (None, 0))(jax.random.PRNGKey(seed), np.arange(100))
+    np.testing.assert_array_equal(episode_keys(seed, 100), expected)
 
 
 def test_an_environment_does_not_depend_on_the_others() -> None:

@@ -17,7 +17,7 @@ from fake_env import FakeEnv
 from surgical_marl.evaluation.evaluate import evaluate
 from surgical_marl.files import write_atomic
 from surgical_marl.learning import config, train, training
-from surgical_marl.learning.config import NetworkSettings, PPOSettings, Settings, load_config
+from surgical_marl.learning.config import ConstraintSettings, NetworkSettings, PPOSettings, Settings, load_config
 from surgical_marl.learning.episodes import Episodes
 from surgical_marl.learning.policy import (
     export_policy,
@@ -42,6 +42,12 @@ SMALL = Settings(
     network=NetworkSettings(hidden=(16,)),
     ppo=PPOSettings(epochs=2, mini_batches=2),
 )
+# What an algorithm may have beside its networks.
+OPTIONS: list[dict[str, Any]] = [
+    {},
+    {"ppo": replace(SMALL.ppo, normalise_values=True)},
+    {"constraint": ConstraintSettings(cost="collision", limit=0.01)},
+]
 
 
 @pytest.fixture
@@ -89,16 +95,18 @@ def test_the_toy_is_learned(algo: Any, tmp_path: Path, fakes: list[Any]) -> None
     assert rows[-1]["success_rate"] > rows[0]["success_rate"]
 
 
-def test_resume_is_bit_for_bit(tmp_path: Path, fakes: list[Any]) -> None:
-    whole = train.train(SMALL, out=tmp_path / "whole")
-    half = train.train(replace(SMALL, iterations=2), out=tmp_path / "half")
-    same = train.train(SMALL, out=half, resume=half)
-    copy = train.train(replace(SMALL, iterations=2), out=tmp_path / "other")
-    moved = train.train(SMALL, out=tmp_path / "moved", resume=copy)
+@pytest.mark.parametrize("options", OPTIONS)
+def test_resume_is_bit_for_bit(options: dict[str, Any], tmp_path: Path, fakes: list[Any]) -> None:
+    settings = replace(SMALL, **options)
+    whole = train.train(settings, out=tmp_path / "whole")
+    half = train.train(replace(settings, iterations=2), out=tmp_path / "half")
+    same = train.train(settings, out=half, resume=half)
+    copy = train.train(replace(settings, iterations=2), out=tmp_path / "other")
+    moved = train.train(settings, out=tmp_path / "moved", resume=copy)
     first = read_checkpoint(whole)
     for run in (same, moved):
         again = read_checkpoint(run)
-        for part in ("actor_state_dict", "critic_state_dict"):
+        for part in ("actor_state_dict", "critic_state_dict", "options_state_dict"):
             for name, value in first["algorithm"][part].items():
                 assert torch.equal(again["algorithm"][part][name], value), name
         moments = first["algorithm"]["optimizer_state_dict"]["state"]
@@ -246,6 +254,8 @@ def test_folders_that_cannot_be_used(tmp_path: Path, fakes: list[Any]) -> None:
         (SMALL, {"out": tmp_path / "new", "resume": exported}, "exported policy"),
         (replace(SMALL, iterations=1), {"out": tmp_path / "new", "resume": run}, "already has 1 iterations"),
         (replace(SMALL, num_envs=8), {"out": run, "resume": run}, "num_envs 32"),
+        (replace(SMALL, **OPTIONS[1]), {"out": run, "resume": run}, "normalise_values False"),
+        (replace(SMALL, **OPTIONS[2]), {"out": run, "resume": run}, "constraint.cost 'none'"),
         (replace(SMALL, scene="psm"), {"out": run, "resume": run}, "'bimanual_psm'"),
     ]
     for settings, arguments, message in cases:
@@ -356,6 +366,10 @@ def test_the_shipped_settings_load() -> None:
         ("network.hidden=[]", "network.hidden must be a list of whole numbers"),
         ("network.hidden=[8, x]", "network.hidden must be a whole number"),
         ("ppo=3", "ppo must be a mapping of settings, not 3"),
+        ("constraint.cost=crash", "constraint.cost must be one of none, collision, .*speed, not 'crash'"),
+        ("constraint.limit=2", "constraint.limit must be a number from 0 to 1, not 2"),
+        ("constraint.kp=-1", "constraint.kp must be a number from 0 to"),
+        ("ppo.normalise_values=1", "ppo.normalise_values must be true or false, not 1"),
         ("max_steps=0", "max_steps must be a whole number from 1"),
         ("ppo.mini_batches=999999", "ppo.mini_batches must be at most num_envs"),
     ],

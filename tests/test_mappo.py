@@ -192,7 +192,8 @@ def test_one_agent_is_rsl_rls_ppo(schedule: Any, clip_value: bool) -> None:
         setattr(storage, name, copy.deepcopy(getattr(mine, name)))
     storage.observations["actor"] = mine.observations["psm"][:, :, 0].clone()
     storage.observations["critic"] = mine.observations["state"].clone()
-    arguments = {k: v for k, v in config["algorithm"].items() if k not in ("class_name", "team_reward")}
+    own = ("class_name", "team_reward", "normalise_values", "constraint")
+    arguments = {k: v for k, v in config["algorithm"].items() if k not in own}
     reference = PPO(actor, critic, storage, **arguments)
     reference.train_mode()
     torch.manual_seed(5)

@@ -65,8 +65,9 @@ def test_every_dependency_is_pinned() -> None:
 
 STARTED = """
 import json, os
-from surgical_marl.runtime import prepare_jax
+from surgical_marl.runtime import prepare_jax, prepare_mjx
 prepare_jax()
+prepare_mjx()
 import jax
 jax.numpy.ones(2).block_until_ready()
 print(json.dumps({
@@ -125,3 +126,20 @@ def test_a_users_own_settings_of_jax_stay(tmp_path: Path) -> None:
 def test_the_flag_is_only_for_versions_that_know_it(version: str, known: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.metadata.version", lambda _: version)
     assert runtime.knows_flag() == known
+
+
+DEFERRED = """
+from surgical_marl.runtime import defer_compiler
+defer_compiler()
+import sys, torch
+from surgical_marl.learning.mappo import MAPPO
+optimizer = torch.optim.Adam([torch.nn.Parameter(torch.ones(2))])
+optimizer.zero_grad()
+optimizer.step()
+print("sympy" in sys.modules)
+print(torch.compile(lambda x: 2 * x, backend="eager")(torch.ones(1)).item(), "sympy" in sys.modules)
+"""
+
+
+def test_torchs_compiler_is_imported_when_it_is_used() -> None:
+    assert run_python(DEFERRED).splitlines() == ["False", "2.0 True"]

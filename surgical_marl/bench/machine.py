@@ -5,8 +5,10 @@ from __future__ import annotations
 import contextlib
 import gc
 import math
+import os
 import platform
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,14 @@ def machine() -> dict[str, Any]:
     """`cpu`, `threads` and `gpu`, None without one, by name."""
     names = _values("/proc/cpuinfo", "model name")
     return {"cpu": names[0] if names else platform.processor() or platform.machine(), "threads": cores(), "gpu": _gpu()}
+
+
+def age() -> float:
+    """Seconds since this process started; since Python measures its own time where a system does not tell."""
+    with contextlib.suppress(OSError, AttributeError, ValueError):
+        started = Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19]
+        return time.clock_gettime(time.CLOCK_BOOTTIME) - int(started) / os.sysconf("SC_CLK_TCK")
+    return time.process_time()
 
 
 def restart_peak() -> float:

@@ -8,10 +8,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter
-
 from surgical_marl.bench.course import Course, make_course
 from surgical_marl.bench.machine import machine
 from surgical_marl.bench.sim import Point, Speed, measure, sweep
@@ -48,7 +44,7 @@ def run(
         if not points:
             raise ValueError(f"nothing to show: {', '.join(engines)} can't run here")
         if out:
-            draw(points, f"{workload.task} on {workload.scene}; {_machine(machine())}", out)
+            draw(points, f"{workload.task} on {workload.scene}; {describe_machine()}", out)
         return json.dumps(sweep_summary(workload, points)) if as_json else sweep_table(points)
     course = make_course(load_scene(workload.scene), workload.motion)
     speeds, left_out = measure(workload, engines, course)
@@ -107,7 +103,7 @@ def table(found: Mapping[str, Any]) -> str:
         [
             f"{found['task']} on {found['scene']}: physics steps of {1e3 * first['dt']:g} ms, "
             f"{first['decimation']} to an environment step; {found['touching']:.1%} of environments touch something",
-            _machine(found),
+            describe_machine(found),
             "",
             *aligned(cells),
             "",
@@ -118,7 +114,9 @@ def table(found: Mapping[str, Any]) -> str:
     )
 
 
-def _machine(found: Mapping[str, Any]) -> str:
+def describe_machine(found: Mapping[str, Any] | None = None) -> str:
+    """This machine, or what `machine` told of another, in a line."""
+    found = found or machine()
     return f"{found['cpu']}, {found['threads']} threads" + (f"; {found['gpu']}" if found["gpu"] else "")
 
 
@@ -156,6 +154,10 @@ def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
 
 def draw(points: Sequence[Point], title: str, out: Path) -> None:
     """A sweep as a picture: physics steps as lines, environment steps dashed; a GPU's with full dots."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import EngFormatter
+
     figure = Figure(figsize=(8, 4.8), layout="constrained")
     FigureCanvasAgg(figure)
     axis = figure.subplots()

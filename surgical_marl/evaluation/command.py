@@ -11,7 +11,6 @@ from typing import Any
 
 from surgical_marl.content import BASELINES, find
 from surgical_marl.evaluation.evaluate import MAX_BATCH, Played, difference, play, summarise
-from surgical_marl.evaluation.figure import draw
 from surgical_marl.evaluation.report import ABOUT, format_table, write_csv
 from surgical_marl.learning.config import Settings
 from surgical_marl.learning.policy import load_policy
@@ -72,6 +71,8 @@ def report(
         if csv:
             write_csv(csv, [*runs, whole] if several else runs)
         if figure:
+            from surgical_marl.evaluation.figure import draw
+
             draw(figure, played)
     except OSError as error:
         raise ValueError(f"cannot write {error.filename}: {error.strerror}") from None

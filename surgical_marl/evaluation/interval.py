@@ -6,7 +6,6 @@ import warnings
 from typing import Any
 
 import numpy as np
-from scipy.stats import DegenerateDataWarning, bootstrap
 
 from surgical_marl.evaluation.metrics import Metric
 
@@ -28,6 +27,7 @@ def interval(metric: Metric) -> list[float] | None:
     runs, episodes, _ = metric.values.shape
     if episodes < 2:
         return None
+    from scipy.stats import DegenerateDataWarning, bootstrap  # takes a second to import
 
     def statistic(*drawn: np.ndarray, axis: int) -> np.ndarray:
         run, episode = (indices.astype(int) for indices in (drawn if runs > 1 else (np.zeros(1), *drawn)))

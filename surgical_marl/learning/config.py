@@ -51,6 +51,20 @@ class PPOSettings(_Checked):
     value_coefficient: float = _number(1.0, 0.0, 100.0)
     entropy_coefficient: float = _number(0.0, 0.0, 1.0)
     max_gradient_norm: float = _number(1.0, 1e-6, 1e6)
+    normalise_values: bool = False
+
+
+@dataclass(frozen=True)
+class ConstraintSettings(_Checked):
+    """A cost that few episodes may have, instead of a weight of a reward term (see `learning/constraint.py`)."""
+
+    prefix: ClassVar[str] = "constraint."
+
+    cost: Literal["none", "collision", "distance", "force", "limit", "speed"] = "none"
+    limit: float = _number(0.005, 0.0, 1.0)
+    kp: float = _number(10.0, 0.0, 1e6)
+    ki: float = _number(1.0, 0.0, 1e6)
+    kd: float = _number(10.0, 0.0, 1e6)
 
 
 @dataclass(frozen=True)
@@ -92,6 +106,7 @@ class Settings(_Checked):
     team_reward: bool = False
     reward: dict[str, float] = field(default_factory=dict)
     ppo: PPOSettings = field(default_factory=PPOSettings)
+    constraint: ConstraintSettings = field(default_factory=ConstraintSettings)
     network: NetworkSettings = field(default_factory=NetworkSettings)
 
     def __post_init__(self) -> None:

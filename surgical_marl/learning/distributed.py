@@ -79,13 +79,20 @@ def average(values: Tensor) -> Tensor:
 
 
 def var_mean(values: Tensor, dim: int | None = None) -> tuple[Tensor, Tensor]:
-    """Population variance and mean of the values of all processes, which have equally many; over all dimensions, or
-    over one that stays as 1."""
-    var, own = torch.var_mean(values, dim=dim, correction=0, keepdim=dim is not None)
+    """Population variance and mean of the values of all processes, which have equally many; over one dimension, or
+    over all."""
+    var, own = torch.var_mean(values, dim=dim, correction=0)
     if size() == 1:
         return var, own
     mean = average(own.clone())
     return average(var + (own - mean).square()), mean
+
+
+def standardised(values: Tensor) -> Tensor:
+    """The values with mean 0 and variance 1 over all processes, which have equally many."""
+    var, mean = var_mean(values)
+    count = values.numel() * size()
+    return (values - mean) / ((var * (count / max(count - 1, 1))).sqrt() + 1e-8)
 
 
 def average_gradients(parameters: Iterable[Tensor], also: Tensor) -> Tensor:

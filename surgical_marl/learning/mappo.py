@@ -7,6 +7,7 @@ one agent (A = 1) this is PPO, by the same code.
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Any
 
 import torch
@@ -18,8 +19,10 @@ from torch import Tensor, nn
 from surgical_marl.interfaces.rsl_rl import RslRlVecEnv
 from surgical_marl.learning import distributed
 from surgical_marl.learning.config import Settings
+from surgical_marl.learning.constraint import Constraint
 from surgical_marl.learning.models import Gaussian, MultiAgentActor, MultiAgentModel
 from surgical_marl.learning.storage import MultiAgentStorage
+from surgical_marl.learning.values import ValueScale
 from surgical_marl.learning.vision import PICTURES, make_model
 
 LOSSES = ("value_loss", "surrogate_loss", "entropy", "kl", "learning_rate")
@@ -29,18 +32,37 @@ LEARNING_RATE_RANGE = (1e-5, 1e-2)  # rsl_rl's limits of the adaptive learning r
 class MAPPO(PPO):
     """PPO with a ratio for each agent, and a critic with a value for each agent.
 
-    `act`, `compute_returns` and `save` are rsl_rl's. `update` is written again for two reasons:
-    rsl_rl's squeezes are wrong for A = 1, and it waits for the device some hundred times an update
-    where this never waits: a CUDA graph can hold it (see `learn`).
+    `update` is not rsl_rl's for two reasons: rsl_rl's squeezes are wrong for A = 1, and it waits
+    for the device some hundred times an update where this never waits: a CUDA graph can hold it
+    (see `learn`).
 
     Args:
         team_reward: give every agent the sum of all agents' rewards, instead of its own.
+        normalise_values: the critic predicts returns of unit variance; all else is in units of reward.
+        constraint: on a cost; the critic then has two values for each agent, of rewards and of costs.
         ppo: arguments of `rsl_rl.algorithms.PPO`.
     """
 
-    def __init__(self, actor: Any, critic: Any, storage: Any, *, team_reward: bool = False, **ppo: Any) -> None:
+    def __init__(
+        self,
+        actor: Any,
+        critic: Any,
+        storage: MultiAgentStorage,
+        *,
+        team_reward: bool = False,
+        normalise_values: bool = False,
+        constraint: Constraint | None = None,
+        **ppo: Any,
+    ) -> None:
         super().__init__(actor, critic, storage, **ppo)
+        self.storage: MultiAgentStorage = storage
         self.team_reward = team_reward
+        self.scale = ValueScale(storage.values.shape[-1]).to(self.device)
+        # What learns beside the networks: it stands in checkpoints.
+        self.options = nn.ModuleDict({"scale": self.scale} if normalise_values else {})
+        self.constraint = constraint
+        if constraint is not None:
+            self.options["constraint"] = constraint
         # As a tensor the learning rate adapts without the host having to read the divergence.
         self._rate = torch.tensor(float(self.learning_rate), device=self.device)
         self._cuda = torch.device(self.device).type == "cuda"
@@ -49,18 +71,23 @@ class MAPPO(PPO):
     def act(self, obs: TensorDict) -> Tensor:
         """Sample the flat joint action `[N, sum]`."""
         with self._precision():
-            return super().act(obs)
+            actions = super().act(obs)
+        self.transition.values = self.scale.restore(self.transition.values)
+        return actions
 
     def process_env_step(self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: dict[str, Any]) -> None:
         """Store one step.
 
         A time-out is worth the value of the state it was cut off in: gamma * V(final state).
         """
-        rewards = extras["agent_rewards"]
+        parts = [extras["agent_rewards"]]
+        if self.constraint is not None:
+            parts.append(self.constraint.add(extras["infos"], dones))
+        rewards = torch.stack(parts, -1)
         if self.team_reward:
-            rewards = rewards.sum(-1, keepdim=True).expand_as(rewards)
-        with self._precision():
-            final_values = self.critic(extras["final_obs"])
+            rewards = rewards.sum(-2, keepdim=True).expand_as(rewards)
+        rewards = rewards.flatten(-2)
+        final_values = self._values(extras["final_obs"])
         self.transition.rewards = rewards + self.gamma * final_values * extras["time_outs"].unsqueeze(-1)
         self.transition.dones = dones
         self.storage.add_transition(self.transition)
@@ -79,11 +106,12 @@ class MAPPO(PPO):
         clipped = ratio.clamp(1 - self.clip_param, 1 + self.clip_param)
         surrogate = -torch.min(batch.advantages * ratio, batch.advantages * clipped).mean()
 
-        values = self.critic(batch.observations)
-        value = (values - batch.returns).square()
+        values, returns = self.critic(batch.observations), self.scale.normalise(batch.returns)
+        value = (values - returns).square()
         if self.use_clipped_value_loss:
-            near = batch.values + (values - batch.values).clamp(-self.clip_param, self.clip_param)
-            value = torch.max(value, (near - batch.returns).square())
+            old = self.scale.normalise(batch.values)
+            near = old + (values - old).clamp(-self.clip_param, self.clip_param)
+            value = torch.max(value, (near - returns).square())
         value = value.mean()
 
         loss = surrogate + self.value_loss_coef * value - self.entropy_coef * entropy
@@ -91,12 +119,15 @@ class MAPPO(PPO):
 
     def compute_returns(self, obs: TensorDict) -> None:
         """Returns and normalised advantages of the stored rollout; `obs` is what comes after it."""
-        with self._precision():
-            super().compute_returns(obs)
-        storage = self.storage  # rsl_rl normalised over this process alone
+        storage = self.storage
+        storage.compute_returns(self._values(obs), self.gamma, self.lam)
+        if "scale" in self.options:
+            self.scale.learn(storage.returns.flatten(0, 1))
         advantages = storage.returns - storage.values
-        var, mean = distributed.var_mean(advantages)
-        storage.advantages = (advantages - mean) / (var.sqrt() + 1e-8)
+        if self.constraint is not None:
+            self.constraint.update()
+            advantages = self.constraint.weigh(advantages.unflatten(-1, (-1, 2)))
+        storage.advantages.copy_(distributed.standardised(advantages))
 
     def update(self) -> dict[str, float]:
         """Learn from the stored rollout; returns mean losses, KL and the learning rate (see `LOSSES`)."""
@@ -130,6 +161,11 @@ class MAPPO(PPO):
         """All that the optimiser changes."""
         return [*self.actor.parameters(), *self.critic.parameters()]
 
+    def _values(self, obs: TensorDict) -> Tensor:
+        """Values of observations, in units of reward."""
+        with self._precision():
+            return self.scale.restore(self.critic(obs))
+
     def _precision(self) -> torch.autocast:
         """bfloat16 for the networks' products if that was asked for; the same when acting and learning, or ratios
         would not begin at 1."""
@@ -143,6 +179,10 @@ class MAPPO(PPO):
         rate = torch.where((divergence < self.desired_kl / 2) & (divergence > 0), faster, self._rate)
         self._rate.copy_(torch.where(divergence > self.desired_kl * 2, slower, rate))
 
+    def save(self) -> dict[str, Any]:
+        """All that `load` needs to go on, as tensors and plain values."""
+        return {**super().save(), "options_state_dict": self.options.state_dict()}
+
     def load(
         self,
         loaded_dict: dict[str, Any],
@@ -154,6 +194,7 @@ class MAPPO(PPO):
         The optimizer then holds its own copy of the learning rate: share it again.
         """
         result = super().load(loaded_dict, load_cfg, strict)
+        self.options.load_state_dict(loaded_dict.get("options_state_dict", {}))
         group = self.optimizer.param_groups[0]
         group["lr"] = self._rate = torch.as_tensor(group["lr"], device=self.device)
         group["capturable"] = self._cuda  # the checkpoint may come from another kind of device
@@ -165,18 +206,24 @@ class MAPPO(PPO):
         runner does it.
         """
         layout = env.layout
+        options, constraint = dict(cfg["algorithm"]), None
+        if bounds := options.pop("constraint"):
+            constraint = Constraint(layout, env.num_envs, **bounds).to(device)
+        per_agent = 1 if constraint is None else 2
+        num_values = per_agent * layout.num_agents
         actor = MultiAgentActor(obs, layout.action_sizes, **cfg["actor"]).to(device)
         if cfg["centralised_critic"]:
             # in the state's pictures agents are no axis: they are those of the one agent that has any
             seen = {name: pictures[:, 0] for name, pictures in obs.items() if name.endswith(PICTURES)}
             sample = TensorDict({"state": obs["state"], **seen}, batch_size=obs.batch_size)
-            critic: nn.Module = make_model(sample, ["state", *seen], layout.num_agents, **cfg["critic"])
+            critic: nn.Module = make_model(sample, ["state", *seen], num_values, **cfg["critic"])
         else:
-            critic = MultiAgentModel(obs, dict.fromkeys(layout.counts, 1), **cfg["critic"])
+            critic = MultiAgentModel(obs, dict.fromkeys(layout.counts, per_agent), **cfg["critic"])
         steps = cfg["num_steps_per_env"]
-        storage = MultiAgentStorage(layout.num_agents, env.num_envs, steps, obs, env.num_actions, device)
-        algorithm = {name: value for name, value in cfg["algorithm"].items() if name != "class_name"}
-        return MAPPO(actor, critic.to(device), storage, device=device, **algorithm)
+        sizes = (layout.num_agents, num_values, env.num_envs, steps)
+        storage = MultiAgentStorage(*sizes, obs, env.num_actions, device)
+        del options["class_name"]
+        return MAPPO(actor, critic.to(device), storage, constraint=constraint, device=device, **options)
 
 
 def rsl_rl_config(settings: Settings) -> dict[str, Any]:
@@ -201,6 +248,8 @@ def rsl_rl_config(settings: Settings) -> dict[str, Any]:
         "algorithm": {
             "class_name": MAPPO,
             "team_reward": settings.team_reward,
+            "normalise_values": ppo.normalise_values,
+            "constraint": asdict(settings.constraint) if settings.constraint.cost != "none" else None,
             "learning_rate": ppo.learning_rate,
             "schedule": ppo.schedule,
             "desired_kl": ppo.desired_kl,

@@ -70,7 +70,7 @@ def load_policy(run: str | Path, env: BatchedEnv) -> Policy:
         )
     actor = _actor(settings, env, layout)
     actor.load_state_dict(checkpoint["algorithm"]["actor_state_dict"])
-    return _acting(actor, layout, str(env.device))
+    return acting_policy(actor, layout, str(env.device))
 
 
 def untrained_policy(env: BatchedEnv, settings: Settings | None = None) -> Policy:
@@ -79,7 +79,7 @@ def untrained_policy(env: BatchedEnv, settings: Settings | None = None) -> Polic
     layout = Layout(env, joint=settings.algo == "joint")
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.seed)
-        return _acting(_actor(settings, env, layout), layout, str(env.device))
+        return acting_policy(_actor(settings, env, layout), layout, str(env.device))
 
 
 def zero_policy(env: BatchedEnv) -> Policy:
@@ -150,7 +150,8 @@ def _actor(settings: Settings, env: BatchedEnv, layout: Layout) -> MultiAgentAct
     return MultiAgentActor(_samples(env, layout), layout.action_sizes, **model).eval()
 
 
-def _acting(actor: MultiAgentActor, layout: Layout, device: str) -> Policy:
+def acting_policy(actor: MultiAgentActor, layout: Layout, device: str) -> Policy:
+    """The deterministic policy of networks, as they are whenever it acts: they may still learn."""
     actor = actor.to(device)
 
     def policy(observations: Mapping[str, Any]) -> dict[str, Any]:

@@ -9,14 +9,21 @@ from torch import Tensor
 
 
 class MultiAgentStorage(RolloutStorage):
-    """rsl_rl's rollout storage with log-probabilities, values, rewards and advantages A wide."""
+    """rsl_rl's rollout storage with log-probabilities and advantages A wide, and rewards, values and returns W wide.
+
+    W is A, or 2 A where each agent has a reward and a cost: one after the other, agent by agent.
+    """
 
     distribution_params: tuple[Tensor, ...] | None
 
-    def __init__(self, num_agents: int, num_envs: int, steps: int, obs: TensorDict, actions: int, device: str) -> None:
+    def __init__(
+        self, num_agents: int, num_values: int, num_envs: int, steps: int, obs: TensorDict, actions: int, device: str
+    ) -> None:
         super().__init__("rl", num_envs, steps, obs, [actions], device)
-        for name in ("rewards", "values", "actions_log_prob", "returns", "advantages"):
+        for name in ("actions_log_prob", "advantages"):
             setattr(self, name, torch.zeros(steps, num_envs, num_agents, device=device))
+        for name in ("rewards", "values", "returns"):
+            setattr(self, name, torch.zeros(steps, num_envs, num_values, device=device))
 
     def add_transition(self, transition: RolloutStorage.Transition) -> None:
         """Copy one step of all environments into the storage."""
@@ -32,3 +39,19 @@ class MultiAgentStorage(RolloutStorage):
         for stored, param in zip(self.distribution_params, params, strict=True):
             stored[self.step].copy_(param)
         self.step += 1
+
+    def compute_returns(self, last_values: Tensor, gamma: float, lam: float) -> None:
+        """Generalised advantage estimation (Schulman et al. 2016, arXiv 1506.02438): `returns` of the full storage.
+
+        Args:
+            last_values: of the observations after the last step, as wide as values.
+            gamma: discount of a step.
+            lam: of the mixture of n-step returns, 0 for one step and 1 for whole episodes.
+        """
+        advantage, next_values = torch.zeros_like(last_values), last_values
+        for step in reversed(range(self.num_transitions_per_env)):
+            goes_on = 1.0 - self.dones[step].float()
+            ahead = self.rewards[step] + goes_on * gamma * next_values - self.values[step]
+            advantage = ahead + goes_on * gamma * lam * advantage
+            next_values = self.values[step]
+            self.returns[step] = advantage + next_values

@@ -7,7 +7,7 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
@@ -17,10 +17,9 @@ from tqdm import tqdm
 from surgical_marl.files import remove_temporaries
 from surgical_marl.learning import distributed
 from surgical_marl.learning.config import Settings
-from surgical_marl.learning.curve import draw_curve
 from surgical_marl.learning.faults import Diverged
 from surgical_marl.learning.log import Log, Reports
-from surgical_marl.learning.room import fitting
+from surgical_marl.learning.memory import check_room, in_memory
 from surgical_marl.learning.run import (
     CHECKPOINT,
     CONFIG,
@@ -52,7 +51,10 @@ CHANGEABLE = {
     "checkpoint_every",
     "team_reward",
     "ppo",
+    "constraint",
 }
+# Except these, which say what stands in a checkpoint.
+FIXED = {"ppo.normalise_values", "constraint.cost"}
 
 
 def make_env(settings: Settings, num_envs: int | None = None) -> BatchedEnv:
@@ -74,6 +76,14 @@ def make_env(settings: Settings, num_envs: int | None = None) -> BatchedEnv:
     )
 
 
+def make_training(settings: Settings) -> Training:
+    """A run in memory. ValueError if it has no room there."""
+    env = make_env(settings)
+    check_room(settings, env)
+    with in_memory(settings.num_envs):
+        return Training(settings, env)
+
+
 def train(settings: Settings, *, out: Path, resume: Path | None = None) -> Path:
     """Train until `settings.iterations`, and return the run folder. Within torchrun all processes call it.
 
@@ -84,8 +94,8 @@ def train(settings: Settings, *, out: Path, resume: Path | None = None) -> Path:
         resume: the run folder to continue from its checkpoint, or from the start if it has none yet.
 
     Raises:
-        ValueError: the folder cannot be used, the settings do not fit the run to resume, or the run does not fit into
-            memory.
+        ValueError: the folder cannot be used, the settings do not fit the run to resume, or so many environments do not
+            fit into memory.
         FloatingPointError: training produced NaN; the last good checkpoint is kept, and `diverged.json` says where.
         KeyboardInterrupt, SystemExit: after Ctrl-C or SIGTERM, when the checkpoint is written.
     """
@@ -97,7 +107,7 @@ def train(settings: Settings, *, out: Path, resume: Path | None = None) -> Path:
             return out
         rows = read_metrics(Path(resume)) if resume is not None and state is not None else []
         with _claimed(out, resume, settings):
-            training = Training(settings, make_env(settings))
+            training = make_training(settings)
             closing.callback(training.close)
             if state is not None:
                 training.set_state(state)
@@ -106,7 +116,7 @@ def train(settings: Settings, *, out: Path, resume: Path | None = None) -> Path:
         _save(training, out)
         if distributed.rank() == 0:
             write_config(out, settings)
-        with fitting(settings):
+        with in_memory(settings.num_envs):
             _run(training, out)
     return out
 
@@ -128,8 +138,7 @@ def _claimed(out: Path, resume: Path | None, settings: Settings) -> Iterator[Non
         if resume is None:
             write_config(out, settings)
     try:
-        with fitting(settings):
-            yield
+        yield
     except ValueError:
         if resume is None:
             (out / CONFIG).unlink()
@@ -174,6 +183,8 @@ def _run(training: Training, out: Path) -> None:
                 write_divergence(out, {**error.summary, "last_checkpoint": read_checkpoint(out)["iteration"]})
             raise
     if log:
+        from surgical_marl.learning.curve import draw_curve  # matplotlib: not before training has begun
+
         draw_curve(out, f"{settings.task} in {settings.scene}, {settings.algo}, seed {settings.seed}")
     distributed.wait(training.env.device)  # where one process ends early, torchrun ends them all
     if training.stopping:
@@ -183,11 +194,11 @@ def _run(training: Training, out: Path) -> None:
 
 def _read_resumed(settings: Settings, run: Path, goes_on: bool) -> dict[str, Any] | None:
     """What this process resumes; None if the run was stopped before its first checkpoint."""
-    old = read_settings(run)
-    for item in fields(Settings):
-        before, now = getattr(old, item.name), getattr(settings, item.name)
-        if item.name not in CHANGEABLE and before != now:
-            raise ValueError(f"the run in {run} has {item.name} {before!r}, and cannot go on with {now!r}")
+    asked = _dotted(settings)
+    for name, before in _dotted(read_settings(run)).items():
+        fixed = name in FIXED or name.partition(".")[0] not in CHANGEABLE
+        if fixed and before != asked[name]:
+            raise ValueError(f"the run in {run} has {name} {before!r}, and cannot go on with {asked[name]!r}")
     if not (run / CHECKPOINT).is_file():
         _say(f"{run} holds no checkpoint yet: its run starts from the beginning")
         return None
@@ -202,7 +213,17 @@ def _read_resumed(settings: Settings, run: Path, goes_on: bool) -> dict[str, Any
             f"the run in {run} already has {state['iteration']} iterations: ask for more than {settings.iterations}"
         )
     samples = settings.num_envs * settings.steps_per_iteration
-    return _own({"processes": 1, "env_steps": state["iteration"] * samples, **state}, run)
+    return _own({"broken": None, "processes": 1, "env_steps": state["iteration"] * samples, **state}, run)
+
+
+def _dotted(settings: Any) -> dict[str, Any]:
+    """Settings by their names, such as "ppo.gamma"."""
+    named: dict[str, Any] = {}
+    for item in fields(settings):
+        value = getattr(settings, item.name)
+        inner = _dotted(value) if is_dataclass(value) else None
+        named |= {item.name: value} if inner is None else {f"{item.name}.{name}": part for name, part in inner.items()}
+    return named
 
 
 def _own(state: dict[str, Any], run: Path) -> dict[str, Any]:
@@ -211,17 +232,16 @@ def _own(state: dict[str, Any], run: Path) -> dict[str, Any]:
     own = state if rank == 0 else read_environments(run, state["iteration"], rank, processes)
     if processes == distributed.size() and own is not None:
         return {**state, **{name: own[name] for name in OWN}}
-    _say(
-        f"{run} was written by {processes} processes, and here are {distributed.size()}: "
-        "what was learned goes on, the environments start anew"
-        if processes != distributed.size()
-        else f"{run} lacks the environments of process {rank}: they start anew"
-    )
+    if processes != distributed.size():
+        who = f"{processes} process{'es' if processes > 1 else ''}, not {distributed.size()}"
+        _say(f"the checkpoint in {run} is of {who}: what was learned goes on, all environments start anew")
+    else:
+        _say(f"{run} lacks the environments of process {rank}: they start anew", by=rank)
     return {name: value for name, value in state.items() if name not in OWN}
 
 
-def _say(what: str) -> None:
-    if distributed.rank() == 0:
+def _say(what: str, by: int = 0) -> None:
+    if distributed.rank() == by:
         print(f"surgical-marl: {what}", file=sys.stderr, flush=True)
 
 

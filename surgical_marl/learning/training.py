@@ -13,16 +13,16 @@ from torch import Tensor
 from surgical_marl.interfaces.rsl_rl import RslRlVecEnv
 from surgical_marl.learning import distributed, faults
 from surgical_marl.learning.config import Settings
+from surgical_marl.learning.constraint import METRICS
 from surgical_marl.learning.episodes import ENDED, Episodes
 from surgical_marl.learning.graphs import Replayed
 from surgical_marl.learning.mappo import LOSSES, MAPPO, rsl_rl_config
-from surgical_marl.learning.room import check_room
 
 if TYPE_CHECKING:
     from surgical_marl.batch import BatchedEnv
 
 
-OWN = ("env", "collided", "random", "random_cuda")
+OWN = ("env", "collided", "broken", "random", "random_cuda")
 """Parts of `Training.state` that belong to one process alone: its environments and its random numbers."""
 
 
@@ -68,7 +68,6 @@ class Training:
             torch.set_float32_matmul_precision("highest" if settings.precision == "float32" else "high")
         # Where each rollout begins and ends: a graph finds its observations at one place.
         self._observations = self.env.get_observations().clone()
-        check_room(settings, self.env)
         self.algorithm = MAPPO.construct_algorithm(self._observations, self.env, rsl_rl_config(settings), device)
         self.algorithm.train_mode()
         if distributed.size() > 1:
@@ -76,11 +75,12 @@ class Training:
             torch.manual_seed(distributed.own_seed(settings.seed))  # of the processes' actions
         terms = self.env.reward_terms
         self.episodes = Episodes(env.agents, terms, self.env.layout.num_agents, env.num_envs, device)
+        self._bounded = METRICS if self.algorithm.constraint is not None else ()
         # What `_update` gathers, in order.
         self._names: dict[str, Sequence[str]] = {
             "episodes": ENDED[:-1],
             "rewards": [ENDED[-1], *terms],
-            "losses": [*LOSSES, "action_std"],
+            "losses": [*LOSSES, *self._bounded, "action_std"],
             "stop": ["stop"],
             "observations": faults.column_names(self._observations),
             "values": ["values", "returns"],
@@ -124,6 +124,7 @@ class Training:
             *("iteration", "env_steps", "seconds", "steps_per_s"),
             *("reward", *self.env.reward_terms),
             *("episodes", "tip_error_mm", "success_rate", "collision_rate"),
+            *self._bounded,
             *LOSSES,
             "action_std",
         )
@@ -185,7 +186,10 @@ class Training:
         losses = self.algorithm.learn()
         std = self.algorithm.actor.output_std.detach().mean()
         weights = torch.stack([weight.detach().sum() for _, weight in self._weights()])
-        self._values.copy_(torch.cat([self.episodes.take(), losses, std[None], self._stop, self._marks, weights]))
+        parts = [self.episodes.take(), losses]
+        if self.algorithm.constraint is not None:
+            parts.append(self.algorithm.constraint.metrics())
+        self._values.copy_(torch.cat([*parts, std[None], self._stop, self._marks, weights]))
         distributed.total(self._values)
 
     def _weights(self) -> list[tuple[str, Tensor]]:
@@ -197,7 +201,7 @@ class Training:
 
     def state(self) -> dict[str, Any]:
         """What `set_state` needs to continue bit for bit, as tensors and plain values."""
-        actor = self.algorithm.actor
+        actor, constraint = self.algorithm.actor, self.algorithm.constraint
         return {
             "iteration": self.iteration,
             "env_steps": self.env_steps,
@@ -207,6 +211,7 @@ class Training:
             "algorithm": self.algorithm.save(),
             "env": {**self.env.carry(), "observations": self._observations.to_dict()},
             "collided": self.episodes.collided,
+            "broken": None if constraint is None else constraint.broken,
             "random": torch.get_rng_state(),
             "random_cuda": torch.cuda.get_rng_state() if self._cuda else None,
         }
@@ -229,6 +234,8 @@ class Training:
         for name, kept in self._observations.items():
             kept.copy_(state["env"]["observations"][name])
         self.episodes.collided.copy_(state["collided"])
+        if self.algorithm.constraint is not None:
+            self.algorithm.constraint.broken.copy_(state["broken"])
         torch.set_rng_state(state["random"])
         if state["random_cuda"] is not None and self._cuda:
             torch.cuda.set_rng_state(state["random_cuda"])

@@ -19,6 +19,7 @@ import numpy as np
 from surgical_marl.engines.common import announce, cores
 from surgical_marl.engines.fused.arrays import make_arrays
 from surgical_marl.engines.fused.kernel import compile_kernels, has_cuda
+from surgical_marl.engines.fused.keys import episode_keys
 from surgical_marl.engines.fused.preludes import LANES
 from surgical_marl.engines.fused.program import Source, load_source
 from surgical_marl.env import Env
@@ -61,12 +62,7 @@ class FusedEngine:
 
     def reset(self, seed: int, first: int = 0) -> None:
         """First episodes. Environment i depends on `seed` and `first` + i alone, not on how many there are."""
-        import jax
-
-        # the same keys as the MJX engine's
-        numbers = np.arange(first, first + self.num_envs)
-        keys = jax.jit(jax.vmap(jax.random.fold_in, (None, 0)))(jax.random.PRNGKey(seed), numbers)
-        self.write(".key", np.asarray(keys))
+        self.write(".key", episode_keys(seed, self.num_envs, first))
         self.write(".episode", np.zeros(self.num_envs, np.int32))
         self._launch("reset")
         self._stepped = False

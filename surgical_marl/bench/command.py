@@ -1,0 +1,90 @@
+"""What `surgical-marl bench` does."""
+
+from __future__ import annotations
+
+# Only light imports up here: caches are looked up when what uses them is imported.
+import contextlib
+import math
+import os
+import tempfile
+from argparse import Namespace
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+from surgical_marl.content import find, list_tasks, unknown
+
+if TYPE_CHECKING:
+    from surgical_marl.learning.config import Settings
+
+
+def run(arguments: Namespace) -> int:
+    """One benchmark; returns the exit code. `arguments` are those of its parser in `surgical_marl/cli.py`."""
+    if arguments.task not in list_tasks():
+        raise unknown("task", arguments.task, list_tasks())
+    find("scenes", arguments.scene)
+    with _no_caches() if arguments.cold else contextlib.nullcontext():
+        return {"sim": _sim, "train": _train, "solve": _solve}[arguments.kind](arguments)
+
+
+def _sim(arguments: Namespace) -> int:
+    if arguments.sweep and arguments.num_envs:
+        raise ValueError(f"--sweep takes every number of environments: leave --num-envs {arguments.num_envs} out")
+    if arguments.out and not arguments.sweep:
+        raise ValueError(f"--out {arguments.out} is for the picture of a sweep: add --sweep")
+    if arguments.out and not (arguments.out.suffix == ".png" and arguments.out.parent.is_dir()):
+        raise ValueError(f"cannot write {arguments.out}: name a .png file in a folder that exists")
+    if arguments.engine == "mujoco" and arguments.device == "cuda":
+        raise ValueError("engine 'mujoco' has no device 'cuda': it runs on a CPU")
+
+    from surgical_marl.bench.contenders import ENGINES
+    from surgical_marl.bench.report import run
+
+    engines = ENGINES if arguments.engine == "all" else (arguments.engine,)
+    keys = ("task", "scene", "num_envs", "device", "decimation", "motion")
+    print(run({k: getattr(arguments, k) for k in keys}, engines, arguments.sweep, arguments.json, arguments.out))
+    return 0
+
+
+def _train(arguments: Namespace) -> int:
+    from surgical_marl.bench.train import run
+    from surgical_marl.bench.workload import NUM_ENVS
+
+    print(run(_settings(arguments, NUM_ENVS), arguments.json))
+    return 0
+
+
+def _solve(arguments: Namespace) -> int:
+    if not (math.isfinite(arguments.limit) and arguments.limit > 0):
+        raise ValueError(f"--limit must be a number of seconds above 0, not {arguments.limit}")
+    for text in arguments.overrides:
+        if text.startswith("iterations="):
+            raise ValueError(f"solve trains until success or --limit: leave {text} out")
+
+    from surgical_marl.bench.solve import NUM_ENVS, Goal, run
+
+    goal = Goal(arguments.success, arguments.collisions)
+    text, solved = run(_settings(arguments, NUM_ENVS), goal, arguments.limit, arguments.json)
+    print(text)
+    return 0 if solved else 1
+
+
+def _settings(arguments: Namespace, num_envs: dict[str, int]) -> Settings:
+    """Settings of a training: those of `configs/`, so many environments by the device, flags, and `key=value`."""
+    from surgical_marl.bench.workload import Workload
+    from surgical_marl.learning.config import load_config
+
+    where = Workload(device=arguments.device).where  # says so if there is no such device
+    keys = ("num_envs", "algo", "seed", "engine")
+    given = [("num_envs", num_envs.get(where)), ("device", where), *((key, getattr(arguments, key)) for key in keys)]
+    flags = [f"{key}={value}" for key, value in given if value is not None]
+    return load_config(arguments.task, arguments.scene, [*flags, *arguments.overrides])
+
+
+@contextlib.contextmanager
+def _no_caches() -> Iterator[None]:
+    """Compilers find their caches empty, and what they leave there is gone afterwards."""
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ["XDG_CACHE_HOME"] = folder
+        for name in ("WARP_CACHE_PATH", "JAX_COMPILATION_CACHE_DIR"):
+            os.environ.pop(name, None)
+        yield

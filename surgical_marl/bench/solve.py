@@ -1,0 +1,271 @@
+"""How long it takes to learn a task: seconds until the frozen evaluation shows success.
+
+    found = solve(load_config("reach", "psm"), Goal(success=0.95, collisions=0.01))
+    found.solved, found.seconds, found.rollout_s
+
+docs/benchmarks.md says what is timed, and how.
+"""
+
+from __future__ import annotations
+
+import json
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any
+
+from surgical_marl.bench import machine
+from surgical_marl.bench.report import aligned, describe_machine
+from surgical_marl.bench.stopwatch import STARTING, Stopwatch, rows
+from surgical_marl.evaluation.evaluate import Played, play
+from surgical_marl.evaluation.goal_set import is_standard
+from surgical_marl.evaluation.metrics import FOLLOWING, SUCCESS_MM, metrics
+from surgical_marl.learning.config import Settings
+from surgical_marl.learning.memory import in_memory
+from surgical_marl.learning.policy import acting_policy
+from surgical_marl.learning.train import make_env, make_training
+from surgical_marl.learning.training import Training
+
+NUM_ENVS = {"cuda": 16384}
+"""Environments by device, unless told; elsewhere those of `configs/`. More make each second's gradients better, but
+fewer of them."""
+EPISODES, SEED = 200, 0
+"""Of the standard goal sets."""
+EAGER, PATIENT = 0.2, 0.05
+"""Share of the time since the last evaluation that one may take: where training's own success promises the goal, and
+elsewhere."""
+
+
+@dataclass(frozen=True)
+class Goal:
+    """What a policy has to show. ValueError unless both are rates."""
+
+    success: float = 0.95
+    """Least share of tips that stay within 2 mm of their goals."""
+    collisions: float = 0.01
+    """The share of episodes with a collision is less than this."""
+
+    def __post_init__(self) -> None:
+        for name, value in asdict(self).items():
+            if not 0 <= value <= 1:
+                raise ValueError(f"{name} must be a share from 0 to 1, not {value!r}")
+
+
+@dataclass(frozen=True)
+class Exam:
+    """What a policy showed in the frozen evaluation."""
+
+    success_2mm: float
+    collision_rate: float
+    median_error_mm: float
+    goal_set: str
+    standard: bool
+    """Whether this is the goal set that this version publishes."""
+
+    def passes(self, goal: Goal) -> bool:
+        """Whether that is enough."""
+        return self.success_2mm >= goal.success and self.collision_rate < goal.collisions
+
+
+@dataclass(frozen=True)
+class Times:
+    """Where the seconds went."""
+
+    imports_s: float
+    """From the start of the process until its packages are imported."""
+    compile_s: float
+    """Environments, networks, graphs; and what the first two iterations take more than the others."""
+    rollout_s: float
+    update_s: float
+    evaluation_s: float
+    rest_s: float
+
+
+@dataclass(frozen=True)
+class Solution:
+    """How a training went until it showed the goal, or was given up."""
+
+    solved: bool
+    seconds: float
+    """From the start to the end of the last evaluation: the sum of `times`."""
+    times: Times
+    iterations: int
+    env_steps: int
+    evaluations: int
+    exam: Exam
+    """The last one."""
+    num_envs: int
+    engine: str
+    device: str
+
+    @property
+    def learning_s(self) -> float:
+        """Seconds without imports and compilation: what settings can change."""
+        return self.seconds - self.times.imports_s - self.times.compile_s
+
+
+def solve(
+    settings: Settings,
+    goal: Goal,
+    give_up: Callable[[float, float], bool] = lambda seconds, learning: False,
+    began: float | None = None,
+) -> Solution:
+    """Trains until the frozen evaluation shows the goal.
+
+    Args:
+        settings: all but `iterations` counts.
+        goal: what has to be shown.
+        give_up: is asked after each iteration, with the seconds from the start and those since learning began.
+        began: the start, by `time.perf_counter`; now if None.
+
+    Raises:
+        ValueError: there is no room for so many environments.
+        FloatingPointError: training diverged.
+    """
+    entered = time.perf_counter()
+    began = entered if began is None else began
+    training, exam_env = make_training(settings), make_env(settings, EPISODES)
+    env = training.env.env
+    watch, looks = Stopwatch(training), Looks(goal)
+    made = time.perf_counter()
+    exams, examining = [], 0.0
+    for row in rows(training):
+        now = time.perf_counter()
+        over = give_up(now - began, now - made)
+        if over or looks.due(row["success_rate"], now - made):
+            watch.wait()
+            now = time.perf_counter()
+            exams.append(examine(training, exam_env))
+            end = time.perf_counter()
+            examining += end - now
+            looks.add(row["success_rate"], exams[-1], end - made, end - now)
+            _say(f"{now - began:.1f} s, iteration {training.iteration}", exams[-1])
+            if over or exams[-1].passes(goal):
+                break
+    times = _times(began, entered, made, watch, examining)
+    return Solution(
+        solved=exams[-1].passes(goal),
+        seconds=sum(asdict(times).values()),
+        times=times,
+        iterations=training.iteration,
+        env_steps=training.iteration * settings.num_envs * settings.steps_per_iteration,
+        evaluations=len(exams),
+        exam=exams[-1],
+        num_envs=settings.num_envs,
+        engine=env.engine.name,
+        device=str(env.device),
+    )
+
+
+def _times(began: float, entered: float, made: float, watch: Stopwatch, examining: float) -> Times:
+    """Of what went on from `began` until now: imports until `entered`, then environments until `made`."""
+    whole = time.perf_counter() - began
+    rollout, update = (watch.seconds(name) for name in ("rollout", "update"))
+    times = Times(
+        imports_s=entered - began,
+        compile_s=made - entered + starting(rollout) + starting(update),
+        rollout_s=sum(rollout) - starting(rollout),
+        update_s=sum(update) - starting(update),
+        evaluation_s=examining,
+        rest_s=0.0,
+    )
+    return replace(times, rest_s=max(0.0, whole - sum(asdict(times).values())))
+
+
+class Looks:
+    """When to evaluate, since that takes time as well.
+
+    Training's own success, of actions with noise, is less than what the evaluation will show: at first a quarter of the
+    goal is worth a look. Once both are known for some iteration, a line from there to where both are 1 says at what
+    training success the goal may be met. Above that an evaluation may take a fifth of the time since the last one;
+    below, a twentieth, lest the line be wrong.
+    """
+
+    def __init__(self, goal: Goal) -> None:
+        self._goal, self._promising = goal, goal.success / 4
+        self._ended = self._took = 0.0
+
+    def due(self, success: float, learning: float) -> bool:
+        """Whether to evaluate after an iteration, with its success rate (NaN if no episode ended), `learning` seconds
+        after learning began."""
+        promising = success >= self._promising
+        if not self._took:
+            return promising
+        return self._took < (EAGER if promising else PATIENT) * (learning - self._ended)
+
+    def add(self, success: float, exam: Exam, learning: float, took: float) -> None:
+        """An evaluation at that success rate of training, which ended `learning` seconds after learning began and took
+        so many."""
+        self._ended, self._took = learning, took
+        missing = max(0.0, self._goal.success - exam.success_2mm) / max(1 - exam.success_2mm, 1e-9)
+        self._promising = success + (1 - success) * min(missing, 1.0)
+
+
+def examine(training: Training, env: Any) -> Exam:
+    """The frozen evaluation of the policy as it is now, in `EPISODES` environments."""
+    policy = acting_policy(training.algorithm.actor, training.env.layout, str(env.device))
+    return _exam(play(env, policy, EPISODES, SEED))
+
+
+def _exam(played: Played) -> Exam:
+    measures = {name: values[None] for name, values in played.measures.items()}
+    found = metrics(measures, played.about["task"] in FOLLOWING)
+    wanted = (f"success_{SUCCESS_MM}mm", "collision_rate", "median_error_mm")
+    success, collisions, error = (float(found[name].reduce(found[name].values.ravel())) for name in wanted)
+    return Exam(success, collisions, error, played.about["goal_set"], is_standard(played.about))
+
+
+def starting(seconds: list[float]) -> float:
+    """What the first iterations took more than the others."""
+    first, others = seconds[:STARTING], seconds[STARTING:]
+    return sum(max(0.0, took - statistics.median(others)) for took in first) if others else 0.0
+
+
+def run(settings: Settings, goal: Goal, limit: float, as_json: bool = False) -> tuple[str, bool]:
+    """All of `surgical-marl bench solve`, from the start of this process: the text of its table or JSON, and whether it
+    is solved. It is given up after `limit` seconds."""
+    began = time.perf_counter() - machine.age()
+    with in_memory(settings.num_envs):
+        found = solve(settings, goal, lambda seconds, learning: seconds > limit, began)
+    return (summary(settings, goal, found) if as_json else table(settings, goal, found)), found.solved
+
+
+def summary(settings: Settings, goal: Goal, found: Solution) -> str:
+    """A solution as JSON, with the settings that it is of."""
+    values = {**asdict(found), **asdict(found.times), **asdict(found.exam)}
+    about = {name: getattr(settings, name) for name in ("task", "scene", "algo", "seed", "control", "difficulty")}
+    del values["times"], values["exam"]
+    return json.dumps({**about, "goal": asdict(goal), **values, **machine.machine()})
+
+
+def table(settings: Settings, goal: Goal, found: Solution) -> str:
+    """A solution for people."""
+    exam = found.exam
+    parts = {item.name.removesuffix("_s"): getattr(found.times, item.name) for item in fields(Times)}
+    cells = [(name, f"{took:.2f} s", f"{took / found.seconds:.0%}") for name, took in parts.items()]
+    wanted = f"{goal.success:.0%} within {SUCCESS_MM} mm and less than {goal.collisions:.0%} collisions"
+    return "\n".join(
+        [
+            f"{settings.task} in {settings.scene}, {settings.algo}, seed {settings.seed}: "
+            + (f"{wanted} after {found.seconds:.1f} s" if found.solved else f"given up after {found.seconds:.1f} s"),
+            describe_machine(),
+            "",
+            *aligned([*cells, ("all", f"{found.seconds:.2f} s", "")]),
+            "",
+            f"{found.iterations} iterations of {found.num_envs} environments ({found.engine} engine, {found.device}), "
+            f"{found.env_steps:,} samples, {found.evaluations} evaluations",
+            f"the last of {EPISODES} episodes: {exam.success_2mm:.1%} within {SUCCESS_MM} mm, median error "
+            f"{exam.median_error_mm:.2f} mm, {exam.collision_rate:.1%} collisions; goal set {exam.goal_set:.12} "
+            f"({'standard' if exam.standard else 'not a standard one'})",
+        ]
+    )
+
+
+def _say(when: str, exam: Exam) -> None:
+    print(
+        f"surgical-marl: {when}: {exam.success_2mm:.1%} within {SUCCESS_MM} mm, {exam.collision_rate:.1%} collisions",
+        file=sys.stderr,
+        flush=True,
+    )
