@@ -35,6 +35,11 @@ def claim_gpu(device: str) -> None:
     os.environ["CUDA_VISIBLE_DEVICES"] = visible.split(",")[int(os.environ["LOCAL_RANK"])]
 
 
+def is_first() -> bool:
+    """Whether this is rank 0, before and after processes are `joined` as well."""
+    return int(os.environ.get("RANK", 0)) == 0
+
+
 @contextmanager
 def joined(device: str) -> Iterator[None]:
     """Within torchrun: the processes are one group while this lasts. `device` is "cpu", "cuda" or "auto"."""
@@ -59,6 +64,14 @@ def rank() -> int:
 def size() -> int:
     """How many processes there are."""
     return dist.get_world_size() if dist.is_initialized() else 1
+
+
+def agreed(text: str) -> str:
+    """The text that rank 0 has."""
+    texts = [text]
+    if size() > 1:
+        dist.broadcast_object_list(texts)
+    return texts[0]
 
 
 def own_seed(seed: int, *more: int) -> int:

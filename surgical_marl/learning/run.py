@@ -53,6 +53,11 @@ def write_config(run: Path, settings: Settings) -> None:
     write_atomic(run / CONFIG, lambda path: path.write_text(config_text(settings, versions)))
 
 
+def has_begun(run: Path) -> bool:
+    """Whether there is a run in a folder, which has its settings from the start."""
+    return (run / CONFIG).is_file()
+
+
 def read_settings(run: str | Path, overrides: Iterable[str] = ()) -> Settings:
     """Settings of a run or of a shipped policy, with `key=value` overrides.
 

@@ -99,8 +99,8 @@ def train(settings: Settings, *, out: Path, resume: Path | None = None) -> Path:
         FloatingPointError: training produced NaN; the last good checkpoint is kept, and `diverged.json` says where.
         KeyboardInterrupt, SystemExit: after Ctrl-C or SIGTERM, when the checkpoint is written.
     """
-    out = Path(out)
     with distributed.joined(settings.device), ExitStack() as closing:
+        out = Path(distributed.agreed(str(out)))  # its name may hold the time
         state = None if resume is None else _read_resumed(settings, Path(resume), _same(out, resume))
         if state is not None and state["iteration"] == settings.iterations:
             _say(f"the run in {out} has its {settings.iterations} iterations: to go on, ask for more")
