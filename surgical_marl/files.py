@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -27,7 +28,8 @@ def write_atomic(path: Path, write: Callable[[Path], object]) -> None:
 def remove_temporaries(folder: Path) -> None:
     """Remove what `write_atomic` leaves in a folder if the process is killed meanwhile."""
     for temporary in folder.glob(".*.tmp"):
-        temporary.unlink(missing_ok=True)
+        if re.fullmatch(r"\..+\.\d+\.tmp", temporary.name):
+            temporary.unlink(missing_ok=True)
 
 
 def _flush(path: Path, flags: int) -> None:

@@ -131,12 +131,12 @@ def _claimed(out: Path, resume: Path | None, settings: Settings) -> Iterator[Non
     new = not out.exists()
     if _same(out, resume):
         check_writable(out)
-        remove_temporaries(out)
         (out / DIVERGED).unlink(missing_ok=True)
     else:
         claim_folder(out)
         if resume is None:
             write_config(out, settings)
+    remove_temporaries(out)
     try:
         yield
     except ValueError:
