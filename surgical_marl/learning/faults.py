@@ -50,9 +50,15 @@ def column_names(observations: TensorDict) -> list[str]:
     return [f"{name}[{column}]" for name, group in _numbers(observations) for column in range(group.shape[-1])]
 
 
-def mark_columns(observations: TensorDict) -> Tensor:
-    """For each column of groups `[..., d]`: 0, or NaN if a value in it is not finite. Pictures have no columns."""
-    return torch.cat([_mark(group.flatten(0, -2).isfinite().all(0)) for _, group in _numbers(observations)])
+def mark_columns(stored: TensorDict, after: TensorDict) -> Tensor:
+    """For each column of the groups `[T, N, ..., d]` of a rollout, and of those `[N, ..., d]` after it: 0, or NaN if a
+    value in it is not finite in the first step in which any is not. From then on, faults spread. Pictures have no
+    columns."""
+    rows = [_numbers(stored), [(name, group.unsqueeze(0)) for name, group in _numbers(after)]]
+    finite = [torch.cat([group.flatten(1, -2).isfinite().all(1) for _, group in groups], -1) for groups in rows]
+    bad = ~torch.cat(finite)
+    first = bad & (bad.any(1, keepdim=True).cumsum(0) == 1)
+    return _mark(~first.any(0))
 
 
 def mark(parts: Iterable[Tensor]) -> Tensor:

@@ -178,7 +178,7 @@ class Training:
             for name, kept in self._observations.items():
                 kept.copy_(observations[name])
             stored = algorithm.storage
-            columns = faults.mark_columns(stored.observations) + faults.mark_columns(observations)
+            columns = faults.mark_columns(stored.observations, observations)
             self._marks.copy_(torch.cat([columns, faults.mark([stored.values, stored.returns])]))
 
     def _update(self) -> None:
