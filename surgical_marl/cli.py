@@ -5,7 +5,6 @@ from __future__ import annotations
 # Only light imports up here: `list` and a typing error should answer at once. What needs torch or
 # JAX is imported by the command that needs it.
 import argparse
-import json
 import os
 import sys
 import time
@@ -139,16 +138,25 @@ def _parser() -> argparse.ArgumentParser:
     audit.add_argument("source", metavar="ARM_OR_SCENE", help="a name, an arm's folder or a scene's .yaml file")
     audit.set_defaults(command=_check, name="check")
 
-    export = commands.add_parser("export", help="write a scene for other programs")
-    export.add_argument("kind", type=_one_of(("scene",)), metavar="scene")
-    export.add_argument("source", metavar="NAME_OR_PATH", help="a scene's name or .yaml file")
-    export.add_argument("--format", type=_one_of(("mjcf",)), default="mjcf", metavar="mjcf", help="MuJoCo's XML")
-    export.add_argument("--out", type=Path, metavar="FILE", help="default: <scene>.xml in the current folder")
-    export.add_argument("--control", type=_one_of(_CONTROL), default=_CONTROL[0], metavar="|".join(_CONTROL))
-    export.set_defaults(command=_export, name="export")
+    export = commands.add_parser("export", help="write a scene for other programs, or a policy to pass on")
+    kinds = export.add_subparsers(required=True, metavar="{scene,policy}")
+    scene = kinds.add_parser("scene", help="a scene as one file for MuJoCo")
+    scene.add_argument("source", metavar="NAME_OR_PATH", help="a scene's name or .yaml file")
+    scene.add_argument("--format", type=_one_of(("mjcf",)), default="mjcf", metavar="mjcf", help="MuJoCo's XML")
+    scene.add_argument("--out", type=Path, metavar="FILE", help="default: <scene>.xml in the current folder")
+    scene.add_argument("--control", type=_one_of(_CONTROL), default=_CONTROL[0], metavar="|".join(_CONTROL))
+    scene.set_defaults(command=_export_scene, name="export scene")
+    policy = kinds.add_parser("policy", help="a trained policy as a folder: ONNX, safetensors, evaluation, card, clip")
+    policy.add_argument(
+        "runs", nargs="+", metavar="RUN", help="run folders of one training, one a seed: the best is taken"
+    )
+    policy.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="the policy's folder, such as policies/NAME"
+    )
+    policy.set_defaults(command=_export_policy, name="export policy")
 
-    bench = commands.add_parser("bench", help="measure how fast this machine simulates and learns")
-    kinds = bench.add_subparsers(required=True, metavar="{sim,train,solve}")
+    bench = commands.add_parser("bench", help="measure how fast this machine simulates, learns and draws")
+    kinds = bench.add_subparsers(required=True, metavar="{sim,train,solve,render}")
     sim = _bench_parser(kinds, "sim", "steps/s of the engines and of C MuJoCo", _BENCHED)
     sim.add_argument("--decimation", type=_whole(1), default=1, metavar="K", help="physics steps an environment step")
     sim.add_argument("--motion", type=_one_of(_MOTIONS), default=_MOTIONS[0], metavar="|".join(_MOTIONS),
@@ -163,6 +171,13 @@ def _parser() -> argparse.ArgumentParser:
     learns.add_argument("--success", type=float, default=0.95, metavar="SHARE", help="wanted within 2 mm")
     learns.add_argument("--collisions", type=float, default=0.01, metavar="SHARE", help="of episodes, to stay below")
     learns.add_argument("--limit", type=float, default=600.0, metavar="SECONDS", help="then it is given up")
+
+    draws = kinds.add_parser("render", help="pictures/s of the endoscope")
+    draws.add_argument("--scene", default="ecm", help="a scene with an endoscope, or a .yaml file")
+    draws.add_argument("--num-envs", type=_whole(1), metavar="N", help="default: 64 on a CPU, 8192 on a GPU")
+    draws.add_argument("--device", type=_one_of(_DEVICES), default="auto", metavar="|".join(_DEVICES))
+    draws.add_argument("--json", action="store_true", help="one JSON object instead of a table")
+    draws.set_defaults(command=_bench, name="bench render", kind="render")
 
     doctor = commands.add_parser("doctor", help="check this machine and this installation")
     doctor.set_defaults(command=_doctor, name="doctor")
@@ -210,7 +225,13 @@ def _check(arguments: argparse.Namespace) -> int:
     return 1 if findings else 0
 
 
-def _export(arguments: argparse.Namespace) -> None:
+def _export_policy(arguments: argparse.Namespace) -> None:
+    from surgical_marl.learning.export import export_policy
+
+    print(export_policy(arguments.runs, arguments.out))
+
+
+def _export_scene(arguments: argparse.Namespace) -> None:
     source = find("scenes", arguments.source)
     out = arguments.out or Path(f"{source.stem}.xml")
     if out.exists():
@@ -268,28 +289,12 @@ def _train(arguments: argparse.Namespace) -> None:
     out = arguments.out or arguments.resume or _run_folder(settings)
     claim_gpu(settings.device)
 
-    from surgical_marl.evaluation.evaluate import evaluate
-    from surgical_marl.evaluation.report import format_table
-    from surgical_marl.files import write_atomic
-    from surgical_marl.learning.policy import load_policy
-    from surgical_marl.learning.train import make_env, train
+    from surgical_marl.evaluation.command import judge
+    from surgical_marl.learning.train import train
 
     run = train(settings, out=out, resume=resume)
-    if not is_first():
-        return
-    print("evaluating 200 episodes", file=sys.stderr)
-    env = make_env(read_settings(run, ["engine=auto", "device=auto"]), num_envs=200)
-    policy = load_policy(run, env)
-    result = evaluate(env, policy, episodes=200, seed=0)
-    text = json.dumps(result, indent=2) + "\n"
-    write_atomic(run / "eval.json", lambda path: path.write_text(text))
-    print(format_table(result))
-    print(run, flush=True)
-
-    from surgical_marl.view.record import record
-
-    print("recording a video", file=sys.stderr)
-    record(env, policy, run / "video.mp4")
+    if is_first():
+        judge(run)
 
 
 def _eval(arguments: argparse.Namespace) -> None:
@@ -320,9 +325,8 @@ def _eval(arguments: argparse.Namespace) -> None:
 
 
 def _run_folder(settings: Any) -> Path:
-    scene = Path(settings.scene).stem
-    stamp = time.strftime("%Y%m%d-%H%M%S")
-    return Path("runs") / f"{settings.task}-{scene}-{settings.algo}-seed{settings.seed}-{stamp}"
+    name = f"{settings.task}-{Path(settings.scene).stem}-{settings.algo}-seed{settings.seed}"
+    return Path("runs") / f"{name}-{time.strftime('%Y%m%d-%H%M%S')}"
 
 
 def _one_of(good: Sequence[str]) -> Callable[[str], str]:

@@ -13,7 +13,7 @@ BASELINES = ("zero", "random", "oracle")
 
 _PACKAGE = Path(__file__).resolve().parent
 _NOUNS = {"arms": "arm", "scenes": "scene", "configs": "config", "policies": "run or policy"}
-_MARKER = {"arms": "arm.yaml"}
+_MARKER = {"arms": "arm.yaml", "policies": "config.yaml"}
 _SUFFIX = {"scenes": ".yaml", "configs": ".yaml"}
 
 

@@ -1,4 +1,4 @@
-"""What `surgical-marl list -v` says of scenes, arms and tasks."""
+"""What `surgical-marl list -v` says of scenes, arms, tasks and policies."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from surgical_marl.arm import load_arm
 from surgical_marl.cache import cached
-from surgical_marl.content import list_arms, list_policies, list_scenes, list_tasks
+from surgical_marl.content import list_arms, list_scenes, list_tasks
 from surgical_marl.scene import Scene, load_scene
 
 SAMPLES = 500
@@ -23,7 +23,7 @@ def describe(kind: str) -> str:
         "tasks": lambda: [_task(name) for name in list_tasks()],
         "scenes": lambda: [_scene(load_scene(name)) for name in list_scenes()],
         "arms": lambda: [_arm(name) for name in list_arms()],
-        "policies": list_policies,
+        "policies": _policies,
     }[kind]()
     return "\n".join(lines)
 
@@ -68,6 +68,12 @@ def _scene(scene: Scene) -> str:
 def _arm(name: str) -> str:
     arm = load_arm(name)
     return f"{name:14} {arm.description}\n    {', '.join(joint.name for joint in arm.actuated)}"
+
+
+def _policies() -> list[str]:
+    from surgical_marl.learning.card import table  # imports torch
+
+    return table().splitlines()
 
 
 def _task(name: str) -> str:

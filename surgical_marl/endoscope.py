@@ -4,8 +4,9 @@
     view = endoscope.render(env.qpos)           # joint positions [N, nq], numpy or torch
     view.rgb                                    # [N, eyes, 64, 64, 3] uint8
 
-Pictures follow from joint positions alone, which any engine has: there is no second physics. MuJoCo Warp's ray tracer
-draws them, on a GPU or a CPU by the same code; docs/rendering.md compares it with C MuJoCo's ray caster.
+Pictures follow from joint positions alone, which any engine has: there is no second physics. MuJoCo Warp finds where
+the bodies are and `surgical_marl/tracer.py` draws them, on a GPU or a CPU by the same code; docs/rendering.md compares
+the pictures with C MuJoCo's ray caster.
 """
 
 from __future__ import annotations
@@ -17,21 +18,22 @@ import numpy as np
 import torch
 
 from surgical_marl.content import unknown
-from surgical_marl.runtime import prepare_jax, prepare_warp
+from surgical_marl.runtime import prepare_mjx, prepare_warp
 from surgical_marl.scene import Scene
 
 SIZE = 64
 """Pixels along each side of a picture."""
 EYES = ("left", "right")
 CHANNELS = ("rgb", "depth", "segmentation")
-BACKGROUND = (0.05, 0.02, 0.02, 1.0)
+_TYPES = {"rgb": torch.uint8, "depth": torch.float32, "segmentation": torch.int32}
+BACKGROUND = (0.05, 0.02, 0.02)
 """What no geom covers: the dark of a body cavity."""
 
 
 @dataclass(frozen=True)
 class View:
     """What the endoscopes of N environments see. Of the library that `render` was given; E eyes, H rows, W columns.
-    What was not asked for is None. The next `render` overwrites depth."""
+    What was not asked for is None."""
 
     rgb: Any = None
     """[N, E, H, W, 3] uint8"""
@@ -44,8 +46,8 @@ class View:
 class Endoscope:
     """The camera of one agent, in N copies of its scene.
 
-    Visual geoms only (groups 0 to 2), as in all pictures. A picture takes 4 bytes a pixel of colour (and 3 in `View`),
-    4 of depth and 8 of segmentation (and 4): 64 x 64 in all channels 92 KiB an eye.
+    Visual geoms only (groups 0 to 2), as in all pictures. A pixel takes 3 bytes of colour, 4 of depth and 4 of
+    segmentation: 64 x 64 in all channels 44 KiB an eye.
 
     Args:
         scene: a scene of which an arm has a `camera`.
@@ -86,61 +88,52 @@ class Endoscope:
         self.eyes = EYES if stereo else EYES[:1]
         self.labels, self.label_names = _labels(scene)
         self._shape = num_envs, len(self.eyes), height, width
-        prepare_jax()
+        prepare_mjx()
         self._warp = prepare_warp()
         from mujoco.mjx.third_party import mujoco_warp
 
+        from surgical_marl.tracer import Tracer
+
         self._mujoco = mujoco_warp
+        cameras = [scene.model.camera(f"{self.agent}/{eye}").id for eye in self.eyes]
         with self._warp.ScopedDevice(device):
             self._model = mujoco_warp.put_model(scene.model)
             self._data = mujoco_warp.make_data(scene.model, num_envs, nconmax=0, njmax=0)
-            self._context = mujoco_warp.create_render_context(
-                scene.model,
-                num_envs,
-                (width, height),
-                use_textures=False,
-                render_rgb="rgb" in channels,
-                render_depth="depth" in channels,
-                render_seg="segmentation" in channels,
-                cam_active=[f"{self.agent}/{eye}" for eye in self.eyes],
-                background_color=BACKGROUND,
-                enable_backface_culling=False,  # as C MuJoCo's rays: who is inside a thing sees it from inside
-            )
+            self._tracer = Tracer(scene.model, cameras, num_envs, width, height, BACKGROUND)
         self._qpos = self._warp.to_torch(self._data.qpos)
         self._warp.synchronize_device(device)  # what made the arrays ran on a stream of Warp's own
 
     def render(self, qpos: Any) -> View:
         """What the endoscopes see at joint positions [N, nq] of the whole scene: numpy for numpy, and torch for torch.
 
-        On a GPU it follows what torch's current stream has to do, and nothing waits or passes through the host, given
-        and asked for torch.
+        On a GPU it follows what torch's current stream has to do, and given torch nothing waits or passes through the
+        host: after a first call it can be captured in a CUDA graph.
         """
         if tuple(qpos.shape) != tuple(self._qpos.shape):
             raise ValueError(f"qpos of shape {tuple(qpos.shape)} must be {tuple(self._qpos.shape)}")
         given = torch.is_tensor(qpos)
         self._qpos.copy_(qpos if given else torch.from_numpy(np.array(qpos, np.float32)))
+        drawn = {name: self._empty(name) for name in CHANNELS}
         with self._stream():
             self._mujoco.kinematics(self._model, self._data)
             self._mujoco.camlight(self._model, self._data)
-            self._mujoco.refit_bvh(self._model, self._data, self._context)
-            self._mujoco.render(self._model, self._data, self._context)
-        found = {name: getattr(self, f"_{name}")() for name in self.channels}
+            self._tracer.draw(self._data, **drawn)
+        found = {name: drawn[name].unflatten(0, self._shape[:2]) for name in self.channels}
         return View(**(found if given else {name: picture.cpu().numpy() for name, picture in found.items()}))
+
+    def _empty(self, channel: str) -> torch.Tensor:
+        """Pictures to draw on, [N * E, H, W] or with [3] colours; none of a channel that nobody asked for."""
+        envs, eyes, height, width = self._shape
+        pictures = envs * eyes if channel in self.channels else 0
+        colours = (3,) if channel == "rgb" else ()
+        return torch.empty((pictures, height, width, *colours), dtype=_TYPES[channel], device=self.device)
 
     def _stream(self) -> Any:
         if self.device == "cpu":
             return self._warp.ScopedDevice("cpu")
-        return self._warp.ScopedStream(self._warp.stream_from_torch(torch.cuda.current_stream()))
-
-    def _rgb(self) -> torch.Tensor:
-        packed = self._warp.to_torch(self._context.rgb_data.view(self._warp.int32)).view(torch.uint8)
-        return packed.reshape(*self._shape, 4)[..., :3].flip(-1)  # blue, green, red, alpha in memory
-
-    def _depth(self) -> torch.Tensor:
-        return self._warp.to_torch(self._context.depth_data).reshape(self._shape)
-
-    def _segmentation(self) -> torch.Tensor:
-        return self._warp.to_torch(self._context.seg_data).reshape(*self._shape, 2)[..., 0].clone()
+        # Nothing is left to do on Warp's own stream, and to wait for it would break a capture.
+        stream = self._warp.stream_from_torch(torch.cuda.current_stream())
+        return self._warp.ScopedStream(stream, sync_enter=False)
 
 
 def find_camera(scene: Scene, agent: str | None = None) -> str:

@@ -12,11 +12,12 @@ import numpy as np
 import pytest
 from mujoco import rollout
 
-from surgical_marl.bench import contenders, machine, sim
+from surgical_marl.bench import contenders, machine, render, sim
 from surgical_marl.bench.clock import race
 from surgical_marl.bench.contenders import Contender
 from surgical_marl.bench.course import HOLD, LAPS, MOTIONS, full_state, make_course
 from surgical_marl.bench.physics import PhysicsAlone
+from surgical_marl.bench.render import measure_rendering
 from surgical_marl.bench.report import QUOTED, draw, ratios, sweep_table
 from surgical_marl.bench.sim import Point, Speed, measure, sweep
 from surgical_marl.bench.workload import Workload
@@ -182,6 +183,22 @@ def test_a_course_takes_back_what_it_did(motion: str) -> None:
     assert len(course.commands) == len(course.actions) == LAPS
 
 
+def test_rendering_as_json_and_as_a_sentence(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(render.clock, "race", lambda clocks, *_: {key: clock(1) for key, clock in clocks.items()})
+    argv = ["bench", "render", "--scene", "ecm", "--num-envs", "2", "--device", "cpu"]
+    assert main([*argv, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert list(found) == ["frames_per_s", "num_envs", "device", "width", "height", "channels", "stereo"]
+    assert found.pop("frames_per_s") > 0
+    assert found == {"num_envs": 2, "device": "cpu", "width": 64, "height": 64, "channels": ["rgb"], "stereo": False}
+    assert main(argv) == 0
+    assert "pictures/s of 64 x 64 pixels of rgb, 2 envs, cpu" in capsys.readouterr().out
+    one, two = (measure_rendering("ecm", 1, "cpu", size=8, stereo=stereo) for stereo in (False, True))
+    assert (one.stereo, two.stereo, two.width) == (False, True, 8)
+
+
 @pytest.mark.parametrize(
     "argv, words",
     [
@@ -199,6 +216,8 @@ def test_a_course_takes_back_what_it_did(motion: str) -> None:
         (["sim", "--sweep", "--num-envs", "4"], ["--sweep", "--num-envs 4"]),
         (["sim", "--sweep", "--out", "a.pdf"], ["a.pdf", ".png"]),
         (["sim", "--sweep", "--out", "none/a.png"], ["none/a.png", "folder"]),
+        (["render", "--scene", "psm"], ["'psm'", "no endoscope"]),
+        (["render", "--scene", "ecm", "--sweep"], ["'--sweep'", "bench render"]),
     ],
 )
 def test_bad_input(argv: list[str], words: list[str], capsys: pytest.CaptureFixture[str]) -> None:

@@ -132,6 +132,29 @@ def test_torch_in_torch_out_and_any_size() -> None:
     assert wide.depth.shape == (POSES, 1, 32, 48) and wide.depth.dtype == np.float32
 
 
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@pytest.mark.parametrize("name", SCENES)
+def test_a_cuda_graph_draws_what_a_cpu_draws(name: str) -> None:
+    """Captured at home and replayed at other postures; the ones before are drawn without a graph."""
+    scene, qpos, view = seen(name)
+    endoscope = Endoscope(scene, POSES, "cuda", stereo=True, channels=CHANNELS)
+    wanted = torch.from_numpy(qpos).float().cuda()
+    eager = endoscope.render(wanted)
+    given = torch.from_numpy(scene.home).float().cuda().repeat(POSES, 1)
+    torch.cuda.synchronize()
+    graph, stream = torch.cuda.CUDAGraph(), torch.cuda.Stream()
+    with torch.cuda.graph(graph, stream=stream):
+        drawn = endoscope.render(given)
+    given.copy_(wanted)
+    graph.replay()
+    for channel in CHANNELS:
+        assert torch.equal(getattr(drawn, channel), getattr(eager, channel))
+    same = drawn.segmentation.cpu().numpy() == view.segmentation
+    assert same.mean() > 0.99
+    assert np.abs(drawn.depth.cpu().numpy() - view.depth)[same].max() < 1e-4
+    assert (np.abs(drawn.rgb.cpu().numpy().astype(int) - view.rgb)[same] <= 1).mean() > 0.999
+
+
 @pytest.mark.parametrize(
     ("scene", "options", "words"),
     [

@@ -21,7 +21,6 @@ from surgical_marl.learning import config, train, training
 from surgical_marl.learning.config import ConstraintSettings, NetworkSettings, PPOSettings, Settings, load_config
 from surgical_marl.learning.episodes import Episodes
 from surgical_marl.learning.policy import (
-    export_policy,
     load_policy,
     random_policy,
     untrained_policy,
@@ -48,7 +47,14 @@ OPTIONS: list[dict[str, Any]] = [
     {},
     {"ppo": replace(SMALL.ppo, normalise_values=True)},
     {"constraint": ConstraintSettings(cost="collision", limit=0.01)},
+    {"network": replace(SMALL.network, recurrent="gru")},
 ]
+ALL: dict[str, Any] = {
+    **OPTIONS[1],
+    **OPTIONS[2],
+    "network": replace(SMALL.network, recurrent="lstm"),
+    "team_reward": True,
+}
 
 
 @pytest.fixture
@@ -96,7 +102,23 @@ def test_the_toy_is_learned(algo: Any, tmp_path: Path, fakes: list[Any]) -> None
     assert rows[-1]["success_rate"] > rows[0]["success_rate"]
 
 
-@pytest.mark.parametrize("options", OPTIONS)
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+@pytest.mark.parametrize("counts", [{"psm": 1}, COUNTS])
+@pytest.mark.parametrize("algo", ["mappo", "ippo", "joint"])
+def test_options_go_together(
+    algo: Any, counts: dict[str, int], precision: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(train, "make_env", lambda settings: FakeEnv(counts, SIZES, settings.num_envs, max_steps=5))
+    settings = replace(SMALL, algo=algo, precision=precision, **ALL, iterations=2)
+    run = train.train(settings, out=tmp_path / "run")
+    assert read_settings(run) == settings
+    last = read_metrics(run)[-1]
+    assert last["cost_rate"] >= 0 and last["lagrange_multiplier"] >= 0 and math.isfinite(last["value_loss"])
+    env: Any = FakeEnv(counts, SIZES, num_envs=4, max_steps=5)
+    assert evaluate(env, load_policy(run, env), episodes=4, seed=0)["mean_error_mm"] > 0
+
+
+@pytest.mark.parametrize("options", [*OPTIONS, ALL])
 def test_resume_is_bit_for_bit(options: dict[str, Any], tmp_path: Path, fakes: list[Any]) -> None:
     settings = replace(SMALL, **options)
     whole = train.train(settings, out=tmp_path / "whole")
@@ -113,6 +135,8 @@ def test_resume_is_bit_for_bit(options: dict[str, Any], tmp_path: Path, fakes: l
         moments = first["algorithm"]["optimizer_state_dict"]["state"]
         for index, moment in again["algorithm"]["optimizer_state_dict"]["state"].items():
             assert torch.equal(moment["exp_avg_sq"], moments[index]["exp_avg_sq"])
+        for name, memory in (first["memory"] or {}).items():
+            assert torch.equal(again["memory"][name], memory) and memory.any()
         assert torch.equal(again["random"], first["random"])
         assert torch.equal(again["env"]["observations"]["state"], first["env"]["observations"]["state"])
         assert [row["iteration"] for row in read_metrics(run)] == [1, 2, 3, 4]
@@ -267,16 +291,15 @@ def test_folders_that_cannot_be_used(tmp_path: Path, fakes: list[Any]) -> None:
     run = train.train(replace(SMALL, iterations=1), out=tmp_path / "run")
     (tmp_path / "file").write_text("")
     (tmp_path / "empty").mkdir()
-    exported = export_policy(run, tmp_path / "exported")
     cases: list[tuple[Settings, dict[str, Any], str]] = [
         (SMALL, {"out": run}, "already holds a run"),
         (SMALL, {"out": tmp_path / "file" / "run"}, "cannot write"),
         (SMALL, {"out": tmp_path / "new", "resume": tmp_path / "empty"}, "not a run folder"),
-        (SMALL, {"out": tmp_path / "new", "resume": exported}, "exported policy"),
         (replace(SMALL, iterations=1), {"out": tmp_path / "new", "resume": run}, "already has 1 iterations"),
         (replace(SMALL, num_envs=8), {"out": run, "resume": run}, "num_envs 32"),
         (replace(SMALL, **OPTIONS[1]), {"out": run, "resume": run}, "normalise_values False"),
         (replace(SMALL, **OPTIONS[2]), {"out": run, "resume": run}, "constraint.cost 'none'"),
+        (replace(SMALL, **OPTIONS[3]), {"out": run, "resume": run}, "network.recurrent 'none'"),
         (replace(SMALL, scene="psm"), {"out": run, "resume": run}, "'bimanual_psm'"),
     ]
     for settings, arguments, message in cases:
@@ -306,13 +329,12 @@ def test_writing_is_atomic(tmp_path: Path) -> None:
 
 def test_policies_act_alike_on_numpy_and_tensors(tmp_path: Path, fakes: list[Any]) -> None:
     run = train.train(replace(SMALL, iterations=1), out=tmp_path / "run")
-    exported = export_policy(run, tmp_path / "exported")
     env: Any = FakeEnv(COUNTS, SIZES, num_envs=4)
     observations, *_ = env.reset(0)
     arrays = {agent: value.numpy() for agent, value in observations.items()}
     policy = load_policy(run, env)
     actions = policy(observations)
-    for agent, action in load_policy(exported, env)(arrays).items():
+    for agent, action in policy(arrays).items():
         assert action.shape == (4, env.sizes[agent]) and abs(action).max() <= 1
         torch.testing.assert_close(torch.from_numpy(action), actions[agent])
     alone = policy({agent: value[1] for agent, value in arrays.items()})
@@ -391,6 +413,7 @@ def test_the_shipped_settings_load() -> None:
         ("constraint.limit=2", "constraint.limit must be a number from 0 to 1, not 2"),
         ("constraint.kp=-1", "constraint.kp must be a number from 0 to"),
         ("ppo.normalise_values=1", "ppo.normalise_values must be true or false, not 1"),
+        ("network.recurrent=rnn", "network.recurrent must be one of none, gru, lstm, not 'rnn'"),
         ("max_steps=0", "max_steps must be a whole number from 1"),
         ("ppo.mini_batches=999999", "ppo.mini_batches must be at most num_envs"),
     ],
@@ -399,6 +422,11 @@ def test_bad_settings_are_named(override: str, message: str) -> None:
     with pytest.raises(ValueError, match=message) as error:
         load_config("reach", "psm", [override])
     assert "\n" not in str(error.value)
+
+
+def test_whole_rollouts_need_an_environment_each() -> None:
+    with pytest.raises(ValueError, match=r"at most num_envs = 2 with network.recurrent, not 4"):
+        load_config("reach", "psm", ["network.recurrent=gru", "num_envs=2"])
 
 
 def test_bad_files_are_named(reach: Callable[[str], None]) -> None:

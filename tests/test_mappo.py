@@ -176,6 +176,8 @@ def test_one_agent_is_rsl_rls_ppo(schedule: Any, clip_value: bool) -> None:
     )
     groups = {"actor": ["actor"], "critic": ["critic"]}
     config = rsl_rl_config(replace(SETTINGS, ppo=ppo))
+    for network in ("actor", "critic"):
+        del config[network]["recurrent"]
     actor = MLPModel(flat, groups, "actor", 3, **config["actor"])
     critic = MLPModel(flat, groups, "critic", 1, **config["critic"])
     actor.load_state_dict(copy.deepcopy(algorithm.actor.models["psm"].state_dict()))

@@ -93,6 +93,31 @@ def test_errors_are_of_the_camera_and_zero_at_the_hidden_posture(scene: str) -> 
     assert there["image_error"].max() < 1
 
 
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_a_step_in_a_cuda_graph_is_a_step() -> None:
+    """Two environments alike, one of them stepped by a graph's replays, over an episode's end."""
+    eager, captured = (
+        BatchedEnv("match_image", "ecm", num_envs=COUNT, max_steps=STEPS, arrays="torch", engine="fused", device="cuda")
+        for _ in range(2)
+    )
+    for env in (eager, captured):
+        env.reset(0)
+    actions = {a: torch.from_numpy(rows).cuda() for a, rows in random_actions(eager, np.random.default_rng(0)).items()}
+    eager.step(actions)
+    captured.step(actions)
+    torch.cuda.synchronize()
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph, stream=torch.cuda.Stream()):
+        found = captured.step(actions)
+    for _ in range(STEPS):
+        wanted = eager.step(actions)
+        graph.replay()
+        for part in ("image", "target", "proprioception"):
+            assert torch.equal(found.observations["ecm_0"][part], wanted.observations["ecm_0"][part])
+            assert torch.equal(found.final_state[part], wanted.final_state[part])
+        assert torch.equal(found.rewards["ecm_0"], wanted.rewards["ecm_0"])
+
+
 def test_nothing_observed_but_the_target_picture_depends_on_the_hidden_pose() -> None:
     env = batched("trimanual_psm_ecm")
     env.reset(0)

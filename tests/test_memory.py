@@ -13,17 +13,18 @@ from fake_env import FakeEnv
 
 from surgical_marl.cli import main
 from surgical_marl.learning import memory, train
-from surgical_marl.learning.config import Settings
+from surgical_marl.learning.config import ConstraintSettings, Settings
 from surgical_marl.learning.memory import check_room, in_memory, rollout_bytes
 from surgical_marl.learning.training import Training
 
 SETTINGS = Settings(num_envs=16, steps_per_iteration=4)
 
 
-@pytest.fixture(params=["mappo", "ippo", "joint"])
+@pytest.fixture(params=[("mappo", "none"), ("ippo", "none"), ("joint", "none"), ("mappo", "collision")])
 def training(request: pytest.FixtureRequest) -> Training:
     env: Any = FakeEnv({"psm": 2, "ecm": 1}, {"psm": 3, "ecm": 2}, 16)
-    return Training(replace(SETTINGS, algo=request.param), env)
+    algo, cost = request.param
+    return Training(replace(SETTINGS, algo=algo, constraint=ConstraintSettings(cost=cost)), env)
 
 
 def test_what_a_rollout_takes_is_what_is_stored(training: Training) -> None:

@@ -19,9 +19,14 @@ if TYPE_CHECKING:
 
 def run(arguments: Namespace) -> int:
     """One benchmark; returns the exit code. `arguments` are those of its parser in `surgical_marl/cli.py`."""
+    find("scenes", arguments.scene)
+    if arguments.kind == "render":
+        from surgical_marl.bench.render import run
+
+        print(run(arguments.scene, arguments.num_envs, arguments.device, arguments.json))
+        return 0
     if arguments.task not in list_tasks():
         raise unknown("task", arguments.task, list_tasks())
-    find("scenes", arguments.scene)
     with _no_caches() if arguments.cold else contextlib.nullcontext():
         return {"sim": _sim, "train": _train, "solve": _solve}[arguments.kind](arguments)
 

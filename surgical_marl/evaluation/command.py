@@ -12,6 +12,7 @@ from typing import Any
 from surgical_marl.content import BASELINES, find
 from surgical_marl.evaluation.evaluate import MAX_BATCH, Played, difference, play, summarise
 from surgical_marl.evaluation.report import ABOUT, format_table, write_csv
+from surgical_marl.files import write_atomic
 from surgical_marl.learning.config import Settings
 from surgical_marl.learning.policy import load_policy
 from surgical_marl.learning.run import read_settings
@@ -84,6 +85,23 @@ def report(
     if older is not None and change is not None:
         return format_table(whole, {older[0]: older[1], "difference": change})
     return format_table(whole, {run["policy"]: run for run in runs} if several else None)
+
+
+def judge(run: Path) -> None:
+    """What `surgical-marl train` does after training: evaluate on the standard goals, say how it went, and film it."""
+    print("evaluating 200 episodes", file=sys.stderr)
+    env = make_env(read_settings(run, ["engine=auto", "device=auto"]), num_envs=200)
+    policy = load_policy(run, env)
+    result = summarise([play(env, policy, episodes=200, seed=0)])
+    text = json.dumps(result, indent=2) + "\n"
+    write_atomic(run / "eval.json", lambda path: path.write_text(text))
+    print(format_table(result))
+    print(run, flush=True)
+
+    from surgical_marl.view.record import record
+
+    print("recording a video", file=sys.stderr)
+    record(env, policy, run / "video.mp4")
 
 
 def read_result(path: Path) -> dict[str, Any]:

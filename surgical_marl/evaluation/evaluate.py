@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import torch
 
+from surgical_marl.acting import forget
 from surgical_marl.evaluation.goal_set import check_same, describe_goals, episode_seed, goal_hash, read_goals
 from surgical_marl.evaluation.interval import interval
 from surgical_marl.evaluation.metrics import FOLLOWING, LAST, TERMS, Metric, Trajectory, measure, metrics
@@ -73,6 +74,7 @@ def play(
     for block in range(math.ceil(episodes / env.num_envs)):
         count = min(env.num_envs, episodes - block * env.num_envs)
         observations, *_ = env.reset(episode_seed(seed, block))
+        forget(policy)
         goals += read_goals(env, count)
         trajectory = _first_episodes(env, policy, observations, count)
         blocks.append(measure(trajectory, env.control_dt, env.task_name in FOLLOWING))
@@ -136,7 +138,9 @@ def _first_episodes(
             name for info in told for name in info if name in (*INFOS, *LAST) or name.startswith(TERMS)
         )
         infos.append({name: np.stack([_numpy(info.get(name, unknown), count) for info in told], -1) for name in names})
-        done = _numpy(step.terminated, count) | _numpy(step.truncated, count)
+        ended = step.terminated | step.truncated
+        forget(policy, ended)
+        done = _numpy(ended, count)
         lengths[done & (lengths == 0)] = number
         if lengths.all():
             break

@@ -27,9 +27,9 @@ def format_table(result: Mapping[str, Any], others: Mapping[str, Mapping[str, An
     goals = f"goal set {result['goal_set']:.12} ({'standard' if is_standard(result) else 'not a standard one'})"
     rows = [["", "all", "95 % interval", *columns]]
     for name, bounds in result["intervals"].items():
-        span = "-" if bounds is None else " to ".join(_number(name, bound) for bound in bounds)
-        rows.append([_title(name), _number(name, result[name]), span])
-        rows[-1] += [_number(name, values.get(name)) for values in columns.values()]
+        span = "-" if bounds is None else " to ".join(number(name, bound) for bound in bounds)
+        rows.append([title(name), number(name, result[name]), span])
+        rows[-1] += [number(name, values.get(name)) for values in columns.values()]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = ("  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]).rstrip() for row in rows)
     return "\n".join([f"{what}, {goals}", *lines])
@@ -61,7 +61,8 @@ def _csv_row(result: Mapping[str, Any], agent: str | None) -> dict[str, Any]:
     return row
 
 
-def _title(name: str) -> str:
+def title(name: str) -> str:
+    """A metric in words, with its unit."""
     name = name.replace("p95_", "95th-percentile_")
     for end, unit in (("_mm", " (mm)"), ("_s", " (s)")):
         name = name.removesuffix(end) + unit if name.endswith(end) else name
@@ -70,7 +71,8 @@ def _title(name: str) -> str:
     return name.replace("_", " ")
 
 
-def _number(name: str, value: float | None) -> str:
+def number(name: str, value: float | None) -> str:
+    """The value of a metric: a rate in percent, all else with two decimals."""
     if value is None:
         return "-"
     rate = name.endswith("_rate") or name.startswith(("success_", "team_success_", "cost_"))

@@ -69,7 +69,7 @@ class ConstraintSettings(_Checked):
 
 @dataclass(frozen=True)
 class NetworkSettings(_Checked):
-    """Actor and critic: one MLP each of this shape."""
+    """Actor and critic: one MLP each of this shape, which a GRU or LSTM cell may come before."""
 
     prefix: ClassVar[str] = "network."
 
@@ -77,6 +77,7 @@ class NetworkSettings(_Checked):
     activation: Literal["elu", "relu", "tanh", "selu", "gelu"] = "elu"
     normalise_observations: bool = True
     init_std: float = _number(0.5, 0.001, 10.0)
+    recurrent: Literal["none", "gru", "lstm"] = "none"
 
 
 @dataclass(frozen=True)
@@ -117,6 +118,11 @@ class Settings(_Checked):
                 "ppo.mini_batches must be at most num_envs * steps_per_iteration "
                 f"= {samples}, not {self.ppo.mini_batches}"
             )
+        if self.network.recurrent != "none" and self.ppo.mini_batches > self.num_envs:
+            raise ValueError(
+                f"ppo.mini_batches must be at most num_envs = {self.num_envs} with network.recurrent, "
+                f"not {self.ppo.mini_batches}"
+            )
 
 
 def load_config(task: str, scene: str, overrides: Iterable[str] = ()) -> Settings:
@@ -146,16 +152,17 @@ def load_config(task: str, scene: str, overrides: Iterable[str] = ()) -> Setting
 def read_config(path: Path, overrides: Iterable[str] = ()) -> Settings:
     """Settings from the `config.yaml` of a run, with overrides as for `load_config`."""
     values = _read_yaml(path)
-    values.pop("versions", None)
+    for note in ("versions", "origin"):
+        values.pop(note, None)
     _reject_unknown(values)
     return _build(_override(values, overrides))
 
 
-def config_text(settings: Settings, versions: Mapping[str, str]) -> str:
-    """The `config.yaml` of a run: what `read_config` reads, and versions of packages."""
+def config_text(settings: Settings, notes: Mapping[str, Mapping[str, Any]]) -> str:
+    """The `config.yaml` of a run: what `read_config` reads, and notes that it passes over."""
     values = asdict(settings)
     values["network"]["hidden"] = list(settings.network.hidden)
-    return yaml.safe_dump({**values, "versions": dict(versions)}, sort_keys=False)
+    return yaml.safe_dump({**values, **notes}, sort_keys=False)
 
 
 def _read_yaml(path: Path) -> dict[str, Any]:

@@ -7,6 +7,7 @@ one agent (A = 1) this is PPO, by the same code.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import asdict
 from typing import Any
 
@@ -20,10 +21,11 @@ from surgical_marl.interfaces.rsl_rl import RslRlVecEnv
 from surgical_marl.learning import distributed
 from surgical_marl.learning.config import Settings
 from surgical_marl.learning.constraint import Constraint
-from surgical_marl.learning.models import Gaussian, MultiAgentActor, MultiAgentModel
+from surgical_marl.learning.models import Gaussian, MultiAgentActor, MultiAgentModel, make_model
+from surgical_marl.learning.recurrent import Memory
 from surgical_marl.learning.storage import MultiAgentStorage
 from surgical_marl.learning.values import ValueScale
-from surgical_marl.learning.vision import PICTURES, make_model
+from surgical_marl.learning.vision import PICTURES
 
 LOSSES = ("value_loss", "surrogate_loss", "entropy", "kl", "learning_rate")
 LEARNING_RATE_RANGE = (1e-5, 1e-2)  # rsl_rl's limits of the adaptive learning rate
@@ -60,6 +62,7 @@ class MAPPO(PPO):
         self.scale = ValueScale(storage.values.shape[-1]).to(self.device)
         # What learns beside the networks: it stands in checkpoints.
         self.options = nn.ModuleDict({"scale": self.scale} if normalise_values else {})
+        self.memory = Memory(storage.num_envs, actor, critic, self.device)
         self.constraint = constraint
         if constraint is not None:
             self.options["constraint"] = constraint
@@ -70,10 +73,17 @@ class MAPPO(PPO):
 
     def act(self, obs: TensorDict) -> Tensor:
         """Sample the flat joint action `[N, sum]`."""
+        step, memory = self.transition, self.memory
+        if self.storage.step == 0:
+            memory.begin()
         with self._precision():
-            actions = super().act(obs)
-        self.transition.values = self.scale.restore(self.transition.values)
-        return actions
+            step.actions = self.actor(obs, None, memory.actor, stochastic_output=True)
+            step.actions_log_prob = self.actor.get_output_log_prob(step.actions)
+        step.values = self._values(obs)
+        memory.step()
+        step.distribution_params = self.actor.output_distribution_params
+        step.observations = obs
+        return step.actions
 
     def process_env_step(self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: dict[str, Any]) -> None:
         """Store one step.
@@ -92,10 +102,12 @@ class MAPPO(PPO):
         self.transition.dones = dones
         self.storage.add_transition(self.transition)
         self.transition.clear()
+        self.memory.clear(dones)
 
     def loss(self, batch: RolloutStorage.Batch) -> tuple[Tensor, Tensor]:
         """Loss of a mini-batch; and value loss, surrogate loss, entropy and KL, detached `[4]`."""
-        self.actor.distribute(batch.observations)
+        actor_memory, critic_memory = batch.hidden_states
+        self.actor.distribute(batch.observations, batch.masks, actor_memory)
         log_prob = self.actor.get_output_log_prob(batch.actions)
         with torch.no_grad():
             params = self.actor.output_distribution_params
@@ -106,7 +118,8 @@ class MAPPO(PPO):
         clipped = ratio.clamp(1 - self.clip_param, 1 + self.clip_param)
         surrogate = -torch.min(batch.advantages * ratio, batch.advantages * clipped).mean()
 
-        values, returns = self.critic(batch.observations), self.scale.normalise(batch.returns)
+        values = self.critic(batch.observations, batch.masks, critic_memory)
+        returns = self.scale.normalise(batch.returns)
         value = (values - returns).square()
         if self.use_clipped_value_loss:
             old = self.scale.normalise(batch.values)
@@ -139,7 +152,7 @@ class MAPPO(PPO):
     def learn(self) -> Tensor:
         """What `update` does, without waiting for the device: `LOSSES` as a tensor."""
         total = torch.zeros(4, device=self.device)
-        for batch in self.storage.mini_batch_generator(self.num_mini_batches, self.num_learning_epochs):
+        for batch in self._batches():
             with self._precision():
                 loss, parts = self.loss(batch)
             self.optimizer.zero_grad()
@@ -161,10 +174,16 @@ class MAPPO(PPO):
         """All that the optimiser changes."""
         return [*self.actor.parameters(), *self.critic.parameters()]
 
+    def _batches(self) -> Iterator[RolloutStorage.Batch]:
+        counts = (self.num_mini_batches, self.num_learning_epochs)
+        if self.actor.is_recurrent:
+            return self.storage.sequences(self.memory.begun, *counts)
+        return self.storage.mini_batch_generator(*counts)
+
     def _values(self, obs: TensorDict) -> Tensor:
         """Values of observations, in units of reward."""
         with self._precision():
-            return self.scale.restore(self.critic(obs))
+            return self.scale.restore(self.critic(obs, None, self.memory.critic))
 
     def _precision(self) -> torch.autocast:
         """bfloat16 for the networks' products if that was asked for; the same when acting and learning, or ratios
@@ -233,6 +252,7 @@ def rsl_rl_config(settings: Settings) -> dict[str, Any]:
         "hidden_dims": list(network.hidden),
         "activation": network.activation,
         "obs_normalization": network.normalise_observations,
+        "recurrent": network.recurrent,
     }
     gaussian = {
         "class_name": Gaussian,

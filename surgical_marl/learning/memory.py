@@ -22,12 +22,14 @@ _SIGNS = ("out of memory", "can't allocate memory", "resource_exhausted")
 
 def rollout_bytes(settings: Settings, env: BatchedEnv) -> int:
     """What a stored rollout takes of memory for one environment: its steps, each with the observations and the state;
-    actions, their means and deviations; and of each agent reward, value, log-probability, return and advantage."""
+    actions, their means and deviations; and of each agent log-probability and advantage, and of its reward, and cost if
+    that is bounded, value and return."""
     layout = Layout(env, joint=settings.algo == "joint")
     seen = layout.stack({agent: _zeros(env.observation_space(agent)) for agent in layout.agents})
     parts = [*seen.values(), proprioception(_zeros(env.state_space))]
     observed = sum(part.numel() * part.element_size() for part in parts)
-    return settings.steps_per_iteration * (observed + 4 * (3 * layout.num_actions + 5 * layout.num_agents) + 1)
+    each = 5 if settings.constraint.cost == "none" else 8
+    return settings.steps_per_iteration * (observed + 4 * (3 * layout.num_actions + each * layout.num_agents) + 1)
 
 
 def check_room(settings: Settings, env: BatchedEnv) -> None:

@@ -6,11 +6,14 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 import torch
+from rsl_rl.models import MLPModel
 from rsl_rl.modules.distribution import GaussianDistribution
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from surgical_marl.learning.vision import PICTURES, make_model
+from surgical_marl.learning.normaliser import Normaliser
+from surgical_marl.learning.recurrent import RecurrentModel, RecurrentPictureModel
+from surgical_marl.learning.vision import ENCODER, PICTURES, PictureModel
 
 # A small last layer starts every arm near its rest, which is where exploration is safe and
 # gradients are largest.
@@ -23,10 +26,11 @@ class MultiAgentModel(nn.Module):
     Args:
         observations: a sample of the groups, `[N, n, d]` each, and pictures `[N, n, C, H, W]` where there are any.
         outputs: width of the output of one agent, by type.
-        model: further arguments of rsl_rl's `MLPModel`.
-    """
+        model: further arguments of `make_model`.
 
-    is_recurrent = False
+    Attributes:
+        is_recurrent: whether the networks remember; then `hidden_state` is their memory, `[N, A, S]`.
+    """
 
     def __init__(self, observations: TensorDict, outputs: Mapping[str, int], **model: Any) -> None:
         super().__init__()
@@ -42,20 +46,42 @@ class MultiAgentModel(nn.Module):
             {name: make_model(sample, seen[name], width, **model) for name, width in outputs.items()}
         )
 
-    def forward(self, observations: TensorDict, *, stochastic_output: bool = False, **_: Any) -> Tensor:
-        """Outputs of all agents, flat: `[N, sum]`, by type and then by agent."""
-        return self._join(model(observations, stochastic_output=stochastic_output) for model in self._models())
+        first = next(iter(self._models()))
+        self.is_recurrent: bool = first.is_recurrent
+        if self.is_recurrent:
+            self.memory_shape = (sum(self.counts.values()), *first.memory_shape)
+
+    def forward(
+        self,
+        observations: TensorDict,
+        masks: Tensor | None = None,
+        hidden_state: Tensor | None = None,
+        stochastic_output: bool = False,
+    ) -> Tensor:
+        """Outputs of all agents, flat: `[N, sum]`, by type and then by agent.
+
+        Args:
+            observations: of one step; or of several, `[T, N]`, if there are masks.
+            masks: where an episode begins, `[T, N]` bool, for networks that remember.
+            hidden_state: what they remember before the first step, `[N, A, S]`.
+            stochastic_output: draw from the distribution, if there is one.
+        """
+        memories = zip(self._models(), self._memories(hidden_state), strict=True)
+        return self._join(model(observations, masks, memory, stochastic_output) for model, memory in memories)
 
     def update_normalization(self, observations: TensorDict) -> None:
         """Update the running mean and variance of each type's observations from a batch `[B]`."""
         for name, model in zip(self.outputs, self._models(), strict=True):
             model.update_normalization({name: observations[name].flatten(0, -2)})
 
-    def reset(self, dones: Tensor | None = None, hidden_state: Any = None) -> None:
-        """Part of rsl_rl's model interface: an MLP has nothing to reset."""
+    def get_hidden_state(self) -> Tensor | None:
+        """What the networks remember after the last step, `[N, A, S]`, if they do."""
+        return torch.cat([model.get_hidden_state() for model in self._models()], -2) if self.is_recurrent else None
 
-    def get_hidden_state(self) -> None:
-        """Part of rsl_rl's model interface: an MLP has no hidden state."""
+    def _memories(self, hidden_state: Tensor | None) -> Iterable[Tensor | None]:
+        if not self.is_recurrent or hidden_state is None:
+            return [None] * len(self.models)
+        return hidden_state.split(list(self.counts.values()), -2)
 
     def _models(self) -> Iterable[Any]:
         return self.models.values()
@@ -81,10 +107,12 @@ class MultiAgentActor(MultiAgentModel):
                 policy.mlp[-1].weight.mul_(OUTPUT_GAIN)
                 policy.mlp[-1].bias.zero_()
 
-    def distribute(self, observations: TensorDict) -> None:
+    def distribute(
+        self, observations: TensorDict, masks: Tensor | None = None, hidden_state: Tensor | None = None
+    ) -> None:
         """A forward pass that draws no actions."""
-        for model in self._models():
-            model.distribution.update(model.mlp(model.get_latent(observations)))
+        for model, memory in zip(self._models(), self._memories(hidden_state), strict=True):
+            model.distribution.update(model.mlp(model.get_latent(observations, masks, memory)))
 
     def get_output_log_prob(self, actions: Tensor) -> Tensor:
         """Log-probability of flat actions `[N, sum]` under the last forward pass: `[N, A]`."""
@@ -125,3 +153,32 @@ class Gaussian(GaussianDistribution):
     def sample(self) -> Tensor:
         """As torch's, which has the host look whether a standard deviation is negative."""
         return self.mean + self.std * torch.randn_like(self.mean)
+
+
+def make_model(
+    observations: TensorDict, groups: list[str], width: int, recurrent: str = "none", **model: Any
+) -> nn.Module:
+    """An MLP, with an encoder before it where there are pictures, and a memory where that is asked for.
+
+    Args:
+        observations: a sample of the groups, vectors [N, d] and pictures [N, C, H, W].
+        groups: what the network sees of them.
+        width: of its output.
+        recurrent: "gru", "lstm" or "none".
+        model: further arguments of rsl_rl's models.
+    """
+    pictures = any(group.endswith(PICTURES) for group in groups)
+    if pictures:
+        model["cnn_cfg"] = ENCODER
+    if recurrent != "none":
+        model["recurrent"] = recurrent
+    kinds = {
+        (False, False): MLPModel,
+        (True, False): PictureModel,
+        (False, True): RecurrentModel,
+        (True, True): RecurrentPictureModel,
+    }
+    made = kinds[pictures, recurrent != "none"](observations, {"all": groups}, "all", width, **model)
+    if made.obs_normalization:
+        made.obs_normalizer = Normaliser(made.obs_dim)
+    return made

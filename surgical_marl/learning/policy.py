@@ -1,12 +1,12 @@
 """Policies that act: trained, untrained, zero and random.
 
 A policy maps the observations of all agents `{agent: [..., d]}` to their actions `{agent: [...,
-a]}` in [-1, 1]; it answers NumPy arrays with NumPy arrays and tensors with tensors.
+a]}` in [-1, 1]; it answers NumPy arrays with NumPy arrays and tensors with tensors. A recurrent one is to be told where
+episodes begin (`surgical_marl/acting.py`).
 """
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,27 +16,20 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from surgical_marl.acting import Policy
 from surgical_marl.content import content_dir, list_policies
 from surgical_marl.interfaces.rsl_rl import Layout
 from surgical_marl.learning.config import Settings
 from surgical_marl.learning.mappo import rsl_rl_config
 from surgical_marl.learning.models import MultiAgentActor
-from surgical_marl.learning.run import (
-    CONFIG,
-    CURVE,
-    METRICS,
-    claim_folder,
-    read_checkpoint,
-    read_settings,
-    write_checkpoint,
-)
+from surgical_marl.learning.recurrent import cleared
+from surgical_marl.learning.run import CHECKPOINT, CONFIG, read_checkpoint, read_settings
+from surgical_marl.learning.weights import holds_weights, read_weights
 from surgical_marl.observations import each, proprioception
 from surgical_marl.oracle import oracle
 
 if TYPE_CHECKING:
     from surgical_marl.batch import BatchedEnv
-
-Policy = Callable[[Mapping[str, Any]], dict[str, Any]]
 
 
 def load_policy(run: str | Path, env: BatchedEnv) -> Policy:
@@ -56,21 +49,29 @@ def load_policy(run: str | Path, env: BatchedEnv) -> Policy:
         return random_policy(env)
     if run == "oracle":
         return oracle(env)
+    return acting_policy(*load_actor(run, env), str(env.device))
+
+
+def load_actor(run: str | Path, env: BatchedEnv) -> tuple[MultiAgentActor, Layout]:
+    """The networks of a run or of a policy that ships, on the CPU, and how agents are stacked for them.
+
+    ValueError as for `load_policy`.
+    """
     folder = find_run(run)
-    settings, checkpoint = read_settings(folder), read_checkpoint(folder)
+    settings = read_settings(folder)
+    trained, state = _read(folder)
     layout = Layout(env, joint=settings.algo == "joint")
-    wanted, trained = (
-        _groups(env, layout),
-        {name: list(widths) for name, widths in checkpoint["groups"].items()},
-    )
-    if wanted != trained:
+    if (wanted := _groups(env, layout)) != trained:
         raise ValueError(
             f"the policy in {run} was trained in scene {settings.scene!r}, whose agents "
             f"({_describe(trained)}) are not those of this environment ({_describe(wanted)})"
         )
     actor = _actor(settings, env, layout)
-    actor.load_state_dict(checkpoint["algorithm"]["actor_state_dict"])
-    return acting_policy(actor, layout, str(env.device))
+    try:
+        actor.load_state_dict(state)
+    except RuntimeError:
+        raise ValueError(f"the weights in {run} are not of the network in its {CONFIG}: restore both") from None
+    return actor, layout
 
 
 def untrained_policy(env: BatchedEnv, settings: Settings | None = None) -> Policy:
@@ -105,22 +106,13 @@ def find_run(run: str | Path) -> Path:
     raise ValueError(f"{str(run)!r} is not a run folder, nor zero, random, oracle or a policy that ships ({shipped})")
 
 
-def export_policy(run: str | Path, out: Path) -> Path:
-    """Copy what acting needs of a run to a new folder: not the state of training."""
-    folder, out = find_run(run), Path(out)
+def _read(folder: Path) -> tuple[dict[str, list[int]], dict[str, Tensor]]:
+    """Agents and widths of each group, and the state of the actor: of a policy that ships, or of a run."""
+    if holds_weights(folder) and not (folder / CHECKPOINT).is_file():
+        return read_weights(folder)
     checkpoint = read_checkpoint(folder)
-    claim_folder(out)
-    weights = {"actor_state_dict": checkpoint["algorithm"]["actor_state_dict"]}
-    small = {
-        "iteration": checkpoint["iteration"],
-        "groups": checkpoint["groups"],
-        "algorithm": weights,
-    }
-    write_checkpoint(out, small)
-    for name in (CONFIG, METRICS, CURVE):
-        if (folder / name).is_file():
-            shutil.copyfile(folder / name, out / name)
-    return out
+    groups = {name: list(widths) for name, widths in checkpoint["groups"].items()}
+    return groups, checkpoint["algorithm"]["actor_state_dict"]
 
 
 def _samples(env: BatchedEnv, layout: Layout) -> TensorDict:
@@ -152,19 +144,43 @@ def _actor(settings: Settings, env: BatchedEnv, layout: Layout) -> MultiAgentAct
 
 def acting_policy(actor: MultiAgentActor, layout: Layout, device: str) -> Policy:
     """The deterministic policy of networks, as they are whenever it acts: they may still learn."""
-    actor = actor.to(device)
+    return _Acting(actor, layout, device)
 
-    def policy(observations: Mapping[str, Any]) -> dict[str, Any]:
+
+class _Acting:
+    """A policy of networks, with a memory of its own if they have one."""
+
+    def __init__(self, actor: MultiAgentActor, layout: Layout, device: str) -> None:
+        self._actor, self._layout, self._device = actor.to(device), layout, device
+        self._memory: Tensor | None = None
+
+    def __call__(self, observations: Mapping[str, Any]) -> dict[str, Any]:
+        agents = self._layout.agents
         tensors = {
-            agent: each(observations[agent], lambda part: torch.as_tensor(part, device=device))
-            for agent in layout.agents
+            agent: each(observations[agent], lambda part: torch.as_tensor(part, device=self._device))
+            for agent in agents
         }
-        batch = proprioception(tensors[layout.agents[0]]).shape[:-1]
+        batch = proprioception(tensors[agents[0]]).shape[:-1]
         with torch.inference_mode():
-            flat = actor(TensorDict({**layout.stack(tensors)}, batch_size=batch)).clamp(-1.0, 1.0)
-        return {agent: _like(observations[agent], action) for agent, action in layout.split(flat).items()}
+            seen = TensorDict({**self._layout.stack(tensors)}, batch_size=batch)
+            flat = self._actor(seen, None, self._remembered(batch)).clamp(-1.0, 1.0)
+            self._memory = self._actor.get_hidden_state()
+        return {agent: _like(observations[agent], action) for agent, action in self._layout.split(flat).items()}
 
-    return policy
+    def reset(self, ended: Any = None) -> None:
+        """Forget everything, or the episodes that `ended`, [N] bool."""
+        if ended is None or self._memory is None:
+            self._memory = None
+        else:
+            self._memory = cleared(self._memory, torch.as_tensor(ended, device=self._device))
+
+    def _remembered(self, batch: torch.Size) -> Tensor | None:
+        if not self._actor.is_recurrent:
+            return None
+        shape = (*batch, *self._actor.memory_shape)
+        if self._memory is None or self._memory.shape != shape:  # another batch is of other episodes
+            self._memory = torch.zeros(shape, device=self._device)
+        return self._memory
 
 
 def _by_agent(env: BatchedEnv, act: Callable[[tuple[int, ...]], np.ndarray]) -> Policy:

@@ -1,7 +1,8 @@
 """A run folder: `config.yaml`, `checkpoint.pt`, `metrics.csv`, `curve.png` and `tensorboard/`; beside the checkpoint
 `environments-*.pt` of further processes, and `diverged.json` where training ended so.
 
-Every write is atomic, but that `metrics.csv` grows by rows.
+A policy that ships has safetensors instead of the checkpoint (`export.py`). Every write is atomic, but that
+`metrics.csv` grows by rows.
 """
 
 from __future__ import annotations
@@ -11,16 +12,21 @@ import csv
 import importlib.metadata
 import json
 import math
+import os
 import platform
+import subprocess
 import tempfile
+import time
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
+import yaml
 
 from surgical_marl.files import write_atomic
 from surgical_marl.learning.config import Settings, config_text, read_config
+from surgical_marl.learning.weights import holds_weights
 
 CONFIG, CHECKPOINT, METRICS, CURVE = "config.yaml", "checkpoint.pt", "metrics.csv", "curve.png"
 DIVERGED = "diverged.json"
@@ -45,12 +51,27 @@ def check_writable(out: Path) -> None:
 
 
 def write_config(run: Path, settings: Settings) -> None:
-    """Write the settings, and the versions of the packages that will make the run."""
+    """Write the settings, and what makes the run: versions of packages, device, commit, time of this start."""
     versions = {"python": platform.python_version()}
     for name in PACKAGES:
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
             versions[name] = importlib.metadata.version(name)
-    write_atomic(run / CONFIG, lambda path: path.write_text(config_text(settings, versions)))
+    from surgical_marl.bench.machine import machine  # imports JAX
+
+    names = machine()
+    origin = {
+        "device": names["cpu"] if settings.device == "cpu" else names["gpu"] or names["cpu"],
+        "commit": _commit(),
+        "started": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
+    }
+    text = config_text(settings, {"versions": versions, "origin": origin})
+    write_atomic(run / CONFIG, lambda path: path.write_text(text))
+
+
+def read_origin(run: Path) -> dict[str, dict[str, str | None]]:
+    """What `write_config` noted beside the settings: `versions` and `origin`; empty where a run has none."""
+    notes = yaml.safe_load((run / CONFIG).read_text())
+    return {name: notes.get(name) or {} for name in ("versions", "origin")}
 
 
 def has_begun(run: Path) -> bool:
@@ -77,6 +98,8 @@ def write_checkpoint(run: Path, checkpoint: Mapping[str, Any]) -> None:
 def read_checkpoint(run: str | Path) -> dict[str, Any]:
     """The checkpoint of a run, on the CPU. ValueError if there is none or it is damaged."""
     path = Path(run) / CHECKPOINT
+    if not path.is_file() and holds_weights(Path(run)):
+        raise ValueError(f"{run} holds an exported policy, which can be evaluated but not resumed")
     if not path.is_file():
         raise ValueError(f"{run} is not a run folder: it has no {CHECKPOINT}")
     try:
@@ -145,3 +168,17 @@ def write_metrics(run: Path, columns: Iterable[str], rows: Iterable[Mapping[str,
             writer.writerows(format_row({name: row.get(name, math.nan) for name in names}) for row in rows)
 
     write_atomic(run / METRICS, write)
+
+
+def _commit() -> str | None:
+    """The commit of the checkout that runs; `GIT_COMMIT` where that is a copy without git; else unknown."""
+    root = Path(__file__).parents[2]
+    if told := os.environ.get("GIT_COMMIT"):
+        return told
+    if not (root / ".git").exists():  # an installed package may lie inside another project's repository
+        return None
+    command = ["git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import torch
 from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
@@ -39,6 +41,32 @@ class MultiAgentStorage(RolloutStorage):
         for stored, param in zip(self.distribution_params, params, strict=True):
             stored[self.step].copy_(param)
         self.step += 1
+
+    def sequences(
+        self, begun: tuple[Tensor, Tensor], num_mini_batches: int, num_epochs: int
+    ) -> Iterator[RolloutStorage.Batch]:
+        """Mini-batches `[T, B]` for networks that remember: whole rollouts of B environments each.
+
+        Args:
+            begun: memories of actor and critic where the rollout began, `[N, ...]` each.
+            num_mini_batches: in an epoch, each of other environments.
+            num_epochs: with the same mini-batches, as rsl_rl does.
+        """
+        begins = torch.cat([torch.zeros_like(self.dones[:1]), self.dones[:-1]]).squeeze(-1).bool()
+        order = torch.randperm(self.num_envs, device=self.device)
+        for _ in range(num_epochs):
+            for chosen in order.split(self.num_envs // num_mini_batches)[:num_mini_batches]:
+                yield RolloutStorage.Batch(
+                    observations=self.observations[:, chosen],
+                    actions=self.actions[:, chosen],
+                    values=self.values[:, chosen],
+                    advantages=self.advantages[:, chosen],
+                    returns=self.returns[:, chosen],
+                    old_actions_log_prob=self.actions_log_prob[:, chosen],
+                    old_distribution_params=tuple(param[:, chosen] for param in self.distribution_params or ()),
+                    hidden_states=(begun[0][chosen], begun[1][chosen]),
+                    masks=begins[:, chosen],
+                )
 
     def compute_returns(self, last_values: Tensor, gamma: float, lam: float) -> None:
         """Generalised advantage estimation (Schulman et al. 2016, arXiv 1506.02438): `returns` of the full storage.

@@ -38,6 +38,7 @@ from surgical_marl.learning.run import (
     write_metrics,
 )
 from surgical_marl.learning.training import OWN, Training
+from surgical_marl.learning.weights import holds_weights
 
 if TYPE_CHECKING:
     from surgical_marl.batch import BatchedEnv
@@ -114,7 +115,7 @@ def train(settings: Settings, *, out: Path, resume: Path | None = None) -> Path:
         if distributed.rank() == 0:
             write_metrics(out, training.columns, [row for row in rows if row["iteration"] <= training.iteration])
         _save(training, out)
-        if distributed.rank() == 0:
+        if distributed.rank() == 0 and resume is not None:
             write_config(out, settings)
         with in_memory(settings.num_envs):
             _run(training, out)
@@ -199,12 +200,10 @@ def _read_resumed(settings: Settings, run: Path, goes_on: bool) -> dict[str, Any
         fixed = name in FIXED or name.partition(".")[0] not in CHANGEABLE
         if fixed and before != asked[name]:
             raise ValueError(f"the run in {run} has {name} {before!r}, and cannot go on with {asked[name]!r}")
-    if not (run / CHECKPOINT).is_file():
+    if not (run / CHECKPOINT).is_file() and not holds_weights(run):
         _say(f"{run} holds no checkpoint yet: its run starts from the beginning")
         return None
     state = read_checkpoint(run)
-    if "env" not in state:
-        raise ValueError(f"{run} holds an exported policy, which can be evaluated but not resumed")
     for name, value in state.get("of", {}).items():
         if value != (now := getattr(settings, name)):
             raise ValueError(f"{run / CHECKPOINT} is of {name} {value!r}, and not of {now!r} as the run it lies in")
@@ -212,8 +211,10 @@ def _read_resumed(settings: Settings, run: Path, goes_on: bool) -> dict[str, Any
         raise ValueError(
             f"the run in {run} already has {state['iteration']} iterations: ask for more than {settings.iterations}"
         )
-    samples = settings.num_envs * settings.steps_per_iteration
-    return _own({"broken": None, "processes": 1, "env_steps": state["iteration"] * samples, **state}, run)
+    steps = state["iteration"] * settings.num_envs * settings.steps_per_iteration
+    # a checkpoint of an older version lacks these
+    state = {"broken": None, "memory": None, "processes": 1, "env_steps": steps, **state}
+    return _own(state, run)
 
 
 def _dotted(settings: Any) -> dict[str, Any]:

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from surgical_marl.batch import BatchedEnv
 
 
-OWN = ("env", "collided", "broken", "random", "random_cuda")
-"""Parts of `Training.state` that belong to one process alone: its environments and its random numbers."""
+OWN = ("env", "collided", "broken", "memory", "random", "random_cuda")
+"""Parts of `Training.state` that belong to one process alone: of its environments, and its random numbers."""
 
 
 class Report(NamedTuple):
@@ -212,6 +212,7 @@ class Training:
             "env": {**self.env.carry(), "observations": self._observations.to_dict()},
             "collided": self.episodes.collided,
             "broken": None if constraint is None else constraint.broken,
+            "memory": self.algorithm.memory.state_dict() if self.algorithm.actor.is_recurrent else None,
             "random": torch.get_rng_state(),
             "random_cuda": torch.cuda.get_rng_state() if self._cuda else None,
         }
@@ -236,6 +237,8 @@ class Training:
         self.episodes.collided.copy_(state["collided"])
         if self.algorithm.constraint is not None:
             self.algorithm.constraint.broken.copy_(state["broken"])
+        if self.algorithm.actor.is_recurrent:
+            self.algorithm.memory.load_state_dict(state["memory"])
         torch.set_rng_state(state["random"])
         if state["random_cuda"] is not None and self._cuda:
             torch.cuda.set_rng_state(state["random_cuda"])

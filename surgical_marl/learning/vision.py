@@ -7,9 +7,7 @@ from typing import Any
 import torch
 from rsl_rl.models import CNNModel, MLPModel
 from tensordict import TensorDict
-from torch import Tensor, nn
-
-from surgical_marl.learning.normaliser import Normaliser
+from torch import Tensor
 
 PICTURES = "_pictures"
 """What the group of an agent type's pictures is called after its name."""
@@ -26,22 +24,3 @@ class PictureModel(CNNModel):
         (group,) = self.obs_groups_2d
         features = self.cnns[group](obs[group].flatten(0, -4).float() / 255 - 0.5)
         return torch.cat([vector, features.reshape(*vector.shape[:-1], -1)], dim=-1)
-
-
-def make_model(observations: TensorDict, groups: list[str], width: int, **model: Any) -> nn.Module:
-    """An MLP, or a network with an encoder where there are pictures.
-
-    Args:
-        observations: a sample of the groups, vectors [N, d] and pictures [N, C, H, W].
-        groups: what the network sees of them.
-        width: of its output.
-        model: further arguments of rsl_rl's models.
-    """
-    made: MLPModel
-    if any(group.endswith(PICTURES) for group in groups):
-        made = PictureModel(observations, {"all": groups}, "all", width, cnn_cfg=ENCODER, **model)
-    else:
-        made = MLPModel(observations, {"all": groups}, "all", width, **model)
-    if made.obs_normalization:
-        made.obs_normalizer = Normaliser(made.obs_dim)
-    return made

@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from surgical_marl.acting import forget
 from surgical_marl.view.render import Renderer, Sphere
 from surgical_marl.view.video import write_video
 
@@ -43,10 +44,13 @@ def frames(
     picture = ScenePicture(env)
     every = max(1, round(1 / (FPS * env.control_dt)))
     observations, *_ = env.reset(seed)
+    forget(policy)
     for step in range(episodes * env.max_steps):
         if step % every == 0:
             yield picture.draw()
-        observations = env.step(dict(policy(observations))).observations
+        outcome = env.step(dict(policy(observations)))
+        observations = outcome.observations
+        forget(policy, outcome.terminated | outcome.truncated)
 
 
 class ScenePicture:

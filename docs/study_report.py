@@ -1,0 +1,215 @@
+"""Tables and figures of docs/study.py, from the run folders that it leaves."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Callable, Sequence
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter, PercentFormatter
+from study import ALGOS, PLAYED, TASK, WHEN, Job
+
+from surgical_marl.evaluation.interval import interval
+from surgical_marl.evaluation.metrics import FOLLOWING, SUCCESS_MM, Metric, metrics, success
+from surgical_marl.files import write_atomic
+from surgical_marl.learning.run import read_metrics, read_settings
+
+NAMES = {"mappo": "MAPPO", "ippo": "IPPO", "joint": "joint PPO"}
+COLORS = {"mappo": "#1f6f8b", "ippo": "#b23a48", "joint": "#7a7a7a"}
+FINAL = (f"success_{SUCCESS_MM}mm", f"team_success_{SUCCESS_MM}mm", "median_error_mm", "collision_rate")
+BROKEN = ("untouched", "frozen", "oracle")
+LEVEL = 0.8
+"""Of training's own success, whose samples and seconds the table gives."""
+POINTS = 60
+BEGIN, END = "<!-- study begin -->", "<!-- study end -->"
+
+
+def report(jobs: Sequence[Job], out: Path, results: Path) -> None:
+    """Writes study.json, study.csv and study.png, and the tables in study.md. ValueError if there is nothing yet."""
+    if not jobs:
+        raise ValueError(f"{out} holds no run that was played: nothing to report")
+    groups = groupby(sorted(jobs, key=lambda job: (jobs_order(job), job.seed)), key=lambda job: (job.scene, job.algo))
+    found = [describe(list(members), out) for _, members in groups]
+    write_atomic(results / "study.json", lambda path: path.write_text(json.dumps(found, indent=1) + "\n"))
+    write_atomic(results / "study.csv", lambda path: _write_csv(path, found))
+    draw(found, results / "study.png")
+    page = results / "study.md"
+    text = page.read_text() if page.is_file() else f"{BEGIN}\n{END}\n"
+    before, _, rest = text.partition(BEGIN)
+    after = rest.partition(END)[2]
+    tables = f"{BEGIN}\n\n{about(found)}\n\n{final_table(found)}\n\n{broken_table(found)}\n\n{END}"
+    write_atomic(page, lambda path: path.write_text(before + tables + after))
+
+
+def jobs_order(job: Job) -> tuple[str, int]:
+    """Scenes by name, algorithms as the study names them."""
+    return job.scene, ALGOS.index(job.algo)
+
+
+def describe(jobs: Sequence[Job], out: Path) -> dict[str, Any]:
+    """What the R runs of one scene and algorithm came to: numbers are [value, low, high], None where unknown."""
+    played = [dict(np.load(out / str(job) / PLAYED)) for job in jobs]
+    abouts = [json.loads(str(each["about"])) for each in played]
+    if len({each["goal_set"] for each in abouts}) > 1:
+        raise ValueError(f"the runs of {jobs[0].scene} did not play the same goals: play them anew")
+    rows = [read_metrics(out / str(job)) for job in jobs]
+    settings = read_settings(out / str(jobs[0]))
+    final = metrics(_stacked(played, "untouched"), TASK in FOLLOWING)
+    return {
+        "scene": jobs[0].scene,
+        "algo": jobs[0].algo,
+        "seeds": [job.seed for job in jobs],
+        "num_envs": settings.num_envs,
+        "steps_per_iteration": settings.steps_per_iteration,
+        "iterations": settings.iterations,
+        **{key: abouts[0][key] for key in ("goal_set", "episodes", "cpu", "gpu")},
+        **{name: number(final[name]) for name in FINAL},
+        "samples": rows[0][-1]["env_steps"],
+        "seconds": number(_over_runs([sum(row["seconds"] for row in run) for run in rows])),
+        "by_seed": [{name: _value(final[name], at) for name in FINAL} for at in range(len(jobs))],
+        "curves": {axis: curve(rows, axis) for axis in ("samples", "seconds")},
+        "broken": {what: broken(played, abouts[0]["agents"], what) for what in BROKEN},
+    }
+
+
+def curve(runs: Sequence[Sequence[dict[str, float]]], axis: str) -> dict[str, Any]:
+    """Success and collisions of training against samples or seconds: means over the runs and their intervals."""
+    reached = [
+        np.cumsum([row["seconds"] for row in run]) if axis == "seconds" else np.array([row["env_steps"] for row in run])
+        for run in runs
+    ]
+    grid = np.linspace(0, min(x[-1] for x in reached), POINTS + 1)[1:]
+    found: dict[str, Any] = {"x": grid.tolist()}
+    for name in ("success_rate", "collision_rate"):
+        lines = []
+        for x, run in zip(reached, runs, strict=True):
+            y = np.array([row[name] for row in run])
+            known = np.isfinite(y)  # no episode ended
+            lines.append(np.interp(grid, x[known], y[known], left=0.0) if known.any() else np.zeros(POINTS))
+        found[name] = [number(_over_runs(values)) for values in np.transpose(lines)]
+    reaches = [x for x, y in zip(grid, found["success_rate"], strict=True) if y[0] >= LEVEL]
+    return {**found, "reached": float(reaches[0]) if reaches else None}
+
+
+def broken(played: Sequence[dict[str, np.ndarray]], agents: Sequence[str], what: str) -> dict[str, Any]:
+    """What is left of success where each arm in turn is taken from its policy: of the others, of the arm itself; and
+    collisions. Of a policy that is left alone these are the arms themselves."""
+    others, itself, collided = [], [], []
+    for index, arm in enumerate(agents):
+        measures = _stacked(played, what if what == "untouched" else f"{what} {arm}")
+        others.append(np.delete(measures["held"], index, -1))
+        itself.append(measures["held"][..., index : index + 1])
+        collided.append(measures["collided"].any(-1, keepdims=True).astype(float))
+    return {
+        "others": number(success(1000 * np.concatenate(others, -1), SUCCESS_MM)),
+        "itself": number(success(1000 * np.concatenate(itself, -1), SUCCESS_MM)),
+        "collisions": number(Metric(np.concatenate(collided, -1), lambda values: values.mean(-1))),
+    }
+
+
+def number(metric: Metric) -> list[float | None]:
+    """[value, low, high] of a 95 % interval."""
+    return [float(metric.reduce(metric.values.ravel())), *(interval(metric) or (None, None))]
+
+
+def about(found: Sequence[dict[str, Any]]) -> str:
+    """What was run, in a sentence."""
+    first = found[0]
+    seeds = sorted({len(each["seeds"]) for each in found})
+    where = f"{first['gpu'] or first['cpu']}"
+    sizes = {(each["num_envs"], each["steps_per_iteration"], each["iterations"]) for each in found}
+    how = "; ".join("{:,} environments, {} steps an iteration, {} iterations".format(*size) for size in sorted(sizes))
+    return f"`{TASK}`, {' to '.join(map(str, seeds))} seeds each, {how}; played on: {where}."
+
+
+def final_table(found: Sequence[dict[str, Any]]) -> str:
+    """The frozen evaluation, and how long it took to learn, as Markdown."""
+    level = f"{LEVEL:.0%} in training"
+    head = ["scene", "algorithm", f"within {SUCCESS_MM} mm", "all arms", "median error (mm)", "collisions",
+            f"M samples to {level}", f"seconds to {level}", "seconds in all"]  # fmt: skip
+    rows = []
+    for each in found:
+        samples, seconds = (each["curves"][axis]["reached"] for axis in ("samples", "seconds"))
+        cells = [_cell(each[name], name) for name in FINAL]
+        cells += ["-" if samples is None else f"{samples / 1e6:.3g}", "-" if seconds is None else f"{seconds:.3g}"]
+        rows.append([f"`{each['scene']}`", NAMES[each["algo"]], *cells, _cell(each["seconds"], "seconds")])
+    return _markdown(head, rows)
+
+
+def broken_table(found: Sequence[dict[str, Any]]) -> str:
+    """What breaks when an arm is taken from its policy, as Markdown."""
+    head = ["scene", "algorithm", f"one arm, after {WHEN:g} s", "other arms", "that arm", "collisions"]
+    rows = [
+        [f"`{each['scene']}`", NAMES[each["algo"]], {"oracle": "moved by the oracle"}.get(what, what)]
+        + [_cell(numbers[name], "rate") for name in ("others", "itself", "collisions")]
+        for each in found
+        for what, numbers in each["broken"].items()
+    ]
+    return _markdown(head, rows)
+
+
+def draw(found: Sequence[dict[str, Any]], out: Path) -> None:
+    """Success against samples and seconds, and collisions: a row for each scene, a line for each algorithm."""
+    scenes = list(dict.fromkeys(each["scene"] for each in found))
+    figure = Figure(figsize=(11, 2.9 * len(scenes)), layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = (("samples", "success_rate"), ("seconds", "success_rate"), ("samples", "collision_rate"))
+    titles = {"success_rate": f"tips within {SUCCESS_MM} mm", "collision_rate": "episodes with a collision"}
+    for axes, scene in zip(figure.subplots(len(scenes), 3, squeeze=False), scenes, strict=True):
+        for axis, (x, name) in zip(axes, panels, strict=True):
+            for each in (each for each in found if each["scene"] == scene):
+                lines = each["curves"][x]
+                mean, low, high = (np.array(side, float) for side in zip(*lines[name], strict=True))
+                axis.plot(lines["x"], mean, color=COLORS[each["algo"]], label=NAMES[each["algo"]])
+                axis.fill_between(lines["x"], low, high, color=COLORS[each["algo"]], alpha=0.2, linewidth=0)
+            axis.set_title(f"{scene}: {titles[name]}", fontsize=9)
+            axis.set_xlabel(x)
+            if x == "samples":
+                axis.xaxis.set_major_formatter(EngFormatter(sep=""))
+            axis.yaxis.set_major_formatter(PercentFormatter(1.0))
+            axis.set_ylim(bottom=-0.02, top=1.02 if name == "success_rate" else None)
+            axis.grid(True, color="#dddddd", linewidth=0.6)
+            axis.spines[["top", "right"]].set_visible(False)
+        axes[0].legend(fontsize=8, frameon=False)
+    write_atomic(out, lambda path: figure.savefig(path, format="png", dpi=120))
+
+
+def _stacked(played: Sequence[dict[str, np.ndarray]], what: str) -> dict[str, np.ndarray]:
+    """Measures [R, E, A] of one way of playing."""
+    names = [name.partition("/")[2] for name in played[0] if name.startswith(f"{what}/")]
+    return {name: np.stack([each[f"{what}/{name}"] for each in played]) for name in names}
+
+
+def _over_runs(values: Any) -> Metric:
+    """The mean over runs; its interval resamples them."""
+    return Metric(np.asarray(values, float)[None, :, None], lambda drawn: drawn.mean(-1))
+
+
+def _value(metric: Metric, run: int) -> float:
+    return float(metric.reduce(metric.values[run].ravel()))
+
+
+def _cell(numbers: Sequence[float | None], name: str) -> str:
+    rate = name.startswith(("success", "team", "collision", "rate"))
+    show: Callable[[float], str] = (lambda x: f"{x:.1%}") if rate else (lambda x: f"{x:.3g}")
+    value, low, high = (None if x is None else show(x) for x in numbers)
+    return f"{value}" if low is None else f"{value} ({low} to {high})"
+
+
+def _markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    return "\n".join("| " + " | ".join(cells) + " |" for cells in (head, ["---"] * len(head), *rows))
+
+
+def _write_csv(path: Path, found: Sequence[dict[str, Any]]) -> None:
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["scene", "algo", "seed", *FINAL])
+        for each in found:
+            for seed, numbers in zip(each["seeds"], each["by_seed"], strict=True):
+                writer.writerow([each["scene"], each["algo"], seed, *(format(numbers[name], ".6g") for name in FINAL)])

@@ -1,0 +1,239 @@
+"""Policies that ship: what their folders hold, ONNX that acts as torch does, and files that are refused."""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnxruntime
+import pytest
+import torch
+from fake_env import FakeEnv
+from gymnasium.spaces import Box, Dict
+from tensordict import TensorDict
+
+from surgical_marl import content
+from surgical_marl.evaluation import command
+from surgical_marl.interfaces.rsl_rl import Layout
+from surgical_marl.learning import card, export, policy, train
+from surgical_marl.learning.config import NetworkSettings, PPOSettings, Settings
+from surgical_marl.learning.onnx_file import write_onnx
+from surgical_marl.learning.policy import load_policy
+from surgical_marl.learning.run import read_origin
+
+ROOT = Path(__file__).parents[1]
+COUNTS, SIZES = {"psm": 2, "ecm": 1}, {"psm": 3, "ecm": 2}
+SMALL = Settings(
+    scene="trimanual_psm_ecm",
+    num_envs=16,
+    iterations=2,
+    steps_per_iteration=8,
+    network=NetworkSettings(hidden=(16,)),
+    ppo=PPOSettings(epochs=2, mini_batches=2),
+)
+
+
+class PictureEnv(FakeEnv):
+    """One of its agents sees pictures."""
+
+    def observation_space(self, agent: str) -> Any:
+        felt = super().observation_space(agent)
+        picture = Box(0, 255, (64, 64, 3), np.uint8)
+        return Dict(proprioception=felt, image=picture, target=picture) if agent == "ecm_0" else felt
+
+
+@pytest.fixture
+def fakes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs are trained, evaluated and exported on fake environments, and not filmed."""
+
+    def make_env(settings: Settings, num_envs: int | None = None) -> Any:
+        return FakeEnv(COUNTS, SIZES, num_envs or settings.num_envs, max_steps=10)
+
+    for module in (train, command, export):
+        monkeypatch.setattr(module, "make_env", make_env)
+    monkeypatch.setattr(export, "record", lambda env, policy, path: path.write_bytes(b"film"))
+
+
+@pytest.fixture
+def runs(fakes: None, tmp_path: Path) -> list[str]:
+    return [str(train.train(replace(SMALL, seed=seed), out=tmp_path / f"seed{seed}")) for seed in (0, 1, 2)]
+
+
+def test_an_export_is_the_best_of_its_seeds(runs: list[str], tmp_path: Path) -> None:
+    out = export.export_policy(runs, tmp_path / "policies" / "reach-fake")
+    names = {"config.yaml", "metrics.csv", "curve.png", "evaluation.json", "README.md", "clip.mp4"}
+    assert {path.name for path in out.iterdir()} == names | {
+        f"{t}.{s}" for t in COUNTS for s in ("onnx", "safetensors")
+    }
+    assert [path.name for path in out.parent.iterdir()] == ["reach-fake"]
+    result = json.loads((out / "evaluation.json").read_text())
+    medians = [card.worst_median(run) for run in result["seeds"]["runs"]]
+    best = medians.index(min(medians))
+    assert result["seeds"]["best"] == best and card.worst_median(result) == medians[best]
+    assert result["episodes"] == 200 and result["seeds"]["aggregate"]["goal_set"] == result["goal_set"]
+
+    text = (out / "README.md").read_text()
+    for said in (
+        *("reach-fake", f"seed {best}", "all training seeds (3)", "trimanual_psm_ecm", "256 environment steps"),
+        *(torch.__version__, "## Limits", "Misses its goal: median error (mm)", "last 2 say which of the 2"),
+    ):
+        assert said in text
+    origin = read_origin(out)["origin"]
+    assert all(origin.values()) and str(origin["commit"]) in text and str(origin["device"]) in text
+
+
+def test_what_is_exported_acts_and_measures_as_the_run(runs: list[str], tmp_path: Path) -> None:
+    out = export.export_policy(runs[:1], tmp_path / "policy")
+    env: Any = FakeEnv(COUNTS, SIZES, num_envs=8)
+    observations, *_ = env.reset(0)
+    before, after = load_policy(runs[0], env)(observations), load_policy(out, env)(observations)
+    assert all(torch.equal(before[agent], after[agent]) for agent in env.agents)
+    published = command.read_result(out / "evaluation.json")
+    played = command.play_all([str(out)], dict.fromkeys(("task", "scene", "control", "difficulty")), 200, 0)
+    again = json.loads(command.report(played, ("published", published), True, None, None))
+    assert set(again["against"]["difference"].values()) <= {0.0, None}
+
+
+def test_runs_that_are_no_policy_together(runs: list[str], tmp_path: Path) -> None:
+    other = str(train.train(replace(SMALL, seed=3, team_reward=True), out=tmp_path / "other"))
+    shutil.copytree(runs[0], tmp_path / "same")
+    (tmp_path / "full").mkdir()
+    for several, out, message in (
+        ([runs[0], other], "new", "team_reward True and .* has False"),
+        ([runs[0], str(tmp_path / "same")], "new", "two of the runs have seed 0"),
+        ([str(tmp_path / "full")], "new", "not a run folder"),
+        ([*runs, "nothing"], "new", "unknown run or policy 'nothing'"),
+        (runs, "full", "exists already"),
+        (runs, "seed0/config.yaml/new", "cannot write"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            export.export_policy(several, tmp_path / out)
+    assert not (tmp_path / "new").exists() and not list(tmp_path.glob(".*"))
+
+
+def test_a_machine_without_films_leaves_the_clip_out(
+    runs: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(*_: Any) -> None:
+        raise RuntimeError("ffmpeg could not write")
+
+    monkeypatch.setattr(export, "record", fail)
+    out = export.export_policy(runs[:1], tmp_path / "policy")
+    assert not (out / "clip.mp4").exists() and "clip" not in (out / "README.md").read_text()
+    assert "no clip, since this machine cannot make one: ffmpeg" in capsys.readouterr().err
+
+
+def test_weights_that_are_not_data_or_not_of_this_scene_are_refused(runs: list[str], tmp_path: Path) -> None:
+    out = export.export_policy(runs[:1], tmp_path / "policy")
+    env: Any = FakeEnv(COUNTS, SIZES)
+    with pytest.raises(ValueError, match=r"trained in scene 'trimanual_psm_ecm'.*1 psm of 6 observations"):
+        load_policy(out, FakeEnv({"psm": 1}, SIZES))  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="exported policy, which can be evaluated but not resumed"):
+        train.train(SMALL, out=out, resume=out)
+
+    class Trap:
+        def __reduce__(self) -> Any:
+            return os.mkdir, (str(tmp_path / "sprung"),)
+
+    weights = out / "psm.safetensors"
+    data = weights.read_bytes()
+    for bad in (b"", data[:4], data[:60], data[:-1], b"junk" * 99, pickle.dumps(Trap())):
+        weights.write_bytes(bad)
+        with pytest.raises(ValueError, match=r"psm\.safetensors is damaged, or not the weights") as error:
+            load_policy(out, env)
+        assert "\n" not in str(error.value)
+    torch.save(Trap(), weights)
+    with pytest.raises(ValueError, match="only one that is loaded"):
+        load_policy(out, env)
+    torch.save(Trap(), Path(runs[0]) / "checkpoint.pt")
+    with pytest.raises(ValueError, match="damaged"):
+        load_policy(runs[0], env)
+    assert not (tmp_path / "sprung").exists()
+
+    weights.write_bytes(data)
+    (out / "config.yaml").write_text((out / "config.yaml").read_text().replace("- 16", "- 8"))
+    with pytest.raises(ValueError, match=r"not of the network in its config\.yaml"):
+        load_policy(out, env)
+
+
+@pytest.mark.parametrize("algo", ["mappo", "joint"])
+@pytest.mark.parametrize(
+    "env",
+    [FakeEnv({"psm": 1}, SIZES), FakeEnv(COUNTS, SIZES), PictureEnv(COUNTS, SIZES)],
+    ids=["one", "three", "pictures"],
+)
+def test_onnx_acts_as_torch_does(env: Any, algo: Any, tmp_path: Path) -> None:
+    """For random observations, far ones too, of any number of agents at once."""
+    torch.manual_seed(0)
+    layout = Layout(env, joint=algo == "joint")
+    actor = policy._actor(replace(SMALL, algo=algo), env, layout)
+    with torch.no_grad():
+        for model in actor.models.values():  # fresh networks hardly act: so that some actions are beyond 1
+            model.mlp[-1].weight.mul_(300)
+    for number in (1, 7):
+        seen = {agent: _random(env.observation_space(agent), number) for agent in env.agents}
+        groups = layout.stack(seen)
+        with torch.inference_mode():
+            actions = actor._split(actor(TensorDict({**groups}, batch_size=[number])).clamp(-1, 1))
+        for (name, model), wanted in zip(actor.models.items(), actions, strict=True):
+            if number == 1:
+                write_onnx(tmp_path / f"{name}.onnx", model)
+            session = onnxruntime.InferenceSession(tmp_path / f"{name}.onnx")
+            for place in range(layout.counts[name]):
+                given = {"observation": groups[name][:, place].numpy()}
+                if f"{name}_pictures" in groups:
+                    given |= {key: seen["ecm_0"][key].numpy() for key in ("image", "target")}
+                (action,) = session.run(None, given)
+                np.testing.assert_allclose(action, wanted[:, place], atol=1e-5, rtol=0)
+    assert not list(tmp_path.glob("[!pej]*"))
+
+
+def _random(space: Any, number: int) -> Any:
+    if isinstance(space, Dict):
+        return {name: _random(part, number) for name, part in space.spaces.items()}
+    if space.dtype == np.uint8:
+        return torch.randint(0, 256, (number, *space.shape), dtype=torch.uint8)
+    return 3 * torch.randn(number, *space.shape)
+
+
+def test_the_example_acts_without_torch(tmp_path: Path) -> None:
+    """docs/onnx_policy.py, with fresh weights: it prints an error for each arm, and nothing imports torch."""
+    from surgical_marl.batch import BatchedEnv
+
+    env = BatchedEnv("reach", "bimanual_psm", num_envs=1)
+    actor = policy._actor(replace(SMALL, scene="bimanual_psm"), env, Layout(env))
+    folder = tmp_path / "policies" / "reach-bimanual_psm"
+    folder.mkdir(parents=True)
+    write_onnx(folder / "psm.onnx", actor.models["psm"])
+    code = (
+        f"import runpy, sys; runpy.run_path({str(ROOT / 'docs' / 'onnx_policy.py')!r}); print('torch' in sys.modules)"
+    )
+    path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+    )
+    assert not done.returncode, done.stderr
+    errors, torch_imported = done.stdout.splitlines()
+    assert errors.startswith("{'psm_0': '") and " mm', 'psm_1': '" in errors and torch_imported == "False"
+
+
+def test_policies_are_listed_by_what_they_do(runs: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    export.export_policy(runs, tmp_path / "policies" / "reach-fake")
+    monkeypatch.setattr(content, "content_dir", lambda kind: tmp_path / kind)
+    monkeypatch.setattr(card, "content_dir", lambda kind: tmp_path / kind)
+    (tmp_path / "policies" / "unfinished").mkdir()
+    assert content.list_policies() == ["reach-fake"]
+    header, _, row = card.table().splitlines()
+    assert "RMSE" in header and "[reach-fake](reach-fake)" in row and "not below 1.00" in row

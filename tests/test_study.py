@@ -1,0 +1,95 @@
+"""The study of docs/study.py: arms that are taken from their policy, and tables from what runs left."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from surgical_marl.learning.config import load_config
+from surgical_marl.learning.run import write_config, write_metrics
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "docs"))
+import study
+import study_report
+
+MEASURES = ("error", "held", "squared", "distance", "center", "path", "time", "smoothness")
+
+
+@pytest.fixture
+def runs(tmp_path: Path) -> Path:
+    """Two seeds of two algorithms: seed 0 succeeds with both arms in half of the episodes, seed 1 always; whoever is
+    frozen fails."""
+    settings = load_config("reach", "bimanual_psm", ["num_envs=8", "iterations=10"])
+    for algo in ("mappo", "joint"):
+        for seed in range(2):
+            run = tmp_path / f"bimanual_psm-{algo}-seed{seed}"
+            run.mkdir()
+            write_config(run, settings)
+            rows = [
+                {"env_steps": 100.0 * i, "seconds": 1.0 + seed, "success_rate": i / 10, "collision_rate": 0.0}
+                for i in range(1, 11)
+            ]
+            write_metrics(run, rows[0], rows)
+            good = np.full((4, 2), 0.001)
+            good[: 2 - 2 * seed] = 0.1
+            found: dict[str, Any] = {f"untouched/{name}": good for name in MEASURES}
+            found["untouched/collided"] = np.zeros((4, 2), bool)
+            for index, arm in enumerate(("psm_0", "psm_1")):
+                for what, itself in (("frozen", 0.1), ("oracle", 0.0)):
+                    held = good.copy()
+                    held[:, index] = itself
+                    found |= {f"{what} {arm}/held": held, f"{what} {arm}/collided": held > 0.05}
+            about = {"goal_set": "hash", "episodes": 4, "agents": ["psm_0", "psm_1"], "cpu": "a CPU", "gpu": None}
+            np.savez_compressed(run / study.PLAYED, about=json.dumps(about), **found)
+    return tmp_path
+
+
+def test_tables_and_files(runs: Path) -> None:
+    page = runs / "study.md"
+    page.write_text(f"before\n{study_report.BEGIN}\nold\n{study_report.END}\nafter\n")
+    argv = ["--only", "report", "--out", str(runs), "--results", str(runs), "--scenes", "bimanual_psm"]
+    assert study.main([*argv, "--algos", "mappo", "joint"]) == 0
+    text = page.read_text()
+    assert text.startswith("before\n") and text.endswith("after\n") and "old" not in text
+    assert "| `bimanual_psm` | MAPPO | 75.0% (" in text
+    assert "| `bimanual_psm` | joint PPO | frozen | 75.0% (" in text
+    first, second = json.loads((runs / "study.json").read_text())
+    assert (first["algo"], second["algo"], first["seeds"]) == ("mappo", "joint", [0, 1])
+    assert [each["success_2mm"] for each in first["by_seed"]] == [0.5, 1.0]
+    assert first["seconds"][0] == 15.0 and first["samples"] == 1000.0
+    assert first["broken"]["frozen"]["itself"][0] == 0.0 and first["broken"]["oracle"]["itself"][0] == 1.0
+    assert first["broken"]["frozen"]["collisions"][0] == 1.0
+    assert 790 <= first["curves"]["samples"]["reached"] <= 820
+    # of both seeds together at the same second: the slower one ends after 20 s, the faster one after 10
+    assert first["curves"]["seconds"]["x"][-1] == 10.0
+    assert len((runs / "study.csv").read_text().splitlines()) == 5
+    assert (runs / "study.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_nothing_to_report(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="no run that was played"):
+        study.main(["--only", "report", "--out", str(tmp_path), "--results", str(tmp_path)])
+
+
+def test_an_arm_is_taken_over() -> None:
+    env = SimpleNamespace(steps=torch.tensor([0, 4, 5, 9]))
+    policy = lambda observations: {name: torch.ones(4, 2) for name in ("a", "b")}  # noqa: E731
+    instead = lambda observations: {name: -torch.ones(4, 2) for name in ("a", "b")}  # noqa: E731
+    actions = study.taken_over(policy, env, "b", instead, start=5)({})
+    assert actions["a"].tolist() == [[1, 1]] * 4
+    assert actions["b"].tolist() == [[1, 1]] * 2 + [[-1, -1]] * 2
+
+
+def test_what_is_wrong_with_one_run_stops_no_other(tmp_path: Path) -> None:
+    job = study.Job("bimanual_psm", "mappo", 0)
+    assert study.work("train", job, tmp_path, ["num_env=3"]) == (
+        job,
+        "unknown setting 'num_env'; did you mean 'num_envs'?",
+    )

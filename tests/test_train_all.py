@@ -1,0 +1,103 @@
+"""policies/train_all.py: what there is to do, in which order, and what happens when a part fails or is stopped."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture
+def script(monkeypatch: pytest.MonkeyPatch) -> Any:
+    monkeypatch.syspath_prepend(str(ROOT / "policies"))
+    import train_all
+
+    return train_all
+
+
+def test_there_are_twenty_and_those_that_ship_are_left_alone(script: Any, tmp_path: Path) -> None:
+    assert len(script.PLACES) == 20 and script.PLACES["match_image-ecm"] == ("match_image", "ecm")
+    arguments = argparse.Namespace(out=tmp_path, runs=tmp_path / "runs", seeds=[0, 3])
+    first, second, last = script._jobs("track-psm", arguments, ["num_envs=64"])
+    assert first.arguments == ("track", "psm", tmp_path / "runs" / "track-psm" / "seed0", ["seed=0", "num_envs=64"])
+    assert second.what == "seed3" and not second.needs
+    assert (last.what, last.needs, len(last.arguments[0])) == ("export", 2, 2)
+    (tmp_path / "track-psm").mkdir()
+    assert script._jobs("track-psm", arguments, []) == []
+
+
+def test_an_export_waits_for_its_seeds_and_a_failure_for_nobody(
+    script: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    good, bad = tmp_path / "good", tmp_path / "no" / "bad"
+
+    def jobs(policy: str, folder: Path) -> list[Any]:
+        return [
+            script.Job(policy, "seed0", os.mkdir, (folder,), tmp_path / "logs" / "0.log"),
+            script.Job(policy, "export", os.mkdir, (folder / "out",), tmp_path / "logs" / "out.log", 1),
+        ]
+
+    failed = script.run([*jobs("bad", bad), *jobs("good", good)], 2)
+    assert (good / "out").is_dir() and not bad.exists()
+    assert [(job.policy, job.what) for job in failed] == [("bad", "seed0"), ("bad", "export")]
+    said = capsys.readouterr().out
+    assert "bad seed0: FAILED, see" in said and "good export: done" in said
+    assert "FileNotFoundError" in (tmp_path / "logs" / "0.log").read_text()
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_who_stops_it_stops_what_it_started(number: int, tmp_path: Path) -> None:
+    code = (
+        "import sys, time; from pathlib import Path; import train_all\n"
+        "if __name__ == '__main__':\n"
+        "    train_all.signal.signal(train_all.signal.SIGTERM, lambda *_: sys.exit(143))\n"
+        "    train_all.run([train_all.Job('p', 'w', time.sleep, (600,), Path('log'))], 1)"
+    )
+    (tmp_path / "main.py").write_text(code)
+    path = os.pathsep.join([str(ROOT), str(ROOT / "policies"), os.environ.get("PYTHONPATH", "")])
+    process = subprocess.Popen([sys.executable, "main.py"], cwd=tmp_path, env={**os.environ, "PYTHONPATH": path})
+    children = _wait_for(lambda: _children(process.pid) if (tmp_path / "log").exists() else [])
+    time.sleep(0.5)
+    process.send_signal(number)
+    process.wait(30)
+    assert _wait_for(lambda: not any(_alive(child) for child in children))
+
+
+def test_a_name_that_is_no_policy() -> None:
+    command = [sys.executable, "policies/train_all.py", "--only", "reach-psmm"]
+    done = subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": str(ROOT)}
+    )
+    assert done.returncode == 2 and "did you mean 'reach-psm'" in done.stderr
+
+
+def test_the_table_replaces_the_old_one(script: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("surgical_marl.learning.card.table", lambda: "new")
+    (tmp_path / "README.md").write_text("before\n<!-- table -->\nold\n<!-- end of table -->\nafter\n")
+    script.write_table(tmp_path / "README.md")
+    assert (tmp_path / "README.md").read_text() == "before\n<!-- table -->\nnew\n<!-- end of table -->\nafter\n"
+
+
+def _children(pid: int) -> list[int]:
+    return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+
+
+def _alive(pid: int) -> bool:
+    stat = Path(f"/proc/{pid}/stat")
+    return stat.exists() and stat.read_text().rpartition(")")[2].split()[0] != "Z"
+
+
+def _wait_for(get: Any, seconds: float = 30.0) -> Any:
+    until = time.monotonic() + seconds
+    while not (found := get()) and time.monotonic() < until:
+        time.sleep(0.1)
+    return found

@@ -1,0 +1,55 @@
+"""The search of docs/tuning.py: where it starts, and what it leaves out."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+pytest.importorskip("optuna", reason="the extra `tune` is not installed")
+sys.path.insert(0, str(Path(__file__).parent.parent / "docs"))
+import tuning
+
+from surgical_marl.learning.config import Settings, load_config
+
+
+def test_shipped_settings_are_a_point_of_the_space() -> None:
+    settings = load_config("reach", "psm")
+    for name, knob in tuning.knobs("cpu").items():
+        point = knob.point(tuning._setting(settings, knob.setting))
+        assert knob.range._contains(point), name
+        value = tuning._setting(settings, knob.setting)
+        assert knob.value(point) == pytest.approx(value, abs=1e-5), name
+
+
+def test_what_is_fixed_is_not_searched() -> None:
+    found = tuning.knobs("cuda", ["num_envs=64", "network.hidden=[8]"])
+    assert "log2_num_envs" not in found and len(found) == len(tuning.knobs("cuda")) - 1
+
+
+def test_slower_trials_are_pruned_and_the_best_is_confirmed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A training takes 1 s for each epoch, and is given up after its limit."""
+
+    def solve(settings: Settings, goal: Any, give_up: Any) -> Any:
+        give_up(0.0, 0.0)
+        solved = not give_up(0.0, float(settings.ppo.epochs))
+        return SimpleNamespace(
+            solved=solved, learning_s=float(settings.ppo.epochs), exam=SimpleNamespace(success_2mm=0.5)
+        )
+
+    monkeypatch.setattr(tuning, "solve", solve)
+    folders = ["--out", str(tmp_path / "out"), "--results", str(tmp_path / "results")]
+    argv = ["--device", "cpu", "--trials", "12", "--limit", "6", "--confirm", "2", *folders]
+    assert tuning.main(argv) == 0
+    found = json.loads((tmp_path / "results" / "reach-psm-mappo-cpu.json").read_text())
+    assert found["seconds"]["shipped"] == [4.0, 4.0]
+    assert found["seconds"]["best"] == [float(found["best"]["ppo.epochs"])] * 2 and found["best"]["ppo.epochs"] <= 4
+    lines = (tmp_path / "results" / "reach-psm-mappo-cpu.csv").read_text().splitlines()
+    assert len(lines) == 13 and lines[1].startswith("0,complete,4.0,,0.001,")
+    assert all("complete" in line or ",pruned," in line for line in lines[1:])
+    assert tuning.main(argv) == 0, "nothing is left to do but to confirm"
+    assert len((tmp_path / "results" / "reach-psm-mappo-cpu.csv").read_text().splitlines()) == 13
