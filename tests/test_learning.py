@@ -135,8 +135,9 @@ def test_resume_is_bit_for_bit(options: dict[str, Any], tmp_path: Path, fakes: l
         moments = first["algorithm"]["optimizer_state_dict"]["state"]
         for index, moment in again["algorithm"]["optimizer_state_dict"]["state"].items():
             assert torch.equal(moment["exp_avg_sq"], moments[index]["exp_avg_sq"])
-        for name, memory in (first["memory"] or {}).items():
-            assert torch.equal(again["memory"][name], memory) and memory.any()
+        for name, memory in first["env"]["memory"].items():
+            assert torch.equal(again["env"]["memory"][name], memory)
+            assert memory.any() == (settings.network.recurrent != "none")
         assert torch.equal(again["random"], first["random"])
         assert torch.equal(again["env"]["observations"]["state"], first["env"]["observations"]["state"])
         assert [row["iteration"] for row in read_metrics(run)] == [1, 2, 3, 4]

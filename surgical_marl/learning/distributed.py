@@ -120,7 +120,18 @@ def average_gradients(parameters: Iterable[Tensor], also: Tensor) -> Tensor:
     return flat[-1]
 
 
-def wait(device: str) -> None:
+def wait() -> None:
     """Return when all processes are here."""
     if size() > 1:
-        total(torch.zeros((), device=device)).item()
+        total(torch.zeros((), device="cuda" if dist.get_backend() == "nccl" else "cpu")).item()
+
+
+@contextmanager
+def in_turn() -> Iterator[None]:
+    """First the first process of each machine, then the others, which find in caches what that one compiled."""
+    first = int(os.environ.get("LOCAL_RANK", 0)) == 0
+    if not first:
+        wait()
+    yield
+    if first:
+        wait()

@@ -79,7 +79,8 @@ def make_env(settings: Settings, num_envs: int | None = None) -> BatchedEnv:
 
 def make_training(settings: Settings) -> Training:
     """A run in memory. ValueError if it has no room there."""
-    env = make_env(settings)
+    with distributed.in_turn():
+        env = make_env(settings)
     check_room(settings, env)
     with in_memory(settings.num_envs):
         return Training(settings, env)
@@ -158,7 +159,7 @@ def _save(training: Training, out: Path) -> None:
     iteration, processes = training.iteration, distributed.size()
     if rank > 0:
         write_environments(out, iteration, rank, processes, {name: state[name] for name in OWN})
-    distributed.wait(training.env.device)
+    distributed.wait()
     if rank == 0:
         write_checkpoint(out, state)
         remove_environments(out, iteration, processes)
@@ -187,7 +188,7 @@ def _run(training: Training, out: Path) -> None:
         from surgical_marl.learning.curve import draw_curve  # matplotlib: not before training has begun
 
         draw_curve(out, f"{settings.task} in {settings.scene}, {settings.algo}, seed {settings.seed}")
-    distributed.wait(training.env.device)  # where one process ends early, torchrun ends them all
+    distributed.wait()  # where one process ends early, torchrun ends them all
     if training.stopping:
         number = received[0] if received else signal.SIGTERM
         raise KeyboardInterrupt if number == signal.SIGINT else SystemExit(128 + number)
@@ -212,8 +213,8 @@ def _read_resumed(settings: Settings, run: Path, goes_on: bool) -> dict[str, Any
             f"the run in {run} already has {state['iteration']} iterations: ask for more than {settings.iterations}"
         )
     steps = state["iteration"] * settings.num_envs * settings.steps_per_iteration
-    # a checkpoint of an older version lacks these
-    state = {"broken": None, "memory": None, "processes": 1, "env_steps": steps, **state}
+    # a checkpoint of an older version lacks these two
+    state = {"processes": 1, "env_steps": steps, **state}
     return _own(state, run)
 
 

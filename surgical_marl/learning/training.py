@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from surgical_marl.batch import BatchedEnv
 
 
-OWN = ("env", "collided", "broken", "memory", "random", "random_cuda")
+OWN = ("env", "collided", "random", "random_cuda")
 """Parts of `Training.state` that belong to one process alone: of its environments, and its random numbers."""
 
 
@@ -209,10 +209,13 @@ class Training:
             "of": {name: getattr(self.settings, name) for name in ("task", "scene", "algo")},
             "groups": {name: _widths(actor, name) for name in actor.counts},
             "algorithm": self.algorithm.save(),
-            "env": {**self.env.carry(), "observations": self._observations.to_dict()},
+            "env": {
+                **self.env.carry(),
+                "observations": self._observations.to_dict(),
+                "memory": self.algorithm.memory.state_dict(),
+                "broken": None if constraint is None else constraint.broken,
+            },
             "collided": self.episodes.collided,
-            "broken": None if constraint is None else constraint.broken,
-            "memory": self.algorithm.memory.state_dict() if self.algorithm.actor.is_recurrent else None,
             "random": torch.get_rng_state(),
             "random_cuda": torch.cuda.get_rng_state() if self._cuda else None,
         }
@@ -234,11 +237,11 @@ class Training:
         self.env.set_carry(state["env"])
         for name, kept in self._observations.items():
             kept.copy_(state["env"]["observations"][name])
-        self.episodes.collided.copy_(state["collided"])
         if self.algorithm.constraint is not None:
-            self.algorithm.constraint.broken.copy_(state["broken"])
+            self.algorithm.constraint.broken.copy_(state["env"]["broken"])
         if self.algorithm.actor.is_recurrent:
-            self.algorithm.memory.load_state_dict(state["memory"])
+            self.algorithm.memory.load_state_dict(state["env"]["memory"])
+        self.episodes.collided.copy_(state["collided"])
         torch.set_rng_state(state["random"])
         if state["random_cuda"] is not None and self._cuda:
             torch.cuda.set_rng_state(state["random_cuda"])
