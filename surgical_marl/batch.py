@@ -114,19 +114,20 @@ class BatchedEnv:
         """Of one environment."""
         return self._action_spaces[agent]
 
-    def reset(self, seed: int | None = None) -> tuple[dict[str, Any], Any, dict[str, dict[str, Any]]]:
+    def reset(self, seed: int | None = None, first: int = 0) -> tuple[dict[str, Any], Any, dict[str, dict[str, Any]]]:
         """Starts a new episode in all environments; returns observations, state and infos.
 
         Args:
             seed: environment i plays the same episodes for the same seed, whatever `num_envs`. None goes on to each
                 environment's next episode, or draws a seed if there was none yet.
+            first: the number of the first environment, where several processes share the environments of a seed.
         """
         if seed is not None and (isinstance(seed, bool) or not 0 <= seed < 2**63):
             raise ValueError(f"seed must be a whole number from 0 to 2**63 - 1, not {seed!r}")
         if seed is None and self._started:
             self.engine.restart()
         else:
-            self.engine.reset(secrets.randbits(63) if seed is None else int(seed))
+            self.engine.reset(secrets.randbits(63) if seed is None else int(seed), first)
         self._started = True
         found = self._outcome(self._target_rows())
         return found["observations"], found["state"], found["infos"]

@@ -109,7 +109,9 @@ def _parser() -> argparse.ArgumentParser:
         flag, check = f"--{key.replace('_', '-')}", str if isinstance(good, str) else _one_of(good)
         train.add_argument(flag, type=check, metavar=good if isinstance(good, str) else "|".join(good), help=text)
     train.add_argument("--out", type=Path, metavar="DIR", help="run folder (default: runs/...)")
-    train.add_argument("--resume", type=Path, metavar="DIR", help="run folder to go on with")
+    train.add_argument(
+        "--resume", type=Path, metavar="DIR", help="run folder to go on with, or to start in with TASK and --scene"
+    )
     train.set_defaults(command=_train, name="train")
 
     evaluate = commands.add_parser("eval", help="measure policies on a fixed set of goals (docs/evaluation.md)")
@@ -271,22 +273,28 @@ def _train(arguments: argparse.Namespace) -> None:
     flags = [f"{key}={value}" for key, value in given if value is not None]
 
     from surgical_marl.learning.config import load_config
-    from surgical_marl.learning.run import read_settings
+    from surgical_marl.learning.distributed import claim_gpu, is_first
+    from surgical_marl.learning.run import has_begun, read_settings
 
-    overrides = [*flags, *arguments.overrides]
-    if arguments.resume:
-        settings = read_settings(arguments.resume, overrides)
+    overrides, resume = [*flags, *arguments.overrides], arguments.resume
+    if resume and None not in (arguments.task, arguments.scene) and not has_begun(resume):
+        resume = None  # the same command starts a run and goes on with it, however early it was killed
+    if resume:
+        settings = read_settings(resume, overrides)
         for key, own in (("task", settings.task), ("scene", settings.scene)):
             if (given_name := getattr(arguments, key)) not in (None, own):
-                raise ValueError(f"the run in {arguments.resume} is of {key} {own!r}, not {given_name!r}")
+                raise ValueError(f"the run in {resume} is of {key} {own!r}, not {given_name!r}")
     else:
         settings = load_config(arguments.task, arguments.scene, overrides)
     out = arguments.out or arguments.resume or _run_folder(settings)
+    claim_gpu(settings.device)
 
     from surgical_marl.evaluation.command import judge
     from surgical_marl.learning.train import train
 
-    judge(train(settings, out=out, resume=arguments.resume))
+    run = train(settings, out=out, resume=resume)
+    if is_first():
+        judge(run)
 
 
 def _eval(arguments: argparse.Namespace) -> None:

@@ -60,9 +60,9 @@ class FakeEnv:
         shapes = {agent: (self.num_envs, 2 * size) for agent, size in self.sizes.items()}
         return {a: torch.rand(s, generator=self.generator) * 2 - 1 for a, s in shapes.items()}
 
-    def reset(self, seed: int | None = None) -> tuple[dict[str, Tensor], Tensor, dict[str, Any]]:
+    def reset(self, seed: int | None = None, first: int = 0) -> tuple[dict[str, Tensor], Tensor, dict[str, Any]]:
         if seed is not None:
-            self.generator.manual_seed(seed)
+            self.generator.manual_seed(seed + 1000 * first)
         self.where = self._draw()
         self.steps = np.zeros(self.num_envs, np.int64)
         return *self._observe(), {agent: self._info(agent) for agent in self.agents}

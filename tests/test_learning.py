@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import signal
@@ -237,6 +238,26 @@ def test_nan_stops_and_keeps_the_last_checkpoint(
     assert checkpoint["iteration"] == 2
     assert all(torch.isfinite(value).all() for value in weights(tmp_path / "run").values())
     assert len(read_metrics(tmp_path / "run")) == 3
+    found = json.loads((tmp_path / "run" / "diverged.json").read_text())
+    assert found["iteration"] == 4 and found["last_checkpoint"] == 2 and found["learning_rate"] > 0
+    assert found["not_finite"]["observations"] == ["psm[0]", "state[0]"]
+    assert {"rewards", "values", "weights"} <= found["not_finite"].keys()
+    monkeypatch.undo()
+    monkeypatch.setattr(train, "make_env", lambda settings: FakeEnv(COUNTS, SIZES, settings.num_envs, max_steps=10))
+    train.train(SMALL, out=tmp_path / "run", resume=tmp_path / "run")
+    assert not (tmp_path / "run" / "diverged.json").exists()
+
+
+def test_a_nan_reward_names_its_term(tmp_path: Path, fakes: list[Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    original = FakeEnv._info
+
+    def info(self: FakeEnv, agent: str) -> dict[str, torch.Tensor]:
+        found = original(self, agent)
+        return found | {"reward_distance": found["reward_distance"].clone().fill_(math.inf)}
+
+    monkeypatch.setattr(FakeEnv, "_info", info)
+    with pytest.raises(FloatingPointError, match=r"rewards became NaN or infinite in iteration 1 \(reward_distance\)"):
+        train.train(SMALL, out=tmp_path / "run")
 
 
 def test_a_nan_loss_stops(tmp_path: Path, fakes: list[Any], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -275,7 +296,7 @@ def test_folders_that_cannot_be_used(tmp_path: Path, fakes: list[Any]) -> None:
         (SMALL, {"out": run}, "already holds a run"),
         (SMALL, {"out": tmp_path / "file" / "run"}, "cannot write"),
         (SMALL, {"out": tmp_path / "new", "resume": tmp_path / "empty"}, "not a run folder"),
-        (replace(SMALL, iterations=1), {"out": run, "resume": run}, "already has 1 iterations"),
+        (replace(SMALL, iterations=1), {"out": tmp_path / "new", "resume": run}, "already has 1 iterations"),
         (replace(SMALL, num_envs=8), {"out": run, "resume": run}, "num_envs 32"),
         (replace(SMALL, **OPTIONS[1]), {"out": run, "resume": run}, "normalise_values False"),
         (replace(SMALL, **OPTIONS[2]), {"out": run, "resume": run}, "constraint.cost 'none'"),

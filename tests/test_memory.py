@@ -39,19 +39,19 @@ def test_what_a_rollout_takes_is_what_is_stored(training: Training) -> None:
 def test_no_room_for_a_rollout(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     env: Any = FakeEnv({"psm": 1}, {"psm": 3}, 16)
     each = rollout_bytes(SETTINGS, env)
-    monkeypatch.setattr(memory, "_free", lambda device: 10 * each)
+    monkeypatch.setattr(memory, "free_memory", lambda device: 10 * each)
     with pytest.raises(ValueError, match=rf"num_envs 16 .* {each} bytes.* at most 10 fit"):
         check_room(SETTINGS, env)
     monkeypatch.setattr(train, "make_env", lambda settings: env)
     with pytest.raises(ValueError, match="num_envs 16"):
         train.train(SETTINGS, out=tmp_path / "run")
     assert not (tmp_path / "run").exists()
-    monkeypatch.setattr(memory, "_free", lambda device: None)
+    monkeypatch.setattr(memory, "free_memory", lambda device: None)
     check_room(SETTINGS, env)
 
 
 def test_memory_is_known_here() -> None:
-    free = memory._free("cpu")
+    free = memory.free_memory("cpu")
     assert free is None or 1e6 < free < 1e15
 
 

@@ -141,9 +141,9 @@ class Hidden(FakeEnv):
             seen[agent] = torch.cat([where, torch.where(begins, goal, 0.0)], -1)
         return seen, torch.cat(list(seen.values()), -1)
 
-    def reset(self, seed: int | None = None) -> Any:
+    def reset(self, seed: int | None = None, first: int = 0) -> Any:
         self.steps = torch.zeros(self.num_envs).long().numpy()
-        return super().reset(seed)
+        return super().reset(seed, first)
 
 
 @pytest.mark.parametrize("kind", ["none", "gru"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from pathlib import Path
 
 from surgical_marl.env import Env
 
@@ -16,6 +17,19 @@ def announce(env: Env, engine: str, device: str) -> None:
         file=sys.stderr,
         flush=True,
     )
+
+
+def free_memory(device: str) -> int | None:
+    """Bytes of memory that are free on "cuda" or "cpu"; None if nobody knows."""
+    if device == "cuda":
+        import torch
+
+        return int(torch.cuda.mem_get_info()[0])
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+    except OSError:
+        return None
+    return next((1024 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")), None)
 
 
 def cores() -> int:

@@ -46,10 +46,10 @@ class MjxEngine:
         paths, self._tree = jax.tree_util.tree_flatten_with_path(shapes)
         self.carry_shapes = {jax.tree_util.keystr(path): leaf.shape for path, leaf in paths}
 
-    def reset(self, seed: int) -> None:
-        """First episodes. Environment i depends on `seed` and i alone, not on how many there are."""
+    def reset(self, seed: int, first: int = 0) -> None:
+        """First episodes. Environment i depends on `seed` and `first` + i alone, not on how many there are."""
         with jax.default_device(self._on):
-            keys = self._first_keys(jax.random.PRNGKey(seed), jnp.arange(self.num_envs))
+            keys = self._first_keys(jax.random.PRNGKey(seed), jnp.arange(first, first + self.num_envs))
             self._begin(keys, jnp.zeros(self.num_envs, jnp.int32))
 
     def restart(self) -> None:

@@ -102,7 +102,7 @@ class RslRlVecEnv(VecEnv):
         reward_terms: names of the weighted terms in the infos that the rewards are the sum of.
     """
 
-    def __init__(self, env: BatchedEnv, *, joint: bool = False, seed: int | None = None) -> None:
+    def __init__(self, env: BatchedEnv, *, joint: bool = False, seed: int | None = None, first: int = 0) -> None:
         self.env = env
         self.layout = Layout(env, joint=joint)
         self.num_envs = env.num_envs
@@ -110,7 +110,7 @@ class RslRlVecEnv(VecEnv):
         self.max_episode_length = env.max_steps
         self.device = env.device
         self.cfg: dict[str, Any] = {}
-        observations, state, infos = env.reset(seed)
+        observations, state, infos = env.reset(seed, first)
         self.reward_terms = sorted({name for info in infos.values() for name in info if name.startswith("reward_")})
         self._observations = self._group(observations, state)
 

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from surgical_marl.interfaces.rsl_rl import Layout
+from surgical_marl.learning import distributed
 
 METRICS = ("cost_rate", "lagrange_multiplier")
 """What `Constraint.metrics` returns."""
@@ -49,7 +50,8 @@ class Constraint(nn.Module):
         self.limit, self.kp, self.ki, self.kd = limit, kp, ki, kd
         for name in ("multiplier", "integral", "rate"):
             self.register_buffer(name, torch.zeros(()))
-        self.register_buffer("broken", torch.zeros(num_envs, dtype=torch.bool))
+        # these two are of this process: `Training` saves the first, and the second is zero between iterations
+        self.register_buffer("broken", torch.zeros(num_envs, dtype=torch.bool), persistent=False)
         # episodes since the last update: all that ended, and those that had the cost
         self.register_buffer("_ended", torch.zeros(2), persistent=False)
 
@@ -62,8 +64,8 @@ class Constraint(nn.Module):
         return costs
 
     def update(self) -> None:
-        """Move the multiplier by the episodes that ended since the last call; none of them, and it stays."""
-        ended, broken = self._ended
+        """Move the multiplier by the episodes of all processes that ended since the last call; none, and it stays."""
+        ended, broken = distributed.total(self._ended)
         rate = broken / ended.clamp(min=1.0)
         excess, growth = rate - self.limit, (rate - self.rate).clamp(min=0.0)
         integral = (self.integral + excess).clamp(min=0.0)

@@ -35,6 +35,11 @@ class Replayed:
             self._graph = self._capture()
             self._graph.replay()
 
+    def release(self) -> None:
+        """Let the graph go; NCCL does not end before graphs that use it."""
+        if self._graph is not None:
+            self._graph.reset()
+
     def _warm_up(self) -> None:
         """The first call is an ordinary one: libraries get their memory, and the optimiser its moments.
 
@@ -49,6 +54,7 @@ class Replayed:
 
     def _capture(self) -> torch.cuda.CUDAGraph:
         graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph):
+        # Other threads may use CUDA meanwhile: NCCL's watchdog does.
+        with torch.cuda.graph(graph, capture_error_mode="thread_local"):
             self._function()
         return graph

@@ -18,6 +18,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from surgical_marl.interfaces.rsl_rl import RslRlVecEnv
+from surgical_marl.learning import distributed
 from surgical_marl.learning.config import Settings
 from surgical_marl.learning.constraint import Constraint
 from surgical_marl.learning.models import Gaussian, MultiAgentActor, MultiAgentModel, make_model
@@ -68,8 +69,7 @@ class MAPPO(PPO):
         # As a tensor the learning rate adapts without the host having to read the divergence.
         self._rate = torch.tensor(float(self.learning_rate), device=self.device)
         self._cuda = torch.device(self.device).type == "cuda"
-        parameters = [*self.actor.parameters(), *self.critic.parameters()]
-        self.optimizer = torch.optim.Adam(parameters, lr=self._rate, fused=True, capturable=self._cuda)
+        self.optimizer = torch.optim.Adam(self.parameters(), lr=self._rate, fused=True, capturable=self._cuda)
 
     def act(self, obs: TensorDict) -> Tensor:
         """Sample the flat joint action `[N, sum]`."""
@@ -140,7 +140,7 @@ class MAPPO(PPO):
         if self.constraint is not None:
             self.constraint.update()
             advantages = self.constraint.weigh(advantages.unflatten(-1, (-1, 2)))
-        storage.advantages.copy_((advantages - advantages.mean()) / (advantages.std() + 1e-8))
+        storage.advantages.copy_(distributed.standardised(advantages))
 
     def update(self) -> dict[str, float]:
         """Learn from the stored rollout; returns mean losses, KL and the learning rate (see `LOSSES`)."""
@@ -155,10 +155,11 @@ class MAPPO(PPO):
         for batch in self._batches():
             with self._precision():
                 loss, parts = self.loss(batch)
-            if self.schedule == "adaptive":
-                self._adapt_rate(parts[-1])
             self.optimizer.zero_grad()
             loss.backward()
+            divergence = distributed.average_gradients(self.parameters(), parts[-1])
+            if self.schedule == "adaptive":
+                self._adapt_rate(divergence)
             for model in (self.actor, self.critic):
                 nn.utils.clip_grad_norm_(model.parameters(), self.max_grad_norm)
             self.optimizer.step()
@@ -168,6 +169,10 @@ class MAPPO(PPO):
         self.critic.update_normalization(observations)
         count = self.num_mini_batches * self.num_learning_epochs
         return torch.cat([total / count, self._rate[None]])
+
+    def parameters(self) -> list[nn.Parameter]:
+        """All that the optimiser changes."""
+        return [*self.actor.parameters(), *self.critic.parameters()]
 
     def _batches(self) -> Iterator[RolloutStorage.Batch]:
         counts = (self.num_mini_batches, self.num_learning_epochs)
@@ -219,12 +224,7 @@ class MAPPO(PPO):
     def construct_algorithm(obs: TensorDict, env: RslRlVecEnv, cfg: dict[str, Any], device: str) -> MAPPO:
         """Build the algorithm from an rsl_rl configuration (see `rsl_rl_config`), as rsl_rl's
         runner does it.
-
-        Raises:
-            ValueError: the configuration asks for several GPUs.
         """
-        if cfg.get("multi_gpu"):
-            raise ValueError("MAPPO runs on one GPU: start it without torchrun")
         layout = env.layout
         options, constraint = dict(cfg["algorithm"]), None
         if bounds := options.pop("constraint"):

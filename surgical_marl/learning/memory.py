@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-import torch
-
+from surgical_marl.engines.common import free_memory
 from surgical_marl.interfaces.rsl_rl import Layout
 from surgical_marl.learning.config import Settings
 from surgical_marl.learning.policy import zeros
@@ -34,7 +32,7 @@ def rollout_bytes(settings: Settings, env: BatchedEnv) -> int:
 
 def check_room(settings: Settings, env: BatchedEnv) -> None:
     """ValueError if a rollout alone has no room. Learning takes more, which shows when it runs out: `in_memory`."""
-    each, room = rollout_bytes(settings, env), _free(str(env.device))
+    each, room = rollout_bytes(settings, env), free_memory(str(env.device))
     if room is not None and each * env.num_envs > room:
         steps = settings.steps_per_iteration
         raise ValueError(
@@ -53,13 +51,3 @@ def in_memory(num_envs: int) -> Iterator[None]:
             raise
         advice = f"try num_envs={num_envs // 2}" if num_envs > 1 else "try fewer steps_per_iteration"
         raise ValueError(f"num_envs {num_envs} does not fit into memory: {advice}") from None
-
-
-def _free(device: str) -> int | None:
-    """Bytes of a device's memory that are free, None if nobody knows."""
-    if device.startswith("cuda"):
-        return int(torch.cuda.mem_get_info()[0])
-    with contextlib.suppress(OSError, StopIteration):
-        lines = Path("/proc/meminfo").read_text().splitlines()
-        return 1024 * int(next(line.split()[1] for line in lines if line.startswith("MemAvailable:")))
-    return None

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-import torch
 from rsl_rl.modules import EmpiricalNormalization
 from torch import Tensor
+
+from surgical_marl.learning import distributed
 
 
 class Normaliser(EmpiricalNormalization):
     """rsl_rl's, whose update stays in place and asks the host for nothing, so that a CUDA graph can repeat it."""
 
     def update(self, x: Tensor) -> None:
-        """Learn from a batch `[B, d]` while training."""
+        """Learn from the batches `[B, d]` of all processes while training."""
         if not self.training:
             return
-        count = x.shape[0]
-        var, mean = torch.var_mean(x, dim=0, correction=0, keepdim=True)
+        count = x.shape[0] * distributed.size()
+        var, mean = distributed.var_mean(x, dim=0)
         self.count += count
         rate = count / self.count
         ahead = mean - self._mean

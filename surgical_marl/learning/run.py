@@ -1,6 +1,8 @@
-"""A run folder: `config.yaml`, `checkpoint.pt`, `metrics.csv`, `curve.png` and `tensorboard/`.
+"""A run folder: `config.yaml`, `checkpoint.pt`, `metrics.csv`, `curve.png` and `tensorboard/`; beside the checkpoint
+`environments-*.pt` of further processes, and `diverged.json` where training ended so.
 
-A policy that ships has safetensors instead of the checkpoint (`export.py`). Every write is atomic.
+A policy that ships has safetensors instead of the checkpoint (`export.py`). Every write is atomic, but that
+`metrics.csv` grows by rows.
 """
 
 from __future__ import annotations
@@ -8,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import csv
 import importlib.metadata
+import json
 import math
 import os
 import platform
@@ -26,6 +29,7 @@ from surgical_marl.learning.config import Settings, config_text, read_config
 from surgical_marl.learning.weights import holds_weights
 
 CONFIG, CHECKPOINT, METRICS, CURVE = "config.yaml", "checkpoint.pt", "metrics.csv", "curve.png"
+DIVERGED = "diverged.json"
 PACKAGES = ("surgical-marl", "torch", "rsl-rl-lib", "jax", "mujoco", "mujoco-mjx", "numpy")
 
 
@@ -70,6 +74,11 @@ def read_origin(run: Path) -> dict[str, dict[str, str | None]]:
     return {name: notes.get(name) or {} for name in ("versions", "origin")}
 
 
+def has_begun(run: Path) -> bool:
+    """Whether there is a run in a folder, which has its settings from the start."""
+    return (run / CONFIG).is_file()
+
+
 def read_settings(run: str | Path, overrides: Iterable[str] = ()) -> Settings:
     """Settings of a run or of a shipped policy, with `key=value` overrides.
 
@@ -102,17 +111,51 @@ def read_checkpoint(run: str | Path) -> dict[str, Any]:
     return checkpoint
 
 
+def write_environments(run: Path, iteration: int, rank: int, processes: int, state: Mapping[str, Any]) -> None:
+    """Write what the checkpoint of an iteration needs of one further process."""
+    write_atomic(_environments(run, iteration, rank, processes), lambda path: torch.save(dict(state), path))
+
+
+def read_environments(run: Path, iteration: int, rank: int, processes: int) -> dict[str, Any] | None:
+    """What `write_environments` wrote, on the CPU; None if it is not there or damaged."""
+    try:
+        state = torch.load(_environments(run, iteration, rank, processes), map_location="cpu", weights_only=True)
+    except Exception:  # as in `read_checkpoint`
+        return None
+    return state if isinstance(state, dict) else None
+
+
+def remove_environments(run: Path, iteration: int, processes: int) -> None:
+    """Remove what no longer belongs to the checkpoint, which is of this iteration and of so many processes."""
+    kept = {_environments(run, iteration, rank, processes) for rank in range(1, processes)}
+    for path in set(run.glob("environments-*.pt")) - kept:
+        path.unlink(missing_ok=True)
+
+
+def _environments(run: Path, iteration: int, rank: int, processes: int) -> Path:
+    return run / f"environments-{iteration}-{rank}-of-{processes}.pt"
+
+
+def write_divergence(run: Path, divergence: Mapping[str, Any]) -> None:
+    """Write `diverged.json`."""
+    write_atomic(run / DIVERGED, lambda path: path.write_text(json.dumps(divergence, indent=2) + "\n"))
+
+
 def format_row(row: Mapping[str, float]) -> list[str]:
     """Cells of a row of metrics. A rate over no episodes (NaN) is an empty cell."""
     return ["" if math.isnan(value) else format(value, ".9g") for value in row.values()]
 
 
 def read_metrics(run: Path) -> list[dict[str, float]]:
-    """Rows of `metrics.csv`; an empty cell is NaN. No file, no rows."""
+    """Rows of `metrics.csv`; an empty cell is NaN. No file, no rows; a row that was cut short is none, nor are those
+    after it."""
     if not (run / METRICS).is_file():
         return []
-    with (run / METRICS).open(newline="") as file:
-        return [{key: float(cell or "nan") for key, cell in row.items()} for row in csv.DictReader(file)]
+    rows: list[dict[str, float]] = []
+    with (run / METRICS).open(newline="", errors="replace") as file, contextlib.suppress(ValueError):
+        for row in csv.DictReader(line for line in file if line.endswith("\n")):
+            rows.append({key: float(cell or "nan") for key, cell in row.items()})
+    return rows
 
 
 def write_metrics(run: Path, columns: Iterable[str], rows: Iterable[Mapping[str, float]]) -> None:

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import csv
-import math
 import signal
 import sys
 import threading
-from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -17,21 +14,31 @@ from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
+from surgical_marl.files import remove_temporaries
+from surgical_marl.learning import distributed
 from surgical_marl.learning.config import Settings
+from surgical_marl.learning.faults import Diverged
+from surgical_marl.learning.log import Log, Reports
 from surgical_marl.learning.memory import check_room, in_memory
 from surgical_marl.learning.run import (
-    METRICS,
+    CHECKPOINT,
+    CONFIG,
+    DIVERGED,
     check_writable,
     claim_folder,
-    format_row,
     read_checkpoint,
+    read_environments,
     read_metrics,
     read_settings,
+    remove_environments,
     write_checkpoint,
     write_config,
+    write_divergence,
+    write_environments,
     write_metrics,
 )
-from surgical_marl.learning.training import Report, Training
+from surgical_marl.learning.training import OWN, Training
+from surgical_marl.learning.weights import holds_weights
 
 if TYPE_CHECKING:
     from surgical_marl.batch import BatchedEnv
@@ -72,130 +79,143 @@ def make_env(settings: Settings, num_envs: int | None = None) -> BatchedEnv:
 
 def make_training(settings: Settings) -> Training:
     """A run in memory. ValueError if it has no room there."""
-    env = make_env(settings)
+    with distributed.in_turn():
+        env = make_env(settings)
     check_room(settings, env)
     with in_memory(settings.num_envs):
         return Training(settings, env)
 
 
 def train(settings: Settings, *, out: Path, resume: Path | None = None) -> Path:
-    """Train until `settings.iterations`, and return the run folder.
+    """Train until `settings.iterations`, and return the run folder. Within torchrun all processes call it.
 
     Args:
         settings: the run; when resuming they must agree with the old run on all that shapes it.
         out: the run folder to write; it must not hold a run yet, unless it is the one that is
             resumed.
-        resume: the run folder to continue from its checkpoint.
+        resume: the run folder to continue from its checkpoint, or from the start if it has none yet.
 
     Raises:
         ValueError: the folder cannot be used, the settings do not fit the run to resume, or so many environments do not
             fit into memory.
-        FloatingPointError: training produced NaN; the last good checkpoint is kept.
+        FloatingPointError: training produced NaN; the last good checkpoint is kept, and `diverged.json` says where.
         KeyboardInterrupt, SystemExit: after Ctrl-C or SIGTERM, when the checkpoint is written.
     """
-    out = Path(out)
+    with distributed.joined(settings.device), ExitStack() as closing:
+        out = Path(distributed.agreed(str(out)))  # its name may hold the time
+        state = None if resume is None else _read_resumed(settings, Path(resume), _same(out, resume))
+        if state is not None and state["iteration"] == settings.iterations:
+            _say(f"the run in {out} has its {settings.iterations} iterations: to go on, ask for more")
+            return out
+        rows = read_metrics(Path(resume)) if resume is not None and state is not None else []
+        with _claimed(out, resume, settings):
+            training = make_training(settings)
+            closing.callback(training.close)
+            if state is not None:
+                training.set_state(state)
+        if distributed.rank() == 0:
+            write_metrics(out, training.columns, [row for row in rows if row["iteration"] <= training.iteration])
+        _save(training, out)
+        if distributed.rank() == 0 and resume is not None:
+            write_config(out, settings)
+        with in_memory(settings.num_envs):
+            _run(training, out)
+    return out
+
+
+@contextmanager
+def _claimed(out: Path, resume: Path | None, settings: Settings) -> Iterator[None]:
+    """The run folder, while the run is made in memory. A new run has its settings there from the start, so that it can
+    be resumed whenever it is killed; if it is refused, there is nothing left of it."""
+    if distributed.rank() > 0:
+        yield
+        return
     new = not out.exists()
-    state = _read_resumed(settings, Path(resume)) if resume is not None else None
-    if resume is not None and out.resolve() == Path(resume).resolve():
+    if _same(out, resume):
         check_writable(out)
+        (out / DIVERGED).unlink(missing_ok=True)
     else:
         claim_folder(out)
-    rows = (
-        [row for row in read_metrics(Path(resume)) if state and row["iteration"] <= state["iteration"]]
-        if resume
-        else []
-    )
-
+        if resume is None:
+            write_config(out, settings)
+    remove_temporaries(out)
     try:
-        training = make_training(settings)
+        yield
     except ValueError:
+        if resume is None:
+            (out / CONFIG).unlink()
         if new:
-            out.rmdir()  # it is empty yet
+            out.rmdir()
         raise
-    if state is not None:
-        training.set_state(state)
-    write_config(out, settings)
-    write_metrics(out, training.columns, rows)
-    write_checkpoint(out, training.state())
-    with in_memory(settings.num_envs):
-        _run(training, out)
-    return out
+
+
+def _same(out: Path, resume: Path | None) -> bool:
+    return resume is not None and out.resolve() == Path(resume).resolve()
+
+
+def _save(training: Training, out: Path) -> None:
+    """A checkpoint of all processes. The others write first: what rank 0 writes stands for a whole."""
+    state, rank = training.state(), distributed.rank()
+    iteration, processes = training.iteration, distributed.size()
+    if rank > 0:
+        write_environments(out, iteration, rank, processes, {name: state[name] for name in OWN})
+    distributed.wait()
+    if rank == 0:
+        write_checkpoint(out, state)
+        remove_environments(out, iteration, processes)
 
 
 def _run(training: Training, out: Path) -> None:
     settings = training.settings
-    with _signals() as received, _Log(training, out) as log:
-        while training.iteration < settings.iterations and not received:
-            log.add(training.iterate())
-            if training.iteration % settings.checkpoint_every == 0:
-                log.catch_up()  # raises if something is not finite: the last good checkpoint stays
-                write_checkpoint(out, training.state())
-        log.catch_up()
-        write_checkpoint(out, training.state())
-    from surgical_marl.learning.curve import draw_curve  # matplotlib: not before training has begun
+    with _signals(training) as received, ExitStack() as files:
+        log = files.enter_context(Log(training, out)) if distributed.rank() == 0 else None
+        reports = Reports(training, log.write if log else lambda row: None)
+        done = False
+        try:
+            while not done:
+                reports.add(training.iterate())
+                done = training.stopping or training.iteration >= settings.iterations
+                if done or training.iteration % settings.checkpoint_every == 0:
+                    reports.catch_up()  # raises if something is not finite: the last good checkpoint stays
+                    if log:
+                        log.keep()
+                    _save(training, out)
+        except Diverged as error:
+            if log:
+                write_divergence(out, {**error.summary, "last_checkpoint": read_checkpoint(out)["iteration"]})
+            raise
+    if log:
+        from surgical_marl.learning.curve import draw_curve  # matplotlib: not before training has begun
 
-    draw_curve(out, f"{settings.task} in {settings.scene}, {settings.algo}, seed {settings.seed}")
-    if received:
-        raise KeyboardInterrupt if received[0] == signal.SIGINT else SystemExit(128 + received[0])
-
-
-class _Log:
-    """`metrics.csv`, tensorboard and the progress bar of a run. It reads an iteration's report when the next one is
-    under way, so that a GPU has always something to do."""
-
-    def __init__(self, training: Training, out: Path) -> None:
-        from torch.utils.tensorboard import SummaryWriter  # takes a second to import
-
-        self._training, self._waiting = training, deque[Report]()
-        self._lag = 1 if training.env.device == "cuda" else 0
-        self._files = ExitStack()
-        self._csv = self._files.enter_context((out / METRICS).open("a", newline=""))
-        board = SummaryWriter(str(out / "tensorboard"), purge_step=training.iteration + 1)
-        self._board = self._files.enter_context(board)
-        total, begun = training.settings.iterations, training.iteration
-        self._bar = self._files.enter_context(
-            tqdm(initial=begun, total=total, unit="it", file=sys.stderr, dynamic_ncols=True)
-        )
-
-    def __enter__(self) -> _Log:
-        return self
-
-    def __exit__(self, *_: Any) -> None:
-        self._files.close()
-
-    def add(self, report: Report) -> None:
-        """Take a report; read those whose iteration should be done."""
-        self._waiting.append(report)
-        while len(self._waiting) > self._lag:
-            self._write(self._training.row(self._waiting.popleft()))
-
-    def catch_up(self) -> None:
-        """Read all reports."""
-        while self._waiting:
-            self._write(self._training.row(self._waiting.popleft()))
-
-    def _write(self, row: dict[str, float]) -> None:
-        csv.writer(self._csv).writerow(format_row(row))
-        self._csv.flush()
-        for name in self._training.columns[1:]:
-            if math.isfinite(row[name]):
-                self._board.add_scalar(name, row[name], row["iteration"])
-        self._bar.set_postfix_str(_describe(row), refresh=False)
-        self._bar.update()
+        draw_curve(out, f"{settings.task} in {settings.scene}, {settings.algo}, seed {settings.seed}")
+    distributed.wait()  # where one process ends early, torchrun ends them all
+    if training.stopping:
+        number = received[0] if received else signal.SIGTERM
+        raise KeyboardInterrupt if number == signal.SIGINT else SystemExit(128 + number)
 
 
-def _read_resumed(settings: Settings, run: Path) -> dict[str, Any]:
-    old, state = read_settings(run), read_checkpoint(run)
+def _read_resumed(settings: Settings, run: Path, goes_on: bool) -> dict[str, Any] | None:
+    """What this process resumes; None if the run was stopped before its first checkpoint."""
     asked = _dotted(settings)
-    for name, before in _dotted(old).items():
+    for name, before in _dotted(read_settings(run)).items():
         fixed = name in FIXED or name.partition(".")[0] not in CHANGEABLE
         if fixed and before != asked[name]:
             raise ValueError(f"the run in {run} has {name} {before!r}, and cannot go on with {asked[name]!r}")
-    if state["iteration"] >= settings.iterations:
+    if not (run / CHECKPOINT).is_file() and not holds_weights(run):
+        _say(f"{run} holds no checkpoint yet: its run starts from the beginning")
+        return None
+    state = read_checkpoint(run)
+    for name, value in state.get("of", {}).items():
+        if value != (now := getattr(settings, name)):
+            raise ValueError(f"{run / CHECKPOINT} is of {name} {value!r}, and not of {now!r} as the run it lies in")
+    if state["iteration"] > settings.iterations or (state["iteration"] == settings.iterations and not goes_on):
         raise ValueError(
             f"the run in {run} already has {state['iteration']} iterations: ask for more than {settings.iterations}"
         )
-    return state
+    steps = state["iteration"] * settings.num_envs * settings.steps_per_iteration
+    # a checkpoint of an older version lacks these two
+    state = {"processes": 1, "env_steps": steps, **state}
+    return _own(state, run)
 
 
 def _dotted(settings: Any) -> dict[str, Any]:
@@ -208,19 +228,30 @@ def _dotted(settings: Any) -> dict[str, Any]:
     return named
 
 
-def _describe(row: Mapping[str, float]) -> str:
-    episodes = "no episode ended"
-    if row["episodes"]:
-        rates = f"success {row['success_rate']:.0%}, collision {row['collision_rate']:.0%}"
-        episodes = f"tip {row['tip_error_mm']:.2f} mm, {rates}"
-    return f"{episodes}, {row['steps_per_s']:,.0f} steps/s"
+def _own(state: dict[str, Any], run: Path) -> dict[str, Any]:
+    """A checkpoint with the environments of this process, or with none if it was written by more or fewer processes."""
+    rank, processes = distributed.rank(), state["processes"]
+    own = state if rank == 0 else read_environments(run, state["iteration"], rank, processes)
+    if processes == distributed.size() and own is not None:
+        return {**state, **{name: own[name] for name in OWN}}
+    if processes != distributed.size():
+        who = f"{processes} process{'es' if processes > 1 else ''}, not {distributed.size()}"
+        _say(f"the checkpoint in {run} is of {who}: what was learned goes on, all environments start anew")
+    else:
+        _say(f"{run} lacks the environments of process {rank}: they start anew", by=rank)
+    return {name: value for name, value in state.items() if name not in OWN}
+
+
+def _say(what: str, by: int = 0) -> None:
+    if distributed.rank() == by:
+        print(f"surgical-marl: {what}", file=sys.stderr, flush=True)
 
 
 @contextmanager
-def _signals() -> Iterator[list[int]]:
+def _signals(training: Training) -> Iterator[list[int]]:
     """Collect Ctrl-C and SIGTERM, so that the iteration ends and is saved.
 
-    A second one stops at once.
+    A second one stops at once, but not one process of several: the others would wait for it.
     """
     received: list[int] = []
     if threading.current_thread() is not threading.main_thread():  # only the main thread may set handlers
@@ -230,9 +261,11 @@ def _signals() -> Iterator[list[int]]:
 
     def receive(number: int, _: FrameType | None) -> None:
         received.append(number)
-        for each, handler in old.items():
-            signal.signal(each, handler)
-        tqdm.write("stopping after this iteration (again to stop at once)", file=sys.stderr)
+        training.stop_wanted = True
+        if distributed.size() == 1:
+            for each, handler in old.items():
+                signal.signal(each, handler)
+            tqdm.write("stopping after this iteration (again to stop at once)", file=sys.stderr)
 
     for number in old:
         signal.signal(number, receive)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping
-from itertools import chain
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from surgical_marl.interfaces.rsl_rl import RslRlVecEnv
+from surgical_marl.learning import distributed, faults
 from surgical_marl.learning.config import Settings
 from surgical_marl.learning.constraint import METRICS
 from surgical_marl.learning.episodes import ENDED, Episodes
@@ -22,10 +22,15 @@ if TYPE_CHECKING:
     from surgical_marl.batch import BatchedEnv
 
 
+OWN = ("env", "collided", "random", "random_cuda")
+"""Parts of `Training.state` that belong to one process alone: of its environments, and its random numbers."""
+
+
 class Report(NamedTuple):
     """What an iteration leaves to be read, on its way from the device."""
 
     iteration: int
+    env_steps: int
     started: float
     values: Tensor
     """On the host: once `arrived`."""
@@ -34,24 +39,29 @@ class Report(NamedTuple):
 
 
 class Training:
-    """A run in memory.
+    """A run in memory, or the part of it that is in this process (see `distributed`).
 
     On a GPU with the fused engine a rollout is one CUDA graph and so is an update: `rollout`, `update` and `iterate`
     enqueue their work and return before it is done.
 
     Args:
         settings: the run.
-        env: its environment, made with `arrays="torch"`.
+        env: its environments in this process, made with `arrays="torch"`.
 
     Attributes:
         iteration: how many have begun.
+        env_steps: steps of all environments of all processes in them.
+        stop_wanted: set it to have all processes stop after the iteration that is under way.
+        stopping: whether a process wanted it, as far as reports have been read.
     """
 
     def __init__(self, settings: Settings, env: BatchedEnv) -> None:
         torch.manual_seed(settings.seed)
         self.settings = settings
-        self.iteration = 0
-        self.env = RslRlVecEnv(env, joint=settings.algo == "joint", seed=settings.seed)
+        self.iteration, self.env_steps = 0, 0
+        self.stop_wanted = self.stopping = False
+        first = distributed.rank() * env.num_envs
+        self.env = RslRlVecEnv(env, joint=settings.algo == "joint", seed=settings.seed, first=first)
         device = str(self.env.device)
         self._cuda = device.startswith("cuda")
         if self._cuda:
@@ -60,15 +70,29 @@ class Training:
         self._observations = self.env.get_observations().clone()
         self.algorithm = MAPPO.construct_algorithm(self._observations, self.env, rsl_rl_config(settings), device)
         self.algorithm.train_mode()
+        if distributed.size() > 1:
+            self.algorithm.broadcast_parameters()
+            torch.manual_seed(distributed.own_seed(settings.seed))  # of the processes' actions
         terms = self.env.reward_terms
         self.episodes = Episodes(env.agents, terms, self.env.layout.num_agents, env.num_envs, device)
         self._bounded = METRICS if self.algorithm.constraint is not None else ()
-        self._names = (*ENDED, *terms, *LOSSES, *self._bounded, "action_std", "finite", "weights")
+        # What `_update` gathers, in order.
+        self._names: dict[str, Sequence[str]] = {
+            "episodes": ENDED[:-1],
+            "rewards": [ENDED[-1], *terms],
+            "losses": [*LOSSES, *self._bounded, "action_std"],
+            "stop": ["stop"],
+            "observations": faults.column_names(self._observations),
+            "values": ["values", "returns"],
+            "weights": [name for name, _ in self._weights()],
+        }
         # All environments start together: let the first episodes end at different times.
         steps = torch.randint(0, max(env.max_steps, 1), (env.num_envs,))
         self.env.episode_length_buf = steps.to(device)
-        self._finite = torch.ones((), device=device)
-        self._values = torch.zeros(len(self._names), device=device)
+        self._stop = torch.zeros(1, device=device)
+        self._marks = torch.zeros(len(self._names["observations"]) + len(self._names["values"]), device=device)
+        self._values = torch.zeros(sum(map(len, self._names.values())), device=device)
+        self._samples = settings.steps_per_iteration * env.num_envs * distributed.size()
         self._read = 0.0
         self.rollout = Replayed(self._rollout, enabled=self._cuda and self.env.capturable)
         self.update = Replayed(self._update, enabled=self._cuda)
@@ -77,14 +101,21 @@ class Training:
         """One rollout and one update; `row` reads its report."""
         started = time.perf_counter()
         self.rollout()
+        self._stop.fill_(self.stop_wanted)
         self.update()
         self.iteration += 1
+        self.env_steps += self._samples
         if not self._cuda:
-            return Report(self.iteration, started, self._values.clone(), None)
+            return Report(self.iteration, self.env_steps, started, self._values.clone(), None)
         host = torch.empty(self._values.shape, pin_memory=True).copy_(self._values, non_blocking=True)
         arrived = torch.cuda.Event()
         arrived.record()
-        return Report(self.iteration, started, host, arrived)
+        return Report(self.iteration, self.env_steps, started, host, arrived)
+
+    def close(self) -> None:
+        """Let the CUDA graphs go."""
+        self.rollout.release()
+        self.update.release()
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -102,37 +133,33 @@ class Training:
         """The metrics of an iteration (see `columns`), when it is done.
 
         Raises:
-            FloatingPointError: an observation, a return, a loss or a weight is not finite.
+            Diverged: something of it is not finite.
         """
         if report.arrived is not None:
             report.arrived.synchronize()
-        found = dict(zip(self._names, report.values.tolist(), strict=True))
-        if not found["finite"]:
-            raise FloatingPointError(
-                f"the environment or a value became NaN in iteration {report.iteration}: "
-                "resume the last checkpoint with a lower ppo.learning_rate"
-            )
-        if not all(map(math.isfinite, (*(found[name] for name in LOSSES), found["weights"]))):
-            raise FloatingPointError(
-                f"the loss became NaN in iteration {report.iteration}: resume the last checkpoint "
-                f"with a lower ppo.learning_rate than {self.settings.ppo.learning_rate:g}"
-            )
+        values = iter(report.values.tolist())
+        sums = {kind: {name: next(values) for name in names} for kind, names in self._names.items()}
+        means = {name: value / distributed.size() for name, value in sums["losses"].items()}
+        if found := faults.find(sums):
+            raise faults.Diverged(report.iteration, found, means["learning_rate"])
+        self.stopping = bool(sums["stop"]["stop"])
         # on a GPU an iteration is enqueued before the last one is done
         now = time.perf_counter()
         seconds = now - max(report.started, self._read)
         self._read = now
-        samples = self.settings.steps_per_iteration * self.env.num_envs
-        share = 1 / found["episodes"] if found["episodes"] else math.nan
+        ended, steps = sums["episodes"], self.settings.steps_per_iteration * distributed.size()
+        share = 1 / ended["episodes"] if ended["episodes"] else math.nan
         row = {
-            **found,
+            **ended,
+            **means,
             "iteration": report.iteration,
-            "env_steps": report.iteration * samples,
+            "env_steps": report.env_steps,
             "seconds": seconds,
-            "steps_per_s": samples / seconds,
-            **{name: found[name] / self.settings.steps_per_iteration for name in ("reward", *self.env.reward_terms)},
-            "tip_error_mm": 1000 * found["error"] * share,
-            "success_rate": found["success"] * share,
-            "collision_rate": found["collision"] * share,
+            "steps_per_s": self._samples / seconds,
+            **{name: value / steps for name, value in sums["rewards"].items()},
+            "tip_error_mm": 1000 * ended["error"] * share,
+            "success_rate": ended["success"] * share,
+            "collision_rate": ended["collision"] * share,
         }
         return {name: row[name] for name in self.columns}
 
@@ -150,33 +177,43 @@ class Training:
             algorithm.compute_returns(observations)
             for name, kept in self._observations.items():
                 kept.copy_(observations[name])
-            stored = [*algorithm.storage.observations.values(), algorithm.storage.returns]
-            self._finite.copy_(torch.stack([part.isfinite().all() for part in stored]).all())
+            stored = algorithm.storage
+            columns = faults.mark_columns(stored.observations, observations)
+            self._marks.copy_(torch.cat([columns, faults.mark([stored.values, stored.returns])]))
 
     def _update(self) -> None:
         """Learns from the rollout, and gathers what `row` reads."""
         losses = self.algorithm.learn()
         std = self.algorithm.actor.output_std.detach().mean()
-        weights = torch.stack([weight.detach().sum() for weight in self._parameters()]).sum()
+        weights = torch.stack([weight.detach().sum() for _, weight in self._weights()])
         parts = [self.episodes.take(), losses]
         if self.algorithm.constraint is not None:
             parts.append(self.algorithm.constraint.metrics())
-        self._values.copy_(torch.cat([*parts, torch.stack([std, self._finite, weights])]))
+        self._values.copy_(torch.cat([*parts, std[None], self._stop, self._marks, weights]))
+        distributed.total(self._values)
 
-    def _parameters(self) -> chain[torch.nn.Parameter]:
-        return chain(self.algorithm.actor.parameters(), self.algorithm.critic.parameters())
+    def _weights(self) -> list[tuple[str, Tensor]]:
+        return [
+            (f"{kind}.{name}", weight)
+            for kind, model in (("actor", self.algorithm.actor), ("critic", self.algorithm.critic))
+            for name, weight in model.named_parameters()
+        ]
 
     def state(self) -> dict[str, Any]:
         """What `set_state` needs to continue bit for bit, as tensors and plain values."""
-        actor = self.algorithm.actor
+        actor, constraint = self.algorithm.actor, self.algorithm.constraint
         return {
             "iteration": self.iteration,
+            "env_steps": self.env_steps,
+            "processes": distributed.size(),
+            "of": {name: getattr(self.settings, name) for name in ("task", "scene", "algo")},
             "groups": {name: _widths(actor, name) for name in actor.counts},
             "algorithm": self.algorithm.save(),
             "env": {
                 **self.env.carry(),
                 "observations": self._observations.to_dict(),
                 "memory": self.algorithm.memory.state_dict(),
+                "broken": None if constraint is None else constraint.broken,
             },
             "collided": self.episodes.collided,
             "random": torch.get_rng_state(),
@@ -184,12 +221,24 @@ class Training:
         }
 
     def set_state(self, state: Mapping[str, Any]) -> None:
-        """Continue from what `state` returned, before the first iteration."""
-        self.iteration = state["iteration"]
-        self.algorithm.load(state["algorithm"])
+        """Continue from what `state` returned, before the first iteration; without `OWN` the environments start anew.
+
+        Raises:
+            ValueError: it is of other agents or networks.
+        """
+        self.iteration, self.env_steps = state["iteration"], state["env_steps"]
+        try:
+            self.algorithm.load(state["algorithm"])
+        except (RuntimeError, ValueError, KeyError):  # with a line for each weight
+            raise ValueError("the networks in the checkpoint are not of the shapes that the settings ask for") from None
+        if "env" not in state:
+            torch.manual_seed(distributed.own_seed(self.settings.seed, self.iteration))
+            return
         self.env.set_carry(state["env"])
         for name, kept in self._observations.items():
             kept.copy_(state["env"]["observations"][name])
+        if self.algorithm.constraint is not None:
+            self.algorithm.constraint.broken.copy_(state["env"]["broken"])
         if self.algorithm.actor.is_recurrent:
             self.algorithm.memory.load_state_dict(state["env"]["memory"])
         self.episodes.collided.copy_(state["collided"])

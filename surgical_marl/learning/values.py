@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from surgical_marl.learning import distributed
+
 DECAY = 0.99
 """What an iteration's returns count of the next one's: the statistics are of about the last hundred iterations."""
 LEAST_STD = 0.01
@@ -36,7 +38,7 @@ class ValueScale(nn.Module):
     def learn(self, returns: Tensor) -> None:
         """Take in the returns `[B, W]` of an iteration, as an exponential average whose first one counts in full."""
         self.weight.mul_(DECAY).add_(1.0)
-        variance, mean = torch.var_mean(returns, dim=0, correction=0)
+        variance, mean = distributed.var_mean(returns, dim=0)
         ahead = mean - self.mean
         self.mean += ahead / self.weight
         self.variance += (variance - self.variance + ahead * (mean - self.mean)) / self.weight

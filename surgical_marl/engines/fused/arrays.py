@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from abc import ABC, abstractmethod
 from typing import Any
 
 import numpy as np
 
+from surgical_marl.engines.common import free_memory
 from surgical_marl.engines.fused.program import Leaf, Source
 from surgical_marl.runtime import prepare_warp
 
@@ -24,10 +24,12 @@ def make_arrays(device: str, source: Source, stride: int, num_envs: int) -> Arra
 class Arrays(ABC):
     """`all` is what `Kernel.launch` takes; columns from `num_envs` on are padding."""
 
+    device: str
+
     def __init__(self, source: Source, stride: int, num_envs: int) -> None:
         self.num_envs, self.stride = num_envs, stride
         each = sum(np.dtype(dtype).itemsize * max(source.sizes[name], 1) for name, dtype in _TYPES.items())
-        room = self._room()
+        room = free_memory(self.device)
         if room is not None and 2 * each * stride > room:  # what is read is copied
             raise ValueError(
                 f"num_envs {num_envs} does not fit into memory: one environment takes {2 * each} bytes, so that "
@@ -58,10 +60,6 @@ class Arrays(ABC):
     @abstractmethod
     def _warp(self, array: Any) -> Any: ...
 
-    @abstractmethod
-    def _room(self) -> int | None:
-        """Bytes of memory that are free, None if nobody knows."""
-
     def rows(self, leaf: Leaf) -> Any:
         """The fields of a leaf, [size, N], of the device's own library: a view."""
         return self._buffers[leaf.buffer][leaf.first : leaf.first + leaf.size, : self.num_envs]
@@ -70,13 +68,10 @@ class Arrays(ABC):
 class CpuArrays(Arrays):
     """numpy arrays."""
 
+    device = "cpu"
+
     def _zeros(self, fields: int, stride: int, dtype: Any) -> Any:
         return np.zeros((fields, stride), dtype)
-
-    def _room(self) -> int | None:
-        if not hasattr(os, "sysconf") or "SC_AVPHYS_PAGES" not in os.sysconf_names:
-            return None
-        return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
     def _constant(self, table: np.ndarray) -> Any:
         return table
@@ -120,15 +115,12 @@ class CpuArrays(Arrays):
 class CudaArrays(Arrays):
     """torch tensors on the GPU."""
 
+    device = "cuda"
+
     def _zeros(self, fields: int, stride: int, dtype: Any) -> Any:
         import torch
 
         return torch.zeros((fields, stride), dtype=torch.from_numpy(np.zeros(1, dtype)).dtype, device="cuda")
-
-    def _room(self) -> int | None:
-        import torch
-
-        return int(torch.cuda.mem_get_info()[0])
 
     def _constant(self, table: np.ndarray) -> Any:
         import torch

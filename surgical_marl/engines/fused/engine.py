@@ -60,9 +60,9 @@ class FusedEngine:
         self._pool = ThreadPoolExecutor(shares, "surgical_marl") if shares > 1 else None
         self._stepped = False
 
-    def reset(self, seed: int) -> None:
-        """First episodes. Environment i depends on `seed` and i alone, not on how many there are."""
-        self.write(".key", episode_keys(seed, self.num_envs))
+    def reset(self, seed: int, first: int = 0) -> None:
+        """First episodes. Environment i depends on `seed` and `first` + i alone, not on how many there are."""
+        self.write(".key", episode_keys(seed, self.num_envs, first))
         self.write(".episode", np.zeros(self.num_envs, np.int32))
         self._launch("reset")
         self._stepped = False

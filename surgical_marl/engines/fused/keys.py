@@ -8,13 +8,13 @@ ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
 PARITY = np.uint32(0x1BD11BDA)
 
 
-def episode_keys(seed: int, count: int) -> np.ndarray:
-    """`jax.random.fold_in(jax.random.PRNGKey(seed), i)` for i = 0 to count - 1, [count, 2] uint32.
+def episode_keys(seed: int, count: int, first: int = 0) -> np.ndarray:
+    """`jax.random.fold_in(jax.random.PRNGKey(seed), first + i)` for i = 0 to count - 1, [count, 2] uint32.
 
     The engine that JAX runs, MJX, has the same keys.
     """
     key = np.array([0, seed & 0xFFFFFFFF], np.uint32)  # JAX takes 32 bits of a seed
-    return np.stack(_threefry(key, np.zeros(count, np.uint32), np.arange(count, dtype=np.uint32)), -1)
+    return np.stack(_threefry(key, np.zeros(count, np.uint32), np.arange(first, first + count, dtype=np.uint32)), -1)
 
 
 def _threefry(key: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

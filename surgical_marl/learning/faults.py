@@ -1,0 +1,75 @@
+"""Where an iteration stopped being finite. Faults are found on the device, and read with the metrics."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+KINDS = ("observations", "rewards", "values", "losses", "weights")
+"""What can be at fault, in the order in which a fault spreads."""
+
+
+class Diverged(FloatingPointError):
+    """An iteration is not finite.
+
+    Attributes:
+        iteration: which one.
+        found: for each of `KINDS` that is at fault the names of what is NaN or infinite.
+        learning_rate: of that iteration, as far as it is known.
+    """
+
+    def __init__(self, iteration: int, found: Mapping[str, Sequence[str]], learning_rate: float) -> None:
+        self.iteration, self.found, self.learning_rate = iteration, dict(found), learning_rate
+        kind = next(kind for kind in KINDS if kind in found)
+        names = ", ".join(found[kind][:3]) + (f" and {len(found[kind]) - 3} more" if len(found[kind]) > 3 else "")
+        super().__init__(
+            f"{kind} became NaN or infinite in iteration {iteration} ({names}): "
+            f"resume the last checkpoint with a lower ppo.learning_rate than {learning_rate:g}"
+        )
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """All of it, as JSON can hold it."""
+        rate = self.learning_rate if math.isfinite(self.learning_rate) else None
+        return {"iteration": self.iteration, "not_finite": self.found, "learning_rate": rate}
+
+
+def find(values: Mapping[str, Mapping[str, float]]) -> dict[str, list[str]]:
+    """Names of what is not finite of each kind; kinds that are fine are left out."""
+    bad = {kind: [name for name, value in values[kind].items() if not math.isfinite(value)] for kind in KINDS}
+    return {kind: names for kind, names in bad.items() if names}
+
+
+def column_names(observations: TensorDict) -> list[str]:
+    """Names of what `mark_columns` returns, such as "psm[3]"."""
+    return [f"{name}[{column}]" for name, group in _numbers(observations) for column in range(group.shape[-1])]
+
+
+def mark_columns(stored: TensorDict, after: TensorDict) -> Tensor:
+    """For each column of the groups `[T, N, ..., d]` of a rollout, and of those `[N, ..., d]` after it: 0, or NaN if a
+    value in it is not finite in the first step in which any is not. From then on, faults spread. Pictures have no
+    columns."""
+    rows = [_numbers(stored), [(name, group.unsqueeze(0)) for name, group in _numbers(after)]]
+    finite = [torch.cat([group.flatten(1, -2).isfinite().all(1) for _, group in groups], -1) for groups in rows]
+    bad = ~torch.cat(finite)
+    first = bad & (bad.any(1, keepdim=True).cumsum(0) == 1)
+    return _mark(~first.any(0))
+
+
+def mark(parts: Iterable[Tensor]) -> Tensor:
+    """For each part: 0, or NaN if a value in it is not finite."""
+    return _mark(torch.stack([part.isfinite().all() for part in parts]))
+
+
+def _numbers(observations: TensorDict) -> list[tuple[str, Tensor]]:
+    groups: dict[str, Any] = dict(observations.items())
+    return [(name, group) for name, group in groups.items() if group.is_floating_point()]
+
+
+def _mark(finite: Tensor) -> Tensor:
+    return 0.0 / finite.float()

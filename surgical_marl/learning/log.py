@@ -1,0 +1,84 @@
+"""What a run says of itself while it trains: `metrics.csv`, tensorboard and a progress bar."""
+
+from __future__ import annotations
+
+import csv
+import math
+import os
+import sys
+from collections import deque
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from surgical_marl.learning.run import METRICS, format_row
+from surgical_marl.learning.training import Report, Training
+
+
+class Reports:
+    """Reads an iteration's report when the next one is under way, so that a GPU has always something to do."""
+
+    def __init__(self, training: Training, write: Callable[[dict[str, float]], None]) -> None:
+        self._training, self._write, self._waiting = training, write, deque[Report]()
+        self._lag = 1 if training.env.device == "cuda" else 0
+
+    def add(self, report: Report) -> None:
+        """Take a report; read those whose iteration should be done."""
+        self._waiting.append(report)
+        self._read(self._lag)
+
+    def catch_up(self) -> None:
+        """Read all reports."""
+        self._read(0)
+
+    def _read(self, left: int) -> None:
+        while len(self._waiting) > left:
+            self._write(self._training.row(self._waiting.popleft()))
+
+
+class Log:
+    """`metrics.csv`, tensorboard and the progress bar of a run."""
+
+    def __init__(self, training: Training, out: Path) -> None:
+        from torch.utils.tensorboard import SummaryWriter  # takes a second to import
+
+        self._columns = training.columns
+        self._files = ExitStack()
+        self._csv = self._files.enter_context((out / METRICS).open("a", newline=""))
+        board = SummaryWriter(str(out / "tensorboard"), purge_step=training.iteration + 1)
+        self._board = self._files.enter_context(board)
+        total, begun = training.settings.iterations, training.iteration
+        self._bar = self._files.enter_context(
+            tqdm(initial=begun, total=total, unit="it", file=sys.stderr, dynamic_ncols=True)
+        )
+
+    def __enter__(self) -> Log:
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        self._files.close()
+
+    def write(self, row: dict[str, float]) -> None:
+        """Write an iteration's metrics."""
+        csv.writer(self._csv).writerow(format_row(row))
+        self._csv.flush()
+        for name in self._columns[1:]:
+            if math.isfinite(row[name]):
+                self._board.add_scalar(name, row[name], row["iteration"])
+        self._bar.set_postfix_str(_describe(row), refresh=False)
+        self._bar.update()
+
+    def keep(self) -> None:
+        """Return when what was written would survive a power loss."""
+        os.fsync(self._csv.fileno())
+
+
+def _describe(row: Mapping[str, float]) -> str:
+    episodes = "no episode ended"
+    if row["episodes"]:
+        rates = f"success {row['success_rate']:.0%}, collision {row['collision_rate']:.0%}"
+        episodes = f"tip {row['tip_error_mm']:.2f} mm, {rates}"
+    return f"{episodes}, {row['steps_per_s']:,.0f} steps/s"
