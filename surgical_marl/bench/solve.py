@@ -30,7 +30,7 @@ from surgical_marl.learning.training import Training
 
 EPISODES, SEED = 200, 0
 """Of the standard goal sets."""
-EAGER, PATIENT = 0.2, 0.05
+EAGER, PATIENT = 1 / 3, 0.05
 """Share of the time since the last evaluation that one may take: where training's own success promises the goal, and
 elsewhere."""
 
@@ -176,7 +176,7 @@ class Looks:
 
     Training's own success, of actions with noise, is less than what the evaluation will show: at first a quarter of the
     goal is worth a look. Once both are known for some iteration, a line from there to where both are 1 says at what
-    training success the goal may be met. Above that an evaluation may take a fifth of the time since the last one;
+    training success the goal may be met. Above that an evaluation may take a third of the time since the last one;
     below, a twentieth, lest the line be wrong.
     """
 
