@@ -277,6 +277,7 @@ def _train(arguments: argparse.Namespace) -> None:
     from surgical_marl.learning.run import has_begun, read_settings
 
     overrides, resume = [*flags, *arguments.overrides], arguments.resume
+    claim_gpu("cpu" if "device=cpu" in overrides else "auto")  # first: to look for a GPU is to start CUDA
     if resume and None not in (arguments.task, arguments.scene) and not has_begun(resume):
         resume = None  # the same command starts a run and goes on with it, however early it was killed
     if resume:
@@ -287,7 +288,6 @@ def _train(arguments: argparse.Namespace) -> None:
     else:
         settings = load_config(arguments.task, arguments.scene, overrides)
     out = arguments.out or arguments.resume or _run_folder(settings)
-    claim_gpu(settings.device)
 
     from surgical_marl.evaluation.command import judge
     from surgical_marl.learning.train import train
