@@ -43,7 +43,8 @@ def report(jobs: Sequence[Job], out: Path, results: Path) -> None:
     text = page.read_text() if page.is_file() else f"{BEGIN}\n{END}\n"
     before, _, rest = text.partition(BEGIN)
     after = rest.partition(END)[2]
-    tables = f"{BEGIN}\n\n{about(found)}\n\n{final_table(found)}\n\n{broken_table(found)}\n\n{END}"
+    picture = "![success and collisions while training](study.png)"
+    tables = f"{BEGIN}\n\n{picture}\n\n{about(found)}\n\n{final_table(found)}\n\n{broken_table(found)}\n\n{END}"
     write_atomic(page, lambda path: path.write_text(before + tables + after))
 
 
