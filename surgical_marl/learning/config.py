@@ -63,7 +63,7 @@ class ConstraintSettings(_Checked):
     cost: Literal["none", "collision", "distance", "force", "limit", "speed"] = "none"
     limit: float = _number(0.005, 0.0, 1.0)
     kp: float = _number(10.0, 0.0, 1e6)
-    ki: float = _number(1.0, 0.0, 1e6)
+    ki: float = _number(5.0, 0.0, 1e6)
     kd: float = _number(10.0, 0.0, 1e6)
 
 
