@@ -61,6 +61,9 @@ def main() -> int:
             parser.error(str(unknown("policy", name, list(PLACES))))
     # Several processes share one GPU: JAX must not take most of its memory for each.
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+    # They share the cores too: torch's threads wait for each other by spinning, and with more of them than cores a CPU
+    # does little else.
+    os.environ.setdefault("OMP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // arguments.jobs)))
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     todo = [job for name in names for job in _jobs(name, arguments, overrides)]
     failed = run(todo, arguments.jobs)
