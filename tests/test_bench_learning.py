@@ -129,7 +129,7 @@ def test_looks_are_worth_their_time() -> None:
     looks.add(0.4, exam(0.8), learning=100.0, took=1.0)
     # (0.4, 0.8) and (1, 1): 0.9 is expected at 0.7
     assert not looks.due(0.69, 119.0) and looks.due(0.69, 121.0), "a twentieth of the time"
-    assert not looks.due(0.71, 104.0) and looks.due(0.71, 106.0), "a fifth of the time"
+    assert not looks.due(0.71, 102.5) and looks.due(0.71, 103.5), "a third of the time"
     looks.add(0.7, exam(0.95, collisions=0.02), learning=200.0, took=1.0)
     assert looks.due(0.7, 206.0), "only collisions are too many"
 

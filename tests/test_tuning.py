@@ -10,7 +10,6 @@ from typing import Any
 
 import pytest
 
-pytest.importorskip("optuna", reason="the extra `tune` is not installed")
 sys.path.insert(0, str(Path(__file__).parent.parent / "docs"))
 import tuning
 
