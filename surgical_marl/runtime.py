@@ -143,6 +143,13 @@ def prepare_warp() -> Any:
     return warp
 
 
+def has_cuda() -> bool:
+    """Whether PyTorch, whose arrays the fused engine works on there, finds a CUDA device."""
+    import torch
+
+    return bool(torch.cuda.is_available())
+
+
 def _has_gpu() -> bool:
     return Path("/dev/nvidiactl").exists()
 

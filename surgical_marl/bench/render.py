@@ -13,8 +13,8 @@ import numpy as np
 import torch
 
 from surgical_marl.bench import clock
-from surgical_marl.bench.workload import has_cuda
 from surgical_marl.endoscope import SIZE, Endoscope
+from surgical_marl.runtime import has_cuda
 from surgical_marl.scene import Scene, load_scene
 
 NUM_ENVS = {"cpu": 64, "cuda": 8192}

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from surgical_marl.bench.course import MOTIONS
 from surgical_marl.content import find, list_tasks, unknown
 from surgical_marl.engines.choose import DEVICES
+from surgical_marl.runtime import has_cuda
 
 NUM_ENVS = {"cpu": 4096, "cuda": 131072}
 """Environments on each device, unless told."""
@@ -52,10 +53,3 @@ class Workload:
     def count(self) -> int:
         """Environments."""
         return self.num_envs or NUM_ENVS[self.where]
-
-
-def has_cuda() -> bool:
-    """Whether PyTorch, whose arrays the fused engine works on there, finds a CUDA device."""
-    import torch
-
-    return bool(torch.cuda.is_available())

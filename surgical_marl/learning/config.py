@@ -13,6 +13,7 @@ from typing import Any, ClassVar, Literal, Union, get_args, get_origin, get_type
 import yaml
 
 from surgical_marl.content import content_dir, unknown
+from surgical_marl.runtime import has_cuda
 
 
 def _number(default: Any, low: float, high: float) -> Any:
@@ -151,7 +152,7 @@ def load_config(task: str, scene: str, overrides: Iterable[str] = ()) -> Setting
         _reject_unknown(section, without=("task", "scene"))
     overrides = list(overrides)
     device = _override(_merge(values, own), overrides).get("device", "auto")
-    if on_gpu and (device == "cuda" or (device == "auto" and _has_gpu())):
+    if on_gpu and (device == "cuda" or (device == "auto" and has_cuda())):
         values = _merge(values, on_gpu)
     return _build({**_override(_merge(values, own), overrides), "task": task, "scene": scene})
 
@@ -170,12 +171,6 @@ def config_text(settings: Settings, notes: Mapping[str, Mapping[str, Any]]) -> s
     values = asdict(settings)
     values["network"]["hidden"] = list(settings.network.hidden)
     return yaml.safe_dump({**values, **notes}, sort_keys=False)
-
-
-def _has_gpu() -> bool:
-    import torch
-
-    return torch.cuda.is_available()
 
 
 def _read_yaml(path: Path) -> dict[str, Any]:
