@@ -29,9 +29,10 @@ class BatchStep(NamedTuple):
 
     observations: dict[str, Any]
     """[N, d]; of the next episode where one ended. A dict of them for an agent that sees pictures
-    (`surgical_marl/pictures.py`), and so is `state`."""
+    (`surgical_marl/pictures.py`)."""
     state: Any
-    """[N, S], the whole state for a centralised critic, likewise."""
+    """[N, S], the whole state for a centralised critic, likewise: all observations but pictures, and what of the goal
+    no agent is told (`Task.hidden`)."""
     rewards: dict[str, Any]
     terminated: Any
     """[N] bool"""
@@ -104,7 +105,6 @@ class BatchedEnv:
 
         self._pictures = Pictures(self.env, self.num_envs, self.device, self.arrays)
         self._observation_spaces[agent] = Pictures.space(self.env.observation_space(agent))
-        self.state_space = Pictures.space(self.env.state_space)
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
         """Of one environment: a Box, or a Dict for an agent that sees pictures."""

@@ -154,7 +154,8 @@ class Env:
     @property
     def state_space(self) -> spaces.Box:
         """Bounds of `State.state`."""
-        low, high = (np.concatenate([self._bounds[agent][i] for agent in self.agents]) for i in (0, 1))
+        hidden = self.task.hidden_bounds
+        low, high = (np.concatenate([*(self._bounds[agent][i] for agent in self.agents), hidden[i]]) for i in (0, 1))
         return spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
 
     def reset(self, key: Array, episode: Array | int = 0) -> State:
@@ -232,7 +233,8 @@ class Env:
             agent: jnp.clip(observation.astype(jnp.float32), *(b.astype(np.float32) for b in self._bounds[agent]))
             for agent, observation in self.task.observations(views, carry.goal).items()
         }
-        return observations, jnp.concatenate([observations[agent] for agent in self.agents])
+        hidden = self.task.hidden(carry.goal)
+        return observations, jnp.concatenate([*(observations[agent] for agent in self.agents), hidden])
 
     def _infos(
         self, views: dict[str, ArmView], before: Carry, after: Carry, terms: dict[str, dict[str, Array]]

@@ -122,6 +122,15 @@ class Task:
             highs += [2 * space, 2 * space[:1]]
         return np.concatenate(lows), np.concatenate(highs)
 
+    def hidden(self, goal: Any) -> Array:
+        """[h]: what the state holds besides all observations, of the goal what no agent is told."""
+        return jnp.zeros(0, jnp.float32)
+
+    @property
+    def hidden_bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Least and greatest of `hidden`, [h] each."""
+        return np.zeros(0), np.zeros(0)
+
     def terms(self, views: Views, goal: Any) -> dict[str, dict[str, Array]]:
         """agent -> reward term -> its value before weighting, for the step that led here. `distance` of tip and target
         in m; `precision`, 1 at the target; `clearance`, up to 1 as another arm comes nearer than `CLEARANCE`;

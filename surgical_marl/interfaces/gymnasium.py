@@ -19,7 +19,7 @@ from gymnasium.vector.utils import batch_space
 
 from surgical_marl.batch import BatchedEnv
 from surgical_marl.interfaces.pettingzoo import RENDER_MODES
-from surgical_marl.observations import each
+from surgical_marl.observations import each, proprioception
 
 
 class SurgicalEnv(gymnasium.Env[Any, np.ndarray]):
@@ -43,9 +43,9 @@ class SurgicalEnv(gymnasium.Env[Any, np.ndarray]):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Starts an episode. With a seed the same one each time; without, the next of the last seed's episodes."""
         super().reset(seed=seed)
-        _, state, infos = self.batch.reset(seed)
+        observations, _, infos = self.batch.reset(seed)
         self._over = False
-        return each(state, lambda part: np.array(part[0])), _joint_info(infos, 0)
+        return _joint(observations, 0), _joint_info(infos, 0)
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """One control step. ValueError for a wrong shape, a value that is not finite, or an episode that is over."""
@@ -55,8 +55,7 @@ class SurgicalEnv(gymnasium.Env[Any, np.ndarray]):
         terminated, truncated = bool(step.terminated[0]), bool(step.truncated[0])
         self._over = terminated or truncated
         reward = float(sum(reward[0] for reward in step.rewards.values()))
-        seen = each(step.final_state, lambda part: np.array(part[0]))
-        return seen, reward, terminated, truncated, _joint_info(step.infos, 0)
+        return _joint(step.final_observations, 0), reward, terminated, truncated, _joint_info(step.infos, 0)
 
     def render(self) -> np.ndarray | None:
         """A picture [H, W, 3] uint8 with render_mode="rgb_array", else None."""
@@ -91,8 +90,8 @@ class SurgicalVectorEnv(VectorEnv[Any, np.ndarray, Any]):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Starts all environments anew."""
-        _, state, infos = self.batch.reset(seed)
-        return each(state, np.array), _joint_info(infos)
+        observations, _, infos = self.batch.reset(seed)
+        return _joint(observations), _joint_info(infos)
 
     def step(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """One control step of all environments: arrays [N, ...]."""
@@ -100,15 +99,34 @@ class SurgicalVectorEnv(VectorEnv[Any, np.ndarray, Any]):
         info = _joint_info(step.infos)
         done = step.terminated | step.truncated
         if done.any():
-            info["final_obs"] = each(step.final_state, np.array)
+            info["final_obs"] = _joint(step.final_observations)
             info["_final_obs"] = np.array(done)
         rewards = np.sum(list(step.rewards.values()), axis=0)
-        return each(step.state, np.array), rewards, np.array(step.terminated), np.array(step.truncated), info
+        return _joint(step.observations), rewards, np.array(step.terminated), np.array(step.truncated), info
 
 
 def _joint_spaces(batch: BatchedEnv) -> tuple[spaces.Space[Any], spaces.Box]:
+    """Of what all arms observe, with the pictures if one sees any, and of what all do."""
+    boxes = [batch.env.observation_space(agent) for agent in batch.agents]
+    low, high = (np.concatenate([getattr(box, end) for box in boxes]) for end in ("low", "high"))
+    box = spaces.Box(low, high, dtype=np.float32)
+    observed: spaces.Space[Any] = box
+    if batch.env.task.camera is not None:
+        from surgical_marl.pictures import Pictures
+
+        observed = Pictures.space(box)
     width = sum(batch.action_space(agent).shape[0] for agent in batch.agents)
-    return batch.state_space, spaces.Box(-1.0, 1.0, (width,), np.float32)
+    return observed, spaces.Box(-1.0, 1.0, (width,), np.float32)
+
+
+def _joint(observations: dict[str, Any], index: int | None = None) -> Any:
+    """What all arms observe as one array, in a dict with the pictures if one sees any; of one environment or of all."""
+    chosen: Any = slice(None) if index is None else index
+    felt = np.concatenate([proprioception(seen)[chosen] for seen in observations.values()], -1)
+    for seen in observations.values():
+        if isinstance(seen, dict):
+            return {**each(seen, lambda part: np.array(part[chosen])), "proprioception": felt}
+    return felt
 
 
 def _split(batch: BatchedEnv, actions: np.ndarray) -> dict[str, np.ndarray]:

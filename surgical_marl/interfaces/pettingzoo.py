@@ -19,8 +19,6 @@ import numpy as np
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
-from surgical_marl.observations import each
-
 if TYPE_CHECKING:
     from surgical_marl.batch import BatchedEnv, BatchStep
 
@@ -62,7 +60,7 @@ class SurgicalParallelEnv(ParallelEnv[str, Any, Any]):
         """Starts an episode. With a seed the same one each time; without, the next of the last seed's episodes."""
         observations, state, infos = self.batch.reset(seed)
         self.agents = list(self.possible_agents)
-        self._state = each(state, self._first)
+        self._state = self._first(state)
         return self._firsts(observations), self._firsts(infos)
 
     def step(self, actions: dict[str, Any]) -> tuple[dict[str, Any], ...]:
@@ -75,7 +73,7 @@ class SurgicalParallelEnv(ParallelEnv[str, Any, Any]):
             raise ValueError("the episode is over: call reset() before step()")
         step = self.batch.step({agent: np.asarray(action)[None] for agent, action in actions.items()})
         terminated, truncated = bool(step.terminated[0]), bool(step.truncated[0])
-        self._state = each(step.final_state, self._first)
+        self._state = self._first(step.final_state)
         outcome = (
             self._firsts(step.final_observations),
             {agent: float(reward[0]) for agent, reward in step.rewards.items()},
@@ -88,7 +86,7 @@ class SurgicalParallelEnv(ParallelEnv[str, Any, Any]):
         return outcome
 
     def state(self) -> Any:
-        """The whole state [S] that a centralised critic sees; with pictures a dict."""
+        """The whole state [S] that a centralised critic sees."""
         if self._state is None:
             raise ValueError("no state yet: call reset() first")
         return self._state

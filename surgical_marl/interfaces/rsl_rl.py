@@ -167,7 +167,7 @@ class RslRlVecEnv(VecEnv):
         self._observations = TensorDict(groups, batch_size=[self.num_envs])
 
     def _group(self, observations: Mapping[str, Any], state: Any) -> TensorDict:
-        groups = {**self.layout.stack(observations), "state": proprioception(state).clone()}
+        groups = {**self.layout.stack(observations), "state": state.clone()}
         return TensorDict(groups, batch_size=[self.num_envs])
 
 

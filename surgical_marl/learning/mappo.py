@@ -25,7 +25,6 @@ from surgical_marl.learning.models import Gaussian, MultiAgentActor, MultiAgentM
 from surgical_marl.learning.recurrent import Memory
 from surgical_marl.learning.storage import MultiAgentStorage
 from surgical_marl.learning.values import ValueScale
-from surgical_marl.learning.vision import PICTURES
 
 LOSSES = ("value_loss", "surrogate_loss", "entropy", "kl", "learning_rate")
 LEARNING_RATE_RANGE = (1e-5, 1e-2)  # rsl_rl's limits of the adaptive learning rate
@@ -233,10 +232,7 @@ class MAPPO(PPO):
         num_values = per_agent * layout.num_agents
         actor = MultiAgentActor(obs, layout.action_sizes, **cfg["actor"]).to(device)
         if cfg["centralised_critic"]:
-            # in the state's pictures agents are no axis: they are those of the one agent that has any
-            seen = {name: pictures[:, 0] for name, pictures in obs.items() if name.endswith(PICTURES)}
-            sample = TensorDict({"state": obs["state"], **seen}, batch_size=obs.batch_size)
-            critic: nn.Module = make_model(sample, ["state", *seen], num_values, **cfg["critic"])
+            critic: nn.Module = make_model(obs, ["state"], num_values, **cfg["critic"])
         else:
             critic = MultiAgentModel(obs, dict.fromkeys(layout.counts, per_agent), **cfg["critic"])
         steps = cfg["num_steps_per_env"]

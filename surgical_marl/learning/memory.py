@@ -10,7 +10,6 @@ from surgical_marl.engines.common import free_memory
 from surgical_marl.interfaces.rsl_rl import Layout
 from surgical_marl.learning.config import Settings
 from surgical_marl.learning.policy import zeros
-from surgical_marl.observations import proprioception
 
 if TYPE_CHECKING:
     from surgical_marl.batch import BatchedEnv
@@ -24,7 +23,7 @@ def rollout_bytes(settings: Settings, env: BatchedEnv) -> int:
     that is bounded, value and return."""
     layout = Layout(env, joint=settings.algo == "joint")
     seen = layout.stack({agent: zeros(env.observation_space(agent)) for agent in layout.agents})
-    parts = [*seen.values(), proprioception(zeros(env.state_space))]
+    parts = [*seen.values(), zeros(env.state_space)]
     observed = sum(part.numel() * part.element_size() for part in parts)
     each = 5 if settings.constraint.cost == "none" else 8
     return settings.steps_per_iteration * (observed + 4 * (3 * layout.num_actions + each * layout.num_agents) + 1)

@@ -4,13 +4,14 @@ Agents        every arm of the scene. The first arm with a camera matches the pi
               target picture shows their tools at home.
 Observation   of the camera's agent a dict: "proprioception" (joint positions and velocities, tool tip, position
               targets; with other arms also as in `reach`), "image" and "target" (what its left eye sees and what it
-              should see, uint8 [64, 64, 3]). Of the others the proprioception alone. Nothing tells the hidden pose.
+              should see, uint8 [64, 64, 3]). Of the others the proprioception alone. Nothing tells the hidden pose, but
+              the state, which a critic may learn from: it ends with the joint positions there.
 Action        one number in [-1, 1] for every joint; the jaw opens above 0 and closes otherwise.
 Reward        per agent, each step, weights in brackets. The camera's: `image`, the mean absolute difference of the two
               pictures, from 0 to 1 (-10): the paper's, which has no absolute value. Options that help learning and are
-              off: `distance` of the camera from the hidden pose (0 / m), `angle` between both views (0 / rad). The
-              others': `stray`, distance of the tip from home (-10 / m). All: `clearance` (-1) and `collision` (-2), as
-              in `reach`.
+              off here, though not in `configs/`: `distance` of the camera from the hidden pose (0 / m), `precision`,
+              exp(-distance / 5 mm) (0), `angle` between both views (0 / rad). The others': `stray`, distance of the tip
+              from home (-10 / m). All: `clearance` (-1) and `collision` (-2), as in `reach`.
 Success       camera within 2 mm of the hidden pose; `angle_error` (rad) and `image_error` (grey levels, 0 to 255) are
               metrics of the camera's agent beside it.
 Termination   none; an episode is truncated after 100 control steps (2 s).
@@ -65,7 +66,10 @@ class Task(task.Task):
     `surgical_marl/pictures.py`."""
 
     levels = {"easy": Level(0.01, 0.0), "default": Level(0.02, 0.0), "hard": Level(0.04, 0.0)}  # noqa: RUF012
-    weights = {"image": -10.0, "distance": 0.0, "angle": 0.0, "stray": -10.0, "clearance": -1.0, "collision": -2.0}  # noqa: RUF012
+    weights = {  # noqa: RUF012
+        "image": -10.0, "distance": 0.0, "precision": 0.0, "angle": 0.0, "stray": -10.0, "clearance": -1.0,
+        "collision": -2.0,
+    }  # fmt: skip
 
     def __init__(self, scene: Scene, difficulty: str = "default", reward: Mapping[str, float] | None = None) -> None:
         super().__init__(scene, difficulty, reward)
@@ -81,6 +85,7 @@ class Task(task.Task):
             tips.append(mount.arm.forward_kinematics(q)[:, :3, 3])
             if agent == self.camera:
                 self._turns = jnp.asarray(self._turn(q), jnp.float32)
+                self._postures = jnp.asarray(q, jnp.float32)
         self._tips = jnp.asarray(np.stack(tips, axis=1), jnp.float32)
 
     def start(self, key: Array) -> PictureGoal:
@@ -98,6 +103,15 @@ class Task(task.Task):
         low, high = (np.concatenate(self._without_targets(agent, bound)) for bound in super().bounds(agent))
         return low, high
 
+    def hidden(self, goal: PictureGoal) -> Array:
+        """Joint positions of the camera's arm at the hidden pose."""
+        return self._postures[goal.row]
+
+    @property
+    def hidden_bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Limits of those joints."""
+        return self._arm.lower, self._arm.upper
+
     def terms(self, views: Views, goal: PictureGoal) -> dict[str, dict[str, Array]]:
         """agent -> reward term -> its value. `image` is 0 here: pictures are compared where they are drawn."""
         errors, safety, none = self.tip_errors(views, goal), super().terms(views, goal), jnp.float32(0.0)
@@ -105,6 +119,7 @@ class Task(task.Task):
             agent: {
                 "image": none,
                 "distance": errors[agent] if agent == self.camera else none,
+                "precision": safety[agent]["precision"] if agent == self.camera else none,
                 "angle": self.angle_error(views, goal) if agent == self.camera else none,
                 "stray": none if agent == self.camera else errors[agent],
                 **{name: safety[agent][name] for name in ("clearance", "collision")},
