@@ -141,13 +141,10 @@ def train(task: str, scene: str, run: Path, overrides: Sequence[str]) -> None:
 
     from surgical_marl.learning import train as learning
     from surgical_marl.learning.config import load_config
-    from surgical_marl.learning.run import CHECKPOINT, read_checkpoint
+    from surgical_marl.learning.run import CONFIG
 
-    settings = load_config(task, scene, overrides)
-    started = (run / CHECKPOINT).is_file()
-    if started and read_checkpoint(run)["iteration"] >= settings.iterations:
-        return
-    learning.train(settings, out=run, resume=run if started else None)
+    # a run has its settings from the start, even if it was stopped before its first checkpoint
+    learning.train(load_config(task, scene, overrides), out=run, resume=run if (run / CONFIG).is_file() else None)
 
 
 def export(runs: Sequence[str], out: Path) -> None:

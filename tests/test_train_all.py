@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -12,6 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+
+from surgical_marl.learning.run import CONFIG, read_metrics
 
 ROOT = Path(__file__).parents[1]
 
@@ -70,6 +73,17 @@ def test_who_stops_it_stops_what_it_started(number: int, tmp_path: Path) -> None
     process.send_signal(number)
     process.wait(30)
     assert _wait_for(lambda: not any(_alive(child) for child in children))
+
+
+def test_a_run_that_was_stopped_goes_on_from_wherever_it_was(script: Any, tmp_path: Path) -> None:
+    small = ["num_envs=4", "steps_per_iteration=4", "iterations=2", "device=cpu"]
+    run, unbroken = tmp_path / "run", tmp_path / "unbroken"
+    script.train("reach", "psm", unbroken, small)
+    run.mkdir()
+    shutil.copy(unbroken / CONFIG, run)  # stopped before its first checkpoint
+    for overrides in ([*small, "iterations=1"], small, small):  # stopped after an iteration; then it is done
+        script.train("reach", "psm", run, overrides)
+    assert [row["reward"] for row in read_metrics(run)] == [row["reward"] for row in read_metrics(unbroken)]
 
 
 def test_a_name_that_is_no_policy() -> None:
