@@ -32,7 +32,7 @@ class BatchStep(NamedTuple):
     (`surgical_marl/pictures.py`)."""
     state: Any
     """[N, S], the whole state for a centralised critic, likewise: all observations but pictures, and what of the goal
-    no agent is told (`Task.hidden`)."""
+    no agent is told (`Task.privileged`)."""
     rewards: dict[str, Any]
     terminated: Any
     """[N] bool"""

@@ -154,8 +154,8 @@ class Env:
     @property
     def state_space(self) -> spaces.Box:
         """Bounds of `State.state`."""
-        hidden = self.task.hidden_bounds
-        low, high = (np.concatenate([*(self._bounds[agent][i] for agent in self.agents), hidden[i]]) for i in (0, 1))
+        every = [*(self._bounds[agent] for agent in self.agents), self.task.privileged_bounds]
+        low, high = map(np.concatenate, zip(*every, strict=True))
         return spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
 
     def reset(self, key: Array, episode: Array | int = 0) -> State:
@@ -233,8 +233,8 @@ class Env:
             agent: jnp.clip(observation.astype(jnp.float32), *(b.astype(np.float32) for b in self._bounds[agent]))
             for agent, observation in self.task.observations(views, carry.goal).items()
         }
-        hidden = self.task.hidden(carry.goal)
-        return observations, jnp.concatenate([*(observations[agent] for agent in self.agents), hidden])
+        every = [*(observations[agent] for agent in self.agents), self.task.privileged(carry.goal)]
+        return observations, jnp.concatenate(every)
 
     def _infos(
         self, views: dict[str, ArmView], before: Carry, after: Carry, terms: dict[str, dict[str, Array]]

@@ -122,13 +122,13 @@ class Task:
             highs += [2 * space, 2 * space[:1]]
         return np.concatenate(lows), np.concatenate(highs)
 
-    def hidden(self, goal: Any) -> Array:
-        """[h]: what the state holds besides all observations, of the goal what no agent is told."""
+    def privileged(self, goal: Any) -> Array:
+        """[p]: what the state holds besides all observations, of the goal what no agent is told."""
         return jnp.zeros(0, jnp.float32)
 
     @property
-    def hidden_bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Least and greatest of `hidden`, [h] each."""
+    def privileged_bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Least and greatest of `privileged`, [p] each."""
         return np.zeros(0), np.zeros(0)
 
     def terms(self, views: Views, goal: Any) -> dict[str, dict[str, Array]]:

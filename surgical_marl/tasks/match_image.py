@@ -103,12 +103,12 @@ class Task(task.Task):
         low, high = (np.concatenate(self._without_targets(agent, bound)) for bound in super().bounds(agent))
         return low, high
 
-    def hidden(self, goal: PictureGoal) -> Array:
+    def privileged(self, goal: PictureGoal) -> Array:
         """Joint positions of the camera's arm at the hidden pose."""
         return self._postures[goal.row]
 
     @property
-    def hidden_bounds(self) -> tuple[np.ndarray, np.ndarray]:
+    def privileged_bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Limits of those joints."""
         return self._arm.lower, self._arm.upper
 
