@@ -59,7 +59,7 @@ def knobs(where: str, fixed: Sequence[str] = ()) -> dict[str, Knob]:
         "learning_rate": Knob("ppo.learning_rate", FloatDistribution(1e-4, 1e-2, log=True)),
         "desired_kl": Knob("ppo.desired_kl", FloatDistribution(0.003, 0.1, log=True)),
         # in control steps
-        "horizon": Knob("ppo.gamma", FloatDistribution(5, 200, log=True), lambda h: 1 - 1 / h, lambda g: 1 / (1 - g)),
+        "horizon": Knob("ppo.gamma", FloatDistribution(2, 200, log=True), lambda h: 1 - 1 / h, lambda g: 1 / (1 - g)),
         "lam": Knob("ppo.lam", FloatDistribution(0.8, 0.99)),
         "epochs": Knob("ppo.epochs", IntDistribution(1, 10)),
         "log2_mini_batches": Knob("ppo.mini_batches", IntDistribution(0, 5), **power),

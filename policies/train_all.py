@@ -141,10 +141,11 @@ def train(task: str, scene: str, run: Path, overrides: Sequence[str]) -> None:
 
     from surgical_marl.learning import train as learning
     from surgical_marl.learning.config import load_config
-    from surgical_marl.learning.run import CONFIG
+    from surgical_marl.learning.run import has_begun, read_metrics
 
-    # a run has its settings from the start, even if it was stopped before its first checkpoint
-    learning.train(load_config(task, scene, overrides), out=run, resume=run if (run / CONFIG).is_file() else None)
+    settings, rows = load_config(task, scene, overrides), read_metrics(run)
+    if not rows or rows[-1]["iteration"] < settings.iterations:
+        learning.train(settings, out=run, resume=run if has_begun(run) else None)
 
 
 def export(runs: Sequence[str], out: Path) -> None:

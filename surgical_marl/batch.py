@@ -31,8 +31,8 @@ class BatchStep(NamedTuple):
     """[N, d]; of the next episode where one ended. A dict of them for an agent that sees pictures
     (`surgical_marl/pictures.py`)."""
     state: Any
-    """[N, S], the whole state for a centralised critic, likewise: all observations but pictures, and what of the goal
-    no agent is told (`Task.privileged`)."""
+    """[N, S], for a centralised critic, likewise of the next episode: all observations but pictures, and
+    `Task.privileged`."""
     rewards: dict[str, Any]
     terminated: Any
     """[N] bool"""
@@ -94,7 +94,7 @@ class BatchedEnv:
         self.device = self.engine.device
         self._observation_spaces: dict[str, spaces.Space[Any]] = {a: self.env.observation_space(a) for a in self.agents}
         self._action_spaces = {agent: self.env.action_space(agent) for agent in self.agents}
-        self.state_space: spaces.Space[Any] = self.env.state_space
+        self.state_space = self.env.state_space
         self._pictures: Any = None
         if self.env.task.camera is not None:
             self._open_eyes(self.env.task.camera)

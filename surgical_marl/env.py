@@ -56,7 +56,7 @@ class State:
     observations: dict[str, Array]
     """[d] each, of the new episode where one ended."""
     state: Array
-    """What a centralised critic sees: all observations, one after the other."""
+    """What a centralised critic sees: all observations, one after the other, and `Task.privileged`."""
     rewards: dict[str, Array]
     terminated: Array
     truncated: Array

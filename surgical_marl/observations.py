@@ -1,4 +1,4 @@
-"""Observations and states: one array each, or a dict of arrays where `surgical_marl/pictures.py` adds pictures."""
+"""Observations: one array each, or a dict of arrays where `surgical_marl/pictures.py` adds pictures."""
 
 from __future__ import annotations
 

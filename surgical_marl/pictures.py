@@ -1,8 +1,9 @@
 """The pictures of a task with a camera: drawn after each step, and put beside what the engine found.
 
 The camera's agent then observes a dict: "proprioception" [d], what the task itself observes; "image", what the
-endoscope sees now, and "target", what it should see, both uint8 [64, 64, 3]. The state has no pictures: it knows what
-they show. The agent's reward term `image` is the mean absolute difference of the two, from 0 to 1, times its weight.
+endoscope sees now, and "target", what it should see, both uint8 [64, 64, 3]. The state has no
+pictures, but the hidden pose that they ask for. The agent's reward term `image` is the mean absolute difference of the
+two, from 0 to 1, times its weight.
 """
 
 from __future__ import annotations
@@ -64,8 +65,8 @@ class Pictures:
         ended = self._tensor(found["terminated"]) | self._tensor(found["truncated"])
         # an episode begins at home, which looks the same in all of them
         first = torch.where(ended[:, None, None, None], self._home, seen)
-        self._show(found["final_observations"], seen, old)
-        self._show(found["observations"], first, new)
+        self._show(found, "final_observations", seen, old)
+        self._show(found, "observations", first, new)
         # in bytes as long as it goes: this reads and writes more memory than drawing does
         error = (torch.maximum(seen, old) - torch.minimum(seen, old)).float().mean((1, 2, 3))
         reward, info = self._weight / 255 * error, found["infos"][self.agent]
@@ -73,9 +74,10 @@ class Pictures:
         info = {**info, "reward_image": self._present(reward), "image_error": self._present(error)}
         found["infos"] = {**found["infos"], self.agent: info}
 
-    def _show(self, observations: dict[str, Any], image: Tensor, target: Tensor) -> None:
+    def _show(self, found: dict[str, Any], observations: str, image: Tensor, target: Tensor) -> None:
         pictures = {"image": self._present(image), "target": self._present(target)}
-        observations[self.agent] = {"proprioception": observations[self.agent], **pictures}
+        known = found[observations]
+        found[observations] = {**known, self.agent: {"proprioception": known[self.agent], **pictures}}
 
     def _tensor(self, values: Any) -> Tensor:
         values = values if torch.is_tensor(values) else torch.from_numpy(np.array(values))

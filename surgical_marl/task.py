@@ -123,7 +123,7 @@ class Task:
         return np.concatenate(lows), np.concatenate(highs)
 
     def privileged(self, goal: Any) -> Array:
-        """[p]: what the state holds besides all observations, of the goal what no agent is told."""
+        """[p]: what the state holds besides all observations: what no agent is told of the goal."""
         return jnp.zeros(0, jnp.float32)
 
     @property

@@ -183,10 +183,11 @@ def test_pettingzoo_accepts_it(scene: str) -> None:
         api_test(sm.match_image_v0.env(scene=scene, max_steps=STEPS), num_cycles=2 * STEPS)
 
 
-def test_gymnasium_accepts_it() -> None:
-    env = gymnasium.make("surgical_marl/MatchImage-v0", scene="ecm", max_steps=STEPS)
+@pytest.mark.parametrize("scene", SCENES)
+def test_gymnasium_accepts_it(scene: str) -> None:
+    env = gymnasium.make("surgical_marl/MatchImage-v0", scene=scene, max_steps=STEPS)
     check_env(env.unwrapped)
-    envs = gymnasium.make_vec("surgical_marl/MatchImage-v0", scene="ecm", num_envs=2, max_steps=STEPS)
+    envs = gymnasium.make_vec("surgical_marl/MatchImage-v0", scene=scene, num_envs=2, max_steps=STEPS)
     observations, _ = envs.reset(seed=0)
     for _ in range(STEPS):
         assert envs.observation_space.contains(observations)

@@ -81,7 +81,7 @@ def test_a_run_that_was_stopped_goes_on_from_wherever_it_was(script: Any, tmp_pa
     script.train("reach", "psm", unbroken, small)
     run.mkdir()
     shutil.copy(unbroken / CONFIG, run)  # stopped before its first checkpoint
-    for overrides in ([*small, "iterations=1"], small, small):  # stopped after an iteration; then it is done
+    for overrides in ([*small, "iterations=1"], small, [*small, "iterations=1"]):  # after the second it is done
         script.train("reach", "psm", run, overrides)
     assert [row["reward"] for row in read_metrics(run)] == [row["reward"] for row in read_metrics(unbroken)]
 

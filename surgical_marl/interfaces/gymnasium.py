@@ -45,7 +45,7 @@ class SurgicalEnv(gymnasium.Env[Any, np.ndarray]):
         super().reset(seed=seed)
         observations, _, infos = self.batch.reset(seed)
         self._over = False
-        return _joint(observations, 0), _joint_info(infos, 0)
+        return _joint(self.batch, observations, 0), _joint_info(infos, 0)
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """One control step. ValueError for a wrong shape, a value that is not finite, or an episode that is over."""
@@ -55,7 +55,7 @@ class SurgicalEnv(gymnasium.Env[Any, np.ndarray]):
         terminated, truncated = bool(step.terminated[0]), bool(step.truncated[0])
         self._over = terminated or truncated
         reward = float(sum(reward[0] for reward in step.rewards.values()))
-        return _joint(step.final_observations, 0), reward, terminated, truncated, _joint_info(step.infos, 0)
+        return _joint(self.batch, step.final_observations, 0), reward, terminated, truncated, _joint_info(step.infos, 0)
 
     def render(self) -> np.ndarray | None:
         """A picture [H, W, 3] uint8 with render_mode="rgb_array", else None."""
@@ -91,7 +91,7 @@ class SurgicalVectorEnv(VectorEnv[Any, np.ndarray, Any]):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Starts all environments anew."""
         observations, _, infos = self.batch.reset(seed)
-        return _joint(observations), _joint_info(infos)
+        return _joint(self.batch, observations), _joint_info(infos)
 
     def step(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """One control step of all environments: arrays [N, ...]."""
@@ -99,10 +99,10 @@ class SurgicalVectorEnv(VectorEnv[Any, np.ndarray, Any]):
         info = _joint_info(step.infos)
         done = step.terminated | step.truncated
         if done.any():
-            info["final_obs"] = _joint(step.final_observations)
+            info["final_obs"] = _joint(self.batch, step.final_observations)
             info["_final_obs"] = np.array(done)
         rewards = np.sum(list(step.rewards.values()), axis=0)
-        return _joint(step.observations), rewards, np.array(step.terminated), np.array(step.truncated), info
+        return _joint(self.batch, step.observations), rewards, np.array(step.terminated), np.array(step.truncated), info
 
 
 def _joint_spaces(batch: BatchedEnv) -> tuple[spaces.Space[Any], spaces.Box]:
@@ -119,14 +119,15 @@ def _joint_spaces(batch: BatchedEnv) -> tuple[spaces.Space[Any], spaces.Box]:
     return observed, spaces.Box(-1.0, 1.0, (width,), np.float32)
 
 
-def _joint(observations: dict[str, Any], index: int | None = None) -> Any:
+def _joint(batch: BatchedEnv, observations: dict[str, Any], index: int | None = None) -> Any:
     """What all arms observe as one array, in a dict with the pictures if one sees any; of one environment or of all."""
     chosen: Any = slice(None) if index is None else index
-    felt = np.concatenate([proprioception(seen)[chosen] for seen in observations.values()], -1)
-    for seen in observations.values():
-        if isinstance(seen, dict):
-            return {**each(seen, lambda part: np.array(part[chosen])), "proprioception": felt}
-    return felt
+    # engines may sort the agents by name
+    felt = np.concatenate([proprioception(observations[agent])[chosen] for agent in batch.agents], -1)
+    camera = batch.env.task.camera
+    if camera is None:
+        return felt
+    return {**each(observations[camera], lambda part: np.array(part[chosen])), "proprioception": felt}
 
 
 def _split(batch: BatchedEnv, actions: np.ndarray) -> dict[str, np.ndarray]:
@@ -139,7 +140,8 @@ def _split(batch: BatchedEnv, actions: np.ndarray) -> dict[str, np.ndarray]:
 
 def _joint_info(infos: dict[str, dict[str, Any]], index: int | None = None) -> dict[str, Any]:
     """The team's info, of all environments or of one as plain Python numbers."""
-    stacked = {key: np.stack([info[key] for info in infos.values()]) for key in next(iter(infos.values()))}
+    shared = [key for key in next(iter(infos.values())) if all(key in info for info in infos.values())]
+    stacked = {key: np.stack([info[key] for info in infos.values()]) for key in shared}
     team: dict[str, Any] = {
         "tip_error": stacked["tip_error"].max(0),
         "success": stacked["success"].all(0),

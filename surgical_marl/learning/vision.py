@@ -23,7 +23,7 @@ class PictureModel(CNNModel):
         """The normalised vector, then the features of the pictures."""
         vector = MLPModel.get_latent(self, obs)
         (group,) = self.obs_groups_2d
-        # as bytes and one channel after the other: cuDNN then has nothing to turn round
+        # while they are bytes, the channels of a pixel side by side: cuDNN then has nothing to turn round
         pictures = obs[group].flatten(0, -4).contiguous(memory_format=torch.channels_last)
         features = self.cnns[group](pictures.float() / 255 - 0.5)
         return torch.cat([vector, features.reshape(*vector.shape[:-1], -1)], dim=-1)

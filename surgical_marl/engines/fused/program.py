@@ -168,7 +168,7 @@ def _body(graph: Graph, leaves: list[Leaf], values: list[list[Value]], vector: b
 
 def _share_fields(layout: Layout, shapes: list[Any], values: list[list[Value]], first: list[list[Value]]) -> list[Leaf]:
     """A leaf for each result. One whose values stand in a row in another, in both kernels, shares its fields: a state
-    is the observations of all agents."""
+    holds the observations of all agents."""
     leaves: dict[int, Leaf] = {}
     for k in sorted(range(len(shapes)), key=lambda k: -len(values[k])):
         size, dtype = len(values[k]), shapes[k].dtype.name
