@@ -61,10 +61,14 @@ def _csv_row(result: Mapping[str, Any], agent: str | None) -> dict[str, Any]:
     return row
 
 
+UNITS = {"_mm": " (mm)", "_s": " (s)", "_deg": " (degrees)", "image_error": "image error (grey levels)"}
+"""Of metrics, by how their names end."""
+
+
 def title(name: str) -> str:
     """A metric in words, with its unit."""
     name = name.replace("p95_", "95th-percentile_")
-    for end, unit in (("_mm", " (mm)"), ("_s", " (s)")):
+    for end, unit in UNITS.items():
         name = name.removesuffix(end) + unit if name.endswith(end) else name
     for threshold in ("1mm", "2mm", "5mm"):
         name = name.replace(f"_{threshold}", f" within {threshold[0]} mm")

@@ -152,7 +152,8 @@ def _limits(result: Mapping[str, Any], settings: Settings) -> str:
     missed = [f"- Misses its goal: {text}." for text in misses(result)]
     rare = 3 / result["episodes"]  # Hanley and Lippman-Hand, JAMA 249(13), 1983
     none = [f"- No collision in {result['episodes']} episodes leaves room for a rate of up to {rare:.1%}."]
-    met = ["- Meets the goals of its task (`surgical_marl/learning/card.py`)."] if not missed else []
+    goals = ", ".join(f"{title(name)} {how} {number(name, goal)}" for name, (how, goal) in GOALS[settings.task].items())
+    met = [] if missed else [f"- Meets the goals of its task: {goals}."]
     return "\n".join([
         "## Limits\n", *missed, *met, *(none if result["collision_rate"] == 0 else []),
         f"- For {settings.control} control, difficulty `{settings.difficulty}`, and arms that stand as in this scene.",
