@@ -47,14 +47,9 @@ class Job(NamedTuple):
 def learn(job: Job, out: Path, overrides: list[str]) -> None:
     """Trains a run, or goes on with it; nothing if it is done."""
     from surgical_marl.learning.config import load_config
-    from surgical_marl.learning.run import CHECKPOINT, read_metrics
-    from surgical_marl.learning.train import train
+    from surgical_marl.learning.train import finish
 
-    run = out / str(job)
-    settings = load_config(TASK, job.scene, [f"algo={job.algo}", f"seed={job.seed}", *overrides])
-    rows = read_metrics(run)
-    if not rows or rows[-1]["iteration"] < settings.iterations:
-        train(settings, out=run, resume=run if (run / CHECKPOINT).is_file() else None)
+    finish(load_config(TASK, job.scene, [f"algo={job.algo}", f"seed={job.seed}", *overrides]), out / str(job))
 
 
 def play(job: Job, out: Path) -> None:

@@ -139,13 +139,10 @@ def train(task: str, scene: str, run: Path, overrides: Sequence[str]) -> None:
     """Train one run from where it is to its end."""
     defer_compiler()
 
-    from surgical_marl.learning import train as learning
     from surgical_marl.learning.config import load_config
-    from surgical_marl.learning.run import has_begun, read_metrics
+    from surgical_marl.learning.train import finish
 
-    settings, rows = load_config(task, scene, overrides), read_metrics(run)
-    if not rows or rows[-1]["iteration"] < settings.iterations:
-        learning.train(settings, out=run, resume=run if has_begun(run) else None)
+    finish(load_config(task, scene, overrides), run)
 
 
 def export(runs: Sequence[str], out: Path) -> None:

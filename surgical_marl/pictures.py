@@ -1,9 +1,9 @@
 """The pictures of a task with a camera: drawn after each step, and put beside what the engine found.
 
 The camera's agent then observes a dict: "proprioception" [d], what the task itself observes; "image", what the
-endoscope sees now, and "target", what it should see, both uint8 [64, 64, 3]. The state has no
-pictures, but the hidden pose that they ask for. The agent's reward term `image` is the mean absolute difference of the
-two, from 0 to 1, times its weight.
+endoscope sees now, and "target", what it should see, both uint8 [64, 64, 3]. The state has no pictures,
+but the hidden pose that they ask for. The agent's reward term `image` is the mean absolute difference of the two, from
+0 to 1, times its weight.
 """
 
 from __future__ import annotations

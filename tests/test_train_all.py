@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from surgical_marl.learning.run import CONFIG, read_metrics
+from surgical_marl.learning.run import CHECKPOINT, CONFIG, read_checkpoint, read_metrics
 
 ROOT = Path(__file__).parents[1]
 
@@ -81,8 +81,14 @@ def test_a_run_that_was_stopped_goes_on_from_wherever_it_was(script: Any, tmp_pa
     script.train("reach", "psm", unbroken, small)
     run.mkdir()
     shutil.copy(unbroken / CONFIG, run)  # stopped before its first checkpoint
-    for overrides in ([*small, "iterations=1"], small, [*small, "iterations=1"]):  # after the second it is done
+    script.train("reach", "psm", run, [*small, "iterations=1"])
+    shutil.copy(run / CHECKPOINT, tmp_path)
+    for overrides in (small, [*small, "iterations=1"]):  # after the first it is done
         script.train("reach", "psm", run, overrides)
+    assert read_checkpoint(run)["iteration"] == 2
+    shutil.copy(tmp_path / CHECKPOINT, run)  # stopped when the last metrics were written, and the last checkpoint not
+    script.train("reach", "psm", run, small)
+    assert read_checkpoint(run)["iteration"] == 2
     assert [row["reward"] for row in read_metrics(run)] == [row["reward"] for row in read_metrics(unbroken)]
 
 

@@ -26,6 +26,7 @@ from surgical_marl.learning.run import (
     DIVERGED,
     check_writable,
     claim_folder,
+    has_begun,
     read_checkpoint,
     read_environments,
     read_metrics,
@@ -121,6 +122,14 @@ def train(settings: Settings, *, out: Path, resume: Path | None = None) -> Path:
         with in_memory(settings.num_envs):
             _run(training, out)
     return out
+
+
+def finish(settings: Settings, run: Path) -> None:
+    """Train a run to its end from wherever it is, in this process: not begun, stopped before its first checkpoint, or
+    later. One that has as many iterations already is left alone. Errors are those of `train`."""
+    done = read_checkpoint(run)["iteration"] if (run / CHECKPOINT).is_file() else 0
+    if done < settings.iterations:
+        train(settings, out=run, resume=run if has_begun(run) else None)
 
 
 @contextmanager

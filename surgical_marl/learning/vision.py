@@ -12,8 +12,8 @@ from torch import Tensor
 PICTURES = "_pictures"
 """What the group of an agent type's pictures is called after its name."""
 ENCODER = {"output_channels": [32, 64, 64], "kernel_size": [4, 4, 3], "stride": [4, 2, 1], "activation": "elu"}
-"""Of 64 x 64 pixels it makes 1600 features. Its first layer sees patches that don't overlap: on a GPU that takes a
-third of the time of the 8 x 8 pixels that are usual."""
+"""Of 64 x 64 pixels it makes 1600 features. Its first layer sees patches that don't overlap: on an H200 learning
+then takes a third less time than with the 8 x 8 pixels that are usual."""
 
 
 class PictureModel(CNNModel):
