@@ -16,7 +16,6 @@ import numpy as np
 from jax import Array
 
 from surgical_marl.content import unknown
-from surgical_marl.workspace import CLEARANCE
 
 if TYPE_CHECKING:
     from surgical_marl.physics import ArmView
@@ -24,6 +23,9 @@ if TYPE_CHECKING:
 
 PRECISION = 0.005
 """Distance in m over which the term for precision falls to a third."""
+APPROACH = 0.025
+"""Another arm nearer than this, m, counts in the term for clearance: three control steps before a touch, at the 8 mm a
+step at which arms come at each other."""
 FAR = 2.0
 """Bound in m of everything observed in space; no arm reaches that far."""
 
@@ -133,14 +135,14 @@ class Task:
 
     def terms(self, views: Views, goal: Any) -> dict[str, dict[str, Array]]:
         """agent -> reward term -> its value before weighting, for the step that led here. `distance` of tip and target
-        in m; `precision`, 1 at the target; `clearance`, up to 1 as another arm comes nearer than `CLEARANCE`;
+        in m; `precision`, 1 at the target; `clearance`, up to 1 as another arm comes nearer than `APPROACH`;
         `collision`, 0 or 1."""
         errors = self.tip_errors(views, goal)
         return {
             agent: {
                 "distance": errors[agent],
                 "precision": jnp.exp(-errors[agent] / PRECISION),
-                "clearance": jnp.clip(1.0 - view.min_distance / CLEARANCE, 0.0, 1.0),
+                "clearance": jnp.clip(1.0 - view.min_distance / APPROACH, 0.0, 1.0),
                 "collision": view.collision.astype(jnp.float32),
             }
             for agent, view in views.items()

@@ -21,8 +21,7 @@ from surgical_marl.content import content_dir
 from surgical_marl.env import Env
 from surgical_marl.learning.policy import load_policy
 from surgical_marl.paths import KNOT, SEGMENTS
-from surgical_marl.task import PRECISION
-from surgical_marl.workspace import CLEARANCE
+from surgical_marl.task import APPROACH, PRECISION
 
 # match_image, whose observations are pictures, has tests of its own
 TASKS, SCENES = [task for task in sm.list_tasks() if task != "match_image"], sm.list_scenes()
@@ -165,7 +164,7 @@ def test_rewards_are_the_sum_of_their_terms_and_reach_is_rewarded_as_documented(
 def test_weights_replace_those_of_single_terms() -> None:
     env = Env("reach", "bimanual_psm", reward={"collision": -5, "precision": 0.5})
     error = np.array([0.0, 0.0, 0.003], np.float32)
-    view = SimpleNamespace(tool_tip=error, min_distance=np.float32(CLEARANCE / 4), collision=np.bool_(True))
+    view = SimpleNamespace(tool_tip=error, min_distance=np.float32(APPROACH / 4), collision=np.bool_(True))
     goal = SimpleNamespace(targets=np.zeros((2, 3), np.float32))
     found = env.task.rewards({"psm_0": view}, goal)["psm_0"]
     expected = {"distance": -0.03, "precision": 0.5 * np.exp(-0.6), "clearance": -0.75, "collision": -5}

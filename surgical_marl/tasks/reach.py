@@ -7,7 +7,7 @@ Observation   joint positions and velocities, tool tip, position targets, goal, 
               way from this tip to the nearest other tip, and the least distance to any other arm. Base frame, SI units.
 Action        one number in [-1, 1] for every joint; the jaw opens above 0 and closes otherwise.
 Reward        per agent, each step, weights in brackets: `distance` of tip and goal (-10 / m); `precision`,
-              exp(-distance / 5 mm) (1); `clearance`, up to 1 as another arm comes closer than 10 mm (-1); `collision`
+              exp(-distance / 5 mm) (1); `clearance`, up to 1 as another arm comes closer than 25 mm (-1); `collision`
               (-2). The sum over the agents is the team's: the paper's summed distance, made dense at the way's end.
 Success       tip within 2 mm of the goal.
 Termination   none; an episode is truncated after 100 control steps (2 s).
