@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import gc
 import importlib
 import importlib.metadata
 import importlib.util
@@ -141,6 +142,18 @@ def prepare_warp() -> Any:
     with contextlib.nullcontext() if _has_gpu() else _silence():
         warp.init()
     return warp
+
+
+@contextlib.contextmanager
+def no_collection() -> Iterator[None]:
+    """Python doesn't look for objects in cycles that nothing uses any more."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
 
 
 def has_cuda() -> bool:

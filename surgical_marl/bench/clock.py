@@ -53,15 +53,17 @@ def cuda_clock(step: Callable[[], object], cycle: int) -> Clock:
     """Times `step` within a CUDA graph of `cycle` steps: without the time that Python takes to launch kernels."""
     import torch
 
+    from surgical_marl.learning.graphs import capture
+
+    def lap() -> None:
+        for _ in range(cycle):
+            step()
+
     stream: Any = torch.cuda.Stream()
     with torch.cuda.stream(stream):
-        for _ in range(cycle):
-            step()
+        lap()
     torch.cuda.synchronize()
-    graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph, stream=stream):
-        for _ in range(cycle):
-            step()
+    graph = capture(lap, stream)
 
     def seconds(count: int) -> float:
         replays = math.ceil(count / cycle)

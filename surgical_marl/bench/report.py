@@ -40,11 +40,13 @@ def run(
     """All of `surgical-marl bench sim`: the text of its table or JSON. `settings` are those of `Workload`."""
     workload = Workload(**settings)
     if sweeping:
-        points = list(sweep(workload, engines))
+        points = []
+        for point in sweep(workload, engines):
+            points.append(point)
+            if out:  # anew with each: a sweep takes minutes, and may be stopped
+                draw(points, f"{workload.task} on {workload.scene}; {describe_machine()}", out)
         if not points:
             raise ValueError(f"nothing to show: {', '.join(engines)} can't run here")
-        if out:
-            draw(points, f"{workload.task} on {workload.scene}; {describe_machine()}", out)
         return json.dumps(sweep_summary(workload, points)) if as_json else sweep_table(points)
     course = make_course(load_scene(workload.scene), workload.motion)
     speeds, left_out = measure(workload, engines, course)

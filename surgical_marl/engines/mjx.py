@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import gc
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields, replace
 from typing import Any
@@ -16,6 +15,7 @@ from jax import Array
 
 from surgical_marl.engines.common import announce, cores
 from surgical_marl.env import Carry, Env, State
+from surgical_marl.runtime import no_collection
 
 RESULTS = tuple(field.name for field in fields(State) if field.name != "carry")
 LEAST_SHARE = 32
@@ -68,7 +68,8 @@ class MjxEngine:
     def step(self, actions: dict[str, Any]) -> None:
         """One control step of all environments; actions [N, n] by agent, of any array library."""
         given = self._state.carry, {agent: self._take(action).astype(jnp.float32) for agent, action in actions.items()}
-        with contextlib.nullcontext() if self._traced else _no_collection():
+        # Tracing makes some million objects that all stay: looking for garbage among them takes a quarter of the time.
+        with contextlib.nullcontext() if self._traced else no_collection():
             if self._shares == 1:
                 self._state = self._step_share(given)
             else:
@@ -121,18 +122,6 @@ class MjxEngine:
 
             return jax.tree.map(torch.from_dlpack, tree)
         return jax.tree.map(np.asarray, tree)
-
-
-@contextlib.contextmanager
-def _no_collection() -> Iterator[None]:
-    """Tracing makes some million objects that all stay: looking for garbage among them takes a quarter of the time."""
-    enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if enabled:
-            gc.enable()
 
 
 def find_device(device: str) -> Any:
