@@ -14,7 +14,7 @@ from typing import Any
 from surgical_marl.content import find
 from surgical_marl.evaluation.command import play_all
 from surgical_marl.evaluation.evaluate import summarise
-from surgical_marl.learning.card import CARD, CLIP, EVALUATION, card, worst_median
+from surgical_marl.learning.card import CARD, CLIP, EVALUATION, card, misses, worst_median
 from surgical_marl.learning.config import Settings
 from surgical_marl.learning.curve import draw_curve
 from surgical_marl.learning.onnx_file import SUFFIX, write_onnx
@@ -32,8 +32,8 @@ MAY_DIFFER = {"seed", "engine", "device"}
 def export_policy(runs: Sequence[str], out: Path) -> Path:
     """Make the folder of a policy from the runs of one training with different seeds; it is there whole or not at all.
 
-    Every run is evaluated on the standard goals. The weights are those of the run with the least median error of its
-    worst arm; the evaluation and the card tell of all of them.
+    Every run is evaluated on the standard goals. The weights are those of the run that misses the fewest goals of its
+    task, and among such the one with the least median error of its worst arm; the evaluation and the card tell of all.
 
     Raises:
         ValueError: no such run, runs of different trainings or with the same seed, or the folder exists already.
@@ -73,7 +73,7 @@ def _evaluate(runs: Sequence[str], seeds: Sequence[int], name: str) -> tuple[dic
     asked = dict.fromkeys(("task", "scene", "control", "difficulty"))
     played = list(play_all(list(runs), asked, EPISODES, SEED).values())
     results = [{"policy": f"seed {seed}", **summarise([run])} for seed, run in zip(seeds, played, strict=True)]
-    best = min(range(len(results)), key=lambda run: worst_median(results[run]))
+    best = min(range(len(results)), key=lambda run: (len(misses(results[run])), worst_median(results[run])))
     whole = {"policy": "aggregate", **summarise(played)}
     every = {"best": seeds[best], "runs": results, "aggregate": whole}
     return {**results[best], "policy": name, "seeds": every}, best
