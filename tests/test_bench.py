@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from mujoco import rollout
 
-from surgical_marl.bench import contenders, machine, render, sim
+from surgical_marl.bench import contenders, machine, render, report, sim
 from surgical_marl.bench.clock import race
 from surgical_marl.bench.contenders import Contender
 from surgical_marl.bench.course import HOLD, LAPS, MOTIONS, full_state, make_course
@@ -145,6 +145,20 @@ def test_a_sweep_as_table_json_and_picture(made_up: None, tmp_path: Path, capsys
     assert list(points[0]) == [*CONTRACT, "bytes_per_env"]
     assert out.read_bytes().startswith(b"\x89PNG")
     assert "4,000,000" in sweep_table([Point(FUSED, 567), Point(MUJOCO, None)])
+
+
+def test_a_sweep_that_is_stopped_leaves_its_picture(
+    made_up: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stopped(*_: Any) -> Iterator[Point]:
+        yield Point(FUSED, 567)
+        yield Point(FUSED, 567)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(report, "sweep", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        report.run({"device": "cpu"}, ("fused",), sweeping=True, out=tmp_path / "sweep.png")
+    assert (tmp_path / "sweep.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_a_picture_of_one_point(tmp_path: Path) -> None:
