@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from dataclasses import replace
 from typing import Any
 
@@ -12,6 +13,7 @@ from test_learning import ALL, COUNTS, OPTIONS, SIZES, SMALL
 from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
 
 from surgical_marl.learning.training import Training
+from surgical_marl.runtime import no_collection
 
 WAITING = ("_local_scalar_dense", "nonzero", "masked_select", "unique", "equal.default", "is_nonzero")
 
@@ -72,3 +74,14 @@ def kept(training: Training) -> list[torch.Tensor]:
     algorithm = training.algorithm
     stored = [part for part in vars(algorithm.storage).values() if isinstance(part, torch.Tensor)]
     return [*algorithm.options.buffers(), *algorithm.memory.buffers(), *algorithm.memory.begun, *stored]
+
+
+def test_nothing_is_collected_while_a_graph_is_captured() -> None:
+    """Garbage may own memory of the device, and freeing that ends a capture."""
+    assert gc.isenabled()
+    with no_collection():
+        assert not gc.isenabled()
+        with pytest.raises(KeyError), no_collection():
+            raise KeyError
+        assert not gc.isenabled()
+    assert gc.isenabled()

@@ -45,10 +45,12 @@ def test_slower_trials_are_pruned_and_the_best_is_confirmed(tmp_path: Path, monk
     argv = ["--device", "cpu", "--trials", "12", "--limit", "6", "--confirm", "2", *folders]
     assert tuning.main(argv) == 0
     found = json.loads((tmp_path / "results" / "reach-psm-mappo-cpu.json").read_text())
-    assert found["seconds"]["shipped"] == [4.0, 4.0]
-    assert found["seconds"]["best"] == [float(found["best"]["ppo.epochs"])] * 2 and found["best"]["ppo.epochs"] <= 4
+    shipped = load_config("reach", "psm", ["device=cpu"]).ppo
+    assert found["seconds"]["shipped"] == [shipped.epochs] * 2
+    assert found["seconds"]["best"] == [found["best"]["ppo.epochs"]] * 2
+    assert found["best"]["ppo.epochs"] <= shipped.epochs
     lines = (tmp_path / "results" / "reach-psm-mappo-cpu.csv").read_text().splitlines()
-    assert len(lines) == 13 and lines[1].startswith("0,complete,4.0,,0.001,")
+    assert len(lines) == 13 and lines[1].startswith(f"0,complete,{float(shipped.epochs)},,{shipped.learning_rate},")
     assert all("complete" in line or ",pruned," in line for line in lines[1:])
     assert tuning.main(argv) == 0, "nothing is left to do but to confirm"
     assert len((tmp_path / "results" / "reach-psm-mappo-cpu.csv").read_text().splitlines()) == 13
