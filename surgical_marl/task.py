@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 PRECISION = 0.005
 """Distance in m over which the term for precision falls to a third."""
 APPROACH = 0.025
-"""Another arm nearer than this, m, counts in the term for clearance: three control steps before a touch, at the 8 mm a
-step at which arms come at each other."""
+"""Another arm nearer than this, m, counts in the term for clearance: two or three control steps before a touch, as arms
+come at each other at 8 mm a step, and some at twice that."""
 FAR = 2.0
 """Bound in m of everything observed in space; no arm reaches that far."""
 

@@ -40,11 +40,11 @@ def run(
     """All of `surgical-marl bench sim`: the text of its table or JSON. `settings` are those of `Workload`."""
     workload = Workload(**settings)
     if sweeping:
-        points = []
+        points, title = [], f"{workload.task} on {workload.scene}; {describe_machine()}"
         for point in sweep(workload, engines):
             points.append(point)
             if out:  # anew with each: a sweep takes minutes, and may be stopped
-                draw(points, f"{workload.task} on {workload.scene}; {describe_machine()}", out)
+                draw(points, title, out)
         if not points:
             raise ValueError(f"nothing to show: {', '.join(engines)} can't run here")
         return json.dumps(sweep_summary(workload, points)) if as_json else sweep_table(points)

@@ -9,16 +9,6 @@ import torch
 from surgical_marl.runtime import no_collection
 
 
-def capture(function: Callable[[], None], stream: torch.cuda.Stream | None = None) -> torch.cuda.CUDAGraph:
-    """What a function enqueues, as a graph to replay."""
-    graph = torch.cuda.CUDAGraph()
-    # Freeing memory of the device ends a capture with an error. Other threads may do so: NCCL's watchdog and JAX's
-    # clients do. This one must not, though whatever Python finds unused may own some.
-    with no_collection(), torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"):
-        function()
-    return graph
-
-
 class Replayed:
     """A function without arguments that works in place, as a CUDA graph from its second call on.
 
@@ -44,7 +34,7 @@ class Replayed:
         elif not self._warm:
             self._warm_up()
         else:
-            self._graph = capture(self._function)
+            self._graph = self._capture()
             self._graph.replay()
 
     def release(self) -> None:
@@ -63,3 +53,11 @@ class Replayed:
             self._function()
         current.wait_stream(side)
         self._warm = True
+
+    def _capture(self) -> torch.cuda.CUDAGraph:
+        graph = torch.cuda.CUDAGraph()
+        # Freeing memory of the device ends a capture with an error. Other threads may do so: NCCL's watchdog and JAX's
+        # clients do. This one must not, though whatever Python finds unused may own some.
+        with no_collection(), torch.cuda.graph(graph, capture_error_mode="thread_local"):
+            self._function()
+        return graph
