@@ -14,6 +14,8 @@ from surgical_marl.runtime import prepare_warp
 wp = prepare_warp()
 
 _TYPES = {"state": np.float32, "counts": np.int32, "actions": np.float32, "outs": np.float32, "flags": np.uint8}
+READ = ("outs", "flags", "counts")
+"""Buffers that a step's results are in."""
 
 
 def make_arrays(device: str, source: Source, stride: int, num_envs: int) -> Arrays:
@@ -50,6 +52,17 @@ class Arrays(ABC):
     @abstractmethod
     def read_tree(self, tree: dict[str, Any], library: str) -> dict[str, Any]:
         """Leaves of a dict of dicts, of one copy of the whole."""
+
+    def _cut(self, node: Any, copies: dict[str, Any], library: str) -> Any:
+        """A tree's leaves out of copies of the buffers. A method, because a function within a function that calls
+        itself keeps what it sees, here a whole step's arrays, until Python's garbage collector finds it."""
+        if isinstance(node, dict):
+            return {name: self._cut(child, copies, library) for name, child in node.items()}
+        rows = copies[node.buffer][node.first : node.first + node.size, : self.num_envs]
+        return self._present(node, rows, library)
+
+    @abstractmethod
+    def _present(self, leaf: Leaf, rows: Any, library: str) -> Any: ...
 
     @abstractmethod
     def _zeros(self, fields: int, stride: int, dtype: Any) -> Any: ...
@@ -89,14 +102,7 @@ class CpuArrays(Arrays):
         return self._present(leaf, self.rows(leaf).copy(), library)
 
     def read_tree(self, tree: dict[str, Any], library: str) -> dict[str, Any]:
-        copies = {name: self._buffers[name][:, : self.num_envs].copy() for name in ("outs", "flags", "counts")}
-
-        def visit(node: Any) -> Any:
-            if isinstance(node, dict):
-                return {name: visit(child) for name, child in node.items()}
-            return self._present(node, copies[node.buffer][node.first : node.first + node.size], library)
-
-        return visit(tree)
+        return self._cut(tree, {name: self._buffers[name].copy() for name in READ}, library)
 
     def _present(self, leaf: Leaf, rows: np.ndarray, library: str) -> Any:
         rows = rows.view(bool) if leaf.dtype == "bool" else rows.view(leaf.dtype)
@@ -143,15 +149,7 @@ class CudaArrays(Arrays):
         return self._present(leaf, self.rows(leaf).clone(), library)
 
     def read_tree(self, tree: dict[str, Any], library: str) -> dict[str, Any]:
-        copies = {name: self._buffers[name].clone() for name in ("outs", "flags", "counts")}
-
-        def visit(node: Any) -> Any:
-            if isinstance(node, dict):
-                return {name: visit(child) for name, child in node.items()}
-            rows = copies[node.buffer][node.first : node.first + node.size, : self.num_envs]
-            return self._present(node, rows, library)
-
-        return visit(tree)
+        return self._cut(tree, {name: self._buffers[name].clone() for name in READ}, library)
 
     def _present(self, leaf: Leaf, rows: Any, library: str) -> Any:
         import torch
