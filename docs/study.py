@@ -60,6 +60,7 @@ def play(job: Job, out: Path) -> None:
     from surgical_marl.learning.policy import load_policy, zero_policy
     from surgical_marl.learning.run import METRICS, read_settings
     from surgical_marl.learning.train import make_env
+    from surgical_marl.oracle import oracle
 
     run = out / str(job)
     done = run / PLAYED
@@ -69,8 +70,8 @@ def play(job: Job, out: Path) -> None:
     policy, start = load_policy(run, env), round(WHEN / env.control_dt)
     untouched = evaluate.play(env, policy, EPISODES, seed=0)
     found: dict[str, Any] = {f"untouched/{name}": values for name, values in untouched.measures.items()}
-    for what, instead in (("frozen", zero_policy(env)), ("oracle", load_policy("oracle", env))):
-        for arm in env.agents:
+    for arm in env.agents:
+        for what, instead in (("frozen", zero_policy(env)), ("oracle", oracle(env, [arm]))):
             measures = evaluate.play(env, taken_over(policy, env, arm, instead, start), EPISODES, seed=0).measures
             found |= {f"{what} {arm}/{name}": measures[name] for name in ("held", "collided")}
     about = json.dumps({**untouched.about, **machine(), "agents": untouched.agents})

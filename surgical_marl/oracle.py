@@ -9,7 +9,7 @@ the environment's goals.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,25 +24,30 @@ ITERATIONS = 8
 """Steps of inverse kinematics from the last joint positions; the first of an episode takes more."""
 
 
-def oracle(env: BatchedEnv) -> Callable[[Mapping[str, Any]], dict[str, Any]]:
+def oracle(env: BatchedEnv, agents: Sequence[str] | None = None) -> Callable[[Mapping[str, Any]], dict[str, Any]]:
     """The oracle of an environment with control "position", for all of its tasks.
 
     Joints follow straight lines in joint space, all arms at the same pace: the way that `surgical_marl/workspace.py`
     has checked. Where a target moves, joints are sent ahead by the time that they lag behind: a control step, and
     damping over stiffness of their drives.
 
+    Args:
+        agents: those it moves, where others have a policy of their own: what an arm waits for then are only these.
+
     Returns:
-        A policy: observations {agent: [N, d]} of `env` as it stands -> actions {agent: [N, a]} of the same library.
+        A policy: observations {agent: [N, d]} of `env` as it stands -> actions {agent: [N, a]} of the same library, of
+        the agents that it moves.
 
     Raises:
         ValueError: the environment has another control mode.
     """
     if env.control != "position":
         raise ValueError(f"the oracle moves position targets: control must be 'position', not {env.control!r}")
-    arms = {agent: _Guide(env, agent, index) for index, agent in enumerate(env.agents)}
+    moved = env.agents if agents is None else agents
+    arms = {agent: _Guide(env, agent, index) for index, agent in enumerate(env.agents) if agent in moved}
 
     def policy(observations: Mapping[str, Any]) -> dict[str, Any]:
-        goal, began = env.goal.astype(float), np.asarray(env.steps) == 0
+        goal, began = env.goal.astype(float), _numpy(env.steps) == 0
         seen = {agent: proprioception(observations[agent]) for agent in arms}
         moves = {agent: arm.move(goal, began, _numpy(seen[agent])) for agent, arm in arms.items()}
         furthest = np.max([np.abs(move).max(-1) for move in moves.values()], axis=0)

@@ -10,6 +10,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+import torch
 import yaml
 from pettingzoo.test import parallel_api_test, parallel_seed_test
 
@@ -19,7 +20,8 @@ from surgical_marl.arm import load_arm
 from surgical_marl.batch import BatchedEnv
 from surgical_marl.content import content_dir
 from surgical_marl.env import Env
-from surgical_marl.learning.policy import load_policy
+from surgical_marl.learning.policy import load_policy, zero_policy
+from surgical_marl.oracle import oracle
 from surgical_marl.paths import KNOT, SEGMENTS
 from surgical_marl.task import APPROACH, PRECISION
 
@@ -103,6 +105,26 @@ def test_the_oracle_shows_that_a_task_is_fair(task: str, scene: str) -> None:
 def test_the_oracle_is_not_what_any_policy_gets() -> None:
     env = batched("track", "psm")
     assert np.sqrt(np.mean(play(env, load_policy("zero", env)).errors ** 2)) > 0.005
+
+
+def test_the_oracle_moves_one_arm_without_waiting_for_others() -> None:
+    """The other never comes to its goal, and an oracle that moved both would slow down for it."""
+    env = batched("reach", "bimanual_psm")
+    rest, one = zero_policy(env), oracle(env, ["psm_1"])
+    assert set(one(env.reset(0)[0])) == {"psm_1"}
+    errors = play(env, lambda observations: {**rest(observations), **one(observations)}).errors[-1]
+    assert (errors[:, 1] < 0.002).mean() >= 0.98 and np.median(errors[:, 0]) > 0.01
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_the_oracle_takes_tensors_on_a_gpu() -> None:
+    env = BatchedEnv("reach", "psm", num_envs=50, device="cuda", arrays="torch")
+    observations, *_ = env.reset(0)
+    policy = load_policy("oracle", env)
+    for _ in range(env.max_steps):
+        step = env.step(policy(observations))
+        observations = step.observations
+    assert float((step.infos["psm_0"]["tip_error"] < 0.002).float().mean()) >= 0.98
 
 
 def test_the_oracle_needs_position_control() -> None:
