@@ -18,7 +18,7 @@ from study import ALGOS, PLAYED, TASK, WHEN, Job
 from surgical_marl.evaluation.interval import interval
 from surgical_marl.evaluation.metrics import FOLLOWING, SUCCESS_MM, Metric, metrics, success
 from surgical_marl.files import write_atomic
-from surgical_marl.learning.run import read_metrics, read_settings
+from surgical_marl.learning.run import read_metrics, read_origin, read_settings
 
 NAMES = {"mappo": "MAPPO", "ippo": "IPPO", "joint": "joint PPO"}
 COLORS = {"mappo": "#1f6f8b", "ippo": "#b23a48", "joint": "#7a7a7a"}
@@ -69,6 +69,7 @@ def describe(jobs: Sequence[Job], out: Path) -> dict[str, Any]:
         "num_envs": settings.num_envs,
         "steps_per_iteration": settings.steps_per_iteration,
         "iterations": settings.iterations,
+        "trained_on": read_origin(out / str(jobs[0]))["origin"].get("device"),
         **{key: abouts[0][key] for key in ("goal_set", "episodes", "cpu", "gpu")},
         **{name: number(final[name]) for name in FINAL},
         "samples": rows[0][-1]["env_steps"],
@@ -123,10 +124,10 @@ def about(found: Sequence[dict[str, Any]]) -> str:
     """What was run, in a sentence."""
     first = found[0]
     seeds = sorted({len(each["seeds"]) for each in found})
-    where = f"{first['gpu'] or first['cpu']}"
     sizes = {(each["num_envs"], each["steps_per_iteration"], each["iterations"]) for each in found}
     how = "; ".join("{:,} environments, {} steps an iteration, {} iterations".format(*size) for size in sorted(sizes))
-    return f"`{TASK}`, {' to '.join(map(str, seeds))} seeds each, {how}; played on: {where}."
+    where = f"trained on {first['trained_on'] or 'an unknown device'}, played on {first['gpu'] or first['cpu']}"
+    return f"`{TASK}`, {' to '.join(map(str, seeds))} seeds each, {how}; {where}."
 
 
 def final_table(found: Sequence[dict[str, Any]]) -> str:
@@ -174,7 +175,7 @@ def draw(found: Sequence[dict[str, Any]], out: Path) -> None:
             if x == "samples":
                 axis.xaxis.set_major_formatter(EngFormatter(sep=""))
             axis.yaxis.set_major_formatter(PercentFormatter(1.0))
-            axis.set_ylim(bottom=-0.02, top=1.02 if name == "success_rate" else None)
+            axis.set_ylim(*((-0.02, 1.02) if name == "success_rate" else (0.0, None)))
             axis.grid(True, color="#dddddd", linewidth=0.6)
             axis.spines[["top", "right"]].set_visible(False)
         axes[0].legend(fontsize=8, frameon=False)

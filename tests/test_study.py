@@ -57,11 +57,12 @@ def test_tables_and_files(runs: Path) -> None:
     page.write_text(f"before\n{study_report.BEGIN}\nold\n{study_report.END}\nafter\n")
     argv = ["--only", "report", "--out", str(runs), "--results", str(runs), "--scenes", "bimanual_psm"]
     assert study.main([*argv, "--algos", "mappo", "joint"]) == 0
+    first, second = json.loads((runs / "study.json").read_text())
     text = page.read_text()
     assert text.startswith("before\n") and text.endswith("after\n") and "old" not in text
+    assert f"10 iterations; trained on {first['trained_on']}, played on a CPU." in text
     assert "| `bimanual_psm` | MAPPO | 75.0% (" in text
     assert "| `bimanual_psm` | joint PPO | frozen | 75.0% (" in text
-    first, second = json.loads((runs / "study.json").read_text())
     assert (first["algo"], second["algo"], first["seeds"]) == ("mappo", "joint", [0, 1])
     assert [each["success_2mm"] for each in first["by_seed"]] == [0.5, 1.0]
     assert first["seconds"][0] == 15.0 and first["samples"] == 1000.0
