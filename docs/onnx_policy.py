@@ -1,12 +1,15 @@
 """A policy that ships acts through onnxruntime: `pip install onnxruntime`, then `python docs/onnx_policy.py`."""
 
+from pathlib import Path
+
 import numpy as np
 import onnxruntime
 
 import surgical_marl as sm
 
 env = sm.parallel_env("reach", scene="bimanual_psm")
-psm = onnxruntime.InferenceSession("policies/reach-bimanual_psm/psm.onnx")
+folder = Path(__file__).parents[1] / "policies/reach-bimanual_psm"
+psm = onnxruntime.InferenceSession(folder / "psm.onnx")
 observations, infos = env.reset(seed=0)
 while env.agents:
     actions = {}

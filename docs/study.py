@@ -1,8 +1,8 @@
 """MAPPO against IPPO and joint PPO on the scenes of several arms, for study.md: trains, evaluates, breaks, reports.
 
     python docs/study.py                                  # all of it; a second call goes on where the first stopped
-    python docs/study.py num_envs=16384 iterations=60     # with other settings than those of configs/
-    python docs/study.py --only report                    # tables and figures of what there is
+    python docs/study.py --out runs/other iterations=60   # with other settings than those of configs/
+    python docs/study.py --only report --results docs     # tables and figures of what there is, for study.md
 
 Every scene, algorithm and seed is a run of its own, as `surgical-marl train` makes it, in a folder of --out. Seconds
 only mean something where runs don't share a machine's cores or GPU: leave --jobs at 1 for them.
@@ -127,6 +127,8 @@ def work(part: str, job: Job, out: Path, overrides: list[str]) -> tuple[Job, str
 
 def main(argv: list[str] | None = None) -> int:
     arguments = _parse(argv)
+    results = arguments.results or arguments.out
+    results.mkdir(parents=True, exist_ok=True)
     jobs = [Job(s, a, n) for n in range(arguments.seeds) for s in arguments.scenes for a in arguments.algos]
     arguments.out.mkdir(parents=True, exist_ok=True)
     failed: dict[str, str] = {}
@@ -144,7 +146,7 @@ def main(argv: list[str] | None = None) -> int:
     if "report" in arguments.only:
         from study_report import report
 
-        report([job for job in jobs if (arguments.out / str(job) / PLAYED).is_file()], arguments.out, arguments.results)
+        report([job for job in jobs if (arguments.out / str(job) / PLAYED).is_file()], arguments.out, results)
     return 1 if failed else 0
 
 
@@ -157,13 +159,10 @@ def _parse(argv: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--only", nargs="+", choices=PARTS, default=PARTS, help="parts of the work")
     parser.add_argument("--scenes", nargs="+", choices=SCENES, default=SCENES)
     parser.add_argument("--algos", nargs="+", choices=ALGOS, default=ALGOS)
-    parser.add_argument("--seeds", type=int, default=5, metavar="N", help="0 to N - 1")
-    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes")
+    parser.add_argument("--seeds", type=_count, default=5, metavar="N", help="0 to N - 1")
+    parser.add_argument("--jobs", type=_count, default=1, metavar="N", help="processes")
     parser.add_argument("--out", type=Path, default=Path("runs/study"), metavar="DIR", help="folder of the runs")
-    here = Path(__file__).parent
-    parser.add_argument(
-        "--results", type=Path, default=here, metavar="DIR", help="folder of study.md, .json, .csv, .png"
-    )
+    parser.add_argument("--results", type=Path, metavar="DIR", help="of study.md, .json, .csv, .png (default: --out)")
     given = sys.argv[1:] if argv is None else argv
     settings = [text for text in given if "=" in text and not text.startswith("-")]
     arguments = parser.parse_args([text for text in given if text not in settings])
@@ -171,10 +170,19 @@ def _parse(argv: list[str] | None) -> argparse.Namespace:
     return arguments
 
 
+def _count(text: str) -> int:
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"must be a whole number of 1 or more, not {text!r}")
+    return int(text)
+
+
 if __name__ == "__main__":
     # what ends this process ends its runs as well: the next call goes on from their checkpoints
     signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     try:
         sys.exit(main())
+    except (ValueError, OSError) as error:  # bad input, in one sentence
+        print(f"study: {' '.join(str(error).split())}", file=sys.stderr)
+        sys.exit(2)
     except KeyboardInterrupt:
         sys.exit("study: interrupted; the same command goes on")

@@ -2,7 +2,7 @@
 
     pip install -c constraints.txt -e '.[tune]'
     python docs/tuning.py --scene psm --trials 100          # a second call goes on where the first stopped
-    python docs/tuning.py --scene psm --timeout 480 network.hidden=[128,128]
+    python docs/tuning.py --scene psm --timeout 480 --out runs/small network.hidden=[128,128]
 
 What is tuned are seconds of learning as `surgical-marl bench solve` counts them, without imports and compilation. All
 trials run in one process, one after the other, so that engines compile once and trials don't share the device. A trial
@@ -36,6 +36,7 @@ from surgical_marl.bench.workload import Workload
 from surgical_marl.files import write_atomic
 from surgical_marl.learning.config import Settings, load_config
 from surgical_marl.learning.memory import in_memory
+from surgical_marl.learning.train import make_env
 
 FRESH = 1000
 """Seeds from here on are not used by the search."""
@@ -84,8 +85,11 @@ class Search:
     def __init__(self, arguments: argparse.Namespace) -> None:
         self.arguments, self.goal = arguments, Goal(arguments.success)
         self.where = Workload(device=arguments.device).where
+        self.results = arguments.results or arguments.out
+        self.results.mkdir(parents=True, exist_ok=True)
         self.name = f"{arguments.task}-{arguments.scene}-{arguments.algo}-{self.where}"
         self.shipped = self.settings([])
+        make_env(self.shipped, 1)  # or every trial would be refused
         self.knobs = knobs(self.where, arguments.settings)
         arguments.out.mkdir(parents=True, exist_ok=True)
         self.study = optuna.create_study(
@@ -227,19 +231,18 @@ def write(search: Search, results: Path) -> None:
 def main(argv: list[str] | None = None) -> int:
     arguments = _parse(argv)
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    arguments.results.mkdir(parents=True, exist_ok=True)
     search = Search(arguments)
     try:
         search.run()
     finally:
         if search.done():
-            write(search, arguments.results)
+            write(search, search.results)
     if not search.solved():
         print(f"tuning: no trial met the goal within {arguments.limit:g} s: try a larger --limit", file=sys.stderr)
         return 1
     found = search.confirm()
     text = json.dumps(found, indent=1) + "\n"
-    write_atomic(arguments.results / f"{search.name}.json", lambda path: path.write_text(text))
+    write_atomic(search.results / f"{search.name}.json", lambda path: path.write_text(text))
     print(text, end="")
     return 0
 
@@ -253,16 +256,19 @@ def _parse(argv: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--algo", default="mappo")
     parser.add_argument("--device", default="auto")
     parser.add_argument("--success", type=float, default=Goal.success, metavar="SHARE", help="wanted within 2 mm")
-    parser.add_argument("--trials", type=int, default=100, metavar="N", help="in all calls together")
-    parser.add_argument("--timeout", type=float, default=float("inf"), metavar="SECONDS", help="no new trial after it")
+    parser.add_argument("--trials", type=_above(0, int), default=100, metavar="N", help="in all calls together")
     parser.add_argument(
-        "--limit", type=float, default=120.0, metavar="SECONDS", help="of learning, while none was better"
+        "--timeout", type=_above(0), default=float("inf"), metavar="SECONDS", help="no new trial after it"
     )
-    parser.add_argument("--seeds", type=int, default=2, metavar="N", help="trainings a trial, whose mean counts")
-    parser.add_argument("--confirm", type=int, default=5, metavar="N", help="fresh seeds in the end")
+    parser.add_argument(
+        "--limit", type=_above(0), default=120.0, metavar="SECONDS", help="of learning, while none was better"
+    )
+    parser.add_argument(
+        "--seeds", type=_above(0, int), default=2, metavar="N", help="trainings a trial, whose mean counts"
+    )
+    parser.add_argument("--confirm", type=_above(-1, int), default=5, metavar="N", help="fresh seeds in the end")
     parser.add_argument("--out", type=Path, default=Path("runs/tuning"), metavar="DIR", help="journal of the search")
-    here = Path(__file__).parent / "tuning"
-    parser.add_argument("--results", type=Path, default=here, metavar="DIR", help="folder of .csv, .json and .png")
+    parser.add_argument("--results", type=Path, metavar="DIR", help="of .csv, .json and .png (default: --out)")
     given = sys.argv[1:] if argv is None else argv
     settings = [text for text in given if "=" in text and not text.startswith("-")]
     arguments = parser.parse_args([text for text in given if text not in settings])
@@ -270,8 +276,25 @@ def _parse(argv: list[str] | None) -> argparse.Namespace:
     return arguments
 
 
+def _above(least: int, kind: type[int] | type[float] = float) -> Callable[[str], float]:
+    def check(text: str) -> float:
+        try:
+            value = kind(text)
+        except ValueError:
+            value = kind(least)
+        if not value > least:
+            what = "whole number" if kind is int else "number"
+            raise argparse.ArgumentTypeError(f"must be a {what} above {least}, not {text!r}")
+        return value
+
+    return check
+
+
 if __name__ == "__main__":
     try:
         sys.exit(main())
+    except (ValueError, OSError) as error:  # bad input, in one sentence
+        print(f"tuning: {' '.join(str(error).split())}", file=sys.stderr)
+        sys.exit(2)
     except KeyboardInterrupt:
         sys.exit("tuning: interrupted; the same command goes on")

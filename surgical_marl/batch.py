@@ -9,6 +9,7 @@ An environment that ends starts its next episode within the same step.
 
 from __future__ import annotations
 
+import numbers
 import secrets
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -122,7 +123,8 @@ class BatchedEnv:
                 environment's next episode, or draws a seed if there was none yet.
             first: the number of the first environment, where several processes share the environments of a seed.
         """
-        if seed is not None and (isinstance(seed, bool) or not 0 <= seed < 2**63):
+        whole = isinstance(seed, numbers.Integral) and not isinstance(seed, bool)
+        if seed is not None and not (whole and 0 <= seed < 2**63):
             raise ValueError(f"seed must be a whole number from 0 to 2**63 - 1, not {seed!r}")
         if seed is None and self._started:
             self.engine.restart()

@@ -119,9 +119,10 @@ def _parser() -> argparse.ArgumentParser:
     evaluate.add_argument("policies", nargs="+", metavar="RUN_OR_POLICY", help=what)
     evaluate.add_argument("--task", help="of a policy that is not trained")
     evaluate.add_argument("--scene", help="likewise: a name (see `list scenes`) or a .yaml file")
-    for key, good in (("control", _CONTROL), ("difficulty", _DIFFICULTY)):
-        evaluate.add_argument(f"--{key}", type=_one_of(good), metavar="|".join(good), help="likewise")
-    evaluate.add_argument("--episodes", type=_whole(1), default=200, metavar="N")
+    own = "of the goals (default: the policy's own)"
+    for key, good, text in (("control", _CONTROL, "likewise"), ("difficulty", _DIFFICULTY, own)):
+        evaluate.add_argument(f"--{key}", type=_one_of(good), metavar="|".join(good), help=text)
+    evaluate.add_argument("--episodes", type=_whole(1, 1_000_000), default=200, metavar="N")
     evaluate.add_argument("--seed", type=_whole(0), default=0, metavar="S")
     evaluate.add_argument("--against", type=Path, metavar="FILE.json", help="an older result to compare with")
     evaluate.add_argument("--json", action="store_true", help="one JSON object instead of a table")
@@ -278,7 +279,8 @@ def _train(arguments: argparse.Namespace) -> None:
 
     overrides, resume = [*flags, *arguments.overrides], arguments.resume
     claim_gpu("cpu" if "device=cpu" in overrides else "auto")  # first: to look for a GPU is to start CUDA
-    if resume and None not in (arguments.task, arguments.scene) and not has_begun(resume):
+    starts = arguments.out is None or resume is None or arguments.out.resolve() == resume.resolve()
+    if resume and starts and None not in (arguments.task, arguments.scene) and not has_begun(resume):
         resume = None  # the same command starts a run and goes on with it, however early it was killed
     if resume:
         settings = read_settings(resume, overrides)
@@ -338,10 +340,12 @@ def _one_of(good: Sequence[str]) -> Callable[[str], str]:
     return check
 
 
-def _whole(least: int) -> Callable[[str], int]:
+def _whole(least: int, most: int | None = None) -> Callable[[str], int]:
+    good = f"of {least} or more" if most is None else f"from {least} to {most}"
+
     def check(text: str) -> int:
-        if not text.isdecimal() or int(text) < least:
-            raise argparse.ArgumentTypeError(f"must be a whole number of {least} or more, not {text!r}")
+        if not text.isdecimal() or int(text) < least or (most is not None and int(text) > most):
+            raise argparse.ArgumentTypeError(f"must be a whole number {good}, not {text!r}")
         return int(text)
 
     return check

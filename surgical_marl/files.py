@@ -21,6 +21,10 @@ def write_atomic(path: Path, write: Callable[[Path], object]) -> None:
         os.replace(temporary, path)
         with contextlib.suppress(OSError):  # not every system can flush a folder
             _flush(path.parent, os.O_RDONLY)
+    except OSError as error:
+        if error.filename == str(temporary):
+            error.filename = str(path)  # the name that whoever asked for it knows
+        raise
     finally:
         temporary.unlink(missing_ok=True)
 

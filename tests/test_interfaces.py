@@ -178,10 +178,12 @@ def test_pictures_are_for_one_environment() -> None:
     frame = env.render()
     assert frame.dtype == np.uint8 and frame.ndim == 3 and frame.std() > 10
     assert make().render() is None
-    with pytest.raises(ValueError, match="one environment only"):
+    with pytest.raises(ValueError, match="'rgb_array' is for one environment: leave num_envs 2 out"):
         make(num_envs=2, render_mode="rgb_array")
     with pytest.warns(UserWarning), pytest.raises(ValueError, match="unknown render_mode 'ansi'"):
         gymnasium.make("surgical_marl/Reach-v0", scene="psm", render_mode="ansi")
+    with pytest.raises(ValueError, match="num_envs 4 is for many environments: use"):
+        gymnasium.make("surgical_marl/Reach-v0", scene="psm", num_envs=4)
 
 
 @pytest.mark.parametrize(
@@ -206,14 +208,16 @@ def test_a_bad_action_is_one_sentence_and_changes_nothing(actions: dict[str, Any
 
 def test_steps_out_of_turn_are_refused() -> None:
     env, still = make(), {agent: np.zeros(7) for agent in ("psm_0", "psm_1")}
-    with pytest.raises(ValueError, match=r"reset\(\)"):
+    with pytest.raises(ValueError, match=r"no episode is under way: call reset\(\)"):
         env.step(still)
     env.reset(seed=0)
     for _ in range(STEPS):
         env.step(still)
-    with pytest.raises(ValueError, match="the episode is over"):
+    with pytest.raises(ValueError, match="no episode is under way"):
         env.step(still)
     with pytest.raises(ValueError, match="arrays='torch' needs num_envs"):
         make(arrays="torch")
-    with pytest.raises(ValueError, match="seed must be a whole number"):
-        env.reset(seed=-1)
+    for seed in (-1, 1.5, "x"):
+        with pytest.raises(ValueError, match="seed must be a whole number"):
+            env.reset(seed=seed)
+    env.reset(seed=np.int64(3))

@@ -27,6 +27,7 @@ from surgical_marl.learning.policy import (
     zero_policy,
 )
 from surgical_marl.learning.run import (
+    CONFIG,
     read_checkpoint,
     read_metrics,
     read_settings,
@@ -167,6 +168,9 @@ def test_resume_drops_rows_beyond_the_checkpoint(tmp_path: Path, fakes: list[Any
         file.write((run / "metrics.csv").read_text().splitlines()[-1].replace("2,", "3,", 1) + "\n")
     train.train(replace(SMALL, iterations=3), out=run, resume=run)
     assert [row["iteration"] for row in read_metrics(run)] == [1, 2, 3]
+    (run / "metrics.csv").write_bytes(b"garbage\x00\xff,,,\n1,2\n")
+    train.train(replace(SMALL, iterations=4), out=run, resume=run)
+    assert [row["iteration"] for row in read_metrics(run)] == [4]
 
 
 def test_a_run_folder_recreates_the_run(tmp_path: Path, fakes: list[Any]) -> None:
@@ -307,6 +311,15 @@ def test_folders_that_cannot_be_used(tmp_path: Path, fakes: list[Any]) -> None:
         with pytest.raises(ValueError, match=message):
             train.train(settings, **arguments)
     assert not (tmp_path / "new").exists()
+    whole = (run / CONFIG).read_text()
+    for text, message in (
+        (b"", "config.yaml has no task"),
+        (whole.replace("scene: bimanual_psm\n", "").encode(), "config.yaml has no scene"),
+        (b"\xdf\xff", "config.yaml is not valid YAML"),
+    ):
+        (run / CONFIG).write_bytes(text)
+        with pytest.raises(ValueError, match=message):
+            read_settings(run)
 
 
 def test_a_run_that_cannot_start_leaves_no_folder(tmp_path: Path) -> None:
@@ -326,6 +339,9 @@ def test_writing_is_atomic(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="disk full"):
         write_atomic(path, fail)
     assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
+    with pytest.raises(FileNotFoundError) as error:
+        write_atomic(tmp_path / "no" / "file", lambda temporary: temporary.write_text(""))
+    assert error.value.filename == str(tmp_path / "no" / "file")
 
 
 def test_policies_act_alike_on_numpy_and_tensors(tmp_path: Path, fakes: list[Any]) -> None:

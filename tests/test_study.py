@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -100,3 +101,17 @@ def test_what_is_wrong_with_one_run_stops_no_other(tmp_path: Path) -> None:
         job,
         "unknown setting 'num_env'; did you mean 'num_envs'?",
     )
+
+
+@pytest.mark.parametrize(
+    ("script", "argv", "words"),
+    [
+        ("study", ["--only", "report"], "study: out holds no run that was played: nothing to report"),
+        ("study", ["--seeds", "0"], "argument --seeds: must be a whole number of 1 or more, not '0'"),
+        ("tuning", ["--scene", "nope"], "tuning: unknown scene 'nope'"),
+    ],
+)
+def test_bad_input_ends_in_one_sentence(script: str, argv: list[str], words: str, tmp_path: Path) -> None:
+    command = [sys.executable, str(Path(study.__file__).with_name(f"{script}.py")), *argv, "--out", "out"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 2 and words in done.stderr and "Traceback" not in done.stderr

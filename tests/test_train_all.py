@@ -83,9 +83,12 @@ def test_a_run_that_was_stopped_goes_on_from_wherever_it_was(script: Any, tmp_pa
     shutil.copy(unbroken / CONFIG, run)  # stopped before its first checkpoint
     script.train("reach", "psm", run, [*small, "iterations=1"])
     shutil.copy(run / CHECKPOINT, tmp_path)
-    for overrides in (small, [*small, "iterations=1"]):  # after the first it is done
-        script.train("reach", "psm", run, overrides)
+    for _ in range(2):  # after the first it is done
+        script.train("reach", "psm", run, small)
     assert read_checkpoint(run)["iteration"] == 2
+    for other, words in (("iterations=1", "already has 2 iterations"), ("num_envs=8", "has num_envs 4")):
+        with pytest.raises(ValueError, match=words):  # it is not what was asked for
+            script.train("reach", "psm", run, [*small, other])
     shutil.copy(tmp_path / CHECKPOINT, run)  # stopped when the last metrics were written, and the last checkpoint not
     script.train("reach", "psm", run, small)
     assert read_checkpoint(run)["iteration"] == 2

@@ -54,3 +54,24 @@ def test_slower_trials_are_pruned_and_the_best_is_confirmed(tmp_path: Path, monk
     assert all("complete" in line or ",pruned," in line for line in lines[1:])
     assert tuning.main(argv) == 0, "nothing is left to do but to confirm"
     assert len((tmp_path / "results" / "reach-psm-mappo-cpu.csv").read_text().splitlines()) == 13
+
+
+@pytest.mark.parametrize(
+    ("argv", "words"),
+    [
+        (["--scene", "nope"], "unknown scene 'nope'"),
+        (["--task", "nope"], "unknown task with training settings 'nope'"),
+        (["--success", "2"], "2"),
+        (["num_env=3"], "did you mean 'num_envs'"),
+        (["--seeds", "0"], "argument --seeds: must be a whole number above 0, not '0'"),
+        (["--trials", "2.5"], "argument --trials: must be a whole number above 0, not '2.5'"),
+        (["--limit", "-1"], "argument --limit: must be a number above 0, not '-1'"),
+    ],
+)
+def test_bad_input_starts_no_search(
+    argv: list[str], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises((ValueError, SystemExit)) as error:
+        tuning.main([*argv, "--device", "cpu", "--out", str(tmp_path / "out")])
+    assert words in (str(error.value) if error.type is ValueError else capsys.readouterr().err)
+    assert not list(tmp_path.rglob("*.csv")) + list(tmp_path.rglob("*.log"))

@@ -24,7 +24,8 @@ def play_all(policies: Sequence[str], asked: Mapping[str, str | None], episodes:
 
     Args:
         policies: runs or shipped policies of one task and scene, or one of `BASELINES` alone.
-        asked: `task`, `scene`, `control` and `difficulty`; a run's own where None, and no others than its own.
+        asked: `task`, `scene`, `control` and `difficulty`; a run's own where None, and no others than its own but for
+            the difficulty.
 
     Raises:
         ValueError: naming what is unknown, or does not go together.
@@ -127,6 +128,8 @@ def _settings(policy: str, asked: Mapping[str, str | None]) -> Settings:
     if policy in BASELINES:
         return Settings(**{key: value for key, value in asked.items() if value is not None})  # type: ignore[arg-type]
     settings = read_settings(find("policies", policy))
+    if difficulty := asked["difficulty"]:
+        settings = replace(settings, difficulty=difficulty)  # type: ignore[arg-type]  # changes goals alone
     for key, value in asked.items():
         if value not in (None, own := getattr(settings, key)):
             raise ValueError(f"{policy} is of {key} {own!r}, not {value!r}: leave --{key} out")

@@ -32,6 +32,8 @@ class SurgicalEnv(gymnasium.Env[Any, np.ndarray]):
     def __init__(self, task: str = "reach", scene: str = "psm", render_mode: str | None = None, **options: Any) -> None:
         """`options` are those of `surgical_marl.batch.BatchedEnv`: control, engine, device, max_steps, difficulty,
         reward."""
+        if "num_envs" in options:
+            raise ValueError(f"num_envs {options['num_envs']!r} is for many environments: use gymnasium.make_vec")
         if render_mode not in RENDER_MODES:
             raise ValueError(f"unknown render_mode {render_mode!r}; the modes are None and 'rgb_array'")
         self.render_mode = render_mode
@@ -50,7 +52,7 @@ class SurgicalEnv(gymnasium.Env[Any, np.ndarray]):
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """One control step. ValueError for a wrong shape, a value that is not finite, or an episode that is over."""
         if self._over:
-            raise ValueError("the episode is over: call reset() before step()")
+            raise ValueError("no episode is under way: call reset() before step()")
         step = self.batch.step(_split(self.batch, np.asarray(action)[None]))
         terminated, truncated = bool(step.terminated[0]), bool(step.truncated[0])
         self._over = terminated or truncated

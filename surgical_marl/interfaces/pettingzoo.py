@@ -70,7 +70,7 @@ class SurgicalParallelEnv(ParallelEnv[str, Any, Any]):
             ValueError: an agent that does not exist or has no action, a wrong shape, or a value that is not finite.
         """
         if not self.agents:
-            raise ValueError("the episode is over: call reset() before step()")
+            raise ValueError("no episode is under way: call reset() before step()")
         step = self.batch.step({agent: np.asarray(action)[None] for agent, action in actions.items()})
         terminated, truncated = bool(step.terminated[0]), bool(step.truncated[0])
         self._state = self._first(step.final_state)
@@ -202,8 +202,10 @@ def parallel_env(
     """
     from surgical_marl.batch import BatchedEnv
 
-    if render_mode not in RENDER_MODES or (render_mode and num_envs is not None):
-        raise ValueError(f"render_mode {render_mode!r} is not one of None, 'rgb_array' (one environment only)")
+    if render_mode not in RENDER_MODES:
+        raise ValueError(f"unknown render_mode {render_mode!r}; the modes are None and 'rgb_array'")
+    if render_mode and num_envs is not None:
+        raise ValueError(f"render_mode {render_mode!r} is for one environment: leave num_envs {num_envs} out")
     if num_envs is None and arrays != "numpy":
         raise ValueError(f"arrays={arrays!r} needs num_envs; one environment speaks numpy")
     batch = BatchedEnv(

@@ -163,6 +163,9 @@ def read_config(path: Path, overrides: Iterable[str] = ()) -> Settings:
     for note in ("versions", "origin"):
         values.pop(note, None)
     _reject_unknown(values)
+    for name in ("task", "scene"):
+        if name not in values:
+            raise ValueError(f"{path} has no {name}: it is cut short, so restore it from a copy")
     return _build(_override(values, overrides))
 
 
@@ -176,7 +179,7 @@ def config_text(settings: Settings, notes: Mapping[str, Mapping[str, Any]]) -> s
 def _read_yaml(path: Path) -> dict[str, Any]:
     try:
         values = yaml.safe_load(path.read_text())
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ValueError(f"{path} is not valid YAML: {' '.join(str(error).split())}") from None
     return dict(_mapping(str(path), values or {}))
 

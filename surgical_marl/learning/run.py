@@ -17,6 +17,7 @@ import platform
 import subprocess
 import tempfile
 import time
+import warnings
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -103,7 +104,8 @@ def read_checkpoint(run: str | Path) -> dict[str, Any]:
     if not path.is_file():
         raise ValueError(f"{run} is not a run folder: it has no {CHECKPOINT}")
     try:
-        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+        with warnings.catch_warnings(action="ignore"):  # what torch says of a file that is none of its own
+            checkpoint = torch.load(path, map_location="cpu", weights_only=True)
     except Exception:  # torch.load raises many types for a damaged file, and all mean the same here
         checkpoint = None
     if not isinstance(checkpoint, dict) or not {"iteration", "groups", "algorithm"} <= checkpoint.keys():
