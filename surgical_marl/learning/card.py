@@ -132,7 +132,7 @@ def _how_trained(folder: Path, settings: Settings) -> str:
     steps = f"{last['env_steps']:,.0f} environment steps in {last['seconds']:,.0f} s of rollouts and updates"
     return f"""## How it was trained
 
-By `{command}` with the settings in `config.yaml`.
+By `{command}`; `config.yaml` holds all settings that it then had.
 
 - {settings.algo}, {settings.num_envs:,} environments, {last["iteration"]:,.0f} iterations: {steps}.
 - On {device}, started {started}, commit `{commit}`.
