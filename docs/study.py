@@ -23,6 +23,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from surgical_marl.cli import whole
+
 TASK = "reach"
 SCENES = ("bimanual_psm", "bimanual_star", "trimanual_psm_ecm")
 ALGOS = ("mappo", "ippo", "joint")
@@ -128,9 +130,9 @@ def work(part: str, job: Job, out: Path, overrides: list[str]) -> tuple[Job, str
 def main(argv: list[str] | None = None) -> int:
     arguments = _parse(argv)
     results = arguments.results or arguments.out
-    results.mkdir(parents=True, exist_ok=True)
     jobs = [Job(s, a, n) for n in range(arguments.seeds) for s in arguments.scenes for a in arguments.algos]
-    arguments.out.mkdir(parents=True, exist_ok=True)
+    for folder in (arguments.out, results):
+        folder.mkdir(parents=True, exist_ok=True)
     failed: dict[str, str] = {}
     for part in [part for part in PARTS[:2] if part in arguments.only]:
         ready = [job for job in jobs if str(job) not in failed]
@@ -159,8 +161,8 @@ def _parse(argv: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--only", nargs="+", choices=PARTS, default=PARTS, help="parts of the work")
     parser.add_argument("--scenes", nargs="+", choices=SCENES, default=SCENES)
     parser.add_argument("--algos", nargs="+", choices=ALGOS, default=ALGOS)
-    parser.add_argument("--seeds", type=_count, default=5, metavar="N", help="0 to N - 1")
-    parser.add_argument("--jobs", type=_count, default=1, metavar="N", help="processes")
+    parser.add_argument("--seeds", type=whole(1), default=5, metavar="N", help="0 to N - 1")
+    parser.add_argument("--jobs", type=whole(1), default=1, metavar="N", help="processes")
     parser.add_argument("--out", type=Path, default=Path("runs/study"), metavar="DIR", help="folder of the runs")
     parser.add_argument("--results", type=Path, metavar="DIR", help="of study.md, .json, .csv, .png (default: --out)")
     given = sys.argv[1:] if argv is None else argv
@@ -168,12 +170,6 @@ def _parse(argv: list[str] | None) -> argparse.Namespace:
     arguments = parser.parse_args([text for text in given if text not in settings])
     arguments.settings = settings
     return arguments
-
-
-def _count(text: str) -> int:
-    if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"must be a whole number of 1 or more, not {text!r}")
-    return int(text)
 
 
 if __name__ == "__main__":

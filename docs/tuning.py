@@ -33,6 +33,7 @@ from optuna.trial import FrozenTrial, TrialState
 from surgical_marl.bench import machine
 from surgical_marl.bench.solve import Goal, Solution, solve
 from surgical_marl.bench.workload import Workload
+from surgical_marl.cli import whole
 from surgical_marl.files import write_atomic
 from surgical_marl.learning.config import Settings, load_config
 from surgical_marl.learning.memory import in_memory
@@ -85,13 +86,13 @@ class Search:
     def __init__(self, arguments: argparse.Namespace) -> None:
         self.arguments, self.goal = arguments, Goal(arguments.success)
         self.where = Workload(device=arguments.device).where
-        self.results = arguments.results or arguments.out
-        self.results.mkdir(parents=True, exist_ok=True)
         self.name = f"{arguments.task}-{arguments.scene}-{arguments.algo}-{self.where}"
         self.shipped = self.settings([])
-        make_env(self.shipped, 1)  # or every trial would be refused
+        make_env(self.shipped, 1)  # what only an environment refuses would look like a trial that failed
         self.knobs = knobs(self.where, arguments.settings)
-        arguments.out.mkdir(parents=True, exist_ok=True)
+        self.results = arguments.results or arguments.out
+        for folder in (arguments.out, self.results):
+            folder.mkdir(parents=True, exist_ok=True)
         self.study = optuna.create_study(
             storage=JournalStorage(JournalFileBackend(str(arguments.out / f"{self.name}.log"))),
             study_name=self.name,
@@ -256,17 +257,15 @@ def _parse(argv: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--algo", default="mappo")
     parser.add_argument("--device", default="auto")
     parser.add_argument("--success", type=float, default=Goal.success, metavar="SHARE", help="wanted within 2 mm")
-    parser.add_argument("--trials", type=_above(0, int), default=100, metavar="N", help="in all calls together")
+    parser.add_argument("--trials", type=whole(1), default=100, metavar="N", help="in all calls together")
     parser.add_argument(
-        "--timeout", type=_above(0), default=float("inf"), metavar="SECONDS", help="no new trial after it"
+        "--timeout", type=_positive, default=float("inf"), metavar="SECONDS", help="no new trial after it"
     )
     parser.add_argument(
-        "--limit", type=_above(0), default=120.0, metavar="SECONDS", help="of learning, while none was better"
+        "--limit", type=_positive, default=120.0, metavar="SECONDS", help="of learning, while none was better"
     )
-    parser.add_argument(
-        "--seeds", type=_above(0, int), default=2, metavar="N", help="trainings a trial, whose mean counts"
-    )
-    parser.add_argument("--confirm", type=_above(-1, int), default=5, metavar="N", help="fresh seeds in the end")
+    parser.add_argument("--seeds", type=whole(1), default=2, metavar="N", help="trainings a trial, whose mean counts")
+    parser.add_argument("--confirm", type=whole(0), default=5, metavar="N", help="fresh seeds in the end")
     parser.add_argument("--out", type=Path, default=Path("runs/tuning"), metavar="DIR", help="journal of the search")
     parser.add_argument("--results", type=Path, metavar="DIR", help="of .csv, .json and .png (default: --out)")
     given = sys.argv[1:] if argv is None else argv
@@ -276,18 +275,14 @@ def _parse(argv: list[str] | None) -> argparse.Namespace:
     return arguments
 
 
-def _above(least: int, kind: type[int] | type[float] = float) -> Callable[[str], float]:
-    def check(text: str) -> float:
-        try:
-            value = kind(text)
-        except ValueError:
-            value = kind(least)
-        if not value > least:
-            what = "whole number" if kind is int else "number"
-            raise argparse.ArgumentTypeError(f"must be a {what} above {least}, not {text!r}")
-        return value
-
-    return check
+def _positive(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not value > 0:
+        raise argparse.ArgumentTypeError(f"must be a number above 0, not {text!r}")
+    return value
 
 
 if __name__ == "__main__":

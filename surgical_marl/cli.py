@@ -122,8 +122,8 @@ def _parser() -> argparse.ArgumentParser:
     own = "of the goals (default: the policy's own)"
     for key, good, text in (("control", _CONTROL, "likewise"), ("difficulty", _DIFFICULTY, own)):
         evaluate.add_argument(f"--{key}", type=_one_of(good), metavar="|".join(good), help=text)
-    evaluate.add_argument("--episodes", type=_whole(1, 1_000_000), default=200, metavar="N")
-    evaluate.add_argument("--seed", type=_whole(0), default=0, metavar="S")
+    evaluate.add_argument("--episodes", type=whole(1, 1_000_000), default=200, metavar="N")
+    evaluate.add_argument("--seed", type=whole(0), default=0, metavar="S")
     evaluate.add_argument("--against", type=Path, metavar="FILE.json", help="an older result to compare with")
     evaluate.add_argument("--json", action="store_true", help="one JSON object instead of a table")
     evaluate.add_argument("--csv", type=Path, metavar="FILE.csv", help="a row for each run and agent")
@@ -159,7 +159,7 @@ def _parser() -> argparse.ArgumentParser:
     bench = commands.add_parser("bench", help="measure how fast this machine simulates, learns and draws")
     kinds = bench.add_subparsers(required=True, metavar="{sim,train,solve,render}")
     sim = _bench_parser(kinds, "sim", "steps/s of the engines and of C MuJoCo", _BENCHED)
-    sim.add_argument("--decimation", type=_whole(1), default=1, metavar="K", help="physics steps an environment step")
+    sim.add_argument("--decimation", type=whole(1), default=1, metavar="K", help="physics steps an environment step")
     sim.add_argument("--motion", type=_one_of(_MOTIONS), default=_MOTIONS[0], metavar="|".join(_MOTIONS),
                      help="random: a new action every control step; rough: arms cross each other's way")  # fmt: skip
     sim.add_argument("--sweep", action="store_true", help="from 1 to 4 million environments, as far as memory goes")
@@ -168,14 +168,14 @@ def _parser() -> argparse.ArgumentParser:
         learns = _bench_parser(kinds, kind, what, _ENGINES)
         learns.usage = "%(prog)s [options] [key=value ...]"
         learns.add_argument("--algo", type=_one_of(_ALGOS), metavar="|".join(_ALGOS), help="who learns from what")
-        learns.add_argument("--seed", type=_whole(0), metavar="S", help="seed of everything random")
+        learns.add_argument("--seed", type=whole(0), metavar="S", help="seed of everything random")
     learns.add_argument("--success", type=float, default=0.95, metavar="SHARE", help="wanted within 2 mm")
     learns.add_argument("--collisions", type=float, default=0.01, metavar="SHARE", help="of episodes, to stay below")
     learns.add_argument("--limit", type=float, default=600.0, metavar="SECONDS", help="then it is given up")
 
     draws = kinds.add_parser("render", help="pictures/s of the endoscope")
     draws.add_argument("--scene", default="ecm", help="a scene with an endoscope, or a .yaml file")
-    draws.add_argument("--num-envs", type=_whole(1), metavar="N", help="default: 64 on a CPU, 8192 on a GPU")
+    draws.add_argument("--num-envs", type=whole(1), metavar="N", help="default: 64 on a CPU, 8192 on a GPU")
     draws.add_argument("--device", type=_one_of(_DEVICES), default="auto", metavar="|".join(_DEVICES))
     draws.add_argument("--json", action="store_true", help="one JSON object instead of a table")
     draws.set_defaults(command=_bench, name="bench render", kind="render")
@@ -190,7 +190,7 @@ def _bench_parser(kinds: Any, kind: str, what: str, engines: Sequence[str]) -> a
     parser: argparse.ArgumentParser = kinds.add_parser(kind, help=what)
     parser.add_argument("--task", default="reach", help=f"one of: {', '.join(list_tasks())}")
     parser.add_argument("--scene", default="psm", help="a name (see `list scenes`) or a .yaml file")
-    parser.add_argument("--num-envs", type=_whole(1), metavar="N", help="default: by the device (docs/benchmarks.md)")
+    parser.add_argument("--num-envs", type=whole(1), metavar="N", help="default: by the device (docs/benchmarks.md)")
     parser.add_argument("--engine", type=_one_of(engines), default=engines[0], metavar="|".join(engines))
     parser.add_argument("--device", type=_one_of(_DEVICES), default="auto", metavar="|".join(_DEVICES))
     parser.add_argument("--cold", action="store_true", help="start without caches")
@@ -279,8 +279,8 @@ def _train(arguments: argparse.Namespace) -> None:
 
     overrides, resume = [*flags, *arguments.overrides], arguments.resume
     claim_gpu("cpu" if "device=cpu" in overrides else "auto")  # first: to look for a GPU is to start CUDA
-    starts = arguments.out is None or resume is None or arguments.out.resolve() == resume.resolve()
-    if resume and starts and None not in (arguments.task, arguments.scene) and not has_begun(resume):
+    in_place = resume and (arguments.out or resume).resolve() == resume.resolve()
+    if in_place and None not in (arguments.task, arguments.scene) and not has_begun(resume):
         resume = None  # the same command starts a run and goes on with it, however early it was killed
     if resume:
         settings = read_settings(resume, overrides)
@@ -340,7 +340,8 @@ def _one_of(good: Sequence[str]) -> Callable[[str], str]:
     return check
 
 
-def _whole(least: int, most: int | None = None) -> Callable[[str], int]:
+def whole(least: int, most: int | None = None) -> Callable[[str], int]:
+    """Of `add_argument(type=...)`: a whole number within these."""
     good = f"of {least} or more" if most is None else f"from {least} to {most}"
 
     def check(text: str) -> int:

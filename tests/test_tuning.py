@@ -63,8 +63,8 @@ def test_slower_trials_are_pruned_and_the_best_is_confirmed(tmp_path: Path, monk
         (["--task", "nope"], "unknown task with training settings 'nope'"),
         (["--success", "2"], "2"),
         (["num_env=3"], "did you mean 'num_envs'"),
-        (["--seeds", "0"], "argument --seeds: must be a whole number above 0, not '0'"),
-        (["--trials", "2.5"], "argument --trials: must be a whole number above 0, not '2.5'"),
+        (["--seeds", "0"], "argument --seeds: must be a whole number of 1 or more, not '0'"),
+        (["--trials", "2.5"], "argument --trials: must be a whole number of 1 or more, not '2.5'"),
         (["--limit", "-1"], "argument --limit: must be a number above 0, not '-1'"),
     ],
 )

@@ -130,13 +130,7 @@ def train(settings: Settings, *, out: Path, resume: Path | None = None) -> Path:
 def finish(settings: Settings, run: Path) -> None:
     """Train a run to its end from wherever it is, in this process: not begun, stopped before its first checkpoint, or
     later. One that has its iterations already is left alone. Errors are those of `train`."""
-    if has_begun(run):
-        _check_same(settings, run)
-    done = read_checkpoint(run)["iteration"] if (run / CHECKPOINT).is_file() else 0
-    if done > settings.iterations:
-        raise ValueError(f"the run in {run} already has {done} iterations, more than {settings.iterations}")
-    if done < settings.iterations:
-        train(settings, out=run, resume=run if has_begun(run) else None)
+    train(settings, out=run, resume=run if has_begun(run) else None)
 
 
 @contextmanager
@@ -212,7 +206,11 @@ def _run(training: Training, out: Path) -> None:
 
 def _read_resumed(settings: Settings, run: Path, goes_on: bool) -> dict[str, Any] | None:
     """What this process resumes; None if the run was stopped before its first checkpoint."""
-    _check_same(settings, run)
+    asked = _dotted(settings)
+    for name, before in _dotted(read_settings(run)).items():
+        fixed = name in FIXED or name.partition(".")[0] not in CHANGEABLE
+        if fixed and before != asked[name]:
+            raise ValueError(f"the run in {run} has {name} {before!r}, and cannot go on with {asked[name]!r}")
     if not (run / CHECKPOINT).is_file() and not holds_weights(run):
         _say(f"{run} holds no checkpoint yet: its run starts from the beginning")
         return None
@@ -228,15 +226,6 @@ def _read_resumed(settings: Settings, run: Path, goes_on: bool) -> dict[str, Any
     # a checkpoint of an older version lacks these two
     state = {"processes": 1, "env_steps": steps, **state}
     return _own(state, run)
-
-
-def _check_same(settings: Settings, run: Path) -> None:
-    """ValueError if a run has other settings than these, but for those that may change on the way."""
-    asked = _dotted(settings)
-    for name, before in _dotted(read_settings(run)).items():
-        fixed = name in FIXED or name.partition(".")[0] not in CHANGEABLE
-        if fixed and before != asked[name]:
-            raise ValueError(f"the run in {run} has {name} {before!r}, and cannot go on with {asked[name]!r}")
 
 
 def _dotted(settings: Any) -> dict[str, Any]:

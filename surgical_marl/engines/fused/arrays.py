@@ -14,7 +14,7 @@ from surgical_marl.runtime import prepare_warp
 wp = prepare_warp()
 
 _TYPES = {"state": np.float32, "counts": np.int32, "actions": np.float32, "outs": np.float32, "flags": np.uint8}
-READ = ("outs", "flags", "counts")
+_READ = ("outs", "flags", "counts")
 """Buffers that a step's results are in."""
 
 
@@ -102,7 +102,7 @@ class CpuArrays(Arrays):
         return self._present(leaf, self.rows(leaf).copy(), library)
 
     def read_tree(self, tree: dict[str, Any], library: str) -> dict[str, Any]:
-        return self._cut(tree, {name: self._buffers[name].copy() for name in READ}, library)
+        return self._cut(tree, {name: self._buffers[name].copy() for name in _READ}, library)
 
     def _present(self, leaf: Leaf, rows: np.ndarray, library: str) -> Any:
         rows = rows.view(bool) if leaf.dtype == "bool" else rows.view(leaf.dtype)
@@ -149,7 +149,7 @@ class CudaArrays(Arrays):
         return self._present(leaf, self.rows(leaf).clone(), library)
 
     def read_tree(self, tree: dict[str, Any], library: str) -> dict[str, Any]:
-        return self._cut(tree, {name: self._buffers[name].clone() for name in READ}, library)
+        return self._cut(tree, {name: self._buffers[name].clone() for name in _READ}, library)
 
     def _present(self, leaf: Leaf, rows: Any, library: str) -> Any:
         import torch
