@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from fake_env import FakeEnv
 
+from fake_env import FakeEnv
 from surgical_marl.learning import train
 from surgical_marl.learning.config import NetworkSettings, PPOSettings, Settings
 from surgical_marl.learning.run import read_checkpoint, read_metrics

@@ -10,8 +10,8 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from fake_env import FakeEnv
 
+from fake_env import FakeEnv
 from surgical_marl.bench import machine, solve, stopwatch, train
 from surgical_marl.bench.solve import Exam, Goal, Looks
 from surgical_marl.bench.stopwatch import STARTING

@@ -8,12 +8,12 @@ from typing import Any
 
 import pytest
 import torch
-from fake_env import FakeEnv
-from test_learning import ALL, COUNTS, OPTIONS, SIZES, SMALL
 from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
 
+from fake_env import FakeEnv
 from surgical_marl.learning.training import Training
 from surgical_marl.runtime import no_collection
+from test_learning import ALL, COUNTS, OPTIONS, SIZES, SMALL
 
 WAITING = ("_local_scalar_dense", "nonzero", "masked_select", "unique", "equal.default", "is_nonzero")
 

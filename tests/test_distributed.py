@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 import torch
 import torch.distributed as dist
+
 from fake_env import FakeEnv
 from processes import end, start_together
 from runs import COUNTS, SIZES, SMALL, fake_env, run, same_state
-
 from surgical_marl.batch import BatchedEnv
 from surgical_marl.engines.fused.keys import episode_keys
 from surgical_marl.interfaces.rsl_rl import RslRlVecEnv

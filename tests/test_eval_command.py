@@ -13,8 +13,8 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
-from fake_env import FakeEnv
 
+from fake_env import FakeEnv
 from surgical_marl.batch import BatchedEnv
 from surgical_marl.cli import main
 from surgical_marl.content import list_scenes, list_tasks

@@ -13,12 +13,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from fused_blocks import all_blocks, programs, random_arrays, several
-from fused_kernels import make_stores, run
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from jax import lax
 
+from fused_blocks import all_blocks, programs, random_arrays, several
+from fused_kernels import make_stores, run
 from surgical_marl.engines.fused import kernel
 from surgical_marl.engines.fused.emit import Emitter
 from surgical_marl.engines.fused.graph import DTYPES, FOLD, KINDS, Branch, Graph, Loop, Value

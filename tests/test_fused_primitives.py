@@ -10,13 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from fused_blocks import STRUCTURES, all_blocks, programs, random_arrays, several
-from fused_kernels import make_stores, run
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from jax import lax
 from jax.extend.core import Primitive, primitives
 
+from fused_blocks import STRUCTURES, all_blocks, programs, random_arrays, several
+from fused_kernels import make_stores, run
 from surgical_marl.engines.fused.primitives import ELEMENTWISE, RULES
 from surgical_marl.engines.fused.trace import Tracer
 from surgical_marl.engines.fused.traced import Symbolic

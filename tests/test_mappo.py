@@ -10,13 +10,13 @@ from typing import Any
 
 import pytest
 import torch
-from fake_env import FakeEnv
 from rsl_rl.algorithms import PPO
 from rsl_rl.models import MLPModel
 from rsl_rl.runners import OnPolicyRunner
 from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 
+from fake_env import FakeEnv
 from surgical_marl.interfaces.rsl_rl import Layout, RslRlVecEnv
 from surgical_marl.learning.config import NetworkSettings, PPOSettings, Settings
 from surgical_marl.learning.mappo import MAPPO, rsl_rl_config

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from fake_env import FakeEnv
 
+from fake_env import FakeEnv
 from surgical_marl.cli import main
 from surgical_marl.learning import memory, train
 from surgical_marl.learning.config import ConstraintSettings, Settings

@@ -16,10 +16,10 @@ import numpy as np
 import onnxruntime
 import pytest
 import torch
-from fake_env import FakeEnv
 from gymnasium.spaces import Box, Dict
 from tensordict import TensorDict
 
+from fake_env import FakeEnv
 from surgical_marl import content
 from surgical_marl.evaluation import command
 from surgical_marl.interfaces.rsl_rl import Layout

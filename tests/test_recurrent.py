@@ -8,14 +8,14 @@ from typing import Any
 
 import pytest
 import torch
-from fake_env import FakeEnv
-from test_mappo import SETTINGS, SIZES, build, gradients, move_weights, roll_out
 
+from fake_env import FakeEnv
 from surgical_marl.acting import forget
 from surgical_marl.evaluation.evaluate import evaluate
 from surgical_marl.learning import train
 from surgical_marl.learning.config import NetworkSettings, PPOSettings, Settings
 from surgical_marl.learning.policy import load_policy, zero_policy
+from test_mappo import SETTINGS, SIZES, build, gradients, move_weights, roll_out
 
 TEAM = {"psm": 2, "ecm": 1}
 

@@ -15,9 +15,9 @@ from typing import Any
 
 import pytest
 import torch
+
 from processes import end, start
 from runs import LONG, MOMENTS, SMALL, run, run_or_resume, run_until, same_state
-
 from surgical_marl.cli import main
 from surgical_marl.files import write_atomic
 from surgical_marl.learning.run import read_checkpoint, read_metrics
