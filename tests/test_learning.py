@@ -13,8 +13,8 @@ from typing import Any
 
 import pytest
 import torch
-from fake_env import FakeEnv
 
+from fake_env import FakeEnv
 from surgical_marl.evaluation.evaluate import evaluate
 from surgical_marl.files import write_atomic
 from surgical_marl.learning import config, train, training
@@ -401,7 +401,8 @@ def test_settings_come_from_task_scene_and_overrides(reach: Callable[[str], None
 
 
 def test_a_gpu_has_settings_of_its_own(reach: Callable[[str], None], monkeypatch: pytest.MonkeyPatch) -> None:
-    reach("num_envs: 64\ncuda: {num_envs: 128, ppo: {lam: 0.8}}\nscenes: {ecm: {num_envs: 32}}\n")
+    own = "scenes: {ecm: {num_envs: 32}, star: {num_envs: 16, cuda: {num_envs: 256}}}"
+    reach(f"num_envs: 64\ncuda: {{num_envs: 128, ppo: {{lam: 0.8}}}}\n{own}\n")
 
     def asked(scene: str, *overrides: str) -> tuple[int, float]:
         settings = load_config("reach", scene, overrides)
@@ -413,9 +414,15 @@ def test_a_gpu_has_settings_of_its_own(reach: Callable[[str], None], monkeypatch
         assert asked("psm", "device=cpu") == (64, 0.95)
         assert asked("psm", "device=cuda", "num_envs=7") == (7, 0.8)
         assert asked("ecm", "device=cuda") == (32, 0.8)
-    reach("cuda: {speed: 1}\n")
-    with pytest.raises(ValueError, match="unknown setting 'speed'"):
-        load_config("reach", "psm", ["device=cpu"])
+        assert asked("star", "device=cuda") == (256, 0.8)
+        assert asked("star", "device=cpu") == (16, 0.95)
+        assert asked("star", "device=cuda", "num_envs=7") == (7, 0.8)
+    reach("scenes: {star: {cuda: {num_envs: 256}}}\n")  # without one for all scenes
+    assert asked("star") == (256, 0.95)  # `there` is still true
+    for text in ("cuda: {speed: 1}\n", "scenes: {psm: {cuda: {speed: 1}}}\n"):
+        reach(text)
+        with pytest.raises(ValueError, match="unknown setting 'speed'"):
+            load_config("reach", "psm", ["device=cpu"])
 
 
 def test_the_shipped_settings_load() -> None:

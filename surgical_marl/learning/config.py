@@ -129,7 +129,7 @@ class Settings(_Checked):
 
 def load_config(task: str, scene: str, overrides: Iterable[str] = ()) -> Settings:
     """Settings for a task in a scene: those of its file, of the file's section `cuda` on a GPU, of the scene's own
-    section, and overrides; what comes later goes first.
+    section, of a section `cuda` in that on a GPU, and overrides; what comes later goes first.
 
     Args:
         task: the name of a file in `configs/`, without `.yaml`.
@@ -146,14 +146,16 @@ def load_config(task: str, scene: str, overrides: Iterable[str] = ()) -> Setting
         names = sorted(file.stem for file in folder.glob("*.yaml"))
         raise unknown("task with training settings", task, names)
     values = _read_yaml(path)
-    on_gpu = _mapping("cuda", values.pop("cuda", None) or {})
     scenes = _mapping("scenes", values.pop("scenes", None) or {})
-    for section in (values, on_gpu, own := _mapping(f"scenes.{scene}", scenes.get(scene) or {})):
+    own = dict(_mapping(f"scenes.{scene}", scenes.get(scene) or {}))
+    on_gpu = _mapping("cuda", values.pop("cuda", None) or {})
+    own_on_gpu = _mapping(f"scenes.{scene}.cuda", own.pop("cuda", None) or {})
+    for section in (values, on_gpu, own, own_on_gpu):
         _reject_unknown(section, without=("task", "scene"))
     overrides = list(overrides)
     device = _override(_merge(values, own), overrides).get("device", "auto")
-    if on_gpu and (device == "cuda" or (device == "auto" and has_cuda())):
-        values = _merge(values, on_gpu)
+    if (on_gpu or own_on_gpu) and (device == "cuda" or (device == "auto" and has_cuda())):
+        values, own = _merge(values, on_gpu), _merge(own, own_on_gpu)
     return _build({**_override(_merge(values, own), overrides), "task": task, "scene": scene})
 
 
