@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 
 import imageio.v3 as imageio
@@ -11,7 +12,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from surgical_marl.view import video
+from surgical_marl.batch import BatchedEnv
+from surgical_marl.learning.policy import zero_policy
+from surgical_marl.view import record, video
 from surgical_marl.view.render import Renderer, View
 
 SIZE = 120
@@ -122,6 +125,23 @@ def frames(count: int) -> Iterator[Image]:
 
 # Reading an mp4 back, imageio forks, which JAX reports if another test has started it.
 @pytest.mark.filterwarnings("ignore:os.fork:RuntimeWarning")
+def test_a_film_shows_what_pictures_of_each_step_show(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Threads draw it, and keep the order. A control step is half of a picture's time."""
+    monkeypatch.setattr(record, "cores", lambda: 3)
+    env = BatchedEnv("track", "ecm", num_envs=2, max_steps=5)
+    still = zero_policy(env)
+    film = list(record.frames(env, still, episodes=2, seed=4))
+    picture = record.ScenePicture(env)
+    observations, *_ = env.reset(4)
+    one_by_one = []
+    for step in range(10):
+        if step % 2 == 0:
+            one_by_one.append(picture.draw())
+        observations = env.step(still(observations)).observations
+    np.testing.assert_array_equal(film, one_by_one)
+    assert all((first != second).any() for first, second in pairwise(film))  # the goal moves
+
+
 @pytest.mark.parametrize("suffix", [".mp4", ".gif"])
 def test_a_video_holds_its_frames(tmp_path: Path, suffix: str) -> None:
     path = video.write_video(tmp_path / f"film{suffix}", frames(12), fps=25)

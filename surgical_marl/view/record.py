@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from surgical_marl.acting import forget
+from surgical_marl.engines.common import cores
 from surgical_marl.view.render import Renderer, Sphere
 from surgical_marl.view.video import write_video
 
@@ -41,39 +44,65 @@ def frames(
     seed: int,
 ) -> Iterator[NDArray[np.uint8]]:
     """Pictures of the first environment, `FPS` of them for a second of simulated time."""
-    picture = ScenePicture(env)
+    picture, most = ScenePicture(env), cores()
+    drawn: deque[Future[NDArray[np.uint8]]] = deque()
+    with ThreadPoolExecutor(most) as threads:  # a picture takes half a second of a core, and leaves Python to others
+        for pose in _poses(env, policy, picture, episodes, seed):
+            drawn.append(threads.submit(picture.draw, pose))
+            if len(drawn) > most:
+                yield drawn.popleft().result()
+        while drawn:
+            yield drawn.popleft().result()
+
+
+def _poses(
+    env: BatchedEnv,
+    policy: Callable[[Mapping[str, Any]], Mapping[str, Any]],
+    picture: ScenePicture,
+    episodes: int,
+    seed: int,
+) -> Iterator[Pose]:
+    """What the pictures of `frames` show."""
     every = max(1, round(1 / (FPS * env.control_dt)))
     observations, *_ = env.reset(seed)
     forget(policy)
     for step in range(episodes * env.max_steps):
         if step % every == 0:
-            yield picture.draw()
+            yield picture.pose()
         outcome = env.step(dict(policy(observations)))
         observations = outcome.observations
         forget(policy, outcome.terminated | outcome.truncated)
 
 
+class Pose(NamedTuple):
+    """What a picture shows."""
+
+    qpos: NDArray[np.float64]
+    balls: list[Sphere]
+    """One at each arm's goal."""
+
+
 class ScenePicture:
-    """Draws the first environment of `env` as it stands, with a ball at each arm's goal."""
+    """Draws the first environment of `env`, with a ball at each arm's goal. Threads may draw at the same time."""
 
     def __init__(self, env: BatchedEnv, width: int = 480, height: int = 360) -> None:
         self._env = env
-        self._data = mujoco.MjData(env.scene.model)
         self._renderer = Renderer(env.scene.model, width, height)
 
-    def draw(self) -> NDArray[np.uint8]:
-        """The picture [height, width, 3]."""
-        model = self._env.scene.model
-        self._data.qpos[:] = self._env.qpos[0]
-        mujoco.mj_kinematics(model, self._data)
-        mujoco.mj_camlight(model, self._data)
-        return self._renderer.render(self._data, spheres=self._goals())
+    def draw(self, pose: Pose | None = None) -> NDArray[np.uint8]:
+        """The picture [height, width, 3] of the environment as it stands, or as it stood."""
+        qpos, balls = pose or self.pose()
+        data = mujoco.MjData(model := self._env.scene.model)
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_camlight(model, data)
+        return self._renderer.render(data, spheres=balls)
 
-    def _goals(self) -> list[Sphere]:
-        # The task gives each goal in its arm's base frame.
+    def pose(self) -> Pose:
+        """How the environment stands now."""
         balls: list[Sphere] = []
         goals = self._env.goal[0]
         for index, mount in enumerate(self._env.scene.mounts.values()):
-            place = mount.rotation @ goals[index] + mount.position
+            place = mount.rotation @ goals[index] + mount.position  # the task has it in its arm's base frame
             balls.append((tuple(place), GOAL_RADIUS, COLOURS[index % len(COLOURS)]))
-        return balls
+        return Pose(np.array(self._env.qpos[0], float), balls)

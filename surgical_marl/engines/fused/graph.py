@@ -54,7 +54,7 @@ COMMUTATIVE = {"add", "mul", "min", "max", "and", "or", "xor", "eq", "ne"}
 
 
 def _divide(a: Any, b: Any) -> Any:
-    return np.divide(a, b) if a.dtype.kind == "f" else (np.fix(np.divide(a, b, dtype=np.float64))).astype(a.dtype)
+    return np.divide(a, b) if a.dtype.kind == "f" else np.trunc(np.divide(a, b, dtype=np.float64)).astype(a.dtype)
 
 
 FOLD: dict[str, Callable[..., Any]] = {
