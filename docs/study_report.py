@@ -124,8 +124,15 @@ def about(found: Sequence[dict[str, Any]]) -> str:
     """What was run, in a sentence."""
     first = found[0]
     seeds = sorted({len(each["seeds"]) for each in found})
-    sizes = {(each["num_envs"], each["steps_per_iteration"], each["iterations"]) for each in found}
-    how = "; ".join("{:,} environments, {} steps an iteration, {} iterations".format(*size) for size in sorted(sizes))
+    scenes: dict[tuple[int, int, int], dict[str, None]] = {}  # of each size, in order
+    for each in found:
+        size = each["num_envs"], each["steps_per_iteration"], each["iterations"]
+        scenes.setdefault(size, {})[f"`{each['scene']}`"] = None
+    how = "; ".join(
+        "{:,} environments, {} steps an iteration, {} iterations".format(*size)
+        + (f" on {' and '.join(names)}" if len(scenes) > 1 else "")
+        for size, names in scenes.items()
+    )
     where = f"trained on {first['trained_on'] or 'an unknown device'}, played on {first['gpu'] or first['cpu']}"
     return f"`{TASK}`, {' to '.join(map(str, seeds))} seeds each, {how}; {where}."
 

@@ -115,3 +115,20 @@ def test_bad_input_ends_in_one_sentence(script: str, argv: list[str], words: str
     command = [sys.executable, str(Path(study.__file__).with_name(f"{script}.py")), *argv, "--out", "out"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 2 and words in done.stderr and "Traceback" not in done.stderr
+
+
+def test_sizes_are_told_by_scene() -> None:
+    where = {
+        "steps_per_iteration": 32,
+        "iterations": 9,
+        "seeds": [0],
+        "trained_on": "a GPU",
+        "gpu": None,
+        "cpu": "a CPU",
+    }
+    found = [{**where, "scene": s, "num_envs": n} for s, n in (("a", 8), ("b", 8), ("a", 8), ("c", 16))]
+    both = "8 environments, 32 steps an iteration, 9 iterations on `a` and `b`"
+    assert study_report.about(found[:3]) == (
+        f"`reach`, 1 seeds each, {both.removesuffix(' on `a` and `b`')}; trained on a GPU, played on a CPU."
+    )
+    assert f"{both}; 16 environments, 32 steps an iteration, 9 iterations on `c`; trained" in study_report.about(found)
