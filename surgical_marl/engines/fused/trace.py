@@ -64,6 +64,8 @@ class Tracer:
         name, params = equation.primitive.name, equation.params
         if name in _INSIDE:
             return self.run(params[_INSIDE[name]], xs)
+        if name == "call_hi_primitive":
+            return self.run(_expanded(params["_prim"]), xs)
         if name == "cond":
             return self._cond(params["branches"], xs[0], xs[1:])
         if name == "scan":
@@ -253,6 +255,15 @@ class Tracer:
     def _unsigned(self, x: Traced) -> Traced:
         aval = jax.ShapeDtypeStruct(x.shape, np.uint32)
         return apply(self.graph, "convert_element_type", [aval], {"new_dtype": np.uint32}, [x])[0]
+
+
+def _expanded(primitive: Any) -> Any:
+    """The jaxpr of what a primitive of jax 0.12 or later that has rules of its own for derivatives computes."""
+
+    def flat(*arguments: Any) -> list[Any]:
+        return jax.tree.leaves(primitive.expand(*jax.tree.unflatten(primitive.in_tree, arguments)))
+
+    return jax.make_jaxpr(flat)(*(jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in primitive.in_avals_flat))
 
 
 def _is_key(aval: Any) -> bool:
