@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from surgical_marl import list_scenes, load_scene
-from surgical_marl.scene import TIMESTEP, Scene
+from surgical_marl.scenes.scene import TIMESTEP, Scene
 
 
 def energy_drift(scene: Scene, seconds: float = 2.0, timestep: float | None = None) -> tuple[np.ndarray, np.ndarray]:

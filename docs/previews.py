@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from surgical_marl import list_arms, list_scenes, load_arm, load_scene
-from surgical_marl.scene import Scene
+from surgical_marl.scenes.scene import Scene
 from surgical_marl.view.render import Renderer
 
 DIRECTION = np.array([0.75, 0.60, 0.30])

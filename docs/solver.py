@@ -11,10 +11,11 @@ import jax
 import mujoco
 import numpy as np
 
-from surgical_marl import dynamics, load_scene, physics, solver
-from surgical_marl.dynamics import Physics
-from surgical_marl.physics import Simulator
-from surgical_marl.scene import DECIMATION, Scene
+from surgical_marl import load_scene
+from surgical_marl.physics.dynamics import Physics
+from surgical_marl.physics.simulator import Simulator, dynamics, solver
+from surgical_marl.physics.simulator import simulator as physics
+from surgical_marl.scenes.scene import DECIMATION, Scene
 
 STEPS, SAMPLES = 5000, 2000
 TOUCHING = ((2, 6), (3, 6), (4, 6), (6, 4), (6, 6), (10, 20))

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 
 from surgical_marl import load_scene
-from surgical_marl.scene import Scene
+from surgical_marl.scenes.scene import Scene
 
 CONTROL = 0.02
 SECONDS = 10.0

@@ -12,8 +12,8 @@ import mujoco
 import numpy as np
 
 from surgical_marl import load_scene
-from surgical_marl.arm import Joint
-from surgical_marl.scene import TIMESTEP
+from surgical_marl.robots.arm import Joint
+from surgical_marl.scenes.scene import TIMESTEP
 
 SHARE = 0.5
 """Of the step that takes full effort: below it the law is linear."""

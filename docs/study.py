@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from surgical_marl.cli import whole
+from surgical_marl.cli.main import whole
 
 TASK = "reach"
 SCENES = ("bimanual_psm", "bimanual_star", "trimanual_psm_ecm")
@@ -48,21 +48,21 @@ class Job(NamedTuple):
 
 def learn(job: Job, out: Path, overrides: list[str]) -> None:
     """Trains a run, or goes on with it; nothing if it is done."""
-    from surgical_marl.learning.config import load_config
     from surgical_marl.learning.train import finish
+    from surgical_marl.runs.settings import load_config
 
     finish(load_config(TASK, job.scene, [f"algo={job.algo}", f"seed={job.seed}", *overrides]), out / str(job))
 
 
 def play(job: Job, out: Path) -> None:
     """Plays the standard goal set with a run's policy: untouched, and with each arm frozen or moved by the oracle."""
-    from surgical_marl.bench.machine import machine
     from surgical_marl.evaluation import evaluate
     from surgical_marl.files import write_atomic
-    from surgical_marl.learning.policy import load_policy, zero_policy
-    from surgical_marl.learning.run import METRICS, read_settings
-    from surgical_marl.learning.train import make_env
-    from surgical_marl.oracle import oracle
+    from surgical_marl.machine import machine
+    from surgical_marl.policies.oracle import oracle
+    from surgical_marl.policies.policy import load_policy, zero_policy
+    from surgical_marl.runs.environment import make_env
+    from surgical_marl.runs.folder import METRICS, read_settings
 
     run = out / str(job)
     done = run / PLAYED
@@ -95,7 +95,7 @@ def taken_over(
     """
     import torch
 
-    from surgical_marl.acting import forget
+    from surgical_marl.policies.acting import forget
 
     def acting(observations: Mapping[str, Any]) -> dict[str, Any]:
         actions, others = dict(policy(observations)), instead(observations)

@@ -18,7 +18,7 @@ from study import ALGOS, PLAYED, TASK, WHEN, Job
 from surgical_marl.evaluation.interval import interval
 from surgical_marl.evaluation.metrics import FOLLOWING, SUCCESS_MM, Metric, metrics, success
 from surgical_marl.files import write_atomic
-from surgical_marl.learning.run import read_metrics, read_origin, read_settings
+from surgical_marl.runs.folder import read_metrics, read_origin, read_settings
 
 NAMES = {"mappo": "MAPPO", "ippo": "IPPO", "joint": "joint PPO"}
 COLORS = {"mappo": "#1f6f8b", "ippo": "#b23a48", "joint": "#7a7a7a"}

@@ -30,14 +30,14 @@ from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
 from optuna.trial import FrozenTrial, TrialState
 
-from surgical_marl.bench import machine
+from surgical_marl import machine
 from surgical_marl.bench.solve import Goal, Solution, solve
 from surgical_marl.bench.workload import Workload
-from surgical_marl.cli import whole
+from surgical_marl.cli.main import whole
 from surgical_marl.files import write_atomic
-from surgical_marl.learning.config import Settings, load_config
-from surgical_marl.learning.memory import in_memory
-from surgical_marl.learning.train import make_env
+from surgical_marl.learning.room import in_memory
+from surgical_marl.runs.environment import make_env
+from surgical_marl.runs.settings import Settings, load_config
 
 FRESH = 1000
 """Seeds from here on are not used by the search."""

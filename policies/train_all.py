@@ -139,23 +139,23 @@ def train(task: str, scene: str, run: Path, overrides: Sequence[str]) -> None:
     """Train one run from where it is to its end."""
     defer_compiler()
 
-    from surgical_marl.learning.config import load_config
     from surgical_marl.learning.train import finish
+    from surgical_marl.runs.settings import load_config
 
     finish(load_config(task, scene, overrides), run)
 
 
 def export(runs: Sequence[str], out: Path) -> None:
     """Evaluate the runs of one policy and write its folder."""
-    from surgical_marl.learning.export import export_policy
+    from surgical_marl.evaluation.export import export_policy
 
     export_policy(runs, out)
 
 
 def write_table(path: Path) -> None:
     """Replace what stands between the two marks in a file by the table of all policies that ship."""
+    from surgical_marl.evaluation.card import table
     from surgical_marl.files import write_atomic
-    from surgical_marl.learning.card import table
 
     before, mark, rest = path.read_text().partition("<!-- table -->\n")
     _, end, after = rest.partition("<!-- end of table -->\n")

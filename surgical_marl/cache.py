@@ -1,14 +1,21 @@
-"""Arrays that take a while to compute, kept on disk by what they were computed from."""
+"""Arrays that take a while to compute, kept on disk by all that they were computed from.
+
+What an array was computed from is data, code and the versions of the libraries that the code calls. The code is found
+by following imports from the module that computes: no list of modules is kept by hand.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import functools
 import hashlib
+import importlib.util
 import os
+import re
 import tempfile
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from zipfile import BadZipFile
 
@@ -16,26 +23,28 @@ import numpy as np
 
 from surgical_marl.runtime import cache_dir
 
-_GEOMETRY = ("arm", "contacts", "describe", "geometry", "inverse_kinematics", "paths", "scene", "spline", "workspace")
+LIBRARIES = ("jax", "mujoco", "mujoco-mjx", "numpy", "scipy", "warp-lang")
+"""What our computations call: another version may give other numbers."""
+_IMPORT = re.compile(
+    r"^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+import[ \t]*(\([^)]*\)|[^\n#]*)|import[ \t]+([\w., \t]+))", re.M
+)
 
 
 def cached(
-    kind: str,
-    settings: str,
-    fingerprint: bytes,
-    compute: Callable[[], np.ndarray],
-    code: tuple[str, ...] = _GEOMETRY,
+    kind: str, compute: Callable[[], np.ndarray], *content: str | bytes, roots: Iterable[str] = ()
 ) -> np.ndarray:
-    """What `compute` returns, from disk if it was computed before for these settings, this scene and this version.
+    """Return what `compute` returns, from disk if it was computed before from the same content, code and libraries.
 
     Args:
-        kind: the folder within the cache.
-        settings: all that the result depends on besides the scene.
-        fingerprint: the scene's.
+        kind: folder within the cache.
         compute: the work. Its array appears on disk whole or not at all; a cache that fails is no error.
-        code: the modules of this package that it comes from, or patterns of them: if one changes, it is computed anew.
+        content: data that the result depends on.
+        roots: modules whose code `compute` runs, besides the module that it is defined in and all that they import.
     """
-    digest = hashlib.sha256("\0".join([kind, settings, _digest(code)]).encode() + fingerprint)
+    digest = hashlib.sha256(kind.encode())
+    for part in (*content, code_digest(frozenset((compute.__module__, *roots))), *_versions()):
+        data = part.encode() if isinstance(part, str) else part
+        digest.update(len(data).to_bytes(8, "little") + data)
     path = cache_dir() / kind / f"{digest.hexdigest()[:32]}.npz"
     with contextlib.suppress(OSError, ValueError, EOFError, KeyError, BadZipFile, zlib.error):  # not there, or damaged
         array: np.ndarray = np.load(path)["array"]
@@ -50,6 +59,64 @@ def cached(
 
 
 @functools.cache
-def _digest(code: tuple[str, ...]) -> str:
-    files = (file for name in code for file in sorted(Path(__file__).parent.glob(f"{name}.py")))
-    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
+def code_digest(roots: frozenset[str]) -> str:
+    """Return a hash of the source of modules and of all that they import, directly or not, of their own packages.
+
+    Args:
+        roots: names of modules, as in "surgical_marl.tasks.reach".
+    """
+    packages = {root.partition(".")[0] for root in roots} | {__name__.partition(".")[0]}
+    waiting, seen = sorted(roots), dict[str, str]()
+    while waiting:
+        name = waiting.pop()
+        if name in seen or name.partition(".")[0] not in packages or not (path := _file(name)):
+            continue
+        seen[name], imported = _read(path)
+        waiting += imported
+    return hashlib.sha256(repr(sorted(seen.items())).encode()).hexdigest()
+
+
+@functools.cache
+def _read(path: Path) -> tuple[str, list[str]]:
+    """The hash of a source file and the names that it may import: those of modules and of what is in them."""
+    text = path.read_text()
+    return hashlib.sha256(text.encode()).hexdigest(), list(_imported(text))
+
+
+def _imported(text: str) -> Iterator[str]:
+    for package, names, modules in _IMPORT.findall(text):
+        for name in re.findall(r"[\w.]+", modules):
+            yield name
+        if package:
+            yield package
+            for name in re.findall(r"\w+", names):
+                yield f"{package}.{name}"
+
+
+def _file(module: str) -> Path | None:
+    """The source file of a module or package; None if it has none or is none."""
+    top, *inner = module.split(".")
+    for folder in _folders(top):
+        path = Path(folder, *inner)
+        for file in (path.with_suffix(".py"), path / "__init__.py"):
+            if file.is_file():
+                return file
+    return None
+
+
+@functools.cache
+def _folders(package: str) -> tuple[str, ...]:
+    """Where the modules of a package lie; of a module that is none, where its file lies without its ending."""
+    spec = importlib.util.find_spec(package)
+    if spec is None or spec.origin is None:
+        return ()
+    return tuple(spec.submodule_search_locations or [str(Path(spec.origin).with_suffix(""))])
+
+
+@functools.cache
+def _versions() -> tuple[str, ...]:
+    found = []
+    for name in LIBRARIES:
+        with contextlib.suppress(PackageNotFoundError):
+            found.append(f"{name} {version(name)}")
+    return tuple(found)

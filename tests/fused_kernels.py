@@ -13,7 +13,7 @@ from surgical_marl.engines.fused.emit import Emitter
 from surgical_marl.engines.fused.graph import Graph
 from surgical_marl.engines.fused.kernel import compile_kernels
 from surgical_marl.engines.fused.preludes import LANES
-from surgical_marl.engines.fused.program import Layout, tables, trace
+from surgical_marl.engines.fused.program import Fields, tables, trace
 
 Stores = list[tuple[str, int, int]]
 
@@ -25,10 +25,10 @@ def shapes_of(columns: Any) -> Any:
 
 def make_stores(
     function: Callable[..., Any], columns: Any, in_place: bool = False
-) -> tuple[Graph, Stores, Layout, Any, Any]:
+) -> tuple[Graph, Stores, Fields, Any, Any]:
     """A function's graph, what is to be stored where, and the leaves of its arguments and results: if `in_place`, the
     same ones."""
-    layout, graph = Layout(), Graph()
+    layout, graph = Fields(), Graph()
     inputs = layout.place(shapes_of(columns), "state")
     values, shapes = trace(graph, function, inputs)
     outputs = inputs if in_place else layout.place(shapes, "outs")

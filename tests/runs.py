@@ -13,8 +13,8 @@ import torch
 
 from fake_env import FakeEnv
 from surgical_marl.learning import train
-from surgical_marl.learning.config import NetworkSettings, PPOSettings, Settings
-from surgical_marl.learning.run import read_checkpoint, read_metrics
+from surgical_marl.runs.folder import read_checkpoint, read_metrics
+from surgical_marl.runs.settings import NetworkSettings, PPOSettings, Settings
 
 COUNTS, SIZES = {"psm": 2, "ecm": 1}, {"psm": 3, "ecm": 2}
 SMALL = Settings(
@@ -112,7 +112,7 @@ MOMENTS: dict[str, Callable[[], None]] = {
     "in a checkpoint": lambda: _at(torch, "save", _half_a_file),
     "before a checkpoint has its name": lambda: _at(os, "replace", _is("checkpoint.pt")),
     "after a checkpoint has its name": lambda: _at(os, "replace", _is("checkpoint.pt"), after=True),
-    "in an iteration": lambda: _at(train.Training, "_update", lambda training: training.iteration == 2),
+    "in an iteration": lambda: _at(train.Trainer, "_update", lambda training: training.iteration == 2),
     "after an iteration": lambda: _at(train.Log, "write", lambda log, row: row["iteration"] == 3, after=True),
 }
 

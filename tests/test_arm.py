@@ -13,7 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from surgical_marl import list_arms, load_arm
-from surgical_marl.arm import Arm
+from surgical_marl.robots.arm import Arm
+from surgical_marl.robots.spec import build_spec
 
 PSM = load_arm("psm")
 HALF = np.pi / 2
@@ -55,7 +56,7 @@ def test_tip_equals_published_kinematics(name: str) -> None:
 def test_tip_equals_yourdfpy_and_mujoco(name: str) -> None:
     arm = load_arm(name)
     urdf = yourdfpy.URDF.load(str(arm.folder / f"{name}.urdf"), load_meshes=False)
-    model = arm.spec().compile()
+    model = build_spec(arm).compile()
     data = mujoco.MjData(model)
     names = [joint.name for joint in arm.actuated]
     for q in configurations(50, arm):
@@ -115,7 +116,7 @@ def test_limits_gains_and_friction_are_the_published_ones(name: str) -> None:
 def test_the_wrist_feels_its_motors_through_the_cables(name: str) -> None:
     """Stiffness and damping at roll, wrist pitch and wrist yaw, as differences of C MuJoCo's actuator forces, and the
     mass matrix, all with the entry that pitch and yaw share."""
-    model = load_arm(name).spec().compile()
+    model = build_spec(load_arm(name)).compile()
     data = mujoco.MjData(model)
     dofs = [int(model.joint(joint).dofadr[0]) for joint in ("roll", "wrist_pitch", "wrist_yaw")]
 
@@ -142,7 +143,7 @@ def test_the_wrist_feels_its_motors_through_the_cables(name: str) -> None:
 def test_a_wrist_joint_never_carries_more_than_its_effort(name: str) -> None:
     """Its own actuator and the cable's together, though each alone may put as much on it."""
     arm = load_arm(name)
-    model = arm.spec().compile()
+    model = build_spec(arm).compile()
     data = mujoco.MjData(model)
     for pitch, yaw in ((1, 1), (-1, -0.1), (-0.1, -1)):
         for joint, sign in (("wrist_pitch", pitch), ("wrist_yaw", yaw)):
@@ -161,7 +162,7 @@ def test_shaft_is_drawn_whole_and_clear_of_the_column(name: str) -> None:
     low, high = tube.origin[2, 3] + np.array([-0.5, 0.5]) * tube.geometry.cylinder.length
     assert low == pytest.approx(0) and high == pytest.approx(LENGTHS[name][1])
     assert all(len(link.visuals) <= 12 for link in arm.urdf.links)
-    model = arm.spec().compile()
+    model = build_spec(arm).compile()
     names = {model.geom(int(i)).name for i in np.flatnonzero(model.geom_group == 3)}
     assert names == {"column", "carriage", "shaft", "wrist", "jaw_left", "jaw_right"}
     # The column stands beside the shaft on the side of the base, -y, and never so near that the two could be a pair.
@@ -197,7 +198,7 @@ def test_kinematics_in_jax_and_without_the_jaw() -> None:
 
 def test_inertia_is_that_of_the_identified_arm() -> None:
     """M11 and M22 of the identified Classic PSM at several poses (within 5 %), and its insertion mass (within 2 %)."""
-    model = PSM.spec().compile()
+    model = build_spec(PSM).compile()
     data = mujoco.MjData(model)
     for pitch, insertion, yaw_inertia, pitch_inertia in [
         (0, 0.07, 0.226, 0.224), (0, 0.12, 0.210, 0.208), (0, 0.20, 0.192, 0.190),

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from surgical_marl import list_arms, load_arm
+from surgical_marl.robots.spec import build_spec
 
 ARMS = Path(__file__).resolve().parents[1] / "arms"
 
@@ -34,4 +35,4 @@ def test_arm_loads_with_its_home_inside_the_limits(name: str) -> None:
     assert np.all((arm.lower <= arm.home) & (arm.home <= arm.upper))
     # A target may not outrun the joint that follows it.
     assert all(0 < joint.drive.speed <= joint.velocity for joint in arm.joints)
-    assert arm.spec().compile().nu == len(arm.joints) + len(arm.cables)
+    assert build_spec(arm).compile().nu == len(arm.joints) + len(arm.cables)

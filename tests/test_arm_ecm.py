@@ -10,8 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from surgical_marl import load_arm
-from surgical_marl.arm import Arm
-from surgical_marl.scene import TIMESTEP, set_physics
+from surgical_marl.robots.arm import Arm
+from surgical_marl.robots.spec import build_spec
+from surgical_marl.scenes.build import set_physics
+from surgical_marl.scenes.scene import TIMESTEP
 
 HALF = np.pi / 2
 # dVRK ECM.json, modified (Craig) convention: alpha, a, theta offset, d, slides
@@ -40,7 +42,7 @@ def configurations(arm: Arm, count: int) -> np.ndarray:
 
 def state(arm: Arm, q: np.ndarray) -> tuple[mujoco.MjModel, mujoco.MjData]:
     """A MuJoCo model of the arm at q, under the physics of a scene."""
-    spec = arm.spec()
+    spec = build_spec(arm)
     set_physics(spec)
     model = spec.compile()
     data = mujoco.MjData(model)

@@ -13,7 +13,9 @@ import pytest
 import yourdfpy
 
 from surgical_marl import load_arm
-from surgical_marl.scene import TIMESTEP, set_physics
+from surgical_marl.robots.spec import build_spec
+from surgical_marl.scenes.build import set_physics
+from surgical_marl.scenes.scene import TIMESTEP
 
 STAR = load_arm("star")
 README = (STAR.folder / "README.md").read_text(encoding="utf-8")
@@ -41,7 +43,7 @@ def configurations(count: int) -> np.ndarray:
 
 def at_home() -> tuple[mujoco.MjModel, mujoco.MjData]:
     """The arm alone, as a scene steps it."""
-    spec = STAR.spec()
+    spec = build_spec(STAR)
     set_physics(spec)
     model = spec.compile()
     data = mujoco.MjData(model)

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from mujoco import rollout
 
-from surgical_marl.bench import contenders, machine, render, report, sim
+from surgical_marl import machine
+from surgical_marl.bench import contenders, render, report, sim
 from surgical_marl.bench.clock import race
 from surgical_marl.bench.contenders import Contender
 from surgical_marl.bench.course import HOLD, LAPS, MOTIONS, full_state, make_course
@@ -21,10 +22,11 @@ from surgical_marl.bench.render import measure_rendering
 from surgical_marl.bench.report import QUOTED, draw, ratios, sweep_table
 from surgical_marl.bench.sim import Point, Speed, measure, sweep
 from surgical_marl.bench.workload import Workload
-from surgical_marl.cli import main
+from surgical_marl.cli.main import main
 from surgical_marl.engines.choose import make_engine
-from surgical_marl.env import Env
-from surgical_marl.scene import TIMESTEP, load_scene
+from surgical_marl.envs.env import Env
+from surgical_marl.scenes.load import load_scene
+from surgical_marl.scenes.scene import TIMESTEP
 
 CONTRACT = [
     "physics_steps_per_s", "env_steps_per_s", "simulated_s_per_s", "num_envs", "engine", "device", "dt", "decimation",

@@ -12,13 +12,15 @@ from typing import Any
 import pytest
 
 from fake_env import FakeEnv
-from surgical_marl.bench import machine, solve, stopwatch, train
+from surgical_marl import machine
+from surgical_marl.bench import learning as train
+from surgical_marl.bench import solve, stopwatch
 from surgical_marl.bench.solve import Exam, Goal, Looks
 from surgical_marl.bench.stopwatch import STARTING
-from surgical_marl.cli import main
+from surgical_marl.cli.main import main
 from surgical_marl.learning import train as learning_train
-from surgical_marl.learning.config import NetworkSettings, PPOSettings, Settings
-from surgical_marl.learning.training import Training
+from surgical_marl.learning.trainer import Trainer
+from surgical_marl.runs.settings import NetworkSettings, PPOSettings, Settings
 
 CONTRACT = [
     "physics_steps_per_s", "env_steps_per_s", "simulated_s_per_s", "num_envs", "engine", "device", "dt", "decimation",
@@ -95,7 +97,7 @@ def test_the_policy_is_examined_as_it_is(fakes: None) -> None:
     other = solve.make_env(SETTINGS, solve.EPISODES)
 
     def losses(examined: bool) -> list[float]:
-        training, found = Training(SETTINGS, solve.make_env(SETTINGS)), []
+        training, found = Trainer(SETTINGS, solve.make_env(SETTINGS)), []
         for row, _ in zip(stopwatch.rows(training), range(3), strict=False):
             found.append(row["value_loss"])
             if examined:
@@ -112,7 +114,7 @@ def test_starting_is_what_the_first_iterations_take_more() -> None:
 
 
 def test_a_stopwatch_times_each_rollout_and_update(fakes: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    training = Training(SETTINGS, solve.make_env(SETTINGS))
+    training = Trainer(SETTINGS, solve.make_env(SETTINGS))
     watch = stopwatch.Stopwatch(training)
     ticks = count()
     monkeypatch.setattr(stopwatch.time, "perf_counter", lambda: float(next(ticks)))

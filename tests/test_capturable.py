@@ -11,7 +11,7 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
 
 from fake_env import FakeEnv
-from surgical_marl.learning.training import Training
+from surgical_marl.learning.trainer import Trainer
 from surgical_marl.runtime import no_collection
 from test_learning import ALL, COUNTS, OPTIONS, SIZES, SMALL
 
@@ -57,7 +57,7 @@ def test_nothing_waits_and_all_stays_in_place(
     algo: Any, options: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     env: Any = Unwatched(COUNTS, SIZES, SMALL.num_envs, max_steps=5)
-    training = Training(replace(SMALL, algo=algo, **options), env)
+    training = Trainer(replace(SMALL, algo=algo, **options), env)
     training.iterate()  # the first call may allocate
     places = [part.data_ptr() for part in kept(training)]
     # Adam reads its step on a CPU, and not where it is capturable.
@@ -69,7 +69,7 @@ def test_nothing_waits_and_all_stays_in_place(
     assert [part.data_ptr() for part in kept(training)] == places
 
 
-def kept(training: Training) -> list[torch.Tensor]:
+def kept(training: Trainer) -> list[torch.Tensor]:
     """What a rollout and an update leave for the next ones."""
     algorithm = training.algorithm
     stored = [part for part in vars(algorithm.storage).values() if isinstance(part, torch.Tensor)]

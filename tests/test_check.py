@@ -12,9 +12,9 @@ import pytest
 from pettingzoo import ParallelEnv
 
 import surgical_marl as sm
-from surgical_marl.check import check
-from surgical_marl.cli import main
-from surgical_marl.export import mjcf
+from surgical_marl.cli.main import main
+from surgical_marl.scenes.check import check
+from surgical_marl.scenes.mjcf import mjcf
 from surgical_marl.view.render import Renderer, View
 
 PAGE = (Path(__file__).parents[1] / "docs" / "your_own_arm.md").read_text()

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from surgical_marl.cli import main
-from surgical_marl.doctor import chain_seconds
+from surgical_marl.cli.doctor import chain_seconds
+from surgical_marl.cli.main import main
 
 ROOT = Path(__file__).parents[1]
 
@@ -116,7 +116,7 @@ def test_doctor_looks_at_everything(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("surgical_marl.doctor._growth", lambda flag: growth)
+    monkeypatch.setattr("surgical_marl.cli.doctor._growth", lambda flag: growth)
     assert main(["doctor"]) == 0
     out = capsys.readouterr().out
     for word in ("Python", "mujoco", "jax devices", "torch devices", "compile cache", verdict):
@@ -132,13 +132,13 @@ def test_interrupting_is_code_130(capsys: pytest.CaptureFixture[str], monkeypatc
     def interrupt() -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("surgical_marl.doctor.report", interrupt)
+    monkeypatch.setattr("surgical_marl.cli.doctor.report", interrupt)
     assert main(["doctor"]) == 130
     assert capsys.readouterr().err == "surgical-marl: interrupted\n"
 
 
 def test_a_reader_that_leaves_is_no_error() -> None:
-    command = [sys.executable, "-m", "surgical_marl.cli", "list"]
+    command = [sys.executable, "-m", "surgical_marl.cli.main", "list"]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         assert process.stdout and process.stderr
         process.stdout.close()

@@ -10,11 +10,11 @@ import pytest
 import torch
 
 from fake_env import FakeEnv
-from surgical_marl.interfaces.rsl_rl import Layout
 from surgical_marl.learning import train
-from surgical_marl.learning.config import ConstraintSettings, NetworkSettings, PPOSettings, Settings
 from surgical_marl.learning.constraint import Constraint
-from surgical_marl.learning.run import read_metrics
+from surgical_marl.policies.layout import Layout
+from surgical_marl.runs.folder import read_metrics
+from surgical_marl.runs.settings import ConstraintSettings, NetworkSettings, PPOSettings, Settings
 from test_mappo import SETTINGS, SIZES, build, roll_out
 
 COLLISION = ConstraintSettings(cost="collision", limit=0.1, kp=2.0, ki=0.5, kd=3.0)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from surgical_marl import list_arms, list_scenes, load_scene
-from surgical_marl.cli import main
-from surgical_marl.describe import shared_workspace
+from surgical_marl.cli.describe import shared_workspace
+from surgical_marl.cli.main import main
 
 
 def test_list_v_names_all_and_says_what_they_are(capsys: pytest.CaptureFixture[str]) -> None:

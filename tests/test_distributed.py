@@ -16,14 +16,14 @@ import torch.distributed as dist
 from fake_env import FakeEnv
 from processes import end, start_together
 from runs import COUNTS, SIZES, SMALL, fake_env, run, same_state
-from surgical_marl.batch import BatchedEnv
 from surgical_marl.engines.fused.keys import episode_keys
+from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.interfaces.rsl_rl import RslRlVecEnv
 from surgical_marl.learning import distributed, train
-from surgical_marl.learning.config import ConstraintSettings, PPOSettings, Settings
 from surgical_marl.learning.mappo import MAPPO, rsl_rl_config
-from surgical_marl.learning.run import read_checkpoint, read_metrics
-from surgical_marl.learning.training import Training
+from surgical_marl.learning.trainer import Trainer
+from surgical_marl.runs.folder import read_checkpoint, read_metrics
+from surgical_marl.runs.settings import ConstraintSettings, PPOSettings, Settings
 
 # One mini-batch: which samples are learned from together does not depend on how they are spread.
 ALIKE = replace(
@@ -104,7 +104,7 @@ def run_and_note(settings: Settings, out: Path, notes: Path, resume: bool = Fals
     """Train, and note for this process what it ended with."""
     original, rank = train._save, []
 
-    def save(training: Training, folder: Path) -> None:
+    def save(training: Trainer, folder: Path) -> None:
         original(training, folder)
         rank[:] = [distributed.rank(), training.state()]
 
@@ -168,13 +168,13 @@ def test_another_number_of_processes_goes_on(
 
 def diverge(settings: Settings, out: Path) -> None:
     """Train; from the third iteration on the last process sees NaN."""
-    original = Training.iterate
+    original = Trainer.iterate
 
-    def iterate(training: Training) -> Any:
+    def iterate(training: Trainer) -> Any:
         training.env.env.poison = distributed.rank() == 1 and training.iteration == 2
         return original(training)
 
-    Training.iterate = iterate
+    Trainer.iterate = iterate
     try:
         run(settings, out)
     except FloatingPointError as error:
@@ -191,13 +191,13 @@ def test_nan_in_one_process_stops_all(tmp_path: Path) -> None:
 
 def stop(settings: Settings, out: Path) -> None:
     """Train; one process is asked to stop in the second iteration."""
-    original = Training.iterate
+    original = Trainer.iterate
 
-    def iterate(training: Training) -> Any:
+    def iterate(training: Trainer) -> Any:
         training.stop_wanted = distributed.rank() == 1 and training.iteration == 1
         return original(training)
 
-    Training.iterate = iterate
+    Trainer.iterate = iterate
     run(settings, out)
 
 

@@ -11,8 +11,8 @@ import torch
 from numpy.typing import NDArray
 
 from surgical_marl import load_scene
-from surgical_marl.endoscope import CHANNELS, SIZE, Endoscope, View
-from surgical_marl.scene import Scene
+from surgical_marl.scenes.scene import Scene
+from surgical_marl.vision.endoscope import CHANNELS, SIZE, Endoscope, View
 
 SCENES = ("ecm", "trimanual_psm_ecm")
 POSES = 16

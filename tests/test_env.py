@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from surgical_marl import list_scenes
-from surgical_marl.batch import BatchedEnv
-from surgical_marl.physics import Physics
-from surgical_marl.scene import DECIMATION, TIMESTEP
+from surgical_marl.envs.batch import BatchedEnv
+from surgical_marl.physics.simulator import Physics
+from surgical_marl.scenes.scene import DECIMATION, TIMESTEP
 
 SCENES = ("psm", "bimanual_psm")
 
@@ -169,7 +169,7 @@ def test_goals_are_reachable_and_spread_as_in_the_paper() -> None:
     table = np.asarray(env.env.task.table)
     assert np.abs(table.std(axis=0) - 0.05).max() < 0.01  # a little less than 0.05: far draws are not reachable
     assert np.abs(table.mean(axis=0) - [0, 0, -0.11]).max() < 0.01
-    from surgical_marl.inverse_kinematics import inverse_kinematics
+    from surgical_marl.robots.inverse_kinematics import inverse_kinematics
 
     arm = env.scene.mounts["psm_0"].arm
     q = inverse_kinematics(arm, table[:200, 0], arm.home)

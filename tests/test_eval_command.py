@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 
 from fake_env import FakeEnv
-from surgical_marl.batch import BatchedEnv
-from surgical_marl.cli import main
+from surgical_marl.cli.main import main
 from surgical_marl.content import list_scenes, list_tasks
-from surgical_marl.env import Env
+from surgical_marl.envs.batch import BatchedEnv
+from surgical_marl.envs.env import Env
 from surgical_marl.evaluation import command
 from surgical_marl.evaluation.goal_set import (
     describe_goals,
@@ -29,8 +29,8 @@ from surgical_marl.evaluation.goal_set import (
     standard_hashes,
 )
 from surgical_marl.learning import train
-from surgical_marl.learning.config import NetworkSettings, Settings
-from surgical_marl.learning.run import write_config
+from surgical_marl.runs.folder import write_config
+from surgical_marl.runs.settings import NetworkSettings, Settings
 
 SMALL = Settings(num_envs=8, iterations=1, steps_per_iteration=8, network=NetworkSettings(hidden=(8,)))
 

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 from surgical_marl import load_arm
-from surgical_marl.batch import BatchedEnv
+from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.evaluation.evaluate import difference, evaluate, play, summarise
 from surgical_marl.evaluation.report import format_table
-from surgical_marl.learning.policy import random_policy
+from surgical_marl.policies.policy import random_policy
 
 
 class Shaft:

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from surgical_marl import list_scenes, load_scene
-from surgical_marl.arm import CONTROL_MODES
-from surgical_marl.arm_spec import COLLISION_GROUP
-from surgical_marl.cli import main
-from surgical_marl.export import mjcf
-from surgical_marl.scene import Scene
+from surgical_marl.cli.main import main
+from surgical_marl.robots.arm import CONTROL_MODES
+from surgical_marl.robots.spec import COLLISION_GROUP
+from surgical_marl.scenes.mjcf import mjcf
+from surgical_marl.scenes.scene import Scene
 
 STEPS = 500
 CROSSED = {"bimanual_psm": [0.03, 0.02, 0.16], "trimanual_psm_ecm": [0.03, 0.02, 0.16]}

@@ -14,17 +14,17 @@ import jax
 import numpy as np
 import pytest
 
-from surgical_marl.arm import CONTROL_MODES, load_arm
-from surgical_marl.batch import BatchedEnv
 from surgical_marl.content import list_scenes, list_tasks
 from surgical_marl.engines.choose import make_engine
 from surgical_marl.engines.fused.engine import FusedEngine, flatten
 from surgical_marl.engines.fused.keys import episode_keys
 from surgical_marl.engines.fused.program import load_source
 from surgical_marl.engines.mjx import MjxEngine
-from surgical_marl.env import Env
-from surgical_marl.path_task import PathTask
-from surgical_marl.paths import DURATION
+from surgical_marl.envs.batch import BatchedEnv
+from surgical_marl.envs.env import Env
+from surgical_marl.robots.arm import CONTROL_MODES, load_arm
+from surgical_marl.tasks.base.path_task import PathTask
+from surgical_marl.tasks.base.paths import DURATION
 
 STATES = 1024
 TOLERANCE = 1e-5
@@ -244,7 +244,7 @@ def test_another_mass_is_another_program(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 START = """
-from surgical_marl.batch import BatchedEnv
+from surgical_marl.envs.batch import BatchedEnv
 env = BatchedEnv("reach", "psm", num_envs=2, engine="fused", device="cpu")
 print(float(env.reset(seed=0)[1].sum()))
 """

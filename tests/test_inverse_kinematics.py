@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from surgical_marl import list_arms, load_arm
-from surgical_marl.arm import Arm
-from surgical_marl.inverse_kinematics import inverse_kinematics
+from surgical_marl.robots.arm import Arm
+from surgical_marl.robots.inverse_kinematics import inverse_kinematics
 
 PSM = load_arm("psm")
 

@@ -17,22 +17,24 @@ import torch
 from fake_env import FakeEnv
 from surgical_marl.evaluation.evaluate import evaluate
 from surgical_marl.files import write_atomic
-from surgical_marl.learning import config, train, training
-from surgical_marl.learning.config import ConstraintSettings, NetworkSettings, PPOSettings, Settings, load_config
+from surgical_marl.learning import train, trainer
+from surgical_marl.learning import trainer as training
 from surgical_marl.learning.episodes import Episodes
-from surgical_marl.learning.policy import (
+from surgical_marl.policies.policy import (
     load_policy,
     random_policy,
     untrained_policy,
     zero_policy,
 )
-from surgical_marl.learning.run import (
+from surgical_marl.runs import settings as config
+from surgical_marl.runs.folder import (
     CONFIG,
     read_checkpoint,
     read_metrics,
     read_settings,
     write_metrics,
 )
+from surgical_marl.runs.settings import ConstraintSettings, NetworkSettings, PPOSettings, Settings, load_config
 
 COUNTS, SIZES = {"psm": 2, "ecm": 1}, {"psm": 3, "ecm": 2}
 SMALL = Settings(
@@ -146,7 +148,7 @@ def test_resume_is_bit_for_bit(options: dict[str, Any], tmp_path: Path, fakes: l
 
 
 def test_the_state_holds_running_episodes(fakes: list[Any]) -> None:
-    first, second = (training.Training(SMALL, train.make_env(SMALL)) for _ in range(2))
+    first, second = (trainer.Trainer(SMALL, train.make_env(SMALL)) for _ in range(2))
     first.iterate()
     first.episodes.collided[::2] = True
     second.set_state(first.state())
@@ -229,13 +231,13 @@ def test_metrics_of_an_older_version_lack_columns(tmp_path: Path) -> None:
 def test_nan_stops_and_keeps_the_last_checkpoint(
     tmp_path: Path, fakes: list[Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    original = training.Training.iterate
+    original = trainer.Trainer.iterate
 
-    def iterate(self: training.Training) -> training.Report:
+    def iterate(self: trainer.Trainer) -> trainer.Report:
         fakes[0].poison = self.iteration == 3
         return original(self)
 
-    monkeypatch.setattr(training.Training, "iterate", iterate)
+    monkeypatch.setattr(trainer.Trainer, "iterate", iterate)
     with pytest.raises(FloatingPointError, match="iteration 4"):
         train.train(replace(SMALL, iterations=9), out=tmp_path / "run")
     checkpoint = read_checkpoint(tmp_path / "run")
@@ -276,14 +278,14 @@ def test_a_nan_loss_stops(tmp_path: Path, fakes: list[Any], monkeypatch: pytest.
 def test_a_signal_ends_the_iteration_and_saves(
     number: int, tmp_path: Path, fakes: list[Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    original = training.Training.iterate
+    original = trainer.Trainer.iterate
 
-    def iterate(self: training.Training) -> training.Report:
+    def iterate(self: trainer.Trainer) -> trainer.Report:
         if self.iteration == 2:
             os.kill(os.getpid(), number)
         return original(self)
 
-    monkeypatch.setattr(training.Training, "iterate", iterate)
+    monkeypatch.setattr(trainer.Trainer, "iterate", iterate)
     before = signal.getsignal(number)
     with pytest.raises((KeyboardInterrupt, SystemExit)) as stopped:
         train.train(replace(SMALL, checkpoint_every=50), out=tmp_path / "run")

@@ -17,9 +17,10 @@ from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 
 from fake_env import FakeEnv
-from surgical_marl.interfaces.rsl_rl import Layout, RslRlVecEnv
-from surgical_marl.learning.config import NetworkSettings, PPOSettings, Settings
+from surgical_marl.interfaces.rsl_rl import RslRlVecEnv
 from surgical_marl.learning.mappo import MAPPO, rsl_rl_config
+from surgical_marl.policies.layout import Layout
+from surgical_marl.runs.settings import NetworkSettings, PPOSettings, Settings
 
 SIZES = {"psm": 3, "ecm": 2}
 TEAMS = [{"psm": 1}, {"psm": 2}, {"psm": 2, "ecm": 1}]

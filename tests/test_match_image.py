@@ -15,10 +15,10 @@ from gymnasium.utils.env_checker import check_env
 from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test
 
 import surgical_marl as sm
-from surgical_marl.batch import BatchedEnv
-from surgical_marl.endoscope import SIZE, Endoscope
-from surgical_marl.env import Env
-from surgical_marl.task import FAR
+from surgical_marl.envs.batch import BatchedEnv
+from surgical_marl.envs.env import Env
+from surgical_marl.tasks.base.task import FAR
+from surgical_marl.vision.endoscope import SIZE, Endoscope
 
 SCENES = ("ecm", "trimanual_psm_ecm")
 COUNT, STEPS = 3, 4

@@ -11,23 +11,24 @@ import pytest
 import torch
 
 from fake_env import FakeEnv
-from surgical_marl.cli import main
-from surgical_marl.learning import memory, train
-from surgical_marl.learning.config import ConstraintSettings, Settings
-from surgical_marl.learning.memory import check_room, in_memory, rollout_bytes
-from surgical_marl.learning.training import Training
+from surgical_marl.cli.main import main
+from surgical_marl.learning import room as memory
+from surgical_marl.learning import train
+from surgical_marl.learning.room import check_room, in_memory, rollout_bytes
+from surgical_marl.learning.trainer import Trainer
+from surgical_marl.runs.settings import ConstraintSettings, Settings
 
 SETTINGS = Settings(num_envs=16, steps_per_iteration=4)
 
 
 @pytest.fixture(params=[("mappo", "none"), ("ippo", "none"), ("joint", "none"), ("mappo", "collision")])
-def training(request: pytest.FixtureRequest) -> Training:
+def training(request: pytest.FixtureRequest) -> Trainer:
     env: Any = FakeEnv({"psm": 2, "ecm": 1}, {"psm": 3, "ecm": 2}, 16)
     algo, cost = request.param
-    return Training(replace(SETTINGS, algo=algo, constraint=ConstraintSettings(cost=cost)), env)
+    return Trainer(replace(SETTINGS, algo=algo, constraint=ConstraintSettings(cost=cost)), env)
 
 
-def test_what_a_rollout_takes_is_what_is_stored(training: Training) -> None:
+def test_what_a_rollout_takes_is_what_is_stored(training: Trainer) -> None:
     training.rollout()
     storage = training.algorithm.storage
     stored = [part for part in vars(storage).values() if isinstance(part, torch.Tensor)]

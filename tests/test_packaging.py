@@ -27,7 +27,7 @@ def run_python(code: str, **env: str) -> str:
 
 
 def test_importing_the_package_and_the_command_line_imports_nothing_heavy() -> None:
-    code = "import surgical_marl, surgical_marl.cli, sys; print(*sys.modules)"
+    code = "import surgical_marl, surgical_marl.cli.main, sys; print(*sys.modules)"
     loaded = set(run_python(code).split())
     assert not loaded & {"jax", "torch", "mujoco", "yourdfpy", "warp", "matplotlib"}
 
@@ -36,7 +36,7 @@ def test_a_wheel_carries_code_and_content(tmp_path: Path) -> None:
     (wheel,) = WheelBuilder(str(ROOT)).build(directory=str(tmp_path), versions=["standard"])
     names = set(zipfile.ZipFile(wheel).namelist())
     assert {
-        "surgical_marl/cli.py",
+        "surgical_marl/cli/main.py",
         "surgical_marl/content/arms/psm/arm.yaml",
         "surgical_marl/content/arms/psm/psm.urdf",
         "surgical_marl/content/scenes/bimanual_psm.yaml",

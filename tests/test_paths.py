@@ -7,11 +7,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from surgical_marl import spline
-from surgical_marl.inverse_kinematics import inverse_kinematics
-from surgical_marl.paths import DURATION, KNOT, SEGMENTS, SLOWEST, TURNING, loops_and_lines, path_table, walks
-from surgical_marl.scene import load_scene
-from surgical_marl.task import Level
+from surgical_marl.robots.inverse_kinematics import inverse_kinematics
+from surgical_marl.scenes.load import load_scene
+from surgical_marl.tasks.base import spline
+from surgical_marl.tasks.base.paths import (
+    DURATION,
+    KNOT,
+    SEGMENTS,
+    SLOWEST,
+    TURNING,
+    loops_and_lines,
+    path_table,
+    walks,
+)
+from surgical_marl.tasks.base.task import Level
 
 FINE = np.linspace(0, SEGMENTS, 20 * SEGMENTS + 1)
 SEEDS = st.integers(0, 2**32 - 1)

@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 
 from surgical_marl import list_scenes, load_arm, load_scene
-from surgical_marl.arm import CONTROL_MODES
-from surgical_marl.contacts import collision_geoms
-from surgical_marl.physics import Simulator
-from surgical_marl.scene import DECIMATION, TIMESTEP, Scene
+from surgical_marl.physics.simulator import Simulator
+from surgical_marl.robots.arm import CONTROL_MODES
+from surgical_marl.scenes.contacts import collision_geoms
+from surgical_marl.scenes.scene import DECIMATION, TIMESTEP, Scene
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "docs"))
 from energy import energy_drift

@@ -21,13 +21,14 @@ from tensordict import TensorDict
 
 from fake_env import FakeEnv
 from surgical_marl import content
-from surgical_marl.evaluation import command
-from surgical_marl.interfaces.rsl_rl import Layout
-from surgical_marl.learning import card, export, policy, train
-from surgical_marl.learning.config import NetworkSettings, PPOSettings, Settings
-from surgical_marl.learning.onnx_file import write_onnx
-from surgical_marl.learning.policy import load_policy
-from surgical_marl.learning.run import read_origin
+from surgical_marl.evaluation import card, command, export
+from surgical_marl.learning import train
+from surgical_marl.policies import policy
+from surgical_marl.policies.layout import Layout
+from surgical_marl.policies.onnx_file import write_onnx
+from surgical_marl.policies.policy import load_policy
+from surgical_marl.runs.folder import read_origin
+from surgical_marl.runs.settings import NetworkSettings, PPOSettings, Settings
 
 ROOT = Path(__file__).parents[1]
 COUNTS, SIZES = {"psm": 2, "ecm": 1}, {"psm": 3, "ecm": 2}
@@ -231,7 +232,7 @@ def _random(space: Any, number: int) -> Any:
 
 def test_the_example_acts_without_torch(tmp_path: Path) -> None:
     """docs/onnx_policy.py, with fresh weights: it prints an error for each arm, and nothing imports torch."""
-    from surgical_marl.batch import BatchedEnv
+    from surgical_marl.envs.batch import BatchedEnv
 
     env = BatchedEnv("reach", "bimanual_psm", num_envs=1)
     actor = policy._actor(replace(SMALL, scene="bimanual_psm"), env, Layout(env))

@@ -11,12 +11,13 @@ import mujoco
 import numpy as np
 import pytest
 
-from surgical_marl.batch import BatchedEnv
 from surgical_marl.content import find
-from surgical_marl.env import Env
-from surgical_marl.physics import Simulator
-from surgical_marl.plant import Plant
-from surgical_marl.scene import DECIMATION, load_scene
+from surgical_marl.envs.batch import BatchedEnv
+from surgical_marl.envs.env import Env
+from surgical_marl.physics.plant import Plant
+from surgical_marl.physics.simulator import Simulator
+from surgical_marl.scenes.load import load_scene
+from surgical_marl.scenes.scene import DECIMATION
 
 ALL = (
     "{offset_angle: 0.05, offset_slide: 0.003, backlash_angle: 0.02, backlash_slide: 0.001, noise_angle: 0.001, "

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from surgical_marl.batch import BatchedEnv
-from surgical_marl.learning.policy import zero_policy
+from surgical_marl.envs.batch import BatchedEnv
+from surgical_marl.policies.policy import zero_policy
 from surgical_marl.view import record, video
 from surgical_marl.view.render import Renderer, View
 

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from surgical_marl import list_scenes, load_scene
 from surgical_marl.content import content_dir
-from surgical_marl.geometry import segment_distance
-from surgical_marl.scene import Scene
+from surgical_marl.scenes.geometry import segment_distance
+from surgical_marl.scenes.scene import Scene
 
 BIMANUAL = load_scene("bimanual_psm")
 LIVER = "arms: {psm_0: {arm: psm}}\ntissue: {liver: {"

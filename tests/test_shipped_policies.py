@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from surgical_marl.content import content_dir, list_policies
+from surgical_marl.evaluation.card import table
 from surgical_marl.evaluation.command import play_all
 from surgical_marl.evaluation.evaluate import summarise
 from surgical_marl.evaluation.goal_set import is_standard
-from surgical_marl.learning.card import table
-from surgical_marl.learning.run import read_origin
+from surgical_marl.runs.folder import read_origin
 
 POLICIES = content_dir("policies")
 MOVED_MM = 1e-3

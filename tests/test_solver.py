@@ -19,10 +19,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from surgical_marl import collision, load_scene, solver
-from surgical_marl.collision import SLOTS, Pairs
-from surgical_marl.dynamics import ITERATIONS
-from surgical_marl.solver import JointRows, Rows, relax, solve
+from surgical_marl import load_scene
+from surgical_marl.physics.collision import SLOTS, Pairs
+from surgical_marl.physics.dynamics import ITERATIONS
+from surgical_marl.physics.simulator import collision, solver
+from surgical_marl.physics.solver import JointRows, Rows, relax, solve
 
 SEEDS = st.integers(0, 2**32 - 1)
 JOINTS, CONTACTS = 5, 2

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from surgical_marl import load_arm
-from surgical_marl.arm import Joint
+from surgical_marl.robots.arm import Joint
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "docs"))
 from step_response import SHARE, WRIST, Linear, identified, simulated_response

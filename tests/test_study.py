@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 import torch
 
-from surgical_marl.acting import forget
-from surgical_marl.learning.config import load_config
-from surgical_marl.learning.run import write_config, write_metrics
+from surgical_marl.policies.acting import forget
+from surgical_marl.runs.folder import write_config, write_metrics
+from surgical_marl.runs.settings import load_config
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "docs"))
 import study

@@ -18,9 +18,9 @@ import torch
 
 from processes import end, start
 from runs import LONG, MOMENTS, SMALL, run, run_or_resume, run_until, same_state
-from surgical_marl.cli import main
+from surgical_marl.cli.main import main
 from surgical_marl.files import write_atomic
-from surgical_marl.learning.run import read_checkpoint, read_metrics
+from surgical_marl.runs.folder import read_checkpoint, read_metrics
 
 KILLED = -signal.SIGKILL
 
@@ -127,7 +127,7 @@ def test_the_command_killed_at_random_moments(tmp_path: Path) -> None:
     def command(out: Path, iterations: int) -> list[str]:
         sizes = ["--num-envs", "32", "steps_per_iteration=4", "checkpoint_every=2", "network.hidden=[32]"]
         what = ["reach", "--scene", "psm", "--device", "cpu", "--iterations", str(iterations)]
-        return [sys.executable, "-m", "surgical_marl.train", *what, *sizes, "--out", str(out), "--resume", str(out)]
+        return [sys.executable, "-m", "surgical_marl", "train", *what, *sizes, "--out", str(out), "--resume", str(out)]
 
     broken, unbroken = tmp_path / "broken", tmp_path / "unbroken"
     for _ in range(20):

@@ -15,15 +15,16 @@ import yaml
 from pettingzoo.test import parallel_api_test, parallel_seed_test
 
 import surgical_marl as sm
-from surgical_marl import safety, spline
-from surgical_marl.arm import load_arm
-from surgical_marl.batch import BatchedEnv
 from surgical_marl.content import content_dir
-from surgical_marl.env import Env
-from surgical_marl.learning.policy import load_policy, zero_policy
-from surgical_marl.oracle import oracle
-from surgical_marl.paths import KNOT, SEGMENTS
-from surgical_marl.task import APPROACH, PRECISION
+from surgical_marl.envs import costs as safety
+from surgical_marl.envs.batch import BatchedEnv
+from surgical_marl.envs.env import Env
+from surgical_marl.policies.oracle import oracle
+from surgical_marl.policies.policy import load_policy, zero_policy
+from surgical_marl.robots.arm import load_arm
+from surgical_marl.tasks.base import spline
+from surgical_marl.tasks.base.paths import KNOT, SEGMENTS
+from surgical_marl.tasks.base.task import APPROACH, PRECISION
 
 # match_image, whose observations are pictures, has tests of its own
 TASKS, SCENES = [task for task in sm.list_tasks() if task != "match_image"], sm.list_scenes()
@@ -242,7 +243,7 @@ def test_harder_levels_are_harder(task: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("task", ["track", "follow_path"])
 def test_hard_paths_cross_and_easy_ones_do_not(task: str) -> None:
-    from surgical_marl.paths import _cross
+    from surgical_marl.tasks.base.paths import _cross
 
     for difficulty, share in (("easy", 0.0), ("default", 0.1), ("hard", 0.5)):
         env = Env(task, "bimanual_psm", difficulty=difficulty)

@@ -17,7 +17,7 @@ prepare_jax()
 wp = prepare_warp()
 from mujoco.mjx.third_party import mujoco_warp  # noqa: E402
 
-from surgical_marl.tracer import Tracer  # noqa: E402
+from surgical_marl.vision.raycaster import RayCaster  # noqa: E402
 
 WIDTH, HEIGHT = 44, 36  # no multiple of a tile
 RING = 6
@@ -60,7 +60,7 @@ def drawn() -> tuple[NDArray[Any], ...]:
     cameras = list(range(model().ncam))
     with wp.ScopedDevice("cpu"):
         data = mujoco_warp.make_data(model(), 1)
-        tracer = Tracer(model(), cameras, 1, WIDTH, HEIGHT, (0.05, 0.02, 0.02))
+        tracer = RayCaster(model(), cameras, 1, WIDTH, HEIGHT, (0.05, 0.02, 0.02))
         place(data)
         shape = len(cameras), HEIGHT, WIDTH
         rgb = torch.empty((*shape, 3), dtype=torch.uint8)

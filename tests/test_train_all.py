@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from surgical_marl.learning.run import CHECKPOINT, CONFIG, read_checkpoint, read_metrics
+from surgical_marl.runs.folder import CHECKPOINT, CONFIG, read_checkpoint, read_metrics
 
 ROOT = Path(__file__).parents[1]
 
@@ -104,7 +104,7 @@ def test_a_name_that_is_no_policy() -> None:
 
 
 def test_the_table_replaces_the_old_one(script: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("surgical_marl.learning.card.table", lambda: "new")
+    monkeypatch.setattr("surgical_marl.evaluation.card.table", lambda: "new")
     (tmp_path / "README.md").write_text("before\n<!-- table -->\nold\n<!-- end of table -->\nafter\n")
     script.write_table(tmp_path / "README.md")
     assert (tmp_path / "README.md").read_text() == "before\n<!-- table -->\nnew\n<!-- end of table -->\nafter\n"

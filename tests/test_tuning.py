@@ -13,7 +13,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parent.parent / "docs"))
 import tuning
 
-from surgical_marl.learning.config import Settings, load_config
+from surgical_marl.runs.settings import Settings, load_config
 
 
 def test_shipped_settings_are_a_point_of_the_space() -> None:

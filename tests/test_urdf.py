@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from surgical_marl import load_arm
-from surgical_marl.arm_spec import COLLISION_GROUP, _bounding_capsule
-from surgical_marl.urdf import Faults, read_mesh, read_urdf
+from surgical_marl.robots.spec import COLLISION_GROUP, _bounding_capsule, build_spec
+from surgical_marl.robots.urdf import Faults, read_mesh, read_urdf
 
 INERTIAL = '<inertial><mass value="1"/><inertia ixx="1e-2" iyy="1e-2" izz="1e-2" ixy="0" ixz="0" iyz="0"/></inertial>'
 SHAPE = '<geometry><mesh filename="part.stl"/></geometry>'
@@ -51,7 +51,7 @@ def refused(folder: Path) -> str:
     """The one sentence with which loading and building fails, without a trace."""
     before = {path: path.read_bytes() for path in folder.parent.rglob("*") if path.is_file() and not path.is_symlink()}
     with pytest.raises(ValueError) as caught:
-        load_arm(folder).spec()
+        build_spec(load_arm(folder))
     sentence = str(caught.value)
     assert "\n" not in sentence and len(sentence) < 500
     assert {p: p.read_bytes() for p in folder.parent.rglob("*") if p.is_file() and not p.is_symlink()} == before
@@ -232,7 +232,7 @@ def test_all_that_is_wrong_is_listed(folder: Path) -> None:
 def test_a_link_called_world_is_renamed(folder: Path) -> None:
     (folder / "two.urdf").write_text(URDF.replace('"base"', '"world"'))
     assert read_urdf(folder / "two.urdf").links[0].name == "world_link"
-    assert load_arm(folder).spec().compile().nbody == 4
+    assert build_spec(load_arm(folder)).compile().nbody == 4
 
 
 @pytest.mark.parametrize("kind", ["stl", "obj", "dae"])
@@ -249,10 +249,10 @@ def test_meshes_become_what_is_seen_and_a_capsule_around_them(folder: Path, kind
     scene = mujoco.MjSpec()
     scene.copy_during_attach = True
     for prefix in ("a/", "b/"):
-        scene.attach(arm.spec(), prefix=prefix, frame=scene.worldbody.add_frame())
+        scene.attach(build_spec(arm), prefix=prefix, frame=scene.worldbody.add_frame())
     assert scene.compile().nmesh == 6
 
-    model = arm.spec().compile()
+    model = build_spec(arm).compile()
     kinds = model.geom_type[model.geom_group == COLLISION_GROUP].tolist()
     assert kinds == [int(mujoco.mjtGeom.mjGEOM_CAPSULE)] * 2
     data = mujoco.MjData(model)
@@ -282,7 +282,7 @@ def test_a_dae_says_what_its_unit_is(folder: Path) -> None:
 def test_a_flat_mesh_can_be_seen(folder: Path) -> None:
     flat = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], [[0, 1, 2], [1, 3, 2]])
     flat.export(folder / "part.stl")
-    assert load_arm(folder).spec().compile().nmesh == 3
+    assert build_spec(load_arm(folder)).compile().nmesh == 3
 
 
 @settings(max_examples=100, deadline=None)

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 import torch
 
-from surgical_marl.batch import BatchedEnv
+from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.evaluation.evaluate import evaluate
-from surgical_marl.interfaces.rsl_rl import Layout, RslRlVecEnv
-from surgical_marl.learning.config import Settings, load_config
-from surgical_marl.learning.policy import load_policy, random_policy, zero_policy
-from surgical_marl.learning.train import Training, train
+from surgical_marl.interfaces.rsl_rl import RslRlVecEnv
+from surgical_marl.learning.train import Trainer, train
+from surgical_marl.policies.layout import Layout
+from surgical_marl.policies.policy import load_policy, random_policy, zero_policy
+from surgical_marl.runs.settings import Settings, load_config
 
 SMALL = [
     "num_envs=8",
@@ -58,7 +59,7 @@ def test_networks_are_shown_both_pictures_channels_first(joint: bool) -> None:
 )
 def test_it_learns_from_pixels(algo: Any, scene: str) -> None:
     """The value loss falls to less than half; the encoder's weights move, and pictures alone change what is done."""
-    training = Training(settings(f"algo={algo}", scene=scene), made(scene))
+    training = Trainer(settings(f"algo={algo}", scene=scene), made(scene))
     (model,) = [model for model in training.algorithm.actor.models.values() if hasattr(model, "cnns")]
     before = [weight.detach().clone() for weight in model.cnns.parameters()]
     losses = [training.row(training.iterate())["value_loss"] for _ in range(6)]

@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING
 from surgical_marl.content import find, list_tasks, unknown
 
 if TYPE_CHECKING:
-    from surgical_marl.learning.config import Settings
+    from surgical_marl.runs.settings import Settings
 
 
 def run(arguments: Namespace) -> int:
-    """One benchmark; returns the exit code. `arguments` are those of its parser in `surgical_marl/cli.py`."""
+    """One benchmark; returns the exit code. `arguments` are those of its parser in `surgical_marl/cli/main.py`."""
     find("scenes", arguments.scene)
     if arguments.kind == "render":
         from surgical_marl.bench.render import run
@@ -51,7 +51,7 @@ def _sim(arguments: Namespace) -> int:
 
 
 def _train(arguments: Namespace) -> int:
-    from surgical_marl.bench.train import run
+    from surgical_marl.bench.learning import run
     from surgical_marl.bench.workload import NUM_ENVS
 
     print(run(_settings(arguments, NUM_ENVS), arguments.json))
@@ -77,7 +77,7 @@ def _settings(arguments: Namespace, num_envs: Mapping[str, int] | None = None) -
     """Settings of a training: those of `configs/`, so many environments by the device where that is said, flags, and
     `key=value`."""
     from surgical_marl.bench.workload import Workload
-    from surgical_marl.learning.config import load_config
+    from surgical_marl.runs.settings import load_config
 
     where = Workload(device=arguments.device).where  # says so if there is no such device
     keys = ("num_envs", "algo", "seed", "engine")

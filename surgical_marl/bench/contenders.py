@@ -12,15 +12,15 @@ import mujoco
 import numpy as np
 from mujoco import rollout
 
-from surgical_marl.batch import BatchedEnv
 from surgical_marl.bench.clock import Clock, cpu_clock, cuda_clock
 from surgical_marl.bench.course import HOLD, LAPS, Course, full_state, tile
 from surgical_marl.bench.physics import PhysicsAlone
 from surgical_marl.bench.workload import Workload
 from surgical_marl.content import unknown
 from surgical_marl.engines.choose import Engine, make_engine
-from surgical_marl.engines.common import cores
-from surgical_marl.scene import load_scene
+from surgical_marl.envs.batch import BatchedEnv
+from surgical_marl.machine import cores
+from surgical_marl.scenes.load import load_scene
 
 ENGINES = ("fused", "mjx", "mujoco")
 MOST_ROLLED = 4096

@@ -9,8 +9,8 @@ import mujoco
 import numpy as np
 from mujoco import rollout
 
-from surgical_marl.physics import Simulator
-from surgical_marl.scene import DECIMATION, Scene
+from surgical_marl.physics.simulator import Simulator
+from surgical_marl.scenes.scene import DECIMATION, Scene
 
 HOLD = DECIMATION
 """Physics steps for which an action is held: a control step of training, whatever is timed."""

@@ -7,8 +7,8 @@ from typing import Any
 import jax.numpy as jnp
 from jax import Array
 
-from surgical_marl.env import Carry, Env, State
-from surgical_marl.physics import Contacts, Physics
+from surgical_marl.envs.env import Carry, Env, State
+from surgical_marl.physics.simulator import Contacts, Physics
 
 
 class PhysicsAlone(Env):

@@ -13,9 +13,10 @@ import numpy as np
 import torch
 
 from surgical_marl.bench import clock
-from surgical_marl.endoscope import SIZE, Endoscope
 from surgical_marl.runtime import has_cuda
-from surgical_marl.scene import Scene, load_scene
+from surgical_marl.scenes.load import load_scene
+from surgical_marl.scenes.scene import Scene
+from surgical_marl.vision.endoscope import SIZE, Endoscope
 
 NUM_ENVS = {"cpu": 64, "cuda": 8192}
 """Environments on each device, unless told."""

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from surgical_marl.bench.course import Course, make_course
-from surgical_marl.bench.machine import machine
 from surgical_marl.bench.sim import Point, Speed, measure, sweep
 from surgical_marl.bench.workload import Workload
 from surgical_marl.files import write_atomic
-from surgical_marl.scene import load_scene
+from surgical_marl.machine import machine
+from surgical_marl.scenes.load import load_scene
 
 QUOTED = {
     "SurRoL": 4_124,

@@ -13,11 +13,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-from surgical_marl.bench import clock, machine
+from surgical_marl import machine
+from surgical_marl.bench import clock
 from surgical_marl.bench.contenders import ENGINES, MOST_ROLLED, Contender, prepare
 from surgical_marl.bench.course import Course, make_course
 from surgical_marl.bench.workload import Workload
-from surgical_marl.scene import TIMESTEP, load_scene
+from surgical_marl.scenes.load import load_scene
+from surgical_marl.scenes.scene import TIMESTEP
 
 SWEEP = tuple(4**k for k in range(12))
 """Environments of a sweep: 1 to 4 million."""

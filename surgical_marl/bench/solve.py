@@ -16,17 +16,18 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
-from surgical_marl.bench import machine
+from surgical_marl import machine
 from surgical_marl.bench.report import aligned, describe_machine
 from surgical_marl.bench.stopwatch import STARTING, Stopwatch, rows
 from surgical_marl.evaluation.evaluate import Played, play
 from surgical_marl.evaluation.goal_set import is_standard
 from surgical_marl.evaluation.metrics import FOLLOWING, SUCCESS_MM, metrics
-from surgical_marl.learning.config import Settings
-from surgical_marl.learning.memory import in_memory
-from surgical_marl.learning.policy import acting_policy
-from surgical_marl.learning.train import make_env, make_training
-from surgical_marl.learning.training import Training
+from surgical_marl.learning.room import in_memory
+from surgical_marl.learning.train import make_training
+from surgical_marl.learning.trainer import Trainer
+from surgical_marl.policies.policy import acting_policy
+from surgical_marl.runs.environment import make_env
+from surgical_marl.runs.settings import Settings
 
 EPISODES, SEED = 200, 0
 """Of the standard goal sets."""
@@ -200,7 +201,7 @@ class Looks:
         self._promising = success + (1 - success) * min(missing, 1.0)
 
 
-def examine(training: Training, env: Any) -> Exam:
+def examine(training: Trainer, env: Any) -> Exam:
     """The frozen evaluation of the policy as it is now, in `EPISODES` environments."""
     policy = acting_policy(training.algorithm.actor, training.env.layout, str(env.device))
     return _exam(play(env, policy, EPISODES, SEED))

@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from surgical_marl.learning.training import Training
+from surgical_marl.learning.trainer import Trainer
 
 STARTING = 2
 """Iterations that take longer than the others: a CUDA graph is captured in the second."""
@@ -20,7 +20,7 @@ class Stopwatch:
     On a GPU it puts events into the queue of work, so that nothing waits for the device.
     """
 
-    def __init__(self, training: Training) -> None:
+    def __init__(self, training: Trainer) -> None:
         self._cuda = str(training.env.device).startswith("cuda")
         self._marks: dict[str, list[tuple[Any, Any]]] = {}
         for name in ("rollout", "update"):
@@ -56,7 +56,7 @@ class Stopwatch:
         return event
 
 
-def rows(training: Training) -> Iterator[dict[str, float]]:
+def rows(training: Trainer) -> Iterator[dict[str, float]]:
     """Metrics of one iteration after the other, without end.
 
     On a GPU a row is read when the next iteration is under way, as `train` does, so that the device always has

@@ -6,7 +6,7 @@ import importlib.util
 import sys
 from typing import Any, Protocol
 
-from surgical_marl.env import Env
+from surgical_marl.engines.stepper import Stepper
 
 ENGINES = ("auto", "fused", "mjx")
 DEVICES = ("auto", "cpu", "cuda")
@@ -34,7 +34,7 @@ class Engine(Protocol):
     def write(self, name: str, values: Any) -> None: ...
 
 
-def make_engine(env: Env, num_envs: int, engine: str = "auto", device: str = "auto") -> Engine:
+def make_engine(env: Stepper, num_envs: int, engine: str = "auto", device: str = "auto") -> Engine:
     """The engine of that name, or the fastest that can run the environment.
 
     Raises:
@@ -57,8 +57,8 @@ def make_engine(env: Env, num_envs: int, engine: str = "auto", device: str = "au
                 return FusedEngine(env, num_envs, device)
             except Unsupported as error:
                 if engine == "fused":
-                    raise ValueError(f"engine 'fused' can't run {env.task_name} on {env.scene.name}: {error}") from None
-                _say(f"{env.task_name} on {env.scene.name} uses {error}")
+                    raise ValueError(f"engine 'fused' can't run {env.title}: {error}") from None
+                _say(f"{env.title} uses {error}")
     from surgical_marl.engines.mjx import MjxEngine
 
     return MjxEngine(env, num_envs, device)

@@ -13,11 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from surgical_marl.engines.common import announce, cores
-from surgical_marl.env import Carry, Env, State
+from surgical_marl.engines.stepper import Stepper, announce
+from surgical_marl.machine import cores
 from surgical_marl.runtime import no_collection
 
-RESULTS = tuple(field.name for field in fields(State) if field.name != "carry")
 LEAST_SHARE = 32
 """Environments that are worth a thread."""
 
@@ -27,7 +26,7 @@ class MjxEngine:
 
     name = "mjx"
 
-    def __init__(self, env: Env, num_envs: int, device: str = "auto") -> None:
+    def __init__(self, env: Stepper, num_envs: int, device: str = "auto") -> None:
         self.env, self.num_envs = env, num_envs
         self._on = find_device(device)
         self.device = "cpu" if self._on.platform == "cpu" else "cuda"
@@ -80,9 +79,9 @@ class MjxEngine:
 
     def outcome(self, library: str) -> dict[str, Any]:
         """What the last step or reset led to, as arrays [N, ...] of "numpy", "torch" or "jax": fields of
-        `surgical_marl.env.State`."""
+        the environment's `State`."""
         state = self._state
-        known = {name: getattr(state, name) for name in RESULTS}
+        known = {field.name: getattr(state, field.name) for field in fields(state) if field.name != "carry"}
         found = {name: self._present(value, library) for name, value in known.items() if jax.tree.leaves(value)}
         return {**found, "contacts": found["contacts"]._asdict()}
 
@@ -99,9 +98,9 @@ class MjxEngine:
         carry = jax.tree.unflatten(self._tree, list(parts.values()))
         self._state, self._stepped = replace(self._state, carry=carry), True
 
-    def _step_share(self, share: tuple[Carry, dict[str, Array]]) -> State:
+    def _step_share(self, share: tuple[Any, dict[str, Array]]) -> Any:
         with jax.default_device(self._on):  # of this thread
-            state: State = jax.block_until_ready(self._step(*share)) if self._shares > 1 else self._step(*share)
+            state: Any = jax.block_until_ready(self._step(*share)) if self._shares > 1 else self._step(*share)
             return state
 
     def _slices(self) -> list[Callable[[Array], Array]]:

@@ -13,10 +13,10 @@ from surgical_marl.content import BASELINES, find
 from surgical_marl.evaluation.evaluate import MAX_BATCH, Played, difference, play, summarise
 from surgical_marl.evaluation.report import ABOUT, format_table, write_csv
 from surgical_marl.files import write_atomic
-from surgical_marl.learning.config import Settings
-from surgical_marl.learning.policy import load_policy
-from surgical_marl.learning.run import read_settings
-from surgical_marl.learning.train import make_env
+from surgical_marl.policies.policy import load_policy
+from surgical_marl.runs.environment import make_env
+from surgical_marl.runs.folder import read_settings
+from surgical_marl.runs.settings import Settings
 
 
 def play_all(policies: Sequence[str], asked: Mapping[str, str | None], episodes: int, seed: int) -> dict[str, Played]:

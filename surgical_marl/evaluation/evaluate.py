@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import torch
 
-from surgical_marl.acting import forget
 from surgical_marl.evaluation.goal_set import check_same, describe_goals, episode_seed, goal_hash, read_goals
 from surgical_marl.evaluation.interval import interval
 from surgical_marl.evaluation.metrics import FOLLOWING, LAST, TERMS, Metric, Trajectory, measure, metrics
+from surgical_marl.policies.acting import forget
 
 if TYPE_CHECKING:
-    from surgical_marl.batch import BatchedEnv
+    from surgical_marl.envs.batch import BatchedEnv
 
 MAX_BATCH = 1024
 """Episodes run at once; make the environment with num_envs=min(episodes, MAX_BATCH)."""

@@ -13,7 +13,7 @@ import numpy as np
 import yaml
 
 if TYPE_CHECKING:
-    from surgical_marl.batch import BatchedEnv
+    from surgical_marl.envs.batch import BatchedEnv
 
 PROTOCOL = 1
 """Raised when the goals are drawn or a metric is computed in another way: older results don't compare then."""

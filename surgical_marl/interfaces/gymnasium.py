@@ -17,9 +17,9 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from surgical_marl.batch import BatchedEnv
+from surgical_marl.envs.batch import BatchedEnv
+from surgical_marl.envs.observations import each, proprioception
 from surgical_marl.interfaces.pettingzoo import RENDER_MODES
-from surgical_marl.observations import each, proprioception
 
 
 class SurgicalEnv(gymnasium.Env[Any, np.ndarray]):
@@ -30,7 +30,7 @@ class SurgicalEnv(gymnasium.Env[Any, np.ndarray]):
     metadata = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012 (Gymnasium's own convention)
 
     def __init__(self, task: str = "reach", scene: str = "psm", render_mode: str | None = None, **options: Any) -> None:
-        """`options` are those of `surgical_marl.batch.BatchedEnv`: control, engine, device, max_steps, difficulty,
+        """`options` are those of `surgical_marl.envs.batch.BatchedEnv`: control, engine, device, max_steps, difficulty,
         reward."""
         if "num_envs" in options:
             raise ValueError(f"num_envs {options['num_envs']!r} is for many environments: use gymnasium.make_vec")
@@ -114,7 +114,7 @@ def _joint_spaces(batch: BatchedEnv) -> tuple[spaces.Space[Any], spaces.Box]:
     box = spaces.Box(low, high, dtype=np.float32)
     observed: spaces.Space[Any] = box
     if batch.env.task.camera is not None:
-        from surgical_marl.pictures import Pictures
+        from surgical_marl.envs.pictures import Pictures
 
         observed = Pictures.space(box)
     width = sum(batch.action_space(agent).shape[0] for agent in batch.agents)

@@ -20,7 +20,7 @@ from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
 if TYPE_CHECKING:
-    from surgical_marl.batch import BatchedEnv, BatchStep
+    from surgical_marl.envs.batch import BatchedEnv, BatchStep
 
 RENDER_MODES = (None, "rgb_array")
 
@@ -200,7 +200,7 @@ def parallel_env(
     Raises:
         ValueError: naming the unknown value and the good ones.
     """
-    from surgical_marl.batch import BatchedEnv
+    from surgical_marl.envs.batch import BatchedEnv
 
     if render_mode not in RENDER_MODES:
         raise ValueError(f"unknown render_mode {render_mode!r}; the modes are None and 'rgb_array'")

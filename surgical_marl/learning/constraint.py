@@ -7,8 +7,8 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor, nn
 
-from surgical_marl.interfaces.rsl_rl import Layout
 from surgical_marl.learning import distributed
+from surgical_marl.policies.layout import Layout
 
 METRICS = ("cost_rate", "lagrange_multiplier")
 """What `Constraint.metrics` returns."""
@@ -24,7 +24,7 @@ class Constraint(nn.Module):
     Args:
         layout: of the environment, which stacks costs as it does rewards.
         num_envs: N.
-        cost: "collision", or the name of a limit in `surgical_marl/safety.py`.
+        cost: "collision", or the name of a limit in `surgical_marl/envs/costs.py`.
         limit: the share of episodes that may have it, 0 to 1.
         kp, ki, kd: what the multiplier grows by for an excess of 1 over the limit, for its sum over iterations, and
             for its growth since the last iteration.
@@ -50,7 +50,7 @@ class Constraint(nn.Module):
         self.limit, self.kp, self.ki, self.kd = limit, kp, ki, kd
         for name in ("multiplier", "integral", "rate"):
             self.register_buffer(name, torch.zeros(()))
-        # these two are of this process: `Training` saves the first, and the second is zero between iterations
+        # these two are of this process: `Trainer` saves the first, and the second is zero between iterations
         self.register_buffer("broken", torch.zeros(num_envs, dtype=torch.bool), persistent=False)
         # episodes since the last update: all that ended, and those that had the cost
         self.register_buffer("_ended", torch.zeros(2), persistent=False)

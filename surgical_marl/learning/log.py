@@ -14,14 +14,14 @@ from typing import Any
 
 from tqdm import tqdm
 
-from surgical_marl.learning.run import METRICS, format_row
-from surgical_marl.learning.training import Report, Training
+from surgical_marl.learning.trainer import Report, Trainer
+from surgical_marl.runs.folder import METRICS, format_row
 
 
 class Reports:
     """Reads an iteration's report when the next one is under way, so that a GPU has always something to do."""
 
-    def __init__(self, training: Training, write: Callable[[dict[str, float]], None]) -> None:
+    def __init__(self, training: Trainer, write: Callable[[dict[str, float]], None]) -> None:
         self._training, self._write, self._waiting = training, write, deque[Report]()
         self._lag = 1 if training.env.device == "cuda" else 0
 
@@ -42,7 +42,7 @@ class Reports:
 class Log:
     """`metrics.csv`, tensorboard and the progress bar of a run."""
 
-    def __init__(self, training: Training, out: Path) -> None:
+    def __init__(self, training: Trainer, out: Path) -> None:
         from torch.utils.tensorboard import SummaryWriter  # takes a second to import
 
         self._columns = training.columns

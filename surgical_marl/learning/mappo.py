@@ -19,12 +19,19 @@ from torch import Tensor, nn
 
 from surgical_marl.interfaces.rsl_rl import RslRlVecEnv
 from surgical_marl.learning import distributed
-from surgical_marl.learning.config import Settings
 from surgical_marl.learning.constraint import Constraint
-from surgical_marl.learning.models import Gaussian, MultiAgentActor, MultiAgentModel, make_model
-from surgical_marl.learning.recurrent import Memory
+from surgical_marl.learning.normaliser import share_normalisers
 from surgical_marl.learning.storage import MultiAgentStorage
 from surgical_marl.learning.values import ValueScale
+from surgical_marl.policies.networks import (
+    MultiAgentActor,
+    MultiAgentModel,
+    actor_config,
+    make_model,
+    network_config,
+)
+from surgical_marl.policies.recurrent import Memory
+from surgical_marl.runs.settings import Settings
 
 LOSSES = ("value_loss", "surrogate_loss", "entropy", "kl", "learning_rate")
 LEARNING_RATE_RANGE = (1e-5, 1e-2)  # rsl_rl's limits of the adaptive learning rate
@@ -230,38 +237,29 @@ class MAPPO(PPO):
             constraint = Constraint(layout, env.num_envs, **bounds).to(device)
         per_agent = 1 if constraint is None else 2
         num_values = per_agent * layout.num_agents
-        actor = MultiAgentActor(obs, layout.action_sizes, **cfg["actor"]).to(device)
+        actor = MultiAgentActor(obs, layout.action_sizes, **cfg["actor"])
         if cfg["centralised_critic"]:
             critic: nn.Module = make_model(obs, ["state"], num_values, **cfg["critic"])
         else:
             critic = MultiAgentModel(obs, dict.fromkeys(layout.counts, per_agent), **cfg["critic"])
+        for model in (actor, critic):
+            share_normalisers(model)
         steps = cfg["num_steps_per_env"]
         sizes = (layout.num_agents, num_values, env.num_envs, steps)
         storage = MultiAgentStorage(*sizes, obs, env.num_actions, device)
         del options["class_name"]
-        return MAPPO(actor, critic.to(device), storage, constraint=constraint, device=device, **options)
+        return MAPPO(actor.to(device), critic.to(device), storage, constraint=constraint, device=device, **options)
 
 
 def rsl_rl_config(settings: Settings) -> dict[str, Any]:
     """The settings as a configuration that rsl_rl's own `OnPolicyRunner` also takes."""
     network, ppo = settings.network, settings.ppo
-    mlp = {
-        "hidden_dims": list(network.hidden),
-        "activation": network.activation,
-        "obs_normalization": network.normalise_observations,
-        "recurrent": network.recurrent,
-    }
-    gaussian = {
-        "class_name": Gaussian,
-        "init_std": network.init_std,
-        "std_type": "log",
-    }
     return {
         "num_steps_per_env": settings.steps_per_iteration,
         "save_interval": settings.checkpoint_every,
         "centralised_critic": settings.algo != "ippo",
-        "actor": {**mlp, "distribution_cfg": gaussian},
-        "critic": mlp,
+        "actor": actor_config(network),
+        "critic": network_config(network),
         "algorithm": {
             "class_name": MAPPO,
             "team_reward": settings.team_reward,

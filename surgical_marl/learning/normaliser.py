@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from rsl_rl.modules import EmpiricalNormalization
-from torch import Tensor
+from torch import Tensor, nn
 
 from surgical_marl.learning import distributed
 
@@ -23,3 +23,10 @@ class Normaliser(EmpiricalNormalization):
         self._mean += rate * ahead
         self._var += rate * (var - self._var + ahead * (mean - self._mean))
         self._std.copy_(self._var.sqrt())
+
+
+def share_normalisers(network: nn.Module) -> None:
+    """Replace every normaliser of observations in a network that is to learn by a `Normaliser`."""
+    for model in network.modules():
+        if getattr(model, "obs_normalization", False):
+            model.obs_normalizer = Normaliser(model.obs_dim)

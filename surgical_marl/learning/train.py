@@ -17,17 +17,19 @@ from tqdm import tqdm
 
 from surgical_marl.files import remove_temporaries
 from surgical_marl.learning import distributed
-from surgical_marl.learning.config import Settings
 from surgical_marl.learning.faults import Diverged
 from surgical_marl.learning.log import Log, Reports
-from surgical_marl.learning.memory import check_room, in_memory
-from surgical_marl.learning.run import (
+from surgical_marl.learning.room import check_room, in_memory
+from surgical_marl.learning.trainer import OWN, Trainer
+from surgical_marl.runs.environment import make_env
+from surgical_marl.runs.folder import (
     CHECKPOINT,
     CONFIG,
     DIVERGED,
     check_writable,
     claim_folder,
     has_begun,
+    holds_weights,
     read_checkpoint,
     read_environments,
     read_metrics,
@@ -39,11 +41,10 @@ from surgical_marl.learning.run import (
     write_environments,
     write_metrics,
 )
-from surgical_marl.learning.training import OWN, Training
-from surgical_marl.learning.weights import holds_weights
+from surgical_marl.runs.settings import Settings
 
 if TYPE_CHECKING:
-    from surgical_marl.batch import BatchedEnv
+    pass
 
 # What may change when a run goes on; everything else shapes the checkpoint or the problem.
 CHANGEABLE = {
@@ -60,32 +61,13 @@ CHANGEABLE = {
 FIXED = {"ppo.normalise_values", "constraint.cost"}
 
 
-def make_env(settings: Settings, num_envs: int | None = None) -> BatchedEnv:
-    """The environment of a run, with torch tensors; `num_envs` replaces the setting."""
-    # Imports JAX, which takes seconds: not before the settings are known to be good.
-    from surgical_marl.batch import BatchedEnv
-
-    return BatchedEnv(
-        settings.task,
-        settings.scene,
-        num_envs=num_envs or settings.num_envs,
-        control=settings.control,
-        engine=settings.engine,
-        device=settings.device,
-        max_steps=settings.max_steps,
-        difficulty=settings.difficulty,
-        reward=settings.reward,
-        arrays="torch",
-    )
-
-
-def make_training(settings: Settings) -> Training:
+def make_training(settings: Settings) -> Trainer:
     """A run in memory. ValueError if it has no room there."""
     with distributed.in_turn():
         env = make_env(settings)
     check_room(settings, env)
     with in_memory(settings.num_envs):
-        return Training(settings, env)
+        return Trainer(settings, env)
 
 
 def train(settings: Settings, *, out: Path, resume: Path | None = None) -> Path:
@@ -163,7 +145,7 @@ def _same(out: Path, resume: Path | None) -> bool:
     return resume is not None and out.resolve() == Path(resume).resolve()
 
 
-def _save(training: Training, out: Path) -> None:
+def _save(training: Trainer, out: Path) -> None:
     """A checkpoint of all processes. The others write first: what rank 0 writes stands for a whole."""
     state, rank = training.state(), distributed.rank()
     iteration, processes = training.iteration, distributed.size()
@@ -175,7 +157,7 @@ def _save(training: Training, out: Path) -> None:
         remove_environments(out, iteration, processes)
 
 
-def _run(training: Training, out: Path) -> None:
+def _run(training: Trainer, out: Path) -> None:
     settings = training.settings
     with _signals(training) as received, ExitStack() as files:
         log = files.enter_context(Log(training, out)) if distributed.rank() == 0 else None
@@ -195,7 +177,7 @@ def _run(training: Training, out: Path) -> None:
                 write_divergence(out, {**error.summary, "last_checkpoint": read_checkpoint(out)["iteration"]})
             raise
     if log:
-        from surgical_marl.learning.curve import draw_curve  # matplotlib: not before training has begun
+        from surgical_marl.runs.curve import draw_curve  # matplotlib: not before training has begun
 
         draw_curve(out, f"{settings.task} in {settings.scene}, {settings.algo}, seed {settings.seed}")
     distributed.wait()  # where one process ends early, torchrun ends them all
@@ -258,7 +240,7 @@ def _say(what: str, by: int = 0) -> None:
 
 
 @contextmanager
-def _signals(training: Training) -> Iterator[list[int]]:
+def _signals(training: Trainer) -> Iterator[list[int]]:
     """Collect Ctrl-C and SIGTERM, so that the iteration ends and is saved.
 
     A second one stops at once, but not one process of several: the others would wait for it.

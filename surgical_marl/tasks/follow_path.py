@@ -9,7 +9,7 @@ Success       tip within 2 mm of the reference point.
 Termination   none; an episode is truncated after 250 control steps (5 s), when the path is passed once.
 Randomisation cubic splines through random waypoints, half of them closed, sampled at equal arc length, from where the
               tool tip is at home. Each has its own speed, from half the greatest to the greatest, and turns by no more
-              than 4 rad/s. Paths are kept only if all arms can follow them together (`surgical_marl/paths.py`). Arms
+              than 4 rad/s. Paths are kept only if all arms can follow them together (`tasks/base/paths.py`). Arms
               start at home.
 Difficulty    greatest speed, and distance from the start: easy 10 mm/s, 50 mm; default 20 mm/s, 50 mm; hard 30 mm/s,
               70 mm. Two arms' paths come within 20 mm of each other in no episode if easy, in a tenth by default, in
@@ -22,9 +22,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from surgical_marl.path_task import PathGoal, PathTask
-from surgical_marl.paths import loops_and_lines
-from surgical_marl.task import FAR, Level, Views
+from surgical_marl.tasks.base.path_task import PathGoal, PathTask
+from surgical_marl.tasks.base.paths import loops_and_lines
+from surgical_marl.tasks.base.task import FAR, Level, Views
 
 AHEAD = (0.1, 0.2, 0.4)
 """How much later the points of the path are reached that an arm sees, s."""

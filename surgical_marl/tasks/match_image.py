@@ -32,14 +32,13 @@ import mujoco
 import numpy as np
 from jax import Array
 
-from surgical_marl import task
 from surgical_marl.cache import cached
-from surgical_marl.endoscope import find_camera
-from surgical_marl.task import Level, Views
-from surgical_marl.workspace import CLEARANCE, PATH_POINTS, choose
+from surgical_marl.tasks.base import task
+from surgical_marl.tasks.base.task import Level, Views
+from surgical_marl.tasks.base.workspace import CLEARANCE, PATH_POINTS, choose
 
 if TYPE_CHECKING:
-    from surgical_marl.scene import Scene
+    from surgical_marl.scenes.scene import Scene
 
 POSTURES = 1024
 """How many hidden postures there are; each has a picture of 12 KiB."""
@@ -49,7 +48,6 @@ IN_VIEW = 0.2
 """Least share of a target picture that shows pieces of tissue, and not just the field around them."""
 RAYS = 8
 """Along each side of a picture, to find out what it shows."""
-CODE = ("tasks/match_image", "arm", "contacts", "geometry", "scene", "workspace")
 
 
 class PictureGoal(NamedTuple):
@@ -63,7 +61,7 @@ class PictureGoal(NamedTuple):
 
 class Task(task.Task):
     """Hidden postures, and how far from them the camera is. Pictures are added where many environments run:
-    `surgical_marl/pictures.py`."""
+    `surgical_marl/envs/pictures.py`."""
 
     levels = {"easy": Level(0.01, 0.0), "default": Level(0.02, 0.0), "hard": Level(0.04, 0.0)}  # noqa: RUF012
     weights = {  # noqa: RUF012
@@ -73,7 +71,7 @@ class Task(task.Task):
 
     def __init__(self, scene: Scene, difficulty: str = "default", reward: Mapping[str, float] | None = None) -> None:
         super().__init__(scene, difficulty, reward)
-        self.camera: str = find_camera(scene)
+        self.camera: str = scene.find_camera()
         same = scene.types[scene.mounts[self.camera].arm.name]
         if len(same) > 1:
             raise ValueError(f"match_image needs a scene with one endoscope; {scene.name!r} has {', '.join(same)}")
@@ -175,9 +173,7 @@ def hidden_postures(scene: Scene, agent: str, extent: float) -> np.ndarray:
 
     camera = model.camera(f"{agent}/left")
     numbers = (extent, POSTURES, *map(float, (*camera.pos, *camera.quat, *camera.fovy)))
-    return cached(
-        "pictures", repr((agent, numbers)), scene.fingerprint, lambda: choose(scene, batch, POSTURES, 0.0), CODE
-    )
+    return cached("pictures", lambda: choose(scene, batch, POSTURES, 0.0), repr((agent, numbers)), scene.fingerprint)
 
 
 def _sees(scene: Scene, agent: str, qpos: np.ndarray, tissue: np.ndarray) -> bool:

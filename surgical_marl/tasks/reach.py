@@ -12,7 +12,7 @@ Reward        per agent, each step, weights in brackets: `distance` of tip and g
 Success       tip within 2 mm of the goal.
 Termination   none; an episode is truncated after 100 control steps (2 s).
 Randomisation goals from a normal distribution about the point in front of each arm, kept only if reachable in
-              1.5 s without collision (`surgical_marl/workspace.py`). Arms start at home.
+              1.5 s without collision (`surgical_marl/tasks/base/workspace.py`). Arms start at home.
 Difficulty    standard deviation of the goals: easy 30 mm, default 50 mm (the paper's), hard 70 mm. Hard: in a quarter
               of the episodes of several arms the straight ways from home, in joint space, collide unless one arm waits.
 """
@@ -26,12 +26,12 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from surgical_marl import task
-from surgical_marl.task import Goal, Level
-from surgical_marl.workspace import target_table
+from surgical_marl.tasks.base import task
+from surgical_marl.tasks.base.task import Goal, Level
+from surgical_marl.tasks.base.workspace import target_table
 
 if TYPE_CHECKING:
-    from surgical_marl.scene import Scene
+    from surgical_marl.scenes.scene import Scene
 
 
 class Task(task.Task):

@@ -12,13 +12,13 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from surgical_marl.acting import forget
-from surgical_marl.engines.common import cores
+from surgical_marl.machine import cores
+from surgical_marl.policies.acting import forget
 from surgical_marl.view.render import Renderer, Sphere
 from surgical_marl.view.video import write_video
 
 if TYPE_CHECKING:
-    from surgical_marl.batch import BatchedEnv
+    from surgical_marl.envs.batch import BatchedEnv
 
 FPS = 25
 GOAL_RADIUS = 0.004

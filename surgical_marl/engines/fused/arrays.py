@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from surgical_marl.engines.common import free_memory
 from surgical_marl.engines.fused.program import Leaf, Source
+from surgical_marl.machine import free_memory
 from surgical_marl.runtime import prepare_warp
 
 wp = prepare_warp()

@@ -16,13 +16,13 @@ from typing import Any
 
 import numpy as np
 
-from surgical_marl.engines.common import announce, cores
 from surgical_marl.engines.fused.arrays import make_arrays
 from surgical_marl.engines.fused.kernel import compile_kernels, has_cuda
 from surgical_marl.engines.fused.keys import episode_keys
 from surgical_marl.engines.fused.preludes import LANES
 from surgical_marl.engines.fused.program import Source, load_source
-from surgical_marl.env import Env
+from surgical_marl.engines.stepper import Stepper, announce
+from surgical_marl.machine import cores
 
 LEAST_SHARE = 32
 """Environments that are worth a thread."""
@@ -38,7 +38,7 @@ class FusedEngine:
 
     name = "fused"
 
-    def __init__(self, env: Env, num_envs: int, device: str = "auto") -> None:
+    def __init__(self, env: Stepper, num_envs: int, device: str = "auto") -> None:
         if device == "cuda" and not has_cuda():
             raise ValueError("device 'cuda' is not there: Warp finds no CUDA device; the other is cpu")
         self.env, self.num_envs = env, num_envs
@@ -83,7 +83,7 @@ class FusedEngine:
 
     def outcome(self, library: str) -> dict[str, Any]:
         """What the last step or reset led to, as arrays [N, ...] of "numpy", "torch" or "jax": fields of
-        `surgical_marl.env.State` as dicts of dicts. Copies, but on a GPU for "torch" the next step overwrites them."""
+        the environment's `State` as dicts of dicts. Copies, but on a GPU for "torch" the next step overwrites them."""
         return self._arrays.read_tree(self.source.results, library)
 
     def read(self, name: str, library: str) -> Any:

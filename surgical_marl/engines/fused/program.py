@@ -10,11 +10,9 @@ import json
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from importlib.metadata import version
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
-import mujoco
 import numpy as np
 
 from surgical_marl.cache import cached
@@ -22,9 +20,7 @@ from surgical_marl.engines.fused.emit import Emitter
 from surgical_marl.engines.fused.graph import KINDS, Graph, Value
 from surgical_marl.engines.fused.trace import Tracer
 from surgical_marl.engines.fused.traced import Traced, lift, lower
-
-if TYPE_CHECKING:
-    from surgical_marl.env import Env
+from surgical_marl.engines.stepper import Stepper
 
 BUFFERS = {"f": "outs", "i": "counts", "u": "counts", "b": "flags"}
 """Where results of each kind go unless they belong to the state."""
@@ -44,7 +40,7 @@ class Leaf:
         return math.prod(self.shape)
 
 
-class Layout:
+class Fields:
     """Gives out fields. `sizes` are how many each array has by now."""
 
     def __init__(self) -> None:
@@ -78,37 +74,27 @@ class Source:
     """Leaves of the rest of the `State`."""
 
 
-_CODE = ("physics", "dynamics", "collision", "solver", "plant", "env", "safety", "scene", "randomisation", "arm",
-         "drive", "arm_spec", "workspace", "paths", "spline", "task", "path_task", "tasks/*",
-         "engines/fused/*")  # fmt: skip
-
-
-def load_source(env: Env, vector: bool, announce: Callable[[], None] = lambda: None) -> Source:
+def load_source(env: Stepper, vector: bool, announce: Callable[[], None] = lambda: None) -> Source:
     """The source of an environment's kernels: for a CPU, with vectors, or for CUDA. Kept on disk; `announce` is called
     before it is made.
 
     Raises:
         Unsupported: the environment can't be traced.
     """
-    versions = {name: version(name) for name in ("jax", "mujoco", "mujoco-mjx")}
-    settings = f"{env.settings} vector={vector} {versions}"
 
     def compute() -> np.ndarray:
         announce()
         return np.frombuffer(json.dumps(asdict(make_source(env, vector)), default=np.ndarray.tolist).encode(), np.uint8)
 
-    model = np.empty(mujoco.mj_sizeModel(env.scene.model), np.uint8)
-    mujoco.mj_saveModel(env.scene.model, None, model)  # masses and gains too
-    content = env.scene.fingerprint + model.tobytes()
-    found = json.loads(cached("fused", settings, content, compute, _CODE).tobytes())
+    found = json.loads(cached("fused", compute, f"vector={vector}", env.content, roots=env.roots).tobytes())
     tables = {dtype: np.array(table, dtype) for dtype, table in found.pop("tables").items()}
     trees = {name: _leaves(found.pop(name)) for name in ("carry", "actions", "results")}
     return Source(tables=tables, **trees, **found)
 
 
-def make_source(env: Env, vector: bool) -> Source:
+def make_source(env: Stepper, vector: bool) -> Source:
     """Traces `env.step` and `env.reset`."""
-    layout, graph = Layout(), Graph()
+    layout, graph = Fields(), Graph()
     key, number = jax.ShapeDtypeStruct((2,), np.uint32), jax.ShapeDtypeStruct((), np.int32)
     carry = layout.place(jax.eval_shape(env.reset, key, number).carry, "state")
     actions = {agent: layout.leaf((env.num_actions(agent),), "float32", "actions") for agent in env.agents}
@@ -167,7 +153,7 @@ def _body(graph: Graph, leaves: list[Leaf], values: list[list[Value]], vector: b
     return Emitter(graph, [(*place, value) for place, value in stores.items()], vector).body()
 
 
-def _share_fields(layout: Layout, shapes: list[Any], values: list[list[Value]], first: list[list[Value]]) -> list[Leaf]:
+def _share_fields(layout: Fields, shapes: list[Any], values: list[list[Value]], first: list[list[Value]]) -> list[Leaf]:
     """A leaf for each result. One whose values stand in a row in another, in both kernels, shares its fields: a state
     holds the observations of all agents."""
     leaves: dict[int, Leaf] = {}

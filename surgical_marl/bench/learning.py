@@ -1,0 +1,136 @@
+"""Throughput of training: samples a second, updates included, and where the time goes.
+
+    found = measure(load_config("reach", "psm", ["num_envs=4096"]))
+    found.train_env_steps_per_s / found.env_steps_per_s     # what learning leaves of the simulator's speed
+
+docs/benchmarks.md says what is timed, and how.
+"""
+
+from __future__ import annotations
+
+import json
+import statistics
+import sys
+import time
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from surgical_marl import machine
+from surgical_marl.bench import clock, sim
+from surgical_marl.bench.report import aligned, describe_machine
+from surgical_marl.bench.stopwatch import STARTING, Stopwatch, rows
+from surgical_marl.bench.workload import Workload
+from surgical_marl.learning.room import in_memory
+from surgical_marl.learning.train import make_training
+from surgical_marl.runs.settings import Settings
+
+QUOTED = {
+    "SurRoL": 1_634,
+    "dVRL": 142,
+    "LapGym, 8 cores": 1_200,
+    "UnityFlexML": 27,
+    "UnityFlexML, nothing deformable": 52,
+    "Surgical Gym": 147_059,
+}
+"""Steps/s with learning, from Table II of Schmidgall et al., "Surgical Gym", 2023, arXiv:2310.04676. Surgical Gym: PPO
+on an 8 GB Quadro RTX 4000."""
+
+
+@dataclass(frozen=True)
+class Speed(sim.Speed):
+    """What a training does in a second, beside what its simulator does alone.
+
+    `compile_s` is what starting takes: from nothing but imported packages to the end of the second iteration, less two
+    iterations.
+    """
+
+    train_env_steps_per_s: float
+    """Environment steps, acted and learned from."""
+    rollout_s: float
+    """Of an iteration; `update_s` and `rest_s` beside it."""
+    update_s: float
+    rest_s: float
+
+
+def run(settings: Settings, as_json: bool = False) -> str:
+    """All of `surgical-marl bench train`: the text of its table or JSON."""
+    speed = measure(settings)
+    return json.dumps(asdict(speed)) if as_json else table(settings, speed)
+
+
+def measure(settings: Settings, seconds: float = clock.SECONDS, repeats: int = clock.REPEATS) -> Speed:
+    """Trains for `repeats` times `seconds` at least, of which the best counts; then steps the simulator alone.
+
+    Raises:
+        ValueError: there is no room for so many environments.
+        FloatingPointError: training diverged.
+    """
+    with in_memory(settings.num_envs):
+        learning = _learn(settings, seconds, repeats)
+    machine.restart_peak()  # gives the training's memory back
+    workload = Workload(settings.task, settings.scene, settings.num_envs, learning["device"], learning["decimation"])
+    found, _ = sim.measure(workload, (learning.pop("engine"),), seconds=seconds, repeats=repeats)
+    (alone,) = found.values()
+    return Speed(**{**asdict(alone), **learning})
+
+
+def _learn(settings: Settings, seconds: float, repeats: int) -> dict[str, Any]:
+    """What is known of the training: part of a `Speed`."""
+    start = time.perf_counter()
+    training = make_training(settings)
+    env = training.env.env
+    watch, going, laps = Stopwatch(training), rows(training), []
+    for _ in range(STARTING):
+        next(going)
+    started = time.perf_counter() - start
+    done = STARTING
+    for repeat in range(repeats):
+        first, start, took = done, time.perf_counter(), 0.0
+        while took < seconds or done == first:
+            next(going)
+            done, took = done + 1, time.perf_counter() - start
+        laps.append((took / (done - first), slice(first, done)))
+        print(f"surgical-marl: timed {repeat + 1} of {repeats}", file=sys.stderr, flush=True)
+    iteration, span = min(laps, key=lambda lap: lap[0])
+    rollout, update = (statistics.fmean(watch.seconds(name)[span]) for name in ("rollout", "update"))
+    return {
+        "engine": env.engine.name,
+        "device": str(env.device),
+        "decimation": env.env.decimation,
+        "compile_s": max(0.0, started - STARTING * iteration),
+        "train_env_steps_per_s": settings.num_envs * settings.steps_per_iteration / iteration,
+        "rollout_s": rollout,
+        "update_s": update,
+        "rest_s": max(0.0, iteration - rollout - update),
+    }
+
+
+def table(settings: Settings, speed: Speed) -> str:
+    """For people, in the form of the paper's Table II."""
+    where = f"{speed.num_envs} envs, {speed.device}, {speed.engine} engine"
+    measured = [
+        ("acting and learning", speed.train_env_steps_per_s, where),
+        ("the simulator alone", speed.env_steps_per_s or 0.0, where),
+    ]
+    lines = [(name, steps, "quoted") for name, steps in QUOTED.items()] + measured
+    cells = [("simulator and learning", "1 M steps (s)", "steps/s", "")]
+    cells += [(name, f"{1e6 / steps:.4g}", f"{steps:,.0f}", note) for name, steps, note in lines]
+    parts = {"rollout": speed.rollout_s, "update": speed.update_s, "rest": speed.rest_s}
+    whole = sum(parts.values())
+    ppo = settings.ppo
+    return "\n".join(
+        [
+            f"{settings.task} on {settings.scene}, {settings.algo}: steps of {1e3 * speed.dt * speed.decimation:g} ms, "
+            f"{settings.steps_per_iteration} of each environment an iteration, {ppo.epochs} epochs of "
+            f"{ppo.mini_batches} mini-batches",
+            describe_machine(),
+            "",
+            *aligned(cells),
+            "",
+            f"an iteration takes {whole:.4g} s: "
+            + ", ".join(f"{name} {took:.4g} s ({took / whole:.0%})" for name, took in parts.items()),
+            f"starting takes {speed.compile_s:.1f} s; learning leaves "
+            f"{speed.train_env_steps_per_s / (speed.env_steps_per_s or 1):.1%} of the simulator's speed",
+            "quoted: Surgical Gym's paper (arXiv:2310.04676), Table II, on its authors' hardware; not measured here.",
+        ]
+    )

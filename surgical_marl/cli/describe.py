@@ -1,0 +1,54 @@
+"""What `surgical-marl list -v` says of scenes, arms, tasks and policies."""
+
+from __future__ import annotations
+
+import importlib
+
+from surgical_marl.content import list_arms, list_scenes, list_tasks
+from surgical_marl.robots.arm import load_arm
+from surgical_marl.scenes.load import load_scene
+from surgical_marl.scenes.scene import Scene
+from surgical_marl.scenes.shared_workspace import shared_workspace
+
+
+def describe(kind: str) -> str:
+    """The names of one kind, with what one wants to know of each."""
+    lines = {
+        "tasks": lambda: [_task(name) for name in list_tasks()],
+        "scenes": lambda: [_scene(load_scene(name)) for name in list_scenes()],
+        "arms": lambda: [_arm(name) for name in list_arms()],
+        "policies": _policies,
+    }[kind]()
+    return "\n".join(lines)
+
+
+def _scene(scene: Scene) -> str:
+    lines = [f"{scene.name:18} {scene.description}"]
+    for agent, mount in scene.mounts.items():
+        x, y, z = mount.position
+        shaft = mount.rotation @ [0, 0, -1]
+        way = f"shaft along ({shaft[0]:.2f}, {shaft[1]:.2f}, {shaft[2]:.2f}) at zero" if mount.arm.remote_center else ""
+        point = "remote center" if mount.arm.remote_center else "base"
+        lines.append(f"    {agent:14} {point} at ({x:.3f}, {y:.3f}, {z:.3f}) m {way}".rstrip())
+    pairs = f"{len(scene.pairs)} pairs of shapes can touch"
+    if len(scene.agents) > 1:
+        home = {agent: mount.arm.home for agent, mount in scene.mounts.items()}
+        pairs += f", {1000 * float(scene.clearance(home)):.0f} mm apart at home"
+        pairs += f", {shared_workspace(scene):.0%} of an arm's workspace shared"
+    return "\n".join([*lines, f"    {pairs}"])
+
+
+def _arm(name: str) -> str:
+    arm = load_arm(name)
+    return f"{name:14} {arm.description}\n    {', '.join(joint.name for joint in arm.actuated)}"
+
+
+def _policies() -> list[str]:
+    from surgical_marl.evaluation.card import table  # imports torch
+
+    return table().splitlines()
+
+
+def _task(name: str) -> str:
+    documentation = importlib.import_module(f"surgical_marl.tasks.{name}").__doc__ or ""
+    return f"{name:14} {documentation.splitlines()[0]}"

@@ -1,0 +1,365 @@
+"""The command `surgical-marl`: train, eval, list, check, export, bench, doctor."""
+
+from __future__ import annotations
+
+# Only light imports up here: `list` and a typing error should answer at once. What needs torch or
+# JAX is imported by the command that needs it.
+import argparse
+import os
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+from surgical_marl.content import BASELINES, find, list_arms, list_policies, list_scenes, list_tasks, unknown
+from surgical_marl.runtime import defer_compiler
+
+_LISTS = {
+    "tasks": list_tasks,
+    "scenes": list_scenes,
+    "arms": list_arms,
+    "policies": list_policies,
+}
+
+_ALGOS = ("mappo", "ippo", "joint")
+_CONTROL = ("position", "velocity", "torque")
+_DIFFICULTY = ("easy", "default", "hard")
+_DEVICES = ("auto", "cpu", "cuda")
+_ENGINES = ("auto", "fused", "mjx")
+_BENCHED = ("all", "fused", "mjx", "mujoco")
+_MOTIONS = ("random", "rough")
+
+# Flags of `train` that are short for `key=value`: key, good values or a placeholder, help.
+_SETTINGS: tuple[tuple[str, str | tuple[str, ...], str], ...] = (
+    ("algo", _ALGOS, "who learns from what"),
+    ("num_envs", "N", "environments that run side by side"),
+    ("iterations", "K", "rounds of acting and learning"),
+    ("seed", "S", "seed of everything random"),
+    ("engine", _ENGINES, "what runs the physics"),
+    ("device", _DEVICES, "where it runs"),
+    ("control", _CONTROL, "what an action commands"),
+    ("difficulty", _DIFFICULTY, "how far, how fast, how crowded"),
+)
+_TAKE_SETTINGS = ("train", "bench train", "bench solve")
+"""Commands that take `key=value`."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command; returns 0, 1 if training diverged or `check` found something, 2 for bad input, 130 if
+    interrupted."""
+    code = 0
+    defer_compiler()
+    try:
+        arguments = _parse(argv)
+        code = arguments.command(arguments) or 0
+        sys.stdout.flush()
+    except ValueError as error:
+        print(f"surgical-marl: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    except FloatingPointError as error:
+        print(f"surgical-marl: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("surgical-marl: interrupted", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        # The reader (`| head`) has left. Point stdout away so that Python's exit does not complain.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return code
+
+
+class _Parser(argparse.ArgumentParser):
+    """Raises instead of printing its usage, so that all bad input ends in `main` alike."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(allow_abbrev=False, **options)
+
+    def error(self, message: str) -> NoReturn:
+        raise ValueError(message)
+
+
+def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
+    # argparse cannot take `key=value` after a flag as a positional: collect what it leaves over.
+    arguments, rest = _parser().parse_known_args(argv)
+    if arguments.command is _train and "=" in (arguments.task or ""):
+        arguments.task, rest = None, [arguments.task, *rest]
+    arguments.overrides = [text for text in rest if "=" in text and not text.startswith("-")]
+    for text in rest:
+        if text not in arguments.overrides or arguments.name not in _TAKE_SETTINGS:
+            raise ValueError(f"unknown argument {text!r}, see surgical-marl {arguments.name} --help")
+    return arguments
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(prog="surgical-marl", description="Surgical robot arms that learn together.")
+    parser.add_argument("--version", action="version", version=f"%(prog)s {_version()}")
+    commands = parser.add_subparsers(required=True, metavar="{train,eval,list,check,export,bench,doctor}")
+
+    train = commands.add_parser(
+        "train",
+        help="train a policy, then evaluate it",
+        usage="%(prog)s TASK --scene SCENE [options] [key=value ...]\n"
+        "       %(prog)s --resume DIR [options] [key=value ...]",
+        epilog="key=value sets anything in configs/, such as ppo.learning_rate=3e-4",
+    )
+    train.add_argument("task", nargs="?", metavar="TASK", help=f"one of: {', '.join(list_tasks())}")
+    train.add_argument("--scene", help="a name (see `list scenes`) or a .yaml file")
+    for key, good, text in _SETTINGS:
+        flag, check = f"--{key.replace('_', '-')}", str if isinstance(good, str) else _one_of(good)
+        train.add_argument(flag, type=check, metavar=good if isinstance(good, str) else "|".join(good), help=text)
+    train.add_argument("--out", type=Path, metavar="DIR", help="run folder (default: runs/...)")
+    train.add_argument(
+        "--resume", type=Path, metavar="DIR", help="run folder to go on with, or to start in with TASK and --scene"
+    )
+    train.set_defaults(command=_train, name="train")
+
+    evaluate = commands.add_parser("eval", help="measure policies on a fixed set of goals (docs/evaluation.md)")
+    what = f"a run folder, a policy's name, {', '.join(BASELINES)}; or runs that differ by their seed, for its spread"
+    evaluate.add_argument("policies", nargs="+", metavar="RUN_OR_POLICY", help=what)
+    evaluate.add_argument("--task", help="of a policy that is not trained")
+    evaluate.add_argument("--scene", help="likewise: a name (see `list scenes`) or a .yaml file")
+    own = "of the goals (default: the policy's own)"
+    for key, good, text in (("control", _CONTROL, "likewise"), ("difficulty", _DIFFICULTY, own)):
+        evaluate.add_argument(f"--{key}", type=_one_of(good), metavar="|".join(good), help=text)
+    evaluate.add_argument("--episodes", type=whole(1, 1_000_000), default=200, metavar="N")
+    evaluate.add_argument("--seed", type=whole(0), default=0, metavar="S")
+    evaluate.add_argument("--against", type=Path, metavar="FILE.json", help="an older result to compare with")
+    evaluate.add_argument("--json", action="store_true", help="one JSON object instead of a table")
+    evaluate.add_argument("--csv", type=Path, metavar="FILE.csv", help="a row for each run and agent")
+    evaluate.add_argument("--figure", type=Path, metavar="FILE.png", help="success against threshold, and the errors")
+    evaluate.set_defaults(command=_eval, name="eval")
+
+    names = commands.add_parser("list", help="list tasks, scenes, arms and policies")
+    names.add_argument("kind", nargs="?", type=_one_of(tuple(_LISTS)), metavar="|".join(_LISTS))
+    names.add_argument("-v", "--verbose", action="store_true", help="what each one is")
+    names.set_defaults(command=_list, name="list")
+
+    audit = commands.add_parser("check", help="say what is wrong with an arm or a scene")
+    audit.add_argument("source", metavar="ARM_OR_SCENE", help="a name, an arm's folder or a scene's .yaml file")
+    audit.set_defaults(command=_check, name="check")
+
+    export = commands.add_parser("export", help="write a scene for other programs, or a policy to pass on")
+    kinds = export.add_subparsers(required=True, metavar="{scene,policy}")
+    scene = kinds.add_parser("scene", help="a scene as one file for MuJoCo")
+    scene.add_argument("source", metavar="NAME_OR_PATH", help="a scene's name or .yaml file")
+    scene.add_argument("--format", type=_one_of(("mjcf",)), default="mjcf", metavar="mjcf", help="MuJoCo's XML")
+    scene.add_argument("--out", type=Path, metavar="FILE", help="default: <scene>.xml in the current folder")
+    scene.add_argument("--control", type=_one_of(_CONTROL), default=_CONTROL[0], metavar="|".join(_CONTROL))
+    scene.set_defaults(command=_export_scene, name="export scene")
+    policy = kinds.add_parser("policy", help="a trained policy as a folder: ONNX, safetensors, evaluation, card, clip")
+    policy.add_argument(
+        "runs", nargs="+", metavar="RUN", help="run folders of one training, one a seed: the best is taken"
+    )
+    policy.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="the policy's folder, such as policies/NAME"
+    )
+    policy.set_defaults(command=_export_policy, name="export policy")
+
+    bench = commands.add_parser("bench", help="measure how fast this machine simulates, learns and draws")
+    kinds = bench.add_subparsers(required=True, metavar="{sim,train,solve,render}")
+    sim = _bench_parser(kinds, "sim", "steps/s of the engines and of C MuJoCo", _BENCHED)
+    sim.add_argument("--decimation", type=whole(1), default=1, metavar="K", help="physics steps an environment step")
+    sim.add_argument("--motion", type=_one_of(_MOTIONS), default=_MOTIONS[0], metavar="|".join(_MOTIONS),
+                     help="random: a new action every control step; rough: arms cross each other's way")  # fmt: skip
+    sim.add_argument("--sweep", action="store_true", help="from 1 to 4 million environments, as far as memory goes")
+    sim.add_argument("--out", type=Path, metavar="FILE.png", help="picture of a sweep")
+    for kind, what in (("train", "steps/s with learning"), ("solve", "seconds until a policy is good")):
+        learns = _bench_parser(kinds, kind, what, _ENGINES)
+        learns.usage = "%(prog)s [options] [key=value ...]"
+        learns.add_argument("--algo", type=_one_of(_ALGOS), metavar="|".join(_ALGOS), help="who learns from what")
+        learns.add_argument("--seed", type=whole(0), metavar="S", help="seed of everything random")
+    learns.add_argument("--success", type=float, default=0.95, metavar="SHARE", help="wanted within 2 mm")
+    learns.add_argument("--collisions", type=float, default=0.01, metavar="SHARE", help="of episodes, to stay below")
+    learns.add_argument("--limit", type=float, default=600.0, metavar="SECONDS", help="then it is given up")
+
+    draws = kinds.add_parser("render", help="pictures/s of the endoscope")
+    draws.add_argument("--scene", default="ecm", help="a scene with an endoscope, or a .yaml file")
+    draws.add_argument("--num-envs", type=whole(1), metavar="N", help="default: 64 on a CPU, 8192 on a GPU")
+    draws.add_argument("--device", type=_one_of(_DEVICES), default="auto", metavar="|".join(_DEVICES))
+    draws.add_argument("--json", action="store_true", help="one JSON object instead of a table")
+    draws.set_defaults(command=_bench, name="bench render", kind="render")
+
+    doctor = commands.add_parser("doctor", help="check this machine and this installation")
+    doctor.set_defaults(command=_doctor, name="doctor")
+    return parser
+
+
+def _bench_parser(kinds: Any, kind: str, what: str, engines: Sequence[str]) -> argparse.ArgumentParser:
+    """The parser of one benchmark, with what all take."""
+    parser: argparse.ArgumentParser = kinds.add_parser(kind, help=what)
+    parser.add_argument("--task", default="reach", help=f"one of: {', '.join(list_tasks())}")
+    parser.add_argument("--scene", default="psm", help="a name (see `list scenes`) or a .yaml file")
+    parser.add_argument("--num-envs", type=whole(1), metavar="N", help="default: by the device (docs/benchmarks.md)")
+    parser.add_argument("--engine", type=_one_of(engines), default=engines[0], metavar="|".join(engines))
+    parser.add_argument("--device", type=_one_of(_DEVICES), default="auto", metavar="|".join(_DEVICES))
+    parser.add_argument("--cold", action="store_true", help="start without caches")
+    parser.add_argument("--json", action="store_true", help="one JSON object instead of a table")
+    parser.set_defaults(command=_bench, kind=kind, name=f"bench {kind}")
+    return parser
+
+
+def _list(arguments: argparse.Namespace) -> None:
+    if arguments.verbose:
+        from surgical_marl.cli.describe import describe
+
+        if arguments.kind:
+            print(describe(arguments.kind))
+        else:
+            print("\n\n".join(f"{kind}\n{describe(kind) or '-'}" for kind in _LISTS))
+        return
+    if arguments.kind:
+        print("\n".join(_LISTS[arguments.kind]()))
+        return
+    for kind, names in _LISTS.items():
+        print(f"{kind:9} {', '.join(names()) or '-'}")
+
+
+def _check(arguments: argparse.Namespace) -> int:
+    from surgical_marl.scenes.check import check, summary
+
+    findings = check(arguments.source)
+    for finding in findings:
+        print(" ".join(finding.split()))
+    if not findings:
+        print(f"{arguments.source}: nothing wrong found ({summary(arguments.source)})")
+    return 1 if findings else 0
+
+
+def _export_policy(arguments: argparse.Namespace) -> None:
+    from surgical_marl.evaluation.export import export_policy
+
+    print(export_policy(arguments.runs, arguments.out))
+
+
+def _export_scene(arguments: argparse.Namespace) -> None:
+    source = find("scenes", arguments.source)
+    out = arguments.out or Path(f"{source.stem}.xml")
+    if out.exists():
+        raise ValueError(f"{out} exists already: name another file with --out")
+
+    from surgical_marl.files import write_atomic
+    from surgical_marl.scenes.load import load_scene
+    from surgical_marl.scenes.mjcf import mjcf
+
+    text = mjcf(load_scene(source, arguments.control))
+    try:
+        write_atomic(out, lambda path: path.write_text(text))
+    except OSError as error:
+        raise ValueError(f"cannot write {out}: {error.strerror}") from None
+    print(out)
+
+
+def _bench(arguments: argparse.Namespace) -> int:
+    from surgical_marl.bench.command import run
+
+    return run(arguments)
+
+
+def _doctor(arguments: argparse.Namespace) -> None:
+    from surgical_marl.cli.doctor import report
+
+    for what, finding in report():
+        print(f"{what:16} {finding}", flush=True)
+
+
+def _train(arguments: argparse.Namespace) -> None:
+    if arguments.task is not None and arguments.task not in list_tasks():
+        raise unknown("task", arguments.task, list_tasks())
+    if arguments.scene is not None:
+        find("scenes", arguments.scene)
+    if not arguments.resume and None in (arguments.task, arguments.scene):
+        raise ValueError(f"train needs TASK ({', '.join(list_tasks())}) and --scene ({', '.join(list_scenes())})")
+    given = ((key, getattr(arguments, key)) for key, _, _ in _SETTINGS)
+    flags = [f"{key}={value}" for key, value in given if value is not None]
+
+    from surgical_marl.learning.distributed import claim_gpu, is_first
+    from surgical_marl.runs.folder import has_begun, read_settings
+    from surgical_marl.runs.settings import load_config
+
+    overrides, resume = [*flags, *arguments.overrides], arguments.resume
+    claim_gpu("cpu" if "device=cpu" in overrides else "auto")  # first: to look for a GPU is to start CUDA
+    in_place = resume and (arguments.out or resume).resolve() == resume.resolve()
+    if in_place and None not in (arguments.task, arguments.scene) and not has_begun(resume):
+        resume = None  # the same command starts a run and goes on with it, however early it was killed
+    if resume:
+        settings = read_settings(resume, overrides)
+        for key, own in (("task", settings.task), ("scene", settings.scene)):
+            if (given_name := getattr(arguments, key)) not in (None, own):
+                raise ValueError(f"the run in {resume} is of {key} {own!r}, not {given_name!r}")
+    else:
+        settings = load_config(arguments.task, arguments.scene, overrides)
+    out = arguments.out or arguments.resume or _run_folder(settings)
+
+    from surgical_marl.evaluation.command import judge
+    from surgical_marl.learning.train import train
+
+    run = train(settings, out=out, resume=resume)
+    if is_first():
+        judge(run)
+
+
+def _eval(arguments: argparse.Namespace) -> None:
+    policies = arguments.policies
+    if baselines := [policy for policy in policies if policy in BASELINES]:
+        if len(policies) > 1:
+            raise ValueError(f"{baselines[0]!r} is not a run of the same training: evaluate it alone")
+        if None in (arguments.task, arguments.scene):
+            good = f"--task ({', '.join(list_tasks())}) and --scene ({', '.join(list_scenes())})"
+            raise ValueError(f"eval {baselines[0]} needs {good}")
+    if arguments.task not in (None, *list_tasks()):
+        raise unknown("task", arguments.task, list_tasks())
+    if arguments.scene is not None:
+        find("scenes", arguments.scene)
+    for policy in policies:
+        if policy not in BASELINES and not Path(policy).is_dir() and policy not in list_policies():
+            raise unknown("run or policy", policy, [*list_policies(), *BASELINES])
+    for flag, path, suffix in (("--csv", arguments.csv, ".csv"), ("--figure", arguments.figure, ".png")):
+        if path and not (path.suffix == suffix and path.parent.is_dir()):
+            raise ValueError(f"cannot write {flag} {path}: name a {suffix} file in a folder that exists")
+
+    from surgical_marl.evaluation.command import play_all, read_result, report
+
+    older = None if arguments.against is None else (str(arguments.against), read_result(arguments.against))
+    asked = {key: getattr(arguments, key) for key in ("task", "scene", "control", "difficulty")}
+    played = play_all(policies, asked, arguments.episodes, arguments.seed)
+    print(report(played, older, arguments.json, arguments.csv, arguments.figure))
+
+
+def _run_folder(settings: Any) -> Path:
+    name = f"{settings.task}-{Path(settings.scene).stem}-{settings.algo}-seed{settings.seed}"
+    return Path("runs") / f"{name}-{time.strftime('%Y%m%d-%H%M%S')}"
+
+
+def _one_of(good: Sequence[str]) -> Callable[[str], str]:
+    def check(text: str) -> str:
+        if text not in good:
+            raise argparse.ArgumentTypeError(str(unknown("choice", text, good)))
+        return text
+
+    return check
+
+
+def whole(least: int, most: int | None = None) -> Callable[[str], int]:
+    """Of `add_argument(type=...)`: a whole number within these."""
+    good = f"of {least} or more" if most is None else f"from {least} to {most}"
+
+    def check(text: str) -> int:
+        if not text.isdecimal() or int(text) < least or (most is not None and int(text) > most):
+            raise argparse.ArgumentTypeError(f"must be a whole number {good}, not {text!r}")
+        return int(text)
+
+    return check
+
+
+def _version() -> str:
+    import importlib.metadata
+
+    try:
+        return importlib.metadata.version("surgical-marl")
+    except importlib.metadata.PackageNotFoundError:
+        return "not installed"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""A task on a scene: one environment in pure JAX, and many at once."""

@@ -1,0 +1,225 @@
+"""Many environments at once: dicts of agents to arrays with a leading axis of environments.
+
+    env = BatchedEnv("reach", "bimanual_psm", num_envs=1024, arrays="torch")
+    observations, state, infos = env.reset(seed=0)
+    step = env.step({agent: torch.zeros(1024, 7) for agent in env.agents})
+
+An environment that ends starts its next episode within the same step.
+"""
+
+from __future__ import annotations
+
+import numbers
+import secrets
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from gymnasium import spaces
+
+from surgical_marl.engines.choose import ENGINES, make_engine
+from surgical_marl.envs.env import Env
+from surgical_marl.physics.simulator import Contacts
+from surgical_marl.scenes.scene import DECIMATION
+
+ARRAYS = ("numpy", "torch", "jax")
+
+
+class BatchStep(NamedTuple):
+    """What a step returns. Shapes start with N, the number of environments; dicts are keyed by agent."""
+
+    observations: dict[str, Any]
+    """[N, d]; of the next episode where one ended. A dict of them for an agent that sees pictures
+    (`surgical_marl/envs/pictures.py`)."""
+    state: Any
+    """[N, S], for a centralised critic, likewise of the next episode: all observations but pictures, and
+    `Task.privileged`."""
+    rewards: dict[str, Any]
+    terminated: Any
+    """[N] bool"""
+    truncated: Any
+    """[N] bool: the time limit."""
+    final_observations: dict[str, Any]
+    """[N, d], of this step's episode even where it ended."""
+    final_state: Any
+    infos: dict[str, dict[str, Any]]
+    """agent -> tip_error (m), success, collision (bool), min_distance (m), contact_force (N), reward_<term> (weighted),
+    cost, cost_<name> (bool), [N] each, and a task's own metrics; of this step's episode."""
+    contacts: Contacts
+    """Distance and penetration (m) and force (N) of every pair in `scene.pairs`, [N, P] each; likewise."""
+
+
+class BatchedEnv:
+    """N environments of one task on one scene.
+
+    Args:
+        task, scene, control, max_steps, decimation, difficulty, reward: as for `surgical_marl.envs.env.Env`.
+        num_envs: how many environments.
+        engine: "fused", "mjx" (the reference), or "auto" for the fastest that works.
+        device: "cpu", "cuda" or "auto".
+        arrays: library of the arrays that come back, "numpy", "torch" or "jax". Don't write into what you get: it may
+            share memory with the engine.
+
+    Raises:
+        ValueError: naming what is unknown or out of range.
+    """
+
+    def __init__(
+        self,
+        task: str = "reach",
+        scene: str = "bimanual_psm",
+        *,
+        num_envs: int = 1,
+        control: str = "position",
+        engine: str = "auto",
+        device: str = "auto",
+        max_steps: int | None = None,
+        decimation: int = DECIMATION,
+        difficulty: str = "default",
+        reward: Mapping[str, float] | None = None,
+        arrays: str = "numpy",
+    ) -> None:
+        if isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1:
+            raise ValueError(f"num_envs must be a whole number of at least 1, not {num_envs!r}")
+        if engine not in ENGINES:
+            raise ValueError(f"unknown engine {engine!r}; the engines are {', '.join(ENGINES)}")
+        if arrays not in ARRAYS:
+            raise ValueError(f"unknown arrays {arrays!r}; the libraries are {', '.join(ARRAYS)}")
+        self.env = Env(task, scene, control, max_steps, decimation, difficulty, reward)
+        self.engine = make_engine(self.env, num_envs, engine, device)
+        self.num_envs, self.arrays = num_envs, arrays
+        self.agents = list(self.env.agents)
+        self.types = {name: list(agents) for name, agents in self.env.scene.types.items()}
+        self.max_steps, self.control_dt = self.env.max_steps, self.env.control_dt
+        self.task_name, self.scene, self.control = task, self.env.scene, control
+        self.device = self.engine.device
+        self._observation_spaces: dict[str, spaces.Space[Any]] = {a: self.env.observation_space(a) for a in self.agents}
+        self._action_spaces = {agent: self.env.action_space(agent) for agent in self.agents}
+        self.state_space = self.env.state_space
+        self._pictures: Any = None
+        if self.env.task.camera is not None:
+            self._open_eyes(self.env.task.camera)
+        self._started = False
+
+    def _open_eyes(self, agent: str) -> None:
+        from surgical_marl.envs.pictures import Pictures
+
+        self._pictures = Pictures(self.env, self.num_envs, self.device, self.arrays)
+        self._observation_spaces[agent] = Pictures.space(self.env.observation_space(agent))
+
+    def observation_space(self, agent: str) -> spaces.Space[Any]:
+        """Of one environment: a Box, or a Dict for an agent that sees pictures."""
+        return self._observation_spaces[agent]
+
+    def action_space(self, agent: str) -> spaces.Box:
+        """Of one environment."""
+        return self._action_spaces[agent]
+
+    def reset(self, seed: int | None = None, first: int = 0) -> tuple[dict[str, Any], Any, dict[str, dict[str, Any]]]:
+        """Starts a new episode in all environments; returns observations, state and infos.
+
+        Args:
+            seed: environment i plays the same episodes for the same seed, whatever `num_envs`. None goes on to each
+                environment's next episode, or draws a seed if there was none yet.
+            first: the number of the first environment, where several processes share the environments of a seed.
+        """
+        whole = isinstance(seed, numbers.Integral) and not isinstance(seed, bool)
+        if seed is not None and not (whole and 0 <= seed < 2**63):
+            raise ValueError(f"seed must be a whole number from 0 to 2**63 - 1, not {seed!r}")
+        if seed is None and self._started:
+            self.engine.restart()
+        else:
+            self.engine.reset(secrets.randbits(63) if seed is None else int(seed), first)
+        self._started = True
+        found = self._outcome(self._target_rows())
+        return found["observations"], found["state"], found["infos"]
+
+    def step(self, actions: dict[str, Any]) -> BatchStep:
+        """One control step of all environments.
+
+        Args:
+            actions: agent -> [N, n] in [-1, 1], of any array library; larger values are clipped.
+
+        Raises:
+            ValueError: an agent is missing or unknown, a shape is wrong, or a value is not finite (numpy only).
+        """
+        if not self._started:
+            raise ValueError("step before reset: call reset() first")
+        actions, rows = self._check(actions), self._target_rows()
+        self.engine.step(actions)
+        found = self._outcome(rows)
+        return BatchStep(**{**found, "contacts": Contacts(**found["contacts"])})
+
+    @property
+    def qpos(self) -> np.ndarray:
+        """Joint positions of the whole scene, [N, nq], for pictures; `goals` beside it."""
+        return np.asarray(self._part(".physics.qpos", "numpy"))
+
+    @property
+    def goal(self) -> Any:
+        """Where the tool tips should be now, [N, arms, 3], numpy; each in its arm's base frame, m."""
+        return self._part(".goal.targets", "numpy")
+
+    @property
+    def steps(self) -> Any:
+        """Steps since reset in each environment, [N] int32. Set it to let episodes end at different times."""
+        return self._part(".steps", self.arrays)
+
+    @steps.setter
+    def steps(self, steps: Any) -> None:
+        if tuple(np.shape(steps)) != (self.num_envs,):
+            raise ValueError(f"steps of shape {tuple(np.shape(steps))} must be [{self.num_envs}]")
+        self.engine.write(".steps", steps)
+
+    def carry(self) -> dict[str, np.ndarray]:
+        """All that the next step depends on, as copies, for checkpoints."""
+        self._part(".steps", "numpy")
+        return {name: np.array(self.engine.read(name, "numpy")) for name in self.engine.carry_shapes}
+
+    def set_carry(self, carry: dict[str, Any]) -> None:
+        """Goes on from what `carry()` returned. ValueError if it is of another scene, task or `num_envs`."""
+        values = {name: np.asarray(carry.get(name)) for name in self.engine.carry_shapes}
+        for name, shape in self.engine.carry_shapes.items():
+            if values[name].shape != (self.num_envs, *shape):
+                raise ValueError(
+                    f"environment state {name} of shape {values[name].shape} does not fit {(self.num_envs, *shape)}"
+                )
+        if not self._started:
+            self.engine.reset(0)
+        for name, value in values.items():
+            self.engine.write(name, value)
+        self._started = True
+
+    def _outcome(self, rows: Any) -> dict[str, Any]:
+        """What the engine found, with pictures for a task that has any; `rows` are the targets' before the step."""
+        found = self.engine.outcome(self.arrays)
+        if self._pictures is not None:
+            self._pictures.add(found, rows, self._target_rows())
+        return found
+
+    def _target_rows(self) -> Any:
+        # as int64, a copy: a step gives its carry away
+        return None if self._pictures is None else self.engine.read(".goal.row", "torch").long()
+
+    def _part(self, name: str, library: str) -> Any:
+        if not self._started:
+            raise ValueError("no episode yet: call reset() first")
+        return self.engine.read(name, library)
+
+    def _check(self, actions: dict[str, Any]) -> dict[str, Any]:
+        for agent in actions:
+            if agent not in self._action_spaces:
+                raise ValueError(f"action for {agent!r}, which is not an agent of the scene ({', '.join(self.agents)})")
+        checked = {}
+        for agent in self.agents:
+            if agent not in actions:
+                raise ValueError(f"no action for agent {agent!r}")
+            action, shape = actions[agent], (self.num_envs, *self._action_spaces[agent].shape)
+            if tuple(np.shape(action)) != shape:
+                raise ValueError(f"action of {agent!r} has shape {tuple(np.shape(action))}, it must be {shape}")
+            if isinstance(action, np.ndarray | list | tuple):
+                action = np.asarray(action, np.float32)
+                if not np.isfinite(action).all():
+                    raise ValueError(f"action of {agent!r} holds a value that is not finite")
+            checked[agent] = action
+        return checked

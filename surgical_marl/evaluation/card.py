@@ -1,0 +1,180 @@
+"""What is said of a shipped policy: its card (`README.md`) and its row in the table of all, both from its files."""
+
+from __future__ import annotations
+
+import json
+import operator
+from collections.abc import Mapping
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from surgical_marl.content import content_dir, list_policies
+from surgical_marl.evaluation.goal_set import is_standard
+from surgical_marl.evaluation.report import number, title
+from surgical_marl.policies.onnx_file import SUFFIX
+from surgical_marl.policies.weights import read_weights
+from surgical_marl.runs.folder import CURVE, read_metrics, read_origin, read_settings
+from surgical_marl.runs.settings import Settings
+from surgical_marl.scenes.load import load_scene
+
+CARD, CLIP, EVALUATION = "README.md", "clip.mp4", "evaluation.json"
+GOALS: dict[str, dict[str, tuple[str, float]]] = {
+    "reach": {"median_error_mm": ("below", 1.0), "success_2mm": ("at least", 0.99), "collision_rate": ("below", 0.005)},
+    "track": {"rmse_mm": ("below", 2.0)},
+    "follow_path": {"rmse_mm": ("below", 2.0)},
+    "match_image": {"median_error_mm": ("below", 2.0)},
+}
+"""What a shipped policy of each task should do."""
+SHOWN = ("median_error_mm", "p95_error_mm", "rmse_mm", "success_1mm", "success_2mm", "success_5mm", "team_success_2mm",
+         "collision_rate", "time_to_success_s", "image_error", "angle_error_deg")  # fmt: skip
+COLUMNS = ("policy", "median error of the worst arm (mm)", "RMSE (mm)", "within 2 mm", "collisions",
+           "median error of each training seed (mm)", "training", "misses")  # fmt: skip
+_HOLDS = {"below": operator.lt, "at least": operator.ge}
+
+
+def worst_median(result: Mapping[str, Any]) -> float:
+    """The median error of the arm that has the largest, mm: arms that only keep still can't hide another's error."""
+    return max(agent["median_error_mm"] for agent in result["agents"].values())
+
+
+def misses(result: Mapping[str, Any]) -> list[str]:
+    """The goals of its task that a result misses, each as "what it has: the goal"."""
+    found = []
+    for name, (relation, goal) in GOALS.get(result["task"], {}).items():
+        value = worst_median(result) if name == "median_error_mm" else result[name]
+        if not _HOLDS[relation](value, goal):
+            found.append(f"{title(name)} is {number(name, value)}, not {relation} {number(name, goal)}")
+    return found
+
+
+def table() -> str:
+    """All policies that ship, in Markdown: what `surgical-marl list policies -v` prints."""
+    rows = [_row(content_dir("policies") / name) for name in list_policies()]
+    widths = [max(map(len, column)) for column in zip(COLUMNS, *rows, strict=True)]
+    lines = [COLUMNS, tuple("-" * width for width in widths), *rows]
+    cells = ([cell.ljust(width) for cell, width in zip(line, widths, strict=True)] for line in lines)
+    return "\n".join("| " + " | ".join(line) + " |" for line in cells) if rows else ""
+
+
+def _row(folder: Path) -> tuple[str, ...]:
+    result = json.loads((folder / EVALUATION).read_text())
+    last, origin = _training(folder), read_origin(folder)["origin"]
+    return (
+        f"[{folder.name}]({folder.name})",
+        f"{worst_median(result):.2f}",
+        number("rmse_mm", result.get("rmse_mm")),
+        number("success_2mm", result["success_2mm"]),
+        number("collision_rate", result["collision_rate"]),
+        ", ".join(f"{worst_median(run):.2f}" for run in result["seeds"]["runs"]),
+        f"{last['seconds']:.0f} s, {origin.get('device') or 'unknown device'}",
+        "; ".join(misses(result)) or "-",
+    )
+
+
+def card(folder: Path, name: str) -> str:
+    """The card of the policy in a folder, in Markdown.
+
+    Args:
+        name: of the policy; a folder that is being written has another one.
+    """
+    settings = read_settings(folder)
+    result = json.loads((folder / EVALUATION).read_text())
+    parts = [_what(settings, name, folder), _how_well(result, name), _how_trained(folder, settings)]
+    return "\n".join([*parts, _limits(result, settings), _files(folder)])
+
+
+def _what(settings: Settings, name: str, folder: Path) -> str:
+    documentation = import_module(f"surgical_marl.tasks.{settings.task}").__doc__ or ""
+    scene = load_scene(settings.scene)
+    task = documentation.splitlines()[0].partition(": ")[2]
+    clip = f"\n[A clip of two episodes]({CLIP}): balls are the goals.\n" if (folder / CLIP).is_file() else ""
+    return f"""# {name}
+
+Plays the task `{settings.task}` in the scene `{settings.scene}`: {task}
+The scene: {scene.description}; agents {", ".join(f"`{agent}`" for agent in scene.agents)}.
+{clip}"""
+
+
+def _how_well(result: Mapping[str, Any], name: str) -> str:
+    every = result["seeds"]
+    together = f"all training seeds ({len(every['runs'])})"
+    rows = [f"| | these weights (seed {every['best']}) | {together} |", "|---|---|---|"]
+    rows += [
+        f"| {title(key)} | {_with_interval(key, result)} | {_with_interval(key, every['aggregate'])} |"
+        for key in SHOWN
+        if key in result
+    ]
+    each = ", ".join(f"{run['policy']}: {worst_median(run):.2f} mm" for run in every["runs"])
+    goals = "the standard goal set" if is_standard(result) else "goal set"
+    return f"""## How well
+
+`surgical-marl eval {name}` repeats this: {result["episodes"]} episodes on {goals} `{result["goal_set"]:.12}`, without
+exploration noise. In brackets the 95 % interval: of these weights over episodes, of the seeds over both
+([docs/evaluation.md](../../docs/evaluation.md)). `{EVALUATION}` has all metrics, of each arm and of each seed.
+
+{chr(10).join(rows)}
+
+Median error of the worst arm, by training seed: {each}. The weights are those of the best.
+"""
+
+
+def _with_interval(key: str, result: Mapping[str, Any]) -> str:
+    bounds = result["intervals"][key]
+    span = "" if bounds is None else f" ({' to '.join(number(key, bound) for bound in bounds)})"
+    return f"{number(key, result[key])}{span}"
+
+
+def _how_trained(folder: Path, settings: Settings) -> str:
+    last, notes = _training(folder), read_origin(folder)
+    device, commit, started = (notes["origin"].get(key) or "unknown" for key in ("device", "commit", "started"))
+    command = f"surgical-marl train {settings.task} --scene {settings.scene} --seed {settings.seed}"
+    steps = f"{last['env_steps']:,.0f} environment steps in {last['seconds']:,.0f} s of rollouts and updates"
+    return f"""## How it was trained
+
+By `{command}`; `config.yaml` holds all settings that it then had.
+
+- {settings.algo}, {settings.num_envs:,} environments, {last["iteration"]:,.0f} iterations: {steps}.
+- On {device}, started {started}, commit `{commit}`.
+- {", ".join(f"{name} {version}" for name, version in notes["versions"].items())}.
+
+![learning curve]({CURVE})
+"""
+
+
+def _training(folder: Path) -> dict[str, float]:
+    """The last row of metrics, with the seconds of all rows."""
+    rows = read_metrics(folder)
+    return {**rows[-1], "seconds": sum(row["seconds"] for row in rows)}
+
+
+def _limits(result: Mapping[str, Any], settings: Settings) -> str:
+    missed = [f"- Misses its goal: {text}." for text in misses(result)]
+    rare = 3 / result["episodes"]  # Hanley and Lippman-Hand, JAMA 249(13), 1983
+    none = [f"- No collision in {result['episodes']} episodes leaves room for a rate of up to {rare:.1%}."]
+    goals = ", ".join(f"{title(name)} {how} {number(name, goal)}" for name, (how, goal) in GOALS[settings.task].items())
+    met = [] if missed else [f"- Meets the goals of its task: {goals}."]
+    return "\n".join([
+        "## Limits\n", *missed, *met, *(none if result["collision_rate"] == 0 else []),
+        f"- For {settings.control} control, difficulty `{settings.difficulty}`, and arms that stand as in this scene.",
+        "- The goals of training and evaluation come from one table: this is no test of generalisation.",
+        "- Learnt in simulation and tried in simulation only. Not fit for use on a patient or near one.\n",
+    ])  # fmt: skip
+
+
+def _files(folder: Path) -> str:
+    groups, state = read_weights(folder)
+    lines = []
+    for name, (count, observation, action) in groups.items():
+        one_hot = f", of which the last {count} say which of the {count} it is" if count > 1 else ""
+        sees = any(key.startswith(f"models.{name}.cnns.") for key in state)
+        pictures = " and `image`, `target` [N, 64, 64, 3] uint8" if sees else ""
+        lines.append(
+            f"- `{name}{SUFFIX}`: `observation` [N, {observation}]{one_hot}{pictures} -> `action` [N, {action}]."
+        )
+    text = "\n".join(lines)
+    return f"""## Files
+
+{text}
+- The same weights in `.safetensors` for `surgical-marl eval`; [how to act with the ONNX files](../README.md).
+"""

@@ -1,0 +1,97 @@
+"""A policy that ships: a folder with what is needed to use, judge and repeat it (`policies/README.md`)."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import sys
+from collections.abc import Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from surgical_marl.content import find
+from surgical_marl.evaluation.card import CARD, CLIP, EVALUATION, card, misses, worst_median
+from surgical_marl.evaluation.command import play_all
+from surgical_marl.evaluation.evaluate import summarise
+from surgical_marl.policies.onnx_file import SUFFIX, write_onnx
+from surgical_marl.policies.policy import load_actor, load_policy
+from surgical_marl.policies.weights import write_weights
+from surgical_marl.runs.curve import draw_curve
+from surgical_marl.runs.environment import make_env
+from surgical_marl.runs.folder import CONFIG, METRICS, read_settings
+from surgical_marl.runs.settings import Settings
+from surgical_marl.view.record import record
+
+EPISODES, SEED = 200, 0
+"""Those of the standard goal sets."""
+MAY_DIFFER = {"seed", "engine", "device"}
+
+
+def export_policy(runs: Sequence[str], out: Path) -> Path:
+    """Make the folder of a policy from the runs of one training with different seeds; it is there whole or not at all.
+
+    Every run is evaluated on the standard goals. The weights are those of the run that misses the fewest goals of its
+    task, and among such the one with the least median error of its worst arm; the evaluation and the card tell of all.
+
+    Raises:
+        ValueError: no such run, runs of different trainings or with the same seed, or the folder exists already.
+    """
+    out = Path(out)
+    if out.exists():
+        raise ValueError(f"{out} exists already: name another folder with --out, or delete it")
+    settings = _settings(runs)
+    evaluation, best = _evaluate(runs, [each.seed for each in settings], out.name)
+    part = out.with_name(f".{out.name}.{os.getpid()}.tmp")
+    try:
+        part.mkdir(parents=True)
+        _fill(part, find("policies", runs[best]), settings[best], evaluation)
+        part.rename(out)
+    except OSError as error:
+        raise ValueError(f"cannot write {out}: {error.strerror}") from None
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+    return out
+
+
+def _settings(runs: Sequence[str]) -> list[Settings]:
+    """Of each run. ValueError if more than their seeds differ, or less."""
+    settings = [read_settings(find("policies", run)) for run in runs]
+    for run, other in zip(runs[1:], settings[1:], strict=True):
+        for name in (item.name for item in fields(Settings) if item.name not in MAY_DIFFER):
+            if (theirs := getattr(other, name)) != (ours := getattr(settings[0], name)):
+                raise ValueError(f"{run} has {name} {theirs!r} and {runs[0]} has {ours!r}: export them one at a time")
+    seeds = [each.seed for each in settings]
+    if twice := [seed for seed in seeds if seeds.count(seed) > 1]:
+        raise ValueError(f"two of the runs have seed {twice[0]}: name runs of one training that differ by their seed")
+    return settings
+
+
+def _evaluate(runs: Sequence[str], seeds: Sequence[int], name: str) -> tuple[dict[str, Any], int]:
+    """What `eval --json` prints of the best run, with `seeds` of all runs beside it; and which run is the best."""
+    asked = dict.fromkeys(("task", "scene", "control", "difficulty"))
+    played = list(play_all(list(runs), asked, EPISODES, SEED).values())
+    results = [{"policy": f"seed {seed}", **summarise([run])} for seed, run in zip(seeds, played, strict=True)]
+    best = min(range(len(results)), key=lambda run: (len(misses(results[run])), worst_median(results[run])))
+    whole = {"policy": "aggregate", **summarise(played)}
+    every = {"best": seeds[best], "runs": results, "aggregate": whole}
+    return {**results[best], "policy": name, "seeds": every}, best
+
+
+def _fill(folder: Path, run: Path, settings: Settings, evaluation: dict[str, Any]) -> None:
+    env = make_env(read_settings(run, ["engine=auto", "device=auto"]), num_envs=1)
+    actor, _ = load_actor(run, env)
+    write_weights(folder, actor)
+    for name, model in actor.models.items():
+        write_onnx(folder / f"{name}{SUFFIX}", model)
+    for name in (CONFIG, METRICS):
+        shutil.copyfile(run / name, folder / name)
+    (folder / EVALUATION).write_text(json.dumps(evaluation, indent=1) + "\n")
+    draw_curve(folder, f"{settings.task} in {settings.scene}, {settings.algo}, seed {settings.seed}")
+    print("recording a clip", file=sys.stderr)
+    try:
+        record(env, load_policy(run, env), folder / CLIP)
+    except (OSError, RuntimeError) as error:
+        print(f"surgical-marl: no clip, since this machine cannot make one: {error}", file=sys.stderr)
+    (folder / CARD).write_text(card(folder, evaluation["policy"]))

@@ -1,0 +1,52 @@
+"""Whether a batch fits into memory, said before it fails where that is known, and in one sentence where it is not."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+from surgical_marl.machine import free_memory
+from surgical_marl.policies.layout import Layout
+from surgical_marl.policies.policy import zeros
+from surgical_marl.runs.settings import Settings
+
+if TYPE_CHECKING:
+    from surgical_marl.envs.batch import BatchedEnv
+
+_SIGNS = ("out of memory", "can't allocate memory", "resource_exhausted")
+
+
+def rollout_bytes(settings: Settings, env: BatchedEnv) -> int:
+    """What a stored rollout takes of memory for one environment: its steps, each with the observations and the state;
+    actions, their means and deviations; and of each agent log-probability and advantage, and of its reward, and cost if
+    that is bounded, value and return."""
+    layout = Layout(env, joint=settings.algo == "joint")
+    seen = layout.stack({agent: zeros(env.observation_space(agent)) for agent in layout.agents})
+    parts = [*seen.values(), zeros(env.state_space)]
+    observed = sum(part.numel() * part.element_size() for part in parts)
+    each = 5 if settings.constraint.cost == "none" else 8
+    return settings.steps_per_iteration * (observed + 4 * (3 * layout.num_actions + each * layout.num_agents) + 1)
+
+
+def check_room(settings: Settings, env: BatchedEnv) -> None:
+    """ValueError if a rollout alone has no room. Learning takes more, which shows when it runs out: `in_memory`."""
+    each, room = rollout_bytes(settings, env), free_memory(str(env.device))
+    if room is not None and each * env.num_envs > room:
+        steps = settings.steps_per_iteration
+        raise ValueError(
+            f"num_envs {env.num_envs} does not fit into memory: {steps} steps of one environment take {each} bytes, so "
+            f"that at most {room // each} fit"
+        )
+
+
+@contextlib.contextmanager
+def in_memory(num_envs: int) -> Iterator[None]:
+    """Within it, memory that is used up is a ValueError that names `num_envs`."""
+    try:
+        yield
+    except (RuntimeError, MemoryError) as error:
+        if not isinstance(error, MemoryError) and not any(sign in str(error).lower() for sign in _SIGNS):
+            raise
+        advice = f"try num_envs={num_envs // 2}" if num_envs > 1 else "try fewer steps_per_iteration"
+        raise ValueError(f"num_envs {num_envs} does not fit into memory: {advice}") from None

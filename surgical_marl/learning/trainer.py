@@ -1,0 +1,252 @@
+"""A training run in memory: the environment, the algorithm, and the rollouts and updates that alternate."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from surgical_marl.interfaces.rsl_rl import RslRlVecEnv
+from surgical_marl.learning import distributed, faults
+from surgical_marl.learning.constraint import METRICS
+from surgical_marl.learning.episodes import ENDED, Episodes
+from surgical_marl.learning.graphs import Replayed
+from surgical_marl.learning.mappo import LOSSES, MAPPO, rsl_rl_config
+from surgical_marl.runs.settings import Settings
+
+if TYPE_CHECKING:
+    from surgical_marl.envs.batch import BatchedEnv
+
+
+OWN = ("env", "collided", "random", "random_cuda")
+"""Parts of `Trainer.state` that belong to one process alone: of its environments, and its random numbers."""
+
+
+class Report(NamedTuple):
+    """What an iteration leaves to be read, on its way from the device."""
+
+    iteration: int
+    env_steps: int
+    started: float
+    values: Tensor
+    """On the host: once `arrived`."""
+    arrived: torch.cuda.Event | None
+    """None where nothing has to arrive."""
+
+
+class Trainer:
+    """A run in memory, or the part of it that is in this process (see `distributed`).
+
+    On a GPU with the fused engine a rollout is one CUDA graph and so is an update: `rollout`, `update` and `iterate`
+    enqueue their work and return before it is done.
+
+    Args:
+        settings: the run.
+        env: its environments in this process, made with `arrays="torch"`.
+
+    Attributes:
+        iteration: how many have begun.
+        env_steps: steps of all environments of all processes in them.
+        stop_wanted: set it to have all processes stop after the iteration that is under way.
+        stopping: whether a process wanted it, as far as reports have been read.
+    """
+
+    def __init__(self, settings: Settings, env: BatchedEnv) -> None:
+        torch.manual_seed(settings.seed)
+        self.settings = settings
+        self.iteration, self.env_steps = 0, 0
+        self.stop_wanted = self.stopping = False
+        first = distributed.rank() * env.num_envs
+        self.env = RslRlVecEnv(env, joint=settings.algo == "joint", seed=settings.seed, first=first)
+        device = str(self.env.device)
+        self._cuda = device.startswith("cuda")
+        if self._cuda:
+            torch.set_float32_matmul_precision("highest" if settings.precision == "float32" else "high")
+        # Where each rollout begins and ends: a graph finds its observations at one place.
+        self._observations = self.env.get_observations().clone()
+        self.algorithm = MAPPO.construct_algorithm(self._observations, self.env, rsl_rl_config(settings), device)
+        self.algorithm.train_mode()
+        if distributed.size() > 1:
+            self.algorithm.broadcast_parameters()
+            torch.manual_seed(distributed.own_seed(settings.seed))  # of the processes' actions
+        terms = self.env.reward_terms
+        self.episodes = Episodes(env.agents, terms, self.env.layout.num_agents, env.num_envs, device)
+        self._bounded = METRICS if self.algorithm.constraint is not None else ()
+        # What `_update` gathers, in order.
+        self._names: dict[str, Sequence[str]] = {
+            "episodes": ENDED[:-1],
+            "rewards": [ENDED[-1], *terms],
+            "losses": [*LOSSES, *self._bounded, "action_std"],
+            "stop": ["stop"],
+            "observations": faults.column_names(self._observations),
+            "values": ["values", "returns"],
+            "weights": [name for name, _ in self._weights()],
+        }
+        # All environments start together: let the first episodes end at different times.
+        steps = torch.randint(0, max(env.max_steps, 1), (env.num_envs,))
+        self.env.episode_length_buf = steps.to(device)
+        self._stop = torch.zeros(1, device=device)
+        self._marks = torch.zeros(len(self._names["observations"]) + len(self._names["values"]), device=device)
+        self._values = torch.zeros(sum(map(len, self._names.values())), device=device)
+        self._samples = settings.steps_per_iteration * env.num_envs * distributed.size()
+        self._read = 0.0
+        self.rollout = Replayed(self._rollout, enabled=self._cuda and self.env.capturable)
+        self.update = Replayed(self._update, enabled=self._cuda)
+
+    def iterate(self) -> Report:
+        """One rollout and one update; `row` reads its report."""
+        started = time.perf_counter()
+        self.rollout()
+        self._stop.fill_(self.stop_wanted)
+        self.update()
+        self.iteration += 1
+        self.env_steps += self._samples
+        if not self._cuda:
+            return Report(self.iteration, self.env_steps, started, self._values.clone(), None)
+        host = torch.empty(self._values.shape, pin_memory=True).copy_(self._values, non_blocking=True)
+        arrived = torch.cuda.Event()
+        arrived.record()
+        return Report(self.iteration, self.env_steps, started, host, arrived)
+
+    def close(self) -> None:
+        """Let the CUDA graphs go."""
+        self.rollout.release()
+        self.update.release()
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Names of what `row` returns."""
+        return (
+            *("iteration", "env_steps", "seconds", "steps_per_s"),
+            *("reward", *self.env.reward_terms),
+            *("episodes", "tip_error_mm", "success_rate", "collision_rate"),
+            *self._bounded,
+            *LOSSES,
+            "action_std",
+        )
+
+    def row(self, report: Report) -> dict[str, float]:
+        """The metrics of an iteration (see `columns`), when it is done.
+
+        Raises:
+            Diverged: something of it is not finite.
+        """
+        if report.arrived is not None:
+            report.arrived.synchronize()
+        values = iter(report.values.tolist())
+        sums = {kind: {name: next(values) for name in names} for kind, names in self._names.items()}
+        means = {name: value / distributed.size() for name, value in sums["losses"].items()}
+        if found := faults.find(sums):
+            raise faults.Diverged(report.iteration, found, means["learning_rate"])
+        self.stopping = bool(sums["stop"]["stop"])
+        # on a GPU an iteration is enqueued before the last one is done
+        now = time.perf_counter()
+        seconds = now - max(report.started, self._read)
+        self._read = now
+        ended, steps = sums["episodes"], self.settings.steps_per_iteration * distributed.size()
+        share = 1 / ended["episodes"] if ended["episodes"] else math.nan
+        row = {
+            **ended,
+            **means,
+            "iteration": report.iteration,
+            "env_steps": report.env_steps,
+            "seconds": seconds,
+            "steps_per_s": self._samples / seconds,
+            **{name: value / steps for name, value in sums["rewards"].items()},
+            "tip_error_mm": 1000 * ended["error"] * share,
+            "success_rate": ended["success"] * share,
+            "collision_rate": ended["collision"] * share,
+        }
+        return {name: row[name] for name in self.columns}
+
+    def _rollout(self) -> None:
+        """`steps_per_iteration` steps of all environments, into the storage; then returns and advantages."""
+        algorithm = self.algorithm
+        algorithm.storage.clear()
+        with torch.inference_mode():
+            observations = self._observations
+            for _ in range(self.settings.steps_per_iteration):
+                actions = algorithm.act(observations)
+                observations, rewards, dones, extras = self.env.step(actions)
+                algorithm.process_env_step(observations, rewards, dones, extras)
+                self.episodes.add(rewards, dones, extras["infos"])
+            algorithm.compute_returns(observations)
+            for name, kept in self._observations.items():
+                kept.copy_(observations[name])
+            stored = algorithm.storage
+            columns = faults.mark_columns(stored.observations, observations)
+            self._marks.copy_(torch.cat([columns, faults.mark([stored.values, stored.returns])]))
+
+    def _update(self) -> None:
+        """Learns from the rollout, and gathers what `row` reads."""
+        losses = self.algorithm.learn()
+        std = self.algorithm.actor.output_std.detach().mean()
+        weights = torch.stack([weight.detach().sum() for _, weight in self._weights()])
+        parts = [self.episodes.take(), losses]
+        if self.algorithm.constraint is not None:
+            parts.append(self.algorithm.constraint.metrics())
+        self._values.copy_(torch.cat([*parts, std[None], self._stop, self._marks, weights]))
+        distributed.total(self._values)
+
+    def _weights(self) -> list[tuple[str, Tensor]]:
+        return [
+            (f"{kind}.{name}", weight)
+            for kind, model in (("actor", self.algorithm.actor), ("critic", self.algorithm.critic))
+            for name, weight in model.named_parameters()
+        ]
+
+    def state(self) -> dict[str, Any]:
+        """What `set_state` needs to continue bit for bit, as tensors and plain values."""
+        actor, constraint = self.algorithm.actor, self.algorithm.constraint
+        return {
+            "iteration": self.iteration,
+            "env_steps": self.env_steps,
+            "processes": distributed.size(),
+            "of": {name: getattr(self.settings, name) for name in ("task", "scene", "algo")},
+            "groups": {name: _widths(actor, name) for name in actor.counts},
+            "algorithm": self.algorithm.save(),
+            "env": {
+                **self.env.carry(),
+                "observations": self._observations.to_dict(),
+                "memory": self.algorithm.memory.state_dict(),
+                "broken": None if constraint is None else constraint.broken,
+            },
+            "collided": self.episodes.collided,
+            "random": torch.get_rng_state(),
+            "random_cuda": torch.cuda.get_rng_state() if self._cuda else None,
+        }
+
+    def set_state(self, state: Mapping[str, Any]) -> None:
+        """Continue from what `state` returned, before the first iteration; without `OWN` the environments start anew.
+
+        Raises:
+            ValueError: it is of other agents or networks.
+        """
+        self.iteration, self.env_steps = state["iteration"], state["env_steps"]
+        try:
+            self.algorithm.load(state["algorithm"])
+        except (RuntimeError, ValueError, KeyError):  # with a line for each weight
+            raise ValueError("the networks in the checkpoint are not of the shapes that the settings ask for") from None
+        if "env" not in state:
+            torch.manual_seed(distributed.own_seed(self.settings.seed, self.iteration))
+            return
+        self.env.set_carry(state["env"])
+        for name, kept in self._observations.items():
+            kept.copy_(state["env"]["observations"][name])
+        if self.algorithm.constraint is not None:
+            self.algorithm.constraint.broken.copy_(state["env"]["broken"])
+        if self.algorithm.actor.is_recurrent:
+            self.algorithm.memory.load_state_dict(state["env"]["memory"])
+        self.episodes.collided.copy_(state["collided"])
+        torch.set_rng_state(state["random"])
+        if state["random_cuda"] is not None and self._cuda:
+            torch.cuda.set_rng_state(state["random_cuda"])
+
+
+def _widths(actor: Any, group: str) -> list[int]:
+    """Agents of a group, width of their observation and of their action."""
+    return [actor.counts[group], actor.models[group].obs_dim, actor.outputs[group]]

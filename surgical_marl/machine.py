@@ -1,0 +1,83 @@
+"""What this machine is called, and its memory. Where a system does not tell, nothing is used and all is free."""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import math
+import os
+import platform
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+
+def machine() -> dict[str, Any]:
+    """`cpu`, `threads` and `gpu`, None without one, by name."""
+    names = _values("/proc/cpuinfo", "model name")
+    return {"cpu": names[0] if names else platform.processor() or platform.machine(), "threads": cores(), "gpu": _gpu()}
+
+
+def free_memory(device: str) -> int | None:
+    """Bytes of memory that are free on "cuda" or "cpu"; None if nobody knows."""
+    if device == "cuda":
+        import torch
+
+        return int(torch.cuda.mem_get_info()[0])
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+    except OSError:
+        return None
+    return next((1024 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")), None)
+
+
+def cores() -> int:
+    """CPU cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def age() -> float:
+    """Seconds since this process started; since Python measures its own time where a system does not tell."""
+    with contextlib.suppress(OSError, AttributeError, ValueError):
+        started = Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19]
+        return time.clock_gettime(time.CLOCK_BOOTTIME) - int(started) / os.sysconf("SC_CLK_TCK")
+    return time.process_time()
+
+
+def restart_peak() -> float:
+    """Forgets the most that this process ever had; returns what it has now, bytes."""
+    gc.collect()
+    if "torch" in sys.modules and sys.modules["torch"].cuda.is_available():
+        sys.modules["torch"].cuda.empty_cache()
+    with contextlib.suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")
+    return peak()
+
+
+def peak() -> float:
+    """The most that this process had since then, bytes."""
+    return _bytes("/proc/self/status", "VmHWM", 0.0)
+
+
+def free() -> float:
+    """What this machine has left, bytes."""
+    return _bytes("/proc/meminfo", "MemAvailable", math.inf)
+
+
+def _gpu() -> str | None:
+    import torch
+
+    return str(torch.cuda.get_device_name(0)) if torch.cuda.is_available() else None
+
+
+def _bytes(file: str, name: str, otherwise: float) -> float:
+    return next((1024.0 * int(value.split()[0]) for value in _values(file, name)), otherwise)
+
+
+def _values(file: str, name: str) -> list[str]:
+    """Of the lines `name: value`."""
+    with contextlib.suppress(OSError):
+        lines = [line.split(":", 1) for line in Path(file).read_text().splitlines() if ":" in line]
+        return [value.strip() for key, value in lines if key.strip() == name]
+    return []

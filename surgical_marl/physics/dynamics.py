@@ -1,0 +1,135 @@
+"""How a model moves while nothing touches, and what it takes to say how it moves if something does: pure JAX, by MJX.
+
+    dynamics = Dynamics(model)
+    physics = dynamics.step(physics)
+
+This is the one module that knows MJX. docs/physics.md says how a step is computed and compares it with C MuJoCo.
+"""
+
+from __future__ import annotations
+
+import copy
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jax import Array
+
+from surgical_marl.physics.solver import JointRows, Rows, relax, solve, solve_positive
+from surgical_marl.runtime import prepare_mjx
+
+ITERATIONS = (1, 1)
+"""Newton steps, and line search steps in each, after joints were relaxed: see docs/physics.md."""
+
+
+class Physics(NamedTuple):
+    """What MuJoCo needs to go on. All that lives between two steps: everything else follows from it."""
+
+    qpos: Array
+    qvel: Array
+    qacc_warmstart: Array
+    ctrl: Array
+    """Command of every actuator: position target, velocity or torque."""
+
+
+class Forces(NamedTuple):
+    """Where a model is, and what acts on it, for n degrees of freedom."""
+
+    data: Any
+    """MJX's, with positions, Jacobians and mass matrix."""
+    mass: Array
+    """[n, n]"""
+    smooth: Array
+    """Sum of all forces but those of constraints, [n]."""
+    damping: Array
+    """What velocity costs, [n, n]: the implicit part of a step."""
+    rows: Rows
+    """Friction of some joints, then the limits of all that have one."""
+
+
+class Dynamics:
+    """MJX on a model of joints that have one degree of freedom each."""
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        mjx = self._mjx = prepare_mjx()
+        smooth = copy.copy(model)
+        smooth.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT  # that is for `collision.py`
+        self.model, self._data = mjx.put_model(smooth), mjx.make_data(smooth)
+        self.dt = np.float32(model.opt.timestep)
+        self._stop = [jnp.asarray(of[0], jnp.float32) for of in (model.pair_solref, model.pair_solimp) if model.npair]
+        self._rubbing, self._limited = np.flatnonzero(model.dof_frictionloss), model.jnt_dofadr[model.jnt_limited > 0]
+
+    def varied(self, fields: dict[str, Array]) -> Dynamics:
+        """A model with other values in some fields."""
+        varied = copy.copy(self)
+        varied.model = self.model.tree_replace(fields)
+        return varied
+
+    def pose(self, qpos: Array) -> Any:
+        """MJX's data with the poses of all bodies, geoms and sites."""
+        return self._mjx.kinematics(self.model, self._data.replace(qpos=qpos))
+
+    def forces(self, physics: Physics) -> Forces:
+        """All of `mjx.forward` but collision and solver."""
+        data = self._data.replace(**physics._asdict())
+        for stage in ("fwd_position", "fwd_velocity", "fwd_actuation"):
+            data = getattr(self._mjx, stage)(self.model, data)
+        smooth = data.qfrc_passive - data.qfrc_bias + data.qfrc_actuator
+        return Forces(data, data._impl.M, smooth, self._damping(data), self._rows(data))
+
+    def relaxed(self, forces: Forces, qacc: Array) -> Array:
+        """Acceleration [n] near to what friction and limits allow, from a guess."""
+        return relax(forces.mass, forces.smooth, self._joint_rows(forces.rows), qacc)
+
+    def step(self, physics: Physics) -> Physics:
+        """A physics step without contacts."""
+        forces = self.forces(physics)
+        qacc = self.relaxed(forces, physics.qacc_warmstart)
+        qacc, _ = solve(forces.mass, forces.smooth, forces.rows, qacc, *ITERATIONS)
+        return self.moved(physics, forces, qacc)
+
+    def moved(self, physics: Physics, forces: Forces, qacc: Array) -> Physics:
+        """The state a step later, implicit in what velocity costs."""
+        change = solve_positive(forces.mass + self.dt * forces.damping, forces.mass @ qacc)
+        qvel = physics.qvel + self.dt * change
+        return Physics(physics.qpos + self.dt * qvel, qvel, qacc, physics.ctrl)
+
+    def _rows(self, data: Any) -> Rows:
+        rows = data._impl
+        friction = rows.efc_frictionloss
+        rubs = np.arange(len(friction)) < len(self._rubbing)
+        low, high = jnp.where(rubs, -friction, 0.0), jnp.where(rubs, friction, np.inf)
+        return Rows(rows.efc_J, rows.efc_D, rows.efc_aref, low, high)
+
+    def _joint_rows(self, rows: Rows) -> JointRows:
+        """Rows, each of which concerns one joint, by joint."""
+        n, k = rows.jacobian.shape[1], len(self._rubbing)
+        friction, limit = (jnp.zeros(n).at[where].set for where in (self._rubbing, self._limited))
+        side = rows.jacobian[np.arange(k, k + len(self._limited)), self._limited]
+        return JointRows(
+            *(friction(column[:k]) for column in (rows.high, rows.impedance, rows.reference)),
+            *(limit(column) for column in (side, rows.impedance[k:], rows.reference[k:])),
+        )
+
+    def _damping(self, data: Any) -> Array:
+        """An actuator at its effort limit can't damp any more, so its damping is not in it, as in C MuJoCo; `mjx.step`
+        would brake each joint that moves at full effort."""
+        model = self.model
+        low, high = model.actuator_forcerange[:, 0], model.actuator_forcerange[:, 1]
+        saturated = (data.actuator_force <= low) | (data.actuator_force >= high)
+        own = jnp.where(saturated, 0.0, -model.actuator_biasprm[:, 2])
+        moment = data._impl.actuator_moment
+        return moment.T @ (own[:, None] * moment) + jnp.diag(model.dof_damping)
+
+    def contact_rows(self, jacobian: Array, distance: Array, weight: Array, qvel: Array) -> Rows:
+        """Rows of frictionless contacts (condim 1), along their normals: jacobian [k, n], distance and weight [k]."""
+        from mujoco.mjx._src.constraint import _kbi
+
+        stiffness, damping, impedance = jax.vmap(lambda d: _kbi(self.model, *self._stop, d))(distance)
+        resistance = jnp.maximum(weight * (1 - impedance) / impedance, mujoco.mjMINVAL)
+        depth = jnp.minimum(distance, 0.0)
+        reference = -damping * (jacobian @ qvel) - stiffness * impedance * depth
+        none = jnp.zeros_like(depth)
+        return Rows(jacobian, 1 / resistance, reference, none, none + np.inf)

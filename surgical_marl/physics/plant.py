@@ -1,0 +1,140 @@
+"""The arms as they are, which physics moves, and as they are measured, which is what policies see.
+
+    plant = Plant(simulator)
+    hidden = plant.start(key)
+    physics, hidden = plant.command(plant.home(hidden), hidden, actions)
+    physics, contacts, views = plant.advance(physics, hidden)
+    seen = plant.measure(physics, hidden, contacts, views, key)
+
+In a scene without randomisation it is the simulator: `hidden` is None, and what is measured is what is.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jax import Array
+
+from surgical_marl.physics.simulator import ArmView, Contacts, Physics, Simulator
+
+Views = dict[str, ArmView]
+
+
+class Hidden(NamedTuple):
+    """What an episode drew and what it remembers. No policy sees it."""
+
+    offset: Array
+    """What each joint's reading adds, [nq], rad or m."""
+    backlash: Array
+    """Play of each joint, [nq], rad or m."""
+    stiffness: Array
+    """Factor of each actuator's gain, [nu]; `damping` likewise."""
+    damping: Array
+    friction: Array
+    """Factor of each joint's friction, [nv]."""
+    payload: Array
+    """Mass at each tool tip, [arms], kg."""
+    latency: Array
+    """Control steps until an action acts, []."""
+    motor: Array
+    """The newest commands, as the motors follow them, on their side of the play, [nu]."""
+    pending: Array
+    """The last actions of all agents, newest first, [greatest latency, n]."""
+
+
+class Plant:
+    """A simulator behind motors, encoders and a network that are not ideal."""
+
+    def __init__(self, simulator: Simulator) -> None:
+        self._simulator, self._ranges = simulator, simulator.scene.randomisation
+        model = simulator.scene.model
+        exact = np.zeros(model.nq, bool)
+        exact[simulator.address[simulator.jaws]] = True
+        slides = model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE
+        each = lambda angle, slide: np.where(exact, 0.0, np.where(slides, slide, angle)).astype(np.float32)  # noqa: E731
+        r = self._ranges
+        self._offset, self._noise = each(r.offset_angle, r.offset_slide), each(r.noise_angle, r.noise_slide)
+        self._positions = simulator.scene.control == "position"
+        self._backlash = each(r.backlash_angle, r.backlash_slide) * self._positions
+
+    def start(self, key: Array) -> Hidden | None:
+        """What an episode draws, by a key of its own."""
+        r, simulator, scene = self._ranges, self._simulator, self._simulator.scene
+        if not r:
+            return None
+        keys = iter(jax.random.split(key, 7))
+        even = lambda n, low, high: jax.random.uniform(next(keys), (n,), jnp.float32, low, high)  # noqa: E731
+        nq, nu, nv, arms = scene.model.nq, scene.model.nu, scene.model.nv, len(scene.agents)
+        offset = even(nq, -1.0, 1.0) * self._offset
+        believed = jnp.matmul(simulator.moment, offset[simulator.address]) if self._positions else 0.0
+        return Hidden(
+            offset=offset,
+            backlash=even(nq, 0.0, 1.0) * self._backlash,
+            stiffness=even(nu, 1 - r.stiffness, 1 + r.stiffness),
+            damping=even(nu, 1 - r.damping, 1 + r.damping),
+            friction=even(nv, 1 - r.friction, 1 + r.friction),
+            payload=even(arms, 0.0, r.payload),
+            latency=jax.random.randint(next(keys), (), 0, r.latency + 1),
+            motor=simulator.home.ctrl + believed,  # to stay where the arms are
+            pending=jnp.zeros((r.latency, sum(len(mount.arm.actuated) for mount in scene.mounts.values()))),
+        )
+
+    def home(self, hidden: Hidden | None) -> Physics:
+        """All arms at home, at rest."""
+        home = self._simulator.home
+        return home if hidden is None else home._replace(ctrl=hidden.motor)
+
+    def command(
+        self, physics: Physics, hidden: Hidden | None, actions: dict[str, Array]
+    ) -> tuple[Physics, Hidden | None]:
+        """What actions make the motors do, in time or late, and the motors the joints."""
+        simulator = self._simulator
+        if hidden is None:
+            return simulator.command(physics, actions), None
+        actions, pending = self._delay(actions, hidden)
+        read = physics.qpos + hidden.offset + self._play(physics, hidden)
+        motor = simulator.command(physics._replace(ctrl=hidden.motor), actions, read).ctrl
+        hidden = hidden._replace(motor=motor, pending=pending)
+        if not self._backlash.any():
+            return physics._replace(ctrl=motor), hidden
+        # a joint's target moves once the motor has crossed the play
+        half, target = hidden.backlash[simulator.address] / 2, motor[simulator.drives]
+        target = jnp.clip(physics.ctrl[simulator.drives], target - half, target + half)
+        return physics._replace(ctrl=jnp.matmul(simulator.moment, target)), hidden
+
+    def advance(self, physics: Physics, hidden: Hidden | None) -> tuple[Physics, Contacts, Views]:
+        """A control step of physics, as `Simulator.advance`."""
+        simulator = self._simulator
+        if hidden is not None:
+            simulator = simulator.varied(
+                hidden.stiffness, hidden.damping, hidden.friction, hidden.payload, hidden.offset
+            )
+        return simulator.advance(physics)
+
+    def measure(self, physics: Physics, hidden: Hidden | None, contacts: Contacts, views: Views, key: Array) -> Views:
+        """What encoders say of arms that are as in `views`, by a key of the step's own."""
+        if hidden is None:
+            return views
+        noise = jax.random.normal(key, self._noise.shape) * self._noise
+        read = physics.qpos + hidden.offset + self._play(physics, hidden) + noise
+        return self._simulator.view(physics._replace(qpos=read, ctrl=hidden.motor), contacts)
+
+    def _delay(self, actions: dict[str, Array], hidden: Hidden) -> tuple[dict[str, Array], Array]:
+        """The actions that act now, and those to remember."""
+        agents = self._simulator.scene.agents
+        newest = jnp.concatenate([jnp.clip(actions[agent], -1.0, 1.0) for agent in agents])
+        known = jnp.concatenate([newest[None], hidden.pending])
+        ends = np.cumsum([actions[agent].shape[-1] for agent in agents])[:-1]
+        now = jnp.split(known[hidden.latency], ends)
+        return dict(zip(agents, now, strict=True)), known[:-1]
+
+    def _play(self, physics: Physics, hidden: Hidden) -> Array:
+        """How far motors are ahead of their joints, [nq]."""
+        simulator, ahead = self._simulator, jnp.zeros(len(self._backlash))
+        if not self._backlash.any():
+            return ahead
+        return ahead.at[simulator.address].set((hidden.motor - physics.ctrl)[simulator.drives])

@@ -1,0 +1,291 @@
+"""The physics of a scene in pure JAX, for one environment: commands in, newest state and contacts out.
+
+    simulator = Simulator(load_scene("bimanual_psm"))
+    physics = simulator.command(simulator.home, actions)
+    physics, contacts, views = simulator.advance(physics)
+
+docs/physics.md says how a step is computed and compares it with C MuJoCo.
+"""
+
+from __future__ import annotations
+
+import copy
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jax import Array
+
+from surgical_marl.physics.collision import Pairs
+from surgical_marl.physics.dynamics import Dynamics, Physics
+from surgical_marl.physics.solver import Rows, solve
+from surgical_marl.scenes.build import alone
+from surgical_marl.scenes.scene import DECIMATION, PAYLOAD, Scene
+
+TOUCHING_ITERATIONS = (6, 6)
+"""Most Newton steps, and line search steps in each, for arms that touch: see docs/physics.md."""
+
+
+class Contacts(NamedTuple):
+    """The pairs of geoms that can touch, in the order of `Scene.pairs`, [P] each."""
+
+    distance: Array
+    """Signed distance in the newest state, m."""
+    penetration: Array
+    """The deepest overlap during the control step, m; 0 without any."""
+    force: Array
+    """The largest normal force during the control step, N."""
+
+
+class ArmView(NamedTuple):
+    """What a task sees of one arm in the newest state. Base frame; SI units."""
+
+    qpos: Array
+    """Positions of the actuated joints, [n]."""
+    qvel: Array
+    command: Array
+    """Position targets (or the last velocity or torque command), [n]."""
+    tool_tip: Array
+    """[3]"""
+    nearest_tip: Array
+    """From this tool tip to that of the nearest other arm, [3]; zero if there is none."""
+    min_distance: Array
+    """Least distance to any other arm, []; inf if there is none."""
+    collision: Array
+    """Whether it touched another arm or itself during the step, []."""
+    contact_force: Array
+    """The largest normal force on it during the step, N, []."""
+
+
+class Kind:
+    """The arms of one type in a scene, which move alike wherever they stand, as gravity is off: each is stepped in its
+    own base frame, and all by the same code, one after the other: a GPU's instruction cache has no room for a
+    copy for every arm."""
+
+    def __init__(self, scene: Scene, agents: tuple[str, ...]) -> None:
+        model = scene.model
+        self._dynamics = Dynamics(alone(scene, agents[0]))
+        owner = lambda name: name.split("/")[0]  # noqa: E731
+        joints, bodies, actuators = (
+            np.array([owner(get(i).name) for i in range(count)])
+            for get, count in ((model.joint, model.njnt), (model.body, model.nbody), (model.actuator, model.nu))
+        )
+        self._dofs, self._bodies, self._actuators = (
+            np.stack([np.flatnonzero(owners == agent) for agent in agents]) for owners in (joints, bodies, actuators)
+        )
+
+    def step(self, physics: Physics, fields: dict[str, Array]) -> Physics:
+        """The physics of the scene after a step of these arms. `fields` of the scene's model may be others."""
+        dofs, actuators = self._dofs, self._actuators
+        own = Physics(physics.qpos[dofs], physics.qvel[dofs], physics.qacc_warmstart[dofs], physics.ctrl[actuators])
+        where = {"actuator": actuators, "dof": dofs, "body": np.insert(self._bodies, 0, 0, axis=1)}
+        others = {name: field[where[name.split("_")[0]]] for name, field in fields.items()}
+
+        def next_arm(queue: tuple[Physics, dict[str, Array]], _: None) -> tuple[tuple[Physics, dict[str, Array]], None]:
+            first = jax.tree.map(lambda x: x[0], queue)
+            moved = self._dynamics.varied(first[1]).step(first[0]), first[1]
+            return jax.tree.map(lambda x, y: jnp.concatenate([x[1:], y[None]]), queue, moved), None
+
+        (own, _), _ = jax.lax.scan(next_arm, (own, others), None, length=len(dofs))
+        qpos, qvel, qacc = (part.at[dofs].set(found) for part, found in zip(physics[:3], own[:3], strict=True))
+        return Physics(qpos, qvel, qacc, physics.ctrl)
+
+
+class Simulator:
+    """The physics of one scene, `decimation` physics steps a control step. `home` is what every episode starts with,
+    `home_views` what tasks see there."""
+
+    def __init__(self, scene: Scene, decimation: int = DECIMATION) -> None:
+        self.scene = scene
+        self._fields: dict[str, Array] = {}
+        self._pairs, self._together = Pairs(scene.model), Dynamics(scene.model)
+        self._kinds = [Kind(scene, agents) for agents in scene.types.values()]
+        self.decimation, self.control_dt = decimation, decimation * scene.model.opt.timestep
+        self._index_joints()
+        self._index_pairs()
+        start = scene.home[self.address]
+        start = start if scene.control == "position" else np.where(self.jaws, start, 0.0)
+        self._home = np.asarray(scene.home, np.float32), np.asarray(self.moment @ start, np.float32)
+        self.home_contacts, self.home_views = self._measure_home()
+
+    @property
+    def home(self) -> Physics:
+        """All arms at home, at rest."""
+        qpos, ctrl = map(jnp.asarray, self._home)
+        still = jnp.zeros(self.scene.model.nv, jnp.float32)
+        return Physics(qpos, still, still, ctrl)
+
+    def command(self, physics: Physics, actions: dict[str, Array], measured: Array | None = None) -> Physics:
+        """The next command of every actuator, from the joints' positions, or from what is `measured` of them, [nq]. A
+        jaw moves to open or closed at its speed, whatever the mode; a cable follows its joints' commands.
+
+        A position target leads its joint by no more than full effort at full speed takes: one that is held up would
+        wind up its target, and race after it once free.
+        """
+        ctrl, own = physics.ctrl[self.drives], jnp.zeros(self.scene.model.nu, jnp.float32)
+        for agent in self.scene.agents:
+            own = own.at[self._actuators[agent]].set(jnp.clip(actions[agent], -1.0, 1.0))
+        action = own[self._leaders]
+        reach = self._speed * np.float32(self.control_dt)
+        if self.scene.control == "position":
+            now = (physics.qpos if measured is None else measured)[self.address]
+            lead = jnp.clip(ctrl + action * reach - now, -self._lead, self._lead)
+            command = jnp.clip(now + lead, self._low, self._high)
+        else:
+            command = action * (self._speed if self.scene.control == "velocity" else self._effort)
+        jaw = ctrl + jnp.clip(jnp.where(action > 0, self._open, self._closed) - ctrl, -reach, reach)
+        return physics._replace(ctrl=jnp.matmul(self.moment, jnp.where(self.jaws, jaw, command)))
+
+    def advance(self, physics: Physics) -> tuple[Physics, Contacts, dict[str, ArmView]]:
+        """A control step of physics, and what is seen where it ends. MuJoCo leaves tips and distances one physics step
+        behind its `qpos`, so they are computed anew."""
+
+        def substep(state: tuple[Physics, Array, Array], _: None) -> tuple[tuple[Physics, Array, Array], None]:
+            physics, nearest, strongest = state
+            distance = self._look(physics.qpos)[1]
+            physics, force = self._step(physics, distance)
+            return (physics, jnp.minimum(nearest, distance), jnp.maximum(strongest, force)), None
+
+        none = jnp.zeros(self._pairs.count, jnp.float32)
+        start = physics, none, none
+        (physics, nearest, strongest), _ = jax.lax.scan(substep, start, None, length=self.decimation)
+        tips, distance = self._look(physics.qpos)
+        contacts = Contacts(distance, -jnp.minimum(nearest, distance), strongest)
+        return physics, contacts, self._view(jnp, physics, tips, contacts)
+
+    def varied(self, stiffness: Array, damping: Array, friction: Array, payload: Array, offset: Array) -> Simulator:
+        """Other arms of this kind: factors of every actuator's gains [nu] and of every joint's friction [nv], masses
+        [arms] at their tool tips if the scene has room for them, and by how much the controllers of joints misread
+        them, [nq]."""
+        model, varied, nominal = self._together.model, copy.copy(self), self.scene.model
+        by_position = nominal.actuator_biasprm[:, 1] != 0
+        by_velocity = ~by_position & (nominal.actuator_biasprm[:, 2] != 0)
+        gain = jnp.where(by_position, stiffness, jnp.where(by_velocity, damping, 1.0))
+        pull = model.actuator_biasprm[:, 1] * stiffness
+        misread = pull * (self.moment @ offset[self.address])
+        bias = jnp.stack([misread, pull, model.actuator_biasprm[:, 2] * damping], -1)
+        loaded = self.scene.agents if self.scene.randomisation.payload else ()
+        bodies = [nominal.body(f"{agent}/{PAYLOAD}").id for agent in loaded]
+        varied._fields = {
+            "actuator_gainprm": model.actuator_gainprm.at[:, 0].set(model.actuator_gainprm[:, 0] * gain),
+            "actuator_biasprm": model.actuator_biasprm.at[:, :3].set(bias),
+            "dof_frictionloss": model.dof_frictionloss * friction,
+            "dof_damping": model.dof_damping * friction,
+            "body_mass": model.body_mass.at[np.array(bodies, int)].set(payload[: len(bodies)]),
+        }
+        return varied
+
+    def view(self, physics: Physics, contacts: Contacts) -> dict[str, ArmView]:
+        """What tasks see at a posture, apart from contacts, which are those of the step before."""
+        tips, distance = self._look(physics.qpos)
+        return self._view(jnp, physics, tips, contacts._replace(distance=distance))
+
+    def _look(self, qpos: Array) -> tuple[Array, Array]:
+        """Tool tips [arms, 3] in the world and the distance of every pair, at a posture."""
+        data = self._together.pose(qpos)
+        tips = data.site_xpos[np.array(list(self._sites.values()))]
+        return tips, self._pairs.closest(data.geom_xpos, data.geom_xmat).distance
+
+    def _step(self, physics: Physics, distance: Array) -> tuple[Physics, Array]:
+        """A physics step, and the normal force of every pair during it. Arms that don't touch anything don't know of
+        each other: each moves on its own."""
+        if not self._pairs.count:
+            return self._apart(physics)
+        return jax.lax.cond((distance < 0).any(), self._touching_step, self._apart, physics)
+
+    def _apart(self, physics: Physics) -> tuple[Physics, Array]:
+        for kind in self._kinds:
+            physics = kind.step(physics, self._fields)
+        return physics, jnp.zeros(self._pairs.count, jnp.float32)
+
+    def _touching_step(self, physics: Physics) -> tuple[Physics, Array]:
+        dynamics = self._together.varied(self._fields)
+        forces = dynamics.forces(physics)
+        touching = self._pairs.deepest(forces.data, self._pairs.closest(forces.data.geom_xpos, forces.data.geom_xmat))
+        contacts = dynamics.contact_rows(touching.jacobian, touching.distance, touching.weight, physics.qvel)
+        joined = Rows(*(jnp.concatenate(parts) for parts in zip(forces.rows, contacts, strict=True)))
+        start = dynamics.relaxed(forces, physics.qacc_warmstart)
+        qacc, force = solve(forces.mass, forces.smooth, joined, start, *TOUCHING_ITERATIONS)
+        its_own = touching.pair == np.arange(self._pairs.count)[:, None]
+        each = jnp.where(its_own, force[len(forces.rows.low) :], 0.0).sum(-1)
+        return dynamics.moved(physics, forces, qacc), each
+
+    def _view(self, xp: Any, physics: Physics, tips: Any, contacts: Contacts) -> dict[str, ArmView]:
+        """Views by the array library `xp` from tool tips [arms, 3] in the world."""
+        views = {}
+        for i, agent in enumerate(self.scene.agents):
+            mount, touching = self.scene.mounts[agent], self._touching[agent]
+            nearest = xp.zeros(3)
+            if len(tips) > 1:
+                offsets = tips[np.arange(len(tips)) != i] - tips[i]
+                nearest = offsets[xp.argmin(xp.sum(offsets**2, axis=-1))]
+            near = self._between[agent]
+            views[agent] = ArmView(
+                qpos=physics.qpos[self._joints[agent]],
+                qvel=physics.qvel[self._joints[agent]],  # one velocity a position: the indices agree
+                command=physics.ctrl[self._actuators[agent]],
+                tool_tip=(tips[i] - mount.position.astype(tips.dtype)) @ mount.rotation.astype(tips.dtype),
+                nearest_tip=nearest @ mount.rotation.astype(tips.dtype),
+                min_distance=contacts.distance[near].min(initial=np.inf),
+                collision=contacts.penetration[touching].max(initial=0.0) > 0,
+                contact_force=contacts.force[touching].max(initial=0.0),
+            )
+        return views
+
+    def _index_joints(self) -> None:
+        """Where each agent's joints and sites stand in the model's arrays, and what an action does to a command."""
+        scene, model = self.scene, self.scene.model
+        names = [model.actuator(i).name for i in range(model.nu)]
+        # actuators of joints: they stand in the URDF's order, `qpos` in that of the tree
+        self.drives = np.flatnonzero(model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT)
+        self.address = model.jnt_qposadr[model.actuator_trnid[self.drives, 0]]
+        self.moment = np.asarray(scene.moment[:, self.address], np.float32)
+        rows = [
+            (names.index(f"{agent}/{joint.leader}"), bool(arm.jaw and joint.leader == arm.jaw.joint), joint, arm.jaw)
+            for agent, arm in ((agent, mount.arm) for agent, mount in scene.mounts.items())
+            for joint in arm.joints
+        ]
+        single = np.float32
+        self._leaders, self.jaws = np.array([row[0] for row in rows]), np.array([row[1] for row in rows])
+        self._speed = np.array([joint.drive.speed for _, _, joint, _ in rows], single)
+        self._effort = np.array([joint.effort for _, _, joint, _ in rows], single)
+        # what a joint feels that moves alone: its own gains and its cables'
+        gains = np.array([model.actuator_gainprm[:, 0], -model.actuator_biasprm[:, 2]], single)
+        stiffness, damping = gains @ self.moment**2
+        self._lead = (self._effort + damping * self._speed) / stiffness
+        self._low = np.array([joint.lower for _, _, joint, _ in rows], single)
+        self._high = np.array([joint.upper for _, _, joint, _ in rows], single)
+        self._open = np.array([jaw.open if is_jaw and jaw else 0.0 for _, is_jaw, _, jaw in rows], single)
+        self._closed = np.array([jaw.closed if is_jaw and jaw else 0.0 for _, is_jaw, _, jaw in rows], single)
+        self._joints = {agent: scene.qpos_index(agent) for agent in scene.agents}
+        self._actuators = {
+            agent: np.array([names.index(f"{agent}/{joint.name}") for joint in mount.arm.actuated])
+            for agent, mount in scene.mounts.items()
+        }
+        self._sites = {agent: model.site(f"{agent}/tool_tip").id for agent in scene.agents}
+
+    def _index_pairs(self) -> None:
+        """Which pairs concern each agent."""
+        owners = [tuple(name.split("/")[0] for name in pair) for pair in self.scene.pairs]
+        self._touching = {a: np.flatnonzero([a in pair for pair in owners]) for a in self.scene.agents}
+        self._between = {
+            a: np.flatnonzero([a in pair and len(set(pair)) > 1 for pair in owners]) for a in self.scene.agents
+        }
+
+    def _measure_home(self) -> tuple[Contacts, dict[str, ArmView]]:
+        """Contacts and views at home, by C MuJoCo: constants, so that a reset within a step computes no second pose."""
+        model = self.scene.model
+        data = mujoco.MjData(model)
+        data.qpos[:] = self.scene.home
+        mujoco.mj_kinematics(model, data)
+        ids = zip(model.pair_geom1, model.pair_geom2, strict=True)
+        distance = np.array([mujoco.mj_geomDistance(model, data, a, b, 100.0, None) for a, b in ids])
+        still = np.zeros(model.nv)
+        contacts: Any = Contacts(distance, np.maximum(-distance, 0.0), 0.0 * distance)  # type: ignore[arg-type]
+        physics: Any = Physics(self.scene.home, still, still, self._home[1])  # type: ignore[arg-type]
+        views = self._view(np, physics, data.site_xpos[list(self._sites.values())], contacts)
+        single = lambda x: jnp.asarray(x, jnp.bool_ if x.dtype == bool else jnp.float32)  # noqa: E731
+        # one by one: JAX would sort the agents by name
+        return jax.tree.map(single, contacts), {agent: jax.tree.map(single, view) for agent, view in views.items()}

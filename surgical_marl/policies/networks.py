@@ -1,0 +1,197 @@
+"""Networks of several agents: one for each agent type, shared by the agents of that type."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import torch
+from rsl_rl.models import MLPModel
+from rsl_rl.modules.distribution import GaussianDistribution
+from tensordict import TensorDict
+from torch import Tensor, nn
+
+from surgical_marl.policies.encoder import ENCODER, PICTURES, PictureModel
+from surgical_marl.policies.recurrent import RecurrentModel, RecurrentPictureModel
+from surgical_marl.runs.settings import NetworkSettings
+
+# A small last layer starts every arm near its rest, which is where exploration is safe and
+# gradients are largest.
+OUTPUT_GAIN = 0.01
+
+
+class MultiAgentModel(nn.Module):
+    """One network for each agent type, shared by the agents of that type.
+
+    Args:
+        observations: a sample of the groups, `[N, n, d]` each, and pictures `[N, n, C, H, W]` where there are any.
+        outputs: width of the output of one agent, by type.
+        model: further arguments of `make_model`.
+
+    Attributes:
+        is_recurrent: whether the networks remember; then `hidden_state` is their memory, `[N, A, S]`.
+    """
+
+    def __init__(self, observations: TensorDict, outputs: Mapping[str, int], **model: Any) -> None:
+        super().__init__()
+        self.counts = {name: observations[name].shape[-2] for name in outputs}
+        self.outputs = dict(outputs)
+        # The networks want to be built from one agent's [N, d], and run with any leading axes.
+        seen = {name: [group for group in (name, name + PICTURES) if group in observations] for name in outputs}
+        sample = TensorDict(
+            {group: observations[group][:, 0] for groups in seen.values() for group in groups},
+            batch_size=observations.batch_size,
+        )
+        self.models = nn.ModuleDict(
+            {name: make_model(sample, seen[name], width, **model) for name, width in outputs.items()}
+        )
+
+        first = next(iter(self._models()))
+        self.is_recurrent: bool = first.is_recurrent
+        if self.is_recurrent:
+            self.memory_shape = (sum(self.counts.values()), *first.memory_shape)
+
+    def forward(
+        self,
+        observations: TensorDict,
+        masks: Tensor | None = None,
+        hidden_state: Tensor | None = None,
+        stochastic_output: bool = False,
+    ) -> Tensor:
+        """Outputs of all agents, flat: `[N, sum]`, by type and then by agent.
+
+        Args:
+            observations: of one step; or of several, `[T, N]`, if there are masks.
+            masks: where an episode begins, `[T, N]` bool, for networks that remember.
+            hidden_state: what they remember before the first step, `[N, A, S]`.
+            stochastic_output: draw from the distribution, if there is one.
+        """
+        memories = zip(self._models(), self._memories(hidden_state), strict=True)
+        return self._join(model(observations, masks, memory, stochastic_output) for model, memory in memories)
+
+    def update_normalization(self, observations: TensorDict) -> None:
+        """Update the running mean and variance of each type's observations from a batch `[B]`."""
+        for name, model in zip(self.outputs, self._models(), strict=True):
+            model.update_normalization({name: observations[name].flatten(0, -2)})
+
+    def get_hidden_state(self) -> Tensor | None:
+        """What the networks remember after the last step, `[N, A, S]`, if they do."""
+        return torch.cat([model.get_hidden_state() for model in self._models()], -2) if self.is_recurrent else None
+
+    def _memories(self, hidden_state: Tensor | None) -> Iterable[Tensor | None]:
+        if not self.is_recurrent or hidden_state is None:
+            return [None] * len(self.models)
+        return hidden_state.split(list(self.counts.values()), -2)
+
+    def _models(self) -> Iterable[Any]:
+        return self.models.values()
+
+    @staticmethod
+    def _join(parts: Iterable[Tensor]) -> Tensor:
+        return torch.cat([part.flatten(-2) for part in parts], -1)
+
+    def _split(self, flat: Tensor) -> list[Tensor]:
+        """Flat `[N, sum]` -> one `[N, n, a]` for each type."""
+        shapes = [(self.counts[name], self.outputs[name]) for name in self.outputs]
+        parts = flat.split([count * width for count, width in shapes], -1)
+        return [part.unflatten(-1, shape) for part, shape in zip(parts, shapes, strict=True)]
+
+
+class MultiAgentActor(MultiAgentModel):
+    """A Gaussian policy for each agent type; log-probabilities and entropies are per agent."""
+
+    def __init__(self, observations: TensorDict, outputs: Mapping[str, int], **model: Any) -> None:
+        super().__init__(observations, outputs, **model)
+        with torch.no_grad():
+            for policy in self._models():
+                policy.mlp[-1].weight.mul_(OUTPUT_GAIN)
+                policy.mlp[-1].bias.zero_()
+
+    def distribute(
+        self, observations: TensorDict, masks: Tensor | None = None, hidden_state: Tensor | None = None
+    ) -> None:
+        """A forward pass that draws no actions."""
+        for model, memory in zip(self._models(), self._memories(hidden_state), strict=True):
+            model.distribution.update(model.mlp(model.get_latent(observations, masks, memory)))
+
+    def get_output_log_prob(self, actions: Tensor) -> Tensor:
+        """Log-probability of flat actions `[N, sum]` under the last forward pass: `[N, A]`."""
+        parts = zip(self._models(), self._split(actions), strict=True)
+        return torch.cat([model.get_output_log_prob(part) for model, part in parts], -1)
+
+    def get_kl_divergence(self, old: tuple[Tensor, ...], new: tuple[Tensor, ...]) -> Tensor:
+        """KL(old || new) of each agent, `[N, A]`, from two `output_distribution_params`."""
+        old_parts = zip(*map(self._split, old), strict=True)
+        new_parts = zip(*map(self._split, new), strict=True)
+        parts = zip(self._models(), old_parts, new_parts, strict=True)
+        return torch.cat([model.get_kl_divergence(before, after) for model, before, after in parts], -1)
+
+    @property
+    def output_distribution_params(self) -> tuple[Tensor, ...]:
+        """Mean and standard deviation of the last forward pass, flat `[N, sum]` each."""
+        params = (model.output_distribution_params for model in self._models())
+        return tuple(self._join(parts) for parts in zip(*params, strict=True))
+
+    @property
+    def output_entropy(self) -> Tensor:
+        """Entropy of each agent's last distribution, `[N, A]`."""
+        return torch.cat([model.output_entropy for model in self._models()], -1)
+
+    @property
+    def output_std(self) -> Tensor:
+        """Standard deviation of the last distribution, flat `[N, sum]`."""
+        return self._join(model.output_std for model in self._models())
+
+
+class Gaussian(GaussianDistribution):
+    """rsl_rl's, in float32 whatever the network computed in."""
+
+    def update(self, mlp_output: Tensor) -> None:
+        """Take the mean from the network's output."""
+        super().update(mlp_output.float())
+
+    def sample(self) -> Tensor:
+        """As torch's, which has the host look whether a standard deviation is negative."""
+        return self.mean + self.std * torch.randn_like(self.mean)
+
+
+def make_model(
+    observations: TensorDict, groups: list[str], width: int, recurrent: str = "none", **model: Any
+) -> nn.Module:
+    """An MLP, with an encoder before it where there are pictures, and a memory where that is asked for.
+
+    Args:
+        observations: a sample of the groups, vectors [N, d] and pictures [N, C, H, W].
+        groups: what the network sees of them.
+        width: of its output.
+        recurrent: "gru", "lstm" or "none".
+        model: further arguments of rsl_rl's models.
+    """
+    pictures = any(group.endswith(PICTURES) for group in groups)
+    if pictures:
+        model["cnn_cfg"] = ENCODER
+    if recurrent != "none":
+        model["recurrent"] = recurrent
+    kinds = {
+        (False, False): MLPModel,
+        (True, False): PictureModel,
+        (False, True): RecurrentModel,
+        (True, True): RecurrentPictureModel,
+    }
+    return kinds[pictures, recurrent != "none"](observations, {"all": groups}, "all", width, **model)
+
+
+def network_config(network: NetworkSettings) -> dict[str, Any]:
+    """Arguments of `make_model` for the networks that settings ask for."""
+    return {
+        "hidden_dims": list(network.hidden),
+        "activation": network.activation,
+        "obs_normalization": network.normalise_observations,
+        "recurrent": network.recurrent,
+    }
+
+
+def actor_config(network: NetworkSettings) -> dict[str, Any]:
+    """Arguments of `MultiAgentActor`, likewise."""
+    gaussian = {"class_name": Gaussian, "init_std": network.init_std, "std_type": "log"}
+    return {**network_config(network), "distribution_cfg": gaussian}

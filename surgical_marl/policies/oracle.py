@@ -1,0 +1,90 @@
+"""The scripted policy that knows the answer: inverse kinematics of the targets, at the joints' speeds.
+
+    policy = oracle(env)            # the same as load_policy("oracle", env)
+    actions = policy(observations)
+
+It bounds what a policy can be asked for: where it fails, a task is unfair. It needs no learning and no observation, but
+the environment's goals.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from surgical_marl.envs.observations import proprioception
+from surgical_marl.robots.inverse_kinematics import inverse_kinematics
+
+if TYPE_CHECKING:
+    from surgical_marl.envs.batch import BatchedEnv
+
+ITERATIONS = 8
+"""Steps of inverse kinematics from the last joint positions; the first of an episode takes more."""
+
+
+def oracle(env: BatchedEnv, agents: Sequence[str] | None = None) -> Callable[[Mapping[str, Any]], dict[str, Any]]:
+    """The oracle of an environment with control "position", for all of its tasks.
+
+    Joints follow straight lines in joint space, all arms at the same pace: the way that `tasks/base/workspace.py`
+    has checked. Where a target moves, joints are sent ahead by the time that they lag behind: a control step, and
+    damping over stiffness of their drives.
+
+    Args:
+        agents: those it moves, where others have a policy of their own: what an arm waits for then are only these.
+
+    Returns:
+        A policy: observations {agent: [N, d]} of `env` as it stands -> actions {agent: [N, a]} of the same library, of
+        the agents that it moves.
+
+    Raises:
+        ValueError: the environment has another control mode.
+    """
+    if env.control != "position":
+        raise ValueError(f"the oracle moves position targets: control must be 'position', not {env.control!r}")
+    moved = env.agents if agents is None else agents
+    arms = {agent: _Guide(env, agent, index) for index, agent in enumerate(env.agents) if agent in moved}
+
+    def policy(observations: Mapping[str, Any]) -> dict[str, Any]:
+        goal, began = env.goal.astype(float), _numpy(env.steps) == 0
+        seen = {agent: proprioception(observations[agent]) for agent in arms}
+        moves = {agent: arm.move(goal, began, _numpy(seen[agent])) for agent, arm in arms.items()}
+        furthest = np.max([np.abs(move).max(-1) for move in moves.values()], axis=0)
+        pace = 1 / np.maximum(furthest, 1)[:, None]
+        return {agent: _like(seen[agent], pace * move) for agent, move in moves.items()}
+
+    return policy
+
+
+class _Guide:
+    """Inverse kinematics of one arm's targets, from step to step."""
+
+    def __init__(self, env: BatchedEnv, agent: str, index: int) -> None:
+        self.index, self.arm, joints = index, env.scene.mounts[agent].arm, env.scene.mounts[agent].arm.actuated
+        self.dt = env.control_dt
+        self.reach = self.dt * self.arm.speed
+        self.lead = self.dt + np.array([joint.drive.damping / joint.drive.stiffness for joint in joints])
+        self.moves = np.array([self.arm.jaw is None or joint.name != self.arm.jaw.joint for joint in joints])
+        self.q = np.tile(self.arm.home, (env.num_envs, 1))
+
+    def move(self, goal: np.ndarray, began: np.ndarray, observation: np.ndarray) -> np.ndarray:
+        """How far the commands have to go, [N, n], in what an action of 1 does."""
+        n, targets = len(self.reach), goal[:, self.index]
+        before = np.where(began[:, None], self.arm.home, self.q)
+        self.q = inverse_kinematics(self.arm, targets, before, starts=1, iterations=20 if began.any() else ITERATIONS)
+        velocity = np.where(began[:, None], 0.0, (self.q - before) / self.dt)
+        wanted = np.clip(self.q + self.lead * velocity, self.arm.lower, self.arm.upper)
+        command = observation[:, 2 * n + 3 : 3 * n + 3]
+        return np.asarray((wanted - command) / self.reach * self.moves)
+
+
+def _numpy(values: Any) -> np.ndarray:
+    return np.asarray(values.cpu() if hasattr(values, "cpu") else values, dtype=float)
+
+
+def _like(example: Any, action: np.ndarray) -> Any:
+    """An action as float32 of the example's library."""
+    if hasattr(example, "new_tensor"):
+        return example.new_tensor(action)
+    return np.asarray(action, np.float32)

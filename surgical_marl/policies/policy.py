@@ -1,0 +1,201 @@
+"""Policies that act: trained, untrained, zero and random.
+
+A policy maps the observations of all agents `{agent: [..., d]}` to their actions `{agent: [...,
+a]}` in [-1, 1]; it answers NumPy arrays with NumPy arrays and tensors with tensors. A recurrent one is to be told where
+episodes begin (`surgical_marl/policies/acting.py`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from surgical_marl.content import content_dir, list_policies
+from surgical_marl.envs.observations import each, proprioception
+from surgical_marl.policies.acting import Policy
+from surgical_marl.policies.layout import Layout
+from surgical_marl.policies.networks import MultiAgentActor, actor_config
+from surgical_marl.policies.oracle import oracle
+from surgical_marl.policies.recurrent import cleared
+from surgical_marl.policies.weights import read_weights
+from surgical_marl.runs.folder import CHECKPOINT, CONFIG, holds_weights, read_checkpoint, read_settings
+from surgical_marl.runs.settings import Settings
+
+if TYPE_CHECKING:
+    from surgical_marl.envs.batch import BatchedEnv
+
+
+def load_policy(run: str | Path, env: BatchedEnv) -> Policy:
+    """The deterministic policy of a run for the agents of an environment.
+
+    Args:
+        run: a run folder, or the name of a policy that ships, or "zero", "random" or "oracle".
+        env: the environment that the policy will act in.
+
+    Raises:
+        ValueError: there is no such run, its checkpoint is damaged, or it was trained on other
+            agents.
+    """
+    if run == "zero":
+        return zero_policy(env)
+    if run == "random":
+        return random_policy(env)
+    if run == "oracle":
+        return oracle(env)
+    return acting_policy(*load_actor(run, env), str(env.device))
+
+
+def load_actor(run: str | Path, env: BatchedEnv) -> tuple[MultiAgentActor, Layout]:
+    """The networks of a run or of a policy that ships, on the CPU, and how agents are stacked for them.
+
+    ValueError as for `load_policy`.
+    """
+    folder = find_run(run)
+    settings = read_settings(folder)
+    trained, state = _read(folder)
+    layout = Layout(env, joint=settings.algo == "joint")
+    if (wanted := _groups(env, layout)) != trained:
+        raise ValueError(
+            f"the policy in {run} was trained in scene {settings.scene!r}, whose agents "
+            f"({_describe(trained)}) are not those of this environment ({_describe(wanted)})"
+        )
+    actor = _actor(settings, env, layout)
+    try:
+        actor.load_state_dict(state)
+    except RuntimeError:
+        raise ValueError(f"the weights in {run} are not of the network in its {CONFIG}: restore both") from None
+    return actor, layout
+
+
+def untrained_policy(env: BatchedEnv, settings: Settings | None = None) -> Policy:
+    """The policy that a run with these settings starts from: fresh weights, to compare with."""
+    settings = settings or Settings()
+    layout = Layout(env, joint=settings.algo == "joint")
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(settings.seed)
+        return acting_policy(_actor(settings, env, layout), layout, str(env.device))
+
+
+def zero_policy(env: BatchedEnv) -> Policy:
+    """The policy that never acts."""
+    return _by_agent(env, lambda shape: np.zeros(shape, np.float32))
+
+
+def random_policy(env: BatchedEnv, seed: int = 0) -> Policy:
+    """The policy of uniform random actions in [-1, 1]."""
+    generator = np.random.default_rng(seed)
+    return _by_agent(env, lambda shape: generator.uniform(-1, 1, shape).astype(np.float32))
+
+
+def find_run(run: str | Path) -> Path:
+    """The folder of a run, by its path, or of a policy that ships, by its name.
+
+    ValueError if there is none.
+    """
+    for folder in (Path(run), content_dir("policies") / str(run)):
+        if (folder / CONFIG).is_file():
+            return folder
+    shipped = ", ".join(list_policies()) or "none yet"
+    raise ValueError(f"{str(run)!r} is not a run folder, nor zero, random, oracle or a policy that ships ({shipped})")
+
+
+def _read(folder: Path) -> tuple[dict[str, list[int]], dict[str, Tensor]]:
+    """Agents and widths of each group, and the state of the actor: of a policy that ships, or of a run."""
+    if holds_weights(folder) and not (folder / CHECKPOINT).is_file():
+        return read_weights(folder)
+    checkpoint = read_checkpoint(folder)
+    groups = {name: list(widths) for name, widths in checkpoint["groups"].items()}
+    return groups, checkpoint["algorithm"]["actor_state_dict"]
+
+
+def _samples(env: BatchedEnv, layout: Layout) -> TensorDict:
+    seen = {agent: zeros(env.observation_space(agent)) for agent in layout.agents}
+    return TensorDict({**layout.stack(seen)}, batch_size=[1])
+
+
+def zeros(space: Any) -> Any:
+    """One observation, of a Box or of a Dict with pictures."""
+    if hasattr(space, "spaces"):
+        return {name: zeros(part) for name, part in space.spaces.items()}
+    return torch.from_numpy(np.zeros((1, *space.shape), space.dtype))
+
+
+def _groups(env: BatchedEnv, layout: Layout) -> dict[str, list[int]]:
+    """Agents of each group, width of their observation and of their action."""
+    samples = _samples(env, layout)
+    return {name: [count, samples[name].shape[-1], layout.action_sizes[name]] for name, count in layout.counts.items()}
+
+
+def _describe(groups: Mapping[str, list[int]]) -> str:
+    return ", ".join(f"{n} {name} of {d} observations and {a} actions" for name, (n, d, a) in groups.items())
+
+
+def _actor(settings: Settings, env: BatchedEnv, layout: Layout) -> MultiAgentActor:
+    return MultiAgentActor(_samples(env, layout), layout.action_sizes, **actor_config(settings.network)).eval()
+
+
+def acting_policy(actor: MultiAgentActor, layout: Layout, device: str) -> Policy:
+    """The deterministic policy of networks, as they are whenever it acts: they may still learn."""
+    return _Acting(actor, layout, device)
+
+
+class _Acting:
+    """A policy of networks, with a memory of its own if they have one."""
+
+    def __init__(self, actor: MultiAgentActor, layout: Layout, device: str) -> None:
+        self._actor, self._layout, self._device = actor.to(device), layout, device
+        self._memory: Tensor | None = None
+
+    def __call__(self, observations: Mapping[str, Any]) -> dict[str, Any]:
+        agents = self._layout.agents
+        tensors = {
+            agent: each(observations[agent], lambda part: torch.as_tensor(part, device=self._device))
+            for agent in agents
+        }
+        batch = proprioception(tensors[agents[0]]).shape[:-1]
+        with torch.inference_mode():
+            seen = TensorDict({**self._layout.stack(tensors)}, batch_size=batch)
+            flat = self._actor(seen, None, self._remembered(batch)).clamp(-1.0, 1.0)
+            self._memory = self._actor.get_hidden_state()
+        return {agent: _like(observations[agent], action) for agent, action in self._layout.split(flat).items()}
+
+    def reset(self, ended: Any = None) -> None:
+        """Forget everything, or the episodes that `ended`, [N] bool."""
+        if ended is None or self._memory is None:
+            self._memory = None
+        else:
+            self._memory = cleared(self._memory, torch.as_tensor(ended, device=self._device))
+
+    def _remembered(self, batch: torch.Size) -> Tensor | None:
+        if not self._actor.is_recurrent:
+            return None
+        shape = (*batch, *self._actor.memory_shape)
+        if self._memory is None or self._memory.shape != shape:  # another batch is of other episodes
+            self._memory = torch.zeros(shape, device=self._device)
+        return self._memory
+
+
+def _by_agent(env: BatchedEnv, act: Callable[[tuple[int, ...]], np.ndarray]) -> Policy:
+    widths = {agent: env.action_space(agent).shape for agent in env.agents}
+
+    def policy(observations: Mapping[str, Any]) -> dict[str, Any]:
+        return {
+            agent: _like(
+                observations[agent],
+                torch.from_numpy(act((*proprioception(observations[agent]).shape[:-1], *(width or ())))),
+            )
+            for agent, width in widths.items()
+        }
+
+    return policy
+
+
+def _like(example: Any, action: Tensor) -> Any:
+    example = proprioception(example)
+    return action.to(example.device) if isinstance(example, Tensor) else action.cpu().numpy()

@@ -1,0 +1,50 @@
+"""The weights of a shipped policy: `<type>.safetensors` for each type of arm, which hold data and no code."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+
+from surgical_marl.files import write_atomic
+from surgical_marl.runs.folder import WEIGHTS
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from surgical_marl.policies.networks import MultiAgentActor
+
+WIDTHS = ("agents", "observation", "action")
+"""What a file says of its type: how many agents, and the widths of what one of them sees and does."""
+
+
+def write_weights(folder: Path, actor: MultiAgentActor) -> None:
+    """Write the network of each type of arm, normalisation of its observations included."""
+    for name, model in actor.models.items():
+        widths = (actor.counts[name], model.obs_dim, actor.outputs[name])
+        about = dict(zip(WIDTHS, map(str, widths), strict=True))
+        tensors = {key: value.detach().cpu().contiguous() for key, value in model.state_dict().items()}
+        write_atomic(folder / f"{name}{WEIGHTS}", partial(Path.write_bytes, data=save(tensors, metadata=about)))
+
+
+def read_weights(folder: Path) -> tuple[dict[str, list[int]], dict[str, Tensor]]:
+    """The widths of each type of arm (see `WIDTHS`) and the state of a `MultiAgentActor`, on the CPU.
+
+    ValueError if a file is truncated, a pickle, or anything else but what `write_weights` wrote.
+    """
+    groups: dict[str, list[int]] = {}
+    state: dict[str, Tensor] = {}
+    for path in sorted(folder.glob(f"[!.]*{WEIGHTS}")):
+        try:
+            with safe_open(path, framework="pt", device="cpu") as file:
+                groups[path.stem] = [int(file.metadata()[key]) for key in WIDTHS]
+                state |= {f"models.{path.stem}.{key}": file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+        except (SafetensorError, OSError, TypeError, KeyError, ValueError):
+            raise ValueError(
+                f"{path} is damaged, or not the weights of a policy in the form safetensors, the only one that is "
+                "loaded: restore it from a copy"
+            ) from None
+    return groups, state

@@ -1,0 +1,1 @@
+"""Surgical arms: bodies, drives and kinematics."""

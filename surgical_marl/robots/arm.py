@@ -1,0 +1,308 @@
+"""One surgical arm, read from its folder: a URDF for the body, `arm.yaml` for how it is driven.
+
+    arm = load_arm("psm")
+    arm.forward_kinematics(arm.home)            # tool tip in the base frame, 4 x 4
+
+Every number of a shipped arm and its source stands in `arms/<name>/README.md`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from surgical_marl.content import find
+from surgical_marl.robots.drives import Cable, Drive, read_cables, read_drives
+from surgical_marl.robots.urdf import MOVING, Faults, read_urdf, resolve_meshes, urdf_faults
+from surgical_marl.yaml_file import build, check_keys, read_yaml
+
+if TYPE_CHECKING:
+    from yourdfpy import urdf as yourdf
+
+CONTROL_MODES = ("position", "velocity", "torque")
+KEYS = ("description", "urdf", "tool_tip", "remote_center", "camera", "joints", "cables", "jaw")
+
+
+@dataclass(frozen=True)
+class Jaw:
+    """The jaw is one command, open or closed, that moves `joint` and the joints that mimic it."""
+
+    joint: str
+    open: float
+    closed: float
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A stereo endoscope. It looks along -z of `link`, x to the right, y up, as a MuJoCo camera does."""
+
+    link: str
+    fovy: float
+    """Vertical field of view in degrees."""
+    baseline: float
+    """Distance of the two eyes along x in m."""
+
+
+@dataclass(frozen=True)
+class Joint:
+    """A moving joint of the URDF with its drive. `leader` is the joint it mimics, or its own name."""
+
+    name: str
+    slides: bool
+    lower: float
+    """Where its stops stand: the URDF's limits, less the drive's `margin`."""
+    upper: float
+    velocity: float
+    effort: float
+    """All that drives the joint, cables too, puts no more than this on it."""
+    viscous: float
+    """Viscous friction, effort per velocity."""
+    coulomb: float
+    """Coulomb friction, effort."""
+    leader: str
+    multiplier: float
+    offset: float
+    drive: Drive
+
+
+@dataclass(frozen=True)
+class Arm:
+    """A surgical arm. Angles in rad, lengths in m, in the frame of the URDF's root link (the base frame)."""
+
+    name: str
+    folder: Path
+    description: str
+    tool_tip: str
+    remote_center: str | None
+    """The link whose z axis, the shaft, always passes through the base frame's origin; None without such a point."""
+    jaw: Jaw | None
+    camera: Camera | None
+    joints: tuple[Joint, ...]
+    """All moving joints in the order of the chain, those that mimic another included."""
+    cables: tuple[Cable, ...]
+    urdf: Any = field(repr=False)
+
+    @cached_property
+    def actuated(self) -> tuple[Joint, ...]:
+        """Joints with a command of their own, in the order of `q`, actions and observations."""
+        return tuple(joint for joint in self.joints if joint.leader == joint.name)
+
+    @property
+    def home(self) -> np.ndarray:
+        """Joint positions at the start of an episode, shape [n]."""
+        return np.array([joint.drive.home for joint in self.actuated])
+
+    @property
+    def lower(self) -> np.ndarray:
+        """Lower joint limits, shape [n]."""
+        return np.array([joint.lower for joint in self.actuated])
+
+    @property
+    def upper(self) -> np.ndarray:
+        """Upper joint limits, shape [n]."""
+        return np.array([joint.upper for joint in self.actuated])
+
+    @property
+    def speed(self) -> np.ndarray:
+        """How fast a full action moves each joint's target, shape [n], rad/s (m/s for joints that slide)."""
+        return np.array([joint.drive.speed for joint in self.actuated])
+
+    def forward_kinematics(self, q: Any) -> Any:
+        """Pose of the tool tip in the base frame.
+
+        Args:
+            q: joint positions, shape [..., n], in the order of `actuated`; joints that don't move the tip (the jaw)
+                may be left out at the end. A numpy or a JAX array.
+
+        Returns:
+            Homogeneous transforms, shape [..., 4, 4], of the same kind of array.
+
+        Raises:
+            ValueError: if the last axis is too short or too long.
+        """
+        return self.link_poses(q, (self.tool_tip,))[self.tool_tip]
+
+    def jacobian(self, q: Any) -> Any:
+        """Geometric Jacobian [..., 6, n] of the tool tip: linear over angular velocity in the base frame, per joint
+        rate.
+
+        `q` as in `forward_kinematics`; n counts all of `actuated`, and joints that don't move the tip have zero
+        columns.
+        """
+        chain = [joint for joint in self._chain(self.tool_tip) if joint.type in MOVING]
+        poses = self.link_poses(q, (self.tool_tip, *(joint.child for joint in chain)))
+        tip = poses[self.tool_tip][..., :3, 3]
+        xp = tip.__array_namespace__()
+        joints = {joint.name: joint for joint in self.joints}
+        columns = {joint.name: xp.zeros((*tip.shape[:-1], 6), dtype=tip.dtype) for joint in self.actuated}
+        for element in chain:
+            joint, pose = joints[element.name], poses[element.child]
+            axis = xp.broadcast_to(pose[..., :3, :3] @ _unit(element.axis), tip.shape)
+            linear = axis if joint.slides else xp.linalg.cross(axis, tip - pose[..., :3, 3])
+            angular = xp.zeros_like(axis) if joint.slides else axis
+            columns[joint.leader] = columns[joint.leader] + joint.multiplier * xp.concatenate([linear, angular], -1)
+        return xp.stack(list(columns.values()), -1)
+
+    def link_poses(self, q: Any, links: tuple[str, ...]) -> dict[str, Any]:
+        """Poses [..., 4, 4] of some links in the base frame; `q` as in `forward_kinematics`."""
+        if not hasattr(q, "__array_namespace__"):
+            q = np.asarray(q, dtype=float)
+        xp = q.__array_namespace__()
+        names = [joint.name for joint in self.actuated]
+        joints = {joint.name: joint for joint in self.joints}
+        chains = {link: self._chain(link) for link in links}
+        moved_by = {joints[j.name].leader for chain in chains.values() for j in chain if j.type in MOVING}
+        least = max((names.index(name) + 1 for name in moved_by), default=0)
+        if q.ndim == 0 or not least <= q.shape[-1] <= len(names):
+            raise ValueError(
+                f"q of shape {tuple(q.shape)} does not fit arm {self.name!r}: "
+                f"its last axis must hold the joints {', '.join(names)}"
+            )
+        known: dict[str, Any] = {}
+        for link, chain in chains.items():
+            pose = xp.eye(4, dtype=q.dtype)
+            for element in chain:
+                if element.child not in known:
+                    known[element.child] = pose @ _matrix(element.origin)
+                    if element.type in MOVING:
+                        joint = joints[element.name]
+                        value = joint.multiplier * q[..., names.index(joint.leader)] + joint.offset
+                        known[element.child] = known[element.child] @ _motion(value, element.axis, joint.slides)
+                pose = known[element.child]
+            known[link] = pose
+        return {link: xp.broadcast_to(known[link], (*q.shape[:-1], 4, 4)) for link in links}
+
+    def remote_center_error(self, q: Any) -> Any:
+        """Distance of the shaft's axis from the remote center of motion in m, [...]; `q` as in `forward_kinematics`.
+
+        Raises:
+            ValueError: for an arm without a remote center.
+        """
+        if self.remote_center is None:
+            raise ValueError(f"arm {self.name!r} has no remote center of motion")
+        pose = self.link_poses(q, (self.remote_center,))[self.remote_center]
+        axis, origin = pose[..., :3, 2], pose[..., :3, 3]
+        xp = axis.__array_namespace__()
+        return xp.linalg.vector_norm(xp.linalg.cross(axis, origin), axis=-1)
+
+    def _chain(self, link: str) -> list[yourdf.Joint]:
+        parents = {joint.child: joint for joint in self.urdf.joints}
+        chain: list[yourdf.Joint] = []
+        while link in parents:
+            chain.append(parents[link])
+            link = parents[link].parent
+        return chain[::-1]
+
+
+def load_arm(name: str | Path) -> Arm:
+    """Reads an arm by a shipped name (`list_arms()`) or the path of a folder that holds `arm.yaml`.
+
+    Raises:
+        ValueError: unknown name, or a URDF or `arm.yaml` that does not hold what it must; mostly `Faults`, a list.
+    """
+    folder = find("arms", name)
+    where = folder / "arm.yaml"
+    settings = read_yaml(where)
+    faults: list[str] = []
+
+    def keep(read: Callable[..., Any], *arguments: Any) -> Any:
+        try:
+            return read(*arguments)
+        except ValueError as error:
+            faults.append(str(error))
+
+    keep(check_keys, settings, KEYS, where)
+    path = _urdf_path(folder, settings.get("urdf"))
+    robot = read_urdf(path)
+    faults += urdf_faults(robot, path) + resolve_meshes(robot, path, folder)
+    leaders = [joint.name for joint in robot.joints if joint.type in MOVING and not joint.mimic]
+    drives = read_drives(settings.get("joints") or {}, leaders, where, keep)
+    camera, jaw = (
+        None if settings.get(key) is None else keep(build, cls, settings[key], where)
+        for key, cls in (("camera", Camera), ("jaw", Jaw))
+    )
+    pulled = [name for name in drives if jaw is None or name != jaw.joint]
+    cables = read_cables(settings.get("cables") or [], pulled, where, keep)
+    links = [link.name for link in robot.links]
+    named = {key: settings.get(key) for key in ("tool_tip", "remote_center")} | {"camera": camera and camera.link}
+    for key, link in named.items():
+        if link not in links and (key == "tool_tip" or link is not None):
+            faults.append(f"{where}: {key} {link!r} is not a link of the URDF ({', '.join(links)})")
+    if jaw is not None and jaw.joint not in leaders:
+        faults.append(f"{where}: jaw joint {jaw.joint!r} is not one of {', '.join(leaders)}")
+    if not leaders:
+        faults.append(f"{path}: no joint moves; an arm needs one that is revolute or prismatic")
+    if faults:
+        raise Faults(faults)
+    return Arm(
+        name=folder.name,
+        folder=folder,
+        description=str(settings.get("description", "")),
+        tool_tip=str(settings["tool_tip"]),
+        remote_center=settings.get("remote_center"),
+        jaw=jaw,
+        camera=camera,
+        joints=tuple(_joint(joint, drives, where) for joint in robot.joints if joint.type in MOVING),
+        cables=cables,
+        urdf=robot,
+    )
+
+
+def _urdf_path(folder: Path, name: Any) -> Path:
+    if not isinstance(name, str) or not name:
+        raise ValueError(f"{folder / 'arm.yaml'}: urdf must name the URDF file in the folder, not {name!r}")
+    path = folder / name
+    if not path.resolve().is_relative_to(folder.resolve()):
+        raise ValueError(f"{folder / 'arm.yaml'}: urdf {name!r} leaves the arm's folder; copy it into the folder")
+    return path
+
+
+def _joint(joint: yourdf.Joint, drives: dict[str, Drive], where: Path) -> Joint:
+    limit, dynamics, mimic = joint.limit, joint.dynamics, joint.mimic
+    leader = mimic.joint if mimic else joint.name
+    margin = drives[leader].margin
+    if not 2 * margin < limit.upper - limit.lower:
+        span = f"[{limit.lower:g}, {limit.upper:g}]"
+        raise ValueError(f"{where}, joint {joint.name!r}: a margin of {margin:g} leaves nothing of {span}")
+    return Joint(
+        name=joint.name,
+        slides=joint.type == "prismatic",
+        lower=limit.lower + margin,
+        upper=limit.upper - margin,
+        velocity=limit.velocity,
+        effort=limit.effort,
+        viscous=float((dynamics and dynamics.damping) or 0.0),  # yourdfpy leaves these two as text
+        coulomb=float((dynamics and dynamics.friction) or 0.0),
+        leader=leader,
+        multiplier=mimic.multiplier if mimic else 1.0,
+        offset=mimic.offset if mimic else 0.0,
+        drive=drives[leader],
+    )
+
+
+def _matrix(origin: np.ndarray | None) -> np.ndarray:
+    return np.eye(4) if origin is None else np.asarray(origin, dtype=float)
+
+
+def _unit(axis: np.ndarray) -> np.ndarray:
+    return np.asarray(axis, dtype=float) / np.linalg.norm(axis)
+
+
+def _motion(value: Any, axis: np.ndarray, slides: bool) -> Any:
+    """Transform [..., 4, 4] of a joint: a slide along its axis, or a turn about it (Rodrigues' formula)."""
+    xp = value.__array_namespace__()
+    axis = _unit(axis)
+    value = value[..., None, None]
+    if slides:
+        step = np.zeros((4, 4))
+        step[:3, 3] = axis
+        return np.eye(4) + value * step
+    x, y, z = axis
+    cross = np.zeros((4, 4))
+    cross[:3, :3] = [[0, -z, y], [z, 0, -x], [-y, x, 0]]
+    return np.eye(4) + xp.sin(value) * cross + (1 - xp.cos(value)) * (cross @ cross)

@@ -1,0 +1,207 @@
+"""Joint positions that bring an arm's tool tip to a position or a pose.
+
+    q = inverse_kinematics(arm, pose)                       # pose [..., 4, 4]: position and orientation
+    q = inverse_kinematics(arm, position)                   # position [..., 3]: the joints stay near the start
+    q = inverse_kinematics(arm, pose, start=q, starts=1)    # follow a path: from the last joint positions only
+
+The code is the same for numpy and, compiled, for JAX.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from surgical_marl.robots.arm import Arm
+
+LENGTH = 0.05
+"""What a radian of orientation error weighs against position, m/rad: 0.1 degrees count about as much as 0.1 mm."""
+CLOSE = 1e-5
+"""Below this error (m, or rad times `LENGTH`) solutions are equally good, and the one nearest the start is taken."""
+PULL = 0.2
+"""Share of the way back to the start that a step takes where the target leaves the joints free."""
+STEP = 0.2
+"""The longest step of a joint, a share of its range: beyond it the linear model of the arm misleads."""
+FAR = 0.5
+"""A longer error (m) counts as this long: far targets make the steps oscillate (S. Buss and J. Kim, Selectively damped
+least squares for inverse kinematics, 2005)."""
+LEAST_DAMPING = 1e-7
+"""m2. Keeps steps finite at a singularity, and is too little to slow the last ones."""
+CANDIDATES = 1024
+"""Configurations spread over the joint ranges; a target is also tried from those nearest to it."""
+
+
+def inverse_kinematics(
+    arm: Arm, targets: Any, start: Any = None, *, starts: int = 8, iterations: int = 20, length: float = LENGTH
+) -> Any:
+    """Joint positions within the limits that bring the tool tip to `targets`.
+
+    Damped least squares (S. Buss, "Introduction to inverse kinematics with Jacobian transpose, pseudoinverse and
+    damped least squares methods", 2004) in joint coordinates that are shares of their ranges. The damping falls with
+    the square of the error (T. Sugihara, "Solvability-unconcerned inverse kinematics by the Levenberg-Marquardt
+    method", IEEE Transactions on Robotics 27, 2011). A joint that would leave its range rests at the limit. The search
+    runs from `start` and from the configurations of a fixed Halton set whose tips are nearest to the target. It always
+    takes `iterations` steps, so it runs under `jax.jit` and `jax.vmap`; in JAX call it from a compiled function.
+
+    Args:
+        arm: the arm.
+        targets: positions [..., 3] of the tool tip in m or its poses [..., 4, 4], in the base frame. A numpy or a JAX
+            array, of which the result is another.
+        start: joint positions [n] or [..., n] in rad (m for joints that slide) to start from; `arm.home` by default.
+            For positions the joints stay near it where they can.
+        starts: from how many configurations to search, `start` among them. With 1 the solution is the one that a
+            short way leads to, which suits targets near `start` and nearly all positions; the time grows with it.
+        iterations: steps from each.
+        length: what an error in orientation weighs against one in position, m/rad.
+
+    Returns:
+        Joint positions [..., n] in the order of `arm.actuated`: of solutions that are equally good the one nearest
+        `start`. Joints that don't move the tip stay at `start`. A target out of reach ends near the best that a search
+        led to: compare `forward_kinematics` with the target.
+
+    Raises:
+        ValueError: if targets or start have a shape that does not fit, or fewer than one start is asked for.
+    """
+    targets, start, xp = _check(arm, targets, start)
+    if starts < 1:
+        raise ValueError(f"starts must be at least 1, not {starts}")
+    lower, scale = arm.lower, arm.upper - arm.lower
+    begin = (start - lower) / scale
+    seeds = _seeds(arm, targets, begin, starts, length)
+    targets = targets[..., None, :] if targets.shape[-1] == 3 else targets[..., None, :, :]
+    pull = PULL * (targets.shape[-1] == 3)
+
+    def step(i: Any, share: Any) -> Any:
+        error, jacobian = _residual(arm, lower + share * scale, targets, length)
+        rest = pull * (2 * i < iterations) * (begin[..., None, :] - share)  # the last half only has to arrive
+        return _step(share, error, jacobian * scale, rest).astype(share.dtype)
+
+    shares = _repeat(step, seeds, iterations, xp)
+    error, _ = _residual(arm, lower + shares * scale, targets, length)
+    error = xp.linalg.vector_norm(error, axis=-1)
+    away = xp.linalg.vector_norm(shares - begin[..., None, :], axis=-1)
+    # Less than 1 for a solution whatever its distance, and more than 1 for what is none.
+    rank = xp.where(error < CLOSE, away / (1 + away), 1 + error)
+    best = xp.argmin(rank, axis=-1)[..., None, None]
+    q = lower + scale * xp.take_along_axis(shares, best, axis=-2)[..., 0, :]
+    return xp.clip(q, arm.lower, arm.upper).astype(start.dtype)
+
+
+def _check(arm: Arm, targets: Any, start: Any) -> tuple[Any, Any, Any]:
+    """Targets and start [..., n] as arrays of floats of one kind, and the namespace of that kind."""
+    start = arm.home if start is None else start
+    arrays = [x if hasattr(x, "__array_namespace__") else np.asarray(x, dtype=float) for x in (targets, start)]
+    xp = next((x.__array_namespace__() for x in arrays if not isinstance(x, np.ndarray)), np)
+    targets, start = map(xp.asarray, arrays)
+    dtype = xp.float64 if xp is np else xp.result_type(targets.dtype, xp.float32)
+    targets, start = targets.astype(dtype), start.astype(dtype)
+    n = len(arm.actuated)
+    if targets.shape[-2:] != (4, 4) and targets.shape[-1:] != (3,):
+        raise ValueError(f"targets must be positions [..., 3] or poses [..., 4, 4], not of shape {targets.shape}")
+    batch = targets.shape[:-1] if targets.shape[-1] == 3 else targets.shape[:-2]
+    try:
+        start = xp.broadcast_to(start, (*batch, n))
+    except ValueError:
+        raise ValueError(
+            f"start of shape {start.shape} does not fit the {n} joints of arm {arm.name!r} and targets of shape "
+            f"{targets.shape}"
+        ) from None
+    return targets, xp.clip(start, arm.lower, arm.upper).astype(dtype), xp
+
+
+def _seeds(arm: Arm, targets: Any, begin: Any, starts: int, length: float) -> Any:
+    """Where to search from, [..., starts, n] in shares of the ranges: `begin` and the candidates nearest the target."""
+    xp = begin.__array_namespace__()
+    first = begin[..., None, :]
+    if starts == 1:
+        return first
+    shares, positions, rotations = _candidates(arm)
+    known = positions if targets.shape[-1] == 3 else np.concatenate([positions, length * rotations], -1)
+    wanted = targets
+    if targets.shape[-1] == 4:
+        turn = targets[..., :3, :3]
+        wanted = xp.concatenate([targets[..., :3, 3], length * turn.reshape(*turn.shape[:-2], 9)], -1)
+    # Square of the distance, less what is the same for all candidates.
+    distance = np.sum(known**2, -1) - 2 * wanted @ known.T
+    near = xp.argsort(distance, axis=-1)[..., : starts - 1]
+    moves = np.any(arm.jacobian(arm.home) != 0, axis=0)
+    others = xp.where(moves, xp.asarray(shares)[near], first)
+    return xp.concatenate([first, others], -2).astype(begin.dtype)
+
+
+def _residual(arm: Arm, q: Any, targets: Any, length: float) -> tuple[Any, Any]:
+    """What is missing to the targets, [..., 3] or [..., 6] with rotation vectors times `length`, and its Jacobian."""
+    pose, jacobian = arm.forward_kinematics(q), arm.jacobian(q)
+    xp = pose.__array_namespace__()
+    if targets.shape[-1] == 3:
+        return targets - pose[..., :3, 3], jacobian[..., :3, :]
+    turn = targets[..., :3, :3] @ xp.matrix_transpose(pose[..., :3, :3])
+    error = xp.concatenate([targets[..., :3, 3] - pose[..., :3, 3], length * _rotation_vector(turn)], -1)
+    return error, xp.concatenate([jacobian[..., :3, :], length * jacobian[..., 3:, :]], -2)
+
+
+def _rotation_vector(turn: Any) -> Any:
+    """Axis times angle in rad, [..., 3], of rotation matrices [..., 3, 3]; at half a turn the axis may be wrong."""
+    xp = turn.__array_namespace__()
+    # The chord gives the angle in float32 too, where the cosine of a small one and the sine of a large one do not.
+    chord = xp.linalg.vector_norm(turn - np.eye(3), axis=(-2, -1), keepdims=True)[..., 0]
+    angle = 2 * xp.arcsin(xp.clip(chord / 8**0.5, 0.0, 1.0))
+    axis = xp.stack(
+        [turn[..., 2, 1] - turn[..., 1, 2], turn[..., 0, 2] - turn[..., 2, 0], turn[..., 1, 0] - turn[..., 0, 1]], -1
+    )
+    axis = axis + 1e-6 * (angle > 3)  # at half a turn nothing is left of it, and any axis leads away from there
+    return angle * axis / xp.maximum(xp.linalg.vector_norm(axis, axis=-1, keepdims=True), 1e-12)
+
+
+def _step(share: Any, error: Any, jacobian: Any, pull: Any) -> Any:
+    """One step of damped least squares from joint coordinates `share` in [0, 1]."""
+    xp = share.__array_namespace__()
+    transposed = xp.matrix_transpose(jacobian)
+    downhill = (transposed @ error[..., None])[..., 0]
+    # Joints that press against a limit are left out, so that the others do without them.
+    held = ((share <= 0) & (downhill < 0)) | ((share >= 1) & (downhill > 0))
+    jacobian = xp.where(held[..., None, :], 0.0, jacobian)
+    transposed = xp.matrix_transpose(jacobian)
+    # Besides Sugihara's, the damping that keeps the matrix regular in spite of rounding (in float32 it counts).
+    least = LEAST_DAMPING + share.shape[-1] * xp.finfo(share.dtype).eps * xp.sum(jacobian**2, axis=(-2, -1))
+    error = error * xp.minimum(1.0, FAR / xp.maximum(xp.linalg.vector_norm(error, axis=-1, keepdims=True), 1e-12))
+    damping = least + 0.5 * xp.sum(error**2, axis=-1)
+    square = transposed @ jacobian + damping[..., None, None] * np.eye(share.shape[-1])
+    rest = error[..., None] - jacobian @ pull[..., None]
+    change = pull + xp.linalg.solve(square, transposed @ rest)[..., 0]
+    return xp.clip(share + xp.clip(change, -STEP, STEP), 0.0, 1.0)
+
+
+def _repeat(step: Callable[[Any, Any], Any], state: Any, times: int, xp: Any) -> Any:
+    """Applies `step(i, state)` so many times; in JAX as one loop, which compiles in the time of a single step."""
+    if xp is np:
+        for i in range(times):
+            state = step(i, state)
+        return state
+    from jax import lax
+
+    return lax.fori_loop(0, times, step, state)
+
+
+@lru_cache(maxsize=64)
+def _halton(count: int, dimensions: int) -> np.ndarray:
+    """The first points of the Halton sequence, [count, dimensions] in (0, 1)."""
+    primes = [p for p in range(2, 100) if all(p % k for k in range(2, p))][:dimensions]
+    points = np.zeros((count, dimensions))
+    for column, prime in enumerate(primes):
+        rest, weight = np.arange(1, count + 1), 1.0
+        while rest.any():
+            weight /= prime
+            points[:, column] += weight * (rest % prime)
+            rest = rest // prime
+    return points
+
+
+def _candidates(arm: Arm) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Configurations [m, n] in shares of the ranges, with positions [m, 3] and rotations [m, 9] of the tool tip."""
+    shares = _halton(CANDIDATES, len(arm.actuated))
+    poses = arm.forward_kinematics(arm.lower + shares * (arm.upper - arm.lower))
+    return shares, poses[:, :3, 3], poses[:, :3, :3].reshape(-1, 9)

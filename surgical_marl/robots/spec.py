@@ -1,0 +1,245 @@
+"""From an `Arm` to a `mujoco.MjSpec`: bodies, joints, geoms, actuators, the tool tip as a site.
+
+Visual geoms come from the URDF's primitives and meshes as they are. Every `<collision>` becomes a capsule or a sphere,
+the cheapest shapes to collide. A cylinder becomes the capsule of the same length and radius, so that slender tools lose
+nothing; a box or a mesh the capsule around it, along the longest side of its bounding box, or the sphere around it if
+that is smaller. Collision geoms collide only through the explicit pairs that a scene makes of them.
+"""
+
+from __future__ import annotations
+
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from surgical_marl.robots.arm import CONTROL_MODES, Arm, Joint
+from surgical_marl.robots.drives import Cable, Drive
+from surgical_marl.robots.urdf import read_mesh
+
+VISUAL_GROUP, COLLISION_GROUP = 2, 3
+SOLREF = (0.005, 1.0)
+"""Time constant in s and damping ratio of joint stops and contacts: as stiff as a step of 2.5 ms lets them be."""
+DEFAULT_RGBA = (0.7, 0.7, 0.72, 1.0)
+
+
+def build_spec(arm: Arm, control: str = "position") -> mujoco.MjSpec:
+    """A new MjSpec of the arm. ValueError for an unknown control mode or a mesh that can't be read."""
+    if control not in CONTROL_MODES:
+        raise ValueError(f"unknown control mode {control!r}; the modes are {', '.join(CONTROL_MODES)}")
+    spec = mujoco.MjSpec()
+    spec.modelname = arm.name
+    spec.compiler.degree = False
+    colors = {m.name: m.color.rgba for m in arm.urdf.materials if m.color is not None}
+    links = {link.name: link for link in arm.urdf.links}
+    children = {joint.child for joint in arm.urdf.joints}
+    root = next(name for name in links if name not in children)
+    bodies = {root: spec.worldbody.add_body(name=root)}
+    _add_link(spec, bodies[root], links[root], colors)
+    joints = {joint.name: joint for joint in arm.joints}
+    waiting = list(arm.urdf.joints)
+    while waiting:  # the URDF may list joints in any order; parents come first in a spec
+        ready = [joint for joint in waiting if joint.parent in bodies]
+        if not ready:
+            raise ValueError(f"arm {arm.name!r}: joint {waiting[0].name!r} hangs on no chain from link {root!r}")
+        waiting = [joint for joint in waiting if joint not in ready]
+        for element in ready:
+            body = bodies[element.parent].add_body(name=element.child, **_place(element.origin))
+            bodies[element.child] = body
+            if element.name in joints:
+                joint = joints[element.name]
+                _add_joint(body, joint, element.axis, _mode(arm, joint, control))
+            _add_link(spec, body, links[element.child], colors)
+    bodies[arm.tool_tip].add_site(name="tool_tip", size=[0.001] * 3, group=4)
+    if arm.camera is not None:
+        for name, side in (("left", -0.5), ("right", 0.5)):
+            eye = [side * arm.camera.baseline, 0, 0]
+            bodies[arm.camera.link].add_camera(name=name, pos=eye, fovy=arm.camera.fovy)
+    for joint in arm.joints:
+        mode = _mode(arm, joint, control)
+        _add_actuator(spec, joint.name, joint.drive, joint.effort, mode, _commands(joint, mode))
+    for number, cable in enumerate(arm.cables):
+        _add_cable(spec, f"cable_{number}", cable, joints, control)
+    return spec
+
+
+def _mode(arm: Arm, joint: Joint, control: str) -> str:
+    """A jaw is told where to be, in every mode."""
+    return "position" if arm.jaw and joint.leader == arm.jaw.joint else control
+
+
+def _add_joint(body: Any, joint: Joint, axis: np.ndarray, control: str) -> None:
+    """A joint under torque has the speed-torque line of a motor: at its speed nothing is left of the full effort."""
+    drag = joint.effort / joint.drive.speed if control == "torque" else 0.0
+    body.add_joint(
+        name=joint.name,
+        type=mujoco.mjtJoint.mjJNT_SLIDE if joint.slides else mujoco.mjtJoint.mjJNT_HINGE,
+        axis=axis,
+        range=[joint.lower, joint.upper],
+        limited=mujoco.mjtLimited.mjLIMITED_TRUE,
+        damping=[joint.viscous + drag, 0, 0],
+        solref_limit=SOLREF,
+        armature=joint.drive.armature,
+        frictionloss=joint.coulomb,
+        # its own actuator and all cables together
+        actfrcrange=[-joint.effort, joint.effort],
+        actfrclimited=mujoco.mjtLimited.mjLIMITED_TRUE,
+    )
+
+
+def _add_cable(spec: mujoco.MjSpec, name: str, cable: Cable, joints: dict[str, Joint], control: str) -> None:
+    """A fixed tendon with an actuator of its own.
+
+    Under torque control it only carries inertia: a commanded torque is that of all the motors together, which share it
+    among them as the cables have it.
+    """
+    tendon = spec.add_tendon(name=name, armature=cable.armature)
+    for joint, coefficient in cable.joints.items():
+        tendon.wrap_joint(joint, coefficient)
+    if control != "torque":
+        ends = [coefficient * _commands(joints[joint], control) for joint, coefficient in cable.joints.items()]
+        _add_actuator(spec, name, cable, cable.effort, control, np.sort(ends).sum(0), mujoco.mjtTrn.mjTRN_TENDON)
+
+
+def _commands(joint: Joint, control: str) -> np.ndarray:
+    """The least and the greatest command of a joint."""
+    high = joint.drive.speed if control == "velocity" else joint.effort
+    return np.array([joint.lower, joint.upper] if control == "position" else [-high, high])
+
+
+def _add_actuator(
+    spec: mujoco.MjSpec,
+    name: str,
+    drive: Drive | Cable,
+    effort: float,
+    control: str,
+    commands: np.ndarray,
+    transmission: mujoco.mjtTrn = mujoco.mjtTrn.mjTRN_JOINT,
+) -> None:
+    """The actuator of a joint, or of a cable: force = gain * command + bias, clamped to the effort.
+
+    Position: the dVRK's PD law, stiffness * (target - q) - damping * qd. Velocity: damping * (command - qd). Torque:
+    the command itself.
+    """
+    laws: dict[str, tuple[float, list[float]]] = {
+        "position": (drive.stiffness, [0, -drive.stiffness, -drive.damping]),
+        "velocity": (drive.damping, [0, 0, -drive.damping]),
+        "torque": (1.0, [0, 0, 0]),
+    }
+    gain, bias = laws[control]
+    spec.add_actuator(
+        name=name,
+        target=name,
+        trntype=transmission,
+        gaintype=mujoco.mjtGain.mjGAIN_FIXED,
+        biastype=mujoco.mjtBias.mjBIAS_AFFINE,
+        gainprm=[gain] + [0] * 9,
+        biasprm=bias + [0] * 7,
+        ctrlrange=commands,
+        ctrllimited=mujoco.mjtLimited.mjLIMITED_TRUE,
+        forcerange=[-effort, effort],
+        forcelimited=mujoco.mjtLimited.mjLIMITED_TRUE,
+    )
+
+
+def _add_link(spec: mujoco.MjSpec, body: Any, link: Any, colors: dict[str, np.ndarray]) -> None:
+    if link.inertial is not None and link.inertial.inertia.any():  # all zeros say as much as no <inertial>
+        origin = _matrix(link.inertial.origin)
+        tensor = origin[:3, :3] @ link.inertial.inertia @ origin[:3, :3].T
+        body.explicitinertial = True
+        body.mass = link.inertial.mass
+        body.ipos = origin[:3, 3]
+        body.fullinertia = tensor[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+    for i, visual in enumerate(link.visuals):
+        material = visual.material
+        rgba: Any = DEFAULT_RGBA
+        if material is not None:
+            rgba = material.color.rgba if material.color is not None else colors.get(material.name, rgba)
+        shape = _visual_shape(spec, visual.geometry, f"{link.name}_{i}")
+        _add_geom(body, shape, _matrix(visual.origin), rgba=rgba, group=VISUAL_GROUP)
+    for i, collision in enumerate(link.collisions):
+        name = collision.name or f"{link.name}_{i}"
+        if spec.geom(name) is not None:  # URDF lets shapes of two links have one name, MuJoCo does not
+            name = f"{link.name}_{i}_{name}"
+        shape, place = _collision_shape(collision.geometry)
+        place = _matrix(collision.origin) @ place
+        _add_geom(body, shape, place, name=name, rgba=[0.9, 0.3, 0.2, 0.3], group=COLLISION_GROUP)
+
+
+def _add_geom(body: Any, shape: dict[str, Any], origin: np.ndarray, **rest: Any) -> None:
+    body.add_geom(**shape, **_place(origin), **rest, mass=0, contype=0, conaffinity=0)
+
+
+def _visual_shape(spec: mujoco.MjSpec, geometry: Any, name: str) -> dict[str, Any]:
+    if geometry.sphere is not None:
+        return _sphere(geometry.sphere.radius)
+    if geometry.cylinder is not None:
+        size = [geometry.cylinder.radius, geometry.cylinder.length / 2, 0]
+        return {"type": mujoco.mjtGeom.mjGEOM_CYLINDER, "size": size}
+    if geometry.box is not None:
+        return {"type": mujoco.mjtGeom.mjGEOM_BOX, "size": np.asarray(geometry.box.size) / 2}
+    vertices, faces = read_mesh(Path(geometry.mesh.filename), geometry.mesh.scale)
+    # As a shell a mesh may be open or inside out: its volume, which nothing here needs, is not computed.
+    spec.add_mesh(
+        name=name,
+        uservert=vertices.ravel(),
+        userface=faces.ravel(),
+        inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,
+    )
+    return {"type": mujoco.mjtGeom.mjGEOM_MESH, "meshname": name}
+
+
+def _collision_shape(geometry: Any) -> tuple[dict[str, Any], np.ndarray]:
+    """A capsule or a sphere, and its place [4, 4] in the frame of the geometry."""
+    if geometry.sphere is not None:
+        return _sphere(geometry.sphere.radius), np.eye(4)
+    if geometry.cylinder is not None:
+        radius, length = geometry.cylinder.radius, geometry.cylinder.length
+        return _capsule(radius, max(length / 2 - radius, 0.0)), np.eye(4)
+    if geometry.box is not None:
+        corners = np.array(list(product((-0.5, 0.5), repeat=3))) * geometry.box.size
+        return _bounding_capsule(corners)
+    return _bounding_capsule(read_mesh(Path(geometry.mesh.filename), geometry.mesh.scale)[0])
+
+
+def _bounding_capsule(points: np.ndarray) -> tuple[dict[str, Any], np.ndarray]:
+    """The shortest capsule that holds points [n, 3] with its axis through the middle of their bounding box and along
+    its longest side, or the sphere around them if that is smaller; and its place."""
+    low, high = points.min(0), points.max(0)
+    place = np.eye(4)
+    # cyclic permutations are rotations: z of the capsule becomes the longest side
+    place[:3, :3] = np.roll(np.eye(3), int(np.argmax(high - low)) + 1, axis=0)
+    place[:3, 3] = (low + high) / 2
+    local = (points - place[:3, 3]) @ place[:3, :3]
+    away = np.linalg.norm(local[:, :2], axis=1)
+    radius = away.max()
+    half = max(float((np.abs(local[:, 2]) - np.sqrt(radius**2 - away**2)).max()), 0.0)
+    around = np.linalg.norm(local, axis=1).max()
+    if around**3 <= radius**3 + 1.5 * radius**2 * half:  # volumes, both over 4/3 pi
+        radius, half = around, 0.0
+    return _capsule(float(radius), half), place
+
+
+def _capsule(radius: float, half: float) -> dict[str, Any]:
+    """A capsule whose axis is `2 * half` long; a sphere if that is nothing."""
+    if half == 0:
+        return _sphere(radius)
+    return {"type": mujoco.mjtGeom.mjGEOM_CAPSULE, "size": [radius, half, 0]}
+
+
+def _sphere(radius: float) -> dict[str, Any]:
+    return {"type": mujoco.mjtGeom.mjGEOM_SPHERE, "size": [radius, 0, 0]}
+
+
+def _matrix(origin: np.ndarray | None) -> np.ndarray:
+    return np.eye(4) if origin is None else origin
+
+
+def _place(origin: np.ndarray | None) -> dict[str, np.ndarray]:
+    if origin is None:
+        return {}
+    quat = np.zeros(4)
+    mujoco.mju_mat2Quat(quat, np.ascontiguousarray(origin[:3, :3]).ravel())
+    return {"pos": origin[:3, 3], "quat": quat}

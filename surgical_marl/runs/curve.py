@@ -1,0 +1,63 @@
+"""The learning curve of a run as a picture."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter, FuncFormatter, NullFormatter, PercentFormatter
+
+from surgical_marl.files import write_atomic
+from surgical_marl.runs.folder import CURVE, read_metrics
+
+PANELS = (
+    ("tip_error_mm", "tip error at the end (mm)", "#1f6f8b"),
+    ("success_rate", "success", "#3a7d44"),
+    ("collision_rate", "episodes with a collision", "#b23a48"),
+)
+
+
+def draw_curve(run: Path, title: str) -> None:
+    """Draw `curve.png` from `metrics.csv`: error, success, collisions against steps."""
+    rows = read_metrics(run)
+    steps = np.array([row["env_steps"] for row in rows])
+    figure = Figure(figsize=(12, 3.6), layout="constrained")
+    FigureCanvasAgg(figure)
+    figure.suptitle(title, fontsize=11)
+    for axis, (name, label, color) in zip(figure.subplots(1, 3), PANELS, strict=True):
+        values = np.array([row[name] for row in rows])
+        known = np.isfinite(values)
+        axis.plot(steps[known], values[known], color=color, alpha=0.25, linewidth=1)
+        axis.plot(steps[known], _smooth(values[known]), color=color, linewidth=2)
+        axis.set(title=label, xlabel="environment steps")
+        axis.title.set_fontsize(10)
+        axis.xaxis.set_major_formatter(EngFormatter(sep=""))
+        axis.grid(True, which="both", color="#dddddd", linewidth=0.6)
+        axis.spines[["top", "right"]].set_visible(False)
+        if name == "tip_error_mm":
+            axis.set_yscale("log")
+            axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+            axis.yaxis.set_minor_formatter(NullFormatter())
+            # Whole decades at least, so that runs compare at a glance and the axis has labels.
+            axis.set_ylim(*_log_limits(values[known]))
+        else:
+            axis.set_ylim(-0.02, 1.02)
+            axis.yaxis.set_major_formatter(PercentFormatter(1.0))
+    write_atomic(run / CURVE, lambda path: figure.savefig(path, format="png", dpi=150))
+
+
+def _smooth(values: np.ndarray) -> np.ndarray:
+    """Running mean over a fiftieth of the curve, with shorter windows at the ends."""
+    half = len(values) // 100
+    sums = np.concatenate([[0.0], np.cumsum(values)])
+    middle = np.arange(len(values))
+    low, high = np.maximum(middle - half, 0), np.minimum(middle + half + 1, len(values))
+    return (sums[high] - sums[low]) / (high - low)
+
+
+def _log_limits(values: np.ndarray) -> tuple[float, float]:
+    """From 1 to 100, and further where the values go further."""
+    positive = values[values > 0]
+    return float(min([1.0, *positive / 1.2])), float(max([100.0, *positive * 1.2]))

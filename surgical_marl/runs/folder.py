@@ -1,0 +1,192 @@
+"""A run folder: `config.yaml`, `checkpoint.pt`, `metrics.csv`, `curve.png` and `tensorboard/`; beside the checkpoint
+`environments-*.pt` of further processes, and `diverged.json` where training ended so.
+
+A policy that ships has safetensors instead of the checkpoint (`export.py`). Every write is atomic, but that
+`metrics.csv` grows by rows.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import importlib.metadata
+import json
+import math
+import os
+import platform
+import subprocess
+import tempfile
+import time
+import warnings
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+
+from surgical_marl.files import write_atomic
+from surgical_marl.runs.settings import Settings, config_text, read_config
+
+CONFIG, CHECKPOINT, METRICS, CURVE = "config.yaml", "checkpoint.pt", "metrics.csv", "curve.png"
+DIVERGED = "diverged.json"
+WEIGHTS = ".safetensors"
+"""How the files end that hold the weights of a policy that ships."""
+PACKAGES = ("surgical-marl", "torch", "rsl-rl-lib", "jax", "mujoco", "mujoco-mjx", "numpy")
+
+
+def claim_folder(out: Path) -> None:
+    """Make the folder of a new run. ValueError if it cannot be written or already holds a run."""
+    if any((out / name).exists() for name in (CONFIG, CHECKPOINT)):
+        raise ValueError(f"{out} already holds a run: choose another folder, or continue it with --resume {out}")
+    check_writable(out)
+
+
+def check_writable(out: Path) -> None:
+    """Make the folder where it is missing. ValueError if it cannot be written."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=out):
+            pass
+    except OSError as error:
+        raise ValueError(f"cannot write to the output folder {out}: {error.strerror}") from None
+
+
+def write_config(run: Path, settings: Settings) -> None:
+    """Write the settings, and what makes the run: versions of packages, device, commit, time of this start."""
+    versions = {"python": platform.python_version()}
+    for name in PACKAGES:
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            versions[name] = importlib.metadata.version(name)
+    from surgical_marl.machine import machine  # imports JAX
+
+    names = machine()
+    origin = {
+        "device": names["cpu"] if settings.device == "cpu" else names["gpu"] or names["cpu"],
+        "commit": _commit(),
+        "started": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
+    }
+    text = config_text(settings, {"versions": versions, "origin": origin})
+    write_atomic(run / CONFIG, lambda path: path.write_text(text))
+
+
+def read_origin(run: Path) -> dict[str, dict[str, str | None]]:
+    """What `write_config` noted beside the settings: `versions` and `origin`; empty where a run has none."""
+    notes = yaml.safe_load((run / CONFIG).read_text())
+    return {name: notes.get(name) or {} for name in ("versions", "origin")}
+
+
+def has_begun(run: Path) -> bool:
+    """Whether there is a run in a folder, which has its settings from the start."""
+    return (run / CONFIG).is_file()
+
+
+def read_settings(run: str | Path, overrides: Iterable[str] = ()) -> Settings:
+    """Settings of a run or of a shipped policy, with `key=value` overrides.
+
+    ValueError if it is not a run folder.
+    """
+    path = Path(run) / CONFIG
+    if not path.is_file():
+        raise ValueError(f"{run} is not a run folder: it has no {CONFIG}")
+    return read_config(path, overrides)
+
+
+def write_checkpoint(run: Path, checkpoint: Mapping[str, Any]) -> None:
+    """Replace the checkpoint of a run."""
+    write_atomic(run / CHECKPOINT, lambda path: torch.save(dict(checkpoint), path))
+
+
+def holds_weights(folder: Path) -> bool:
+    """Whether a policy ships in this folder."""
+    return any(folder.glob(f"[!.]*{WEIGHTS}"))
+
+
+def read_checkpoint(run: str | Path) -> dict[str, Any]:
+    """The checkpoint of a run, on the CPU. ValueError if there is none or it is damaged."""
+    path = Path(run) / CHECKPOINT
+    if not path.is_file() and holds_weights(Path(run)):
+        raise ValueError(f"{run} holds an exported policy, which can be evaluated but not resumed")
+    if not path.is_file():
+        raise ValueError(f"{run} is not a run folder: it has no {CHECKPOINT}")
+    try:
+        with warnings.catch_warnings(action="ignore"):  # what torch says of a file that is none of its own
+            checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception:  # torch.load raises many types for a damaged file, and all mean the same here
+        checkpoint = None
+    if not isinstance(checkpoint, dict) or not {"iteration", "groups", "algorithm"} <= checkpoint.keys():
+        raise ValueError(f"{path} is damaged, or not a checkpoint of this program: restore it from a copy")
+    return checkpoint
+
+
+def write_environments(run: Path, iteration: int, rank: int, processes: int, state: Mapping[str, Any]) -> None:
+    """Write what the checkpoint of an iteration needs of one further process."""
+    write_atomic(_environments(run, iteration, rank, processes), lambda path: torch.save(dict(state), path))
+
+
+def read_environments(run: Path, iteration: int, rank: int, processes: int) -> dict[str, Any] | None:
+    """What `write_environments` wrote, on the CPU; None if it is not there or damaged."""
+    try:
+        state = torch.load(_environments(run, iteration, rank, processes), map_location="cpu", weights_only=True)
+    except Exception:  # as in `read_checkpoint`
+        return None
+    return state if isinstance(state, dict) else None
+
+
+def remove_environments(run: Path, iteration: int, processes: int) -> None:
+    """Remove what no longer belongs to the checkpoint, which is of this iteration and of so many processes."""
+    kept = {_environments(run, iteration, rank, processes) for rank in range(1, processes)}
+    for path in set(run.glob("environments-*.pt")) - kept:
+        path.unlink(missing_ok=True)
+
+
+def _environments(run: Path, iteration: int, rank: int, processes: int) -> Path:
+    return run / f"environments-{iteration}-{rank}-of-{processes}.pt"
+
+
+def write_divergence(run: Path, divergence: Mapping[str, Any]) -> None:
+    """Write `diverged.json`."""
+    write_atomic(run / DIVERGED, lambda path: path.write_text(json.dumps(divergence, indent=2) + "\n"))
+
+
+def format_row(row: Mapping[str, float]) -> list[str]:
+    """Cells of a row of metrics. A rate over no episodes (NaN) is an empty cell."""
+    return ["" if math.isnan(value) else format(value, ".9g") for value in row.values()]
+
+
+def read_metrics(run: Path) -> list[dict[str, float]]:
+    """Rows of `metrics.csv`; an empty cell is NaN. No file, no rows; a row that was cut short is none, nor are those
+    after it."""
+    if not (run / METRICS).is_file():
+        return []
+    rows: list[dict[str, float]] = []
+    with (run / METRICS).open(newline="", errors="replace") as file, contextlib.suppress(ValueError):
+        for row in csv.DictReader(line for line in file if line.endswith("\n")):
+            rows.append({key: float(cell or "nan") for key, cell in row.items()})
+    return rows
+
+
+def write_metrics(run: Path, columns: Iterable[str], rows: Iterable[Mapping[str, float]]) -> None:
+    """Replace `metrics.csv`. A column that a row lacks is empty there."""
+
+    def write(path: Path) -> None:
+        with path.open("w", newline="") as file:
+            writer = csv.writer(file)
+            writer.writerow(names := list(columns))
+            writer.writerows(format_row({name: row.get(name, math.nan) for name in names}) for row in rows)
+
+    write_atomic(run / METRICS, write)
+
+
+def _commit() -> str | None:
+    """The commit of the checkout that runs; `GIT_COMMIT` where that is a copy without git; else unknown."""
+    root = Path(__file__).parents[2]
+    if told := os.environ.get("GIT_COMMIT"):
+        return told
+    if not (root / ".git").exists():  # an installed package may lie inside another project's repository
+        return None
+    command = ["git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return None

@@ -1,0 +1,1 @@
+"""Arms mounted in a world, as one MuJoCo model."""

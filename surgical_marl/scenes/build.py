@@ -1,0 +1,72 @@
+"""From mounted arms to a MuJoCo model."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+
+from surgical_marl.robots.spec import COLLISION_GROUP, build_spec
+from surgical_marl.scenes.randomisation import Randomisation
+from surgical_marl.scenes.scene import PAYLOAD, TIMESTEP, Mount, Scene
+
+
+def set_physics(spec: mujoco.MjSpec) -> None:
+    """The physics options of every scene."""
+    option = spec.option
+    option.timestep = TIMESTEP
+    # Implicit in velocity: the stiff wrist controllers stay stable even at 5 ms. docs/physics.md compares.
+    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+    # dVRK arms are balanced by counterweights (identified gravity torque under 0.4 N m), so gravity is off.
+    option.gravity = [0.0, 0.0, 0.0]
+
+
+def build_scene(name: str, mounts: dict[str, Mount], control: str, randomisation: Randomisation) -> mujoco.MjSpec:
+    spec = mujoco.MjSpec()
+    spec.modelname = name
+    spec.compiler.degree = False
+    spec.copy_during_attach = True
+    set_physics(spec)
+    for agent, mount in mounts.items():
+        quat = np.zeros(4)
+        mujoco.mju_mat2Quat(quat, mount.rotation.ravel())
+        frame = spec.worldbody.add_frame(pos=mount.position, quat=quat)
+        spec.attach(build_spec(mount.arm, control), prefix=f"{agent}/", frame=frame)
+        if randomisation.payload:
+            spec.body(f"{agent}/{mount.arm.tool_tip}").add_body(name=f"{agent}/{PAYLOAD}")
+    return spec
+
+
+def compile_scene(spec: mujoco.MjSpec) -> mujoco.MjModel:
+    try:
+        return spec.compile()
+    except (ValueError, mujoco.FatalError) as error:
+        raise ValueError(f"scene {spec.modelname!r} does not compile: {' '.join(str(error).split())}") from None
+
+
+def weigh_shapes(model: mujoco.MjModel, home: np.ndarray) -> mujoco.MjModel:
+    """Sets what a body weighs in a contact (`body_invweight0`, 1/kg) to what it weighs where its shapes are.
+
+    MuJoCo takes the centre of mass. A balanced link has it at the pivot, where nothing can move it: its contacts would
+    be infinitely stiff, and throw the arms about.
+    """
+    data = mujoco.MjData(model)
+    data.qpos[:] = home
+    mujoco.mj_forward(model, data)
+    for body in np.unique(model.geom_bodyid[model.geom_group == COLLISION_GROUP]):
+        weights = []
+        for geom in np.flatnonzero((model.geom_bodyid == body) & (model.geom_group == COLLISION_GROUP)):
+            jacobian, moved = np.zeros((3, model.nv)), np.zeros((3, model.nv))
+            mujoco.mj_jac(model, data, jacobian, None, data.geom_xpos[geom], body)
+            mujoco.mj_solveM(model, data, moved, jacobian)
+            weights.append(np.sum(jacobian * moved) / 3)
+        model.body_invweight0[body, 0] = np.mean(weights)
+    return model
+
+
+def alone(scene: Scene, agent: str) -> mujoco.MjModel:
+    """The model of one arm of a scene, its base frame at the origin."""
+    mount = replace(scene.mounts[agent], position=np.zeros(3), rotation=np.eye(3))
+    return compile_scene(build_scene(scene.name, {agent: mount}, scene.control, scene.randomisation))

@@ -1,0 +1,260 @@
+"""What is wrong with an arm or a scene, one sentence each: what keeps it from loading, then what it does once loaded.
+
+    for finding in check("my_arm"):
+        print(finding)
+
+`surgical-marl check my_arm` prints them.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import combinations
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from surgical_marl.content import find, list_arms, list_scenes, unknown
+from surgical_marl.robots.arm import Arm, load_arm
+from surgical_marl.robots.inverse_kinematics import inverse_kinematics
+from surgical_marl.robots.spec import COLLISION_GROUP, build_spec
+from surgical_marl.robots.urdf import Faults
+from surgical_marl.scenes.build import set_physics
+from surgical_marl.scenes.contacts import collision_geoms, neighbours
+from surgical_marl.scenes.load import load_scene
+from surgical_marl.scenes.scene import TIMESTEP, Scene
+
+REACH = 0.001
+"""A scene's workspace point must be within reach to this, m."""
+CENTER = 1e-4
+"""The shaft may miss the remote center by this, m: a URDF's angles are rounded."""
+POSTURES = 20
+"""Postures, besides home, in which the controller must be stable."""
+GROWTH = 1e-3
+"""A disturbance may grow by this share in a physics step: undamped joints neither grow nor fall, up to rounding."""
+
+
+def check(source: str | Path) -> list[str]:
+    """Findings about an arm or a scene, empty if nothing is wrong.
+
+    Args:
+        source: the name of a shipped arm or scene (of both, if both have it), an arm's folder or a scene's YAML file.
+
+    Raises:
+        ValueError: if there is no such arm or scene.
+    """
+    folder, path = _find(source)
+    findings: list[str] = []
+    if folder is not None:
+        findings += _check_arm(folder)
+    if path is not None:
+        findings += _check_scene(path)
+    return list(dict.fromkeys(findings))
+
+
+def summary(source: str | Path) -> str:
+    """What was checked, in a few words: "7 joints, 4 collision shapes; scene of 1 arm"."""
+    folder, path = _find(source)
+    words = []
+    if folder is not None:
+        arm = load_arm(folder)
+        shapes = sum(len(link.collisions) for link in arm.urdf.links)
+        words.append(f"{_count(len(arm.actuated), 'joint')}, {_count(shapes, 'collision shape')}")
+    if path is not None:
+        words.append(f"scene of {_count(len(load_scene(path).agents), 'arm')}")
+    return "; ".join(words)
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}{'s' * (number != 1)}"
+
+
+def _find(source: str | Path) -> tuple[Path | None, Path | None]:
+    """The folder of an arm and the file of a scene that go by this name; one may be None."""
+    text = os.fspath(source)
+    arm, scene = text in list_arms(), text in list_scenes()
+    if arm or scene:
+        return find("arms", text) if arm else None, find("scenes", text) if scene else None
+    path = Path(text).expanduser().resolve()  # so that `./psm` is not taken for the shipped psm further down
+    if text and path.name == "arm.yaml" and path.is_file():
+        path = path.parent
+    if text and path.is_dir():
+        return path, None
+    if text and path.is_file():
+        return None, path
+    raise unknown("arm or scene", text, list(dict.fromkeys([*list_arms(), *list_scenes()])))
+
+
+def _check_arm(folder: Path) -> list[str]:
+    findings: list[str] = []
+    try:
+        for finding in _arm_findings(load_arm(folder)):
+            findings.append(finding)
+    except Faults as error:
+        return error.faults
+    except ValueError as error:
+        findings.append(str(error))
+    return findings
+
+
+def _check_scene(path: Path) -> list[str]:
+    try:
+        scene = load_scene(path)
+    except Faults as error:
+        return error.faults
+    except ValueError as error:
+        return [str(error)]
+    arms = {mount.arm.folder: mount.arm for mount in scene.mounts.values()}
+    findings = [finding for arm in arms.values() for finding in _arm_findings(arm)]
+    return findings + list(_scene_findings(scene))
+
+
+def _arm_findings(arm: Arm) -> Iterator[str]:
+    where = f"arm {arm.name!r}"
+    for finding in (*_joint_findings(arm), *_remote_center_findings(arm)):
+        yield f"{where}: {finding}"
+    model = _model(arm)
+    for finding in (*_collision_findings(arm, model), *_controller_findings(arm, model)):
+        yield f"{where}: {finding}"
+
+
+def _joint_findings(arm: Arm) -> Iterator[str]:
+    for joint in arm.joints:
+        unit = "m" if joint.slides else "rad"
+        home = joint.multiplier * joint.drive.home + joint.offset
+        if not joint.lower <= home <= joint.upper:
+            limits = f"[{joint.lower:g}, {joint.upper:g}] {unit}"
+            yield f"joint {joint.name!r} has its home at {home:g} {unit}, outside its limits {limits}"
+        if arm.jaw is not None and arm.jaw.joint == joint.name:
+            for what, value in (("open", arm.jaw.open), ("closed", arm.jaw.closed)):
+                if not joint.lower <= value <= joint.upper:
+                    limits = f"[{joint.lower:g}, {joint.upper:g}]"
+                    yield f"the jaw is {what} at {value:g} {unit}, outside the limits {limits} of joint {joint.name!r}"
+
+
+def _remote_center_findings(arm: Arm) -> Iterator[str]:
+    if arm.remote_center is None:
+        return
+    shares = np.random.default_rng(0).uniform(size=(200, len(arm.actuated)))
+    worst = float(np.max(arm.remote_center_error(arm.lower + shares * (arm.upper - arm.lower))))
+    if worst > CENTER:
+        yield (
+            f"the z axis of the remote_center link {arm.remote_center!r} misses the origin of the base frame by up to "
+            f"{1000 * worst:.3g} mm; name the shaft's link and make that origin the remote center, or leave the key out"
+        )
+
+
+def _model(arm: Arm) -> mujoco.MjModel:
+    """The arm alone, under the physics of a scene."""
+    spec = build_spec(arm, "position")
+    set_physics(spec)
+    try:
+        return spec.compile()
+    except (ValueError, mujoco.FatalError) as error:
+        raise ValueError(f"arm {arm.name!r} does not compile: {' '.join(str(error).split())}") from None
+
+
+def _collision_findings(arm: Arm, model: mujoco.MjModel) -> Iterator[str]:
+    geoms = [int(geom) for geom in np.flatnonzero(model.geom_group == COLLISION_GROUP)]
+    if not geoms:
+        yield "it has no <collision>, so other arms can't touch it; give at least its tool a cylinder"
+    data = _at(arm, model, arm.home)
+    for a, b in combinations(geoms, 2):
+        if _meet_by_design(arm, model, a, b):
+            continue
+        depth = -mujoco.mj_geomDistance(model, data, a, b, 1.0, None)
+        if depth > 0:
+            yield (
+                f"at home its collision shapes {model.geom(a).name!r} and {model.geom(b).name!r} overlap by "
+                f"{1000 * depth:.3g} mm; change home or make the shapes smaller"
+            )
+
+
+def _meet_by_design(arm: Arm, model: mujoco.MjModel, a: int, b: int) -> bool:
+    """Whether two geoms are on one body, are neighbours with no collision geom between them, or are jaw fingers."""
+    if neighbours(model, a, b):
+        return True
+    one, other = (int(model.body_weldid[model.geom_bodyid[geom]]) for geom in (a, b))
+    leaders = {joint.name: joint.leader for joint in arm.joints}
+    moved_by = [leaders[model.joint(int(model.body_jntadr[body])).name] for body in (one, other) if body != 0]
+    return len(moved_by) == 2 and moved_by[0] == moved_by[1]
+
+
+def _at(arm: Arm, model: mujoco.MjModel, q: np.ndarray) -> mujoco.MjData:
+    """The arm at rest at joint positions [n], where its position targets are too."""
+    data = mujoco.MjData(model)
+    values = dict(zip((joint.name for joint in arm.actuated), q, strict=True))
+    for joint in arm.joints:
+        value = joint.multiplier * values[joint.leader] + joint.offset
+        data.joint(joint.name).qpos = value
+    mujoco.mj_fwdPosition(model, data)
+    data.ctrl[:] = data.actuator_length
+    mujoco.mj_forward(model, data)
+    return data
+
+
+def _controller_findings(arm: Arm, model: mujoco.MjModel) -> Iterator[str]:
+    """Steps C MuJoCo from slightly disturbed postures: a disturbance of a stable arm does not grow.
+
+    Joint limits, dry friction and effort limits only bound a disturbance that grows, as chatter, so they are left out.
+    """
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    model.actuator_forcelimited[:], model.jnt_actfrclimited[:] = 0, 0
+    shares = np.random.default_rng(0).uniform(size=(POSTURES, len(arm.actuated)))
+    for q in (arm.home, *(arm.lower + shares * (arm.upper - arm.lower))):
+        data, step = _at(arm, model, q), np.zeros((2 * model.nv, 2 * model.nv))
+        with _no_log():
+            mujoco.mjd_transitionFD(model, data, 1e-6, True, step, None, None, None)
+        if data.warning.number.any() or not np.isfinite(step).all():  # beyond all numbers in a single step
+            name = max(arm.joints, key=lambda joint: joint.drive.stiffness).name
+        else:
+            growth, modes = np.linalg.eig(step)
+            worst = int(np.argmax(np.abs(growth)))
+            if np.abs(growth[worst]) <= 1 + GROWTH:
+                continue
+            name = model.joint(int(np.argmax(np.abs(modes[: model.nv, worst])))).name
+        yield (
+            f"its controller is unstable at the physics step of {1000 * TIMESTEP:g} ms, joint {name!r} most of all; "
+            "lower stiffness, or raise armature or damping"
+        )
+        return
+
+
+@contextmanager
+def _no_log() -> Iterator[None]:
+    """MuJoCo writes MUJOCO_LOG.TXT into the working folder when numbers run away; here that is a finding instead."""
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda _: None)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)
+
+
+def _scene_findings(scene: Scene) -> Iterator[str]:
+    where = f"scene {scene.name!r}"
+    model, data = scene.model, mujoco.MjData(scene.model)
+    data.qpos[:] = scene.home
+    mujoco.mj_kinematics(model, data)
+    geoms = {agent: collision_geoms(model, agent) for agent in scene.agents}
+    for one, other in combinations(scene.agents, 2):
+        pairs = [(a, b) for a in geoms[one] for b in geoms[other]]
+        depths = {pair: -mujoco.mj_geomDistance(model, data, *pair, 1.0, None) for pair in pairs}
+        worst = max(depths, key=lambda pair: depths[pair], default=None)
+        if worst is not None and depths[worst] > 0:
+            names = " and ".join(repr(model.geom(geom).name) for geom in worst)
+            yield (
+                f"{where}: {one} and {other} overlap at home, {names} by {1000 * depths[worst]:.3g} mm; "
+                "move one of them or change a home"
+            )
+    for agent, mount in scene.mounts.items():
+        q = inverse_kinematics(mount.arm, mount.workspace)
+        off = float(np.linalg.norm(mount.arm.forward_kinematics(q)[:3, 3] - mount.workspace))
+        if off > REACH:
+            yield (
+                f"{where}: the workspace point {mount.workspace.tolist()} of {agent} is {1000 * off:.3g} mm out of its "
+                "reach; it is in the arm's base frame, in m"
+            )

@@ -1,0 +1,67 @@
+"""Scene files: which arms stand where.
+
+    scene = load_scene("bimanual_psm")
+
+A scene file names each agent's arm, where its base frame stands, and the point its targets are drawn around. Which
+geoms can touch is found by `surgical_marl/scenes/contacts.py`.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from surgical_marl.content import find
+from surgical_marl.robots.arm import load_arm
+from surgical_marl.robots.spec import SOLREF
+from surgical_marl.scenes.build import build_scene, compile_scene, weigh_shapes
+from surgical_marl.scenes.contacts import contact_pairs
+from surgical_marl.scenes.randomisation import read_randomisation
+from surgical_marl.scenes.scene import Mount, Scene
+from surgical_marl.scenes.surroundings import add_surroundings, add_tissue
+from surgical_marl.scenes.vectors import read_mapping, read_vector, rotation_matrix
+from surgical_marl.yaml_file import check_keys, read_yaml
+
+
+def load_scene(name: str | Path, control: str = "position") -> Scene:
+    """Reads a scene by a shipped name (`list_scenes()`) or the path of a YAML file.
+
+    Raises:
+        ValueError: unknown name or control mode, or a file that does not hold what a scene must.
+    """
+    path = find("scenes", name)
+    settings = read_yaml(path)
+    check_keys(settings, ("description", "arms", "view", "tissue", "randomisation"), path)
+    arms = settings.get("arms")
+    if not isinstance(arms, dict) or not arms:
+        raise ValueError(f"{path}: arms must map agent names such as psm_0 to arms")
+    mounts = {agent: _read_mount(agent, mount, path) for agent, mount in arms.items()}
+    randomisation = read_randomisation(settings.get("randomisation"), path)
+    spec = build_scene(path.stem, mounts, control, randomisation)
+    add_surroundings(spec, mounts, settings.get("view"), path)
+    for piece, what in read_mapping(settings.get("tissue"), f"{path}, tissue").items():
+        add_tissue(spec, f"tissue/{piece}", what, f"{path}, tissue {piece!r}")
+    model = compile_scene(spec)
+    scene = Scene(path.stem, str(settings.get("description", "")), control, mounts, model, randomisation)
+    for one, other in contact_pairs(scene):
+        spec.add_pair(geomname1=one, geomname2=other, condim=1, solref=SOLREF)
+    return replace(scene, model=weigh_shapes(compile_scene(spec), scene.home))
+
+
+def _read_mount(agent: str, settings: Any, path: Path) -> Mount:
+    where = f"{path}, agent {agent!r}"
+    if not isinstance(settings, dict) or "arm" not in settings:
+        raise ValueError(f"{where}: must be a mapping that names its arm")
+    check_keys(settings, ("arm", "position", "turn", "tilt", "workspace"), where)
+    source = str(settings["arm"])
+    local = path.parent / source  # a user's own arm may be named relative to the scene file
+    arm = load_arm(local if (local / "arm.yaml").is_file() else source)
+    if not re.fullmatch(re.escape(arm.name) + r"_\d+", str(agent)):
+        raise ValueError(f"{where}: an agent of arm {arm.name!r} is called {arm.name}_0, {arm.name}_1 and so on")
+    vectors = {key: read_vector(settings.get(key, [0.0, 0.0, 0.0]), f"{where}, {key}") for key in
+               ("position", "tilt", "workspace")}  # fmt: skip
+    turn = read_vector([0.0, 0.0, settings.get("turn", 0.0)], f"{where}, turn")
+    rotation = rotation_matrix(vectors["tilt"]) @ rotation_matrix(turn)
+    return Mount(arm, vectors["position"], rotation, vectors["workspace"])

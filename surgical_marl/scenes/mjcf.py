@@ -1,0 +1,158 @@
+"""A scene as MJCF, for plain MuJoCo: one text that steps as `Scene.model` does.
+
+    Path("psm.xml").write_text(mjcf(load_scene("psm")))
+    model = mujoco.MjModel.from_xml_path("psm.xml")
+
+It is written from the compiled model, with all digits: `MjSpec.to_xml` rounds to six. Meshes stand in it as numbers.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+from xml.etree.ElementTree import Element, SubElement, indent, tostring
+
+import mujoco
+import numpy as np
+
+from surgical_marl.robots.spec import COLLISION_GROUP
+from surgical_marl.scenes.scene import Scene
+
+
+def mjcf(scene: Scene) -> str:
+    """The text of an MJCF file: same `qpos`, options, pairs and actuators as `scene.model`, and a keyframe `home`.
+
+    What a body weighs in a contact has no place in MJCF: MuJoCo takes it from the body's centre of mass. So the
+    collision shapes of a link are in a body of their own within it, `<link>/contact`, without mass, whose centre is
+    where the link weighs what it weighs in `scene.model` (`_weigh_shapes` in `scene.py`), or comes nearest to it.
+    """
+    model = scene.model
+    root = Element("mujoco", model=scene.name)
+    _add(root, "compiler", angle="radian")
+    _add(root, "option", timestep=model.opt.timestep, gravity=model.opt.gravity,
+         integrator=_word(mujoco.mjtIntegrator(model.opt.integrator)),
+         jacobian=_word(mujoco.mjtJacobian(model.opt.jacobian)))  # fmt: skip
+    _add(_add(root, "default"), "geom", contype=0, conaffinity=0, mass=0)
+    assets = _add(root, "asset")
+    for mesh in map(model.mesh, range(model.nmesh)):
+        rows = slice(mesh.vertadr[0], mesh.vertadr[0] + mesh.vertnum[0])
+        faces = slice(mesh.faceadr[0], mesh.faceadr[0] + mesh.facenum[0])
+        _add(assets, "mesh", name=mesh.name, vertex=model.mesh_vert[rows], face=model.mesh_face[faces], inertia="shell")
+    bodies = [_add(root, "worldbody")]
+    for body in range(model.nbody):
+        if body > 0:
+            bodies.append(_add_body(bodies[model.body_parentid[body]], model, body))
+        _add_parts(bodies[body], model, body)
+    pairs = _add(root, "contact")
+    for (one, other), pair in zip(scene.pairs, range(model.npair), strict=True):
+        _add(pairs, "pair", geom1=one, geom2=other, condim=model.pair_dim[pair], solref=model.pair_solref[pair])
+    _add_actuators(root, model)
+    holding = np.where(model.actuator_biasprm[:, 1] != 0, scene.moment @ scene.home, 0.0)
+    _add(_add(root, "keyframe"), "key", name="home", qpos=scene.home, ctrl=holding)
+    indent(root)
+    return tostring(root, encoding="unicode") + "\n"
+
+
+def _add(parent: Element, tag: str, **attributes: Any) -> Element:
+    """A child element; an attribute of None is left out."""
+    given = {key: value for key, value in attributes.items() if value is not None}
+    texts = {key.rstrip("_"): value if isinstance(value, str) else _numbers(value) for key, value in given.items()}
+    return SubElement(parent, tag, texts)
+
+
+def _numbers(value: Any) -> str:
+    """Numbers that read back as the same ones."""
+    return " ".join(repr(number) for number in np.ravel(value).tolist())
+
+
+def _word(value: Any) -> str:
+    """What MJCF calls a value of an enumeration: mjINT_IMPLICITFAST is implicitfast."""
+    return str(value.name.split("_")[1].lower())
+
+
+def _add_body(parent: Element, model: mujoco.MjModel, body: int) -> Element:
+    element = _add(parent, "body", name=model.body(body).name, pos=model.body_pos[body], quat=model.body_quat[body])
+    if model.body_mass[body] > 0:
+        _add(element, "inertial", pos=model.body_ipos[body], quat=model.body_iquat[body], mass=model.body_mass[body],
+             diaginertia=model.body_inertia[body])  # fmt: skip
+    for joint in np.flatnonzero(model.jnt_bodyid == body):
+        dof = model.jnt_dofadr[joint]
+        _add(element, "joint", name=model.joint(joint).name, type=_word(mujoco.mjtJoint(model.jnt_type[joint])),
+             pos=model.jnt_pos[joint], axis=model.jnt_axis[joint], range=model.jnt_range[joint],
+             solreflimit=model.jnt_solref[joint], actuatorfrcrange=model.jnt_actfrcrange[joint],
+             damping=model.dof_damping[dof], armature=model.dof_armature[dof],
+             frictionloss=model.dof_frictionloss[dof])  # fmt: skip
+    return element
+
+
+def _add_parts(element: Element, model: mujoco.MjModel, body: int) -> None:
+    """What is fixed to a body: shapes, sites, cameras, lights."""
+    shapes = np.flatnonzero(model.geom_bodyid == body)
+    collides = model.geom_group[shapes] == COLLISION_GROUP
+    touching = element
+    if collides.any() and model.body_weldid[body] > 0:
+        touching = _add(element, "body", name=f"{model.body(body).name}/contact")
+        # its axes are the link's: MuJoCo takes them for those of a shape that is turned alike
+        _add(touching, "inertial", pos=_contact_center(model, body, shapes[collides]), quat=model.body_iquat[body],
+             mass=0, diaginertia=np.zeros(3))  # fmt: skip
+    for geom, touches in zip(shapes, collides, strict=True):
+        kind, mesh = mujoco.mjtGeom(model.geom_type[geom]), int(model.geom_dataid[geom])
+        _add(touching if touches else element, "geom", name=model.geom(geom).name or None, type=_word(kind),
+             size=model.geom_size[geom] if mesh < 0 else None, mesh=model.mesh(mesh).name if mesh >= 0 else None,
+             pos=model.geom_pos[geom], quat=model.geom_quat[geom], group=model.geom_group[geom],
+             rgba=model.geom_rgba[geom].astype(float).round(6))  # fmt: skip
+    for site in np.flatnonzero(model.site_bodyid == body):
+        _add(element, "site", name=model.site(site).name, pos=model.site_pos[site], quat=model.site_quat[site],
+             size=model.site_size[site], group=model.site_group[site])  # fmt: skip
+    for camera in np.flatnonzero(model.cam_bodyid == body):
+        _add(element, "camera", name=model.camera(camera).name, pos=model.cam_pos[camera],
+             quat=model.cam_quat[camera], fovy=model.cam_fovy[camera])  # fmt: skip
+    for light in np.flatnonzero(model.light_bodyid == body):
+        _add(element, "light", pos=model.light_pos[light], dir=model.light_dir[light])
+
+
+def _contact_center(model: mujoco.MjModel, body: int, geoms: np.ndarray) -> np.ndarray:
+    """The point of a link, in its frame, where it weighs `body_invweight0` (1/kg) with all joints at zero, [3].
+
+    What a link weighs at a point is quadratic: the point lies on the line from where it is least through the shapes.
+    """
+    data = mujoco.MjData(model)
+    mujoco.mj_fwdPosition(model, data)
+
+    def spread(point: np.ndarray, turning: bool = False) -> np.ndarray:
+        jacobians = np.zeros((2, 3, model.nv))
+        mujoco.mj_jac(model, data, *jacobians, point, body)
+        jacobian, moved = jacobians[int(turning)], np.zeros((3, model.nv))
+        mujoco.mj_solveM(model, data, moved, jacobian)
+        return jacobian @ moved.T
+
+    def weight(point: np.ndarray) -> float:
+        return float(np.trace(spread(point))) / 3
+
+    shapes = data.geom_xpos[geoms].mean(0)
+    turns = spread(shapes, turning=True)
+    curvature = (np.trace(turns) * np.eye(3) - turns) / 3
+    slope = np.array([weight(shapes + way) - weight(shapes - way) for way in np.eye(3)]) / 2
+    least = shapes - np.linalg.pinv(curvature, rcond=1e-9) @ slope / 2
+    way, lightest = shapes - least, weight(least)
+    if weight(shapes) - lightest <= 1e-6 * lightest:  # the shapes are there themselves
+        way = np.linalg.eigh(curvature)[1][:, 2]
+    grown = weight(least + way) - lightest
+    share = max(model.body_invweight0[body, 0] - lightest, 0.0) / grown if grown > 0 else 1.0
+    point = least + np.sqrt(share) * way
+    return data.xmat[body].reshape(3, 3).T @ (point - data.xpos[body])
+
+
+def _add_actuators(root: Element, model: mujoco.MjModel) -> None:
+    tendons = _add(root, "tendon")
+    for i in range(model.ntendon):
+        fixed = _add(tendons, "fixed", name=model.tendon(i).name, armature=model.tendon_armature[i])
+        for wrap in range(model.tendon_adr[i], model.tendon_adr[i] + model.tendon_num[i]):
+            _add(fixed, "joint", joint=model.joint(model.wrap_objid[wrap]).name, coef=model.wrap_prm[wrap])
+    actuators = _add(root, "actuator")
+    for i in range(model.nu):
+        pulls_joint, target = model.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT, model.actuator_trnid[i, 0]
+        _add(actuators, "general", name=model.actuator(i).name,
+             joint=model.joint(target).name if pulls_joint else None,
+             tendon=None if pulls_joint else model.tendon(target).name,
+             gainprm=model.actuator_gainprm[i, :1], biastype="affine", biasprm=model.actuator_biasprm[i, :3],
+             ctrlrange=model.actuator_ctrlrange[i], forcerange=model.actuator_forcerange[i])  # fmt: skip

@@ -1,0 +1,169 @@
+"""A scene: arms mounted in a world, as one MuJoCo model.
+
+scene = load_scene("bimanual_psm")
+scene.agents                                # ("psm_0", "psm_1")
+scene.model                                 # mujoco.MjModel; names of an arm start with "psm_0/"
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from surgical_marl.content import unknown
+from surgical_marl.robots.arm import Arm
+from surgical_marl.robots.spec import COLLISION_GROUP
+from surgical_marl.scenes.geometry import Capsule, capsule_distance
+from surgical_marl.scenes.randomisation import Randomisation
+
+TIMESTEP = 0.0025
+"""Physics step in s. docs/physics.md has the stability test that chose it."""
+DECIMATION = 8
+"""Physics steps a control step: control at 50 Hz."""
+PAYLOAD = "payload"
+"""The body at an arm's tool tip that stands for what it carries, where that is randomised: `<agent>/payload`."""
+
+
+@dataclass(frozen=True)
+class Mount:
+    """An arm in a scene."""
+
+    arm: Arm
+    position: np.ndarray
+    """Origin of the base frame in the world, m, shape [3]."""
+    rotation: np.ndarray
+    """Axes of the base frame in the world, shape [3, 3]."""
+    workspace: np.ndarray
+    """The point in front of the arm that targets are drawn around, base frame, m, shape [3]."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Arms in a world. `model` holds them all; `control` is how their actuators read commands."""
+
+    name: str
+    description: str
+    control: str
+    mounts: dict[str, Mount]
+    model: mujoco.MjModel = field(repr=False)
+    randomisation: Randomisation
+    """How far arms are from the model and from what is measured; not at all unless the file says so."""
+
+    @property
+    def agents(self) -> tuple[str, ...]:
+        """Names `<arm>_<number>`, in the order of the scene file."""
+        return tuple(self.mounts)
+
+    @cached_property
+    def types(self) -> dict[str, tuple[str, ...]]:
+        """Agents by the arm they are: {"psm": ("psm_0", "psm_1")}."""
+        names = dict.fromkeys(mount.arm.name for mount in self.mounts.values())
+        return {name: tuple(a for a in self.agents if self.mounts[a].arm.name == name) for name in names}
+
+    def find_camera(self, agent: str | None = None) -> str:
+        """The agent whose camera that is: the first that has one, or the one that is named. ValueError without any."""
+        found = [name for name, mount in self.mounts.items() if mount.arm.camera is not None]
+        if not found:
+            raise ValueError(f"scene {self.name!r} has no endoscope: no arm of {', '.join(self.agents)} has a camera")
+        if agent is not None and agent not in found:
+            raise unknown("agent with a camera", agent, found)
+        return agent or found[0]
+
+    @property
+    def home(self) -> np.ndarray:
+        """`qpos` with every arm at its home, shape [nq]."""
+        return self.full_qpos({agent: mount.arm.home for agent, mount in self.mounts.items()})
+
+    def qpos_index(self, agent: str) -> np.ndarray:
+        """Where the actuated joints of an agent stand in `qpos`, shape [n]."""
+        names = [joint.name for joint in self.mounts[agent].arm.actuated]
+        return np.array([self.model.joint(f"{agent}/{name}").qposadr[0] for name in names])
+
+    def full_qpos(self, q: dict[str, np.ndarray]) -> np.ndarray:
+        """`qpos` [..., nq] from each agent's actuated joints [..., n]: joints that mimic another follow it."""
+        batch = np.broadcast_shapes(*(np.shape(value)[:-1] for value in q.values()))
+        qpos = np.zeros((*batch, self.model.nq))
+        for agent, mount in self.mounts.items():
+            names = [joint.name for joint in mount.arm.actuated]
+            for joint in mount.arm.joints:
+                address = self.model.joint(f"{agent}/{joint.name}").qposadr[0]
+                qpos[..., address] = joint.multiplier * q[agent][..., names.index(joint.leader)] + joint.offset
+        return qpos
+
+    @cached_property
+    def moment(self) -> np.ndarray:
+        """What the actuators act on, [nu, nv]: 1 at a joint's own, the coefficients of a cable's joints at a cable's.
+
+        `moment @ qpos` commands a posture to position control, `moment @ qvel` velocities to velocity control.
+        """
+        data, moment = mujoco.MjData(self.model), np.zeros((self.model.nu, self.model.nv))
+        mujoco.mj_fwdPosition(self.model, data)
+        rows = data.moment_rownnz, data.moment_rowadr, data.moment_colind
+        mujoco.mju_sparse2dense(moment, data.actuator_moment, *rows)
+        return moment
+
+    @cached_property
+    def pairs(self) -> tuple[tuple[str, str], ...]:
+        """Geoms that can touch, by their names `<agent>/<geom>`, in the order of `State.contacts`."""
+        geom = self.model.geom
+        ids = zip(self.model.pair_geom1, self.model.pair_geom2, strict=True)
+        return tuple((geom(int(a)).name, geom(int(b)).name) for a, b in ids)
+
+    @property
+    def fingerprint(self) -> bytes:
+        """What kinematics and shapes come from: equal for scenes that move and touch alike."""
+        m = self.model
+        numbers = (m.body_parentid, m.body_pos, m.body_quat, m.jnt_axis, m.jnt_pos, m.jnt_range, m.jnt_type, m.site_pos,
+                   m.geom_bodyid, m.geom_group, m.geom_type, m.geom_size, m.geom_pos, m.geom_quat, self.home,
+                   *(mount.workspace for mount in self.mounts.values()))  # fmt: skip
+        joints = {
+            agent: mount.arm.joints for agent, mount in self.mounts.items()
+        }  # what mimics what is not in the model
+        return repr(joints).encode() + b"".join(np.ascontiguousarray(number).tobytes() for number in numbers)
+
+    def clearance(self, q: dict[str, np.ndarray], within: bool = False) -> np.ndarray:
+        """Least distance in m of any two arms, or of parts within one arm; inf if there is no such pair.
+
+        `q` holds each agent's joints [..., n]; the result is [...].
+        """
+        capsules = self.capsules(q)
+        least: Any = np.full(np.broadcast_shapes(*(np.shape(value)[:-1] for value in q.values())), np.inf)
+        ids = zip(self.model.pair_geom1, self.model.pair_geom2, strict=True)
+        for (one, other), (a, b) in zip(self.pairs, ids, strict=True):
+            if (one.split("/")[0] == other.split("/")[0]) == within:
+                least = np.minimum(least, capsule_distance(capsules[a], capsules[b]))
+        return np.asarray(least)
+
+    def capsules(self, q: dict[str, np.ndarray]) -> dict[int, Capsule]:
+        """Axis ends in the world and radius of every collision geom, by geom id; joints of each agent [..., n]."""
+        model, capsules = self.model, {}
+        for agent, mount in self.mounts.items():
+            geoms = collision_geoms(model, agent)
+            links = {geom: model.body(model.geom_bodyid[geom]).name.removeprefix(f"{agent}/") for geom in geoms}
+            poses = mount.arm.link_poses(q[agent], tuple(dict.fromkeys(links.values())))
+            for geom in geoms:
+                rotation = np.zeros(9)
+                mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
+                # a sphere has no half length: MuJoCo leaves zero there
+                half = rotation.reshape(3, 3)[:, 2] * model.geom_size[geom, 1]
+                pose = poses[links[geom]] @ _transform(model.geom_pos[geom])
+                a, b = ((pose[..., :3, :3] @ end + pose[..., :3, 3]) @ mount.rotation.T + mount.position
+                        for end in (-half, half))  # fmt: skip
+                capsules[geom] = (a, b, float(model.geom_size[geom, 0]))
+        return capsules
+
+
+def collision_geoms(model: mujoco.MjModel, agent: str) -> list[int]:
+    """Ids of the collision geoms of one agent."""
+    ids = np.flatnonzero(model.geom_group == COLLISION_GROUP)
+    return [int(i) for i in ids if model.geom(int(i)).name.startswith(f"{agent}/")]
+
+
+def _transform(position: np.ndarray) -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[:3, 3] = position
+    return matrix

@@ -1,0 +1,77 @@
+"""What tasks with moving targets share: a row of a table of paths, and a time on it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from surgical_marl.tasks.base import spline
+from surgical_marl.tasks.base.paths import KNOT, SEGMENTS, path_table
+from surgical_marl.tasks.base.task import Level, Task
+
+if TYPE_CHECKING:
+    from surgical_marl.scenes.scene import Scene
+
+
+class PathGoal(NamedTuple):
+    """Where targets are, and where they go."""
+
+    targets: Array
+    """[arms, 3], m, each in its arm's base frame."""
+    row: Array
+    """Of the table of paths."""
+    time: Array
+    """Since the start of the episode, s."""
+
+
+class PathTask(Task):
+    """A task whose targets move along paths of `surgical_marl/tasks/base/paths.py`, which `draw` draws."""
+
+    max_steps = 250
+
+    @staticmethod
+    def draw(rng: np.random.Generator, count: int, start: np.ndarray, level: Level) -> np.ndarray:
+        """One of the ways to draw paths in `surgical_marl/tasks/base/paths.py`."""
+        raise NotImplementedError
+
+    def __init__(self, scene: Scene, difficulty: str = "default", reward: Mapping[str, float] | None = None) -> None:
+        super().__init__(scene, difficulty, reward)
+        table = path_table(scene, self.draw, self.level)
+        self.closed = np.isclose(table[:, :3], table[:, -3:], rtol=0, atol=1e-7).all(axis=(1, 2, 3))
+        self.table = jnp.asarray(table, jnp.float32)
+
+    def start(self, key: Array) -> PathGoal:
+        """A path, at its start."""
+        row, time = jax.random.randint(key, (), 0, len(self.table)), jnp.float32(0.0)
+        return PathGoal(self.along(row, time), row, time)
+
+    def advance(self, goal: PathGoal, dt: float) -> PathGoal:
+        """The targets `dt` seconds further on their paths."""
+        time = goal.time + np.float32(dt)
+        return PathGoal(self.along(goal.row, time), goal.row, time)
+
+    def along(self, row: Array, time: Array) -> Array:
+        """Targets [arms, 3] at a time in s, or [..., arms, 3] at times [...]. At the end of a closed path its next
+        round begins; targets of an open one rest there."""
+        near, f = self._near(row, time)
+        return (jnp.stack(spline.weights(f), axis=-1)[..., None, None] * near).sum(-3)
+
+    def velocities(self, goal: PathGoal) -> Array:
+        """Of the targets, [arms, 3], m/s."""
+        near, f = self._near(goal.row, goal.time)
+        slopes = jnp.stack(spline.slopes(f), axis=-1) / np.float32(KNOT)
+        rests = ~jnp.asarray(self.closed)[goal.row] & (goal.time >= np.float32(SEGMENTS * KNOT))
+        return jnp.where(rests, 0.0, (slopes[..., None, None] * (near[1:] - near[:-1])).sum(-3))
+
+    def _near(self, row: Array, time: Array) -> tuple[Array, Array]:
+        """The four control points [..., 4, arms, 3] of the segment at a time, and the share of it that has passed."""
+        u = time * np.float32(1 / KNOT)
+        around = u - SEGMENTS * jnp.floor(u / np.float32(SEGMENTS))
+        u = jnp.where(jnp.asarray(self.closed)[row], around, jnp.minimum(u, np.float32(SEGMENTS)))
+        k = jnp.clip(jnp.floor(u).astype(jnp.int32), 0, SEGMENTS - 1)
+        return self.table[row, k[..., None] + np.arange(4)], u - k.astype(jnp.float32)

@@ -1,0 +1,142 @@
+"""Targets that a scene's arms can reach: drawn on the host once, looked up by the environments.
+
+Targets are drawn from a normal distribution about the point in front of each arm, and a draw is kept only if every arm
+reaches its target within its joint limits and in time, and if the arms stay apart both there and on the straight
+joint-space path from home. An environment then picks rows of the table, so a reset costs one lookup, whatever the arm.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import combinations
+
+import numpy as np
+
+from surgical_marl.cache import cached
+from surgical_marl.robots.inverse_kinematics import inverse_kinematics
+from surgical_marl.scenes.scene import Scene
+
+TABLE_SIZE = 4096
+CLEARANCE = 0.01
+"""Arms stay this far apart on the way to their targets, m."""
+PATH_POINTS = 8
+CROSSING_POINTS = 6
+TIME = 1.5
+"""Arms get to their targets in this time at their joints' speeds, s: an episode of `reach` leaves them half a second to
+settle."""
+MOST_BATCHES = 8
+"""So many are drawn in search of targets that cross."""
+TOLERANCE = 1e-4
+"""A target is reached when inverse kinematics comes this close, m."""
+
+
+def target_table(scene: Scene, spread: float, crossing: float = 0.0, seed: int = 0) -> np.ndarray:
+    """Reachable, collision-free targets for all arms of a scene at once.
+
+    Args:
+        spread: standard deviation of the draws in m, the same along each axis.
+        crossing: share of rows, 0 to 1, in which the straight joint-space paths of two arms from home collide, if the
+            one has come far and the other not yet, though all are apart at their targets. These are drawn about the
+            middle between the points in front of an arm and of the next.
+        seed: of the draws; the same seed gives the same table.
+
+    Returns:
+        Targets [TABLE_SIZE, arms, 3] in each arm's base frame, m. Kept on disk by content, so a second call is quick.
+
+    Raises:
+        ValueError: if fewer than one draw in a hundred can be kept.
+    """
+    crossing = crossing if len(scene.agents) > 1 else 0.0
+    speeds = [mount.arm.speed.tolist() for mount in scene.mounts.values()]
+    settings = repr(
+        (TABLE_SIZE, CLEARANCE, PATH_POINTS, CROSSING_POINTS, TOLERANCE, TIME, speeds, spread, crossing, seed)
+    )
+    return cached("targets", lambda: _draw(scene, spread, crossing, seed), settings, scene.fingerprint)
+
+
+def choose(
+    scene: Scene, batch: Callable[[bool], tuple[np.ndarray, np.ndarray]], rows: int, crossing: float
+) -> np.ndarray:
+    """So many rows from batches of draws, a share of them crossing.
+
+    Args:
+        scene: for the message.
+        batch: draws about `rows` of them and gives those that can be kept [n, ...] and which of these cross, [n] bool.
+            If it is called with True, only those that cross are needed. It is called until there are enough. If a
+            batch or `MOST_BATCHES` show that the arms never or hardly meet, others stand in for those that cross.
+        rows: how many.
+        crossing: share of rows that cross, 0 to 1.
+
+    Raises:
+        ValueError: if fewer than one draw in a hundred can be kept.
+    """
+    wanted, drawn = round(crossing * rows), 0
+    plain: list[np.ndarray] = []
+    crossed: list[np.ndarray] = []
+    while not (enough := sum(map(len, plain)) >= rows) or sum(map(len, crossed)) < wanted:
+        if enough and drawn >= MOST_BATCHES:
+            break
+        found, crosses = batch(enough)
+        if enough and not len(found):  # arms that never meet
+            break
+        plain.append(found[~crosses])
+        crossed.append(found[crosses])
+        drawn += 1
+        if drawn >= 4 and sum(map(len, plain)) < drawn * rows / 100:
+            raise ValueError(
+                f"scene {scene.name!r}: fewer than 1 % of targets are within reach without collision; move the arms or "
+                "their workspace points"
+            )
+    chosen = np.concatenate(crossed)[:wanted]
+    return np.concatenate([np.concatenate(plain)[: rows - len(chosen)], chosen])
+
+
+def _draw(scene: Scene, spread: float, crossing: float, seed: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+
+    def batch(only_crossing: bool) -> tuple[np.ndarray, np.ndarray]:
+        targets = rng.normal(0.0, spread, (TABLE_SIZE, len(scene.agents), 3))
+        targets += _between(scene) if only_crossing else [mount.workspace for mount in scene.mounts.values()]
+        goals, good = _reach(scene, targets)
+        if only_crossing:
+            good &= (scene.clearance(goals) > CLEARANCE) & _cross(scene, goals)
+        else:
+            for share in np.linspace(0.0, 1.0, PATH_POINTS + 1)[1:]:
+                way = {a: (1 - share) * scene.mounts[a].arm.home + share * q for a, q in goals.items()}
+                good &= scene.clearance(way) > CLEARANCE
+        return targets[good], np.full(good.sum(), only_crossing)
+
+    return choose(scene, batch, TABLE_SIZE, crossing)
+
+
+def _reach(scene: Scene, targets: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Joint positions [N, n] of each agent at its targets [N, arms, 3], and whether all get there, and in time, [N]."""
+    good, goals = np.ones(len(targets), dtype=bool), {}
+    for i, agent in enumerate(scene.agents):
+        arm = scene.mounts[agent].arm
+        goals[agent] = inverse_kinematics(arm, targets[:, i], starts=1)
+        tips = arm.forward_kinematics(goals[agent])[:, :3, 3]
+        good &= np.linalg.norm(tips - targets[:, i], axis=-1) < TOLERANCE
+        good &= (np.abs(goals[agent] - arm.home) <= TIME * arm.speed).all(-1)
+    return goals, good
+
+
+def _cross(scene: Scene, goals: dict[str, np.ndarray]) -> np.ndarray:
+    """Where two arms collide at any two points of their straight ways from home, the others being there, [N] bool."""
+    least = np.full(len(next(iter(goals.values()))), np.inf)
+    shares = np.linspace(0.0, 1.0, CROSSING_POINTS)[:, None]
+    for one, other in combinations(scene.agents, 2):
+        way = {}
+        for agent, mount in scene.mounts.items():
+            path = mount.arm.home + shares * (goals[agent] - mount.arm.home)[:, None]
+            way[agent] = {one: path[:, :, None], other: path[:, None]}.get(agent, mount.arm.home)
+        least = np.minimum(least, scene.clearance(way).min((1, 2)))
+    return least < 0
+
+
+def _between(scene: Scene) -> np.ndarray:
+    """For each arm, in its base frame, the middle between the points in front of it and of the next arm, [arms, 3]."""
+    mounts = list(scene.mounts.values())
+    world = np.array([mount.rotation @ mount.workspace + mount.position for mount in mounts])
+    middle = (world + np.roll(world, -1, axis=0)) / 2
+    return np.array([(point - mount.position) @ mount.rotation for point, mount in zip(middle, mounts, strict=True)])

@@ -1,0 +1,145 @@
+"""Pictures from a scene's endoscope for many environments at once: colour, depth and what each pixel shows.
+
+    endoscope = Endoscope(load_scene("trimanual_psm_ecm"), num_envs=1024)
+    view = endoscope.render(env.qpos)           # joint positions [N, nq], numpy or torch
+    view.rgb                                    # [N, eyes, 64, 64, 3] uint8
+
+Pictures follow from joint positions alone, which any engine has: there is no second physics. MuJoCo Warp finds where
+the bodies are and `vision/raycaster.py` draws them, on a GPU or a CPU by the same code; docs/rendering.md compares
+the pictures with C MuJoCo's ray caster.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from surgical_marl.content import unknown
+from surgical_marl.runtime import prepare_mjx, prepare_warp
+from surgical_marl.scenes.scene import Scene
+
+SIZE = 64
+"""Pixels along each side of a picture."""
+EYES = ("left", "right")
+CHANNELS = ("rgb", "depth", "segmentation")
+_TYPES = {"rgb": torch.uint8, "depth": torch.float32, "segmentation": torch.int32}
+BACKGROUND = (0.05, 0.02, 0.02)
+"""What no geom covers: the dark of a body cavity."""
+
+
+@dataclass(frozen=True)
+class View:
+    """What the endoscopes of N environments see. Of the library that `render` was given; E eyes, H rows, W columns.
+    What was not asked for is None."""
+
+    rgb: Any = None
+    """[N, E, H, W, 3] uint8"""
+    depth: Any = None
+    """[N, E, H, W] float32: distance along the optical axis, m; 0 where nothing is."""
+    segmentation: Any = None
+    """[N, E, H, W] int32: the geom's id in `scene.model`, -1 where nothing is. `Endoscope.labels` says whose it is."""
+
+
+class Endoscope:
+    """The camera of one agent, in N copies of its scene.
+
+    Visual geoms only (groups 0 to 2), as in all pictures. A pixel takes 3 bytes of colour, 4 of depth and 4 of
+    segmentation: 64 x 64 in all channels 44 KiB an eye.
+
+    Args:
+        scene: a scene of which an arm has a `camera`.
+        num_envs: N.
+        device: "cpu" or "cuda".
+        width, height: of a picture, pixels. The field of view is the arm's, from top to bottom.
+        stereo: both eyes; else the left one.
+        channels: what to draw, of `CHANNELS`.
+        agent: whose camera; None for the first agent that has one.
+
+    Raises:
+        ValueError: a scene without an endoscope, an agent without one, a size or number below 1, an unknown channel,
+            or a device that is not there.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        num_envs: int = 1,
+        device: str = "cpu",
+        *,
+        width: int = SIZE,
+        height: int = SIZE,
+        stereo: bool = False,
+        channels: tuple[str, ...] = ("rgb",),
+        agent: str | None = None,
+    ) -> None:
+        for name, value in (("num_envs", num_envs), ("width", width), ("height", height)):
+            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+                raise ValueError(f"{name} must be a whole number of at least 1, not {value!r}")
+        for channel in channels:
+            if channel not in CHANNELS:
+                raise unknown("channel", channel, CHANNELS)
+        if device not in ("cpu", "cuda") or (device == "cuda" and not torch.cuda.is_available()):
+            raise ValueError(f"device {device!r} is not there: the devices are cpu, and cuda where torch finds it")
+        self.scene, self.num_envs, self.device, self.channels = scene, num_envs, device, tuple(channels)
+        self.agent = scene.find_camera(agent)
+        self.eyes = EYES if stereo else EYES[:1]
+        self.labels, self.label_names = _labels(scene)
+        self._shape = num_envs, len(self.eyes), height, width
+        prepare_mjx()
+        self._warp = prepare_warp()
+        from mujoco.mjx.third_party import mujoco_warp
+
+        from surgical_marl.vision.raycaster import RayCaster
+
+        self._mujoco = mujoco_warp
+        cameras = [scene.model.camera(f"{self.agent}/{eye}").id for eye in self.eyes]
+        with self._warp.ScopedDevice(device):
+            self._model = mujoco_warp.put_model(scene.model)
+            self._data = mujoco_warp.make_data(scene.model, num_envs, nconmax=0, njmax=0)
+            self._caster = RayCaster(scene.model, cameras, num_envs, width, height, BACKGROUND)
+        self._qpos = self._warp.to_torch(self._data.qpos)
+        self._warp.synchronize_device(device)  # what made the arrays ran on a stream of Warp's own
+
+    def render(self, qpos: Any) -> View:
+        """What the endoscopes see at joint positions [N, nq] of the whole scene: numpy for numpy, and torch for torch.
+
+        On a GPU it follows what torch's current stream has to do, and given torch nothing waits or passes through the
+        host: after a first call it can be captured in a CUDA graph.
+        """
+        if tuple(qpos.shape) != tuple(self._qpos.shape):
+            raise ValueError(f"qpos of shape {tuple(qpos.shape)} must be {tuple(self._qpos.shape)}")
+        given = torch.is_tensor(qpos)
+        self._qpos.copy_(qpos if given else torch.from_numpy(np.array(qpos, np.float32)))
+        drawn = {name: self._empty(name) for name in CHANNELS}
+        with self._stream():
+            self._mujoco.kinematics(self._model, self._data)
+            self._mujoco.camlight(self._model, self._data)
+            self._caster.draw(self._data, **drawn)
+        found = {name: drawn[name].unflatten(0, self._shape[:2]) for name in self.channels}
+        return View(**(found if given else {name: picture.cpu().numpy() for name, picture in found.items()}))
+
+    def _empty(self, channel: str) -> torch.Tensor:
+        """Pictures to draw on, [N * E, H, W] or with [3] colours; none of a channel that nobody asked for."""
+        envs, eyes, height, width = self._shape
+        pictures = envs * eyes if channel in self.channels else 0
+        colours = (3,) if channel == "rgb" else ()
+        return torch.empty((pictures, height, width, *colours), dtype=_TYPES[channel], device=self.device)
+
+    def _stream(self) -> Any:
+        if self.device == "cpu":
+            return self._warp.ScopedDevice("cpu")
+        # Nothing is left to do on Warp's own stream, and to wait for it would break a capture.
+        stream = self._warp.stream_from_torch(torch.cuda.current_stream())
+        return self._warp.ScopedStream(stream, sync_enter=False)
+
+
+def _labels(scene: Scene) -> tuple[np.ndarray, tuple[str, ...]]:
+    """For `labels[segmentation]`: whose a geom is, int32 [ngeom + 1], the last for -1; and the names of the labels."""
+    names = ("nothing", "tissue", *scene.agents)
+    model = scene.model
+    owners = [model.body(body).name.split("/")[0] for body in model.geom_bodyid]
+    own = [names.index(owner) if owner in scene.agents else 1 for owner in owners]
+    return np.array([*own, 0], np.int32), names

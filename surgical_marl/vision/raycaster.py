@@ -1,0 +1,131 @@
+"""Draws a scene's cameras for many environments at once, from where its bodies are."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+import torch
+
+from surgical_marl.runtime import prepare_warp
+from surgical_marl.vision.rays import BOX, CAPSULE, CYLINDER, ELLIPSOID, MESH, TILE, Light, cull, make_draw, place
+
+wp = prepare_warp()
+
+GROUPS = 3
+"""Geoms of the groups below this one are drawn."""
+BLOCK = 128
+"""Threads in a CUDA block."""
+SMOOTH = 0.8
+"""A mesh looks smooth where its faces' directions differ by less than this cosine, as in MuJoCo."""
+_KINDS = {
+    mujoco.mjtGeom.mjGEOM_SPHERE: ELLIPSOID,
+    mujoco.mjtGeom.mjGEOM_ELLIPSOID: ELLIPSOID,
+    mujoco.mjtGeom.mjGEOM_CAPSULE: CAPSULE,
+    mujoco.mjtGeom.mjGEOM_CYLINDER: CYLINDER,
+    mujoco.mjtGeom.mjGEOM_BOX: BOX,
+    mujoco.mjtGeom.mjGEOM_MESH: MESH,
+}
+
+
+class RayCaster:
+    """Cameras of a scene in N copies of it, on Warp's current device.
+
+    Args:
+        model: a scene's, with one lamp that stands still.
+        cameras: ids of C cameras with one field of view.
+        num_envs: N.
+        width, height: of a picture, pixels.
+        background: colour of what no geom covers, from 0 to 1.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        cameras: Sequence[int],
+        num_envs: int,
+        width: int,
+        height: int,
+        background: Sequence[float],
+    ) -> None:
+        geoms = np.flatnonzero((model.geom_group < GROUPS) & (model.geom_rgba[:, 3] > 0))
+        kinds = np.array([_KINDS[mujoco.mjtGeom(kind)] for kind in model.geom_type[geoms]], np.int32)
+        meshes = np.where(kinds == MESH, model.geom_dataid[geoms], -1)
+        pictures, tiles = num_envs * len(cameras), -(-width // TILE) * -(-height // TILE)
+        pixel = float(2 * np.tan(np.radians(model.cam_fovy[cameras[0]]) / 2) / height)
+        self._meshes = {mesh: _mesh(model, mesh) for mesh in set(meshes) - {-1}}  # a handle alone keeps none alive
+        self._handles = wp.array([self._meshes[m].id if m >= 0 else 0 for m in meshes], dtype=wp.uint64)
+        self._first_faces = wp.array(np.append(model.mesh_faceadr, 0)[meshes], dtype=int)
+        self._normals = wp.array(_normals(model), dtype=wp.vec3)
+        self._kinds, self._geoms, self._cameras = (wp.array(ids, dtype=int) for ids in (kinds, geoms, cameras))
+        self._sizes = wp.array(_sizes(model, geoms), dtype=wp.vec3)
+        self._colours = wp.array(model.geom_rgba[geoms, :3], dtype=wp.vec3)
+        self._turns = wp.empty((pictures, len(geoms)), dtype=wp.mat33)
+        self._eyes = wp.empty((pictures, len(geoms)), dtype=wp.vec3)
+        self._listed = wp.empty((pictures, tiles, len(geoms)), dtype=wp.uint16)
+        self._counts = wp.empty((pictures, tiles), dtype=int)
+        self._screen = pixel, width, height
+        self._light, self._background = _light(model), wp.vec3(*background)
+        self._draw = make_draw(bool(self._meshes))
+
+    def draw(self, data: Any, rgb: torch.Tensor, depth: torch.Tensor, segmentation: torch.Tensor) -> None:
+        """Writes pictures [N * C, height, width], of colour [..., 3]; of a channel that is empty, none.
+
+        Args:
+            data: MuJoCo Warp's, with `kinematics` and `camlight` done.
+        """
+        cameras, placed = [data.cam_xpos, data.cam_xmat, self._cameras], [self._turns, self._eyes]
+        listed = [self._listed, self._counts]
+        inputs = [data.geom_xpos, data.geom_xmat, self._geoms, *cameras, *placed]
+        wp.launch(place, self._turns.shape, inputs, block_dim=BLOCK)
+        inputs = [self._kinds, self._sizes, *placed, *self._screen, *listed]
+        wp.launch(cull, self._counts.shape, inputs, block_dim=BLOCK)
+        inputs = [self._kinds, self._sizes, self._colours, self._geoms, self._handles, self._first_faces, self._normals]
+        inputs += [*placed, *listed, *cameras, *self._screen, self._light, self._background]
+        inputs += [wp.from_torch(rgb, dtype=wp.vec3ub), wp.from_torch(depth), wp.from_torch(segmentation)]
+        wp.launch(self._draw, (*self._counts.shape, TILE**2), inputs, block_dim=BLOCK)
+
+
+def _sizes(model: mujoco.MjModel, geoms: np.ndarray) -> np.ndarray:
+    """As `raycast` wants them: of a ball three radii, of a mesh the box about its origin that holds it."""
+    sizes = model.geom_size[geoms]
+    balls, meshes = (
+        model.geom_type[geoms] == kind for kind in (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_MESH)
+    )
+    sizes[balls] = sizes[balls][:, :1]
+    box = model.geom_aabb[geoms]
+    sizes[meshes] = (np.abs(box[:, :3]) + box[:, 3:])[meshes]
+    return sizes
+
+
+def _mesh(model: mujoco.MjModel, mesh: int) -> Any:
+    start, first = model.mesh_vertadr[mesh], model.mesh_faceadr[mesh]
+    points = model.mesh_vert[start : start + model.mesh_vertnum[mesh]]
+    faces = model.mesh_face[first : first + model.mesh_facenum[mesh]]
+    return wp.Mesh(wp.array(points, dtype=wp.vec3), wp.array(faces.ravel(), dtype=int))
+
+
+def _normals(model: mujoco.MjModel) -> np.ndarray:
+    """At the corners of every face of all meshes, [faces, 3, 3]: the vertex's, or the face's where that is far off."""
+    found = np.zeros((max(len(model.mesh_face), 1), 3, 3), np.float32)
+    for mesh in range(model.nmesh):
+        rows = slice(model.mesh_faceadr[mesh], model.mesh_faceadr[mesh] + model.mesh_facenum[mesh])
+        corners = model.mesh_vert[model.mesh_vertadr[mesh] + model.mesh_face[rows]]
+        flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-30)
+        smooth = model.mesh_normal[model.mesh_normaladr[mesh] + model.mesh_facenormal[rows]]
+        alike = np.einsum("fcx,fx->fc", smooth, flat) >= SMOOTH
+        found[rows] = np.where(alike[..., None], smooth, flat[:, None])
+    return found
+
+
+def _light(model: mujoco.MjModel) -> Any:
+    light, head = Light(), model.vis.headlight
+    light.position, light.direction = wp.vec3(*model.light_pos[0]), wp.vec3(*model.light_dir[0])
+    light.cutoff, light.exponent = float(np.cos(np.radians(model.light_cutoff[0]))), float(model.light_exponent[0])
+    light.diffuse, light.specular = wp.vec3(*model.light_diffuse[0]), wp.vec3(*model.light_specular[0])
+    light.head_ambient, light.head_diffuse = wp.vec3(*head.ambient), wp.vec3(*head.diffuse)
+    light.head_specular = wp.vec3(*head.specular)
+    return light
