@@ -15,7 +15,8 @@ from typing import Any
 import yaml
 
 import surgical_marl.evaluation.goal_set
-from surgical_marl.content import BASELINES, list_scenes, list_tasks
+from surgical_marl.content import BASELINES, list_scenes
+from surgical_marl.plugins.tasks import list_tasks
 from surgical_marl.evaluation.command import play_all
 from surgical_marl.evaluation.evaluate import summarise
 

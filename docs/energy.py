@@ -11,7 +11,8 @@ import mujoco
 import numpy as np
 
 from surgical_marl import list_scenes, load_scene
-from surgical_marl.scenes.scene import TIMESTEP, Scene
+from surgical_marl.scenes.scene import Scene
+from surgical_marl.scenes.timing import TIMESTEP
 
 
 def energy_drift(scene: Scene, seconds: float = 2.0, timestep: float | None = None) -> tuple[np.ndarray, np.ndarray]:

@@ -15,7 +15,8 @@ from surgical_marl import load_scene
 from surgical_marl.physics.dynamics import Physics
 from surgical_marl.physics.simulator import Simulator, dynamics, solver
 from surgical_marl.physics.simulator import simulator as physics
-from surgical_marl.scenes.scene import DECIMATION, Scene
+from surgical_marl.scenes.scene import Scene
+from surgical_marl.scenes.timing import DECIMATION
 
 STEPS, SAMPLES = 5000, 2000
 TOUCHING = ((2, 6), (3, 6), (4, 6), (6, 4), (6, 6), (10, 20))

@@ -13,7 +13,7 @@ import numpy as np
 
 from surgical_marl import load_scene
 from surgical_marl.robots.arm import Joint
-from surgical_marl.scenes.scene import TIMESTEP
+from surgical_marl.scenes.timing import TIMESTEP
 
 SHARE = 0.5
 """Of the step that takes full effort: below it the law is linear."""

@@ -24,7 +24,8 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import NamedTuple
 
-from surgical_marl.content import content_dir, list_scenes, list_tasks, unknown
+from surgical_marl.content import content_dir, list_scenes, unknown
+from surgical_marl.plugins.tasks import list_tasks
 from surgical_marl.runtime import defer_compiler
 
 PICTURES = {"match_image": ("ecm", "trimanual_psm_ecm")}

@@ -12,14 +12,16 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from surgical_marl.content import list_arms, list_policies, list_scenes, list_tasks
-from surgical_marl.interfaces.registration import gymnasium_ids, pettingzoo_ids, task_modules
+from surgical_marl.content import list_arms, list_policies, list_scenes
+from surgical_marl.interfaces.registration import register_ids
+from surgical_marl.plugins.tasks import list_tasks, register_task
 
 if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv
     from surgical_marl.interfaces.pettingzoo import parallel_env
     from surgical_marl.robots.arm import load_arm
     from surgical_marl.scenes.load import load_scene
+    from surgical_marl.tasks.base.task import Task, TipTask
 
 __version__ = "0.1.0"
 
@@ -27,11 +29,15 @@ _LAZY = {
     "BatchedEnv": "surgical_marl.envs.batch",
     "load_arm": "surgical_marl.robots.arm",
     "load_scene": "surgical_marl.scenes.load",
+    "Task": "surgical_marl.tasks.base.task",
+    "TipTask": "surgical_marl.tasks.base.task",
     "parallel_env": "surgical_marl.interfaces.pettingzoo",
 }
 
 __all__ = [
     "BatchedEnv",
+    "Task",
+    "TipTask",
     "list_arms",
     "list_policies",
     "list_scenes",
@@ -39,11 +45,10 @@ __all__ = [
     "load_arm",
     "load_scene",
     "parallel_env",
+    "register_task",
 ]
 
-gymnasium_ids()
-pettingzoo_ids()
-globals().update(task_modules())
+register_ids()
 
 
 def __getattr__(name: str) -> Any:
@@ -53,4 +58,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return [*__all__, *task_modules(), "__version__"]
+    return [*__all__, *(f"{task}_v0" for task in list_tasks()), "__version__"]

@@ -40,12 +40,6 @@ def list_policies() -> list[str]:
     return _names("policies")
 
 
-def list_tasks() -> list[str]:
-    """Names of the tasks, read from the file names so that nothing heavy is imported."""
-    files = (_PACKAGE / "tasks").glob("[!_]*.py")
-    return sorted(file.stem for file in files)
-
-
 def find(kind: str, name_or_path: str | os.PathLike[str]) -> Path:
     """The file or folder of shipped content by its name, or of a user's own by its path."""
     folder, suffix = content_dir(kind), _SUFFIX.get(kind, "")

@@ -15,7 +15,7 @@ import types
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 FLAG = "--xla_cpu_use_fusion_emitters"
 """XLA's fusion emitter on CPUs computes a serial chain of rotations again for each link that uses it, so that an arm
@@ -97,6 +97,24 @@ def prepare_mjx() -> Any:
             if warp is not None:
                 sys.modules["warp"] = warp
     return mjx
+
+
+class _Lazy(types.ModuleType):
+    """A module of JAX that is imported, after `prepare_jax`, when something of it is first asked for."""
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__") and name != "__version__":  # who asks all modules for their `__file__` means no harm
+            raise AttributeError(name)
+        prepare_jax()
+        return getattr(importlib.import_module(self.__name__), name)
+
+
+# To import JAX takes most of a second, and an environment whose kernel is in the cache never calls it.
+if TYPE_CHECKING:
+    import jax as jax
+    import jax.numpy as jnp
+else:
+    jax, jnp = _Lazy("jax"), _Lazy("jax.numpy")
 
 
 class _Deferred(types.ModuleType):

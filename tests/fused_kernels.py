@@ -13,7 +13,7 @@ from surgical_marl.engines.fused.emit import Emitter
 from surgical_marl.engines.fused.graph import Graph
 from surgical_marl.engines.fused.kernel import compile_kernels
 from surgical_marl.engines.fused.preludes import LANES
-from surgical_marl.engines.fused.program import Fields, tables, trace
+from surgical_marl.engines.fused.translate import Fields, tables, trace
 
 Stores = list[tuple[str, int, int]]
 
@@ -43,7 +43,7 @@ def run(function: Callable[..., Any], *columns: Any, in_place: bool = False) -> 
     kernel = compile_kernels({"run": Emitter(graph, stores, vector=True).body()}, "cpu")["run"]
     count = len(jax.tree.leaves(columns)[0])
     stride = -(-count // LANES) * LANES
-    arrays: Any = make_arrays("cpu", SimpleNamespace(sizes=layout.sizes, tables=tables(graph)), stride, count)
+    arrays: Any = make_arrays("cpu", SimpleNamespace(sizes=layout.sizes), tables(graph), stride, count)
     for leaf, column in zip(jax.tree.leaves(inputs), jax.tree.leaves(columns), strict=True):
         arrays.write(leaf, column)
     kernel.launch(arrays.all, stride, 0, stride)

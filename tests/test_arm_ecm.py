@@ -13,7 +13,7 @@ from surgical_marl import load_arm
 from surgical_marl.robots.arm import Arm
 from surgical_marl.robots.spec import build_spec
 from surgical_marl.scenes.build import set_physics
-from surgical_marl.scenes.scene import TIMESTEP
+from surgical_marl.scenes.timing import TIMESTEP
 
 HALF = np.pi / 2
 # dVRK ECM.json, modified (Craig) convention: alpha, a, theta offset, d, slides

@@ -15,7 +15,7 @@ import yourdfpy
 from surgical_marl import load_arm
 from surgical_marl.robots.spec import build_spec
 from surgical_marl.scenes.build import set_physics
-from surgical_marl.scenes.scene import TIMESTEP
+from surgical_marl.scenes.timing import TIMESTEP
 
 STAR = load_arm("star")
 README = (STAR.folder / "README.md").read_text(encoding="utf-8")

@@ -26,7 +26,7 @@ from surgical_marl.cli.main import main
 from surgical_marl.engines.choose import make_engine
 from surgical_marl.envs.env import Env
 from surgical_marl.scenes.load import load_scene
-from surgical_marl.scenes.scene import TIMESTEP
+from surgical_marl.scenes.timing import TIMESTEP
 
 CONTRACT = [
     "physics_steps_per_s", "env_steps_per_s", "simulated_s_per_s", "num_envs", "engine", "device", "dt", "decimation",

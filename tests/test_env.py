@@ -13,7 +13,8 @@ import pytest
 from surgical_marl import list_scenes
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.physics.simulator import Physics
-from surgical_marl.scenes.scene import DECIMATION, TIMESTEP
+from surgical_marl.scenes.timing import TIMESTEP
+from surgical_marl.scenes.timing import DECIMATION
 
 SCENES = ("psm", "bimanual_psm")
 

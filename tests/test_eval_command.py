@@ -16,7 +16,8 @@ import pytest
 
 from fake_env import FakeEnv
 from surgical_marl.cli.main import main
-from surgical_marl.content import list_scenes, list_tasks
+from surgical_marl.content import list_scenes
+from surgical_marl.plugins.tasks import list_tasks
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.envs.env import Env
 from surgical_marl.evaluation import command

@@ -14,7 +14,8 @@ import jax
 import numpy as np
 import pytest
 
-from surgical_marl.content import list_scenes, list_tasks
+from surgical_marl.content import list_scenes
+from surgical_marl.plugins.tasks import list_tasks
 from surgical_marl.engines.choose import make_engine
 from surgical_marl.engines.fused.engine import FusedEngine, flatten
 from surgical_marl.engines.fused.keys import episode_keys

@@ -18,7 +18,9 @@ from surgical_marl import list_scenes, load_arm, load_scene
 from surgical_marl.physics.simulator import Simulator
 from surgical_marl.robots.arm import CONTROL_MODES
 from surgical_marl.scenes.contacts import collision_geoms
-from surgical_marl.scenes.scene import DECIMATION, TIMESTEP, Scene
+from surgical_marl.scenes.scene import Scene
+from surgical_marl.scenes.timing import TIMESTEP
+from surgical_marl.scenes.timing import DECIMATION
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "docs"))
 from energy import energy_drift

@@ -17,7 +17,7 @@ from surgical_marl.envs.env import Env
 from surgical_marl.physics.plant import Plant
 from surgical_marl.physics.simulator import Simulator
 from surgical_marl.scenes.load import load_scene
-from surgical_marl.scenes.scene import DECIMATION
+from surgical_marl.scenes.timing import DECIMATION
 
 ALL = (
     "{offset_angle: 0.05, offset_slide: 0.003, backlash_angle: 0.02, backlash_slide: 0.001, noise_angle: 0.001, "

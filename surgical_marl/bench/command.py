@@ -11,7 +11,8 @@ from argparse import Namespace
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
-from surgical_marl.content import find, list_tasks, unknown
+from surgical_marl.content import find, unknown
+from surgical_marl.plugins.tasks import list_tasks
 
 if TYPE_CHECKING:
     from surgical_marl.runs.settings import Settings

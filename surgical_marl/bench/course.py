@@ -10,7 +10,8 @@ import numpy as np
 from mujoco import rollout
 
 from surgical_marl.physics.simulator import Simulator
-from surgical_marl.scenes.scene import DECIMATION, Scene
+from surgical_marl.scenes.scene import Scene
+from surgical_marl.scenes.timing import DECIMATION
 
 HOLD = DECIMATION
 """Physics steps for which an action is held: a control step of training, whatever is timed."""

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from surgical_marl.envs.env import Carry, Env, State
-from surgical_marl.physics.simulator import Contacts, Physics
+from surgical_marl.physics.simulator import Physics
+from surgical_marl.physics.views import Contacts
 
 
 class PhysicsAlone(Env):
@@ -19,17 +20,23 @@ class PhysicsAlone(Env):
         vars(self).update(vars(env))
         self.simulator = env.simulator
         self.task_name, self.agents, self.decimation = "physics alone", (), 1
+        self.parameters = {}
 
-    def reset(self, key: Array, episode: Array | int = 0) -> State:
+    def reset(self, key: Array, episode: Array | int = 0, parameters: Any = None) -> State:
         """At home."""
         carry = Carry(self.simulator.home, (), key, jnp.int32(episode), jnp.int32(0))
         return self._state(carry, carry.physics, self.simulator.home_contacts.distance)
 
-    def step(self, carry: Carry, actions: dict[str, Array]) -> State:
+    def step(self, carry: Carry, actions: dict[str, Array], parameters: Any = None) -> State:
         """One physics step; there are no actions."""
         _, distance = self.simulator._look(carry.physics.qpos)
         physics, _ = self.simulator._step(carry.physics, distance)
         return self._state(carry, physics, distance)
+
+    @property
+    def pauses(self) -> bool:
+        """Never: nobody looks."""
+        return False
 
     def _state(self, carry: Carry, physics: Physics, distance: Array) -> State:
         nothing: Any = {}

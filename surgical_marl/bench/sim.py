@@ -19,7 +19,7 @@ from surgical_marl.bench.contenders import ENGINES, MOST_ROLLED, Contender, prep
 from surgical_marl.bench.course import Course, make_course
 from surgical_marl.bench.workload import Workload
 from surgical_marl.scenes.load import load_scene
-from surgical_marl.scenes.scene import TIMESTEP
+from surgical_marl.scenes.timing import TIMESTEP
 
 SWEEP = tuple(4**k for k in range(12))
 """Environments of a sweep: 1 to 4 million."""

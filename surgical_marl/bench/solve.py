@@ -21,7 +21,7 @@ from surgical_marl.bench.report import aligned, describe_machine
 from surgical_marl.bench.stopwatch import STARTING, Stopwatch, rows
 from surgical_marl.evaluation.evaluate import Played, play
 from surgical_marl.evaluation.goal_set import is_standard
-from surgical_marl.evaluation.metrics import FOLLOWING, SUCCESS_MM, metrics
+from surgical_marl.evaluation.metrics import SUCCESS_MM, metrics
 from surgical_marl.learning.room import in_memory
 from surgical_marl.learning.train import make_training
 from surgical_marl.learning.trainer import Trainer
@@ -209,7 +209,7 @@ def examine(training: Trainer, env: Any) -> Exam:
 
 def _exam(played: Played) -> Exam:
     measures = {name: values[None] for name, values in played.measures.items()}
-    found = metrics(measures, played.about["task"] in FOLLOWING)
+    found = metrics(measures, played.follows)
     wanted = (f"success_{SUCCESS_MM}mm", "collision_rate", "median_error_mm")
     success, collisions, error = (float(found[name].reduce(found[name].values.ravel())) for name in wanted)
     return Exam(success, collisions, error, played.about["goal_set"], is_standard(played.about))

@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from surgical_marl.bench.course import MOTIONS
-from surgical_marl.content import find, list_tasks, unknown
+from surgical_marl.content import find, unknown
 from surgical_marl.engines.choose import DEVICES
+from surgical_marl.plugins.tasks import list_tasks
 from surgical_marl.runtime import has_cuda
 
 NUM_ENVS = {"cpu": 4096, "cuda": 131072}

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import importlib
-
-from surgical_marl.content import list_arms, list_scenes, list_tasks
+from surgical_marl.content import list_arms, list_scenes
+from surgical_marl.plugins.tasks import TASKS, list_tasks
 from surgical_marl.robots.arm import load_arm
 from surgical_marl.scenes.load import load_scene
 from surgical_marl.scenes.scene import Scene
@@ -50,5 +49,7 @@ def _policies() -> list[str]:
 
 
 def _task(name: str) -> str:
-    documentation = importlib.import_module(f"surgical_marl.tasks.{name}").__doc__ or ""
-    return f"{name:14} {documentation.splitlines()[0]}"
+    try:
+        return f"{name:14} {TASKS.load(name).summary()}"
+    except ValueError as error:  # one that can't be imported keeps no one from the others
+        return f"{name:14} {error}"

@@ -12,7 +12,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-from surgical_marl.content import BASELINES, find, list_arms, list_policies, list_scenes, list_tasks, unknown
+from surgical_marl.content import BASELINES, find, list_arms, list_policies, list_scenes, unknown
+from surgical_marl.plugins.tasks import list_tasks
 from surgical_marl.runtime import defer_compiler
 
 _LISTS = {

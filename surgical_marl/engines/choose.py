@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import sys
+from collections.abc import Callable
 from typing import Any, Protocol
 
 from surgical_marl.engines.stepper import Stepper
@@ -25,7 +26,7 @@ class Engine(Protocol):
 
     def restart(self) -> None: ...
 
-    def step(self, actions: dict[str, Any]) -> None: ...
+    def step(self, actions: dict[str, Any], sense: Callable[[], dict[str, Any]] | None = None) -> None: ...
 
     def outcome(self, library: str) -> dict[str, Any]: ...
 

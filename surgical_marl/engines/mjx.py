@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import fields, replace
 from typing import Any
 
 import jax
@@ -30,9 +29,12 @@ class MjxEngine:
         self.env, self.num_envs = env, num_envs
         self._on = find_device(device)
         self.device = "cpu" if self._on.platform == "cpu" else "cuda"
+        self._parameters = jax.device_put(env.parameters, self._on)
+        every = lambda function, axes: jax.jit(jax.vmap(function, (*axes, None)))  # noqa: E731
         self._first_keys = jax.jit(jax.vmap(jax.random.fold_in, (None, 0)))
-        self._reset = jax.jit(jax.vmap(env.reset))
-        self._step = jax.jit(jax.vmap(env.step), donate_argnums=0)
+        self._reset = every(env.reset, (0, 0))
+        self._step = jax.jit(jax.vmap(env.step, (0, 0, None)), donate_argnums=0)
+        self._move, self._finish = every(env.move, (0, 0)), every(env.finish, (0, 0))
         # XLA runs a step on one CPU core: every core takes a share of the environments
         shares = min(cores(), num_envs // LEAST_SHARE) if self.device == "cpu" else 1
         self._shares = next(n for n in range(max(shares, 1), 0, -1) if num_envs % n == 0)
@@ -40,10 +42,13 @@ class MjxEngine:
         self._split = jax.jit(lambda tree: [jax.tree.map(share, tree) for share in self._slices()])
         self._join = jax.jit(lambda *parts: jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts))
         self._state: Any = None
-        self._announced = self._traced = self._stepped = False
-        shapes = jax.eval_shape(env.reset, jax.ShapeDtypeStruct((2,), jnp.uint32), 0).carry
-        paths, self._tree = jax.tree_util.tree_flatten_with_path(shapes)
-        self.carry_shapes = {jax.tree_util.keystr(path): leaf.shape for path, leaf in paths}
+        self._moved: Any = None
+        self._announced = self._stepped = False
+        self._traced: set[Any] = set()
+        key, number = jax.ShapeDtypeStruct((2,), jnp.uint32), jax.ShapeDtypeStruct((), jnp.int32)
+        shapes = jax.eval_shape(env.reset, key, number, env.parameters).carry
+        self._tree = jax.tree.structure(shapes)
+        self.carry_shapes = {name: leaf.shape for name, leaf in _paths(shapes).items()}
 
     def reset(self, seed: int, first: int = 0) -> None:
         """First episodes. Environment i depends on `seed` and `first` + i alone, not on how many there are."""
@@ -62,46 +67,66 @@ class MjxEngine:
             announce(self.env, self.name, self.device)
             self._announced = True
         with jax.default_device(self._on):
-            self._state, self._stepped = self._reset(keys, episodes), False
+            self._state, self._stepped = self._reset(keys, episodes, self._parameters), False
 
-    def step(self, actions: dict[str, Any]) -> None:
-        """One control step of all environments; actions [N, n] by agent, of any array library."""
-        given = self._state.carry, {agent: self._take(action).astype(jnp.float32) for agent, action in actions.items()}
+    def step(self, actions: dict[str, Any], sense: Callable[[], dict[str, Any]] | None = None) -> None:
+        """One control step of all environments.
+
+        Args:
+            actions: [N, n] by agent, of any array library.
+            sense: returns what the environment senses, [N] each, once everything has moved: `.moved` can be read then.
+        """
+        given = {agent: self._take(action).astype(jnp.float32) for agent, action in actions.items()}
+        if self.env.pauses:
+            self._moved = self._run(self._move, self._state.carry, given)
+            sensed = {name: self._take(values) for name, values in (sense() if sense else {}).items()}
+            self._state = self._run(self._finish, self._moved, sensed)
+        else:
+            self._state = self._run(self._step, self._state.carry, given)
+        self._stepped = True
+
+    def _run(self, function: Any, *given: Any) -> Any:
+        """A function of all environments, each core with its share of them."""
+        traced = function in self._traced
         # Tracing makes some million objects that all stay: looking for garbage among them takes a quarter of the time.
-        with contextlib.nullcontext() if self._traced else no_collection():
+        with contextlib.nullcontext() if traced else no_collection():
             if self._shares == 1:
-                self._state = self._step_share(given)
+                found = self._run_share(function, given)
             else:
                 shares = self._split(given)
-                first = [] if self._traced else [self._step_share(shares.pop(0))]  # compiles once, not in every thread
-                self._state = self._join(*first, *self._pool.map(self._step_share, shares))
-        self._traced = self._stepped = True
+                first = (
+                    [] if traced else [self._run_share(function, shares.pop(0))]
+                )  # compiles once, not in each thread
+                rest = self._pool.map(lambda share: self._run_share(function, share), shares)
+                found = self._join(*first, *rest)
+        self._traced.add(function)
+        return found
 
     def outcome(self, library: str) -> dict[str, Any]:
-        """What the last step or reset led to, as arrays [N, ...] of "numpy", "torch" or "jax": fields of
-        the environment's `State`."""
-        state = self._state
-        known = {field.name: getattr(state, field.name) for field in fields(state) if field.name != "carry"}
+        """What the last step or reset led to, as arrays [N, ...] of "numpy", "torch" or "jax": fields of the
+        environment's `State` as dicts."""
+        known = {name: value for name, value in self._state._asdict().items() if name != "carry"}
         found = {name: self._present(value, library) for name, value in known.items() if jax.tree.leaves(value)}
         return {**found, "contacts": found["contacts"]._asdict()}
 
     def read(self, name: str, library: str) -> Any:
-        """A part of the `Carry`, one of `carry_shapes`, [N, ...]."""
-        return self._present(
-            dict(zip(self.carry_shapes, jax.tree.leaves(self._state.carry), strict=True))[name], library
-        )
+        """A part of the `Carry`, one of `carry_shapes`, or of what has moved, as in ".moved.carry.physics.qpos"; [N, ...]."""
+        tree, path = self._state.carry, name
+        if name.startswith(".moved"):
+            tree, path = self._moved, name.removeprefix(".moved")
+        return self._present(_paths(tree)[path], library)
 
     def write(self, name: str, values: Any) -> None:
         """Sets a part of the `Carry`."""
-        parts = dict(zip(self.carry_shapes, jax.tree.leaves(self._state.carry), strict=True))
+        parts = _paths(self._state.carry)
         parts[name] = jnp.array(self._take(values), parts[name].dtype)  # a copy: a step gives its carry away
         carry = jax.tree.unflatten(self._tree, list(parts.values()))
-        self._state, self._stepped = replace(self._state, carry=carry), True
+        self._state, self._stepped = self._state._replace(carry=carry), True
 
-    def _step_share(self, share: tuple[Any, dict[str, Array]]) -> Any:
+    def _run_share(self, function: Any, share: tuple[Any, ...]) -> Any:
         with jax.default_device(self._on):  # of this thread
-            state: Any = jax.block_until_ready(self._step(*share)) if self._shares > 1 else self._step(*share)
-            return state
+            found = function(*share, self._parameters)
+            return jax.block_until_ready(found) if self._shares > 1 else found
 
     def _slices(self) -> list[Callable[[Array], Array]]:
         size = self.num_envs // self._shares
@@ -131,3 +156,8 @@ def find_device(device: str) -> Any:
         return jax.devices(device)[0]
     except RuntimeError:
         raise ValueError(f"device {device!r} is not there: JAX sees {jax.default_backend()} only") from None
+
+
+def _paths(tree: Any) -> dict[str, Any]:
+    """Leaves of a tree by their path, as in ".physics.qpos"."""
+    return {jax.tree_util.keystr(path): leaf for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]}

@@ -11,16 +11,18 @@ from __future__ import annotations
 
 import numbers
 import secrets
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
 
 from surgical_marl.engines.choose import ENGINES, make_engine
 from surgical_marl.envs.env import Env
-from surgical_marl.physics.simulator import Contacts
-from surgical_marl.scenes.scene import DECIMATION
+from surgical_marl.physics.views import Contacts
+
+if TYPE_CHECKING:
+    from surgical_marl.envs.sight import Sight
 
 ARRAYS = ("numpy", "torch", "jax")
 
@@ -29,11 +31,11 @@ class BatchStep(NamedTuple):
     """What a step returns. Shapes start with N, the number of environments; dicts are keyed by agent."""
 
     observations: dict[str, Any]
-    """[N, d]; of the next episode where one ended. A dict of them for an agent that sees pictures
-    (`surgical_marl/envs/pictures.py`)."""
+    """[N, d]; of the next episode where one ended. For an agent that sees pictures a dict of it, as "proprioception", and
+    of the pictures, [N, H, W, C] each."""
     state: Any
-    """[N, S], for a centralised critic, likewise of the next episode: all observations but pictures, and
-    `Task.privileged`."""
+    """[N, S], for a centralised critic, likewise of the next episode: all observations but pictures, what agents were
+    not shown of them, and `Task.privileged`."""
     rewards: dict[str, Any]
     terminated: Any
     """[N] bool"""
@@ -43,8 +45,9 @@ class BatchStep(NamedTuple):
     """[N, d], of this step's episode even where it ended."""
     final_state: Any
     infos: dict[str, dict[str, Any]]
-    """agent -> tip_error (m), success, collision (bool), min_distance (m), contact_force (N), reward_<term> (weighted),
-    cost, cost_<name> (bool), [N] each, and a task's own metrics; of this step's episode."""
+    """agent -> success, collision (bool), min_distance (m), contact_force (N), stage_<name> (bool), reward_<term>
+    (weighted), cost, cost_<name> (bool), [N] each, and a task's own metrics such as tip_error (m); of this step's
+    episode."""
     contacts: Contacts
     """Distance and penetration (m) and force (N) of every pair in `scene.pairs`, [N, P] each; likewise."""
 
@@ -53,12 +56,15 @@ class BatchedEnv:
     """N environments of one task on one scene.
 
     Args:
-        task, scene, control, max_steps, decimation, difficulty, reward: as for `surgical_marl.envs.env.Env`.
+        task: a name of `list_tasks()`.
+        scene: a name of `list_scenes()` or the path of a scene file.
         num_envs: how many environments.
         engine: "fused", "mjx" (the reference), or "auto" for the fastest that works.
         device: "cpu", "cuda" or "auto".
         arrays: library of the arrays that come back, "numpy", "torch" or "jax". Don't write into what you get: it may
             share memory with the engine.
+        options: further fields of `surgical_marl.tasks.base.options.Options`: control, difficulty, start, max_steps,
+            decimation, reward, observe.
 
     Raises:
         ValueError: naming what is unknown or out of range.
@@ -70,14 +76,10 @@ class BatchedEnv:
         scene: str = "bimanual_psm",
         *,
         num_envs: int = 1,
-        control: str = "position",
         engine: str = "auto",
         device: str = "auto",
-        max_steps: int | None = None,
-        decimation: int = DECIMATION,
-        difficulty: str = "default",
-        reward: Mapping[str, float] | None = None,
         arrays: str = "numpy",
+        **options: Any,
     ) -> None:
         if isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1:
             raise ValueError(f"num_envs must be a whole number of at least 1, not {num_envs!r}")
@@ -85,27 +87,47 @@ class BatchedEnv:
             raise ValueError(f"unknown engine {engine!r}; the engines are {', '.join(ENGINES)}")
         if arrays not in ARRAYS:
             raise ValueError(f"unknown arrays {arrays!r}; the libraries are {', '.join(ARRAYS)}")
-        self.env = Env(task, scene, control, max_steps, decimation, difficulty, reward)
+        self._made = {"task": task, "scene": scene, "num_envs": num_envs, "engine": engine, "device": device,
+                      "arrays": arrays, **options}  # fmt: skip
+        self.env = Env(task, scene, **options)
         self.engine = make_engine(self.env, num_envs, engine, device)
         self.num_envs, self.arrays = num_envs, arrays
         self.agents = list(self.env.agents)
         self.types = {name: list(agents) for name, agents in self.env.scene.types.items()}
+        self.task, self.task_name, self.scene, self.control = (
+            self.env.task,
+            task,
+            self.env.scene,
+            self.env.scene.control,
+        )
         self.max_steps, self.control_dt = self.env.max_steps, self.env.control_dt
-        self.task_name, self.scene, self.control = task, self.env.scene, control
         self.device = self.engine.device
-        self._observation_spaces: dict[str, spaces.Space[Any]] = {a: self.env.observation_space(a) for a in self.agents}
         self._action_spaces = {agent: self.env.action_space(agent) for agent in self.agents}
+        self._observation_spaces: dict[str, spaces.Space[Any]] = {a: self.env.observation_space(a) for a in self.agents}
         self.state_space = self.env.state_space
-        self._pictures: Any = None
-        if self.env.task.camera is not None:
-            self._open_eyes(self.env.task.camera)
+        self._sight: Sight | None = None
+        if self.env.pauses:
+            from surgical_marl.envs.sight import Sight  # imports torch
+
+            self._sight = Sight(self.env, self.engine, num_envs, arrays)
+            self._observation_spaces |= self._sight.spaces(self._observation_spaces)
         self._started = False
 
-    def _open_eyes(self, agent: str) -> None:
-        from surgical_marl.envs.pictures import Pictures
+    def __getstate__(self) -> dict[str, Any]:
+        """What makes a copy: the arguments, and where all environments are."""
+        return {"made": self._made, "carry": self.carry() if self._started else None}
 
-        self._pictures = Pictures(self.env, self.num_envs, self.device, self.arrays)
-        self._observation_spaces[agent] = Pictures.space(self.env.observation_space(agent))
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__init__(**state["made"])  # type: ignore[misc]
+        if state["carry"] is not None:
+            self.set_carry(state["carry"])
+
+    def observation_terms(self, agent: str) -> dict[str, slice]:
+        """Return the names of what an agent observes, and where each stands in its vector.
+
+        Pictures stand beside the vector, under their own names.
+        """
+        return dict(self.env.observed[agent].slices)
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
         """Of one environment: a Box, or a Dict for an agent that sees pictures."""
@@ -131,7 +153,9 @@ class BatchedEnv:
         else:
             self.engine.reset(secrets.randbits(63) if seed is None else int(seed), first)
         self._started = True
-        found = self._outcome(self._target_rows())
+        found = self.engine.outcome(self.arrays)
+        if self._sight is not None:
+            self._sight.begin(found)
         return found["observations"], found["state"], found["infos"]
 
     def step(self, actions: dict[str, Any]) -> BatchStep:
@@ -145,20 +169,23 @@ class BatchedEnv:
         """
         if not self._started:
             raise ValueError("step before reset: call reset() first")
-        actions, rows = self._check(actions), self._target_rows()
-        self.engine.step(actions)
-        found = self._outcome(rows)
+        checked = self._check(actions)
+        self.engine.step(checked, None if self._sight is None else self._sight.sense)
+        found = self.engine.outcome(self.arrays)
+        if self._sight is not None:
+            self._sight.show(found)
         return BatchStep(**{**found, "contacts": Contacts(**found["contacts"])})
 
     @property
     def qpos(self) -> np.ndarray:
-        """Joint positions of the whole scene, [N, nq], for pictures; `goals` beside it."""
+        """Joint positions of the whole scene, [N, nq], numpy."""
         return np.asarray(self._part(".physics.qpos", "numpy"))
 
     @property
-    def goal(self) -> Any:
-        """Where the tool tips should be now, [N, arms, 3], numpy; each in its arm's base frame, m."""
-        return self._part(".goal.targets", "numpy")
+    def goal(self) -> SimpleNamespace:
+        """What the episodes are after: the fields of the task's goal, [N, ...] each, numpy."""
+        names = [name for name in self.engine.carry_shapes if name.startswith(".goal.")]
+        return SimpleNamespace(**{name.removeprefix(".goal."): self._part(name, "numpy") for name in names})
 
     @property
     def steps(self) -> Any:
@@ -189,17 +216,6 @@ class BatchedEnv:
         for name, value in values.items():
             self.engine.write(name, value)
         self._started = True
-
-    def _outcome(self, rows: Any) -> dict[str, Any]:
-        """What the engine found, with pictures for a task that has any; `rows` are the targets' before the step."""
-        found = self.engine.outcome(self.arrays)
-        if self._pictures is not None:
-            self._pictures.add(found, rows, self._target_rows())
-        return found
-
-    def _target_rows(self) -> Any:
-        # as int64, a copy: a step gives its carry away
-        return None if self._pictures is None else self.engine.read(".goal.row", "torch").long()
 
     def _part(self, name: str, library: str) -> Any:
         if not self._started:

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import jax.numpy as jnp
 import numpy as np
-from jax import Array
+
+from surgical_marl.runtime import jnp
 
 if TYPE_CHECKING:
-    from surgical_marl.physics.simulator import ArmView
+    from jax import Array
+
+    from surgical_marl.physics.views import ArmView
     from surgical_marl.robots.arm import Arm
 
 NEAR = 0.005

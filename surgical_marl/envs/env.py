@@ -11,25 +11,28 @@ environment that ends is reset within the same step: `observations` then belong 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 from gymnasium import spaces
-from jax import Array
 
-from surgical_marl.content import list_tasks, unknown
 from surgical_marl.envs.costs import costs
-from surgical_marl.physics.plant import Hidden, Plant
-from surgical_marl.physics.simulator import ArmView, Contacts, Physics, Simulator
-from surgical_marl.runtime import prepare_jax
+from surgical_marl.envs.observed import Observed
+from surgical_marl.plugins.tasks import TASKS
+from surgical_marl.runtime import jax, jnp, prepare_jax
 from surgical_marl.scenes.load import load_scene
-from surgical_marl.scenes.scene import DECIMATION
+from surgical_marl.tasks.base.options import Options, make_options
+from surgical_marl.tasks.base.task import Task, World
+
+if TYPE_CHECKING:
+    from jax import Array
+
+    from surgical_marl.physics.dynamics import Physics
+    from surgical_marl.physics.plant import Hidden, Plant
+    from surgical_marl.physics.simulator import Simulator
+    from surgical_marl.physics.views import ArmView, Contacts
 
 HIDDEN, NOISE = 2**31 - 1, 2**31 - 2
 """What the episode's key is folded with for what a scene's randomisation draws: far from what tasks take."""
@@ -49,16 +52,14 @@ class Carry(NamedTuple):
     """What the episode drew for the arms (`surgical_marl/physics/plant.py`)."""
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class State:
+class State(NamedTuple):
     """The outcome of a reset or a step. Dicts are keyed by agent."""
 
     carry: Carry
     observations: dict[str, Array]
     """[d] each, of the new episode where one ended."""
     state: Array
-    """What a centralised critic sees: all observations, one after the other, and `Task.privileged`."""
+    """What a centralised critic sees: all observations, what agents were not shown of them, and `Task.privileged`."""
     rewards: dict[str, Array]
     terminated: Array
     truncated: Array
@@ -67,13 +68,22 @@ class State:
     """Of this step's episode, even if it ended."""
     final_state: Array
     infos: dict[str, dict[str, Array]]
-    """tip_error (m), success, collision, min_distance (m), contact_force (N); `reward_<term>`, the weighted terms that
-    the reward is the sum of; `cost_<name>`, the limits broken (`envs/costs.py`), and their number `cost`. Of
-    this step's episode, even if it ended."""
+    """success, collision, min_distance (m), contact_force (N); `stage_<name>` and the task's own metrics, such as
+    tip_error (m); `reward_<term>`, the weighted terms that the reward is the sum of; `cost_<name>`, the limits broken
+    (`surgical_marl/envs/costs.py`), and their number `cost`. Of this step's episode, even if it ended."""
     contacts: Contacts
     """Every pair of geoms that can touch, likewise."""
-    qpos: Any = ()
-    """Joint positions of the whole scene [nq], likewise, for a task with pictures; else nothing."""
+
+
+class Moved(NamedTuple):
+    """What `Env.move` leaves for `Env.finish`."""
+
+    carry: Carry
+    """After the step, before a reset."""
+    tips: Array
+    """Tool tips before it, as in `Carry`."""
+    contacts: Contacts
+    arms: dict[str, ArmView]
 
 
 class Env:
@@ -82,44 +92,30 @@ class Env:
     Args:
         task: a name of `list_tasks()`.
         scene: a name of `list_scenes()` or the path of a scene file.
-        control: how actions drive the joints: "position" moves position targets, "velocity" and "torque" command
-            those. Actions are in [-1, 1]; 1 is the joint's `speed`, or its effort limit for torque.
-        max_steps: control steps until truncation; the task's own number if None.
-        decimation: physics steps a control step.
-        difficulty: "easy", "default" or "hard"; the task's module says what each is.
-        reward: weights of reward terms that replace the task's own, as in {"collision": -5}.
+        options: further fields of `surgical_marl.tasks.base.options.Options`.
 
     Raises:
         ValueError: naming what is unknown or out of range.
     """
 
-    def __init__(
-        self,
-        task: str = "reach",
-        scene: str = "bimanual_psm",
-        control: str = "position",
-        max_steps: int | None = None,
-        decimation: int = DECIMATION,
-        difficulty: str = "default",
-        reward: Mapping[str, float] | None = None,
-    ) -> None:
-        if task not in list_tasks():
-            raise unknown("task", task, list_tasks())
-        if max_steps is not None and (isinstance(max_steps, bool) or not isinstance(max_steps, int) or max_steps < 1):
-            raise ValueError(f"max_steps must be a whole number of at least 1, not {max_steps!r}")
-        if isinstance(decimation, bool) or not isinstance(decimation, int) or decimation < 1:
-            raise ValueError(f"decimation must be a whole number of at least 1, not {decimation!r}")
-        from importlib import import_module
-
+    def __init__(self, task: str = "reach", scene: str = "bimanual_psm", **options: Any) -> None:
         prepare_jax()
-        self.scene = load_scene(scene, control)
+        self.options: Options = make_options(task, scene, options)
+        task_class = TASKS.load(task)
+        self.scene = load_scene(scene, self.options.control)
         self.task_name = task
-        self.task = import_module(f"surgical_marl.tasks.{task}").Task(self.scene, difficulty, reward)
-        self.max_steps = max_steps or self.task.max_steps
+        self.task: Task = task_class(self.scene, self.options)
+        self.max_steps = self.options.max_steps or self.task.max_steps
         self.agents = self.scene.agents
-        self.decimation, self.control_dt = decimation, decimation * self.scene.model.opt.timestep
-        self.difficulty = difficulty
-        self._bounds = {agent: self.task.bounds(agent) for agent in self.agents}
+        self.decimation = self.options.decimation
+        self.control_dt = self.decimation * self.scene.model.opt.timestep
+        chosen = {**self.scene.observe, **self.options.observe}
+        for agent in chosen:
+            if agent not in self.agents:
+                raise ValueError(
+                    f"observe names {agent!r}, which is not an agent of the scene ({', '.join(self.agents)})"
+                )
+        self.observed = {agent: Observed(self.task, agent, chosen.get(agent)) for agent in self.agents}
 
     @property
     def title(self) -> str:
@@ -127,14 +123,32 @@ class Env:
         return f"{self.task_name} on {self.scene.name}"
 
     @property
+    def pauses(self) -> bool:
+        """Whether someone looks at what has moved before a step is finished: an agent that observes pictures, or a task
+        that senses them."""
+        return bool(self.task.senses) or any(seen.pictures for seen in self.observed.values())
+
+    @cached_property
+    def begins_at_home(self) -> bool:
+        """Whether all episodes begin with all arms at home."""
+        parameters = self.parameters
+        start = lambda key, p: self.task.bound(p["weights"], p["tables"]).start(key)  # noqa: E731
+        return jax.eval_shape(start, jax.ShapeDtypeStruct((2,), np.uint32), parameters).qpos is None
+
+    @property
+    def senses(self) -> tuple[str, ...]:
+        """Numbers that are measured outside, between `move` and `finish`."""
+        return self.task.senses
+
+    @property
     def content(self) -> bytes:
-        """All that a step depends on besides code: the model with its masses and gains, and the options."""
+        """All that a step depends on besides code and `parameters`: the model with its masses and gains, and the
+        options."""
         model = np.empty(mujoco.mj_sizeModel(self.scene.model), np.uint8)
         mujoco.mj_saveModel(self.scene.model, None, model)
-        weights = sorted(self.task.weights.items())
-        how = f"{self.scene.control} {self.max_steps} {self.decimation} {self.scene.randomisation}"
-        options = f"{self.task_name} {self.difficulty} {weights} {how}"
-        return self.scene.fingerprint + options.encode() + model.tobytes()
+        observed = {agent: (seen.names, seen.unseen) for agent, seen in self.observed.items()}
+        how = (self.scene.control, self.decimation, self.scene.randomisation, self.options.start, observed)
+        return self.scene.fingerprint + f"{self.task_name} {how}".encode() + model.tobytes()
 
     @property
     def roots(self) -> tuple[str, ...]:
@@ -142,14 +156,28 @@ class Env:
         return type(self).__module__, type(self.task).__module__
 
     @cached_property
+    def parameters(self) -> dict[str, Any]:
+        """Numbers that a step reads as inputs, so that another value of one compiles nothing: `max_steps`, the `weights`
+        of reward terms, and the task's `tables`. A tree of numpy arrays."""
+        return {
+            "max_steps": np.int32(self.max_steps),
+            "weights": {name: np.float32(weight) for name, weight in self.task.weights.items()},
+            "tables": {name: _single(table) for name, table in self.task.tables.items()},
+        }
+
+    @cached_property
     def simulator(self) -> Simulator:
         """The physics, set up when first needed, even while JAX traces a step."""
+        from surgical_marl.physics.simulator import Simulator
+
         with jax.ensure_compile_time_eval():
             return Simulator(self.scene, self.decimation)
 
     @cached_property
     def plant(self) -> Plant:
         """The physics behind motors and encoders, as good or bad as the scene has them."""
+        from surgical_marl.physics.plant import Plant
+
         return Plant(self.simulator)
 
     def num_actions(self, agent: str) -> int:
@@ -162,23 +190,25 @@ class Env:
         return spaces.Box(-1.0, 1.0, (self.num_actions(agent),), np.float32)
 
     def observation_space(self, agent: str) -> spaces.Box:
-        """Bounds that observations are clipped to."""
-        low, high = self._bounds[agent]
-        return spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
+        """Bounds of the vector that an agent observes."""
+        return _box(*self.observed[agent].bounds(self.task))
 
     @property
     def state_space(self) -> spaces.Box:
         """Bounds of `State.state`."""
-        every = [*(self._bounds[agent] for agent in self.agents), self.task.privileged_bounds]
-        low, high = map(np.concatenate, zip(*every, strict=True))
-        return spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
+        every = [
+            *(self.observed[agent].bounds(self.task, unseen=True) for agent in self.agents),
+            self.task.privileged_bounds,
+        ]
+        return _box(*map(np.concatenate, zip(*every, strict=True)))
 
-    def reset(self, key: Array, episode: Array | int = 0) -> State:
+    def reset(self, key: Array, episode: Array | int = 0, parameters: Any = None) -> State:
         """The start of an episode. `key` is raw (uint32 [2], as of `jax.random.PRNGKey`) and numbers its episodes."""
-        carry = self._start(key, jnp.int32(episode))
-        views = self.simulator.home_views
-        observations, state = self._observe(carry, self.simulator.home_contacts, views)
-        nothing = jax.tree.map(jnp.zeros_like, self.task.rewards(views, carry.goal))
+        task, _ = self._bound(parameters)
+        carry, contacts, arms = self._start(task, key, jnp.int32(episode))
+        observations, state = self._observe(task, carry, contacts, arms)
+        world = World(arms, carry.goal, self._unsensed())
+        nothing = jax.tree.map(jnp.zeros_like, task.reward_terms(world))
         return State(
             carry=carry,
             observations=observations,
@@ -188,86 +218,115 @@ class Env:
             truncated=jnp.bool_(False),
             final_observations=observations,
             final_state=state,
-            infos=self._infos(views, carry, carry, nothing),
-            contacts=self.simulator.home_contacts,
-            qpos=self.simulator.home.qpos if self.task.camera else (),
+            infos=self._infos(task, world, carry.tips, carry, nothing),
+            contacts=contacts,
         )
 
-    def step(self, carry: Carry, actions: dict[str, Array]) -> State:
-        """One control step, and a reset if it ends the episode."""
+    def step(self, carry: Carry, actions: dict[str, Array], parameters: Any = None) -> State:
+        """One control step, and a reset if it ends the episode. What a task senses in pictures is 0 here."""
+        return self.finish(self.move(carry, actions, parameters), self._unsensed(), parameters)
+
+    def move(self, carry: Carry, actions: dict[str, Array], parameters: Any = None) -> Moved:
+        """The first half of a step: physics, and where goals are afterwards."""
+        task, _ = self._bound(parameters)
         physics, hidden = self.plant.command(carry.physics, carry.hidden, actions)
-        physics, contacts, views = self.plant.advance(physics, hidden)
-        goal = self.task.advance(carry.goal, self.control_dt)
-        tips = jnp.stack([view.tool_tip for view in views.values()])
-        terms = self.task.rewards(views, goal)
-        terminated = self.task.terminated(views, goal)
-        steps = carry.steps + 1
-        truncated = (steps >= self.max_steps) & ~terminated
-        moved = carry._replace(physics=physics, hidden=hidden, goal=goal, tips=tips, steps=steps)
-        final_observations, final_state = self._observe(moved, contacts, views)
-        going = moved, final_observations, final_state
+        physics, contacts, arms = self.plant.advance(physics, hidden)
+        goal = task.advance(carry.goal, self.control_dt)
+        tips = jnp.stack([view.tool_tip for view in arms.values()])
+        after = carry._replace(physics=physics, hidden=hidden, goal=goal, tips=tips, steps=carry.steps + 1)
+        return Moved(after, carry.tips, contacts, arms)
+
+    def finish(self, moved: Moved, sensed: dict[str, Array], parameters: Any = None) -> State:
+        """The second half of a step: observations, reward, and a reset if it ends the episode."""
+        task, max_steps = self._bound(parameters)
+        carry, contacts = moved.carry, moved.contacts
+        arms = {agent: moved.arms[agent] for agent in self.agents}  # JAX sorts them by name
+        world = World(arms, carry.goal, sensed)
+        terms = task.rewards(world)
+        terminated = task.terminated(world)
+        truncated = (carry.steps >= max_steps) & ~terminated
+        final_observations, final_state = self._observe(task, carry, contacts, arms)
 
         def begin(_: Any) -> Any:
-            fresh = self._start(carry.key, carry.episode + 1)
-            return fresh, *self._observe(fresh, self.simulator.home_contacts, self.simulator.home_views)
+            fresh, touching, seen = self._start(task, carry.key, carry.episode + 1)
+            return fresh, *self._observe(task, fresh, touching, seen)
 
+        going = carry, final_observations, final_state
         done = terminated | truncated
         next_carry, observations, state = jax.lax.cond(done, begin, lambda going: going, going)
         return State(
             carry=next_carry,
             observations=observations,
             state=state,
-            rewards={agent: sum(values.values()) for agent, values in terms.items()},
+            rewards={agent: sum(values.values(), start=jnp.float32(0.0)) for agent, values in terms.items()},
             terminated=terminated,
             truncated=truncated,
             final_observations=final_observations,
             final_state=final_state,
-            infos=self._infos(views, carry, moved, terms),
+            infos=self._infos(task, world, moved.tips, carry, terms),
             contacts=contacts,
-            qpos=physics.qpos if self.task.camera else (),
         )
 
-    def _start(self, key: Array, episode: Array) -> Carry:
+    def _bound(self, parameters: Any) -> tuple[Task, Array]:
+        """The task with its parameters, and the time limit; its own where none are given."""
+        known = jax.tree.map(jnp.asarray, self.parameters) if parameters is None else parameters
+        return self.task.bound(known["weights"], known["tables"]), known["max_steps"]
+
+    def _unsensed(self) -> dict[str, Array]:
+        return {name: jnp.float32(0.0) for name in self.senses}
+
+    def _start(self, task: Task, key: Array, episode: Array) -> tuple[Carry, Contacts, dict[str, ArmView]]:
+        """How an episode begins, and what is seen of the arms there."""
         own = jax.random.fold_in(key, episode)
-        hidden = self.plant.start(jax.random.fold_in(own, HIDDEN))
-        return Carry(
-            physics=self.plant.home(hidden),
-            hidden=hidden,
-            goal=self.task.start(own),
-            tips=jnp.stack([view.tool_tip for view in self.simulator.home_views.values()]),
-            key=key,
-            episode=episode,
-            steps=jnp.int32(0),
-        )
+        start = task.start(own)
+        hidden = self.plant.start(jax.random.fold_in(own, HIDDEN), start.qpos)
+        physics = self.plant.at_rest(hidden, start.qpos)
+        contacts, arms = self.simulator.home_contacts, self.simulator.home_views
+        if start.qpos is not None:
+            contacts, arms = self.simulator.look(physics)
+        tips = jnp.stack([view.tool_tip for view in arms.values()])
+        zero = jnp.int32(0)
+        return Carry(physics, start.goal, key, episode, zero, tips, hidden), contacts, arms
 
-    def _observe(self, carry: Carry, contacts: Contacts, views: dict[str, ArmView]) -> tuple[dict[str, Array], Array]:
-        """What policies see of arms that are as in `views`."""
+    def _observe(
+        self, task: Task, carry: Carry, contacts: Contacts, arms: dict[str, ArmView]
+    ) -> tuple[dict[str, Array], Array]:
+        """What policies and critics see of arms that are as in `arms`."""
         noise = jax.random.fold_in(jax.random.fold_in(jax.random.fold_in(carry.key, carry.episode), NOISE), carry.steps)
-        views = self.plant.measure(carry.physics, carry.hidden, contacts, views, noise)
-        observations = {
-            agent: jnp.clip(observation.astype(jnp.float32), *(b.astype(np.float32) for b in self._bounds[agent]))
-            for agent, observation in self.task.observations(views, carry.goal).items()
-        }
-        every = [*(observations[agent] for agent in self.agents), self.task.privileged(carry.goal)]
-        return observations, jnp.concatenate(every)
+        world = World(self.plant.measure(carry.physics, carry.hidden, contacts, arms, noise), carry.goal)
+        observations, every = {}, []
+        for agent, seen in self.observed.items():
+            observations[agent] = seen.read(task, world)
+            every += [observations[agent], seen.read(task, world, unseen=True)]
+        return observations, jnp.concatenate([*every, task.privileged(carry.goal)])
 
     def _infos(
-        self, views: dict[str, ArmView], before: Carry, after: Carry, terms: dict[str, dict[str, Array]]
+        self, task: Task, world: World, before: Array, after: Carry, terms: dict[str, dict[str, Array]]
     ) -> dict[str, dict[str, Array]]:
-        errors, infos = self.task.tip_errors(views, after.goal), {}
-        metrics = self.task.metrics(views, after.goal)
-        speeds = jnp.linalg.norm(after.tips - before.tips, axis=-1) / np.float32(self.control_dt)
-        for i, (agent, view) in enumerate(views.items()):
+        success, stages, metrics = task.success(world), task.stages(world), task.metrics(world)
+        speeds, infos = jnp.linalg.norm(after.tips - before, axis=-1) / np.float32(self.control_dt), {}
+        for i, (agent, view) in enumerate(world.arms.items()):
             broken = costs(self.scene.mounts[agent].arm, view, speeds[i])
             infos[agent] = {
-                "tip_error": errors[agent],
-                "success": errors[agent] < self.task.success,
+                "success": success[agent],
                 "collision": view.collision,
                 "min_distance": view.min_distance,
                 "contact_force": view.contact_force,
+                **{f"stage_{name}": reached for name, reached in stages[agent].items()},
                 **{f"reward_{name}": value for name, value in terms[agent].items()},
-                "cost": sum(cost.astype(jnp.float32) for cost in broken.values()),
+                "cost": sum((cost.astype(jnp.float32) for cost in broken.values()), start=jnp.float32(0.0)),
                 **{f"cost_{name}": cost for name, cost in broken.items()},
                 **metrics[agent],
             }
         return infos
+
+
+def _box(low: np.ndarray, high: np.ndarray) -> spaces.Box:
+    return spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
+
+
+def _single(table: np.ndarray) -> np.ndarray:
+    """A table as kernels hold it: floats in float32, all else in int32 or bool."""
+    if table.dtype == bool:
+        return table
+    return table.astype(np.float32 if table.dtype.kind == "f" else np.int32)

@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 import operator
 from collections.abc import Mapping
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from surgical_marl.content import content_dir, list_policies
 from surgical_marl.evaluation.goal_set import is_standard
 from surgical_marl.evaluation.report import number, title
+from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.policies.onnx_file import SUFFIX
 from surgical_marl.policies.weights import read_weights
 from surgical_marl.runs.folder import CURVE, read_metrics, read_origin, read_settings
@@ -19,13 +19,6 @@ from surgical_marl.runs.settings import Settings
 from surgical_marl.scenes.load import load_scene
 
 CARD, CLIP, EVALUATION = "README.md", "clip.mp4", "evaluation.json"
-GOALS: dict[str, dict[str, tuple[str, float]]] = {
-    "reach": {"median_error_mm": ("below", 1.0), "success_2mm": ("at least", 0.99), "collision_rate": ("below", 0.005)},
-    "track": {"rmse_mm": ("below", 2.0)},
-    "follow_path": {"rmse_mm": ("below", 2.0)},
-    "match_image": {"median_error_mm": ("below", 2.0)},
-}
-"""What a shipped policy of each task should do."""
 SHOWN = ("median_error_mm", "p95_error_mm", "rmse_mm", "success_1mm", "success_2mm", "success_5mm", "team_success_2mm",
          "collision_rate", "time_to_success_s", "image_error", "angle_error_deg")  # fmt: skip
 COLUMNS = ("policy", "median error of the worst arm (mm)", "RMSE (mm)", "within 2 mm", "collisions",
@@ -41,7 +34,7 @@ def worst_median(result: Mapping[str, Any]) -> float:
 def misses(result: Mapping[str, Any]) -> list[str]:
     """The goals of its task that a result misses, each as "what it has: the goal"."""
     found = []
-    for name, (relation, goal) in GOALS.get(result["task"], {}).items():
+    for name, (relation, goal) in TASKS.load(result["task"]).wanted.items():
         value = worst_median(result) if name == "median_error_mm" else result[name]
         if not _HOLDS[relation](value, goal):
             found.append(f"{title(name)} is {number(name, value)}, not {relation} {number(name, goal)}")
@@ -85,9 +78,7 @@ def card(folder: Path, name: str) -> str:
 
 
 def _what(settings: Settings, name: str, folder: Path) -> str:
-    documentation = import_module(f"surgical_marl.tasks.{settings.task}").__doc__ or ""
-    scene = load_scene(settings.scene)
-    task = documentation.splitlines()[0].partition(": ")[2]
+    scene, task = load_scene(settings.scene), TASKS.load(settings.task).summary().partition(": ")[2]
     clip = f"\n[A clip of two episodes]({CLIP}): balls are the goals.\n" if (folder / CLIP).is_file() else ""
     return f"""# {name}
 
@@ -152,7 +143,9 @@ def _limits(result: Mapping[str, Any], settings: Settings) -> str:
     missed = [f"- Misses its goal: {text}." for text in misses(result)]
     rare = 3 / result["episodes"]  # Hanley and Lippman-Hand, JAMA 249(13), 1983
     none = [f"- No collision in {result['episodes']} episodes leaves room for a rate of up to {rare:.1%}."]
-    goals = ", ".join(f"{title(name)} {how} {number(name, goal)}" for name, (how, goal) in GOALS[settings.task].items())
+    goals = ", ".join(
+        f"{title(name)} {how} {number(name, goal)}" for name, (how, goal) in TASKS.load(settings.task).wanted.items()
+    )
     met = [] if missed else [f"- Meets the goals of its task: {goals}."]
     return "\n".join([
         "## Limits\n", *missed, *met, *(none if result["collision_rate"] == 0 else []),

@@ -129,7 +129,7 @@ def _settings(policy: str, asked: Mapping[str, str | None]) -> Settings:
         return Settings(**{key: value for key, value in asked.items() if value is not None})  # type: ignore[arg-type]
     settings = read_settings(find("policies", policy))
     if difficulty := asked["difficulty"]:
-        settings = replace(settings, difficulty=difficulty)  # type: ignore[arg-type]  # changes goals alone
+        settings = replace(settings, difficulty=difficulty)  # changes goals alone
     for key, value in asked.items():
         if value not in (None, own := getattr(settings, key)):
             raise ValueError(f"{policy} is of {key} {own!r}, not {value!r}: leave --{key} out")

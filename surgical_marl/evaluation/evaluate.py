@@ -15,7 +15,7 @@ import torch
 
 from surgical_marl.evaluation.goal_set import check_same, describe_goals, episode_seed, goal_hash, read_goals
 from surgical_marl.evaluation.interval import interval
-from surgical_marl.evaluation.metrics import FOLLOWING, LAST, TERMS, Metric, Trajectory, measure, metrics
+from surgical_marl.evaluation.metrics import LAST, STAGE, TERMS, Metric, Trajectory, measure, metrics
 from surgical_marl.policies.acting import forget
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 MAX_BATCH = 1024
 """Episodes run at once; make the environment with num_envs=min(episodes, MAX_BATCH)."""
-INFOS = ("tip_error", "collision", "min_distance")
+INFOS = ("tip_error", "success", "collision", "min_distance")
 
 
 class Played(NamedTuple):
@@ -34,6 +34,8 @@ class Played(NamedTuple):
     agents: list[str]
     measures: dict[str, np.ndarray]
     """[E, A] each, see `surgical_marl.evaluation.metrics.measure`."""
+    follows: bool = False
+    """Whether the task's goals move."""
 
 
 def evaluate(
@@ -77,10 +79,11 @@ def play(
         forget(policy)
         goals += read_goals(env, count)
         trajectory = _first_episodes(env, policy, observations, count)
-        blocks.append(measure(trajectory, env.control_dt, env.task_name in FOLLOWING))
+        blocks.append(measure(trajectory, env.control_dt, env.task.follows))
     about = describe_goals(env, episodes)
     measures = {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
-    return Played({**about, "seed": seed, "goal_set": goal_hash(about, goals)}, list(env.agents), measures)
+    found = {**about, "seed": seed, "goal_set": goal_hash(about, goals)}
+    return Played(found, list(env.agents), measures, env.task.follows)
 
 
 def summarise(runs: Sequence[Played]) -> dict[str, Any]:
@@ -92,7 +95,7 @@ def summarise(runs: Sequence[Played]) -> dict[str, Any]:
     for number, run in enumerate(runs[1:], 2):
         check_same(first.about, run.about, f"run {number}")
     measures = {name: np.stack([run.measures[name] for run in runs]) for name in first.measures}
-    following = first.about["task"] in FOLLOWING
+    following = first.follows
     agents = {
         agent: _numbers(metrics({name: values[..., i : i + 1] for name, values in measures.items()}, following))
         for i, agent in enumerate(first.agents)
@@ -119,6 +122,8 @@ def _numbers(found: Mapping[str, Metric]) -> dict[str, Any]:
     values = {name: float(metric.reduce(metric.values.ravel())) for name, metric in found.items()}
     numbers: dict[str, Any] = {name: value if math.isfinite(value) else None for name, value in values.items()}
     undefined = {name for name, metric in found.items() if metric.extreme or numbers[name] is None}
+    if stages := {name.removeprefix(STAGE): value for name, value in numbers.items() if name.startswith(STAGE)}:
+        numbers["stages"] = stages
     numbers["intervals"] = {n: None if n in undefined else interval(metric) for n, metric in found.items()}
     return numbers
 
@@ -135,7 +140,7 @@ def _first_episodes(
         observations = step.observations
         told = [step.infos[agent] for agent in env.agents]
         names = dict.fromkeys(
-            name for info in told for name in info if name in (*INFOS, *LAST) or name.startswith(TERMS)
+            name for info in told for name in info if name in (*INFOS, *LAST) or name.startswith((*TERMS, STAGE))
         )
         infos.append({name: np.stack([_numpy(info.get(name, unknown), count) for info in told], -1) for name in names})
         ended = step.terminated | step.truncated
@@ -147,9 +152,10 @@ def _first_episodes(
     else:
         raise RuntimeError(f"{int((lengths == 0).sum())} episodes did not end within max_steps = {env.max_steps}")
     series = {name: np.stack([info[name] for info in infos]).astype(float) for name in infos[0]}
-    error, collision, distance = (series.pop(name) for name in INFOS)
+    success, collision, distance = (series.pop(name) for name in INFOS[1:])
+    error = series.pop(INFOS[0], np.full(success.shape, np.nan))
     tip, center = _kinematics(env, np.stack(starts))
-    return Trajectory(lengths, error, collision > 0, distance, tip, center, series)
+    return Trajectory(lengths, error, success > 0, collision > 0, distance, tip, center, series)
 
 
 def _kinematics(env: BatchedEnv, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

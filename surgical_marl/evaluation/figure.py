@@ -13,7 +13,7 @@ from matplotlib.ticker import FuncFormatter, NullFormatter, PercentFormatter
 
 from surgical_marl.evaluation.evaluate import Played
 from surgical_marl.evaluation.interval import interval
-from surgical_marl.evaluation.metrics import FOLLOWING, HOLD, THRESHOLDS_MM, success
+from surgical_marl.evaluation.metrics import HOLD, THRESHOLDS_MM, success
 from surgical_marl.files import write_atomic
 
 COLOR, PALE = "#1f6f8b", "#9fc3cf"
@@ -40,7 +40,7 @@ def draw(path: Path, runs: Mapping[str, Played]) -> None:
         axis.grid(True, color="#dddddd", linewidth=0.6)
         axis.spines[["top", "right"]].set_visible(False)
     parts = {name: held[i : i + 1] for i, name in enumerate(runs)} if len(runs) > 1 else {}
-    following = first.about["task"] in FOLLOWING
+    following = first.follows
     _draw_success(left, held, parts, np.geomspace(low, high, POINTS))
     left.set_xlabel("threshold (mm), held " + ("all the time" if following else f"for {HOLD} s"))
     _draw_errors(right, error, first.agents)

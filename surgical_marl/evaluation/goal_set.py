@@ -7,6 +7,7 @@ import json
 from collections.abc import Iterable, Mapping
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -33,7 +34,7 @@ def describe_goals(env: BatchedEnv, episodes: int) -> dict[str, Any]:
         "task": env.task_name,
         "scene": env.scene.name,
         "control": env.control,
-        "difficulty": env.env.difficulty,
+        "difficulty": env.env.options.difficulty,
         "episodes": episodes,
         "max_steps": env.max_steps,
         "control_dt": round(float(env.control_dt), 9),
@@ -42,15 +43,10 @@ def describe_goals(env: BatchedEnv, episodes: int) -> dict[str, Any]:
 
 
 def read_goals(env: BatchedEnv, count: int) -> list[np.ndarray]:
-    """The goals of the episodes that the first `count` environments have just begun, [count, ...] each, m.
-
-    Where goals move this is the path, from the task's table: what comes from it is computed on the device, with another
-    last digit on each.
-    """
-    carry = env.carry()
-    if ".goal.row" in carry:
-        return [np.asarray(env.env.task.table)[carry[".goal.row"][:count]]]
-    return [carry[name][:count] for name in sorted(carry) if name.startswith(".goal")]
+    """Return what the episodes that the first `count` environments have just begun are after, [count, ...] each: the
+    task says what that is."""
+    goal = {name: values[:count] for name, values in vars(env.goal).items()}
+    return env.task.goal_content(SimpleNamespace(**goal))
 
 
 def goal_hash(about: Mapping[str, Any], goals: Iterable[np.ndarray]) -> str:

@@ -13,10 +13,10 @@ HOLD = 0.2
 THRESHOLDS_MM = (1, 2, 5)
 SUCCESS_MM = 2
 """The threshold of team success and of the time to success."""
-FOLLOWING = ("track", "follow_path")
-"""Tasks whose goal moves: every step counts, not the last ones. A closed path ends where it began."""
 TERMS = ("reward_", "cost")
 """How names of reward terms and costs begin in `infos`."""
+STAGE = "stage_"
+"""How names of a task's stages begin there."""
 LAST = {"angle_error": ("angle_error_deg", 180 / math.pi), "image_error": ("image_error", 1.0)}
 """Of infos that only some agents have, the last step counts: how it is reported, and in what unit."""
 STILL = 1e-3
@@ -29,7 +29,9 @@ class Trajectory(NamedTuple):
     lengths: np.ndarray
     """[E], steps of each episode."""
     error: np.ndarray
-    """[T, E, A], distance of tip and goal after each step, m."""
+    """[T, E, A], distance of tip and goal after each step, m; NaN in a task without such goals."""
+    success: np.ndarray
+    """[T, E, A] bool, what the task calls success, after each step."""
     collision: np.ndarray
     """[T, E, A] bool, during each step."""
     distance: np.ndarray
@@ -39,8 +41,8 @@ class Trajectory(NamedTuple):
     center: np.ndarray
     """[T, E, A], distance of the shaft from its remote center at the start of each step, m; NaN without one."""
     terms: Mapping[str, np.ndarray]
-    """Reward terms, costs and what `LAST` has, of each step, by their names in `infos`, [T, E, A]; NaN for an agent
-    that has none."""
+    """Reward terms, costs, stages and what `LAST` has, of each step, by their names in `infos`, [T, E, A]; NaN for an
+    agent that has none."""
 
 
 class Metric(NamedTuple):
@@ -83,15 +85,21 @@ def measure(trajectory: Trajectory, dt: float, following: bool) -> dict[str, np.
         "squared": squared,
         "distance": -_largest(-trajectory.distance, going),
         "center": np.where(np.isnan(trajectory.center[0]), np.nan, _largest(trajectory.center, going)),
+        "success": final(trajectory.success),
         "collided": (trajectory.collision & going).any(0),
         "time": np.where((held < SUCCESS_MM / 1000) & (not following), dt * (last_miss + 1), np.nan),
         "path": moves.sum(0),
         "smoothness": _smoothness(moves / dt, trajectory.lengths - 1, dt),
-        **{
-            name: final(values) if name in LAST else np.where(going, values, 0.0).sum(0) / lengths
-            for name, values in trajectory.terms.items()
-        },
+        **{name: _reduced(name, values, going, final) for name, values in trajectory.terms.items()},
     }
+
+
+def _reduced(name: str, values: np.ndarray, going: np.ndarray, final: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """One number an episode and arm: of a stage whether it was ever reached, of `LAST` the last, else the mean."""
+    if name in LAST:
+        return final(values)
+    kept = np.where(going, values, 0.0)
+    return kept.max(0) if name.startswith(STAGE) else kept.sum(0) / going.sum(0)
 
 
 def metrics(measures: Mapping[str, np.ndarray], following: bool) -> dict[str, Metric]:
@@ -109,6 +117,7 @@ def metrics(measures: Mapping[str, np.ndarray], following: bool) -> dict[str, Me
         found[f"success_{threshold}mm"] = success(mm["held"], threshold)
     found |= {
         f"team_success_{SUCCESS_MM}mm": success(mm["held"].max(-1, keepdims=True), SUCCESS_MM),
+        "success_rate": Metric(measures["success"].astype(float), _mean),
         "collision_rate": Metric(measures["collided"].any(-1, keepdims=True).astype(float), _mean),
         "time_to_success_s": Metric(measures["time"], _mean_of_known),
         "path_length_mm": Metric(mm["path"], _mean),
@@ -121,12 +130,14 @@ def metrics(measures: Mapping[str, np.ndarray], following: bool) -> dict[str, Me
     for name, (title, unit) in LAST.items():
         if name in measures:
             found[title] = Metric(unit * measures[name], _mean_of_known)
-    return found | {n: Metric(values, _mean_of_known) for n, values in measures.items() if n.startswith(TERMS)}
+    return found | {
+        n: Metric(values, _mean_of_known) for n, values in measures.items() if n.startswith((*TERMS, STAGE))
+    }
 
 
 def success(held: np.ndarray, threshold: float) -> Metric:
-    """The share of arms whose held error [R, E, A] is below a threshold of the same unit."""
-    return Metric((held < threshold).astype(float), _mean)
+    """The share of arms whose held error [R, E, A] is below a threshold of the same unit; NaN where it is."""
+    return Metric(np.where(np.isnan(held), np.nan, held < threshold), _mean)
 
 
 def spectral_arc_length(speed: np.ndarray, dt: float) -> float:

@@ -30,8 +30,7 @@ class SurgicalEnv(gymnasium.Env[Any, np.ndarray]):
     metadata = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012 (Gymnasium's own convention)
 
     def __init__(self, task: str = "reach", scene: str = "psm", render_mode: str | None = None, **options: Any) -> None:
-        """`options` are those of `surgical_marl.envs.batch.BatchedEnv`: control, engine, device, max_steps, difficulty,
-        reward."""
+        """`options` are further arguments of `surgical_marl.envs.batch.BatchedEnv`."""
         if "num_envs" in options:
             raise ValueError(f"num_envs {options['num_envs']!r} is for many environments: use gymnasium.make_vec")
         if render_mode not in RENDER_MODES:
@@ -67,6 +66,9 @@ class SurgicalEnv(gymnasium.Env[Any, np.ndarray]):
 
         self._picture = self._picture or ScenePicture(self.batch)
         return self._picture.draw()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "_picture": None}
 
 
 class SurgicalVectorEnv(VectorEnv[Any, np.ndarray, Any]):
@@ -108,28 +110,37 @@ class SurgicalVectorEnv(VectorEnv[Any, np.ndarray, Any]):
 
 
 def _joint_spaces(batch: BatchedEnv) -> tuple[spaces.Space[Any], spaces.Box]:
-    """Of what all arms observe, with the pictures if one sees any, and of what all do."""
-    boxes = [batch.env.observation_space(agent) for agent in batch.agents]
+    """Of what all arms observe, with the pictures if any sees some, and of what all do."""
+    own = {agent: batch.observation_space(agent) for agent in batch.agents}
+    boxes = [proprioception(space.spaces if isinstance(space, spaces.Dict) else space) for space in own.values()]
     low, high = (np.concatenate([getattr(box, end) for box in boxes]) for end in ("low", "high"))
-    box = spaces.Box(low, high, dtype=np.float32)
-    observed: spaces.Space[Any] = box
-    if batch.env.task.camera is not None:
-        from surgical_marl.envs.pictures import Pictures
-
-        observed = Pictures.space(box)
+    observed: spaces.Space[Any] = spaces.Box(low, high, dtype=np.float32)
+    if any(isinstance(space, spaces.Dict) for space in own.values()):
+        observed = spaces.Dict({"proprioception": observed, **_pictures(own)})
     width = sum(batch.action_space(agent).shape[0] for agent in batch.agents)
     return observed, spaces.Box(-1.0, 1.0, (width,), np.float32)
 
 
 def _joint(batch: BatchedEnv, observations: dict[str, Any], index: int | None = None) -> Any:
-    """What all arms observe as one array, in a dict with the pictures if one sees any; of one environment or of all."""
+    """What all arms observe as one array, in a dict with the pictures if any sees some; of one environment or of all."""
     chosen: Any = slice(None) if index is None else index
     # engines may sort the agents by name
     felt = np.concatenate([proprioception(observations[agent])[chosen] for agent in batch.agents], -1)
-    camera = batch.env.task.camera
-    if camera is None:
-        return felt
-    return {**each(observations[camera], lambda part: np.array(part[chosen])), "proprioception": felt}
+    pictures = _pictures({agent: observations[agent] for agent in batch.agents})
+    return {"proprioception": felt, **each(pictures, lambda part: np.array(part[chosen]))} if pictures else felt
+
+
+def _pictures(observations: dict[str, Any]) -> dict[str, Any]:
+    """The pictures of all agents, or their spaces, under their names; of several agents that see some as
+    "<agent>/<name>"."""
+    own = {agent: dict(part.items()) for agent, part in observations.items() if hasattr(part, "keys")}
+    several = len(own) > 1
+    return {
+        f"{agent}/{name}" if several else name: picture
+        for agent, parts in own.items()
+        for name, picture in parts.items()
+        if name != "proprioception"
+    }
 
 
 def _split(batch: BatchedEnv, actions: np.ndarray) -> dict[str, np.ndarray]:
@@ -145,7 +156,7 @@ def _joint_info(infos: dict[str, dict[str, Any]], index: int | None = None) -> d
     shared = [key for key in next(iter(infos.values())) if all(key in info for info in infos.values())]
     stacked = {key: np.stack([info[key] for info in infos.values()]) for key in shared}
     team: dict[str, Any] = {
-        "tip_error": stacked["tip_error"].max(0),
+        **({"tip_error": stacked["tip_error"].max(0)} if "tip_error" in stacked else {}),
         "success": stacked["success"].all(0),
         "collision": stacked["collision"].any(0),
         "min_distance": stacked["min_distance"].min(0),

@@ -12,7 +12,6 @@ empties.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -100,6 +99,9 @@ class SurgicalParallelEnv(ParallelEnv[str, Any, Any]):
         self._picture = self._picture or ScenePicture(self.batch)
         return self._picture.draw()
 
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "_picture": None}
+
     def _first(self, value: Any) -> Any:
         return np.array(value[0])
 
@@ -171,31 +173,29 @@ def parallel_env(
     task: str = "reach",
     scene: str = "bimanual_psm",
     *,
-    control: str = "position",
     engine: str = "auto",
     device: str = "auto",
     num_envs: int | None = None,
-    max_steps: int | None = None,
     max_cycles: int | None = None,
-    difficulty: str = "default",
-    reward: Mapping[str, float] | None = None,
     arrays: str = "numpy",
     render_mode: str | None = None,
+    **options: Any,
 ) -> SurgicalParallelEnv | SurgicalBatchedParallelEnv:
-    """A PettingZoo parallel environment.
+    """Make a PettingZoo parallel environment.
 
     Args:
         task: a name of `list_tasks()`.
         scene: a name of `list_scenes()` or the path of a scene file.
-        control: "position" (targets moved by increments), "velocity" or "torque".
         engine: "auto", "fused" or "mjx".
         device: "auto", "cpu" or "cuda".
         num_envs: None for one environment, N for the same dicts with a leading N.
-        max_steps: control steps until truncation; the task's own if None. `max_cycles` is PettingZoo's name for it.
-        difficulty: "easy", "default" or "hard".
-        reward: weights of reward terms that replace the task's own, as in {"collision": -5}.
+        max_cycles: PettingZoo's name for the option `max_steps`.
         arrays: with `num_envs`, the library of the arrays: "numpy", "torch" or "jax".
         render_mode: None or "rgb_array" (one environment).
+        options: `control` ("position", "velocity" or "torque"), `difficulty` (a level of the task), `start` ("home" or
+            "random"), `max_steps` (control steps until truncation), `decimation` (physics steps a control step),
+            `reward` (weights of reward terms, as in {"collision": -5}) and `observe` (terms that agents see, as in
+            {"ecm_0": ["qpos", "image"]}): see `surgical_marl.tasks.base.options.Options`.
 
     Raises:
         ValueError: naming the unknown value and the good ones.
@@ -208,18 +208,10 @@ def parallel_env(
         raise ValueError(f"render_mode {render_mode!r} is for one environment: leave num_envs {num_envs} out")
     if num_envs is None and arrays != "numpy":
         raise ValueError(f"arrays={arrays!r} needs num_envs; one environment speaks numpy")
-    batch = BatchedEnv(
-        task,
-        scene,
-        num_envs=1 if num_envs is None else num_envs,
-        control=control,
-        engine=engine,
-        device=device,
-        max_steps=max_cycles if max_steps is None else max_steps,
-        difficulty=difficulty,
-        reward=reward,
-        arrays=arrays,
-    )
+    if options.get("max_steps") is None:
+        options["max_steps"] = max_cycles
+    count = 1 if num_envs is None else num_envs
+    batch = BatchedEnv(task, scene, num_envs=count, engine=engine, device=device, arrays=arrays, **options)
     return SurgicalParallelEnv(batch, render_mode) if num_envs is None else SurgicalBatchedParallelEnv(batch)
 
 

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 ENDED = ("episodes", "error", "success", "collision", "reward")
-"""What `Episodes.take` sums up, before the reward terms."""
+"""What `Episodes.take` sums up, before the reward terms. A task without tip errors has none: 0."""
+KNOWN = ("success", "collision")
 
 
 class Episodes:
@@ -31,9 +32,9 @@ class Episodes:
 
     def add(self, rewards: Tensor, dones: Tensor, infos: Mapping[str, Mapping[str, Tensor]]) -> None:
         """Count one step: rewards `[N]`, dones `[N]`, and the infos of each agent."""
-        error, success, collision = (
-            torch.stack([infos[agent][name] for agent in self.agents]) for name in ("tip_error", "success", "collision")
-        )
+        success, collision = (torch.stack([infos[agent][name] for agent in self.agents]) for name in KNOWN)
+        errors = [infos[agent]["tip_error"] for agent in self.agents if "tip_error" in infos[agent]]
+        error = torch.stack(errors) if errors else torch.zeros_like(rewards)[None]
         self.collided |= collision.any(0)
         # where, not a product: the error of an episode that runs on must not matter, whatever it
         # is.

@@ -2,7 +2,7 @@
 
     plant = Plant(simulator)
     hidden = plant.start(key)
-    physics, hidden = plant.command(plant.home(hidden), hidden, actions)
+    physics, hidden = plant.command(plant.at_rest(hidden), hidden, actions)
     physics, contacts, views = plant.advance(physics, hidden)
     seen = plant.measure(physics, hidden, contacts, views, key)
 
@@ -19,7 +19,8 @@ import mujoco
 import numpy as np
 from jax import Array
 
-from surgical_marl.physics.simulator import ArmView, Contacts, Physics, Simulator
+from surgical_marl.physics.simulator import Physics, Simulator
+from surgical_marl.physics.views import ArmView, Contacts
 
 Views = dict[str, ArmView]
 
@@ -61,8 +62,8 @@ class Plant:
         self._positions = simulator.scene.control == "position"
         self._backlash = each(r.backlash_angle, r.backlash_slide) * self._positions
 
-    def start(self, key: Array) -> Hidden | None:
-        """What an episode draws, by a key of its own."""
+    def start(self, key: Array, qpos: Array | None = None) -> Hidden | None:
+        """What an episode draws, by a key of its own, for arms that begin at `qpos` [nq], or at home."""
         r, simulator, scene = self._ranges, self._simulator, self._simulator.scene
         if not r:
             return None
@@ -79,14 +80,15 @@ class Plant:
             friction=even(nv, 1 - r.friction, 1 + r.friction),
             payload=even(arms, 0.0, r.payload),
             latency=jax.random.randint(next(keys), (), 0, r.latency + 1),
-            motor=simulator.home.ctrl + believed,  # to stay where the arms are
+            motor=(simulator.home if qpos is None else simulator.at(qpos)).ctrl
+            + believed,  # to stay where the arms are
             pending=jnp.zeros((r.latency, sum(len(mount.arm.actuated) for mount in scene.mounts.values()))),
         )
 
-    def home(self, hidden: Hidden | None) -> Physics:
-        """All arms at home, at rest."""
-        home = self._simulator.home
-        return home if hidden is None else home._replace(ctrl=hidden.motor)
+    def at_rest(self, hidden: Hidden | None, qpos: Array | None = None) -> Physics:
+        """All arms at rest at joint positions [nq] of the whole scene, or at home."""
+        physics = self._simulator.home if qpos is None else self._simulator.at(qpos)
+        return physics if hidden is None else physics._replace(ctrl=hidden.motor)
 
     def command(
         self, physics: Physics, hidden: Hidden | None, actions: dict[str, Array]

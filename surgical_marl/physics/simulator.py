@@ -10,7 +10,7 @@ docs/physics.md says how a step is computed and compares it with C MuJoCo.
 from __future__ import annotations
 
 import copy
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -21,42 +21,13 @@ from jax import Array
 from surgical_marl.physics.collision import Pairs
 from surgical_marl.physics.dynamics import Dynamics, Physics
 from surgical_marl.physics.solver import Rows, solve
+from surgical_marl.physics.views import ArmView, Contacts
 from surgical_marl.scenes.build import alone
-from surgical_marl.scenes.scene import DECIMATION, PAYLOAD, Scene
+from surgical_marl.scenes.scene import PAYLOAD, Scene
+from surgical_marl.scenes.timing import DECIMATION
 
 TOUCHING_ITERATIONS = (6, 6)
 """Most Newton steps, and line search steps in each, for arms that touch: see docs/physics.md."""
-
-
-class Contacts(NamedTuple):
-    """The pairs of geoms that can touch, in the order of `Scene.pairs`, [P] each."""
-
-    distance: Array
-    """Signed distance in the newest state, m."""
-    penetration: Array
-    """The deepest overlap during the control step, m; 0 without any."""
-    force: Array
-    """The largest normal force during the control step, N."""
-
-
-class ArmView(NamedTuple):
-    """What a task sees of one arm in the newest state. Base frame; SI units."""
-
-    qpos: Array
-    """Positions of the actuated joints, [n]."""
-    qvel: Array
-    command: Array
-    """Position targets (or the last velocity or torque command), [n]."""
-    tool_tip: Array
-    """[3]"""
-    nearest_tip: Array
-    """From this tool tip to that of the nearest other arm, [3]; zero if there is none."""
-    min_distance: Array
-    """Least distance to any other arm, []; inf if there is none."""
-    collision: Array
-    """Whether it touched another arm or itself during the step, []."""
-    contact_force: Array
-    """The largest normal force on it during the step, N, []."""
 
 
 class Kind:
@@ -105,17 +76,24 @@ class Simulator:
         self.decimation, self.control_dt = decimation, decimation * scene.model.opt.timestep
         self._index_joints()
         self._index_pairs()
-        start = scene.home[self.address]
-        start = start if scene.control == "position" else np.where(self.jaws, start, 0.0)
-        self._home = np.asarray(scene.home, np.float32), np.asarray(self.moment @ start, np.float32)
         self.home_contacts, self.home_views = self._measure_home()
 
     @property
     def home(self) -> Physics:
         """All arms at home, at rest."""
-        qpos, ctrl = map(jnp.asarray, self._home)
+        return self.at(jnp.asarray(self.scene.home, jnp.float32))
+
+    def at(self, qpos: Array) -> Physics:
+        """All arms at rest at joint positions [nq] of the whole scene, with the commands that keep them there."""
         still = jnp.zeros(self.scene.model.nv, jnp.float32)
-        return Physics(qpos, still, still, ctrl)
+        return Physics(qpos, still, still, self._holding(qpos))
+
+    def _holding(self, qpos: Any) -> Any:
+        """The commands [nu] that keep arms where they are."""
+        joints = qpos[self.address]
+        if self.scene.control != "position":
+            joints = joints * self.jaws  # a jaw is told where to be in every mode
+        return self.moment @ joints
 
     def command(self, physics: Physics, actions: dict[str, Array], measured: Array | None = None) -> Physics:
         """The next command of every actuator, from the joints' positions, or from what is `measured` of them, [nq]. A
@@ -176,6 +154,12 @@ class Simulator:
             "body_mass": model.body_mass.at[np.array(bodies, int)].set(payload[: len(bodies)]),
         }
         return varied
+
+    def look(self, physics: Physics) -> tuple[Contacts, dict[str, ArmView]]:
+        """Contacts and views of arms at rest, which nothing has pressed yet."""
+        tips, distance = self._look(physics.qpos)
+        contacts = Contacts(distance, jnp.maximum(-distance, 0.0), jnp.zeros_like(distance))
+        return contacts, self._view(jnp, physics, tips, contacts)
 
     def view(self, physics: Physics, contacts: Contacts) -> dict[str, ArmView]:
         """What tasks see at a posture, apart from contacts, which are those of the step before."""
@@ -284,7 +268,7 @@ class Simulator:
         distance = np.array([mujoco.mj_geomDistance(model, data, a, b, 100.0, None) for a, b in ids])
         still = np.zeros(model.nv)
         contacts: Any = Contacts(distance, np.maximum(-distance, 0.0), 0.0 * distance)  # type: ignore[arg-type]
-        physics: Any = Physics(self.scene.home, still, still, self._home[1])  # type: ignore[arg-type]
+        physics: Any = Physics(self.scene.home, still, still, self._holding(self.scene.home))  # type: ignore[arg-type]
         views = self._view(np, physics, data.site_xpos[list(self._sites.values())], contacts)
         single = lambda x: jnp.asarray(x, jnp.bool_ if x.dtype == bool else jnp.float32)  # noqa: E731
         # one by one: JAX would sort the agents by name

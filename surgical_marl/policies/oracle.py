@@ -41,15 +41,17 @@ def oracle(env: BatchedEnv, agents: Sequence[str] | None = None) -> Callable[[Ma
     Raises:
         ValueError: the environment has another control mode.
     """
+    if not env.task.has_targets:
+        raise ValueError(f"the task {env.task_name!r} has no target for tool tips that an oracle could move to")
     if env.control != "position":
         raise ValueError(f"the oracle moves position targets: control must be 'position', not {env.control!r}")
     moved = env.agents if agents is None else agents
     arms = {agent: _Guide(env, agent, index) for index, agent in enumerate(env.agents) if agent in moved}
 
     def policy(observations: Mapping[str, Any]) -> dict[str, Any]:
-        goal, began = env.goal.astype(float), _numpy(env.steps) == 0
+        targets, began = np.asarray(env.task.targets(env.goal), float), _numpy(env.steps) == 0
         seen = {agent: proprioception(observations[agent]) for agent in arms}
-        moves = {agent: arm.move(goal, began, _numpy(seen[agent])) for agent, arm in arms.items()}
+        moves = {agent: arm.move(targets, began, _numpy(seen[agent])) for agent, arm in arms.items()}
         furthest = np.max([np.abs(move).max(-1) for move in moves.values()], axis=0)
         pace = 1 / np.maximum(furthest, 1)[:, None]
         return {agent: _like(seen[agent], pace * move) for agent, move in moves.items()}
@@ -67,15 +69,18 @@ class _Guide:
         self.lead = self.dt + np.array([joint.drive.damping / joint.drive.stiffness for joint in joints])
         self.moves = np.array([self.arm.jaw is None or joint.name != self.arm.jaw.joint for joint in joints])
         self.q = np.tile(self.arm.home, (env.num_envs, 1))
+        self.terms = env.observation_terms(agent)
+        if missing := {"qpos", "command"} - self.terms.keys():
+            raise ValueError(f"the oracle needs to observe {' and '.join(sorted(missing))} of {agent!r}")
 
-    def move(self, goal: np.ndarray, began: np.ndarray, observation: np.ndarray) -> np.ndarray:
-        """How far the commands have to go, [N, n], in what an action of 1 does."""
-        n, targets = len(self.reach), goal[:, self.index]
-        before = np.where(began[:, None], self.arm.home, self.q)
-        self.q = inverse_kinematics(self.arm, targets, before, starts=1, iterations=20 if began.any() else ITERATIONS)
+    def move(self, targets: np.ndarray, began: np.ndarray, observation: np.ndarray) -> np.ndarray:
+        """How far the commands have to go, [N, n], in what an action of 1 does, to targets [N, arms, 3]."""
+        before = np.where(began[:, None], observation[:, self.terms["qpos"]], self.q)
+        iterations = 20 if began.any() else ITERATIONS
+        self.q = inverse_kinematics(self.arm, targets[:, self.index], before, starts=1, iterations=iterations)
         velocity = np.where(began[:, None], 0.0, (self.q - before) / self.dt)
         wanted = np.clip(self.q + self.lead * velocity, self.arm.lower, self.arm.upper)
-        command = observation[:, 2 * n + 3 : 3 * n + 3]
+        command = observation[:, self.terms["command"]]
         return np.asarray((wanted - command) / self.reach * self.moves)
 
 

@@ -9,7 +9,8 @@ import numpy as np
 
 from surgical_marl.robots.spec import COLLISION_GROUP, build_spec
 from surgical_marl.scenes.randomisation import Randomisation
-from surgical_marl.scenes.scene import PAYLOAD, TIMESTEP, Mount, Scene
+from surgical_marl.scenes.scene import PAYLOAD, Mount, Scene
+from surgical_marl.scenes.timing import TIMESTEP
 
 
 def set_physics(spec: mujoco.MjSpec) -> None:

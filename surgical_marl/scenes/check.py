@@ -25,7 +25,8 @@ from surgical_marl.robots.urdf import Faults
 from surgical_marl.scenes.build import set_physics
 from surgical_marl.scenes.contacts import collision_geoms, neighbours
 from surgical_marl.scenes.load import load_scene
-from surgical_marl.scenes.scene import TIMESTEP, Scene
+from surgical_marl.scenes.scene import Scene
+from surgical_marl.scenes.timing import TIMESTEP
 
 REACH = 0.001
 """A scene's workspace point must be within reach to this, m."""

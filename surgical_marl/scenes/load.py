@@ -33,7 +33,7 @@ def load_scene(name: str | Path, control: str = "position") -> Scene:
     """
     path = find("scenes", name)
     settings = read_yaml(path)
-    check_keys(settings, ("description", "arms", "view", "tissue", "randomisation"), path)
+    check_keys(settings, ("description", "arms", "view", "tissue", "randomisation", "observe"), path)
     arms = settings.get("arms")
     if not isinstance(arms, dict) or not arms:
         raise ValueError(f"{path}: arms must map agent names such as psm_0 to arms")
@@ -44,7 +44,8 @@ def load_scene(name: str | Path, control: str = "position") -> Scene:
     for piece, what in read_mapping(settings.get("tissue"), f"{path}, tissue").items():
         add_tissue(spec, f"tissue/{piece}", what, f"{path}, tissue {piece!r}")
     model = compile_scene(spec)
-    scene = Scene(path.stem, str(settings.get("description", "")), control, mounts, model, randomisation)
+    observe = read_mapping(settings.get("observe"), f"{path}, observe")
+    scene = Scene(path.stem, str(settings.get("description", "")), control, mounts, model, randomisation, observe)
     for one, other in contact_pairs(scene):
         spec.add_pair(geomname1=one, geomname2=other, condim=1, solref=SOLREF)
     return replace(scene, model=weigh_shapes(compile_scene(spec), scene.home))

@@ -16,14 +16,10 @@ import numpy as np
 
 from surgical_marl.content import unknown
 from surgical_marl.robots.arm import Arm
-from surgical_marl.robots.spec import COLLISION_GROUP
+from surgical_marl.robots.spec import COLLISION_GROUP, build_spec
 from surgical_marl.scenes.geometry import Capsule, capsule_distance
 from surgical_marl.scenes.randomisation import Randomisation
 
-TIMESTEP = 0.0025
-"""Physics step in s. docs/physics.md has the stability test that chose it."""
-DECIMATION = 8
-"""Physics steps a control step: control at 50 Hz."""
 PAYLOAD = "payload"
 """The body at an arm's tool tip that stands for what it carries, where that is randomised: `<agent>/payload`."""
 
@@ -52,6 +48,8 @@ class Scene:
     model: mujoco.MjModel = field(repr=False)
     randomisation: Randomisation
     """How far arms are from the model and from what is measured; not at all unless the file says so."""
+    observe: dict[str, list[str]] = field(default_factory=dict)
+    """Agent -> names of the observation terms that it sees, instead of the task's own choice."""
 
     @property
     def agents(self) -> tuple[str, ...]:
@@ -60,9 +58,21 @@ class Scene:
 
     @cached_property
     def types(self) -> dict[str, tuple[str, ...]]:
-        """Agents by the arm they are: {"psm": ("psm_0", "psm_1")}."""
-        names = dict.fromkeys(mount.arm.name for mount in self.mounts.values())
-        return {name: tuple(a for a in self.agents if self.mounts[a].arm.name == name) for name in names}
+        """Agents by what their arms are, whatever their folders are called: {"psm": ("psm_0", "psm_1")}.
+
+        A type has the name of its first arm's folder; where another type has it already, a number follows.
+        """
+        groups: list[list[str]] = []
+        for agent, mount in self.mounts.items():
+            same = (group for group in groups if are_alike(self.mounts[group[0]].arm, mount.arm))
+            group = next(same, None)
+            groups.append([agent]) if group is None else group.append(agent)
+        found: dict[str, tuple[str, ...]] = {}
+        for group in groups:
+            name = self.mounts[group[0]].arm.name
+            taken = sum(other.partition("-")[0] == name for other in found)
+            found[f"{name}-{taken + 1}" if taken else name] = tuple(group)
+        return found
 
     def find_camera(self, agent: str | None = None) -> str:
         """The agent whose camera that is: the first that has one, or the one that is named. ValueError without any."""
@@ -155,6 +165,24 @@ class Scene:
                         for end in (-half, half))  # fmt: skip
                 capsules[geom] = (a, b, float(model.geom_size[geom, 0]))
         return capsules
+
+
+def are_alike(one: Arm, other: Arm) -> bool:
+    """Return whether two arms have the same model: bodies, joints, drives, shapes and colours."""
+    if one.folder == other.folder:
+        return True
+    if [joint.name for joint in one.joints] != [joint.name for joint in other.joints]:
+        return False
+    return _model_content(one) == _model_content(other)
+
+
+def _model_content(arm: Arm) -> bytes:
+    spec = build_spec(arm)
+    spec.modelname = ""
+    model = spec.compile()
+    content = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, content)
+    return content.tobytes()
 
 
 def collision_geoms(model: mujoco.MjModel, agent: str) -> list[int]:

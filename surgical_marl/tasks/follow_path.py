@@ -18,13 +18,17 @@ Difficulty    greatest speed, and distance from the start: easy 10 mm/s, 50 mm; 
 
 from __future__ import annotations
 
-import jax.numpy as jnp
-import numpy as np
-from jax import Array
+from typing import TYPE_CHECKING
 
-from surgical_marl.tasks.base.path_task import PathGoal, PathTask
+import numpy as np
+
+from surgical_marl.tasks.base.path_task import PathTask
 from surgical_marl.tasks.base.paths import loops_and_lines
-from surgical_marl.tasks.base.task import FAR, Level, Views
+from surgical_marl.tasks.base.task import Level, World
+from surgical_marl.tasks.base.terms import FAR, Picture, Term
+
+if TYPE_CHECKING:
+    from jax import Array
 
 AHEAD = (0.1, 0.2, 0.4)
 """How much later the points of the path are reached that an arm sees, s."""
@@ -40,15 +44,15 @@ class Task(PathTask):
         "hard": Level(0.07, 0.5, 0.03),
     }
 
-    def observations(self, views: Views, goal: PathGoal) -> dict[str, Array]:
-        """[d] each; the points ahead come last."""
-        known = super().observations(views, goal)
-        ahead = self.along(goal.row, goal.time + np.array(AHEAD, np.float32))
-        ways = {agent: (ahead[:, i] - view.tool_tip).ravel() for i, (agent, view) in enumerate(views.items())}
-        return {agent: jnp.concatenate([known[agent], ways[agent]]) for agent in views}
-
-    def bounds(self, agent: str) -> tuple[np.ndarray, np.ndarray]:
-        """Least and greatest observation of an agent, [d] each."""
-        low, high = super().bounds(agent)
+    def terms(self, agent: str) -> dict[str, Term | Picture]:
+        """Return those of `reach`, and `to_path_ahead` [9], the ways from the tip to three points ahead, m."""
         space = np.full(3 * len(AHEAD), 2 * FAR)
-        return np.append(low, -space), np.append(high, space)
+        return {**super().terms(agent), "to_path_ahead": Term(lambda w: self._ahead(w, agent), -space, space)}
+
+    def observes(self, agent: str) -> tuple[str, ...]:
+        """Return what is observed in `reach`, then the points ahead."""
+        return (*super().observes(agent), "to_path_ahead")
+
+    def _ahead(self, world: World, agent: str) -> Array:
+        points = self.along(world.goal.row, world.goal.time + np.array(AHEAD, np.float32))
+        return (points[:, self.scene.agents.index(agent)] - world.arms[agent].tool_tip).ravel()

@@ -26,18 +26,19 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jax import Array
 
 from surgical_marl.cache import cached
-from surgical_marl.tasks.base import task
-from surgical_marl.tasks.base.task import Level, Views
+from surgical_marl.runtime import jax, jnp
+from surgical_marl.tasks.base.options import Options
+from surgical_marl.tasks.base.task import Level, Start, TipTask, World
+from surgical_marl.tasks.base.terms import Picture, Term
 from surgical_marl.tasks.base.workspace import CLEARANCE, PATH_POINTS, choose
 
 if TYPE_CHECKING:
+    from jax import Array
+
     from surgical_marl.scenes.scene import Scene
 
 POSTURES = 1024
@@ -56,95 +57,103 @@ class PictureGoal(NamedTuple):
     targets: Array
     """Tool tips: the camera's at the hidden pose, the others' at home; [arms, 3], m, each in its arm's base frame."""
     row: Array
-    """Of `Task.table`."""
+    """Of the tables."""
 
 
-class Task(task.Task):
-    """Hidden postures, and how far from them the camera is. Pictures are added where many environments run:
-    `surgical_marl/envs/pictures.py`."""
+class Task(TipTask):
+    """Hidden postures, and how far from them the camera is."""
 
     levels = {"easy": Level(0.01, 0.0), "default": Level(0.02, 0.0), "hard": Level(0.04, 0.0)}  # noqa: RUF012
     weights = {  # noqa: RUF012
         "image": -10.0, "distance": 0.0, "precision": 0.0, "angle": 0.0, "stray": -10.0, "clearance": -1.0,
         "collision": -2.0,
     }  # fmt: skip
+    senses = ("image_error",)
+    wanted = {"median_error_mm": ("below", 2.0)}  # noqa: RUF012
 
-    def __init__(self, scene: Scene, difficulty: str = "default", reward: Mapping[str, float] | None = None) -> None:
-        super().__init__(scene, difficulty, reward)
+    def __init__(self, scene: Scene, options: Options) -> None:
+        super().__init__(scene, options)
         self.camera: str = scene.find_camera()
         same = scene.types[scene.mounts[self.camera].arm.name]
         if len(same) > 1:
             raise ValueError(f"match_image needs a scene with one endoscope; {scene.name!r} has {', '.join(same)}")
-        self.table = hidden_postures(scene, self.camera, self.level.extent)
-        """`qpos` of the whole scene when a target picture is taken, [rows, nq]."""
-        tips, self._arm = [], scene.mounts[self.camera].arm
-        for agent, mount in scene.mounts.items():
-            q = self.table[:, scene.qpos_index(agent)]
-            tips.append(mount.arm.forward_kinematics(q)[:, :3, 3])
-            if agent == self.camera:
-                self._turns = jnp.asarray(self._turn(q), jnp.float32)
-                self._postures = jnp.asarray(q, jnp.float32)
-        self._tips = jnp.asarray(np.stack(tips, axis=1), jnp.float32)
+        self._arm = scene.mounts[self.camera].arm
+        table = hidden_postures(scene, self.camera, self.level.extent)
+        joints = {agent: table[:, scene.qpos_index(agent)] for agent in scene.agents}
+        tips = [mount.arm.forward_kinematics(joints[agent])[:, :3, 3] for agent, mount in scene.mounts.items()]
+        tables = {"tips": np.stack(tips, 1), "turns": self._turn(joints[self.camera]), "joints": joints[self.camera]}
+        self.tables |= {name: np.asarray(values, np.float32) for name, values in tables.items()}
+        self.postures = {"hidden": table}
+        self.watched = {self.camera: ("image", "target")}
 
-    def start(self, key: Array) -> PictureGoal:
-        """A hidden posture."""
-        row = jax.random.randint(key, (), 0, len(self._tips))
-        return PictureGoal(self._tips[row], row)
+    def start(self, key: Array) -> Start:
+        """Return a hidden posture."""
+        row = jax.random.randint(key, (), 0, len(self.tables["tips"]))
+        return Start(PictureGoal(self.tables["tips"][row], row))
 
-    def observations(self, views: Views, goal: PictureGoal) -> dict[str, Array]:
-        """[d] each, without the targets."""
-        known = super().observations(views, goal)
-        return {agent: jnp.concatenate(self._without_targets(agent, seen)) for agent, seen in known.items()}
+    def terms(self, agent: str) -> dict[str, Term | Picture]:
+        """Return those of an arm, without its target, and the picture to be matched as `target`."""
+        terms = super().terms(agent)
+        del terms["to_target"]
+        return {**terms, "target": Picture(self.camera, table="hidden")}
 
-    def bounds(self, agent: str) -> tuple[np.ndarray, np.ndarray]:
-        """Least and greatest observation of an agent, [d] each."""
-        low, high = (np.concatenate(self._without_targets(agent, bound)) for bound in super().bounds(agent))
-        return low, high
+    def observes(self, agent: str) -> tuple[str, ...]:
+        """Return what an arm knows of itself and of the others; for the camera's agent both pictures too."""
+        vector = tuple(name for name in super().observes(agent) if name not in ("target", "to_target"))
+        return (*vector, "image", "target") if agent == self.camera else vector
 
     def privileged(self, goal: PictureGoal) -> Array:
-        """Joint positions of the camera's arm at the hidden pose."""
-        return self._postures[goal.row]
+        """Return the joint positions of the camera's arm at the hidden pose."""
+        return self.tables["joints"][goal.row]
 
     @property
     def privileged_bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Limits of those joints."""
         return self._arm.lower, self._arm.upper
 
-    def terms(self, views: Views, goal: PictureGoal) -> dict[str, dict[str, Array]]:
-        """agent -> reward term -> its value. `image` is 0 here: pictures are compared where they are drawn."""
-        errors, safety, none = self.tip_errors(views, goal), super().terms(views, goal), jnp.float32(0.0)
+    def sense(self, pictures: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+        """Return `image_error`, the mean absolute difference of both pictures in grey levels, 0 to 255, [N]."""
+        import torch
+
+        seen, wanted = pictures[self.camera]["image"], pictures[self.camera]["target"]
+        # in bytes as long as it goes: this reads and writes more memory than drawing does
+        return {"image_error": (torch.maximum(seen, wanted) - torch.minimum(seen, wanted)).float().mean((1, 2, 3))}
+
+    def reward_terms(self, world: World) -> dict[str, dict[str, Array]]:
+        """Return agent -> reward term -> its value before weighting; the camera's first four and the others' `stray`."""
+        errors, known, none = self.tip_errors(world), super().reward_terms(world), jnp.float32(0.0)
+        looks = {agent: agent == self.camera for agent in world.arms}
         return {
             agent: {
-                "image": none,
-                "distance": errors[agent] if agent == self.camera else none,
-                "precision": safety[agent]["precision"] if agent == self.camera else none,
-                "angle": self.angle_error(views, goal) if agent == self.camera else none,
-                "stray": none if agent == self.camera else errors[agent],
-                **{name: safety[agent][name] for name in ("clearance", "collision")},
+                "image": world.sensed["image_error"] / 255 if looks[agent] else none,
+                "distance": errors[agent] if looks[agent] else none,
+                "precision": known[agent]["precision"] if looks[agent] else none,
+                "angle": self.angle_error(world) if looks[agent] else none,
+                "stray": none if looks[agent] else errors[agent],
+                **{name: known[agent][name] for name in ("clearance", "collision")},
             }
-            for agent in views
+            for agent in world.arms
         }
 
-    def metrics(self, views: Views, goal: PictureGoal) -> dict[str, dict[str, Array]]:
-        """`angle_error` of the camera's agent, rad."""
-        return {
-            agent: {"angle_error": self.angle_error(views, goal)} if agent == self.camera else {} for agent in views
-        }
+    def metrics(self, world: World) -> dict[str, dict[str, Array]]:
+        """Return `tip_error`; and of the camera's agent `angle_error`, rad, and `image_error`, grey levels."""
+        found = super().metrics(world)
+        found[self.camera] |= {"angle_error": self.angle_error(world), "image_error": world.sensed["image_error"]}
+        return found
 
-    def angle_error(self, views: Views, goal: PictureGoal) -> Array:
-        """Angle in rad by which the camera is turned away from the hidden pose, about whatever axis."""
-        turn = self._turn(views[self.camera].qpos) - self._turns[goal.row]
+    def angle_error(self, world: World) -> Array:
+        """Return the angle in rad by which the camera is turned away from the hidden pose, about whatever axis."""
+        turn = self._turn(world.arms[self.camera].qpos) - self.tables["turns"][world.goal.row]
         chord = jnp.sqrt(jnp.sum(turn * turn)) / np.float32(np.sqrt(8))  # of rotations: sine of half the angle
         return 2 * jnp.arcsin(jnp.minimum(chord, 1.0))
 
-    def _turn(self, q: Array | np.ndarray) -> Array:
-        """Rotation of the tool tip's frame, [..., 3, 3], from joints [..., n]."""
-        pose: Array = self._arm.forward_kinematics(q)[..., :3, :3]
-        return pose
+    def goal_content(self, goal: Any) -> list[np.ndarray]:
+        """Return the hidden postures."""
+        return [self.postures["hidden"][goal.row]]
 
-    def _without_targets(self, agent: str, values: Any) -> list[Any]:
-        n = len(self.scene.mounts[agent].arm.actuated)
-        return [values[: 3 * n + 3], values[3 * n + 9 :]]
+    def _turn(self, q: Any) -> Any:
+        """Rotation of the tool tip's frame, [..., 3, 3], from joints [..., n]."""
+        return self._arm.forward_kinematics(q)[..., :3, :3]
 
 
 def hidden_postures(scene: Scene, agent: str, extent: float) -> np.ndarray:

@@ -12,37 +12,47 @@ Reward        per agent, each step, weights in brackets: `distance` of tip and g
 Success       tip within 2 mm of the goal.
 Termination   none; an episode is truncated after 100 control steps (2 s).
 Randomisation goals from a normal distribution about the point in front of each arm, kept only if reachable in
-              1.5 s without collision (`surgical_marl/tasks/base/workspace.py`). Arms start at home.
+              1.5 s without collision (`surgical_marl/tasks/base/workspace.py`). Arms start at home, or with
+              `start=random` at postures from all of their joints' ranges, from which the goals are reached likewise.
 Difficulty    standard deviation of the goals: easy 30 mm, default 50 mm (the paper's), hard 70 mm. Hard: in a quarter
               of the episodes of several arms the straight ways from home, in joint space, collide unless one arm waits.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-import jax
-import jax.numpy as jnp
-from jax import Array
-
-from surgical_marl.tasks.base import task
-from surgical_marl.tasks.base.task import Goal, Level
-from surgical_marl.tasks.base.workspace import target_table
+from surgical_marl.runtime import jax
+from surgical_marl.tasks.base.options import Options
+from surgical_marl.tasks.base.task import Goal, Level, Start, TipTask
+from surgical_marl.tasks.base.workspace import start_table, target_table
 
 if TYPE_CHECKING:
+    from jax import Array
+
     from surgical_marl.scenes.scene import Scene
 
 
-class Task(task.Task):
+class Task(TipTask):
     """Goals that stay where they are."""
 
     levels = {"easy": Level(0.03, 0.0), "default": Level(0.05, 0.0), "hard": Level(0.07, 0.25)}  # noqa: RUF012
+    starts = ("home", "random")
+    wanted = {  # noqa: RUF012
+        "median_error_mm": ("below", 1.0),
+        "success_2mm": ("at least", 0.99),
+        "collision_rate": ("below", 0.005),
+    }
 
-    def __init__(self, scene: Scene, difficulty: str = "default", reward: Mapping[str, float] | None = None) -> None:
-        super().__init__(scene, difficulty, reward)
-        self.table = jnp.asarray(target_table(scene, self.level.extent, self.level.crossing), jnp.float32)
+    def __init__(self, scene: Scene, options: Options) -> None:
+        super().__init__(scene, options)
+        if self.starts_at == "home":
+            self.tables["targets"] = target_table(scene, self.level.extent, self.level.crossing)
+        else:
+            self.tables |= start_table(scene, self.level.extent)
 
-    def start(self, key: Array) -> Goal:
-        """Goals of all arms."""
-        return Goal(self.table[jax.random.randint(key, (), 0, len(self.table))])
+    def start(self, key: Array) -> Start:
+        """Return goals of all arms, and postures where these are drawn too."""
+        row = jax.random.randint(key, (), 0, len(self.tables["targets"]))
+        postures = self.tables.get("postures")
+        return Start(Goal(self.tables["targets"][row]), None if postures is None else postures[row])

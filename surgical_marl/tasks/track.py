@@ -16,13 +16,12 @@ Difficulty    greatest speed and distance: easy 10 mm/s, 50 mm; default 20 mm/s,
 
 from __future__ import annotations
 
-import jax.numpy as jnp
 import numpy as np
-from jax import Array
 
-from surgical_marl.tasks.base.path_task import PathGoal, PathTask
+from surgical_marl.tasks.base.path_task import PathTask
 from surgical_marl.tasks.base.paths import walks
-from surgical_marl.tasks.base.task import Level, Views
+from surgical_marl.tasks.base.task import Level
+from surgical_marl.tasks.base.terms import Picture, Term
 
 
 class Task(PathTask):
@@ -35,12 +34,14 @@ class Task(PathTask):
         "hard": Level(0.07, 0.5, 0.03),
     }
 
-    def observations(self, views: Views, goal: PathGoal) -> dict[str, Array]:
-        """[d] each; the velocity comes last."""
-        known, velocities = super().observations(views, goal), self.velocities(goal)
-        return {agent: jnp.concatenate([known[agent], velocities[i]]) for i, agent in enumerate(views)}
+    def terms(self, agent: str) -> dict[str, Term | Picture]:
+        """Return those of `reach`, and `target_velocity` [3], m/s."""
+        i, fastest = self.scene.agents.index(agent), np.full(3, 2 * max(level.speed for level in self.levels.values()))
+        return {
+            **super().terms(agent),
+            "target_velocity": Term(lambda w: self.velocities(w.goal)[i], -fastest, fastest),
+        }
 
-    def bounds(self, agent: str) -> tuple[np.ndarray, np.ndarray]:
-        """Least and greatest observation of an agent, [d] each."""
-        low, high = super().bounds(agent)
-        return np.append(low, np.full(3, -2 * self.level.speed)), np.append(high, np.full(3, 2 * self.level.speed))
+    def observes(self, agent: str) -> tuple[str, ...]:
+        """Return what is observed in `reach`, then the target's velocity."""
+        return (*super().observes(agent), "target_velocity")

@@ -101,8 +101,9 @@ class ScenePicture:
     def pose(self) -> Pose:
         """How the environment stands now."""
         balls: list[Sphere] = []
-        goals = self._env.goal[0]
-        for index, mount in enumerate(self._env.scene.mounts.values()):
-            place = mount.rotation @ goals[index] + mount.position  # the task has it in its arm's base frame
+        env = self._env
+        targets = env.task.targets(env.goal)[0] if env.task.has_targets else []
+        for index, (mount, target) in enumerate(zip(env.scene.mounts.values(), targets, strict=False)):
+            place = mount.rotation @ target + mount.position  # the task has it in its arm's base frame
             balls.append((tuple(place), GOAL_RADIUS, COLOURS[index % len(COLOURS)]))
         return Pose(np.array(self._env.qpos[0], float), balls)

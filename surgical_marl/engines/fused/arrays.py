@@ -18,9 +18,9 @@ _READ = ("outs", "flags", "counts")
 """Buffers that a step's results are in."""
 
 
-def make_arrays(device: str, source: Source, stride: int, num_envs: int) -> Arrays:
+def make_arrays(device: str, source: Source, tables: dict[str, np.ndarray], stride: int, num_envs: int) -> Arrays:
     """Arrays for a program, zero. ValueError if there is no room for them."""
-    return (CudaArrays if device == "cuda" else CpuArrays)(source, stride, num_envs)
+    return (CudaArrays if device == "cuda" else CpuArrays)(source, tables, stride, num_envs)
 
 
 class Arrays(ABC):
@@ -28,7 +28,7 @@ class Arrays(ABC):
 
     device: str
 
-    def __init__(self, source: Source, stride: int, num_envs: int) -> None:
+    def __init__(self, source: Source, tables: dict[str, np.ndarray], stride: int, num_envs: int) -> None:
         self.num_envs, self.stride = num_envs, stride
         each = sum(np.dtype(dtype).itemsize * max(source.sizes[name], 1) for name, dtype in _TYPES.items())
         room = free_memory(self.device)
@@ -38,8 +38,11 @@ class Arrays(ABC):
                 f"{room // (2 * each)} fit"
             )
         self._buffers = {name: self._zeros(max(source.sizes[name], 1), stride, dtype) for name, dtype in _TYPES.items()}
-        tables = [self._constant(table) for table in source.tables.values()]
-        self.all = [*(self._warp(buffer) for buffer in self._buffers.values()), *(self._warp(t) for t in tables)]
+        constants = [self._constant(table) for table in tables.values()]
+        self.all = [
+            *(self._warp(buffer) for buffer in self._buffers.values()),
+            *(self._warp(constant) for constant in constants),
+        ]
 
     @abstractmethod
     def write(self, leaf: Leaf, values: Any) -> None:

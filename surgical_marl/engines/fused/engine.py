@@ -10,6 +10,7 @@ The state of all environments stays in four arrays on the device, [field, enviro
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from typing import Any
@@ -46,11 +47,12 @@ class FusedEngine:
         self.source: Source = load_source(
             env, vector=self.device == "cpu", announce=lambda: announce(env, self.name, self.device)
         )
-        self._leaves = flatten(self.source.carry)
-        self.carry_shapes = {name: leaf.shape for name, leaf in self._leaves.items()}
+        carry = flatten(self.source.carry)
+        self.carry_shapes = {name: leaf.shape for name, leaf in carry.items()}
+        self._leaves = {**carry, **flatten(self.source.moved, ".moved")}
         self._stride = -(-num_envs // LANES) * LANES
-        self._arrays = make_arrays(self.device, self.source, self._stride, num_envs)
-        self._kernels = compile_kernels({"step": self.source.step, "reset": self.source.reset}, self.device)
+        self._arrays = make_arrays(self.device, self.source, self._filled_tables(), self._stride, num_envs)
+        self._kernels = compile_kernels(self.source.bodies, self.device)
         vectors = self._stride // LANES
         shares = min(cores(), max(1, num_envs // LEAST_SHARE)) if self.device == "cpu" else 1
         edges = [round(vectors * k / shares) * LANES for k in range(shares + 1)]
@@ -74,11 +76,22 @@ class FusedEngine:
         self._launch("reset")
         self._stepped = False
 
-    def step(self, actions: dict[str, Any]) -> None:
-        """One control step of all environments; actions [N, n] by agent, of any array library."""
+    def step(self, actions: dict[str, Any], sense: Callable[[], dict[str, Any]] | None = None) -> None:
+        """One control step of all environments.
+
+        Args:
+            actions: [N, n] by agent, of any array library.
+            sense: returns what the environment senses, [N] each, once everything has moved: `.moved` can be read then.
+        """
         for agent, action in actions.items():
             self._arrays.write(self.source.actions[agent], action)
-        self._launch("step")
+        if self.env.pauses:
+            self._launch("move")
+            for name, values in (sense() if sense else {}).items():
+                self._arrays.write(self.source.sensed[name], values)
+            self._launch("finish")
+        else:
+            self._launch("step")
         self._stepped = True
 
     def outcome(self, library: str) -> dict[str, Any]:
@@ -87,13 +100,22 @@ class FusedEngine:
         return self._arrays.read_tree(self.source.results, library)
 
     def read(self, name: str, library: str) -> Any:
-        """A part of the `Carry`, one of `carry_shapes`, [N, ...]; a copy."""
+        """A part of the `Carry`, one of `carry_shapes`, or of what has moved, as in ".moved.carry.physics.qpos"; [N, ...],
+        a copy."""
         return self._arrays.read(self._leaves[name], library)
 
     def write(self, name: str, values: Any) -> None:
         """Sets a part of the `Carry`."""
         self._arrays.write(self._leaves[name], values)
         self._stepped = True
+
+    def _filled_tables(self) -> dict[str, np.ndarray]:
+        """The constant tables with the parameters in their places."""
+        filled = {dtype: table.copy() for dtype, table in self.source.tables.items()}
+        for name, values in _paths(self.env.parameters).items():
+            leaf = self.source.parameters[name]
+            filled[leaf.buffer][leaf.first : leaf.first + leaf.size] = np.ravel(values)
+        return filled
 
     def _launch(self, name: str) -> None:
         launch = lambda share: self._kernels[name].launch(self._arrays.all, self._stride, *share)  # noqa: E731
@@ -110,3 +132,10 @@ def flatten(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
         path = f"{prefix}.{name}"
         found.update(flatten(value, path) if isinstance(value, dict) else {path: value})
     return found
+
+
+def _paths(tree: Any, prefix: str = "") -> dict[str, Any]:
+    """Leaves of a dict of dicts by their path, as JAX writes it: ['weights']['distance']."""
+    if not isinstance(tree, dict):
+        return {prefix: tree}
+    return {path: leaf for name, child in tree.items() for path, leaf in _paths(child, f"{prefix}[{name!r}]").items()}

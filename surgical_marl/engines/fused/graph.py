@@ -86,6 +86,8 @@ class Graph:
         self.constants: list[Any] = []
         self.groups: list[Branch | Loop] = []
         self.tables: list[np.ndarray] = []
+        self.inputs: set[int] = set()
+        """Tables whose values are not known: parameters."""
         self._constant_ids: dict[tuple[str, Any], Value] = {}
         self._table_numbers: dict[tuple[str, bytes], int] = {}
         self._known: dict[tuple[Any, ...], Value] = {}
@@ -302,10 +304,16 @@ class Graph:
             self.tables.append(table)
         return number
 
+    def input_table(self, example: np.ndarray) -> int:
+        """The number of a new table of this size and type, whose values are given when the program runs."""
+        self.tables.append(example)
+        self.inputs.add(len(self.tables) - 1)
+        return len(self.tables) - 1
+
     def lookup(self, number: int, index: Value) -> Value:
         """`tables[number][index]`; the index must be in range."""
         table = self.tables[number]
-        if index < 0:
+        if index < 0 and number not in self.inputs:
             return self.constant(table[int(self.constants[~index])])
         return self.node("lookup", number, index, kind=KINDS[table.dtype.name])
 

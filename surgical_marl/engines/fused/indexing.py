@@ -15,7 +15,7 @@ import numpy as np
 
 from surgical_marl.engines.fused.graph import KINDS, Graph, Value
 from surgical_marl.engines.fused.scalars import convert
-from surgical_marl.engines.fused.traced import Symbolic, Traced, Unsupported, lift
+from surgical_marl.engines.fused.traced import Symbolic, Table, Traced, Unsupported, lift
 
 LEAST_TABLE = 16
 """Constants from this many on are looked up in memory rather than chosen one by one."""
@@ -24,7 +24,7 @@ Places = list[np.ndarray]
 """For each axis of an array, where on it each element of a result comes from."""
 
 
-def gather(g: Graph, shape: Any, params: Any, operand: Traced, indices: Traced) -> Traced:
+def gather(g: Graph, shape: Any, params: Any, operand: Traced | Table, indices: Traced) -> Traced:
     """`lax.gather`"""
     numbers, sizes = params["dimension_numbers"], params["slice_sizes"]
     grid = np.indices(shape)
@@ -43,11 +43,11 @@ def gather(g: Graph, shape: Any, params: Any, operand: Traced, indices: Traced) 
         last = operand.shape[axis] - sizes[axis]
         inside &= (start >= 0) & (start <= last)
         place[axis] = place[axis] + np.clip(start.astype(int), 0, last)
-    found = _take(operand, place)
+    found = _take(g, operand, place)
     return found if fill is None or inside.all() else Symbolic(np.where(inside, lift(g, found), fill))
 
 
-def dynamic_slice(g: Graph, shape: Any, params: Any, operand: Traced, *starts: Traced) -> Traced:
+def dynamic_slice(g: Graph, shape: Any, params: Any, operand: Traced | Table, *starts: Traced) -> Traced:
     """`lax.dynamic_slice`"""
     place, moving = list(np.indices(shape)), {}
     for axis, start in enumerate(starts):
@@ -55,7 +55,7 @@ def dynamic_slice(g: Graph, shape: Any, params: Any, operand: Traced, *starts: T
             moving[axis] = np.broadcast_to(start.ids, shape)
         else:
             place[axis] = place[axis] + int(np.clip(int(start), 0, operand.shape[axis] - shape[axis]))
-    return _choose(g, operand, shape, place, moving, None) if moving else _take(operand, place)
+    return _choose(g, operand, shape, place, moving, None) if moving else _take(g, operand, place)
 
 
 def dynamic_update_slice(g: Graph, shape: Any, params: Any, operand: Traced, update: Traced, *starts: Traced) -> Traced:
@@ -104,7 +104,7 @@ def scatter(
     return Symbolic(out)
 
 
-def _windows(shape: Any, operand: Traced, dropped: Any, batched: Any, windows: Places) -> Places:
+def _windows(shape: Any, operand: Traced | Table, dropped: Any, batched: Any, windows: Places) -> Places:
     """Places within the window of each element; its axes are those that are neither dropped nor batched."""
     kept = [axis for axis in range(len(operand.shape)) if axis not in dropped and axis not in batched]
     place = [np.zeros(shape, int) for _ in operand.shape]
@@ -113,9 +113,12 @@ def _windows(shape: Any, operand: Traced, dropped: Any, batched: Any, windows: P
     return place
 
 
-def _take(operand: Traced, place: Places) -> Traced:
+def _take(g: Graph, operand: Traced | Table, place: Places) -> Traced:
     if isinstance(operand, Symbolic):
         return Symbolic(np.asarray(operand.ids[tuple(place)]))
+    if isinstance(operand, Table):
+        found = [look_up(g, operand, [int(axis[at]) for axis in place], {}) for at in np.ndindex(place[0].shape)]
+        return Symbolic(np.array(found, np.int32).reshape(place[0].shape))
     return np.asarray(operand[tuple(place)])
 
 
@@ -123,14 +126,14 @@ def _take(operand: Traced, place: Places) -> Traced:
 
 
 def _choose(
-    g: Graph, operand: Traced, sizes: Any, place: Places, starts: dict[int, np.ndarray], fill: Value | None
+    g: Graph, operand: Traced | Table, sizes: Any, place: Places, starts: dict[int, np.ndarray], fill: Value | None
 ) -> Symbolic:
     """Elements of `operand` at `place + starts`. The starts are values; a window, of `sizes`, that is not inside is
     `fill`, or moved there."""
     shape, lasts = place[0].shape, {axis: operand.shape[axis] - sizes[axis] for axis in starts}
     find: Callable[[list[int], dict[int, Value]], Value]
-    if isinstance(operand, np.ndarray) and operand.size >= LEAST_TABLE:
-        find = partial(_look_up, g, operand)
+    if isinstance(operand, Table) or (isinstance(operand, np.ndarray) and operand.size >= LEAST_TABLE):
+        find = partial(look_up, g, operand)
     else:
         find = partial(_choose_one, g, lift(g, operand), lasts)
     out = []
@@ -145,11 +148,15 @@ def _choose(
     return Symbolic(np.array(out, np.int32).reshape(shape))
 
 
-def _look_up(g: Graph, operand: np.ndarray, fixed: list[int], moving: dict[int, Value]) -> Value:
-    kind, real = KINDS[operand.dtype.name], operand.dtype.kind == "f"
-    number = g.table(operand.ravel() if real else operand.ravel().astype(np.int32))
+def look_up(g: Graph, operand: np.ndarray | Table, fixed: list[int], moving: dict[int, Value]) -> Value:
+    """The element of a table at `fixed` places, plus `moving` ones on some axes."""
+    kind = KINDS[operand.dtype.name]
+    if isinstance(operand, Table):
+        number = operand.number
+    else:
+        number = g.table(operand.ravel() if operand.dtype.kind == "f" else operand.ravel().astype(np.int32))
     strides = np.cumprod([1, *operand.shape[:0:-1]])[::-1]
-    flat = g.constant(np.int32(np.dot(fixed, strides)))
+    flat = g.constant(np.int32(np.dot(fixed, strides[: len(fixed)])))
     for axis, start in moving.items():
         flat = g.add(flat, g.mul(g.constant(np.int32(strides[axis])), convert(g, start, "i")))
     return convert(g, g.lookup(number, flat), kind)
@@ -193,7 +200,7 @@ def _like(g: Graph, value: Value, number: int) -> Value:
     return g.constant(g.dtype(value)(number))
 
 
-def _fill(g: Graph, params: Any, operand: Traced) -> Value:
+def _fill(g: Graph, params: Any, operand: Traced | Table) -> Value:
     """What stands for elements outside."""
     dtype = np.dtype(g.dtype(int(operand.ids.flat[0])) if isinstance(operand, Symbolic) else operand.dtype)
     given = params.get("fill_value")

@@ -8,7 +8,7 @@ one round). Other scans are unrolled.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -35,7 +35,7 @@ class Tracer:
         self.graph = graph
         self._around = 0  # the loops that are being traced, as bits
 
-    def run(self, closed: Any, args: list[Traced]) -> list[Traced]:
+    def run(self, closed: Any, args: Sequence[Any]) -> list[Traced]:
         """The results of a closed jaxpr. Unsupported, naming the line of the source, if there is no rule for
         something in it."""
         jaxpr, consts = getattr(closed, "jaxpr", closed), getattr(closed, "consts", ())

@@ -23,6 +23,18 @@ class Symbolic:
         return self.ids.shape
 
 
+class Table:
+    """An argument that all environments share and that stays in memory: its elements can only be looked up.
+
+    `number` is that of a table of the graph.
+    """
+
+    __slots__ = ("dtype", "number", "shape")
+
+    def __init__(self, number: int, shape: tuple[int, ...], dtype: np.dtype) -> None:
+        self.number, self.shape, self.dtype = number, shape, dtype
+
+
 Traced = np.ndarray | Symbolic
 """A numpy array if all its elements are known."""
 
@@ -46,10 +58,12 @@ def kind_of(dtype: Any) -> str:
     return KINDS[name]
 
 
-def lift(graph: Graph, array: Traced) -> np.ndarray:
+def lift(graph: Graph, array: Traced | Table) -> np.ndarray:
     """The values of a traced array, known or not."""
     if isinstance(array, Symbolic):
         return array.ids
+    if isinstance(array, Table):
+        raise Unsupported("more of a table than a look-up")
     array = np.asarray(array)
     kind_of(array.dtype)
     flat = [graph.constant(element) for element in array.ravel()]

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jax import Array
 
+from surgical_marl.runtime import jax, jnp
 from surgical_marl.tasks.base import spline
+from surgical_marl.tasks.base.options import Options
 from surgical_marl.tasks.base.paths import KNOT, SEGMENTS, path_table
-from surgical_marl.tasks.base.task import Level, Task
+from surgical_marl.tasks.base.task import Level, Start, TipTask
 
 if TYPE_CHECKING:
+    from jax import Array
+
     from surgical_marl.scenes.scene import Scene
 
 
@@ -29,26 +29,28 @@ class PathGoal(NamedTuple):
     """Since the start of the episode, s."""
 
 
-class PathTask(Task):
+class PathTask(TipTask):
     """A task whose targets move along paths of `surgical_marl/tasks/base/paths.py`, which `draw` draws."""
 
     max_steps = 250
+    follows = True
+    wanted: ClassVar = {"rmse_mm": ("below", 2.0)}
 
     @staticmethod
     def draw(rng: np.random.Generator, count: int, start: np.ndarray, level: Level) -> np.ndarray:
         """One of the ways to draw paths in `surgical_marl/tasks/base/paths.py`."""
         raise NotImplementedError
 
-    def __init__(self, scene: Scene, difficulty: str = "default", reward: Mapping[str, float] | None = None) -> None:
-        super().__init__(scene, difficulty, reward)
+    def __init__(self, scene: Scene, options: Options) -> None:
+        super().__init__(scene, options)
         table = path_table(scene, self.draw, self.level)
-        self.closed = np.isclose(table[:, :3], table[:, -3:], rtol=0, atol=1e-7).all(axis=(1, 2, 3))
-        self.table = jnp.asarray(table, jnp.float32)
+        closed = np.isclose(table[:, :3], table[:, -3:], rtol=0, atol=1e-7).all(axis=(1, 2, 3))
+        self.tables |= {"paths": table.astype(np.float32), "closed": closed}
 
-    def start(self, key: Array) -> PathGoal:
-        """A path, at its start."""
-        row, time = jax.random.randint(key, (), 0, len(self.table)), jnp.float32(0.0)
-        return PathGoal(self.along(row, time), row, time)
+    def start(self, key: Array) -> Start:
+        """Return a path, at its start."""
+        row, time = jax.random.randint(key, (), 0, len(self.tables["paths"])), jnp.float32(0.0)
+        return Start(PathGoal(self.along(row, time), row, time))
 
     def advance(self, goal: PathGoal, dt: float) -> PathGoal:
         """The targets `dt` seconds further on their paths."""
@@ -65,13 +67,18 @@ class PathTask(Task):
         """Of the targets, [arms, 3], m/s."""
         near, f = self._near(goal.row, goal.time)
         slopes = jnp.stack(spline.slopes(f), axis=-1) / np.float32(KNOT)
-        rests = ~jnp.asarray(self.closed)[goal.row] & (goal.time >= np.float32(SEGMENTS * KNOT))
+        rests = ~self.tables["closed"][goal.row] & (goal.time >= np.float32(SEGMENTS * KNOT))
         return jnp.where(rests, 0.0, (slopes[..., None, None] * (near[1:] - near[:-1])).sum(-3))
 
     def _near(self, row: Array, time: Array) -> tuple[Array, Array]:
         """The four control points [..., 4, arms, 3] of the segment at a time, and the share of it that has passed."""
         u = time * np.float32(1 / KNOT)
         around = u - SEGMENTS * jnp.floor(u / np.float32(SEGMENTS))
-        u = jnp.where(jnp.asarray(self.closed)[row], around, jnp.minimum(u, np.float32(SEGMENTS)))
+        u = jnp.where(self.tables["closed"][row], around, jnp.minimum(u, np.float32(SEGMENTS)))
         k = jnp.clip(jnp.floor(u).astype(jnp.int32), 0, SEGMENTS - 1)
-        return self.table[row, k[..., None] + np.arange(4)], u - k.astype(jnp.float32)
+        return self.tables["paths"][row, k[..., None] + np.arange(4)], u - k.astype(jnp.float32)
+
+    def goal_content(self, goal: Any) -> list[np.ndarray]:
+        """Return the paths from the table: what comes from them is computed on the device, with another last digit on
+        each."""
+        return [self.tables["paths"][goal.row]]

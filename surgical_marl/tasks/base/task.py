@@ -1,24 +1,28 @@
-"""What a task is: goals that move, observations, named reward terms.
+"""What a task is: how an episode begins, what each agent observes, named reward terms, and what success is.
 
-A task is a module of `surgical_marl/tasks/` with a class `Task(scene, difficulty, reward)` of pure functions, derived
-from the one here. It gives `levels`, `max_steps` and `start`; where goals move also `advance`; and overrides the rest
-where it differs. Its docstring is its page.
+A task is a class with pure functions, derived from `Task`, or from `TipTask` where every tool tip has a target. One that
+ships is the class `Task` of a module in `surgical_marl/tasks/`; one of another package is named by its entry point
+(docs/your_own_task.md). Its docstring, or its module's, is its page.
 """
 
 from __future__ import annotations
 
-import math
+import copy
+import sys
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
-from jax import Array
 
 from surgical_marl.content import unknown
+from surgical_marl.runtime import jnp
+from surgical_marl.tasks.base.options import Options
+from surgical_marl.tasks.base.terms import FAR, Picture, Term, arm_terms, picture_terms
 
 if TYPE_CHECKING:
-    from surgical_marl.physics.simulator import ArmView
+    from jax import Array
+
+    from surgical_marl.physics.views import ArmView
     from surgical_marl.scenes.scene import Scene
 
 PRECISION = 0.005
@@ -26,18 +30,25 @@ PRECISION = 0.005
 APPROACH = 0.025
 """Another arm nearer than this, m, counts in the term for clearance: two or three control steps before a touch, as arms
 come at each other at 8 mm a step, and some at twice that."""
-FAR = 2.0
-"""Bound in m of everything observed in space; no arm reaches that far."""
-
-Views = Mapping[str, "ArmView"]
-"""What is seen of each agent's arm."""
 
 
-class Goal(NamedTuple):
-    """What every task's goal holds. A task of its own may carry more fields."""
+class Start(NamedTuple):
+    """How an episode begins."""
 
-    targets: Array
-    """Where the tool tips should be now, [arms, 3], m, each in its arm's base frame."""
+    goal: Any
+    """What the episode is after, as a named tuple of arrays: the task's own."""
+    qpos: Array | None = None
+    """Joint positions of the whole scene, [nq]; None where every episode begins at home."""
+
+
+class World(NamedTuple):
+    """What the functions of a task are given: one environment after a step."""
+
+    arms: Mapping[str, ArmView]
+    """What is seen of each agent's arm."""
+    goal: Any
+    sensed: Mapping[str, Array] = {}
+    """What `Task.sense` made of the pictures, by the names in `Task.senses`."""
 
 
 class Level(NamedTuple):
@@ -52,80 +63,80 @@ class Level(NamedTuple):
 
 
 class Task:
-    """The pure functions of a task. `views` and results are keyed by agent, for one environment.
+    """The pure functions of a task. Results are keyed by agent, for one environment.
+
+    What a function reads from `self.tables` and `self.weights` is an input of the kernel: another table or weight of the
+    same shape compiles nothing. All else that it reads from `self` is a constant there.
 
     Args:
         scene: the arms.
-        difficulty: "easy", "default" or "hard": a key of `levels`.
-        reward: weights of reward terms that replace those of `weights`.
+        options: `difficulty`, `start` and `reward` concern a task.
 
     Raises:
-        ValueError: an unknown difficulty or reward term, or a weight that is no finite number.
+        ValueError: an unknown difficulty, start or reward term.
     """
 
+    levels: ClassVar[Mapping[str, Any]] = {"default": None}
+    starts: ClassVar[tuple[str, ...]] = ("home",)
+    """What episodes may begin with: see `Options.start`."""
     max_steps: int = 100
-    success: float = 0.002
-    levels: ClassVar[Mapping[str, Level]] = {}
-    weights: Mapping[str, float] = {"distance": -10.0, "precision": 1.0, "clearance": -1.0, "collision": -2.0}
-    """Of each term of `terms`."""
-    camera: str | None = None
-    """The agent whose endoscope's pictures are part of its observation (`envs/pictures.py`). Its goal then has
-    a `row` of `table`, `qpos` [rows, nq] that target pictures are taken from, and `weights` a term `image`."""
+    weights: Mapping[str, float] = {}
+    """Of each term of `reward_terms`."""
+    senses: tuple[str, ...] = ()
+    """Numbers that `sense` makes of an environment's pictures after each step, before reward is given."""
+    follows: ClassVar[bool] = False
+    """Whether goals move, so that every step of an episode counts in its evaluation, and not the last ones alone."""
+    has_targets: ClassVar[bool] = False
+    """Whether `targets` says where tool tips should be."""
+    wanted: ClassVar[Mapping[str, tuple[str, float]]] = {}
+    """What a trained policy should reach: metric -> ("below" or "at least", number)."""
 
-    def __init__(self, scene: Scene, difficulty: str = "default", reward: Mapping[str, float] | None = None) -> None:
-        if difficulty not in self.levels:
-            raise unknown("difficulty", difficulty, list(self.levels))
-        self.scene, self.level = scene, self.levels[difficulty]
-        self.weights = {**self.weights, **{name: self._weight(name, value) for name, value in (reward or {}).items()}}
+    def __init__(self, scene: Scene, options: Options) -> None:
+        if options.difficulty not in self.levels:
+            raise unknown("difficulty", options.difficulty, list(self.levels))
+        if options.start not in self.starts:
+            raise unknown(f"start of task {options.task!r}", options.start, self.starts)
+        self.scene, self.level, self.starts_at = scene, self.levels[options.difficulty], options.start
+        for name in options.reward:
+            if name not in self.weights:
+                raise unknown("reward term", name, list(self.weights))
+        self.weights = {**self.weights, **options.reward}
+        self.tables: dict[str, np.ndarray] = {}
+        self.postures: dict[str, np.ndarray] = {}
+        """Tables of `qpos` of the whole scene, [rows, nq] each, that pictures to be matched are taken from."""
+        self.watched: dict[str, tuple[str, ...]] = {}
+        """Agent -> pictures that `sense` looks at, whether or not the agent observes them."""
 
-    def start(self, key: Array) -> Any:
-        """The goal at the start of an episode; `key` is the episode's."""
+    @classmethod
+    def summary(cls) -> str:
+        """Return the first line of the task's page: that of its module, or of the class."""
+        page = sys.modules[cls.__module__].__doc__ if cls.__name__ == "Task" else cls.__doc__
+        return (page or cls.__name__).splitlines()[0]
+
+    def bound(self, weights: Mapping[str, Array], tables: Mapping[str, Array]) -> Any:
+        """Return the task with other weights and tables, which may be traced."""
+        task = copy.copy(self)
+        task.weights, task.tables = weights, tables  # type: ignore[assignment]
+        return task
+
+    def start(self, key: Array) -> Start:
+        """Return how an episode begins, drawn by its key."""
         raise NotImplementedError
 
     def advance(self, goal: Any, dt: float) -> Any:
-        """The goal `dt` seconds later."""
+        """Return the goal `dt` seconds later."""
         return goal
 
-    def tip_errors(self, views: Views, goal: Any) -> dict[str, Array]:
-        """Distance of tool tip and target in m."""
-        return {
-            agent: jnp.linalg.norm(goal.targets[i] - view.tool_tip) for i, (agent, view) in enumerate(views.items())
-        }
+    def terms(self, agent: str) -> dict[str, Term | Picture]:
+        """Return all that an agent may observe, by name."""
+        return {**arm_terms(self.scene, agent), **picture_terms(self.scene, agent)}
 
-    def observations(self, views: Views, goal: Any) -> dict[str, Array]:
-        """[d] each: joint positions and velocities, tool tip, commands, target, target minus tip; with other arms also
-        the way to the nearest other tip and the least distance to any other arm."""
-        found = {}
-        for i, (agent, view) in enumerate(views.items()):
-            target = goal.targets[i]
-            parts = [view.qpos, view.qvel, view.tool_tip, view.command, target, target - view.tool_tip]
-            if len(views) > 1:
-                parts += [view.nearest_tip, view.min_distance[None]]
-            found[agent] = jnp.concatenate(parts)
-        return found
-
-    def bounds(self, agent: str) -> tuple[np.ndarray, np.ndarray]:
-        """Least and greatest observation of an agent, [d] each."""
-        joints = self.scene.mounts[agent].arm.actuated
-        slack = np.array([0.1 * (joint.upper - joint.lower) for joint in joints])
-        low = np.array([joint.lower for joint in joints]) - slack
-        high = np.array([joint.upper for joint in joints]) + slack
-        speed = 2 * np.array([joint.velocity for joint in joints])
-        if self.scene.control == "position":
-            command_low, command_high = low, high
-        else:
-            command_high = np.array([max(joint.velocity, joint.effort, joint.upper) for joint in joints])
-            command_low = -command_high
-        space = np.full(3, FAR)
-        lows = [low, -speed, -space, command_low, -space, -2 * space]
-        highs = [high, speed, space, command_high, space, 2 * space]
-        if len(self.scene.agents) > 1:
-            lows += [-2 * space, -space[:1]]
-            highs += [2 * space, 2 * space[:1]]
-        return np.concatenate(lows), np.concatenate(highs)
+    def observes(self, agent: str) -> tuple[str, ...]:
+        """Return the names of what it does observe unless a scene or a call chooses others."""
+        return tuple(name for name, term in arm_terms(self.scene, agent).items() if name != "contact_force")
 
     def privileged(self, goal: Any) -> Array:
-        """[p]: what the state holds besides all observations: what no agent is told of the goal."""
+        """Return what only critics see: what no agent is told of the goal, [p]."""
         return jnp.zeros(0, jnp.float32)
 
     @property
@@ -133,39 +144,117 @@ class Task:
         """Least and greatest of `privileged`, [p] each."""
         return np.zeros(0), np.zeros(0)
 
-    def terms(self, views: Views, goal: Any) -> dict[str, dict[str, Array]]:
-        """agent -> reward term -> its value before weighting, for the step that led here. `distance` of tip and target
-        in m; `precision`, 1 at the target; `clearance`, up to 1 as another arm comes nearer than `APPROACH`;
-        `collision`, 0 or 1."""
-        errors = self.tip_errors(views, goal)
+    def reward_terms(self, world: World) -> dict[str, dict[str, Array]]:
+        """Return agent -> reward term -> its value before weighting, for the step that led here.
+
+        Those of every task: `clearance`, up to 1 as another arm comes nearer than `APPROACH`, and `collision`, 0 or 1.
+        """
         return {
             agent: {
-                "distance": errors[agent],
-                "precision": jnp.exp(-errors[agent] / PRECISION),
                 "clearance": jnp.clip(1.0 - view.min_distance / APPROACH, 0.0, 1.0),
                 "collision": view.collision.astype(jnp.float32),
             }
-            for agent, view in views.items()
+            for agent, view in world.arms.items()
         }
 
-    def metrics(self, views: Views, goal: Any) -> dict[str, dict[str, Array]]:
-        """agent -> what its `infos` hold besides what those of all tasks do."""
-        return {agent: {} for agent in views}
-
-    def rewards(self, views: Views, goal: Any) -> dict[str, dict[str, Array]]:
-        """agent -> reward term -> its weighted value. Their sum is the agent's reward."""
+    def rewards(self, world: World) -> dict[str, dict[str, Array]]:
+        """Return agent -> reward term -> its weighted value. Their sum is the agent's reward."""
         return {
-            agent: {name: np.float32(self.weights[name]) * value for name, value in terms.items()}
-            for agent, terms in self.terms(views, goal).items()
+            agent: {name: self.weights[name] * value for name, value in terms.items()}
+            for agent, terms in self.reward_terms(world).items()
         }
 
-    def terminated(self, views: Views, goal: Any) -> Array:
-        """Never: arms go on holding or following their targets."""
+    def success(self, world: World) -> dict[str, Array]:
+        """Return whether each agent has reached what it is after, [] bool."""
+        raise NotImplementedError
+
+    def stages(self, world: World) -> dict[str, dict[str, Array]]:
+        """Return agent -> stage of the task -> whether it is reached now, [] bool; stages in their order."""
+        return {agent: {} for agent in world.arms}
+
+    def metrics(self, world: World) -> dict[str, dict[str, Array]]:
+        """Return agent -> what its `infos` hold besides what those of all tasks do."""
+        return {agent: {} for agent in world.arms}
+
+    def terminated(self, world: World) -> Array:
+        """Return whether the episode ends here, [] bool. Never: arms go on holding or following their targets."""
         return jnp.bool_(False)
 
-    def _weight(self, name: str, value: Any) -> float:
-        if name not in self.weights:
-            raise unknown("reward term", name, list(self.weights))
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-            raise ValueError(f"the weight of reward term {name!r} must be a finite number, not {value!r}")
-        return float(value)
+    def sense(self, pictures: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+        """Return what `senses` names, [N] float32, from the pictures that agents see after a step.
+
+        Args:
+            pictures: agent -> term -> torch tensor [N, H, W, C].
+        """
+        return {}
+
+    # -- on the host, for N environments at once
+
+    def targets(self, goal: Any) -> np.ndarray:
+        """Return where tool tips should be, [N, arms, 3], each in its arm's base frame, m, if the task `has_targets`.
+
+        Args:
+            goal: fields of the goal, [N, ...] each.
+        """
+        raise NotImplementedError
+
+    def goal_content(self, goal: Any) -> list[np.ndarray]:
+        """Return the numbers that say what N episodes are after, [N, ...] each: what an evaluation's hash is made of."""
+        return [np.asarray(value) for _, value in sorted(vars(goal).items())]
+
+
+class Goal(NamedTuple):
+    """What the goal of a `TipTask` holds. A task of its own may carry more fields."""
+
+    targets: Array
+    """Where the tool tips should be now, [arms, 3], m, each in its arm's base frame."""
+
+
+class TipTask(Task):
+    """A task in which every tool tip has a target."""
+
+    weights: Mapping[str, float] = {"distance": -10.0, "precision": 1.0, "clearance": -1.0, "collision": -2.0}
+    has_targets = True
+    tolerance: ClassVar[float] = 0.002
+    """A tip nearer to its target than this is successful, m."""
+
+    def tip_errors(self, world: World) -> dict[str, Array]:
+        """Return the distance of tool tip and target in m."""
+        targets = world.goal.targets
+        return {
+            agent: jnp.linalg.norm(targets[i] - view.tool_tip) for i, (agent, view) in enumerate(world.arms.items())
+        }
+
+    def terms(self, agent: str) -> dict[str, Term | Picture]:
+        """Return those of every task, `target` [3], and `to_target` [3] from the tip."""
+        i, space = self.scene.agents.index(agent), np.full(3, FAR)
+        targets = {
+            "target": Term(lambda world: world.goal.targets[i], -space, space),
+            "to_target": Term(lambda world: world.goal.targets[i] - world.arms[agent].tool_tip, -2 * space, 2 * space),
+        }
+        return {**super().terms(agent), **targets}
+
+    def observes(self, agent: str) -> tuple[str, ...]:
+        """Return what the agent knows of itself, then its target, then what it knows of the others."""
+        own = super().observes(agent)
+        return (*own[:4], "target", "to_target", *own[4:])
+
+    def reward_terms(self, world: World) -> dict[str, dict[str, Array]]:
+        """Return those of every task, `distance` of tip and target in m, and `precision`, 1 at the target."""
+        errors, safety = self.tip_errors(world), super().reward_terms(world)
+        return {
+            agent: {"distance": error, "precision": jnp.exp(-error / PRECISION), **safety[agent]}
+            for agent, error in errors.items()
+        }
+
+    def success(self, world: World) -> dict[str, Array]:
+        """Return whether each tip is at its target."""
+        return {agent: error < self.tolerance for agent, error in self.tip_errors(world).items()}
+
+    def metrics(self, world: World) -> dict[str, dict[str, Array]]:
+        """Return `tip_error`, the distance of tip and target in m."""
+        return {agent: {"tip_error": error} for agent, error in self.tip_errors(world).items()}
+
+    def targets(self, goal: Any) -> np.ndarray:
+        """Return where tool tips should be, [N, arms, 3], each in its arm's base frame, m."""
+        return np.asarray(goal.targets)

@@ -13,6 +13,7 @@ from itertools import combinations
 import numpy as np
 
 from surgical_marl.cache import cached
+from surgical_marl.robots.arm import Arm
 from surgical_marl.robots.inverse_kinematics import inverse_kinematics
 from surgical_marl.scenes.scene import Scene
 
@@ -52,6 +53,29 @@ def target_table(scene: Scene, spread: float, crossing: float = 0.0, seed: int =
         (TABLE_SIZE, CLEARANCE, PATH_POINTS, CROSSING_POINTS, TOLERANCE, TIME, speeds, spread, crossing, seed)
     )
     return cached("targets", lambda: _draw(scene, spread, crossing, seed), settings, scene.fingerprint)
+
+
+def start_table(scene: Scene, spread: float, seed: int = 0) -> dict[str, np.ndarray]:
+    """Return postures to begin with, and targets that all arms of a scene can reach from there.
+
+    Every joint but the jaw's is drawn evenly from its whole range. A draw is kept if the arms are apart there, and if
+    they get to their targets as `target_table` asks, from there instead of home.
+
+    Args:
+        spread: standard deviation of the targets in m, the same along each axis.
+        seed: of the draws; the same seed gives the same table.
+
+    Returns:
+        `postures` [TABLE_SIZE, nq], `qpos` of the scene, and `targets` [TABLE_SIZE, arms, 3] in each arm's base frame, m.
+        Kept on disk by content.
+
+    Raises:
+        ValueError: fewer than one draw in a hundred can be kept.
+    """
+    settings = repr([spread, seed, *(mount.arm.speed.tolist() for mount in scene.mounts.values())])
+    table = cached("starts", lambda: _draw_starts(scene, spread, seed), settings, scene.fingerprint)
+    nq = scene.model.nq
+    return {"postures": table[:, :nq], "targets": table[:, nq:].reshape(len(table), -1, 3)}
 
 
 def choose(
@@ -109,15 +133,46 @@ def _draw(scene: Scene, spread: float, crossing: float, seed: int) -> np.ndarray
     return choose(scene, batch, TABLE_SIZE, crossing)
 
 
-def _reach(scene: Scene, targets: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Joint positions [N, n] of each agent at its targets [N, arms, 3], and whether all get there, and in time, [N]."""
+def _draw_starts(scene: Scene, spread: float, seed: int) -> np.ndarray:
+    """Postures and targets of `start_table`, side by side, [TABLE_SIZE, nq + 3 arms]."""
+    rng, arms = np.random.default_rng(seed), {agent: mount.arm for agent, mount in scene.mounts.items()}
+
+    def batch(_: bool) -> tuple[np.ndarray, np.ndarray]:
+        starts = {agent: _any_posture(rng, arm) for agent, arm in arms.items()}
+        targets = rng.normal(0.0, spread, (TABLE_SIZE, len(arms), 3))
+        targets += [mount.workspace for mount in scene.mounts.values()]
+        good = (scene.clearance(starts) > CLEARANCE) & (scene.clearance(starts, within=True) > 0)
+        starts, targets = {agent: q[good] for agent, q in starts.items()}, targets[good]
+        goals, good = _reach(scene, targets, starts)
+        for share in np.linspace(0.0, 1.0, PATH_POINTS + 1)[1:]:
+            way = {agent: (1 - share) * starts[agent] + share * q for agent, q in goals.items()}
+            good &= (scene.clearance(way) > CLEARANCE) & (scene.clearance(way, within=True) > 0)
+        rows = np.concatenate([scene.full_qpos(starts), targets.reshape(len(targets), -1)], -1)[good]
+        return rows, np.zeros(len(rows), bool)
+
+    return choose(scene, batch, TABLE_SIZE, 0.0)
+
+
+def _any_posture(rng: np.random.Generator, arm: Arm) -> np.ndarray:
+    """Joint positions [TABLE_SIZE, n] from all of their ranges, the jaw at home."""
+    q = rng.uniform(arm.lower, arm.upper, (TABLE_SIZE, len(arm.actuated)))
+    jaw = [arm.jaw is not None and joint.name == arm.jaw.joint for joint in arm.actuated]
+    return np.where(jaw, arm.home, q)
+
+
+def _reach(
+    scene: Scene, targets: np.ndarray, starts: dict[str, np.ndarray] | None = None
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Joint positions [N, n] of each agent at its targets [N, arms, 3], and whether all get there, and in time, [N];
+    from postures [N, n] of each agent, or from home."""
     good, goals = np.ones(len(targets), dtype=bool), {}
     for i, agent in enumerate(scene.agents):
         arm = scene.mounts[agent].arm
-        goals[agent] = inverse_kinematics(arm, targets[:, i], starts=1)
+        start = arm.home if starts is None else starts[agent]
+        goals[agent] = inverse_kinematics(arm, targets[:, i], start, starts=1)
         tips = arm.forward_kinematics(goals[agent])[:, :3, 3]
         good &= np.linalg.norm(tips - targets[:, i], axis=-1) < TOLERANCE
-        good &= (np.abs(goals[agent] - arm.home) <= TIME * arm.speed).all(-1)
+        good &= (np.abs(goals[agent] - start) <= TIME * arm.speed).all(-1)
     return goals, good
 
 

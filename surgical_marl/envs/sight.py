@@ -1,0 +1,113 @@
+"""What agents see: pictures as terms of their observations, between and after the halves of a step."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+
+from surgical_marl.envs.env import Env
+from surgical_marl.vision.pictures import Pictures, picture_space
+
+if TYPE_CHECKING:
+    from surgical_marl.engines.choose import Engine
+
+Seen = dict[str, dict[str, torch.Tensor]]
+"""agent -> term -> picture [N, H, W, C]"""
+
+
+class Sight:
+    """The pictures of N environments that an engine runs.
+
+    Args:
+        env: one of the environments.
+        engine: runs them.
+        num_envs: N.
+        arrays: library of what is put into observations: "numpy", "torch" or "jax".
+    """
+
+    def __init__(self, env: Env, engine: Engine, num_envs: int, arrays: str) -> None:
+        self._env, self._engine, self._arrays = env, engine, arrays
+        self._observed = {agent: tuple(own.pictures) for agent, own in env.observed.items() if own.pictures}
+        terms = {agent: env.task.terms(agent) for agent in env.agents}
+        names = {agent: (*self._observed.get(agent, ()), *env.task.watched.get(agent, ())) for agent in env.agents}
+        wanted = {agent: {name: terms[agent][name] for name in own} for agent, own in names.items() if own}
+        self._pictures = Pictures(env.scene, wanted, env.task.postures, num_envs, engine.device)
+        self._matched = ".goal.row" in engine.carry_shapes
+        self._seen: Seen = {}
+        self._home: Seen = {}
+        if env.begins_at_home:  # which looks the same in all episodes
+            home = torch.from_numpy(np.repeat(env.scene.home[None], num_envs, 0)).to(engine.device)
+            rows = torch.zeros(num_envs, dtype=torch.long, device=engine.device) if self._matched else None
+            drawn = self._pictures.draw(home, rows)
+            self._home = {
+                agent: {name: picture[:1].clone() for name, picture in own.items()} for agent, own in drawn.items()
+            }
+
+    def spaces(self, vectors: dict[str, spaces.Space[Any]]) -> dict[str, spaces.Space[Any]]:
+        """Return the spaces of agents that see pictures, from those of their vectors."""
+        found: dict[str, spaces.Space[Any]] = {}
+        for agent, names in self._observed.items():
+            pictures = {name: picture_space(self._env.observed[agent].pictures[name]) for name in names}
+            found[agent] = spaces.Dict({"proprioception": vectors[agent], **pictures})
+        return found
+
+    def begin(self, found: dict[str, Any]) -> None:
+        """Put pictures into the observations of environments that have just been reset."""
+        seen = self._draw("")
+        for kind in ("observations", "final_observations"):
+            found[kind] = self._with(found[kind], seen)
+
+    def sense(self) -> dict[str, Any]:
+        """Draw what is seen where a step has moved to, and return what the task senses of it, [N] each."""
+        self._seen = self._draw(".moved.carry")
+        return self._env.task.sense(self._seen)
+
+    def show(self, found: dict[str, Any]) -> None:
+        """Put pictures into the outcome of a step: where an episode ended, `observations` are of the next one."""
+        ended = self._tensor(found["terminated"]) | self._tensor(found["truncated"])
+        found["final_observations"] = self._with(found["final_observations"], self._seen)
+        found["observations"] = self._with(found["observations"], self._next(ended))
+
+    def _next(self, ended: torch.Tensor) -> Seen:
+        if not self._home:
+            return self._draw("")
+        rows, where = self._rows(""), ended[:, None, None, None]
+        return {
+            agent: {
+                name: self._pictures.wanted(agent, name, rows)
+                if self._pictures.is_matched(agent, name)
+                else torch.where(where, self._home[agent][name], picture)
+                for name, picture in own.items()
+            }
+            for agent, own in self._seen.items()
+        }
+
+    def _draw(self, place: str) -> Seen:
+        return self._pictures.draw(self._engine.read(f"{place}.physics.qpos", "torch"), self._rows(place))
+
+    def _rows(self, place: str) -> torch.Tensor | None:
+        # as int64, a copy: a step gives its carry away
+        return self._engine.read(f"{place}.goal.row", "torch").long() if self._matched else None
+
+    def _with(self, observations: dict[str, Any], seen: Seen) -> dict[str, Any]:
+        found = dict(observations)
+        for agent, names in self._observed.items():
+            pictures = {name: self._present(seen[agent][name]) for name in names}
+            found[agent] = {"proprioception": observations[agent], **pictures}
+        return found
+
+    def _tensor(self, values: Any) -> torch.Tensor:
+        values = values if torch.is_tensor(values) else torch.from_numpy(np.array(values))
+        return values.to(self._engine.device)
+
+    def _present(self, values: torch.Tensor) -> Any:
+        if self._arrays == "torch":
+            return values
+        if self._arrays == "numpy":
+            return values.cpu().numpy()
+        import jax
+
+        return jax.dlpack.from_dlpack(values.contiguous())

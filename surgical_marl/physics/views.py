@@ -1,0 +1,39 @@
+"""What others see of the physics: contacts, and each arm."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    from jax import Array
+
+
+class Contacts(NamedTuple):
+    """The pairs of geoms that can touch, in the order of `Scene.pairs`, [P] each."""
+
+    distance: Array
+    """Signed distance in the newest state, m."""
+    penetration: Array
+    """The deepest overlap during the control step, m; 0 without any."""
+    force: Array
+    """The largest normal force during the control step, N."""
+
+
+class ArmView(NamedTuple):
+    """What a task sees of one arm in the newest state. Base frame; SI units."""
+
+    qpos: Array
+    """Positions of the actuated joints, [n]."""
+    qvel: Array
+    command: Array
+    """Position targets (or the last velocity or torque command), [n]."""
+    tool_tip: Array
+    """[3]"""
+    nearest_tip: Array
+    """From this tool tip to that of the nearest other arm, [3]; zero if there is none."""
+    min_distance: Array
+    """Least distance to any other arm, []; inf if there is none."""
+    collision: Array
+    """Whether it touched another arm or itself during the step, []."""
+    contact_force: Array
+    """The largest normal force on it during the step, N, []."""

@@ -1,0 +1,108 @@
+"""Observation terms: the named parts of what an agent observes.
+
+A term is declared once, with the function that reads it and its bounds. The vector of an observation, its space, and the
+names and slices within it all follow from that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from surgical_marl.runtime import jnp
+from surgical_marl.scenes.scene import Scene
+
+if TYPE_CHECKING:
+    from jax import Array
+
+    from surgical_marl.tasks.base.task import World
+
+FAR = 2.0
+"""Bound in m of everything observed in space; no arm reaches that far."""
+STRONGEST = 100.0
+"""Bound of an observed contact force, N."""
+EYES, CHANNELS = ("left", "right"), ("rgb", "depth")
+
+
+class Term(NamedTuple):
+    """A part of an observation that is a vector."""
+
+    read: Callable[[World], Array]
+    """The value [d] in a world."""
+    low: np.ndarray
+    """Least value, [d]: what is observed is clipped to the bounds."""
+    high: np.ndarray
+
+
+class Picture(NamedTuple):
+    """A part of an observation that is a picture: of colours uint8 [64, 64, 3], of depth float32 [64, 64, 1] in m."""
+
+    camera: str
+    """The agent whose endoscope sees it."""
+    eye: str = "left"
+    channel: str = "rgb"
+    table: str | None = None
+    """Of a picture that is to be matched: the task's table of postures `qpos` [rows, nq] that it is taken from. Row
+    `goal.row` is the episode's."""
+
+
+def arm_terms(scene: Scene, agent: str) -> dict[str, Term]:
+    """Return what every arm knows of itself and of the others, in its base frame and SI units.
+
+    `qpos` and `qvel` [n] of its joints, `tool_tip` [3], `command` [n], `contact_force` [1] on it; with other arms also
+    `to_nearest_tip` [3] from its tip, and the least distance `min_distance` [1] to any of them.
+    """
+    joints = scene.mounts[agent].arm.actuated
+    low, high = (np.array([getattr(joint, end) for joint in joints]) for end in ("lower", "upper"))
+    slack, speed = 0.1 * (high - low), 2 * np.array([joint.velocity for joint in joints])
+    low, high, space = low - slack, high + slack, np.full(3, FAR)
+    furthest = np.array([max(joint.velocity, joint.effort, joint.upper) for joint in joints])
+    commands = (low, high) if scene.control == "position" else (-furthest, furthest)
+    of: Callable[[str], Callable[[World], Array]] = lambda name: lambda world: getattr(world.arms[agent], name)  # noqa: E731
+    single: Callable[[str], Callable[[World], Array]] = lambda name: lambda world: of(name)(world)[None]  # noqa: E731
+    terms = {
+        "qpos": Term(of("qpos"), low, high),
+        "qvel": Term(of("qvel"), -speed, speed),
+        "tool_tip": Term(of("tool_tip"), -space, space),
+        "command": Term(of("command"), *commands),
+    }
+    if len(scene.agents) > 1:
+        terms["to_nearest_tip"] = Term(of("nearest_tip"), -2 * space, 2 * space)
+        terms["min_distance"] = Term(single("min_distance"), -space[:1], 2 * space[:1])
+    terms["contact_force"] = Term(single("contact_force"), np.zeros(1), np.full(1, STRONGEST))
+    return terms
+
+
+def picture_terms(scene: Scene, agent: str) -> dict[str, Picture]:
+    """Return the pictures that any agent of a scene may observe: `image`, `image_right`, `depth` and `depth_right` of its
+    own endoscope, or else of the scene's first; those of any endoscope as `<its agent>/image` and so on."""
+    cameras = [name for name, mount in scene.mounts.items() if mount.arm.camera is not None]
+    own = agent if agent in cameras else next(iter(cameras), None)
+    found: dict[str, Picture] = {}
+    for camera in cameras:
+        for channel, word in zip(CHANNELS, ("image", "depth"), strict=True):
+            for eye, end in zip(EYES, ("", "_right"), strict=True):
+                picture = Picture(camera, eye, channel)
+                found |= {f"{word}{end}": picture} if camera == own else {}
+                found[f"{camera}/{word}{end}"] = picture
+    return found
+
+
+def read_vector(terms: dict[str, Term], names: tuple[str, ...], world: World) -> Array:
+    """Return the terms of these names one after the other, each clipped to its bounds, [d] float32."""
+    parts = []
+    for name in names:
+        low, high = (bound.astype(np.float32) for bound in terms[name][1:])
+        parts.append(jnp.clip(terms[name].read(world).astype(jnp.float32), low, high))
+    return jnp.concatenate(parts) if parts else jnp.zeros(0, jnp.float32)
+
+
+def slices(terms: dict[str, Any], names: tuple[str, ...]) -> dict[str, slice]:
+    """Return where each term stands in the vector of these terms."""
+    found, start = {}, 0
+    for name in names:
+        found[name] = slice(start, start + len(terms[name].low))
+        start += len(terms[name].low)
+    return found
