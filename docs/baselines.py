@@ -16,9 +16,9 @@ import yaml
 
 import surgical_marl.evaluation.goal_set
 from surgical_marl.content import BASELINES, list_scenes
-from surgical_marl.plugins.tasks import list_tasks
 from surgical_marl.evaluation.command import play_all
 from surgical_marl.evaluation.evaluate import summarise
+from surgical_marl.plugins.tasks import list_tasks
 
 HASHES = Path(surgical_marl.evaluation.goal_set.__file__).with_name("goal_sets.yaml")
 ERRORS = {"median_error_mm": "median error (mm)", "p95_error_mm": "95th percentile (mm)"}

@@ -13,8 +13,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from surgical_marl.content import list_arms, list_policies, list_scenes
-from surgical_marl.interfaces.registration import register_ids
-from surgical_marl.plugins.tasks import list_tasks, register_task
+from surgical_marl.interfaces.registration import register_ids, register_task
+from surgical_marl.plugins.tasks import list_tasks
 
 if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv

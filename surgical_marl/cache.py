@@ -46,15 +46,41 @@ def cached(
         data = part.encode() if isinstance(part, str) else part
         digest.update(len(data).to_bytes(8, "little") + data)
     path = cache_dir() / kind / f"{digest.hexdigest()[:32]}.npz"
-    with contextlib.suppress(OSError, ValueError, EOFError, KeyError, BadZipFile, zlib.error):  # not there, or damaged
-        array: np.ndarray = np.load(path)["array"]
+    if (array := _load(path)) is not None:
         return array
-    array = compute()
-    with contextlib.suppress(OSError):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
-            np.savez(file, array=array)
-        os.replace(file.name, path)
+    with locked(path):
+        if (array := _load(path)) is not None:  # another process has made it meanwhile
+            return array
+        array = compute()
+        with contextlib.suppress(OSError):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
+                np.savez(file, array=array)
+            os.replace(file.name, path)
+    return array
+
+
+@contextlib.contextmanager
+def locked(path: Path) -> Iterator[None]:
+    """Hold a lock that belongs to a path of the cache, so that of several processes one does the work.
+
+    A process that dies lets it go. Where no lock can be made, there is none.
+    """
+    from filelock import FileLock
+
+    with contextlib.ExitStack() as held:
+        with contextlib.suppress(OSError, NotImplementedError):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            held.enter_context(FileLock(path.with_name(f".{path.name}.lock")))
+        yield
+
+
+def _load(path: Path) -> np.ndarray | None:
+    """The array in a file of the cache; None if it is not there, or damaged."""
+    try:
+        array: np.ndarray = np.load(path)["array"]
+    except (OSError, ValueError, EOFError, KeyError, BadZipFile, zlib.error):
+        return None
     return array
 
 

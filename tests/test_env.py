@@ -13,8 +13,7 @@ import pytest
 from surgical_marl import list_scenes
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.physics.simulator import Physics
-from surgical_marl.scenes.timing import TIMESTEP
-from surgical_marl.scenes.timing import DECIMATION
+from surgical_marl.scenes.timing import DECIMATION, TIMESTEP
 
 SCENES = ("psm", "bimanual_psm")
 

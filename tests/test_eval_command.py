@@ -17,7 +17,6 @@ import pytest
 from fake_env import FakeEnv
 from surgical_marl.cli.main import main
 from surgical_marl.content import list_scenes
-from surgical_marl.plugins.tasks import list_tasks
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.envs.env import Env
 from surgical_marl.evaluation import command
@@ -30,6 +29,7 @@ from surgical_marl.evaluation.goal_set import (
     standard_hashes,
 )
 from surgical_marl.learning import train
+from surgical_marl.plugins.tasks import list_tasks
 from surgical_marl.runs.folder import write_config
 from surgical_marl.runs.settings import NetworkSettings, Settings
 

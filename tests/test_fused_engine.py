@@ -15,14 +15,14 @@ import numpy as np
 import pytest
 
 from surgical_marl.content import list_scenes
-from surgical_marl.plugins.tasks import list_tasks
 from surgical_marl.engines.choose import make_engine
 from surgical_marl.engines.fused.engine import FusedEngine, flatten
 from surgical_marl.engines.fused.keys import episode_keys
-from surgical_marl.engines.fused.program import load_source
+from surgical_marl.engines.fused.load import load_source
 from surgical_marl.engines.mjx import MjxEngine
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.envs.env import Env
+from surgical_marl.plugins.tasks import list_tasks
 from surgical_marl.robots.arm import CONTROL_MODES, load_arm
 from surgical_marl.tasks.base.path_task import PathTask
 from surgical_marl.tasks.base.paths import DURATION

@@ -15,6 +15,7 @@ from typing import Any, NoReturn
 from surgical_marl.content import BASELINES, find, list_arms, list_policies, list_scenes, unknown
 from surgical_marl.plugins.tasks import list_tasks
 from surgical_marl.runtime import defer_compiler
+from surgical_marl.tasks.base.options import choices
 
 _LISTS = {
     "tasks": list_tasks,
@@ -24,8 +25,7 @@ _LISTS = {
 }
 
 _ALGOS = ("mappo", "ippo", "joint")
-_CONTROL = ("position", "velocity", "torque")
-_DIFFICULTY = ("easy", "default", "hard")
+_CONTROL = choices("control")
 _DEVICES = ("auto", "cpu", "cuda")
 _ENGINES = ("auto", "fused", "mjx")
 _BENCHED = ("all", "fused", "mjx", "mujoco")
@@ -40,7 +40,8 @@ _SETTINGS: tuple[tuple[str, str | tuple[str, ...], str], ...] = (
     ("engine", _ENGINES, "what runs the physics"),
     ("device", _DEVICES, "where it runs"),
     ("control", _CONTROL, "what an action commands"),
-    ("difficulty", _DIFFICULTY, "how far, how fast, how crowded"),
+    ("difficulty", "LEVEL", "how far, how fast, how crowded: easy, default or hard, or a level of the task's own"),
+    ("start", choices("start"), "postures that episodes begin with"),
 )
 _TAKE_SETTINGS = ("train", "bench train", "bench solve")
 """Commands that take `key=value`."""
@@ -120,9 +121,10 @@ def _parser() -> argparse.ArgumentParser:
     evaluate.add_argument("policies", nargs="+", metavar="RUN_OR_POLICY", help=what)
     evaluate.add_argument("--task", help="of a policy that is not trained")
     evaluate.add_argument("--scene", help="likewise: a name (see `list scenes`) or a .yaml file")
-    own = "of the goals (default: the policy's own)"
-    for key, good, text in (("control", _CONTROL, "likewise"), ("difficulty", _DIFFICULTY, own)):
-        evaluate.add_argument(f"--{key}", type=_one_of(good), metavar="|".join(good), help=text)
+    evaluate.add_argument("--control", type=_one_of(_CONTROL), metavar="|".join(_CONTROL), help="likewise")
+    evaluate.add_argument("--difficulty", metavar="LEVEL", help="of the goals (default: the policy's own)")
+    for key, text in (("start", "default: the policy's own"), ("goals", "default: held_out")):
+        evaluate.add_argument(f"--{key}", type=_one_of(choices(key)), metavar="|".join(choices(key)), help=text)
     evaluate.add_argument("--episodes", type=whole(1, 1_000_000), default=200, metavar="N")
     evaluate.add_argument("--seed", type=whole(0), default=0, metavar="S")
     evaluate.add_argument("--against", type=Path, metavar="FILE.json", help="an older result to compare with")
@@ -319,10 +321,10 @@ def _eval(arguments: argparse.Namespace) -> None:
         if path and not (path.suffix == suffix and path.parent.is_dir()):
             raise ValueError(f"cannot write {flag} {path}: name a {suffix} file in a folder that exists")
 
-    from surgical_marl.evaluation.command import play_all, read_result, report
+    from surgical_marl.evaluation.command import CHOSEN, OWN, play_all, read_result, report
 
     older = None if arguments.against is None else (str(arguments.against), read_result(arguments.against))
-    asked = {key: getattr(arguments, key) for key in ("task", "scene", "control", "difficulty")}
+    asked = {key: getattr(arguments, key) for key in (*OWN, *CHOSEN)}
     played = play_all(policies, asked, arguments.episodes, arguments.seed)
     print(report(played, older, arguments.json, arguments.csv, arguments.figure))
 

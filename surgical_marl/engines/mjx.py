@@ -110,7 +110,8 @@ class MjxEngine:
         return {**found, "contacts": found["contacts"]._asdict()}
 
     def read(self, name: str, library: str) -> Any:
-        """A part of the `Carry`, one of `carry_shapes`, or of what has moved, as in ".moved.carry.physics.qpos"; [N, ...]."""
+        """A part of the `Carry`, one of `carry_shapes`, or of what has moved, as in ".moved.carry.physics.qpos"; [N,
+        ...]."""
         tree, path = self._state.carry, name
         if name.startswith(".moved"):
             tree, path = self._moved, name.removeprefix(".moved")

@@ -28,7 +28,8 @@ class Stepper(Protocol):
 
     @property
     def parameters(self) -> Any:
-        """Numbers that are the same for all environments: a tree of numpy arrays, the last argument of each function."""
+        """Numbers that are the same for all environments: a tree of numpy arrays, the last argument of each
+        function."""
 
     @property
     def pauses(self) -> bool:

@@ -31,8 +31,8 @@ class BatchStep(NamedTuple):
     """What a step returns. Shapes start with N, the number of environments; dicts are keyed by agent."""
 
     observations: dict[str, Any]
-    """[N, d]; of the next episode where one ended. For an agent that sees pictures a dict of it, as "proprioception", and
-    of the pictures, [N, H, W, C] each."""
+    """[N, d]; of the next episode where one ended. For an agent that sees pictures a dict of it, as "proprioception",
+    and of the pictures, [N, H, W, C] each."""
     state: Any
     """[N, S], for a centralised critic, likewise of the next episode: all observations but pictures, what agents were
     not shown of them, and `Task.privileged`."""

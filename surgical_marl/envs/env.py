@@ -24,7 +24,8 @@ from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.runtime import jax, jnp, prepare_jax
 from surgical_marl.scenes.load import load_scene
 from surgical_marl.tasks.base.options import Options, make_options
-from surgical_marl.tasks.base.task import Task, World
+from surgical_marl.tasks.base.task import Task
+from surgical_marl.tasks.base.world import World
 
 if TYPE_CHECKING:
     from jax import Array
@@ -157,8 +158,8 @@ class Env:
 
     @cached_property
     def parameters(self) -> dict[str, Any]:
-        """Numbers that a step reads as inputs, so that another value of one compiles nothing: `max_steps`, the `weights`
-        of reward terms, and the task's `tables`. A tree of numpy arrays."""
+        """Numbers that a step reads as inputs, so that another value of one compiles nothing: `max_steps`, the
+        `weights` of reward terms, and the task's `tables`. A tree of numpy arrays."""
         return {
             "max_steps": np.int32(self.max_steps),
             "weights": {name: np.float32(weight) for name, weight in self.task.weights.items()},

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from surgical_marl.content import unknown
-from surgical_marl.tasks.base.task import Task, World
+from surgical_marl.tasks.base.task import Task
 from surgical_marl.tasks.base.terms import Picture, Term, read_vector, slices
+from surgical_marl.tasks.base.world import World
 
 if TYPE_CHECKING:
     from jax import Array

@@ -18,24 +18,29 @@ from surgical_marl.runs.environment import make_env
 from surgical_marl.runs.folder import read_settings
 from surgical_marl.runs.settings import Settings
 
+OWN, CHOSEN = ("task", "scene", "control"), ("difficulty", "start", "goals")
+"""What an evaluation plays that a trained policy determines, and what may be asked of any."""
+
 
 def play_all(policies: Sequence[str], asked: Mapping[str, str | None], episodes: int, seed: int) -> dict[str, Played]:
-    """The episodes of each policy, on the same goals.
+    """Return the episodes of each policy, on the same goals.
 
     Args:
         policies: runs or shipped policies of one task and scene, or one of `BASELINES` alone.
-        asked: `task`, `scene`, `control` and `difficulty`; a run's own where None, and no others than its own but for
-            the difficulty.
+        asked: of `OWN` and `CHOSEN`, where it is not None. Goals are held-out ones unless asked otherwise; of all else
+            a
+            trained policy has its own, and no others of `OWN`.
 
     Raises:
         ValueError: naming what is unknown, or does not go together.
     """
     if len(set(policies)) < len(policies):
         raise ValueError(f"{max(policies, key=policies.count)!r} is named twice")
-    settings = {policy: _settings(policy, asked) for policy in policies}
+    given = {"goals": "held_out", **{key: value for key, value in asked.items() if value is not None}}
+    settings = {policy: _settings(policy, given) for policy in policies}
     first = settings[policies[0]]
     for policy, other in settings.items():
-        for key in (*asked, "max_steps"):
+        for key in (*OWN, *CHOSEN, "max_steps"):
             if (theirs := getattr(other, key)) != (ours := getattr(first, key)):
                 raise ValueError(
                     f"{policy} has {key} {theirs!r} and {policies[0]} has {ours!r}: evaluate them one at a time"
@@ -91,7 +96,7 @@ def report(
 def judge(run: Path) -> None:
     """What `surgical-marl train` does after training: evaluate on the standard goals, say how it went, and film it."""
     print("evaluating 200 episodes", file=sys.stderr)
-    env = make_env(read_settings(run, ["engine=auto", "device=auto"]), num_envs=200)
+    env = make_env(read_settings(run, ["engine=auto", "device=auto", "goals=held_out"]), num_envs=200)
     policy = load_policy(run, env)
     result = summarise([play(env, policy, episodes=200, seed=0)])
     text = json.dumps(result, indent=2) + "\n"
@@ -124,13 +129,12 @@ def read_result(path: Path) -> dict[str, Any]:
     return found
 
 
-def _settings(policy: str, asked: Mapping[str, str | None]) -> Settings:
+def _settings(policy: str, asked: Mapping[str, str]) -> Settings:
     if policy in BASELINES:
-        return Settings(**{key: value for key, value in asked.items() if value is not None})  # type: ignore[arg-type]
+        return Settings(**asked)  # type: ignore[arg-type]
     settings = read_settings(find("policies", policy))
-    if difficulty := asked["difficulty"]:
-        settings = replace(settings, difficulty=difficulty)  # changes goals alone
-    for key, value in asked.items():
-        if value not in (None, own := getattr(settings, key)):
-            raise ValueError(f"{policy} is of {key} {own!r}, not {value!r}: leave --{key} out")
-    return replace(settings, engine="auto", device="auto")
+    for key in OWN:
+        if asked.get(key, own := getattr(settings, key)) != own:
+            raise ValueError(f"{policy} is of {key} {own!r}, not {asked[key]!r}: leave --{key} out")
+    chosen: Any = {key: asked[key] for key in CHOSEN if key in asked}
+    return replace(settings, engine="auto", device="auto", **chosen)

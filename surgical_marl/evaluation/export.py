@@ -70,8 +70,7 @@ def _settings(runs: Sequence[str]) -> list[Settings]:
 
 def _evaluate(runs: Sequence[str], seeds: Sequence[int], name: str) -> tuple[dict[str, Any], int]:
     """What `eval --json` prints of the best run, with `seeds` of all runs beside it; and which run is the best."""
-    asked = dict.fromkeys(("task", "scene", "control", "difficulty"))
-    played = list(play_all(list(runs), asked, EPISODES, SEED).values())
+    played = list(play_all(list(runs), {}, EPISODES, SEED).values())
     results = [{"policy": f"seed {seed}", **summarise([run])} for seed, run in zip(seeds, played, strict=True)]
     best = min(range(len(results)), key=lambda run: (len(misses(results[run])), worst_median(results[run])))
     whole = {"policy": "aggregate", **summarise(played)}

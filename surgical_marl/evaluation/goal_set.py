@@ -16,7 +16,7 @@ import yaml
 if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv
 
-PROTOCOL = 1
+PROTOCOL = 2
 """Raised when the goals are drawn or a metric is computed in another way: older results don't compare then."""
 ROUNDING = 1e-6
 """Goals are hashed as whole multiples of this, m: digits that another machine may compute otherwise are left out."""
@@ -35,6 +35,8 @@ def describe_goals(env: BatchedEnv, episodes: int) -> dict[str, Any]:
         "scene": env.scene.name,
         "control": env.control,
         "difficulty": env.env.options.difficulty,
+        "goals": env.env.options.goals,
+        "start": env.env.options.start,
         "episodes": episodes,
         "max_steps": env.max_steps,
         "control_dt": round(float(env.control_dt), 9),
@@ -59,14 +61,16 @@ def goal_hash(about: Mapping[str, Any], goals: Iterable[np.ndarray]) -> str:
 
 
 def is_standard(result: Mapping[str, Any]) -> bool:
-    """Whether a result is of the goal set that this version publishes for its task and scene."""
-    return bool(result["goal_set"] == standard_hashes().get(result["task"], {}).get(result["scene"]))
+    """Return whether a result is of a goal set that this version publishes for its task, scene and start."""
+    scenes = standard_hashes().get(result.get("start", ""), {}).get(result["task"], {})
+    return bool(result["goal_set"] == scenes.get(result["scene"]))
 
 
 @cache
-def standard_hashes() -> dict[str, dict[str, str]]:
-    """Hashes of the standard goal sets by task and scene: what `surgical-marl eval` plays if told nothing else."""
-    found: dict[str, dict[str, str]] = yaml.safe_load(_FILE.read_text())
+def standard_hashes() -> dict[str, dict[str, dict[str, str]]]:
+    """Hashes of the standard goal sets by start, task and scene: what `surgical-marl eval` plays if told nothing else,
+    and with `--start random`."""
+    found: dict[str, dict[str, dict[str, str]]] = yaml.safe_load(_FILE.read_text())
     return found
 
 
@@ -83,5 +87,5 @@ def check_same(result: Mapping[str, Any], other: Mapping[str, Any], name: str) -
 
 
 def _describe(result: Mapping[str, Any]) -> str:
-    what = "{task} in {scene}, {difficulty}, {control} control, {episodes} episodes, seed {seed}".format(**result)
-    return f"{result['goal_set']:.12} ({what})"
+    words = "{task} in {scene}, {difficulty}, {control} control, {goals} goals, {start} start, {episodes} episodes"
+    return f"{result['goal_set']:.12} ({words.format(**result)}, seed {result['seed']})"

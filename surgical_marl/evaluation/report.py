@@ -11,8 +11,20 @@ from surgical_marl.evaluation.goal_set import is_standard
 from surgical_marl.files import write_atomic
 
 ABOUT = (
-    *("policy", "task", "scene", "control", "difficulty", "episodes", "seed", "max_steps", "control_dt", "protocol"),
-    "goal_set",
+    *(
+        "policy",
+        "task",
+        "scene",
+        "control",
+        "difficulty",
+        "goals",
+        "start",
+        "episodes",
+        "seed",
+        "max_steps",
+        "control_dt",
+    ),
+    *("protocol", "goal_set"),
 )
 
 
@@ -23,7 +35,8 @@ def format_table(result: Mapping[str, Any], others: Mapping[str, Mapping[str, An
         others: columns to stand beside it, metrics by title; the agents if None.
     """
     columns = result["agents"] if others is None else others
-    what = "{task} in {scene}, {difficulty}, {control} control: {episodes} episodes, seed {seed}".format(**result)
+    words = "{task} in {scene}, {difficulty}, {control} control, {goals} goals, {start} start: {episodes} episodes"
+    what = f"{words.format(**result)}, seed {result['seed']}"
     goals = f"goal set {result['goal_set']:.12} ({'standard' if is_standard(result) else 'not a standard one'})"
     rows = [["", "all", "95 % interval", *columns]]
     for name, bounds in result["intervals"].items():

@@ -122,7 +122,8 @@ def _joint_spaces(batch: BatchedEnv) -> tuple[spaces.Space[Any], spaces.Box]:
 
 
 def _joint(batch: BatchedEnv, observations: dict[str, Any], index: int | None = None) -> Any:
-    """What all arms observe as one array, in a dict with the pictures if any sees some; of one environment or of all."""
+    """What all arms observe as one array, in a dict with the pictures if any sees some; of one environment or of
+    all."""
     chosen: Any = slice(None) if index is None else index
     # engines may sort the agents by name
     felt = np.concatenate([proprioception(observations[agent])[chosen] for agent in batch.agents], -1)

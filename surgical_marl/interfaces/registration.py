@@ -12,7 +12,7 @@ from importlib import import_module
 from types import ModuleType
 from typing import Any
 
-from surgical_marl.plugins.tasks import list_tasks
+from surgical_marl.plugins.tasks import TASKS, list_tasks
 
 PACKAGE = "surgical_marl"
 FACES = f"{PACKAGE}.interfaces"
@@ -24,6 +24,19 @@ def register_ids() -> None:
         _gymnasium(task)
         _pettingzoo(task)
         _module(task)
+
+
+def register_task(name: str, cls: type) -> None:
+    """Make a subclass of `surgical_marl.tasks.base.task.Task` known by a name, in this program.
+
+    Its ids for Gymnasium and PettingZoo and its module, such as `my_task_v0`, are there at once. A package declares its
+    own by the entry-point group `surgical_marl.tasks` instead (docs/your_own_task.md).
+
+    Raises:
+        ValueError: the name belongs to another class, or the class is not a subclass of `Task`.
+    """
+    TASKS.register(name, cls)
+    register_ids()
 
 
 def _gymnasium(task: str) -> None:

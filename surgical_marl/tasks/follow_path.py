@@ -24,8 +24,9 @@ import numpy as np
 
 from surgical_marl.tasks.base.path_task import PathTask
 from surgical_marl.tasks.base.paths import loops_and_lines
-from surgical_marl.tasks.base.task import Level, World
+from surgical_marl.tasks.base.task import Level
 from surgical_marl.tasks.base.terms import FAR, Picture, Term
+from surgical_marl.tasks.base.world import World
 
 if TYPE_CHECKING:
     from jax import Array

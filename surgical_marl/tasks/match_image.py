@@ -32,9 +32,10 @@ import numpy as np
 from surgical_marl.cache import cached
 from surgical_marl.runtime import jax, jnp
 from surgical_marl.tasks.base.options import Options
-from surgical_marl.tasks.base.task import Level, Start, TipTask, World
+from surgical_marl.tasks.base.task import Level, Start, TipTask
 from surgical_marl.tasks.base.terms import Picture, Term
 from surgical_marl.tasks.base.workspace import CLEARANCE, PATH_POINTS, choose
+from surgical_marl.tasks.base.world import World
 
 if TYPE_CHECKING:
     from jax import Array
@@ -78,7 +79,7 @@ class Task(TipTask):
         if len(same) > 1:
             raise ValueError(f"match_image needs a scene with one endoscope; {scene.name!r} has {', '.join(same)}")
         self._arm = scene.mounts[self.camera].arm
-        table = hidden_postures(scene, self.camera, self.level.extent)
+        table = hidden_postures(scene, self.camera, self.level.extent, self.seed)
         joints = {agent: table[:, scene.qpos_index(agent)] for agent in scene.agents}
         tips = [mount.arm.forward_kinematics(joints[agent])[:, :3, 3] for agent, mount in scene.mounts.items()]
         tables = {"tips": np.stack(tips, 1), "turns": self._turn(joints[self.camera]), "joints": joints[self.camera]}
@@ -120,7 +121,8 @@ class Task(TipTask):
         return {"image_error": (torch.maximum(seen, wanted) - torch.minimum(seen, wanted)).float().mean((1, 2, 3))}
 
     def reward_terms(self, world: World) -> dict[str, dict[str, Array]]:
-        """Return agent -> reward term -> its value before weighting; the camera's first four and the others' `stray`."""
+        """Return agent -> reward term -> its value before weighting; the camera's first four and the others'
+        `stray`."""
         errors, known, none = self.tip_errors(world), super().reward_terms(world), jnp.float32(0.0)
         looks = {agent: agent == self.camera for agent in world.arms}
         return {
@@ -156,7 +158,7 @@ class Task(TipTask):
         return self._arm.forward_kinematics(q)[..., :3, :3]
 
 
-def hidden_postures(scene: Scene, agent: str, extent: float) -> np.ndarray:
+def hidden_postures(scene: Scene, agent: str, extent: float, seed: int = 0) -> np.ndarray:
     """Postures that target pictures are taken from: `qpos` [POSTURES, nq], all arms but the agent's at home.
 
     Raises:
@@ -166,7 +168,7 @@ def hidden_postures(scene: Scene, agent: str, extent: float) -> np.ndarray:
     tissue = np.array([model.geom(geom).name.startswith("tissue/") for geom in range(model.ngeom)])
     if not tissue.any():
         raise ValueError(f"scene {scene.name!r} has no tissue for its endoscope to look at: give it some in its file")
-    arm, rng = scene.mounts[agent].arm, np.random.default_rng(0)
+    arm, rng = scene.mounts[agent].arm, np.random.default_rng(seed)
     reach = np.linalg.norm(arm.forward_kinematics(arm.home)[:3, 3])
     spread = np.array([extent if joint.slides else extent / reach for joint in arm.actuated])
     home = {name: mount.arm.home for name, mount in scene.mounts.items()}
@@ -181,7 +183,7 @@ def hidden_postures(scene: Scene, agent: str, extent: float) -> np.ndarray:
         return qpos[good], np.zeros(good.sum(), bool)
 
     camera = model.camera(f"{agent}/left")
-    numbers = (extent, POSTURES, *map(float, (*camera.pos, *camera.quat, *camera.fovy)))
+    numbers = (extent, seed, POSTURES, *map(float, (*camera.pos, *camera.quat, *camera.fovy)))
     return cached("pictures", lambda: choose(scene, batch, POSTURES, 0.0), repr((agent, numbers)), scene.fingerprint)
 
 

@@ -47,9 +47,9 @@ class Task(TipTask):
     def __init__(self, scene: Scene, options: Options) -> None:
         super().__init__(scene, options)
         if self.starts_at == "home":
-            self.tables["targets"] = target_table(scene, self.level.extent, self.level.crossing)
+            self.tables["targets"] = target_table(scene, self.level.extent, self.level.crossing, self.seed)
         else:
-            self.tables |= start_table(scene, self.level.extent)
+            self.tables |= start_table(scene, self.level.extent, self.seed)
 
     def start(self, key: Array) -> Start:
         """Return goals of all arms, and postures where these are drawn too."""

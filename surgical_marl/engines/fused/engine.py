@@ -20,8 +20,9 @@ import numpy as np
 from surgical_marl.engines.fused.arrays import make_arrays
 from surgical_marl.engines.fused.kernel import compile_kernels, has_cuda
 from surgical_marl.engines.fused.keys import episode_keys
+from surgical_marl.engines.fused.load import load_source
 from surgical_marl.engines.fused.preludes import LANES
-from surgical_marl.engines.fused.program import Source, load_source
+from surgical_marl.engines.fused.program import Source
 from surgical_marl.engines.stepper import Stepper, announce
 from surgical_marl.machine import cores
 
@@ -100,8 +101,8 @@ class FusedEngine:
         return self._arrays.read_tree(self.source.results, library)
 
     def read(self, name: str, library: str) -> Any:
-        """A part of the `Carry`, one of `carry_shapes`, or of what has moved, as in ".moved.carry.physics.qpos"; [N, ...],
-        a copy."""
+        """A part of the `Carry`, one of `carry_shapes`, or of what has moved, as in ".moved.carry.physics.qpos"; [N,
+        ...], a copy."""
         return self._arrays.read(self._leaves[name], library)
 
     def write(self, name: str, values: Any) -> None:

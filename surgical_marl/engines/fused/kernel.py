@@ -15,6 +15,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from surgical_marl.cache import locked
 from surgical_marl.engines.fused.preludes import CPU, CUDA, LANES, UNDEFINE
 from surgical_marl.files import write_atomic
 from surgical_marl.runtime import cache_dir, prepare_warp
@@ -38,7 +39,8 @@ def compile_kernels(bodies: dict[str, str], device: str, max_registers: int | No
     # contraction: a * b + c is one operation, as on a GPU
     module.options.update(enable_backward=False, cpu_compiler_flags="-march=native -ffp-contract=fast")
     made = {name: _make(f"{name}_{digest}", source, module, max_registers) for name, source in sources.items()}
-    with _checked(module.name):
+    # Warp itself has no way for two processes to compile the same module at a time
+    with locked(cache_dir() / "kernels" / module.name), _checked(module.name):
         module.load(wp.get_device(device), block_dim=BLOCK if device == "cuda" else 1)
     return {name: Kernel(kernel, device) for name, kernel in made.items()}
 

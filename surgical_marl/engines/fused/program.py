@@ -6,16 +6,11 @@ an array whose columns are environments.
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-
-from surgical_marl.cache import cached
-from surgical_marl.engines.stepper import Stepper
 
 TREES = ("carry", "actions", "results", "parameters", "moved", "sensed")
 
@@ -54,37 +49,3 @@ class Source:
     moved: dict[str, Any]
     """Leaves of what is between both halves of a step, and of what is `sensed` there; none if a step is one kernel."""
     sensed: dict[str, Any]
-
-
-def load_source(env: Stepper, vector: bool, announce: Callable[[], None] = lambda: None) -> Source:
-    """The source of an environment's kernels: for a CPU, with vectors, or for CUDA. Kept on disk; `announce` is called
-    before it is made.
-
-    Raises:
-        Unsupported: the environment can't be traced.
-    """
-
-    def compute() -> np.ndarray:
-        from surgical_marl.engines.fused.translate import make_source  # imports JAX
-
-        announce()
-        return np.frombuffer(json.dumps(asdict(make_source(env, vector)), default=np.ndarray.tolist).encode(), np.uint8)
-
-    settings = f"vector={vector} {_describe(env.parameters)}"
-    found = json.loads(cached("fused", compute, settings, env.content, roots=env.roots).tobytes())
-    tables = {dtype: np.array(table, dtype) for dtype, table in found.pop("tables").items()}
-    trees = {name: _leaves(found.pop(name)) for name in TREES}
-    return Source(tables=tables, **trees, **found)
-
-
-def _describe(parameters: Any) -> str:
-    """Names, shapes and types of parameters, without JAX: their values are inputs of the kernels."""
-    if isinstance(parameters, dict):
-        return repr({name: _describe(value) for name, value in sorted(parameters.items())})
-    return f"{np.shape(parameters)} {parameters.dtype.name}"
-
-
-def _leaves(tree: Any) -> Any:
-    if "buffer" in tree and not isinstance(tree["buffer"], dict):
-        return Leaf(tree["buffer"], tree["first"], tuple(tree["shape"]), tree["dtype"])
-    return {name: _leaves(child) for name, child in tree.items()}

@@ -47,6 +47,7 @@ class Options(Checked):
         scene: a name of `list_scenes()` or the path of a scene file.
         control: what an action commands: "position" moves position targets, "velocity" and "torque" command those.
         difficulty: a level of the task; its page says what each is.
+        goals: "training", or "held_out" for those of evaluations, which training never draws.
         start: "home", or "random" for a collision-free posture drawn anew in each episode, where the task has it.
         max_steps: control steps until an episode is truncated; the task's own number if None.
         decimation: physics steps a control step.
@@ -62,6 +63,7 @@ class Options(Checked):
     scene: str = "bimanual_psm"
     control: Literal["position", "velocity", "torque"] = choice("position", "what an action commands")
     difficulty: str = choice("default", "how far, how fast, how crowded: a level of the task")
+    goals: Literal["training", "held_out"] = choice("training", "which goals episodes are drawn from")
     start: Literal["home", "random"] = choice("home", "postures that episodes begin with")
     max_steps: int | None = number(None, 1, 1_000_000, "control steps of an episode")
     decimation: int = number(DECIMATION, 1, 1_000_000, "physics steps a control step")

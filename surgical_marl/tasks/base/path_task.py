@@ -43,7 +43,7 @@ class PathTask(TipTask):
 
     def __init__(self, scene: Scene, options: Options) -> None:
         super().__init__(scene, options)
-        table = path_table(scene, self.draw, self.level)
+        table = path_table(scene, self.draw, self.level, self.seed)
         closed = np.isclose(table[:, :3], table[:, -3:], rtol=0, atol=1e-7).all(axis=(1, 2, 3))
         self.tables |= {"paths": table.astype(np.float32), "closed": closed}
 

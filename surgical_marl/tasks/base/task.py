@@ -1,7 +1,7 @@
 """What a task is: how an episode begins, what each agent observes, named reward terms, and what success is.
 
-A task is a class with pure functions, derived from `Task`, or from `TipTask` where every tool tip has a target. One that
-ships is the class `Task` of a module in `surgical_marl/tasks/`; one of another package is named by its entry point
+A task is a class with pure functions, derived from `Task`, or from `TipTask` where every tool tip has a target. One
+that ships is the class `Task` of a module in `surgical_marl/tasks/`; one of another package is named by its entry point
 (docs/your_own_task.md). Its docstring, or its module's, is its page.
 """
 
@@ -18,11 +18,11 @@ from surgical_marl.content import unknown
 from surgical_marl.runtime import jnp
 from surgical_marl.tasks.base.options import Options
 from surgical_marl.tasks.base.terms import FAR, Picture, Term, arm_terms, picture_terms
+from surgical_marl.tasks.base.world import World
 
 if TYPE_CHECKING:
     from jax import Array
 
-    from surgical_marl.physics.views import ArmView
     from surgical_marl.scenes.scene import Scene
 
 PRECISION = 0.005
@@ -32,6 +32,10 @@ APPROACH = 0.025
 come at each other at 8 mm a step, and some at twice that."""
 
 
+SEEDS = {"training": 0, "held_out": 1}
+"""Seeds of the tables that goals are drawn from."""
+
+
 class Start(NamedTuple):
     """How an episode begins."""
 
@@ -39,16 +43,6 @@ class Start(NamedTuple):
     """What the episode is after, as a named tuple of arrays: the task's own."""
     qpos: Array | None = None
     """Joint positions of the whole scene, [nq]; None where every episode begins at home."""
-
-
-class World(NamedTuple):
-    """What the functions of a task are given: one environment after a step."""
-
-    arms: Mapping[str, ArmView]
-    """What is seen of each agent's arm."""
-    goal: Any
-    sensed: Mapping[str, Array] = {}
-    """What `Task.sense` made of the pictures, by the names in `Task.senses`."""
 
 
 class Level(NamedTuple):
@@ -65,8 +59,8 @@ class Level(NamedTuple):
 class Task:
     """The pure functions of a task. Results are keyed by agent, for one environment.
 
-    What a function reads from `self.tables` and `self.weights` is an input of the kernel: another table or weight of the
-    same shape compiles nothing. All else that it reads from `self` is a constant there.
+    What a function reads from `self.tables` and `self.weights` is an input of the kernel: another table or weight of
+    the same shape compiles nothing. All else that it reads from `self` is a constant there.
 
     Args:
         scene: the arms.
@@ -97,6 +91,8 @@ class Task:
         if options.start not in self.starts:
             raise unknown(f"start of task {options.task!r}", options.start, self.starts)
         self.scene, self.level, self.starts_at = scene, self.levels[options.difficulty], options.start
+        self.seed = SEEDS[options.goals]
+        """Of what the task draws on the host: held-out goals come from another seed than those of training."""
         for name in options.reward:
             if name not in self.weights:
                 raise unknown("reward term", name, list(self.weights))
@@ -199,7 +195,8 @@ class Task:
         raise NotImplementedError
 
     def goal_content(self, goal: Any) -> list[np.ndarray]:
-        """Return the numbers that say what N episodes are after, [N, ...] each: what an evaluation's hash is made of."""
+        """Return the numbers that say what N episodes are after, [N, ...] each: what an evaluation's hash is made
+        of."""
         return [np.asarray(value) for _, value in sorted(vars(goal).items())]
 
 

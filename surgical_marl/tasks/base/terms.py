@@ -1,7 +1,7 @@
 """Observation terms: the named parts of what an agent observes.
 
-A term is declared once, with the function that reads it and its bounds. The vector of an observation, its space, and the
-names and slices within it all follow from that.
+A term is declared once, with the function that reads it and its bounds. The vector of an observation, its space, and
+the names and slices within it all follow from that.
 """
 
 from __future__ import annotations
@@ -13,11 +13,10 @@ import numpy as np
 
 from surgical_marl.runtime import jnp
 from surgical_marl.scenes.scene import Scene
+from surgical_marl.tasks.base.world import World
 
 if TYPE_CHECKING:
     from jax import Array
-
-    from surgical_marl.tasks.base.task import World
 
 FAR = 2.0
 """Bound in m of everything observed in space; no arm reaches that far."""
@@ -76,8 +75,8 @@ def arm_terms(scene: Scene, agent: str) -> dict[str, Term]:
 
 
 def picture_terms(scene: Scene, agent: str) -> dict[str, Picture]:
-    """Return the pictures that any agent of a scene may observe: `image`, `image_right`, `depth` and `depth_right` of its
-    own endoscope, or else of the scene's first; those of any endoscope as `<its agent>/image` and so on."""
+    """Return the pictures that any agent of a scene may observe: `image`, `image_right`, `depth` and `depth_right` of
+    its own endoscope, or else of the scene's first; those of any endoscope as `<its agent>/image` and so on."""
     cameras = [name for name, mount in scene.mounts.items() if mount.arm.camera is not None]
     own = agent if agent in cameras else next(iter(cameras), None)
     found: dict[str, Picture] = {}

@@ -66,8 +66,8 @@ def start_table(scene: Scene, spread: float, seed: int = 0) -> dict[str, np.ndar
         seed: of the draws; the same seed gives the same table.
 
     Returns:
-        `postures` [TABLE_SIZE, nq], `qpos` of the scene, and `targets` [TABLE_SIZE, arms, 3] in each arm's base frame, m.
-        Kept on disk by content.
+        `postures` [TABLE_SIZE, nq], `qpos` of the scene, and `targets` [TABLE_SIZE, arms, 3] in each arm's base frame,
+        m. Kept on disk by content.
 
     Raises:
         ValueError: fewer than one draw in a hundred can be kept.

@@ -1,0 +1,48 @@
+"""Programs from the cache on disk, or made anew."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from surgical_marl.cache import cached
+from surgical_marl.engines.fused.program import TREES, Leaf, Source
+from surgical_marl.engines.stepper import Stepper
+
+
+def load_source(env: Stepper, vector: bool, announce: Callable[[], None] = lambda: None) -> Source:
+    """The source of an environment's kernels: for a CPU, with vectors, or for CUDA. Kept on disk; `announce` is called
+    before it is made.
+
+    Raises:
+        Unsupported: the environment can't be traced.
+    """
+
+    def compute() -> np.ndarray:
+        from surgical_marl.engines.fused.translate import make_source  # imports JAX
+
+        announce()
+        return np.frombuffer(json.dumps(asdict(make_source(env, vector)), default=np.ndarray.tolist).encode(), np.uint8)
+
+    settings = f"vector={vector} {_describe(env.parameters)}"
+    found = json.loads(cached("fused", compute, settings, env.content, roots=env.roots).tobytes())
+    tables = {dtype: np.array(table, dtype) for dtype, table in found.pop("tables").items()}
+    trees = {name: _leaves(found.pop(name)) for name in TREES}
+    return Source(tables=tables, **trees, **found)
+
+
+def _describe(parameters: Any) -> str:
+    """Names, shapes and types of parameters, without JAX: their values are inputs of the kernels."""
+    if isinstance(parameters, dict):
+        return repr({name: _describe(value) for name, value in sorted(parameters.items())})
+    return f"{np.shape(parameters)} {parameters.dtype.name}"
+
+
+def _leaves(tree: Any) -> Any:
+    if "buffer" in tree and not isinstance(tree["buffer"], dict):
+        return Leaf(tree["buffer"], tree["first"], tuple(tree["shape"]), tree["dtype"])
+    return {name: _leaves(child) for name, child in tree.items()}
