@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from xml.etree import ElementTree
@@ -19,9 +18,7 @@ from surgical_marl.physics.simulator import Simulator
 from surgical_marl.robots.arm import CONTROL_MODES
 from surgical_marl.scenes.contacts import collision_geoms
 from surgical_marl.scenes.scene import DECIMATION, TIMESTEP, Scene
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "docs"))
-from energy import energy_drift
+from surgical_marl.studies.energy import energy_drift
 
 SCENES = list_scenes()
 STEPS = 10_000
