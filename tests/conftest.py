@@ -4,8 +4,8 @@ import os
 
 from surgical_marl.runtime import prepare_jax
 
-# XLA takes half of the time to compile code that it does not optimise. That code runs as fast for a few environments, and
-# computes the same: the engine that it makes is the reference, not the fast one.
+# XLA takes half of the time for code that it does not optimise. That code runs about as fast for a few environments, and
+# computes the same: the MJX engine is the reference here, not the fast one.
 os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=0".strip()
 
 # Only in a worker of pytest-xdist, whose environment is the controller's: what the controller set would stay. torch's
