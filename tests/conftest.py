@@ -4,7 +4,7 @@ import os
 
 from surgical_marl.runtime import prepare_jax
 
-# XLA takes half of the time for code that it does not optimise. That code runs about as fast for a few environments, and
+# XLA takes half of the time for code that it does not optimise. That code is about as fast for a few environments, and
 # computes the same: the MJX engine is the reference here, not the fast one.
 os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=0".strip()
 
