@@ -17,8 +17,9 @@ help:
 train: $(READY)
 	$(BIN)/surgical-marl train reach --scene bimanual_psm $(ARGS)
 
+# Neighbours in a file share what they compile: a worker takes half of the tests, in order, and from the other when done.
 test: $(READY)
-	$(BIN)/pytest -n 2 $(ARGS)
+	$(BIN)/pytest -n 2 --dist worksteal $(ARGS)
 
 lint: $(READY)
 	$(BIN)/ruff check .

@@ -1,11 +1,16 @@
-"""JAX starts the way the package starts it, whichever test comes first; tests beside each other share the cores."""
+"""JAX starts the way the package starts it, whichever test comes first; workers beside each other share the cores."""
 
 import os
 
 from surgical_marl.runtime import prepare_jax
 
-# torch's threads wait for each other by spinning: with more of them than cores a CPU does little else.
-_side_by_side = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
-os.environ.setdefault("OMP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // _side_by_side)))
+# XLA takes half of the time for code that it does not optimise. That code is about as fast for a few environments, and
+# computes the same: the MJX engine is the reference here, not the fast one.
+os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=0".strip()
+
+# Only in a worker of pytest-xdist, whose environment is the controller's: what the controller set would stay. torch's
+# threads wait for each other by spinning, so that more of them than cores do little else.
+if workers := os.environ.get("PYTEST_XDIST_WORKER_COUNT"):
+    os.environ["OMP_NUM_THREADS"] = str(max(1, (os.cpu_count() or 1) // int(workers)))
 
 prepare_jax()

@@ -14,6 +14,7 @@ from surgical_marl.robots.arm import Arm
 from surgical_marl.robots.spec import build_spec
 from surgical_marl.scenes.build import set_physics
 from surgical_marl.scenes.timing import TIMESTEP
+from tests.helpers.rollouts import read_state, roll_out
 
 HALF = np.pi / 2
 # dVRK ECM.json, modified (Craig) convention: alpha, a, theta offset, d, slides
@@ -150,11 +151,9 @@ def test_step_response_settles_without_ringing() -> None:
     arm = load_arm("ecm")
     model, data = state(arm, arm.home)
     step = np.array([0.02, 0.02, 0.002, 0.02])
-    data.ctrl[:] = arm.home + step
-    path = np.empty((round(2 / TIMESTEP), 4))
-    for moment in path:
-        mujoco.mj_step(model, data)
-        moment[:] = (data.qpos - arm.home) / step
+    targets = np.tile(arm.home + step, (1, round(2 / TIMESTEP), 1))
+    _, qpos, _ = roll_out(model, data, read_state(model, data)[None], targets)
+    path = (qpos[0] - arm.home) / step
     assert np.all(path.max(0) < 1.1)
     # Coulomb friction leaves an error: less than friction / stiffness.
     left = np.array([joint.coulomb / joint.drive.stiffness for joint in arm.actuated])

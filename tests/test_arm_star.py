@@ -150,8 +150,7 @@ def test_stays_stable_with_efforts_at_their_limits() -> None:
             assert (data.qpos > low - 0.05 * (high - low)).all() and (data.qpos < high + 0.05 * (high - low)).all()
     assert saturated.all() and not data.warning.number.any()
     data.ctrl[:] = STAR.home
-    for _ in range(round(3 / TIMESTEP)):
-        mujoco.mj_step(model, data)
+    mujoco.mj_step(model, data, round(3 / TIMESTEP))
     # Coulomb friction holds a joint up to friction / stiffness away; it is a little soft, so the joint creeps
     left = np.array([joint.coulomb / joint.drive.stiffness for joint in STAR.joints])
     assert (np.abs(data.qpos - STAR.home) < 1.01 * left).all() and np.abs(data.qvel).max() < 1e-4

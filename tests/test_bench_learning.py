@@ -11,7 +11,6 @@ from typing import Any
 
 import pytest
 
-from fake_env import FakeEnv
 from surgical_marl import machine
 from surgical_marl.bench import learning as train
 from surgical_marl.bench import solve, stopwatch
@@ -21,6 +20,7 @@ from surgical_marl.cli.main import main
 from surgical_marl.learning import train as learning_train
 from surgical_marl.learning.trainer import Trainer
 from surgical_marl.runs.settings import NetworkSettings, PPOSettings, Settings
+from tests.helpers.fake_env import FakeEnv
 
 CONTRACT = [
     "physics_steps_per_s", "env_steps_per_s", "simulated_s_per_s", "num_envs", "engine", "device", "dt", "decimation",

@@ -10,10 +10,10 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
 
-from fake_env import FakeEnv
 from surgical_marl.learning.trainer import Trainer
 from surgical_marl.runtime import no_collection
-from test_learning import ALL, COUNTS, OPTIONS, SIZES, SMALL
+from tests.helpers.fake_env import FakeEnv
+from tests.helpers.runs import ALL, COUNTS, OPTIONS, SIZES, SMALL
 
 WAITING = ("_local_scalar_dense", "nonzero", "masked_select", "unique", "equal.default", "is_nonzero")
 

@@ -9,13 +9,13 @@ from typing import Any
 import pytest
 import torch
 
-from fake_env import FakeEnv
 from surgical_marl.learning import train
 from surgical_marl.learning.constraint import Constraint
 from surgical_marl.policies.layout import Layout
 from surgical_marl.runs.folder import read_metrics
 from surgical_marl.runs.settings import ConstraintSettings, NetworkSettings, PPOSettings, Settings
-from test_mappo import SETTINGS, SIZES, build, roll_out
+from tests.helpers.fake_env import FakeEnv
+from tests.test_mappo import SETTINGS, SIZES, build, roll_out
 
 COLLISION = ConstraintSettings(cost="collision", limit=0.1, kp=2.0, ki=0.5, kd=3.0)
 BOUNDED = replace(SETTINGS, constraint=COLLISION)

@@ -13,9 +13,6 @@ import pytest
 import torch
 import torch.distributed as dist
 
-from fake_env import FakeEnv
-from processes import end, start_together
-from runs import COUNTS, SIZES, SMALL, fake_env, run, same_state
 from surgical_marl.engines.fused.keys import episode_keys
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.interfaces.rsl_rl import RslRlVecEnv
@@ -24,6 +21,9 @@ from surgical_marl.learning.mappo import MAPPO, rsl_rl_config
 from surgical_marl.learning.trainer import Trainer
 from surgical_marl.runs.folder import read_checkpoint, read_metrics
 from surgical_marl.runs.settings import ConstraintSettings, PPOSettings, Settings
+from tests.helpers.fake_env import FakeEnv
+from tests.helpers.processes import end, start_together
+from tests.helpers.runs import COUNTS, SIZES, SMALL, fake_env, run, same_state
 
 # One mini-batch: which samples are learned from together does not depend on how they are spread.
 ALIKE = replace(

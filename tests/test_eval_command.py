@@ -14,7 +14,6 @@ import jax
 import numpy as np
 import pytest
 
-from fake_env import FakeEnv
 from surgical_marl.cli.main import main
 from surgical_marl.content import list_scenes
 from surgical_marl.envs.batch import BatchedEnv
@@ -32,6 +31,7 @@ from surgical_marl.learning import train
 from surgical_marl.plugins.tasks import list_tasks
 from surgical_marl.runs.folder import write_config
 from surgical_marl.runs.settings import NetworkSettings, Settings
+from tests.helpers.fake_env import FakeEnv
 
 SMALL = Settings(num_envs=8, iterations=1, steps_per_iteration=8, network=NetworkSettings(hidden=(8,)))
 

@@ -15,11 +15,12 @@ from hypothesis import strategies as st
 from jax import lax
 from jax.extend.core import Primitive, primitives
 
-from fused_blocks import STRUCTURES, all_blocks, programs, random_arrays, several
-from fused_kernels import make_stores, run
 from surgical_marl.engines.fused.primitives import ELEMENTWISE, RULES
 from surgical_marl.engines.fused.trace import Tracer
 from surgical_marl.engines.fused.traced import Symbolic
+from tests.helpers.fused_blocks import all_blocks, random_arrays
+from tests.helpers.fused_kernels import make_stores, run
+from tests.helpers.fused_programs import STRUCTURES, programs, several
 
 Arrays = Any
 

@@ -6,7 +6,6 @@ import json
 import math
 import os
 import signal
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,11 +13,9 @@ from typing import Any
 import pytest
 import torch
 
-from fake_env import FakeEnv
 from surgical_marl.evaluation.evaluate import evaluate
 from surgical_marl.files import write_atomic
 from surgical_marl.learning import train, trainer
-from surgical_marl.learning import trainer as training
 from surgical_marl.learning.episodes import Episodes
 from surgical_marl.policies.policy import (
     load_policy,
@@ -26,7 +23,6 @@ from surgical_marl.policies.policy import (
     untrained_policy,
     zero_policy,
 )
-from surgical_marl.runs import settings as config
 from surgical_marl.runs.folder import (
     CONFIG,
     read_checkpoint,
@@ -34,30 +30,9 @@ from surgical_marl.runs.folder import (
     read_settings,
     write_metrics,
 )
-from surgical_marl.runs.settings import ConstraintSettings, NetworkSettings, PPOSettings, Settings, load_config
-
-COUNTS, SIZES = {"psm": 2, "ecm": 1}, {"psm": 3, "ecm": 2}
-SMALL = Settings(
-    num_envs=32,
-    iterations=4,
-    steps_per_iteration=8,
-    checkpoint_every=2,
-    network=NetworkSettings(hidden=(16,)),
-    ppo=PPOSettings(epochs=2, mini_batches=2),
-)
-# What an algorithm may have beside its networks.
-OPTIONS: list[dict[str, Any]] = [
-    {},
-    {"ppo": replace(SMALL.ppo, normalise_values=True)},
-    {"constraint": ConstraintSettings(cost="collision", limit=0.01)},
-    {"network": replace(SMALL.network, recurrent="gru")},
-]
-ALL: dict[str, Any] = {
-    **OPTIONS[1],
-    **OPTIONS[2],
-    "network": replace(SMALL.network, recurrent="lstm"),
-    "team_reward": True,
-}
+from surgical_marl.runs.settings import NetworkSettings, PPOSettings, Settings
+from tests.helpers.fake_env import FakeEnv
+from tests.helpers.runs import ALL, COUNTS, OPTIONS, SIZES, SMALL
 
 
 @pytest.fixture
@@ -268,7 +243,7 @@ def test_a_nan_reward_names_its_term(tmp_path: Path, fakes: list[Any], monkeypat
 
 def test_a_nan_loss_stops(tmp_path: Path, fakes: list[Any], monkeypatch: pytest.MonkeyPatch) -> None:
     losses = torch.tensor([math.nan, 0.0, 0.0, 0.0, 0.0])
-    monkeypatch.setattr(training.MAPPO, "learn", lambda self: losses)
+    monkeypatch.setattr(trainer.MAPPO, "learn", lambda self: losses)
     with pytest.raises(FloatingPointError, match="learning_rate"):
         train.train(SMALL, out=tmp_path / "run")
     assert read_checkpoint(tmp_path / "run")["iteration"] == 0
@@ -307,7 +282,7 @@ def test_folders_that_cannot_be_used(tmp_path: Path, fakes: list[Any]) -> None:
         (replace(SMALL, **OPTIONS[1]), {"out": run, "resume": run}, "normalise_values False"),
         (replace(SMALL, **OPTIONS[2]), {"out": run, "resume": run}, "constraint.cost 'none'"),
         (replace(SMALL, **OPTIONS[3]), {"out": run, "resume": run}, "network.recurrent 'none'"),
-        (replace(SMALL, scene="psm"), {"out": run, "resume": run}, "'bimanual_psm'"),
+        (replace(SMALL, scene="ecm"), {"out": run, "resume": run}, "'psm'"),
     ]
     for settings, arguments, message in cases:
         with pytest.raises(ValueError, match=message):
@@ -316,7 +291,7 @@ def test_folders_that_cannot_be_used(tmp_path: Path, fakes: list[Any]) -> None:
     whole = (run / CONFIG).read_text()
     for text, message in (
         (b"", "config.yaml has no task"),
-        (whole.replace("scene: bimanual_psm\n", "").encode(), "config.yaml has no scene"),
+        (whole.replace("scene: psm\n", "").encode(), "config.yaml has no scene"),
         (b"\xdf\xff", "config.yaml is not valid YAML"),
     ):
         (run / CONFIG).write_bytes(text)
@@ -379,111 +354,3 @@ def test_policies_that_cannot_be_loaded(tmp_path: Path, fakes: list[Any]) -> Non
         (run / "checkpoint.pt").write_bytes(damaged)
         with pytest.raises(ValueError, match="damaged"):
             load_policy(run, env)
-
-
-@pytest.fixture
-def reach(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
-    """Replaces the text of `reach.yaml`."""
-    monkeypatch.setattr(config, "content_dir", lambda kind: tmp_path)
-
-    def write(text: str) -> None:
-        (tmp_path / "reach.yaml").write_text(text)
-
-    return write
-
-
-def test_settings_come_from_task_scene_and_overrides(reach: Callable[[str], None]) -> None:
-    reach("num_envs: 64\nppo: {gamma: 0.9, lam: 0.8}\nscenes: {ecm: {num_envs: 32, ppo: {lam: 0.7}}}\n")
-    assert load_config("reach", "psm").num_envs == 64
-    settings = load_config("reach", "ecm", ["ppo.learning_rate=1e-4", "network.hidden=[8, 8]"])
-    assert (settings.task, settings.scene, settings.num_envs) == ("reach", "ecm", 32)
-    assert (settings.ppo.gamma, settings.ppo.lam, settings.ppo.learning_rate) == (0.9, 0.7, 1e-4)
-    assert settings.network.hidden == (8, 8)
-    assert load_config("reach", "ecm", ["num_envs=5", "num_envs=6", "max_steps=null"]).num_envs == 6
-
-
-def test_a_gpu_has_settings_of_its_own(reach: Callable[[str], None], monkeypatch: pytest.MonkeyPatch) -> None:
-    own = "scenes: {ecm: {num_envs: 32}, star: {num_envs: 16, cuda: {num_envs: 256}}}"
-    reach(f"num_envs: 64\ncuda: {{num_envs: 128, ppo: {{lam: 0.8}}}}\n{own}\n")
-
-    def asked(scene: str, *overrides: str) -> tuple[int, float]:
-        settings = load_config("reach", scene, overrides)
-        return settings.num_envs, settings.ppo.lam
-
-    for there in (False, True):
-        monkeypatch.setattr(torch.cuda, "is_available", lambda there=there: there)
-        assert asked("psm") == ((128, 0.8) if there else (64, 0.95))
-        assert asked("psm", "device=cpu") == (64, 0.95)
-        assert asked("psm", "device=cuda", "num_envs=7") == (7, 0.8)
-        assert asked("ecm", "device=cuda") == (32, 0.8)
-        assert asked("star", "device=cuda") == (256, 0.8)
-        assert asked("star", "device=cpu") == (16, 0.95)
-        assert asked("star", "device=cuda", "num_envs=7") == (7, 0.8)
-    reach("scenes: {star: {cuda: {num_envs: 256}}}\n")  # without one for all scenes
-    assert asked("star") == (256, 0.95)  # `there` is still true
-    for text in ("cuda: {speed: 1}\n", "scenes: {psm: {cuda: {speed: 1}}}\n"):
-        reach(text)
-        with pytest.raises(ValueError, match="unknown setting 'speed'"):
-            load_config("reach", "psm", ["device=cpu"])
-
-
-def test_the_shipped_settings_load() -> None:
-    settings = load_config("reach", "bimanual_psm")
-    assert settings.network == NetworkSettings()
-    assert settings.network.hidden == (256, 128, 64) and settings.network.normalise_observations
-
-
-@pytest.mark.parametrize(
-    ("override", "message"),
-    [
-        ("num_env=3", r"unknown setting 'num_env'; did you mean 'num_envs'\?"),
-        ("learning_rate=3", r"unknown setting 'learning_rate'; did you mean 'ppo.learning_rate'\?"),
-        ("ppo.gama=1", r"did you mean 'ppo.gamma'\?"),
-        ("scene=psm", "unknown setting 'scene'"),
-        ("zzz=1", "the settings are: control"),
-        ("num_envs", "not an override of the form key=value"),
-        ("num_envs=0", "num_envs must be a whole number from 1 to .*, not 0"),
-        ("num_envs=1.5", "num_envs must be a whole number.*not 1.5"),
-        ("num_envs=true", "num_envs must be a whole number.*not True"),
-        ("ppo.gamma=1.5", "ppo.gamma must be a number from 0 to 1, not 1.5"),
-        ("ppo.gamma=nan", "ppo.gamma must be a number"),
-        ("ppo.gamma=fast", "ppo.gamma must be a number from 0 to 1, not 'fast'"),
-        ("algo=qmix", "algo must be one of mappo, ippo, joint, not 'qmix'"),
-        ("team_reward=1", "team_reward must be true or false, not 1"),
-        ("network.hidden=[]", "network.hidden must be a list of whole numbers"),
-        ("network.hidden=[8, x]", "network.hidden must be a whole number"),
-        ("ppo=3", "ppo must be a mapping of settings, not 3"),
-        ("constraint.cost=crash", "constraint.cost must be one of none, collision, .*speed, not 'crash'"),
-        ("constraint.limit=2", "constraint.limit must be a number from 0 to 1, not 2"),
-        ("constraint.kp=-1", "constraint.kp must be a number from 0 to"),
-        ("ppo.normalise_values=1", "ppo.normalise_values must be true or false, not 1"),
-        ("network.recurrent=rnn", "network.recurrent must be one of none, gru, lstm, not 'rnn'"),
-        ("max_steps=0", "max_steps must be a whole number from 1"),
-        ("ppo.mini_batches=999999", "ppo.mini_batches must be at most num_envs"),
-    ],
-)
-def test_bad_settings_are_named(override: str, message: str) -> None:
-    with pytest.raises(ValueError, match=message) as error:
-        load_config("reach", "psm", [override])
-    assert "\n" not in str(error.value)
-
-
-def test_whole_rollouts_need_an_environment_each() -> None:
-    with pytest.raises(ValueError, match=r"at most num_envs = 2 with network.recurrent, not 4"):
-        load_config("reach", "psm", ["network.recurrent=gru", "num_envs=2"])
-
-
-def test_bad_files_are_named(reach: Callable[[str], None]) -> None:
-    for text, message in (
-        ("num_envs: [", "not valid YAML"),
-        ("- 1", "must be a mapping"),
-        ("num_env: 3", "did you mean 'num_envs'"),
-        ("scenes: {psm: {num_env: 3}}", "did you mean 'num_envs'"),
-        ("scenes: 3", "scenes must be a mapping"),
-        ("ppo: 3", "ppo must be a mapping"),
-    ):
-        reach(text)
-        with pytest.raises(ValueError, match=message):
-            load_config("reach", "psm")
-    with pytest.raises(ValueError, match=r"'reech', did you mean 'reach'"):
-        load_config("reech", "psm")

@@ -16,11 +16,11 @@ from rsl_rl.runners import OnPolicyRunner
 from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 
-from fake_env import FakeEnv
 from surgical_marl.interfaces.rsl_rl import RslRlVecEnv
 from surgical_marl.learning.mappo import MAPPO, rsl_rl_config
 from surgical_marl.policies.layout import Layout
 from surgical_marl.runs.settings import NetworkSettings, PPOSettings, Settings
+from tests.helpers.fake_env import FakeEnv
 
 SIZES = {"psm": 3, "ecm": 2}
 TEAMS = [{"psm": 1}, {"psm": 2}, {"psm": 2, "ecm": 1}]

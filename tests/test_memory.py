@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 import torch
 
-from fake_env import FakeEnv
 from surgical_marl.cli.main import main
 from surgical_marl.learning import room as memory
 from surgical_marl.learning import train
 from surgical_marl.learning.room import check_room, in_memory, rollout_bytes
 from surgical_marl.learning.trainer import Trainer
 from surgical_marl.runs.settings import ConstraintSettings, Settings
+from tests.helpers.fake_env import FakeEnv
 
 SETTINGS = Settings(num_envs=16, steps_per_iteration=4)
 

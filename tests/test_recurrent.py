@@ -9,13 +9,13 @@ from typing import Any
 import pytest
 import torch
 
-from fake_env import FakeEnv
 from surgical_marl.evaluation.evaluate import evaluate
 from surgical_marl.learning import train
 from surgical_marl.policies.acting import forget
 from surgical_marl.policies.policy import load_policy, zero_policy
 from surgical_marl.runs.settings import NetworkSettings, PPOSettings, Settings
-from test_mappo import SETTINGS, SIZES, build, gradients, move_weights, roll_out
+from tests.helpers.fake_env import FakeEnv
+from tests.test_mappo import SETTINGS, SIZES, build, gradients, move_weights, roll_out
 
 TEAM = {"psm": 2, "ecm": 1}
 

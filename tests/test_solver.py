@@ -20,9 +20,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from surgical_marl import load_scene
+from surgical_marl.physics import collision, solver
 from surgical_marl.physics.collision import SLOTS, Pairs
 from surgical_marl.physics.dynamics import ITERATIONS
-from surgical_marl.physics.simulator import collision, solver
 from surgical_marl.physics.solver import JointRows, Rows, relax, solve
 
 SEEDS = st.integers(0, 2**32 - 1)

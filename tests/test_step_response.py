@@ -1,18 +1,13 @@
-"""The PSM's joints answer a step of their target as the identified arm would: what docs/step_response.py draws."""
+"""The PSM's joints answer a step of their target as the identified arm would: what docs/step_response.png shows."""
 
 from __future__ import annotations
-
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from surgical_marl import load_arm
 from surgical_marl.robots.arm import Joint
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "docs"))
-from step_response import SHARE, WRIST, Linear, identified, simulated_response
+from surgical_marl.studies.step_response import SHARE, WRIST, Linear, identified, simulated_response
 
 JOINTS = load_arm("psm").actuated[:6]
 

@@ -1,4 +1,4 @@
-"""The study of docs/study.py: arms that are taken from their policy, and tables from what runs left."""
+"""The study of docs/study.md: arms that are taken from their policy, and tables from what runs left."""
 
 from __future__ import annotations
 
@@ -16,10 +16,7 @@ import torch
 from surgical_marl.policies.acting import forget
 from surgical_marl.runs.folder import write_config, write_metrics
 from surgical_marl.runs.settings import load_config
-
-sys.path.insert(0, str(Path(__file__).parent.parent / "docs"))
-import study
-import study_report
+from surgical_marl.studies import study, study_report, study_runs
 
 MEASURES = ("error", "held", "squared", "distance", "center", "path", "time", "smoothness")
 
@@ -87,7 +84,7 @@ def test_an_arm_is_taken_over() -> None:
     instead = lambda observations: {name: -torch.ones(4, 2) for name in ("a", "b")}  # noqa: E731
     forgotten: list[Any] = []
     policy.reset = forgotten.append  # type: ignore[attr-defined]
-    acting = study.taken_over(policy, env, "b", instead, start=5)
+    acting = study_runs.taken_over(policy, env, "b", instead, start=5)
     forget(acting, "ended")
     assert forgotten == ["ended"]
     actions = acting({})
@@ -96,8 +93,8 @@ def test_an_arm_is_taken_over() -> None:
 
 
 def test_what_is_wrong_with_one_run_stops_no_other(tmp_path: Path) -> None:
-    job = study.Job("bimanual_psm", "mappo", 0)
-    assert study.work("train", job, tmp_path, ["num_env=3"]) == (
+    job = study_runs.Job("bimanual_psm", "mappo", 0)
+    assert study_runs.work("train", job, tmp_path, ["num_env=3"]) == (
         job,
         "unknown setting 'num_env'; did you mean 'num_envs'?",
     )
@@ -112,7 +109,7 @@ def test_what_is_wrong_with_one_run_stops_no_other(tmp_path: Path) -> None:
     ],
 )
 def test_bad_input_ends_in_one_sentence(script: str, argv: list[str], words: str, tmp_path: Path) -> None:
-    command = [sys.executable, str(Path(study.__file__).with_name(f"{script}.py")), *argv, "--out", "out"]
+    command = [sys.executable, "-m", f"surgical_marl.studies.{script}", *argv, "--out", "out"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 2 and words in done.stderr and "Traceback" not in done.stderr
 

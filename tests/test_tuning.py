@@ -1,19 +1,16 @@
-"""The search of docs/tuning.py: where it starts, and what it leaves out."""
+"""The search of docs/tuning.md: where it starts, and what it leaves out."""
 
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parent.parent / "docs"))
-import tuning
-
 from surgical_marl.runs.settings import Settings, load_config
+from surgical_marl.studies import tuning
 
 
 def test_shipped_settings_are_a_point_of_the_space() -> None:

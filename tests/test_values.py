@@ -10,7 +10,7 @@ import torch
 
 from surgical_marl.learning.mappo import MAPPO
 from surgical_marl.learning.values import DECAY, LEAST_STD, ValueScale
-from test_mappo import SETTINGS, build, gradients, roll_out
+from tests.test_mappo import SETTINGS, build, gradients, roll_out
 
 NORMALISED = replace(SETTINGS, ppo=replace(SETTINGS.ppo, normalise_values=True))
 

@@ -13,5 +13,9 @@ def make_env(settings: Settings, num_envs: int | None = None) -> BatchedEnv:
     """The environment of a run, with torch tensors; `num_envs` replaces the setting."""
     options = {item.name: getattr(settings, item.name) for item in fields(Options)}
     return BatchedEnv(
-        **options, num_envs=num_envs or settings.num_envs, engine=settings.engine, device=settings.device, arrays="torch"
+        **options,
+        num_envs=num_envs or settings.num_envs,
+        engine=settings.engine,
+        device=settings.device,
+        arrays="torch",
     )

@@ -11,10 +11,10 @@ from typing import Any
 
 import torch
 
-from fake_env import FakeEnv
 from surgical_marl.learning import train
 from surgical_marl.runs.folder import read_checkpoint, read_metrics
-from surgical_marl.runs.settings import NetworkSettings, PPOSettings, Settings
+from surgical_marl.runs.settings import ConstraintSettings, NetworkSettings, PPOSettings, Settings
+from tests.helpers.fake_env import FakeEnv
 
 COUNTS, SIZES = {"psm": 2, "ecm": 1}, {"psm": 3, "ecm": 2}
 SMALL = Settings(
@@ -27,6 +27,19 @@ SMALL = Settings(
     network=NetworkSettings(hidden=(16,)),
     ppo=PPOSettings(epochs=2, mini_batches=2),
 )
+OPTIONS: list[dict[str, Any]] = [
+    {},
+    {"ppo": replace(SMALL.ppo, normalise_values=True)},
+    {"constraint": ConstraintSettings(cost="collision", limit=0.01)},
+    {"network": replace(SMALL.network, recurrent="gru")},
+]
+"""What an algorithm may have beside its networks."""
+ALL: dict[str, Any] = {
+    **OPTIONS[1],
+    **OPTIONS[2],
+    "network": replace(SMALL.network, recurrent="lstm"),
+    "team_reward": True,
+}
 
 
 def fake_env(settings: Settings, num_envs: int | None = None) -> Any:

@@ -1,23 +1,25 @@
 """Each joint's answer to a small step of its target, beside that of the identified linear model.
 
-Run: python docs/step_response.py; writes docs/step_response.png.
+Run: python -m surgical_marl.studies.step_response --results docs; it writes docs/step_response.png.
 """
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import NamedTuple
 
 import mujoco
 import numpy as np
+from mujoco import rollout
 
 from surgical_marl import load_scene
 from surgical_marl.robots.arm import Joint
 from surgical_marl.scenes.timing import TIMESTEP
+from surgical_marl.studies.command import results_folder
 
 SHARE = 0.5
 """Of the step that takes full effort: below it the law is linear."""
 SECONDS = 0.4
+STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
 
 # The identified Classic PSM at insertion 0.12 m, kg m2 and kg (dvrk_dynamics_identification).
 INERTIA = {"yaw": 0.210, "pitch": 0.208, "insertion": 0.713}
@@ -75,15 +77,16 @@ def simulated_response(joint: Joint, timestep: float | None = None) -> tuple[np.
     own = linear.joints.index(joint.name)
     step = SHARE * joint.effort / linear.stiffness[own, own]
     target[address[own]] += step
-    data.ctrl[:] = scene.moment @ target
-    way = []
-    for _ in range(round(SECONDS / model.opt.timestep)):
-        mujoco.mj_step(model, data)
-        way.append((data.qpos - start)[address] / step)
-    return model.opt.timestep * (1 + np.arange(len(way))), np.array(way)
+    steps = round(SECONDS / model.opt.timestep)
+    initial, control = np.zeros(mujoco.mj_stateSize(model, STATE)), np.tile(scene.moment @ target, (steps, 1))
+    mujoco.mj_getState(model, data, initial, STATE)
+    states, _ = rollout.rollout(model, data, initial, control)
+    qpos = states[0, :, 1 : 1 + model.nq]  # after the time
+    return model.opt.timestep * (1 + np.arange(steps)), (qpos - start)[:, address] / step
 
 
-def main() -> None:
+def main(argv: list[str] | None = None) -> None:
+    folder = results_folder(__doc__, argv)
     import matplotlib
 
     matplotlib.use("Agg")
@@ -106,7 +109,7 @@ def main() -> None:
                 axis.plot(time, way, color="#c8792b", label=f"meanwhile {name}")
         axis.set(title=joint.name, xlabel="time (s)", ylabel="share of the step")
         axis.legend(loc="center right")
-    path = Path(__file__).with_suffix(".png")
+    path = folder / "step_response.png"
     figure.savefig(path, dpi=110)
     print(path)
 

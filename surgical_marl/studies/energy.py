@@ -1,11 +1,9 @@
 """Kinetic energy of every scene's arms that coast without actuators, friction and limits: what the integrator adds.
 
-Run: python docs/energy.py; writes docs/energy.png.
+Run: python -m surgical_marl.studies.energy --results docs; it writes docs/energy.png.
 """
 
 from __future__ import annotations
-
-from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -13,6 +11,7 @@ import numpy as np
 from surgical_marl import list_scenes, load_scene
 from surgical_marl.scenes.scene import Scene
 from surgical_marl.scenes.timing import TIMESTEP
+from surgical_marl.studies.command import results_folder
 
 
 def energy_drift(scene: Scene, seconds: float = 2.0, timestep: float | None = None) -> tuple[np.ndarray, np.ndarray]:
@@ -38,7 +37,8 @@ def energy_drift(scene: Scene, seconds: float = 2.0, timestep: float | None = No
     return model.opt.timestep * (1 + np.arange(len(energy))), np.array(energy) / start - 1
 
 
-def main() -> None:
+def main(argv: list[str] | None = None) -> None:
+    folder = results_folder(__doc__, argv)
     import matplotlib
 
     matplotlib.use("Agg")
@@ -51,7 +51,7 @@ def main() -> None:
     title = f"coasting, physics step {1000 * TIMESTEP:g} ms"
     axis.set(xlabel="time (s)", ylabel="change of kinetic energy (%)", title=title)
     axis.legend()
-    path = Path(__file__).with_suffix(".png")
+    path = folder / "energy.png"
     figure.savefig(path, dpi=110)
     print(path)
 

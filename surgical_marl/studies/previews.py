@@ -1,4 +1,7 @@
-"""Draw every arm into its folder (preview.png) and every scene into docs/scenes.png. Run: python docs/previews.py"""
+"""Draw every arm into its folder (preview.png) and all scenes into one picture.
+
+Run: python -m surgical_marl.studies.previews --results docs; it writes docs/scenes.png.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +14,7 @@ import numpy as np
 
 from surgical_marl import list_arms, list_scenes, load_arm, load_scene
 from surgical_marl.scenes.scene import Scene
+from surgical_marl.studies.command import results_folder
 from surgical_marl.view.render import Renderer
 
 DIRECTION = np.array([0.75, 0.60, 0.30])
@@ -42,7 +46,8 @@ def portrait(name: str, folder: Path) -> np.ndarray:
     return picture(load_scene(path), 480, 480)
 
 
-def main() -> None:
+def main(argv: list[str] | None = None) -> None:
+    results = results_folder(__doc__, argv)
     with tempfile.TemporaryDirectory() as folder:
         for name in list_arms():
             path = load_arm(name).folder / "preview.png"
@@ -50,7 +55,7 @@ def main() -> None:
             print(path)
     pictures = [picture(load_scene(name), 480, 360) for name in list_scenes()]
     rows = [np.concatenate(pictures[i : i + 3], axis=1) for i in range(0, len(pictures), 3)]
-    path = Path(__file__).with_name("scenes.png")
+    path = results / "scenes.png"
     imageio.imwrite(path, np.concatenate(rows))
     print(path)
 

@@ -1,6 +1,6 @@
 """How many solver iterations a physics step needs: one step of `Simulator`, against C MuJoCo's converged one.
 
-Run: python docs/solver.py
+Run: python -m surgical_marl.studies.solver_iterations
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ import mujoco
 import numpy as np
 
 from surgical_marl import load_scene
+from surgical_marl.physics import dynamics, simulator, solver
 from surgical_marl.physics.dynamics import Physics
 from surgical_marl.physics.simulator import Simulator, dynamics, solver
-from surgical_marl.physics.simulator import simulator as physics
 from surgical_marl.scenes.scene import Scene
 from surgical_marl.scenes.timing import DECIMATION
 
@@ -30,8 +30,8 @@ def states_in_contact(scene: Scene) -> tuple[Physics, np.ndarray, np.ndarray]:
     model, data, rng = scene.model, mujoco.MjData(scene.model), np.random.default_rng(0)
     pairs = zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)
     index = {frozenset(pair): i for i, pair in enumerate(pairs)}
-    simulator = Simulator(scene)
-    command, now = jax.jit(simulator.command), simulator.home
+    simulated = Simulator(scene)
+    command, now = jax.jit(simulated.command), simulated.home
     data.qpos[:] = scene.home
     before, velocities, forces, wrench = [], [], [], np.zeros(6)
     for step in range(STEPS):
@@ -89,8 +89,8 @@ def speeds(scene: Scene) -> np.ndarray:
 
 def step(scene: Scene, states: Physics, touching: bool) -> tuple[np.ndarray, np.ndarray]:
     """Velocity [S, nv] and contact forces [S, P] after one physics step here."""
-    simulator = Simulator(scene)
-    advance = simulator._touching_step if touching else simulator._apart
+    simulated = Simulator(scene)
+    advance = simulated._touching_step if touching else simulated._apart
     after, force = jax.jit(jax.vmap(advance))(states)
     return np.asarray(after.qvel), np.asarray(force)
 
@@ -105,7 +105,7 @@ def touching() -> None:
     print("| iterations | line search | velocity off: 99 % | worst | largest force off: 99 % | worst |")
     print("|---|---|---|---|---|---|")
     for iterations, line_search in TOUCHING:
-        physics.TOUCHING_ITERATIONS = iterations, line_search
+        simulator.TOUCHING_ITERATIONS = iterations, line_search
         velocity, force = step(scene, states, touching=True)
         off = (np.abs(velocity - velocities) / speeds(scene)).max(1)
         force_off = np.abs(force - forces).max(1) / np.maximum(forces.max(1), 1.0)

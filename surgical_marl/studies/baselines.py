@@ -1,6 +1,6 @@
-"""Measure the policies that need no learning on every scene, for the tables in evaluation.md.
+"""Measure the policies that need no learning on every scene, for the tables in docs/evaluation.md.
 
-    python docs/baselines.py [TASK ...]
+    python -m surgical_marl.studies.baselines [TASK ...]
 
 It prints a table for each task and writes the hashes of the goals to `surgical_marl/evaluation/goal_sets.yaml`, so what
 is committed must not change without a reason.

@@ -1,8 +1,8 @@
-"""Searches the settings that reach the frozen evaluation's success soonest, with Optuna, for tuning.md and configs/.
+"""Searches the settings that reach the frozen evaluation's success soonest, with Optuna: docs/tuning.md, configs/.
 
     pip install -c constraints.txt -e '.[tune]'
-    python docs/tuning.py --scene psm --trials 100          # a second call goes on where the first stopped
-    python docs/tuning.py --scene psm --timeout 480 --out runs/small network.hidden=[128,128]
+    python -m surgical_marl.studies.tuning --scene psm --trials 100     # a second call goes on where the first stopped
+    python -m surgical_marl.studies.tuning --scene psm --timeout 480 --out runs/small network.hidden=[128,128]
 
 What is tuned are seconds of learning as `surgical-marl bench solve` counts them, without imports and compilation. All
 trials run in one process, one after the other, so that engines compile once and trials don't share the device. A trial
@@ -38,6 +38,7 @@ from surgical_marl.files import write_atomic
 from surgical_marl.learning.room import in_memory
 from surgical_marl.runs.environment import make_env
 from surgical_marl.runs.settings import Settings, load_config
+from surgical_marl.studies.command import make_parser, parse_with_settings, run
 
 FRESH = 1000
 """Seeds from here on are not used by the search."""
@@ -163,11 +164,12 @@ class Search:
 
     def best(self) -> float:
         """Seconds of the best trial, the limit if there is none."""
-        return min([trial.value for trial in self.solved()], default=self.arguments.limit)
+        return min((seconds for _, seconds in self.solved()), default=self.arguments.limit)
 
-    def solved(self) -> list[FrozenTrial]:
-        """Trials that met the goal."""
-        return self.study.get_trials(states=(TrialState.COMPLETE,))
+    def solved(self) -> list[tuple[int, float]]:
+        """Number and seconds of the trials that met the goal."""
+        trials = self.study.get_trials(states=(TrialState.COMPLETE,))
+        return [(trial.number, trial.value) for trial in trials if trial.value is not None]
 
     def done(self) -> list[FrozenTrial]:
         """These, and what was pruned."""
@@ -217,7 +219,7 @@ def write(search: Search, results: Path) -> None:
     figure = Figure(figsize=(7, 3.4), layout="constrained")
     FigureCanvasAgg(figure)
     axis = figure.subplots()
-    solved = [(trial.number, trial.value) for trial in search.solved()]
+    solved = search.solved()
     best = [min(value for _, value in solved[: i + 1]) for i in range(len(solved))]
     if solved:
         axis.plot(*zip(*solved, strict=True), "o", color="#9fc3cf", label="trials that met the goal")
@@ -249,9 +251,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _parse(argv: list[str] | None) -> argparse.Namespace:
-    usage = "%(prog)s [options] [key=value ...]"
-    raw = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(usage=usage, description=__doc__, formatter_class=raw)
+    parser = make_parser(__doc__, usage="%(prog)s [options] [key=value ...]")
     parser.add_argument("--task", default="reach")
     parser.add_argument("--scene", default="psm")
     parser.add_argument("--algo", default="mappo")
@@ -268,11 +268,7 @@ def _parse(argv: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--confirm", type=whole(0), default=5, metavar="N", help="fresh seeds in the end")
     parser.add_argument("--out", type=Path, default=Path("runs/tuning"), metavar="DIR", help="journal of the search")
     parser.add_argument("--results", type=Path, metavar="DIR", help="of .csv, .json and .png (default: --out)")
-    given = sys.argv[1:] if argv is None else argv
-    settings = [text for text in given if "=" in text and not text.startswith("-")]
-    arguments = parser.parse_args([text for text in given if text not in settings])
-    arguments.settings = settings
-    return arguments
+    return parse_with_settings(parser, argv)
 
 
 def _positive(text: str) -> float:
@@ -286,10 +282,4 @@ def _positive(text: str) -> float:
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main())
-    except (ValueError, OSError) as error:  # bad input, in one sentence
-        print(f"tuning: {' '.join(str(error).split())}", file=sys.stderr)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        sys.exit("tuning: interrupted; the same command goes on")
+    sys.exit(run("tuning", main))

@@ -1,4 +1,4 @@
-"""Tables and figures of docs/study.py, from the run folders that it leaves."""
+"""Tables and figures of the study, from the folders that its runs leave."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, PercentFormatter
-from study import ALGOS, PLAYED, TASK, WHEN, Job
 
 from surgical_marl.evaluation.interval import interval
 from surgical_marl.evaluation.metrics import FOLLOWING, SUCCESS_MM, Metric, metrics, success
 from surgical_marl.files import write_atomic
 from surgical_marl.runs.folder import read_metrics, read_origin, read_settings
+from surgical_marl.studies.study_runs import ALGOS, PLAYED, TASK, WHEN, Job
 
 NAMES = {"mappo": "MAPPO", "ippo": "IPPO", "joint": "joint PPO"}
 COLORS = {"mappo": "#1f6f8b", "ippo": "#b23a48", "joint": "#7a7a7a"}

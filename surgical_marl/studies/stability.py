@@ -1,4 +1,7 @@
-"""The sweeps behind docs/physics.md: how large a physics step may be. Run: python docs/stability.py"""
+"""Sweeps of docs/physics.md: how large a physics step may be.
+
+Run: python -m surgical_marl.studies.stability
+"""
 
 from __future__ import annotations
 
@@ -45,7 +48,8 @@ def rollout(model: mujoco.MjModel, scene: Scene, ctrl: np.ndarray) -> tuple[np.n
     data = mujoco.MjData(model)
     data.qpos[:] = scene.home
     low, high = model.jnt_range.T
-    found, passed = [], 0.0
+    found: list[np.ndarray] = []
+    passed = 0.0
     for target in ctrl:
         data.ctrl[:] = target
         for _ in range(round(CONTROL / model.opt.timestep)):

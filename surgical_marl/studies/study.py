@@ -1,0 +1,64 @@
+"""MAPPO against IPPO and joint PPO on scenes of several arms, for docs/study.md: trains, evaluates, breaks, reports.
+
+    python -m surgical_marl.studies.study                 # all of it; a second call goes on where the first stopped
+    python -m surgical_marl.studies.study --out runs/other iterations=60   # with other settings than those of configs/
+    python -m surgical_marl.studies.study --only report --results docs     # tables and figures of what there is
+
+Every scene, algorithm and seed is a run of its own, as `surgical-marl train` makes it, in a folder of --out. Seconds
+only mean something where runs don't share a machine's cores or GPU: leave --jobs at 1 for them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import sys
+from functools import partial
+from pathlib import Path
+
+from surgical_marl.cli.main import whole
+from surgical_marl.studies.command import make_parser, parse_with_settings, run
+from surgical_marl.studies.study_runs import ALGOS, PLAYED, SCENES, Job, work
+
+PARTS = ("train", "play", "report")
+
+
+def main(argv: list[str] | None = None) -> int:
+    arguments = _parse(argv)
+    results = arguments.results or arguments.out
+    jobs = [Job(s, a, n) for n in range(arguments.seeds) for s in arguments.scenes for a in arguments.algos]
+    for folder in (arguments.out, results):
+        folder.mkdir(parents=True, exist_ok=True)
+    failed: dict[str, str] = {}
+    for part in [part for part in PARTS[:2] if part in arguments.only]:
+        ready = [job for job in jobs if str(job) not in failed]
+        # processes of their own: a GPU's context does not survive a fork
+        with multiprocessing.get_context("spawn").Pool(arguments.jobs) as pool:
+            one = partial(work, part, out=arguments.out, overrides=arguments.settings)
+            for number, (job, wrong) in enumerate(pool.imap_unordered(one, ready), 1):
+                print(f"{part} {number} of {len(ready)}: {job} {wrong or 'done'}", file=sys.stderr, flush=True)
+                if wrong:
+                    failed[str(job)] = wrong
+            pool.close()
+            pool.join()
+    if "report" in arguments.only:
+        from surgical_marl.studies.study_report import report
+
+        report([job for job in jobs if (arguments.out / str(job) / PLAYED).is_file()], arguments.out, results)
+    return 1 if failed else 0
+
+
+def _parse(argv: list[str] | None) -> argparse.Namespace:
+    parser = make_parser(__doc__, usage="%(prog)s [options] [key=value ...]")
+    parser.add_argument("--only", nargs="+", choices=PARTS, default=PARTS, help="parts of the work")
+    parser.add_argument("--scenes", nargs="+", choices=SCENES, default=SCENES)
+    parser.add_argument("--algos", nargs="+", choices=ALGOS, default=ALGOS)
+    parser.add_argument("--seeds", type=whole(1), default=5, metavar="N", help="0 to N - 1")
+    parser.add_argument("--jobs", type=whole(1), default=1, metavar="N", help="processes")
+    parser.add_argument("--out", type=Path, default=Path("runs/study"), metavar="DIR", help="folder of the runs")
+    parser.add_argument("--results", type=Path, metavar="DIR", help="of study.md, .json, .csv, .png (default: --out)")
+    return parse_with_settings(parser, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(run("study", main))

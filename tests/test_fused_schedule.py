@@ -1,0 +1,247 @@
+"""The schedule of the fused engine's compiler: where and when values are computed."""
+
+from __future__ import annotations
+
+from collections import ChainMap, Counter
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from jax import lax
+
+from surgical_marl.engines.fused.graph import FOLD, Branch, Graph, Loop, Value
+from surgical_marl.engines.fused.schedule import Schedule, Scheduler
+from tests.helpers.fused_blocks import all_blocks, random_arrays
+from tests.helpers.fused_kernels import make_stores
+from tests.helpers.fused_programs import programs, several
+
+
+def schedule(function: Callable[..., Any], *arguments: Any) -> tuple[Graph, Schedule]:
+    """Of a function of float32 scalars, or of columns."""
+    columns = arguments or (np.zeros(1, np.float32),) * function.__code__.co_argcount
+    graph, stores, *_ = make_stores(function, columns)
+    return graph, Scheduler(graph, [value for _, _, value in stores]).run()
+
+
+def where(graph: Graph, plan: Schedule, op: str) -> list[int]:
+    """The regions that compute values of an operation."""
+    return [
+        number
+        for number, region in enumerate(plan.regions)
+        for kind, item in region.items
+        if kind == "node" and graph.ops[item] == op
+    ]
+
+
+def test_a_value_of_one_side_is_computed_there() -> None:
+    """Also if it was computed before the branch, as JAX's operands are."""
+
+    def function(x: Any, y: Any) -> Any:
+        angle = jnp.tan(y)
+        return lax.cond(x > 0, lambda: angle * lax.acos(x), lambda: lax.asin(y))
+
+    graph, plan = schedule(function)
+    ((chosen, other),) = plan.inside.values()
+    assert where(graph, plan, "tan") == where(graph, plan, "acos") == [chosen]
+    assert where(graph, plan, "asin") == [other]
+
+
+def test_a_value_of_both_sides_is_computed_in_each_or_before() -> None:
+    def function(x: Any, y: Any) -> Any:
+        before = jnp.tan(x)
+        return lax.cond(x > 0, lambda: before + lax.acos(y), lambda: before - lax.acos(y))
+
+    graph, plan = schedule(function)
+    assert where(graph, plan, "tan") == [0]
+    assert sorted(where(graph, plan, "acos")) == [1, 2]
+
+
+def test_a_loop_invariant_leaves_the_loop() -> None:
+    """Even from a branch and from two loops; what depends on a round does not."""
+
+    def function(x: Any, y: Any) -> Any:
+        def inner(k: Any, s: Any) -> Any:
+            return lax.cond(s > 0, lambda: s + jnp.tan(x), lambda: s - 1) + lax.acos(s)
+
+        def outer(k: Any, s: Any) -> Any:
+            return lax.fori_loop(0, 5, inner, s) + lax.asin(s)
+
+        return lax.fori_loop(0, 4, outer, y)
+
+    graph, plan = schedule(function)
+    assert where(graph, plan, "tan") == [0]
+    (asin,), (acos,) = where(graph, plan, "asin"), where(graph, plan, "acos")
+    assert plan.regions[asin].depth == 1 and plan.regions[acos].depth == 2
+
+
+def test_a_search_stays_where_it_is_meant_to_be() -> None:
+    """It might never end where it was not asked for."""
+
+    def function(x: Any, y: Any) -> Any:
+        def step(k: Any, s: Any) -> Any:
+            found = lax.cond(y > 0, lambda: lax.while_loop(lambda v: v < 9, lambda v: v * y, x), lambda: x)
+            return s + jnp.tan(found)
+
+        return lax.fori_loop(0, 4, step, x)
+
+    graph, plan = schedule(function)
+    (search,) = (number for number, group in enumerate(graph.groups) if getattr(group, "condition", None) is not None
+                 and isinstance(group, Loop) and number in plan.inside)  # fmt: skip
+    region = plan.regions[plan.inside[search][0]]
+    assert region.depth == 3 and where(graph, plan, "tan") != [0]
+
+
+def test_what_no_result_needs_is_left_out() -> None:
+    def function(x: Any, y: Any) -> Any:
+        step = lambda k, s: (s[0] + 1, s[1] + jnp.tan(s[0]), s[2] + lax.acos(y))  # noqa: E731
+        return lax.fori_loop(0, 4, step, (x, x, x))[0], lax.cond(x > 0, lambda: (x, lax.asin(y)), lambda: (y, y))[0]
+
+    graph, plan = schedule(function)
+    assert not any(where(graph, plan, op) for op in ("tan", "acos", "asin"))
+    assert {len(wanted) for wanted in plan.alive.values()} == {1}
+
+
+class Direct:
+    """Values of a graph for one environment, each computed when it is asked for: what the schedule has to amount to."""
+
+    def __init__(self, graph: Graph, loads: Mapping[tuple[str, int], Any]) -> None:
+        self.graph, self.loads, self.known = graph, loads, {}  # type: ignore[var-annotated]
+
+    def __call__(self, value: Value) -> Any:
+        if value < 0:
+            return self.graph.constants[~value]
+        stack = [value]  # rather than calls within calls, which go too deep
+        while stack:
+            missing = [] if stack[-1] in self.known else [a for a in self._reads(stack[-1]) if a not in self.known]
+            stack.extend(missing)
+            if not missing:
+                node = stack.pop()
+                if node not in self.known:
+                    self.known[node] = self._compute(node)
+        return self.known[value]
+
+    def _reads(self, node: Value) -> list[Value]:
+        op, args = self.graph.ops[node], self.graph.args[node]
+        if op == "out" and isinstance(group := self.graph.groups[args[0]], Branch):
+            condition = group.condition
+            if condition not in self.known:
+                return [condition]
+            read = (group.chosen if self.known[condition] else group.others)[args[1]]
+            return [read] if read >= 0 else []
+        return self.graph.reads(node)
+
+    def _compute(self, node: Value) -> Any:
+        op, args = self.graph.ops[node], self.graph.args[node]
+        if op != "out":
+            return compute(self.graph, node, self, self.loads)
+        group = self.graph.groups[args[0]]
+        if isinstance(group, Branch):
+            return self((group.chosen if self(group.condition) else group.others)[args[1]])
+        return self._loop(group)[args[1]]
+
+    def _loop(self, loop: Loop) -> list[Any]:
+        outside, values, count = self.known, [self(start) for start in loop.starts], 0
+        while True:
+            self.known = {**outside, **dict(zip(loop.phis, values, strict=True))}
+            if not (count < loop.length if loop.condition is None else self(loop.condition)):
+                break
+            values, count = [self(value) for value in loop.nexts], count + 1
+        self.known = outside
+        return values
+
+
+def compute(g: Graph, node: Value, read: Callable[[Value], Any], loads: Mapping[tuple[str, int], Any]) -> Any:
+    op, args = g.ops[node], g.args[node]
+    if op == "load":
+        return loads[args]
+    if op == "lookup":
+        return g.tables[args[0]][int(read(args[1]))]
+    if op == "select":
+        return read(args[2]) if read(args[0]) else read(args[1])
+    with np.errstate(all="ignore"):
+        return np.asarray(FOLD[op](*map(read, args)))[()]
+
+
+class Scheduled:
+    """Values of a graph for one environment, computed as a schedule has them. KeyError for one that comes too late."""
+
+    def __init__(self, graph: Graph, plan: Schedule, loads: Mapping[tuple[str, int], Any]) -> None:
+        self.graph, self.plan, self.loads = graph, plan, loads
+
+    def results(self, values: list[Value]) -> list[Any]:
+        found: dict[int, Any] = {}
+        self._region(0, ChainMap(), lambda k, read: found.__setitem__(k, read(values[k])))
+        return [found[k] for k in range(len(values))]
+
+    def _region(self, number: int, known: Any, result: Callable[[int, Callable[[Value], Any]], Any]) -> bool:
+        """Whether `result` let it come to its end."""
+
+        def read(value: Value) -> Any:
+            return known[value] if value >= 0 else self.graph.constants[~value]
+
+        for kind, item in self.plan.regions[number].items:
+            if kind == "node":
+                known[item] = compute(self.graph, item, read, self.loads)
+            elif kind == "group":
+                group = self.graph.groups[item]
+                (self._branch if isinstance(group, Branch) else self._loop)(item, group, known, read)  # type: ignore
+            elif result(item, read) is False:
+                return False
+        return True
+
+    def _branch(self, number: int, branch: Branch, known: Any, read: Callable[[Value], Any]) -> None:
+        wanted, taken = self.plan.alive[number], bool(read(branch.condition))
+        values, found = (branch.chosen if taken else branch.others), {}
+        region = self.plan.inside[number][0 if taken else 1]
+        self._region(region, known.new_child(), lambda k, read: found.__setitem__(k, read(values[wanted[k]])))
+        known.update({branch.outs[j]: found[k] for k, j in enumerate(wanted)})
+
+    def _loop(self, number: int, loop: Loop, known: Any, read: Callable[[Value], Any]) -> None:
+        wanted, tested, count = self.plan.alive[number], loop.condition is not None, 0
+        values = [read(loop.starts[j]) for j in wanted]
+        while tested or count < loop.length:
+            found: list[Any] = []
+
+            def result(k: int, read: Callable[[Value], Any], found: list[Any] = found) -> bool:
+                if tested and k == 0:
+                    return bool(read(loop.condition))  # type: ignore[arg-type]
+                found.append(read(loop.nexts[wanted[k - tested]]))
+                return True
+
+            inside = known.new_child(dict(zip((loop.phis[j] for j in wanted), values, strict=True)))
+            if not self._region(self.plan.inside[number][0], inside, result):
+                break
+            values, count = found, count + 1
+        known.update({loop.outs[j]: value for j, value in zip(wanted, values, strict=True)})
+
+
+def assert_schedule_is_right(function: Callable[..., Any], *columns: Any) -> None:
+    """For the first environment of columns [N, ...] it gives what the graph says, and computes everything once."""
+    graph, stores, _, inputs, _ = make_stores(function, columns)
+    loads = {
+        (leaf.buffer, leaf.first + k): element
+        for leaf, column in zip(jax.tree.leaves(inputs), jax.tree.leaves(columns), strict=True)
+        for k, element in enumerate(column[0].ravel())
+    }
+    values = [value for _, _, value in stores]
+    plan = Scheduler(graph, values).run()
+    computed = Counter(item for region in plan.regions for item in region.items if item[0] != "result")
+    assert set(computed.values()) <= {1}
+    direct = Direct(graph, loads)
+    np.testing.assert_array_equal(Scheduled(graph, plan, loads).results(values), [direct(value) for value in values])
+
+
+def test_the_schedule_of_every_block() -> None:
+    for group in ("a", "f", "m", "x"):
+        assert_schedule_is_right(partial(all_blocks, group), random_arrays(0))
+
+
+@settings(max_examples=50, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+@given(st.lists(programs(2), min_size=1, max_size=1))
+def test_the_schedule_of_programs(written: list[list[Any]]) -> None:
+    assert_schedule_is_right(partial(several, written), random_arrays(0))

@@ -1,0 +1,120 @@
+"""Settings of training: from task, scene and overrides; what is wrong with them is said in one sentence."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+
+from surgical_marl.runs import settings as config
+from surgical_marl.runs.settings import NetworkSettings, load_config
+
+
+@pytest.fixture
+def reach(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
+    """Replaces the text of `reach.yaml`."""
+    monkeypatch.setattr(config, "content_dir", lambda kind: tmp_path)
+
+    def write(text: str) -> None:
+        (tmp_path / "reach.yaml").write_text(text)
+
+    return write
+
+
+def test_settings_come_from_task_scene_and_overrides(reach: Callable[[str], None]) -> None:
+    reach("num_envs: 64\nppo: {gamma: 0.9, lam: 0.8}\nscenes: {ecm: {num_envs: 32, ppo: {lam: 0.7}}}\n")
+    assert load_config("reach", "psm").num_envs == 64
+    settings = load_config("reach", "ecm", ["ppo.learning_rate=1e-4", "network.hidden=[8, 8]"])
+    assert (settings.task, settings.scene, settings.num_envs) == ("reach", "ecm", 32)
+    assert (settings.ppo.gamma, settings.ppo.lam, settings.ppo.learning_rate) == (0.9, 0.7, 1e-4)
+    assert settings.network.hidden == (8, 8)
+    assert load_config("reach", "ecm", ["num_envs=5", "num_envs=6", "max_steps=null"]).num_envs == 6
+
+
+def test_a_gpu_has_settings_of_its_own(reach: Callable[[str], None], monkeypatch: pytest.MonkeyPatch) -> None:
+    own = "scenes: {ecm: {num_envs: 32}, star: {num_envs: 16, cuda: {num_envs: 256}}}"
+    reach(f"num_envs: 64\ncuda: {{num_envs: 128, ppo: {{lam: 0.8}}}}\n{own}\n")
+
+    def asked(scene: str, *overrides: str) -> tuple[int, float]:
+        settings = load_config("reach", scene, overrides)
+        return settings.num_envs, settings.ppo.lam
+
+    for there in (False, True):
+        monkeypatch.setattr(torch.cuda, "is_available", lambda there=there: there)
+        assert asked("psm") == ((128, 0.8) if there else (64, 0.95))
+        assert asked("psm", "device=cpu") == (64, 0.95)
+        assert asked("psm", "device=cuda", "num_envs=7") == (7, 0.8)
+        assert asked("ecm", "device=cuda") == (32, 0.8)
+        assert asked("star", "device=cuda") == (256, 0.8)
+        assert asked("star", "device=cpu") == (16, 0.95)
+        assert asked("star", "device=cuda", "num_envs=7") == (7, 0.8)
+    reach("scenes: {star: {cuda: {num_envs: 256}}}\n")  # without one for all scenes
+    assert asked("star") == (256, 0.95)  # `there` is still true
+    for text in ("cuda: {speed: 1}\n", "scenes: {psm: {cuda: {speed: 1}}}\n"):
+        reach(text)
+        with pytest.raises(ValueError, match="unknown setting 'speed'"):
+            load_config("reach", "psm", ["device=cpu"])
+
+
+def test_the_shipped_settings_load() -> None:
+    settings = load_config("reach", "bimanual_psm")
+    assert settings.network == NetworkSettings()
+    assert settings.network.hidden == (256, 128, 64) and settings.network.normalise_observations
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("num_env=3", r"unknown setting 'num_env'; did you mean 'num_envs'\?"),
+        ("learning_rate=3", r"unknown setting 'learning_rate'; did you mean 'ppo.learning_rate'\?"),
+        ("ppo.gama=1", r"did you mean 'ppo.gamma'\?"),
+        ("scene=psm", "unknown setting 'scene'"),
+        ("zzz=1", "the settings are: control"),
+        ("num_envs", "not an override of the form key=value"),
+        ("num_envs=0", "num_envs must be a whole number from 1 to .*, not 0"),
+        ("num_envs=1.5", "num_envs must be a whole number.*not 1.5"),
+        ("num_envs=true", "num_envs must be a whole number.*not True"),
+        ("ppo.gamma=1.5", "ppo.gamma must be a number from 0 to 1, not 1.5"),
+        ("ppo.gamma=nan", "ppo.gamma must be a number"),
+        ("ppo.gamma=fast", "ppo.gamma must be a number from 0 to 1, not 'fast'"),
+        ("algo=qmix", "algo must be one of mappo, ippo, joint, not 'qmix'"),
+        ("team_reward=1", "team_reward must be true or false, not 1"),
+        ("network.hidden=[]", "network.hidden must be a list of whole numbers"),
+        ("network.hidden=[8, x]", "network.hidden must be a whole number"),
+        ("ppo=3", "ppo must be a mapping of settings, not 3"),
+        ("constraint.cost=crash", "constraint.cost must be one of none, collision, .*speed, not 'crash'"),
+        ("constraint.limit=2", "constraint.limit must be a number from 0 to 1, not 2"),
+        ("constraint.kp=-1", "constraint.kp must be a number from 0 to"),
+        ("ppo.normalise_values=1", "ppo.normalise_values must be true or false, not 1"),
+        ("network.recurrent=rnn", "network.recurrent must be one of none, gru, lstm, not 'rnn'"),
+        ("max_steps=0", "max_steps must be a whole number from 1"),
+        ("ppo.mini_batches=999999", "ppo.mini_batches must be at most num_envs"),
+    ],
+)
+def test_bad_settings_are_named(override: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message) as error:
+        load_config("reach", "psm", [override])
+    assert "\n" not in str(error.value)
+
+
+def test_whole_rollouts_need_an_environment_each() -> None:
+    with pytest.raises(ValueError, match=r"at most num_envs = 2 with network.recurrent, not 4"):
+        load_config("reach", "psm", ["network.recurrent=gru", "num_envs=2"])
+
+
+def test_bad_files_are_named(reach: Callable[[str], None]) -> None:
+    for text, message in (
+        ("num_envs: [", "not valid YAML"),
+        ("- 1", "must be a mapping"),
+        ("num_env: 3", "did you mean 'num_envs'"),
+        ("scenes: {psm: {num_env: 3}}", "did you mean 'num_envs'"),
+        ("scenes: 3", "scenes must be a mapping"),
+        ("ppo: 3", "ppo must be a mapping"),
+    ):
+        reach(text)
+        with pytest.raises(ValueError, match=message):
+            load_config("reach", "psm")
+    with pytest.raises(ValueError, match=r"'reech', did you mean 'reach'"):
+        load_config("reech", "psm")
