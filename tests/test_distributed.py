@@ -16,7 +16,7 @@ import torch.distributed as dist
 from fake_env import FakeEnv
 from processes import end, start_together
 from runs import COUNTS, SIZES, SMALL, fake_env, run, same_state
-from surgical_marl.engines.fused.keys import episode_keys
+from surgical_marl.engines.fused.threefry import episode_keys
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.interfaces.rsl_rl import RslRlVecEnv
 from surgical_marl.learning import distributed, train
