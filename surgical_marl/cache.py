@@ -124,5 +124,6 @@ def _versions() -> tuple[str, ...]:
 
 def _version(name: str) -> str:
     """The version of a package, seven times as fast as `importlib.metadata.version`, which reads all the metadata."""
-    metadata = distribution(name).read_text("METADATA") or ""
-    return metadata.partition("\nVersion: ")[2].partition("\n")[0]
+    installed = distribution(name)
+    metadata = installed.read_text("METADATA") or ""
+    return metadata.partition("\nVersion: ")[2].partition("\n")[0] or installed.version

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import mujoco
 import pytest
+from rsl_rl.models import MLPModel
 
 from surgical_marl.runtime import prepare_mjx
 
@@ -62,3 +63,9 @@ def test_mjx_still_carries_mujoco_warp() -> None:
         pytest.fail("mujoco-mjx moved third_party.mujoco_warp: vision.endoscope needs its new place")
     for name in ("put_model", "make_data", "kinematics", "camlight"):
         assert hasattr(warp, name), f"mujoco_warp moved {name}: vision.endoscope needs its new place"
+
+
+def test_rsl_rl_still_asks_its_models_how_wide_they_are_before_the_mlp() -> None:
+    assert hasattr(MLPModel, "_get_latent_dim"), (
+        "rsl_rl renamed MLPModel._get_latent_dim: policies.recurrent overrides it and needs its new name"
+    )

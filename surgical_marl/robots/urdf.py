@@ -97,12 +97,15 @@ def _link(link: yourdf.Link, colors: Mapping[str, Any]) -> Link:
 def _shape(part: yourdf.Visual | yourdf.Collision, rgba: Vector | None) -> Shape:
     kind = next(kind for kind in SHAPES if getattr(part.geometry, kind) is not None)
     shape = getattr(part.geometry, kind)
-    size = {
-        "box": lambda: shape.size,
-        "cylinder": lambda: (shape.radius, shape.length),
-        "sphere": lambda: shape.radius,
-        "mesh": lambda: np.broadcast_to(1.0 if shape.scale is None else shape.scale, 3),
-    }[kind]()
+    match kind:
+        case "box":
+            size = shape.size
+        case "cylinder":
+            size = shape.radius, shape.length
+        case "sphere":
+            size = shape.radius
+        case _:
+            size = np.broadcast_to(1.0 if shape.scale is None else shape.scale, 3)
     return Shape(kind, _vector(size), _pose(part.origin), part.name, rgba, getattr(shape, "filename", None))
 
 
