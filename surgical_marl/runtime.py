@@ -17,6 +17,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import platformdirs
+
 FLAG = "--xla_cpu_use_fusion_emitters"
 """XLA's fusion emitter on CPUs computes a serial chain of rotations again for each link that uses it, so that an arm
 costs some three times more with every joint: `surgical-marl doctor` measures it."""
@@ -35,9 +37,8 @@ _LEAST_THREADS = 8
 
 
 def cache_dir() -> Path:
-    """The folder of this package's caches, by the XDG rules."""
-    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(base) / "surgical-marl"
+    """Return the folder of this package's caches, on Linux `~/.cache/surgical-marl` or below `$XDG_CACHE_HOME`."""
+    return platformdirs.user_cache_path("surgical-marl", appauthor=False)
 
 
 def knows_flag(flag: str = FLAG) -> bool:

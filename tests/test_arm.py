@@ -159,7 +159,7 @@ def test_shaft_is_drawn_whole_and_clear_of_the_column(name: str) -> None:
     """The tube reaches d4 above the wrist; column, carriage, shaft, wrist and both fingers are there to collide."""
     arm = load_arm(name)
     tube = next(link for link in arm.urdf.links if link.name == "roll_link").visuals[0]
-    low, high = tube.origin[2, 3] + np.array([-0.5, 0.5]) * tube.geometry.cylinder.length
+    low, high = tube.origin[2][3] + np.array([-0.5, 0.5]) * tube.size[1]
     assert low == pytest.approx(0) and high == pytest.approx(LENGTHS[name][1])
     assert all(len(link.visuals) <= 12 for link in arm.urdf.links)
     model = build_spec(arm).compile()

@@ -13,7 +13,7 @@ import pytest
 import torch
 import torch.distributed as dist
 
-from surgical_marl.engines.fused.keys import episode_keys
+from surgical_marl.engines.fused.threefry import episode_keys
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.interfaces.rsl_rl import RslRlVecEnv
 from surgical_marl.learning import distributed, train

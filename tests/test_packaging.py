@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import ast
+import importlib.metadata
 import json
 import os
+import re
 import subprocess
 import sys
 import tomllib
@@ -61,6 +64,24 @@ def test_every_dependency_is_pinned() -> None:
     for requirement in wanted:
         name = requirement.split("[")[0].split(">")[0].split("=")[0].strip()
         assert name.lower() in pins, name
+
+
+def test_every_import_is_declared() -> None:
+    trees = [ast.parse(path.read_text()) for path in (ROOT / "surgical_marl").rglob("*.py")]
+    nodes = [node for tree in trees for node in ast.walk(tree)]
+    modules = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
+    modules |= {str(node.module) for node in nodes if isinstance(node, ast.ImportFrom)}
+    imported = {module.partition(".")[0] for module in modules} - {"surgical_marl", *sys.stdlib_module_names}
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    declared = {plain(re.split(r"[^\w.-]", requirement)[0]) for requirement in project["dependencies"]}
+    distributions = importlib.metadata.packages_distributions()
+    assert {"numpy", "yaml"} <= imported
+    assert not [name for name in imported if not declared & set(map(plain, distributions.get(name, [])))]
+
+
+def plain(name: str) -> str:
+    """The name of a distribution as registries compare it."""
+    return re.sub(r"[-_.]+", "-", name).lower()
 
 
 STARTED = """

@@ -19,10 +19,6 @@ from surgical_marl.robots.arm import CONTROL_MODES
 from surgical_marl.scenes.contacts import collision_geoms
 from surgical_marl.scenes.scene import Scene
 from surgical_marl.scenes.timing import DECIMATION, TIMESTEP
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "docs"))
-from energy import energy_drift
-
 from surgical_marl.studies.energy import energy_drift
 from tests.helpers.rollouts import read_state, roll_out
 

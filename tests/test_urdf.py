@@ -13,8 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from surgical_marl import load_arm
+from surgical_marl.robots.mesh import read_mesh
 from surgical_marl.robots.spec import COLLISION_GROUP, _bounding_capsule, build_spec
-from surgical_marl.robots.urdf import Faults, read_mesh, read_urdf
+from surgical_marl.robots.urdf import Faults, read_urdf
 
 INERTIAL = '<inertial><mass value="1"/><inertia ixx="1e-2" iyy="1e-2" izz="1e-2" ixy="0" ixz="0" iyz="0"/></inertial>'
 SHAPE = '<geometry><mesh filename="part.stl"/></geometry>'

@@ -11,12 +11,12 @@ from __future__ import annotations
 import copy
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jax import Array
 
+from surgical_marl.physics.impedance import response
 from surgical_marl.physics.solver import JointRows, Rows, relax, solve, solve_positive
 from surgical_marl.runtime import prepare_mjx
 
@@ -77,7 +77,7 @@ class Dynamics:
         for stage in ("fwd_position", "fwd_velocity", "fwd_actuation"):
             data = getattr(self._mjx, stage)(self.model, data)
         smooth = data.qfrc_passive - data.qfrc_bias + data.qfrc_actuator
-        return Forces(data, data._impl.M, smooth, self._damping(data), self._rows(data))
+        return Forces(data, _internal(data).M, smooth, self._damping(data), self._rows(data))
 
     def relaxed(self, forces: Forces, qacc: Array) -> Array:
         """Acceleration [n] near to what friction and limits allow, from a guess."""
@@ -97,7 +97,7 @@ class Dynamics:
         return Physics(physics.qpos + self.dt * qvel, qvel, qacc, physics.ctrl)
 
     def _rows(self, data: Any) -> Rows:
-        rows = data._impl
+        rows = _internal(data)
         friction = rows.efc_frictionloss
         rubs = np.arange(len(friction)) < len(self._rubbing)
         low, high = jnp.where(rubs, -friction, 0.0), jnp.where(rubs, friction, np.inf)
@@ -120,16 +120,23 @@ class Dynamics:
         low, high = model.actuator_forcerange[:, 0], model.actuator_forcerange[:, 1]
         saturated = (data.actuator_force <= low) | (data.actuator_force >= high)
         own = jnp.where(saturated, 0.0, -model.actuator_biasprm[:, 2])
-        moment = data._impl.actuator_moment
+        moment = _internal(data).actuator_moment
         return moment.T @ (own[:, None] * moment) + jnp.diag(model.dof_damping)
 
     def contact_rows(self, jacobian: Array, distance: Array, weight: Array, qvel: Array) -> Rows:
         """Rows of frictionless contacts (condim 1), along their normals: jacobian [k, n], distance and weight [k]."""
-        from mujoco.mjx._src.constraint import _kbi
-
-        stiffness, damping, impedance = jax.vmap(lambda d: _kbi(self.model, *self._stop, d))(distance)
+        solref, solimp = self._stop
+        stiffness, damping, impedance = response(solref, solimp, distance, self.dt)
         resistance = jnp.maximum(weight * (1 - impedance) / impedance, mujoco.mjMINVAL)
         depth = jnp.minimum(distance, 0.0)
         reference = -damping * (jacobian @ qvel) - stiffness * impedance * depth
         none = jnp.zeros_like(depth)
         return Rows(jacobian, 1 / resistance, reference, none, none + np.inf)
+
+
+def _internal(data: Any) -> Any:
+    """What MJX computes besides what its data shows: mass matrix, rows of constraints, moment of actuators.
+
+    MJX's own errors name this way to them. Nothing else here reads names that MJX keeps to itself.
+    """
+    return data._impl

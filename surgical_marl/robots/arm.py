@@ -9,20 +9,21 @@ Every number of a shipped arm and its source stands in `arms/<name>/README.md`.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from surgical_marl.content import find
+from surgical_marl.robots.description import MOVING, Robot, RobotJoint, Vector
 from surgical_marl.robots.drives import Cable, Drive, read_cables, read_drives
-from surgical_marl.robots.urdf import MOVING, Faults, read_urdf, resolve_meshes, urdf_faults
+from surgical_marl.robots.mesh import MAX_MESH, mesh_files, resolve_meshes
+from surgical_marl.robots.safe_xml import read_bytes
+from surgical_marl.robots.urdf import Faults, read_urdf
+from surgical_marl.robots.urdf_faults import robot_faults
 from surgical_marl.yaml_file import build, check_keys, read_yaml
-
-if TYPE_CHECKING:
-    from yourdfpy import urdf as yourdf
 
 CONTROL_MODES = ("position", "velocity", "torque")
 KEYS = ("description", "urdf", "tool_tip", "remote_center", "camera", "joints", "cables", "jaw")
@@ -85,7 +86,14 @@ class Arm:
     joints: tuple[Joint, ...]
     """All moving joints in the order of the chain, those that mimic another included."""
     cables: tuple[Cable, ...]
-    urdf: Any = field(repr=False)
+    urdf: Robot = field(repr=False)
+    """Links, joints and shapes; meshes by their files in `folder`."""
+
+    @property
+    def content(self) -> tuple[bytes, ...]:
+        """All that a model of the arm is made from, meshes included, wherever its folder lies: a key for caches."""
+        said = repr((replace(self, folder=Path()), self.urdf)).encode()
+        return said, *(read_bytes(self.folder / name, MAX_MESH) for name in mesh_files(self.urdf))
 
     @cached_property
     def actuated(self) -> tuple[Joint, ...]:
@@ -168,7 +176,7 @@ class Arm:
             pose = xp.eye(4, dtype=q.dtype)
             for element in chain:
                 if element.child not in known:
-                    known[element.child] = pose @ _matrix(element.origin)
+                    known[element.child] = pose @ np.array(element.origin)
                     if element.type in MOVING:
                         joint = joints[element.name]
                         value = joint.multiplier * q[..., names.index(joint.leader)] + joint.offset
@@ -190,9 +198,9 @@ class Arm:
         xp = axis.__array_namespace__()
         return xp.linalg.vector_norm(xp.linalg.cross(axis, origin), axis=-1)
 
-    def _chain(self, link: str) -> list[yourdf.Joint]:
+    def _chain(self, link: str) -> list[RobotJoint]:
         parents = {joint.child: joint for joint in self.urdf.joints}
-        chain: list[yourdf.Joint] = []
+        chain: list[RobotJoint] = []
         while link in parents:
             chain.append(parents[link])
             link = parents[link].parent
@@ -218,8 +226,8 @@ def load_arm(name: str | Path) -> Arm:
 
     keep(check_keys, settings, KEYS, where)
     path = _urdf_path(folder, settings.get("urdf"))
-    robot = read_urdf(path)
-    faults += urdf_faults(robot, path) + resolve_meshes(robot, path, folder)
+    robot, lost = resolve_meshes(read_urdf(path), path, folder)
+    faults += robot_faults(robot, path) + lost
     leaders = [joint.name for joint in robot.joints if joint.type in MOVING and not joint.mimic]
     drives = read_drives(settings.get("joints") or {}, leaders, where, keep)
     camera, jaw = (
@@ -262,8 +270,9 @@ def _urdf_path(folder: Path, name: Any) -> Path:
     return path
 
 
-def _joint(joint: yourdf.Joint, drives: dict[str, Drive], where: Path) -> Joint:
-    limit, dynamics, mimic = joint.limit, joint.dynamics, joint.mimic
+def _joint(joint: RobotJoint, drives: dict[str, Drive], where: Path) -> Joint:
+    limit, mimic = joint.limit, joint.mimic
+    assert limit is not None  # or else `robot_faults` had said so
     leader = mimic.joint if mimic else joint.name
     margin = drives[leader].margin
     if not 2 * margin < limit.upper - limit.lower:
@@ -276,8 +285,8 @@ def _joint(joint: yourdf.Joint, drives: dict[str, Drive], where: Path) -> Joint:
         upper=limit.upper - margin,
         velocity=limit.velocity,
         effort=limit.effort,
-        viscous=float((dynamics and dynamics.damping) or 0.0),  # yourdfpy leaves these two as text
-        coulomb=float((dynamics and dynamics.friction) or 0.0),
+        viscous=joint.damping,
+        coulomb=joint.friction,
         leader=leader,
         multiplier=mimic.multiplier if mimic else 1.0,
         offset=mimic.offset if mimic else 0.0,
@@ -285,24 +294,18 @@ def _joint(joint: yourdf.Joint, drives: dict[str, Drive], where: Path) -> Joint:
     )
 
 
-def _matrix(origin: np.ndarray | None) -> np.ndarray:
-    return np.eye(4) if origin is None else np.asarray(origin, dtype=float)
-
-
-def _unit(axis: np.ndarray) -> np.ndarray:
+def _unit(axis: Vector) -> np.ndarray:
     return np.asarray(axis, dtype=float) / np.linalg.norm(axis)
 
 
-def _motion(value: Any, axis: np.ndarray, slides: bool) -> Any:
+def _motion(value: Any, axis: Vector, slides: bool) -> Any:
     """Transform [..., 4, 4] of a joint: a slide along its axis, or a turn about it (Rodrigues' formula)."""
     xp = value.__array_namespace__()
-    axis = _unit(axis)
-    value = value[..., None, None]
+    value, (x, y, z) = value[..., None, None], _unit(axis)
     if slides:
         step = np.zeros((4, 4))
-        step[:3, 3] = axis
+        step[:3, 3] = x, y, z
         return np.eye(4) + value * step
-    x, y, z = axis
     cross = np.zeros((4, 4))
     cross[:3, :3] = [[0, -z, y], [z, 0, -x], [-y, x, 0]]
     return np.eye(4) + xp.sin(value) * cross + (1 - xp.cos(value)) * (cross @ cross)

@@ -16,8 +16,10 @@ import mujoco
 import numpy as np
 
 from surgical_marl.robots.arm import CONTROL_MODES, Arm, Joint
+from surgical_marl.robots.description import Link, Shape, Vector
 from surgical_marl.robots.drives import Cable, Drive
-from surgical_marl.robots.urdf import read_mesh
+from surgical_marl.robots.mesh import read_mesh
+from surgical_marl.robots.rotation import quaternion
 
 VISUAL_GROUP, COLLISION_GROUP = 2, 3
 SOLREF = (0.005, 1.0)
@@ -32,12 +34,11 @@ def build_spec(arm: Arm, control: str = "position") -> mujoco.MjSpec:
     spec = mujoco.MjSpec()
     spec.modelname = arm.name
     spec.compiler.degree = False
-    colors = {m.name: m.color.rgba for m in arm.urdf.materials if m.color is not None}
     links = {link.name: link for link in arm.urdf.links}
     children = {joint.child for joint in arm.urdf.joints}
     root = next(name for name in links if name not in children)
     bodies = {root: spec.worldbody.add_body(name=root)}
-    _add_link(spec, bodies[root], links[root], colors)
+    _add_link(spec, bodies[root], links[root], arm.folder)
     joints = {joint.name: joint for joint in arm.joints}
     waiting = list(arm.urdf.joints)
     while waiting:  # the URDF may list joints in any order; parents come first in a spec
@@ -46,12 +47,12 @@ def build_spec(arm: Arm, control: str = "position") -> mujoco.MjSpec:
             raise ValueError(f"arm {arm.name!r}: joint {waiting[0].name!r} hangs on no chain from link {root!r}")
         waiting = [joint for joint in waiting if joint not in ready]
         for element in ready:
-            body = bodies[element.parent].add_body(name=element.child, **_place(element.origin))
+            body = bodies[element.parent].add_body(name=element.child, **_place(np.array(element.origin)))
             bodies[element.child] = body
             if element.name in joints:
                 joint = joints[element.name]
                 _add_joint(body, joint, element.axis, _mode(arm, joint, control))
-            _add_link(spec, body, links[element.child], colors)
+            _add_link(spec, body, links[element.child], arm.folder)
     bodies[arm.tool_tip].add_site(name="tool_tip", size=[0.001] * 3, group=4)
     if arm.camera is not None:
         for name, side in (("left", -0.5), ("right", 0.5)):
@@ -70,7 +71,7 @@ def _mode(arm: Arm, joint: Joint, control: str) -> str:
     return "position" if arm.jaw and joint.leader == arm.jaw.joint else control
 
 
-def _add_joint(body: Any, joint: Joint, axis: np.ndarray, control: str) -> None:
+def _add_joint(body: Any, joint: Joint, axis: Vector, control: str) -> None:
     """A joint under torque has the speed-torque line of a motor: at its speed nothing is left of the full effort."""
     drag = joint.effort / joint.drive.speed if control == "torque" else 0.0
     body.add_joint(
@@ -144,27 +145,24 @@ def _add_actuator(
     )
 
 
-def _add_link(spec: mujoco.MjSpec, body: Any, link: Any, colors: dict[str, np.ndarray]) -> None:
-    if link.inertial is not None and link.inertial.inertia.any():  # all zeros say as much as no <inertial>
-        origin = _matrix(link.inertial.origin)
-        tensor = origin[:3, :3] @ link.inertial.inertia @ origin[:3, :3].T
+def _add_link(spec: mujoco.MjSpec, body: Any, link: Link, folder: Path) -> None:
+    if link.inertial is not None and np.any(link.inertial.inertia):  # all zeros say as much as no <inertial>
+        origin = np.array(link.inertial.origin)
+        tensor = origin[:3, :3] @ np.array(link.inertial.inertia) @ origin[:3, :3].T
         body.explicitinertial = True
         body.mass = link.inertial.mass
         body.ipos = origin[:3, 3]
         body.fullinertia = tensor[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
     for i, visual in enumerate(link.visuals):
-        material = visual.material
-        rgba: Any = DEFAULT_RGBA
-        if material is not None:
-            rgba = material.color.rgba if material.color is not None else colors.get(material.name, rgba)
-        shape = _visual_shape(spec, visual.geometry, f"{link.name}_{i}")
-        _add_geom(body, shape, _matrix(visual.origin), rgba=rgba, group=VISUAL_GROUP)
+        shape = _visual_shape(spec, visual, f"{link.name}_{i}", folder)
+        rgba = DEFAULT_RGBA if visual.rgba is None else visual.rgba
+        _add_geom(body, shape, np.array(visual.origin), rgba=rgba, group=VISUAL_GROUP)
     for i, collision in enumerate(link.collisions):
         name = collision.name or f"{link.name}_{i}"
         if spec.geom(name) is not None:  # URDF lets shapes of two links have one name, MuJoCo does not
             name = f"{link.name}_{i}_{name}"
-        shape, place = _collision_shape(collision.geometry)
-        place = _matrix(collision.origin) @ place
+        shape, place = _collision_shape(collision, folder)
+        place = np.array(collision.origin) @ place
         _add_geom(body, shape, place, name=name, rgba=[0.9, 0.3, 0.2, 0.3], group=COLLISION_GROUP)
 
 
@@ -172,15 +170,15 @@ def _add_geom(body: Any, shape: dict[str, Any], origin: np.ndarray, **rest: Any)
     body.add_geom(**shape, **_place(origin), **rest, mass=0, contype=0, conaffinity=0)
 
 
-def _visual_shape(spec: mujoco.MjSpec, geometry: Any, name: str) -> dict[str, Any]:
-    if geometry.sphere is not None:
-        return _sphere(geometry.sphere.radius)
-    if geometry.cylinder is not None:
-        size = [geometry.cylinder.radius, geometry.cylinder.length / 2, 0]
-        return {"type": mujoco.mjtGeom.mjGEOM_CYLINDER, "size": size}
-    if geometry.box is not None:
-        return {"type": mujoco.mjtGeom.mjGEOM_BOX, "size": np.asarray(geometry.box.size) / 2}
-    vertices, faces = read_mesh(Path(geometry.mesh.filename), geometry.mesh.scale)
+def _visual_shape(spec: mujoco.MjSpec, shape: Shape, name: str, folder: Path) -> dict[str, Any]:
+    if shape.kind == "sphere":
+        return _sphere(shape.size[0])
+    if shape.kind == "cylinder":
+        radius, length = shape.size
+        return {"type": mujoco.mjtGeom.mjGEOM_CYLINDER, "size": [radius, length / 2, 0]}
+    if shape.kind == "box":
+        return {"type": mujoco.mjtGeom.mjGEOM_BOX, "size": np.array(shape.size) / 2}
+    vertices, faces = read_mesh(folder / str(shape.mesh), shape.size)
     # As a shell a mesh may be open or inside out: its volume, which nothing here needs, is not computed.
     spec.add_mesh(
         name=name,
@@ -191,17 +189,16 @@ def _visual_shape(spec: mujoco.MjSpec, geometry: Any, name: str) -> dict[str, An
     return {"type": mujoco.mjtGeom.mjGEOM_MESH, "meshname": name}
 
 
-def _collision_shape(geometry: Any) -> tuple[dict[str, Any], np.ndarray]:
-    """A capsule or a sphere, and its place [4, 4] in the frame of the geometry."""
-    if geometry.sphere is not None:
-        return _sphere(geometry.sphere.radius), np.eye(4)
-    if geometry.cylinder is not None:
-        radius, length = geometry.cylinder.radius, geometry.cylinder.length
+def _collision_shape(shape: Shape, folder: Path) -> tuple[dict[str, Any], np.ndarray]:
+    """A capsule or a sphere, and its place [4, 4] in the frame of the shape."""
+    if shape.kind == "sphere":
+        return _sphere(shape.size[0]), np.eye(4)
+    if shape.kind == "cylinder":
+        radius, length = shape.size
         return _capsule(radius, max(length / 2 - radius, 0.0)), np.eye(4)
-    if geometry.box is not None:
-        corners = np.array(list(product((-0.5, 0.5), repeat=3))) * geometry.box.size
-        return _bounding_capsule(corners)
-    return _bounding_capsule(read_mesh(Path(geometry.mesh.filename), geometry.mesh.scale)[0])
+    if shape.kind == "box":
+        return _bounding_capsule(np.array(list(product((-0.5, 0.5), repeat=3))) * shape.size)
+    return _bounding_capsule(read_mesh(folder / str(shape.mesh), shape.size)[0])
 
 
 def _bounding_capsule(points: np.ndarray) -> tuple[dict[str, Any], np.ndarray]:
@@ -233,13 +230,5 @@ def _sphere(radius: float) -> dict[str, Any]:
     return {"type": mujoco.mjtGeom.mjGEOM_SPHERE, "size": [radius, 0, 0]}
 
 
-def _matrix(origin: np.ndarray | None) -> np.ndarray:
-    return np.eye(4) if origin is None else origin
-
-
-def _place(origin: np.ndarray | None) -> dict[str, np.ndarray]:
-    if origin is None:
-        return {}
-    quat = np.zeros(4)
-    mujoco.mju_mat2Quat(quat, np.ascontiguousarray(origin[:3, :3]).ravel())
-    return {"pos": origin[:3, 3], "quat": quat}
+def _place(origin: np.ndarray) -> dict[str, np.ndarray]:
+    return {"pos": origin[:3, 3], "quat": quaternion(origin[:3, :3])}

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import mujoco
 import numpy as np
 
+from surgical_marl.cache import cached
+from surgical_marl.robots.rotation import quaternion
 from surgical_marl.robots.spec import COLLISION_GROUP, build_spec
 from surgical_marl.scenes.randomisation import Randomisation
 from surgical_marl.scenes.scene import PAYLOAD, Mount, Scene
@@ -31,9 +34,7 @@ def build_scene(name: str, mounts: dict[str, Mount], control: str, randomisation
     spec.copy_during_attach = True
     set_physics(spec)
     for agent, mount in mounts.items():
-        quat = np.zeros(4)
-        mujoco.mju_mat2Quat(quat, mount.rotation.ravel())
-        frame = spec.worldbody.add_frame(pos=mount.position, quat=quat)
+        frame = spec.worldbody.add_frame(pos=mount.position, quat=quaternion(mount.rotation))
         spec.attach(build_spec(mount.arm, control), prefix=f"{agent}/", frame=frame)
         if randomisation.payload:
             spec.body(f"{agent}/{mount.arm.tool_tip}").add_body(name=f"{agent}/{PAYLOAD}")
@@ -70,4 +71,23 @@ def weigh_shapes(model: mujoco.MjModel, home: np.ndarray) -> mujoco.MjModel:
 def alone(scene: Scene, agent: str) -> mujoco.MjModel:
     """The model of one arm of a scene, its base frame at the origin."""
     mount = replace(scene.mounts[agent], position=np.zeros(3), rotation=np.eye(3))
-    return compile_scene(build_scene(scene.name, {agent: mount}, scene.control, scene.randomisation))
+
+    def compute() -> mujoco.MjModel:
+        return compile_scene(build_scene(scene.name, {agent: mount}, scene.control, scene.randomisation))
+
+    about = repr((scene.name, agent, scene.control, scene.randomisation))
+    return cached_model(compute, about, *mount.arm.content)
+
+
+def cached_model(compute: Callable[[], mujoco.MjModel], *content: str | bytes) -> mujoco.MjModel:
+    """Return the model that `compute` returns, from disk if it was compiled before from the same content and code."""
+
+    def saved() -> np.ndarray:
+        model = compute()
+        buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+        mujoco.mj_saveModel(model, None, buffer)
+        return buffer
+
+    name = "model.mjb"
+    binary = cached("models", saved, *content, roots=(compute.__module__,)).tobytes()
+    return mujoco.MjModel.from_binary_path(name, {name: binary})

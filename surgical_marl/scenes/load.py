@@ -9,19 +9,23 @@ geoms can touch is found by `surgical_marl/scenes/contacts.py`.
 from __future__ import annotations
 
 import re
-from dataclasses import replace
+from collections.abc import Callable
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
+import mujoco
+
 from surgical_marl.content import find
-from surgical_marl.robots.arm import load_arm
+from surgical_marl.robots.arm import Arm, load_arm
+from surgical_marl.robots.rotation import turned
 from surgical_marl.robots.spec import SOLREF
-from surgical_marl.scenes.build import build_scene, compile_scene, weigh_shapes
+from surgical_marl.scenes.build import build_scene, cached_model, compile_scene, weigh_shapes
 from surgical_marl.scenes.contacts import contact_pairs
 from surgical_marl.scenes.randomisation import read_randomisation
 from surgical_marl.scenes.scene import Mount, Scene
 from surgical_marl.scenes.surroundings import add_surroundings, add_tissue
-from surgical_marl.scenes.vectors import read_mapping, read_vector, rotation_matrix
+from surgical_marl.scenes.vectors import read_mapping, read_vector
 from surgical_marl.yaml_file import check_keys, read_yaml
 
 
@@ -37,32 +41,40 @@ def load_scene(name: str | Path, control: str = "position") -> Scene:
     arms = settings.get("arms")
     if not isinstance(arms, dict) or not arms:
         raise ValueError(f"{path}: arms must map agent names such as psm_0 to arms")
-    mounts = {agent: _read_mount(agent, mount, path) for agent, mount in arms.items()}
+    load = cache(load_arm)  # two agents may be the same arm
+    mounts = {agent: _read_mount(agent, mount, path, load) for agent, mount in arms.items()}
     randomisation = read_randomisation(settings.get("randomisation"), path)
-    spec = build_scene(path.stem, mounts, control, randomisation)
-    add_surroundings(spec, mounts, settings.get("view"), path)
-    for piece, what in read_mapping(settings.get("tissue"), f"{path}, tissue").items():
-        add_tissue(spec, f"tissue/{piece}", what, f"{path}, tissue {piece!r}")
-    model = compile_scene(spec)
+    description = str(settings.get("description", ""))
     observe = read_mapping(settings.get("observe"), f"{path}, observe")
-    scene = Scene(path.stem, str(settings.get("description", "")), control, mounts, model, randomisation, observe)
-    for one, other in contact_pairs(scene):
-        spec.add_pair(geomname1=one, geomname2=other, condim=1, solref=SOLREF)
-    return replace(scene, model=weigh_shapes(compile_scene(spec), scene.home))
+    scene = partial(Scene, path.stem, description, control, mounts, randomisation=randomisation, observe=observe)
+
+    def compute() -> mujoco.MjModel:
+        spec = build_scene(path.stem, mounts, control, randomisation)
+        add_surroundings(spec, mounts, settings.get("view"), path)
+        for piece, what in read_mapping(settings.get("tissue"), f"{path}, tissue").items():
+            add_tissue(spec, f"tissue/{piece}", what, f"{path}, tissue {piece!r}")
+        bare = scene(model=compile_scene(spec))
+        for one, other in contact_pairs(bare):
+            spec.add_pair(geomname1=one, geomname2=other, condim=1, solref=SOLREF)
+        return weigh_shapes(compile_scene(spec), bare.home)
+
+    about = repr((path.stem, control, settings))
+    contents = (part for mount in mounts.values() for part in mount.arm.content)
+    return scene(model=cached_model(compute, about, *contents))
 
 
-def _read_mount(agent: str, settings: Any, path: Path) -> Mount:
+def _read_mount(agent: str, settings: Any, path: Path, load: Callable[[str | Path], Arm]) -> Mount:
     where = f"{path}, agent {agent!r}"
     if not isinstance(settings, dict) or "arm" not in settings:
         raise ValueError(f"{where}: must be a mapping that names its arm")
     check_keys(settings, ("arm", "position", "turn", "tilt", "workspace"), where)
     source = str(settings["arm"])
     local = path.parent / source  # a user's own arm may be named relative to the scene file
-    arm = load_arm(local if (local / "arm.yaml").is_file() else source)
+    arm = load(local if (local / "arm.yaml").is_file() else source)
     if not re.fullmatch(re.escape(arm.name) + r"_\d+", str(agent)):
         raise ValueError(f"{where}: an agent of arm {arm.name!r} is called {arm.name}_0, {arm.name}_1 and so on")
     vectors = {key: read_vector(settings.get(key, [0.0, 0.0, 0.0]), f"{where}, {key}") for key in
                ("position", "tilt", "workspace")}  # fmt: skip
     turn = read_vector([0.0, 0.0, settings.get("turn", 0.0)], f"{where}, turn")
-    rotation = rotation_matrix(vectors["tilt"]) @ rotation_matrix(turn)
+    rotation = turned(vectors["tilt"]) @ turned(turn)
     return Mount(arm, vectors["position"], rotation, vectors["workspace"])

@@ -16,6 +16,7 @@ import numpy as np
 
 from surgical_marl.content import unknown
 from surgical_marl.robots.arm import Arm
+from surgical_marl.robots.rotation import matrix_of
 from surgical_marl.robots.spec import COLLISION_GROUP, build_spec
 from surgical_marl.scenes.geometry import Capsule, capsule_distance
 from surgical_marl.scenes.randomisation import Randomisation
@@ -156,10 +157,8 @@ class Scene:
             links = {geom: model.body(model.geom_bodyid[geom]).name.removeprefix(f"{agent}/") for geom in geoms}
             poses = mount.arm.link_poses(q[agent], tuple(dict.fromkeys(links.values())))
             for geom in geoms:
-                rotation = np.zeros(9)
-                mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
                 # a sphere has no half length: MuJoCo leaves zero there
-                half = rotation.reshape(3, 3)[:, 2] * model.geom_size[geom, 1]
+                half = matrix_of(model.geom_quat[geom])[:, 2] * model.geom_size[geom, 1]
                 pose = poses[links[geom]] @ _transform(model.geom_pos[geom])
                 a, b = ((pose[..., :3, :3] @ end + pose[..., :3, 3]) @ mount.rotation.T + mount.position
                         for end in (-half, half))  # fmt: skip

@@ -8,8 +8,9 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from surgical_marl.robots.rotation import quaternion, turned
 from surgical_marl.scenes.scene import Mount
-from surgical_marl.scenes.vectors import read_mapping, read_vector, rotation_matrix
+from surgical_marl.scenes.vectors import read_mapping, read_vector
 from surgical_marl.yaml_file import check_keys
 
 STILL = {"contype": 0, "conaffinity": 0, "group": 1}
@@ -30,11 +31,9 @@ def add_surroundings(spec: mujoco.MjSpec, mounts: dict[str, Mount], view: Any, p
     )  # fmt: skip
     for agent, mount in mounts.items():
         if mount.arm.remote_center is not None:
-            quat = np.zeros(4)
-            mujoco.mju_mat2Quat(quat, mount.rotation.ravel())
             spec.worldbody.add_geom(
                 name=f"{agent}_trocar", type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=[0.011, 0.002, 0],
-                pos=mount.position, quat=quat, rgba=[0.95, 0.78, 0.20, 1], **STILL,
+                pos=mount.position, quat=quaternion(mount.rotation), rgba=[0.95, 0.78, 0.20, 1], **STILL,
             )  # fmt: skip
     spec.worldbody.add_light(pos=[0.2, 0.4, 0.9], dir=[-0.2, -0.4, -0.9])
     view = {"position": [0.0, 0.75, 0.40], "target": [0.0, 0.0, 0.07], **read_mapping(view, f"{path}, view")}
@@ -60,8 +59,7 @@ def add_tissue(spec: mujoco.MjSpec, name: str, settings: Any, where: str) -> Non
     if not (size > 0).all() or not ((colour >= 0) & (colour <= 1)).all():
         raise ValueError(f"{where}: size {size.tolist()} must be above 0, and colour {colour.tolist()} from 0 to 1")
     position, tilt = (read_vector(settings.get(key, [0, 0, 0]), f"{where}, {key}") for key in ("position", "tilt"))
-    quat = np.zeros(4)
-    mujoco.mju_mat2Quat(quat, rotation_matrix(tilt).ravel())
+    quat = quaternion(turned(tilt))
     spec.worldbody.add_geom(
         name=name, type=kind, size=[*size, 0][:3], pos=position, quat=quat, rgba=[*colour, 1], **STILL
     )

@@ -1,10 +1,9 @@
-"""Vectors, rotations and mappings as people write them in a scene file."""
+"""Vectors and mappings as people write them in a scene file."""
 
 from __future__ import annotations
 
 from typing import Any
 
-import mujoco
 import numpy as np
 
 
@@ -16,14 +15,6 @@ def read_vector(value: Any, where: str, count: int = 3, words: str = "three fini
     if vector.shape != (count,) or not np.isfinite(vector).all():
         raise ValueError(f"{where}: {value!r} must be {words}")
     return vector
-
-
-def rotation_matrix(tilt: np.ndarray) -> np.ndarray:
-    """Rotation matrix of turns by `tilt` degrees about the fixed axes x, then y, then z."""
-    quat, matrix = np.zeros(4), np.zeros(9)
-    mujoco.mju_euler2Quat(quat, np.radians(tilt), "XYZ")
-    mujoco.mju_quat2Mat(matrix, quat)
-    return matrix.reshape(3, 3)
 
 
 def read_mapping(value: Any, where: str) -> dict[str, Any]:

@@ -14,7 +14,7 @@ import numpy as np
 from surgical_marl import load_scene
 from surgical_marl.physics import dynamics, simulator, solver
 from surgical_marl.physics.dynamics import Physics
-from surgical_marl.physics.simulator import Simulator, dynamics, solver
+from surgical_marl.physics.simulator import Simulator
 from surgical_marl.scenes.scene import Scene
 from surgical_marl.scenes.timing import DECIMATION
 

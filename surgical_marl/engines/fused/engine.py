@@ -19,10 +19,10 @@ import numpy as np
 
 from surgical_marl.engines.fused.arrays import make_arrays
 from surgical_marl.engines.fused.kernel import compile_kernels, has_cuda
-from surgical_marl.engines.fused.keys import episode_keys
 from surgical_marl.engines.fused.load import load_source
 from surgical_marl.engines.fused.preludes import LANES
 from surgical_marl.engines.fused.program import Source
+from surgical_marl.engines.fused.threefry import episode_keys
 from surgical_marl.engines.stepper import Stepper, announce
 from surgical_marl.machine import cores
 

@@ -16,6 +16,7 @@ from surgical_marl.engines.fused import elementary, linear
 from surgical_marl.engines.fused.graph import FOLD, Graph, Value
 from surgical_marl.engines.fused.indexing import dynamic_slice, dynamic_update_slice, gather, scatter
 from surgical_marl.engines.fused.scalars import ELEMENTWISE, bitcast, convert, extreme, logic, round_
+from surgical_marl.engines.fused.threefry import threefry
 from surgical_marl.engines.fused.traced import Rule, Symbolic, Traced, Unsupported, each, kind_of, lift, lower
 
 
@@ -105,24 +106,18 @@ def _iota(g: Graph, shape: Any, params: Any) -> Traced:
 
 
 def _threefry(g: Graph, shape: Any, params: Any, *xs: Traced) -> list[Traced]:
-    """The block cipher of JAX's random numbers: Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", 2011."""
-    columns = [np.broadcast_to(lift(g, x), shape).ravel().tolist() for x in xs]
-    pairs = [_threefry_block(g, *words) for words in zip(*columns, strict=True)]
-    return [Symbolic(np.array(half, np.int32).reshape(shape)) for half in zip(*pairs, strict=True)]
-
-
-def _threefry_block(g: Graph, key0: Value, key1: Value, x0: Value, x1: Value) -> tuple[Value, Value]:
     number = lambda k: g.constant(np.uint32(k))  # noqa: E731
-    keys = [key0, key1, g.logic("xor", g.logic("xor", key0, key1), number(0x1BD11BDA))]
-    x0, x1 = g.add(x0, keys[0]), g.add(x1, keys[1])
-    for block in range(5):
-        for turn in ((13, 15, 26, 6), (17, 29, 16, 24))[block % 2]:
-            x0 = g.add(x0, x1)
-            turned = g.logic("or", g.binary("shl", x1, number(turn)), g.binary("shr", x1, number(32 - turn)))
-            x1 = g.logic("xor", turned, x0)
-        x0 = g.add(x0, keys[(block + 1) % 3])
-        x1 = g.add(g.add(x1, keys[(block + 2) % 3]), number(block + 1))
-    return x0, x1
+
+    def rotate(word: Value, distance: int) -> Value:
+        left, right = g.binary("shl", word, number(distance)), g.binary("shr", word, number(32 - distance))
+        return g.logic("or", left, right)
+
+    columns = [np.broadcast_to(lift(g, x), shape).ravel().tolist() for x in xs]
+    pairs = [
+        threefry((k0, k1), (c0, c1), g.add, partial(g.logic, "xor"), rotate, number)
+        for k0, k1, c0, c1 in zip(*columns, strict=True)
+    ]
+    return [Symbolic(np.array(half, np.int32).reshape(shape)) for half in zip(*pairs, strict=True)]
 
 
 def _iota_pair(g: Graph, shape: Any, params: Any) -> list[Traced]:

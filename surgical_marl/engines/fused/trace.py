@@ -9,11 +9,12 @@ one round). Other scans are unrolled.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import cache, partial
 from typing import Any
 
 import jax
 import numpy as np
-from jax.extend import core
+from jax.extend import core, random, source_info_util
 
 from surgical_marl.engines.fused.graph import DTYPES, Branch, Graph, Loop, Value
 from surgical_marl.engines.fused.primitives import apply
@@ -54,8 +55,6 @@ class Tracer:
             except Unsupported as error:
                 if error.place:
                     raise
-                from jax._src import source_info_util
-
                 raise Unsupported(error.what, source_info_util.summarize(equation.source_info)) from None
             known.update(zip(equation.outvars, results, strict=True))
         return [read(variable) for variable in jaxpr.outvars]
@@ -235,7 +234,10 @@ class Tracer:
         if name in ("random_wrap", "random_unwrap"):
             return xs[0]
         source = out if name == "random_seed" else equation.invars[0].aval
-        implementation, words = source.dtype._impl, source.dtype._impl.key_shape
+        implementation = _key_kinds().get(source.dtype)
+        if implementation is None:
+            raise Unsupported(f"random keys of {source.dtype}")
+        words = implementation.key_shape
         if name != "random_seed" and source.shape:
             raise Unsupported(f"{name} of many keys at once")
         if name == "random_fold_in":
@@ -264,6 +266,13 @@ def _expanded(primitive: Any) -> Any:
         return jax.tree.leaves(primitive.expand(*jax.tree.unflatten(primitive.in_tree, arguments)))
 
     return jax.make_jaxpr(flat)(*(jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in primitive.in_avals_flat))
+
+
+@cache
+def _key_kinds() -> dict[Any, Any]:
+    """How the random keys of each dtype are drawn from."""
+    kinds = (random.threefry_prng_impl, random.rbg_prng_impl, random.unsafe_rbg_prng_impl)
+    return {jax.eval_shape(partial(jax.random.key, 0, impl=kind)).dtype: kind for kind in kinds}
 
 
 def _is_key(aval: Any) -> bool:

@@ -1,0 +1,90 @@
+"""XML that anybody may have written: read by defusedxml, which refuses what could expand or name other files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NamedTuple
+from xml.etree.ElementTree import Element, TreeBuilder, tostring
+
+MAX_DEPTH = 256
+"""Of elements within each other; libxml2 has the same limit."""
+
+
+class Document(NamedTuple):
+    """An XML document without a DOCTYPE."""
+
+    root: Element
+    lines: dict[Element, int]
+    """The line on which each element starts."""
+
+
+def parse_xml(data: bytes, path: Path, noun: str) -> Document:
+    """Parse XML that has no DOCTYPE: only there can entities be defined or other files be named.
+
+    Args:
+        data: the text.
+        path: for the message.
+        noun: what the file should be, for the message.
+
+    Raises:
+        ValueError: a DOCTYPE, an encoding that is not read, elements nested too deeply, or no XML.
+    """
+    from defusedxml.common import DTDForbidden
+    from defusedxml.ElementTree import DefusedXMLParser, ParseError
+
+    builder = _Lines()
+    builder.expat = (parser := DefusedXMLParser(target=builder, forbid_dtd=True)).parser
+    try:
+        parser.feed(data)
+        return Document(parser.close(), builder.lines)
+    except DTDForbidden:
+        raise ValueError(f"{path} has a DOCTYPE, which can define entities; remove it") from None
+    except (ParseError, LookupError, ValueError) as error:
+        raise ValueError(f"{path} is not a {noun} that can be read: {error}") from None
+
+
+def write_xml(root: Element) -> bytes:
+    """Return the text of an element. Other parsers get it in place of a file's own text: they may know encodings in
+    which that holds what defusedxml did not see."""
+    return tostring(root)
+
+
+def read_bytes(path: Path, most: int) -> bytes:
+    """Return what a file holds; ValueError if it can't be read or holds more than `most` bytes."""
+    try:
+        with path.open("rb") as file:
+            data = file.read(most + 1)
+    except OSError as error:
+        raise ValueError(f"{path} cannot be read: {error.strerror}") from None
+    if len(data) > most:
+        raise ValueError(f"{path} is larger than {most // 1_000_000} MB, the most that is read")
+    return data
+
+
+def shown(text: str) -> str:
+    """Return a text in quotes, cut if it is long."""
+    return repr(text if len(text) <= 80 else text[:77] + "...")
+
+
+class _Lines(TreeBuilder):
+    """Builds a tree that is not too deep for recursion and keeps the line of each element."""
+
+    expat: Any
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.lines: dict[Element, int] = {}
+        self._depth = 0
+
+    def start(self, tag: Any, attributes: Any, /) -> Element:
+        line = self.expat.CurrentLineNumber
+        self._depth += 1
+        if self._depth > MAX_DEPTH:
+            raise ValueError(f"elements are nested deeper than {MAX_DEPTH}: line {line}")
+        element = super().start(tag, attributes)
+        self.lines[element] = line
+        return element
+
+    def end(self, tag: Any, /) -> Element:
+        self._depth -= 1
+        return super().end(tag)

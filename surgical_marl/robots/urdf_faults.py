@@ -1,0 +1,184 @@
+"""What keeps a URDF from being an arm's: one sentence for each thing that is wrong."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from surgical_marl.robots.description import MOVING, SHAPES, Robot
+from surgical_marl.robots.safe_xml import Document, shown
+
+LEAST = 1e-15
+"""Masses (kg) and moments of inertia (kg m2) up to here are zero to MuJoCo."""
+
+_ANY, _NOT_NEGATIVE, _POSITIVE = "finite", "finite and not negative", "finite and above 0"
+# Numbers of a URDF by tag and attribute: how many there must be, and of what kind.
+_NUMBERS: dict[tuple[str, str], tuple[tuple[int, ...], str]] = {
+    **dict.fromkeys([("origin", "xyz"), ("origin", "rpy"), ("axis", "xyz")], ((3,), _ANY)),
+    **dict.fromkeys([("inertia", key) for key in ("ixx", "iyy", "izz")], ((1,), _NOT_NEGATIVE)),
+    **dict.fromkeys([("inertia", key) for key in ("ixy", "ixz", "iyz")], ((1,), _ANY)),
+    **dict.fromkeys([("cylinder", "radius"), ("cylinder", "length"), ("sphere", "radius")], ((1,), _POSITIVE)),
+    **dict.fromkeys([("limit", "lower"), ("limit", "upper")], ((1,), _ANY)),
+    **dict.fromkeys([("limit", "velocity"), ("limit", "effort"), ("mass", "value")], ((1,), _NOT_NEGATIVE)),
+    **dict.fromkeys([("dynamics", "damping"), ("dynamics", "friction")], ((1,), _NOT_NEGATIVE)),
+    **dict.fromkeys([("mimic", "multiplier"), ("mimic", "offset")], ((1,), _ANY)),
+    **dict.fromkeys([("calibration", key) for key in ("rising", "falling")], ((1,), _ANY)),
+    **dict.fromkeys(
+        [("safety_controller", f"soft_{side}_limit") for side in ("lower", "upper")]
+        + [("safety_controller", f"k_{of}") for of in ("position", "velocity")],
+        ((1,), _ANY),
+    ),
+    ("box", "size"): ((3,), _POSITIVE),
+    ("mesh", "scale"): ((1, 3), _ANY),
+    ("color", "rgba"): ((4,), _NOT_NEGATIVE),
+}
+_ATTRIBUTES = {
+    "link": ("name",), "joint": ("name", "type"), "parent": ("link",), "child": ("link",), "mimic": ("joint",),
+    "mass": ("value",), "inertia": ("ixx", "iyy", "izz"),
+    "box": ("size",), "cylinder": ("radius", "length"), "sphere": ("radius",), "mesh": ("filename",),
+}  # fmt: skip
+_CHILDREN = {"joint": ("parent", "child"), "inertial": ("mass", "inertia"),
+             "visual": ("geometry",), "collision": ("geometry",)}  # fmt: skip
+
+
+def robot_faults(robot: Robot, path: Path) -> list[str]:
+    """Return what is wrong with links, joints and inertias: one sentence each that names the file."""
+    faults = list(_tree_faults(robot)) or list(_inertia_faults(robot))
+    return [f"{path}: {fault}" for fault in (*faults, *_joint_faults(robot))]
+
+
+def xml_faults(document: Document, path: Path) -> Iterator[str]:
+    """Yield tags without what they must have, and numbers that are none. `<gazebo>`, `<transmission>` and such are not
+    read."""
+    root = document.root
+    if root.tag != "robot" or not root.get("name"):
+        yield f"{path} is not a URDF: its root must be <robot name=...>, not <{root.tag}>"
+        return
+    for part in root:
+        if part.tag not in ("link", "joint", "material"):
+            continue
+        for element in part.iter():
+            where = f"{path}, line {document.lines[element]}"
+            for key in _ATTRIBUTES.get(element.tag, ()):
+                if not element.get(key):
+                    yield f"{where}: <{element.tag}> needs {key}=..."
+            for tag in _CHILDREN.get(element.tag, ()):
+                if element.find(tag) is None:
+                    yield f"{where}: <{element.tag}> of {part.tag} {part.get('name')!r} needs <{tag}>"
+            if element.tag == "geometry" and (not len(element) or element[0].tag not in SHAPES):
+                yield f"{where}: <geometry> of link {part.get('name')!r} needs one of {', '.join(SHAPES)}"
+            for key, text in element.attrib.items():
+                if (fault := _number_fault(element.tag, key, text)) is not None:
+                    yield f"{where}: {fault}"
+
+
+def _number_fault(tag: str, key: str, text: str) -> str | None:
+    if (tag, key) not in _NUMBERS:
+        return None
+    counts, kind = _NUMBERS[tag, key]
+    try:
+        numbers = [float(word) for word in text.split()]
+    except ValueError:
+        numbers = []
+    good = len(numbers) in counts and all(map(math.isfinite, numbers))
+    if kind == _NOT_NEGATIVE:
+        good = good and min(numbers) >= 0
+    if kind == _POSITIVE:
+        good = good and min(numbers) > 0
+    if tag == "axis":
+        good, kind = good and any(numbers), "finite and not all 0"
+    much = " or ".join(map(str, counts))
+    return None if good else f"{key}={shown(text)} of <{tag}> must be {much} number{'s' * (much != '1')}, {kind}"
+
+
+def _tree_faults(robot: Robot) -> Iterator[str]:
+    """What keeps links and joints from being one tree."""
+    links = [link.name for link in robot.links]
+    for noun, names in (("link", links), ("joint", [joint.name for joint in robot.joints])):
+        for name, count in Counter(names).items():
+            if count > 1:
+                yield f"{count} {noun}s are called {name!r}; each needs a name of its own"
+    for joint in robot.joints:
+        for role, name in (("parent", joint.parent), ("child", joint.child)):
+            if name not in links:
+                yield f"joint {joint.name!r} has the {role} {name!r}, which is not a link of the URDF"
+    for name, count in Counter(joint.child for joint in robot.joints).items():
+        if count > 1:
+            yield f"link {name!r} is the child of {count} joints; a link of a tree has one parent"
+    parents = {joint.child: joint.parent for joint in robot.joints}
+    roots = [name for name in dict.fromkeys(links) if name not in parents]
+    if not links:
+        yield "it has no links"
+    if len(roots) > 1:
+        yield f"the links {', '.join(map(repr, roots))} have no parent; a tree has one root"
+    if (looped := _looped(parents)) is not None:
+        yield f"link {looped!r} is its own ancestor; links must form a tree"
+
+
+def _looped(parents: dict[str, str]) -> str | None:
+    """A link that one comes back to on the way from child to parent."""
+    clear: set[str] = set()
+    for start in parents:
+        way: set[str] = set()
+        link = start
+        while link in parents and link not in clear:
+            if link in way:
+                return link
+            way.add(link)
+            link = parents[link]
+        clear |= way
+    return None
+
+
+def _joint_faults(robot: Robot) -> Iterator[str]:
+    moving = {joint.name: joint for joint in robot.joints if joint.type in MOVING}
+    for joint in robot.joints:
+        name, limit, mimic = joint.name, joint.limit, joint.mimic
+        if joint.type == "continuous":
+            yield f"joint {name!r} is continuous, so it has no limits; make it revolute with a lower and an upper limit"
+            continue
+        if joint.type not in (*MOVING, "fixed"):
+            yield f"joint {name!r} is {joint.type}; revolute, prismatic and fixed work"
+        if joint.type not in MOVING:
+            continue
+        if mimic is not None and mimic.joint not in moving:
+            yield f"joint {name!r} mimics {mimic.joint!r}, which is not a moving joint of the URDF"
+        elif mimic is not None and moving[mimic.joint].mimic is not None:
+            yield f"joint {name!r} mimics {mimic.joint!r}, which mimics a joint itself; let both mimic the same joint"
+        if limit is None:
+            yield f"joint {name!r} needs a limit with lower, upper, velocity and effort"
+        elif not limit.lower < limit.upper:
+            yield f"joint {name!r} has lower limit {limit.lower} not below upper {limit.upper}"
+        elif limit.velocity == 0 or limit.effort == 0:
+            which = "velocity" if limit.velocity == 0 else "effort"
+            yield f"joint {name!r} has the {which} limit 0, so it can't move; give the one of its motor"
+
+
+def _inertia_faults(robot: Robot) -> Iterator[str]:
+    """Masses and inertias that no body can have: MuJoCo compiles none of them."""
+    masses = {}
+    for link in robot.links:
+        masses[link.name] = mass = 0.0 if link.inertial is None else link.inertial.mass
+        inertia = np.zeros((3, 3)) if link.inertial is None else np.array(link.inertial.inertia)
+        moments = np.linalg.eigvalsh(inertia)
+        three = ", ".join(f"{moment:.4g}" for moment in moments)
+        if not inertia.any():
+            if mass > 0:
+                yield f"link {link.name!r} has a mass of {mass:g} kg but zero inertia"
+        elif moments[0] <= LEAST:
+            yield f"link {link.name!r} has the moments of inertia {three} kg m2; all three must be above 0"
+        elif moments[0] + moments[1] < moments[2] * (1 - 1e-9):
+            yield f"link {link.name!r} has the moments of inertia {three} kg m2; no body has one above the sum of two"
+    fixed = [joint for joint in robot.joints if joint.type not in MOVING]
+    for joint in robot.joints:
+        if joint.type not in MOVING:
+            continue
+        welded = {joint.child}  # a link without mass is fine where a fixed joint ties it to one with mass
+        while more := {j.child for j in fixed if j.parent in welded} - welded:
+            welded |= more
+        if sum(masses[name] for name in welded) <= LEAST:
+            yield f"link {joint.child!r} is moved by joint {joint.name!r} but has no mass"
