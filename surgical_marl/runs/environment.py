@@ -1,0 +1,22 @@
+"""The environment that a run learns in."""
+
+from __future__ import annotations
+
+from surgical_marl.envs.batch import BatchedEnv
+from surgical_marl.runs.settings import Settings
+
+
+def make_env(settings: Settings, num_envs: int | None = None) -> BatchedEnv:
+    """The environment of a run, with torch tensors; `num_envs` replaces the setting."""
+    return BatchedEnv(
+        settings.task,
+        settings.scene,
+        num_envs=num_envs or settings.num_envs,
+        control=settings.control,
+        engine=settings.engine,
+        device=settings.device,
+        max_steps=settings.max_steps,
+        difficulty=settings.difficulty,
+        reward=settings.reward,
+        arrays="torch",
+    )
