@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from surgical_marl.content import list_arms, list_policies, list_scenes, list_tasks
 from surgical_marl.interfaces.registration import gymnasium_ids, pettingzoo_ids, task_modules
+from surgical_marl.plugins.algorithms import list_algorithms, register_algorithm
 
 if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv
@@ -32,6 +33,7 @@ _LAZY = {
 
 __all__ = [
     "BatchedEnv",
+    "list_algorithms",
     "list_arms",
     "list_policies",
     "list_scenes",
@@ -39,6 +41,7 @@ __all__ = [
     "load_arm",
     "load_scene",
     "parallel_env",
+    "register_algorithm",
 ]
 
 gymnasium_ids()

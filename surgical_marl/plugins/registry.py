@@ -1,0 +1,120 @@
+"""Find classes by name: those that ship, those of installed packages, and those that a program registers."""
+
+from __future__ import annotations
+
+import pkgutil
+from collections.abc import Callable
+from functools import cached_property, partial
+from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any, NamedTuple
+
+from surgical_marl.content import unknown
+
+
+class Source(NamedTuple):
+    """Where a class comes from."""
+
+    where: str
+    load: Callable[[], Any]
+
+
+class Registry:
+    """Classes by name. Names are found without importing what they stand for.
+
+    Args:
+        noun: what one of them is, for messages.
+        package: the package of those that ship: a module each, of their name, with one subclass of `base`.
+        group: the entry-point group in which an installed package declares its own as `name = "module:Class"`.
+        base: "module:Class", which all of them are subclasses of.
+    """
+
+    def __init__(self, noun: str, package: str, group: str, base: str) -> None:
+        self.noun, self.package, self.group, self.base = noun, package, group, base
+        self._registered: dict[str, type] = {}
+
+    def names(self) -> list[str]:
+        """Return all names, sorted."""
+        return sorted(self._sources())
+
+    def check(self, name: str) -> None:
+        """Raise a ValueError that names the good ones if there is no such name."""
+        if name not in (names := self.names()):
+            raise unknown(self.noun, name, names)
+
+    def load(self, name: str) -> Any:
+        """Return the class of a name.
+
+        Raises:
+            ValueError: there is no such name or more than one, or its package cannot be imported or holds something
+                else under it.
+        """
+        self.check(name)
+        sources = self._sources()[name]
+        if len(sources) > 1:
+            where = " and of ".join(source.where for source in sources)
+            raise ValueError(f"the {self.noun} {name!r} is of {where}: uninstall or rename all but one")
+        (source,) = sources
+        try:
+            found = source.load()
+        except Exception as error:  # whatever the module of a stranger raises
+            reason = f"{type(error).__name__}: {error}"
+            raise ValueError(f"the {self.noun} {name!r} of {source.where} cannot be imported: {reason}") from error
+        self._check_class(name, source.where, found)
+        return found
+
+    def register(self, name: str, cls: type) -> None:
+        """Add a class of this program. Defining it again, as in a notebook, replaces it.
+
+        Raises:
+            ValueError: the name belongs to another class, or the class is not a subclass of `base`.
+        """
+        where = _where(cls)
+        self._check_class(name, where, cls)
+        taken = [source.where for source in self._sources().get(name, []) if source.where != where]
+        if taken:
+            raise ValueError(f"the {self.noun} {name!r} of {where} exists already, of {taken[0]}: choose another name")
+        self._registered[name] = cls
+
+    def _check_class(self, name: str, where: str, found: Any) -> None:
+        if not isinstance(found, type) or not issubclass(found, self._base()):
+            raise ValueError(f"the {self.noun} {name!r} of {where} must be a subclass of {self.base}, not {found!r}")
+
+    def _base(self) -> type:
+        module, _, name = self.base.partition(":")
+        return getattr(import_module(module), name)
+
+    def _sources(self) -> dict[str, list[Source]]:
+        found: dict[str, list[Source]] = {}
+        for name in self._shipped:
+            found.setdefault(name, []).append(Source("surgical-marl", partial(self._load_shipped, name)))
+        for point in self._points:
+            where = f"the package {point.dist.name}" if point.dist else point.value
+            found.setdefault(point.name, []).append(Source(where, point.load))
+        for name, cls in self._registered.items():
+            found.setdefault(name, []).append(Source(_where(cls), partial(_itself, cls)))
+        return found
+
+    @cached_property
+    def _shipped(self) -> list[str]:
+        modules = pkgutil.iter_modules(import_module(self.package).__path__)
+        return [module.name for module in modules if not module.ispkg and not module.name.startswith("_")]
+
+    @cached_property
+    def _points(self) -> list[EntryPoint]:
+        return list(entry_points(group=self.group))
+
+    def _load_shipped(self, name: str) -> type:
+        module, base = import_module(f"{self.package}.{name}"), self._base()
+        own = [each for each in vars(module).values() if isinstance(each, type) and each.__module__ == module.__name__]
+        (cls,) = (each for each in own if issubclass(each, base))
+        return cls
+
+
+def _itself(cls: type) -> type:
+    return cls
+
+
+def _where(cls: Any) -> str:
+    """Return the place of a class that a program defines."""
+    return f"{getattr(cls, '__module__', 'this program')}.{getattr(cls, '__qualname__', cls)}"
