@@ -4,8 +4,8 @@ From the rollout's advantage `A` of all agents together, an agent `i` maximises
 
     mean(min(r_i M, clip(r_i, 1 - clip, 1 + clip) M)),   M = A * product of r_j over the agents j that learned before
 
-with `r` the ratios of new to old probabilities: equations 10 and 11 and algorithm 3 of Kuba et al. 2022 (arXiv
-2109.11251). Which agent learns first is drawn anew for every update. See also Zhong et al. 2024 (JMLR 25, HARL).
+with `r` the ratios of new to old probabilities (Kuba et al. 2022, arXiv 2109.11251; Zhong et al. 2024, JMLR 25). The
+order of the agents is drawn anew for every update.
 """
 
 from __future__ import annotations
