@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from surgical_marl.content import list_arms, list_policies, list_scenes
 from surgical_marl.interfaces.registration import register_ids, register_task
+from surgical_marl.plugins.algorithms import list_algorithms, register_algorithm
 from surgical_marl.plugins.tasks import list_tasks
 
 if TYPE_CHECKING:
@@ -38,6 +39,7 @@ __all__ = [
     "BatchedEnv",
     "Task",
     "TipTask",
+    "list_algorithms",
     "list_arms",
     "list_policies",
     "list_scenes",
@@ -45,6 +47,7 @@ __all__ = [
     "load_arm",
     "load_scene",
     "parallel_env",
+    "register_algorithm",
     "register_task",
 ]
 

@@ -11,6 +11,7 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
 
 from surgical_marl.learning.trainer import Trainer
+from surgical_marl.plugins.algorithms import list_algorithms
 from surgical_marl.runtime import no_collection
 from tests.helpers.fake_env import FakeEnv
 from tests.helpers.runs import ALL, COUNTS, OPTIONS, SIZES, SMALL
@@ -51,7 +52,7 @@ def test_waiting_is_seen() -> None:
     assert len(waits.found) == 2
 
 
-@pytest.mark.parametrize("algo", ["mappo", "ippo", "joint"])
+@pytest.mark.parametrize("algo", list_algorithms())
 @pytest.mark.parametrize("options", [*OPTIONS, ALL])
 def test_nothing_waits_and_all_stays_in_place(
     algo: Any, options: dict[str, Any], monkeypatch: pytest.MonkeyPatch

@@ -11,6 +11,7 @@ import torch
 
 from surgical_marl.learning import train
 from surgical_marl.learning.constraint import Constraint
+from surgical_marl.plugins.algorithms import list_algorithms
 from surgical_marl.policies.layout import Layout
 from surgical_marl.runs.folder import read_metrics
 from surgical_marl.runs.settings import ConstraintSettings, NetworkSettings, PPOSettings, Settings
@@ -21,9 +22,9 @@ COLLISION = ConstraintSettings(cost="collision", limit=0.1, kp=2.0, ki=0.5, kd=3
 BOUNDED = replace(SETTINGS, constraint=COLLISION)
 
 
-def made(counts: dict[str, int], num_envs: int = 4, joint: bool = False) -> Constraint:
+def made(counts: dict[str, int], num_envs: int = 4, grouping: Any = "type") -> Constraint:
     fake: Any = FakeEnv(counts, SIZES)
-    return Constraint(Layout(fake, joint=joint), num_envs, cost="collision", limit=0.1, kp=2.0, ki=0.5, kd=3.0)
+    return Constraint(Layout(fake, grouping), num_envs, cost="collision", limit=0.1, kp=2.0, ki=0.5, kd=3.0)
 
 
 def infos(*collisions: list[bool]) -> dict[str, dict[str, torch.Tensor]]:
@@ -58,11 +59,11 @@ def test_episodes_are_broken_by_any_agent_in_any_step() -> None:
     constraint.add(infos([True] * 4, [True] * 4), none)
     constraint.update()  # no episode ended: nothing is known
     assert (constraint.multiplier.item(), constraint.integral.item()) == kept
-    assert made({"psm": 2}, joint=True).add(infos([True] * 4, [True] * 4), none).tolist() == [[2.0]] * 4
+    assert made({"psm": 2}, grouping="joint").add(infos([True] * 4, [True] * 4), none).tolist() == [[2.0]] * 4
 
 
 @pytest.mark.parametrize("team_reward", [False, True])
-@pytest.mark.parametrize("algo", ["mappo", "ippo", "joint"])
+@pytest.mark.parametrize("algo", list_algorithms())
 def test_advantages_are_the_lagrangians(algo: Any, team_reward: bool) -> None:
     env, algorithm = build({"psm": 2}, replace(BOUNDED, algo=algo, team_reward=team_reward))
     env.env.line = 0.5  # type: ignore[attr-defined]

@@ -17,8 +17,10 @@ from surgical_marl.engines.fused.threefry import episode_keys
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.interfaces.rsl_rl import RslRlVecEnv
 from surgical_marl.learning import distributed, train
-from surgical_marl.learning.mappo import MAPPO, rsl_rl_config
+from surgical_marl.learning.algorithm import Algorithm
+from surgical_marl.learning.configuration import rsl_rl_config
 from surgical_marl.learning.trainer import Trainer
+from surgical_marl.plugins.algorithms import ALGORITHMS
 from surgical_marl.runs.folder import read_checkpoint, read_metrics
 from surgical_marl.runs.settings import ConstraintSettings, PPOSettings, Settings
 from tests.helpers.fake_env import FakeEnv
@@ -35,11 +37,12 @@ ALIKE = replace(
 STORED = ("observations", "actions", "values", "returns", "rewards", "dones", "actions_log_prob", "distribution_params")
 
 
-def algorithm(settings: Settings, num_envs: int) -> tuple[RslRlVecEnv, MAPPO]:
+def algorithm(settings: Settings, num_envs: int) -> tuple[RslRlVecEnv, Algorithm]:
     torch.manual_seed(1)
     fake: Any = FakeEnv(COUNTS, SIZES, num_envs, max_steps=5)
-    env = RslRlVecEnv(fake, seed=3)
-    made = MAPPO.construct_algorithm(env.get_observations(), env, rsl_rl_config(settings), "cpu")
+    cls = ALGORITHMS.load(settings.algo)
+    env = RslRlVecEnv(fake, grouping=cls.grouping, seed=3)
+    made = cls.construct_algorithm(env.get_observations(), env, rsl_rl_config(settings), "cpu")
     made.train_mode()
     return env, made
 
@@ -52,7 +55,7 @@ def share(value: Any, axis: int) -> Any:
     return value.narrow(axis, half * distributed.rank(), half).clone()
 
 
-def learned(made: MAPPO, last: Any) -> dict[str, Any]:
+def learned(made: Algorithm, last: Any) -> dict[str, Any]:
     """What an update makes of a stored rollout."""
     with torch.inference_mode():
         made.compute_returns(last)
@@ -61,10 +64,10 @@ def learned(made: MAPPO, last: Any) -> dict[str, Any]:
     return {"advantages": advantages, "divergence": losses[3], "rate": losses[4], **made.save()}
 
 
-def learn_a_share(rollout: Path, out: Path) -> None:
+def learn_a_share(settings: Settings, rollout: Path, out: Path) -> None:
     with distributed.joined("cpu"):
         given = torch.load(rollout, weights_only=False)
-        _, made = algorithm(ALIKE, ALIKE.num_envs)
+        _, made = algorithm(settings, settings.num_envs)
         for name in STORED:
             setattr(made.storage, name, share(given[name], 1))
         assert made.constraint is not None
@@ -72,8 +75,10 @@ def learn_a_share(rollout: Path, out: Path) -> None:
         torch.save(learned(made, share(given["last"], 0)), out / f"{distributed.rank()}.pt")
 
 
-def test_two_processes_learn_what_one_learns_of_the_same_rollout(tmp_path: Path) -> None:
-    env, whole = algorithm(ALIKE, 2 * ALIKE.num_envs)
+@pytest.mark.parametrize("algo", ["mappo", "happo"])
+def test_two_processes_learn_what_one_learns_of_the_same_rollout(algo: str, tmp_path: Path) -> None:
+    settings = replace(ALIKE, algo=algo)
+    env, whole = algorithm(settings, 2 * settings.num_envs)
     with torch.inference_mode():
         last = env.get_observations()
         for _ in range(ALIKE.steps_per_iteration):
@@ -83,7 +88,7 @@ def test_two_processes_learn_what_one_learns_of_the_same_rollout(tmp_path: Path)
     assert whole.constraint is not None
     given = {name: getattr(whole.storage, name) for name in STORED}
     torch.save({**given, "last": last, "ended": whole.constraint._ended}, tmp_path / "rollout.pt")
-    processes = start_together(2, learn_a_share, tmp_path / "rollout.pt", tmp_path)
+    processes = start_together(2, learn_a_share, settings, tmp_path / "rollout.pt", tmp_path)
     expected = learned(whole, last)
     assert end(processes) == [0, 0]
     first, second = (torch.load(tmp_path / f"{rank}.pt", weights_only=False) for rank in range(2))
@@ -113,9 +118,10 @@ def run_and_note(settings: Settings, out: Path, notes: Path, resume: bool = Fals
     torch.save(rank[1], notes / f"{rank[0]}.pt")
 
 
-def test_processes_stay_in_step_and_one_writes(tmp_path: Path) -> None:
+@pytest.mark.parametrize("algo", ["mappo", "happo"])
+def test_processes_stay_in_step_and_one_writes(algo: str, tmp_path: Path) -> None:
     out = tmp_path / "run"
-    assert end(start_together(2, run_and_note, SMALL, out, tmp_path)) == [0, 0]
+    assert end(start_together(2, run_and_note, replace(SMALL, algo=algo), out, tmp_path)) == [0, 0]
     first, second = (torch.load(tmp_path / f"{rank}.pt", weights_only=True) for rank in range(2))
     for part in ("actor_state_dict", "critic_state_dict"):
         for name, value in first["algorithm"][part].items():
@@ -124,7 +130,7 @@ def test_processes_stay_in_step_and_one_writes(tmp_path: Path) -> None:
         first["algorithm"]["optimizer_state_dict"]["param_groups"]
         == (second["algorithm"]["optimizer_state_dict"]["param_groups"])
     )
-    assert not torch.equal(first["env"]["observations"]["psm"], second["env"]["observations"]["psm"])
+    assert not torch.equal(first["env"]["observations"]["state"], second["env"]["observations"]["state"])
     assert not torch.equal(first["random"], second["random"])
     rows = read_metrics(out)
     assert [row["iteration"] for row in rows] == [1, 2, 3, 4]

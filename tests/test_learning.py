@@ -16,7 +16,9 @@ import torch
 from surgical_marl.evaluation.evaluate import evaluate
 from surgical_marl.files import write_atomic
 from surgical_marl.learning import train, trainer
+from surgical_marl.learning.algorithm import Algorithm
 from surgical_marl.learning.episodes import Episodes
+from surgical_marl.plugins.algorithms import ALGORITHMS, list_algorithms
 from surgical_marl.policies.policy import (
     load_policy,
     random_policy,
@@ -56,7 +58,7 @@ def without_time(rows: list[dict[str, float]]) -> str:
     return str([{k: v for k, v in row.items() if k not in ("seconds", "steps_per_s")} for row in rows])
 
 
-@pytest.mark.parametrize("algo", ["mappo", "ippo", "joint"])
+@pytest.mark.parametrize("algo", list_algorithms())
 def test_the_toy_is_learned(algo: Any, tmp_path: Path, fakes: list[Any]) -> None:
     ppo = PPOSettings(learning_rate=3e-3, gamma=0.9, mini_batches=2)
     settings = replace(
@@ -72,7 +74,8 @@ def test_the_toy_is_learned(algo: Any, tmp_path: Path, fakes: list[Any]) -> None
     env: Any = FakeEnv(COUNTS, SIZES, num_envs=100, max_steps=10)
     trained = evaluate(env, load_policy(run, env), episodes=100, seed=7)["mean_error_mm"]
     nothing = evaluate(env, zero_policy(env), episodes=100, seed=7)["mean_error_mm"]
-    untrained = evaluate(env, untrained_policy(env, settings), episodes=100, seed=7)["mean_error_mm"]
+    fresh = untrained_policy(env, settings, ALGORITHMS.load(algo).grouping)
+    untrained = evaluate(env, fresh, episodes=100, seed=7)["mean_error_mm"]
     assert trained < nothing / 3
     assert untrained > nothing / 2
     rows = read_metrics(run)
@@ -82,7 +85,7 @@ def test_the_toy_is_learned(algo: Any, tmp_path: Path, fakes: list[Any]) -> None
 
 @pytest.mark.parametrize("precision", ["float32", "bfloat16"])
 @pytest.mark.parametrize("counts", [{"psm": 1}, COUNTS])
-@pytest.mark.parametrize("algo", ["mappo", "ippo", "joint"])
+@pytest.mark.parametrize("algo", list_algorithms())
 def test_options_go_together(
     algo: Any, counts: dict[str, int], precision: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -242,8 +245,7 @@ def test_a_nan_reward_names_its_term(tmp_path: Path, fakes: list[Any], monkeypat
 
 
 def test_a_nan_loss_stops(tmp_path: Path, fakes: list[Any], monkeypatch: pytest.MonkeyPatch) -> None:
-    losses = torch.tensor([math.nan, 0.0, 0.0, 0.0, 0.0])
-    monkeypatch.setattr(trainer.MAPPO, "learn", lambda self: losses)
+    monkeypatch.setattr(Algorithm, "conclude", lambda self: self.losses.fill_(math.nan))
     with pytest.raises(FloatingPointError, match="learning_rate"):
         train.train(SMALL, out=tmp_path / "run")
     assert read_checkpoint(tmp_path / "run")["iteration"] == 0

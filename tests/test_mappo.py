@@ -17,7 +17,10 @@ from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 
 from surgical_marl.interfaces.rsl_rl import RslRlVecEnv
-from surgical_marl.learning.mappo import MAPPO, rsl_rl_config
+from surgical_marl.learning.algorithm import Algorithm
+from surgical_marl.learning.algorithms.mappo import MAPPO
+from surgical_marl.learning.configuration import rsl_rl_config
+from surgical_marl.plugins.algorithms import ALGORITHMS
 from surgical_marl.policies.layout import Layout
 from surgical_marl.runs.settings import NetworkSettings, PPOSettings, Settings
 from tests.helpers.fake_env import FakeEnv
@@ -32,16 +35,17 @@ SETTINGS = Settings(
 )
 
 
-def build(counts: dict[str, int], settings: Settings = SETTINGS, max_steps: int = 5) -> tuple[RslRlVecEnv, MAPPO]:
+def build(counts: dict[str, int], settings: Settings = SETTINGS, max_steps: int = 5) -> tuple[RslRlVecEnv, Algorithm]:
     torch.manual_seed(1)
     fake: Any = FakeEnv(counts, SIZES, settings.num_envs, max_steps)
-    env = RslRlVecEnv(fake, joint=settings.algo == "joint", seed=3)
-    algorithm = MAPPO.construct_algorithm(env.get_observations(), env, rsl_rl_config(settings), "cpu")
+    cls = ALGORITHMS.load(settings.algo)
+    env = RslRlVecEnv(fake, grouping=cls.grouping, seed=3)
+    algorithm = cls.construct_algorithm(env.get_observations(), env, rsl_rl_config(settings), "cpu")
     algorithm.train_mode()
     return env, algorithm
 
 
-def roll_out(env: RslRlVecEnv, algorithm: MAPPO) -> list[dict[str, Any]]:
+def roll_out(env: RslRlVecEnv, algorithm: Algorithm) -> list[dict[str, Any]]:
     seen = []
     with torch.inference_mode():
         observations = env.get_observations()
@@ -54,7 +58,7 @@ def roll_out(env: RslRlVecEnv, algorithm: MAPPO) -> list[dict[str, Any]]:
     return seen
 
 
-def move_weights(algorithm: MAPPO) -> None:
+def move_weights(algorithm: Algorithm) -> None:
     """Change the policy, so that ratios differ from 1 and some are clipped."""
     torch.manual_seed(2)
     with torch.no_grad():
@@ -62,7 +66,7 @@ def move_weights(algorithm: MAPPO) -> None:
             parameter += 0.05 * torch.randn_like(parameter)
 
 
-def paper_loss(env: RslRlVecEnv, algorithm: MAPPO, clip: float, entropy_coefficient: float) -> torch.Tensor:
+def paper_loss(env: RslRlVecEnv, algorithm: Algorithm, clip: float, entropy_coefficient: float) -> torch.Tensor:
     """Equation by equation, one agent after the other, with the weights of `algorithm`."""
     store, layout = algorithm.storage, env.layout
     critic, actor = algorithm.critic.mlp, algorithm.actor
@@ -94,7 +98,7 @@ def paper_loss(env: RslRlVecEnv, algorithm: MAPPO, clip: float, entropy_coeffici
     return -torch.stack(surrogates).mean() + value_loss - entropy_coefficient * entropy
 
 
-def gradients(algorithm: MAPPO) -> torch.Tensor:
+def gradients(algorithm: Algorithm) -> torch.Tensor:
     parameters = [*algorithm.actor.parameters(), *algorithm.critic.parameters()]
     return torch.cat([parameter.grad.flatten() for parameter in parameters])
 
@@ -271,7 +275,7 @@ def test_vec_env_stacks_types_and_reports_the_finished_step() -> None:
 
 def test_joint_layout_sums_rewards_and_keeps_action_order() -> None:
     fake: Any = FakeEnv({"psm": 2, "ecm": 1}, SIZES, num_envs=4)
-    layout = Layout(fake, joint=True)
+    layout = Layout(fake, "joint")
     rewards = layout.rewards(
         {agent: torch.full((4,), value) for agent, value in zip(fake.agents, (1.0, 2.0, 4.0), strict=True)}
     )

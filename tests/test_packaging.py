@@ -153,7 +153,7 @@ DEFERRED = """
 from surgical_marl.runtime import defer_compiler
 defer_compiler()
 import sys, torch
-from surgical_marl.learning.mappo import MAPPO
+from surgical_marl.learning.algorithms.mappo import MAPPO
 optimizer = torch.optim.Adam([torch.nn.Parameter(torch.ones(2))])
 optimizer.zero_grad()
 optimizer.step()

@@ -22,6 +22,7 @@ from tensordict import TensorDict
 from surgical_marl import content
 from surgical_marl.evaluation import card, command, export
 from surgical_marl.learning import train
+from surgical_marl.plugins.algorithms import ALGORITHMS
 from surgical_marl.policies import policy
 from surgical_marl.policies.layout import Layout
 from surgical_marl.policies.onnx_file import write_onnx
@@ -193,7 +194,7 @@ def test_onnx_acts_as_torch_does(env: Any, algo: Any, recurrent: Any, tmp_path: 
     """For random observations, pictures and memories of any number of agents at once."""
     torch.manual_seed(0)
     network = NetworkSettings(hidden=(16,), recurrent=recurrent)
-    layout = Layout(env, joint=algo == "joint")
+    layout = Layout(env, ALGORITHMS.load(algo).grouping)
     actor = policy._actor(replace(SMALL, algo=algo, network=network), env, layout)
     with torch.no_grad():
         for model in actor.models.values():  # fresh networks hardly act: so that some actions are beyond 1

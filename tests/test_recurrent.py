@@ -11,6 +11,7 @@ import torch
 
 from surgical_marl.evaluation.evaluate import evaluate
 from surgical_marl.learning import train
+from surgical_marl.plugins.algorithms import list_algorithms
 from surgical_marl.policies.acting import forget
 from surgical_marl.policies.policy import load_policy, zero_policy
 from surgical_marl.runs.settings import NetworkSettings, PPOSettings, Settings
@@ -50,7 +51,7 @@ def by_hand(model: Any, seen: torch.Tensor, memory: torch.Tensor, dones: torch.T
     return torch.stack(outputs)
 
 
-@pytest.mark.parametrize("algo", ["mappo", "ippo", "joint"])
+@pytest.mark.parametrize("algo", list_algorithms())
 @pytest.mark.parametrize("kind", ["gru", "lstm"])
 @pytest.mark.parametrize("counts", [{"psm": 1}, TEAM])
 def test_ratios_begin_at_one(kind: str, algo: Any, counts: dict[str, int]) -> None:

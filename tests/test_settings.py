@@ -79,7 +79,7 @@ def test_the_shipped_settings_load() -> None:
         ("ppo.gamma=1.5", "ppo.gamma must be a number from 0 to 1, not 1.5"),
         ("ppo.gamma=nan", "ppo.gamma must be a number"),
         ("ppo.gamma=fast", "ppo.gamma must be a number from 0 to 1, not 'fast'"),
-        ("algo=qmix", "algo must be one of mappo, ippo, joint, not 'qmix'"),
+        ("algo=qmix", r"unknown algorithm 'qmix' \(choose from .*happo, ippo, joint, mappo"),
         ("team_reward=1", "team_reward must be true or false, not 1"),
         ("network.hidden=[]", "network.hidden must be a list of whole numbers"),
         ("network.hidden=[8, x]", "network.hidden must be a whole number"),

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 
-from surgical_marl.learning.mappo import MAPPO
+from surgical_marl.learning.algorithm import Algorithm
 from surgical_marl.learning.values import DECAY, LEAST_STD, ValueScale
 from tests.test_mappo import SETTINGS, build, gradients, roll_out
 
@@ -71,7 +71,7 @@ def test_advantages_and_losses_are_of_restored_values() -> None:
     torch.testing.assert_close(value_loss, expected, rtol=1e-4, atol=1e-6)
 
 
-def updated(unit: float, settings: Any) -> tuple[MAPPO, torch.Tensor]:
+def updated(unit: float, settings: Any) -> tuple[Algorithm, torch.Tensor]:
     """An algorithm after an update, and its last gradients, where a reward of 1 is worth `unit`."""
     env, algorithm = build({"psm": 2, "ecm": 1}, settings)
     step = env.step

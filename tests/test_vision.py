@@ -35,14 +35,14 @@ def made(scene: str, arrays: str = "torch") -> BatchedEnv:
     return BatchedEnv("match_image", scene, num_envs=8, max_steps=8, arrays=arrays)
 
 
-@pytest.mark.parametrize("joint", [False, True])
-def test_networks_are_shown_both_pictures_channels_first(joint: bool) -> None:
+@pytest.mark.parametrize("grouping, seer", [("type", "ecm"), ("agent", "ecm_0"), ("joint", "joint")])
+def test_networks_are_shown_both_pictures_channels_first(grouping: Any, seer: str) -> None:
     env = made("trimanual_psm_ecm")
     observations, *_ = env.reset(0)
-    groups = Layout(env, joint=joint).stack(observations)
-    names = {"joint", "joint_pictures"} if joint else {"psm", "ecm", "ecm_pictures"}
-    assert set(groups) == names
-    pictures = groups["joint_pictures" if joint else "ecm_pictures"]
+    layout = Layout(env, grouping)
+    groups = layout.stack(observations)
+    assert set(groups) == {*layout.counts, f"{seer}_pictures"}
+    pictures = groups[f"{seer}_pictures"]
     assert pictures.shape == (8, 1, 6, 64, 64) and pictures.dtype == torch.uint8
     for place, name in enumerate(("image", "target")):
         shown = pictures[:, 0, 3 * place : 3 * place + 3]

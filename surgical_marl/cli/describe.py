@@ -1,8 +1,11 @@
-"""What `surgical-marl list -v` says of scenes, arms, tasks and policies."""
+"""What `surgical-marl list -v` says of scenes, arms, tasks, algorithms and policies."""
 
 from __future__ import annotations
 
+import inspect
+
 from surgical_marl.content import list_arms, list_scenes
+from surgical_marl.plugins.algorithms import ALGORITHMS, list_algorithms
 from surgical_marl.plugins.tasks import TASKS, list_tasks
 from surgical_marl.robots.arm import load_arm
 from surgical_marl.scenes.load import load_scene
@@ -16,6 +19,7 @@ def describe(kind: str) -> str:
         "tasks": lambda: [_task(name) for name in list_tasks()],
         "scenes": lambda: [_scene(load_scene(name)) for name in list_scenes()],
         "arms": lambda: [_arm(name) for name in list_arms()],
+        "algorithms": lambda: [_algorithm(name) for name in list_algorithms()],
         "policies": _policies,
     }[kind]()
     return "\n".join(lines)
@@ -53,3 +57,12 @@ def _task(name: str) -> str:
         return f"{name:14} {TASKS.load(name).summary()}"
     except ValueError as error:  # one that can't be imported keeps no one from the others
         return f"{name:14} {error}"
+
+
+def _algorithm(name: str) -> str:
+    """Return what an algorithm is, or why it cannot be had: a package that is broken leaves the others alone."""
+    try:
+        documentation = inspect.getdoc(ALGORITHMS.load(name)) or ""
+    except ValueError as error:
+        return f"{name:14} {error}"
+    return f"{name:14} {documentation.partition(chr(10))[0]}"

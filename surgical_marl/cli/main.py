@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from surgical_marl.content import BASELINES, find, list_arms, list_policies, list_scenes, unknown
+from surgical_marl.plugins.algorithms import list_algorithms
 from surgical_marl.plugins.tasks import list_tasks
 from surgical_marl.runtime import defer_compiler
 from surgical_marl.tasks.base.options import choices
@@ -21,19 +22,21 @@ _LISTS = {
     "tasks": list_tasks,
     "scenes": list_scenes,
     "arms": list_arms,
+    "algorithms": list_algorithms,
     "policies": list_policies,
 }
 
-_ALGOS = ("mappo", "ippo", "joint")
 _CONTROL = choices("control")
 _DEVICES = ("auto", "cpu", "cuda")
 _ENGINES = ("auto", "fused", "mjx")
 _BENCHED = ("all", "fused", "mjx", "mujoco")
 _MOTIONS = ("random", "rough")
 
+_ALGO = "learning algorithm (see `list algorithms`)"
+
 # Flags of `train` that are short for `key=value`: key, good values or a placeholder, help.
 _SETTINGS: tuple[tuple[str, str | tuple[str, ...], str], ...] = (
-    ("algo", _ALGOS, "who learns from what"),
+    ("algo", "NAME", _ALGO),
     ("num_envs", "N", "environments that run side by side"),
     ("iterations", "K", "rounds of acting and learning"),
     ("seed", "S", "seed of everything random"),
@@ -133,7 +136,7 @@ def _parser() -> argparse.ArgumentParser:
     evaluate.add_argument("--figure", type=Path, metavar="FILE.png", help="success against threshold, and the errors")
     evaluate.set_defaults(command=_eval, name="eval")
 
-    names = commands.add_parser("list", help="list tasks, scenes, arms and policies")
+    names = commands.add_parser("list", help="list tasks, scenes, arms, algorithms and policies")
     names.add_argument("kind", nargs="?", type=_one_of(tuple(_LISTS)), metavar="|".join(_LISTS))
     names.add_argument("-v", "--verbose", action="store_true", help="what each one is")
     names.set_defaults(command=_list, name="list")
@@ -170,7 +173,7 @@ def _parser() -> argparse.ArgumentParser:
     for kind, what in (("train", "steps/s with learning"), ("solve", "seconds until a policy is good")):
         learns = _bench_parser(kinds, kind, what, _ENGINES)
         learns.usage = "%(prog)s [options] [key=value ...]"
-        learns.add_argument("--algo", type=_one_of(_ALGOS), metavar="|".join(_ALGOS), help="who learns from what")
+        learns.add_argument("--algo", metavar="NAME", help=_ALGO)
         learns.add_argument("--seed", type=whole(0), metavar="S", help="seed of everything random")
     learns.add_argument("--success", type=float, default=0.95, metavar="SHARE", help="wanted within 2 mm")
     learns.add_argument("--collisions", type=float, default=0.01, metavar="SHARE", help="of episodes, to stay below")
@@ -215,7 +218,7 @@ def _list(arguments: argparse.Namespace) -> None:
         print("\n".join(_LISTS[arguments.kind]()))
         return
     for kind, names in _LISTS.items():
-        print(f"{kind:9} {', '.join(names()) or '-'}")
+        print(f"{kind:10} {', '.join(names()) or '-'}")
 
 
 def _check(arguments: argparse.Namespace) -> int:

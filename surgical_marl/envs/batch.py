@@ -93,7 +93,7 @@ class BatchedEnv:
         self.engine = make_engine(self.env, num_envs, engine, device)
         self.num_envs, self.arrays = num_envs, arrays
         self.agents = list(self.env.agents)
-        self.types = {name: list(agents) for name, agents in self.env.scene.types.items()}
+        self.types = self._types()
         self.task, self.task_name, self.scene, self.control = (
             self.env.task,
             task,
@@ -121,6 +121,17 @@ class BatchedEnv:
         self.__init__(**state["made"])  # type: ignore[misc]
         if state["carry"] is not None:
             self.set_carry(state["carry"])
+
+    def _types(self) -> dict[str, list[str]]:
+        """Agents whose arms are alike and that observe alike, by the name of their arms' type."""
+        found: dict[str, list[str]] = {}
+        for name, agents in self.env.scene.types.items():
+            kinds: dict[Any, list[str]] = {}
+            for agent in agents:
+                seen = self.env.observed[agent]
+                kinds.setdefault((seen.names, tuple(seen.pictures)), []).append(agent)
+            found |= {name if k == 0 else f"{name}-seeing-{k + 1}": list(own) for k, own in enumerate(kinds.values())}
+        return found
 
     def observation_terms(self, agent: str) -> dict[str, slice]:
         """Return the names of what an agent observes, and where each stands in its vector.

@@ -14,7 +14,7 @@ from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 from torch import Tensor
 
-from surgical_marl.policies.layout import Layout
+from surgical_marl.policies.layout import Grouping, Layout
 
 if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv
@@ -23,17 +23,19 @@ if TYPE_CHECKING:
 class RslRlVecEnv(VecEnv):
     """A `BatchedEnv` (made with `arrays="torch"`) as an `rsl_rl.env.VecEnv`.
 
-    Observations are a TensorDict of batch size [N]: one group `[N, n, d]` for each agent type (see
-    `Layout`) and "state" `[N, S]`. The environment is reset once, here; `get_observations` neither
-    resets nor steps.
+    Observations are a TensorDict of batch size [N]: one group `[N, n, d]` for each agent type, or as `grouping` says
+    (see `Layout`), and "state" `[N, S]`. The environment is reset once, here; `get_observations` neither resets nor
+    steps.
 
     Attributes:
         reward_terms: names of the weighted terms in the infos that the rewards are the sum of.
     """
 
-    def __init__(self, env: BatchedEnv, *, joint: bool = False, seed: int | None = None, first: int = 0) -> None:
+    def __init__(
+        self, env: BatchedEnv, *, grouping: Grouping = "type", seed: int | None = None, first: int = 0
+    ) -> None:
         self.env = env
-        self.layout = Layout(env, joint=joint)
+        self.layout = Layout(env, grouping)
         self.num_envs = env.num_envs
         self.num_actions = self.layout.num_actions
         self.max_episode_length = env.max_steps

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from surgical_marl.machine import free_memory
+from surgical_marl.plugins.algorithms import ALGORITHMS
 from surgical_marl.policies.layout import Layout
 from surgical_marl.policies.policy import zeros
 from surgical_marl.runs.settings import Settings
@@ -21,7 +22,7 @@ def rollout_bytes(settings: Settings, env: BatchedEnv) -> int:
     """What a stored rollout takes of memory for one environment: its steps, each with the observations and the state;
     actions, their means and deviations; and of each agent log-probability and advantage, and of its reward, and cost if
     that is bounded, value and return."""
-    layout = Layout(env, joint=settings.algo == "joint")
+    layout = Layout(env, ALGORITHMS.load(settings.algo).grouping)
     seen = layout.stack({agent: zeros(env.observation_space(agent)) for agent in layout.agents})
     parts = [*seen.values(), zeros(env.state_space)]
     observed = sum(part.numel() * part.element_size() for part in parts)

@@ -52,7 +52,7 @@ class MultiAgentStorage(RolloutStorage):
             num_mini_batches: in an epoch, each of other environments.
             num_epochs: with the same mini-batches, as rsl_rl does.
         """
-        begins = torch.cat([torch.zeros_like(self.dones[:1]), self.dones[:-1]]).squeeze(-1).bool()
+        begins = self.begins()
         order = torch.randperm(self.num_envs, device=self.device)
         for _ in range(num_epochs):
             for chosen in order.split(self.num_envs // num_mini_batches)[:num_mini_batches]:
@@ -67,6 +67,10 @@ class MultiAgentStorage(RolloutStorage):
                     hidden_states=(begun[0][chosen], begun[1][chosen]),
                     masks=begins[:, chosen],
                 )
+
+    def begins(self) -> Tensor:
+        """Return where in the rollout an episode begins, `[T, N]` bool: nowhere in its first step."""
+        return torch.cat([torch.zeros_like(self.dones[:1]), self.dones[:-1]]).squeeze(-1).bool()
 
     def compute_returns(self, last_values: Tensor, gamma: float, lam: float) -> None:
         """Generalised advantage estimation (Schulman et al. 2016, arXiv 1506.02438): `returns` of the full storage.

@@ -12,10 +12,12 @@ from torch import Tensor
 
 from surgical_marl.interfaces.rsl_rl import RslRlVecEnv
 from surgical_marl.learning import distributed, faults
+from surgical_marl.learning.algorithm import LOSSES, Algorithm
+from surgical_marl.learning.configuration import rsl_rl_config
 from surgical_marl.learning.constraint import METRICS
 from surgical_marl.learning.episodes import ENDED, Episodes
 from surgical_marl.learning.graphs import Replayed
-from surgical_marl.learning.mappo import LOSSES, MAPPO, rsl_rl_config
+from surgical_marl.plugins.algorithms import ALGORITHMS
 from surgical_marl.runs.settings import Settings
 
 if TYPE_CHECKING:
@@ -41,8 +43,8 @@ class Report(NamedTuple):
 class Trainer:
     """A run in memory, or the part of it that is in this process (see `distributed`).
 
-    On a GPU with the fused engine a rollout is one CUDA graph and so is an update: `rollout`, `update` and `iterate`
-    enqueue their work and return before it is done.
+    On a GPU with the fused engine a rollout is one CUDA graph, and an update is one for each of its parts: `rollout`,
+    `update` and `iterate` enqueue their work and return before it is done.
 
     Args:
         settings: the run.
@@ -61,14 +63,15 @@ class Trainer:
         self.iteration, self.env_steps = 0, 0
         self.stop_wanted = self.stopping = False
         first = distributed.rank() * env.num_envs
-        self.env = RslRlVecEnv(env, joint=settings.algo == "joint", seed=settings.seed, first=first)
+        algorithm: type[Algorithm] = ALGORITHMS.load(settings.algo)
+        self.env = RslRlVecEnv(env, grouping=algorithm.grouping, seed=settings.seed, first=first)
         device = str(self.env.device)
         self._cuda = device.startswith("cuda")
         if self._cuda:
             torch.set_float32_matmul_precision("highest" if settings.precision == "float32" else "high")
         # Where each rollout begins and ends: a graph finds its observations at one place.
         self._observations = self.env.get_observations().clone()
-        self.algorithm = MAPPO.construct_algorithm(self._observations, self.env, rsl_rl_config(settings), device)
+        self.algorithm = algorithm.construct_algorithm(self._observations, self.env, rsl_rl_config(settings), device)
         self.algorithm.train_mode()
         if distributed.size() > 1:
             self.algorithm.broadcast_parameters()
@@ -76,7 +79,7 @@ class Trainer:
         terms = self.env.reward_terms
         self.episodes = Episodes(env.agents, terms, self.env.layout.num_agents, env.num_envs, device)
         self._bounded = METRICS if self.algorithm.constraint is not None else ()
-        # What `_update` gathers, in order.
+        # What `_gather_values` puts together, in order.
         self._names: dict[str, Sequence[str]] = {
             "episodes": ENDED[:-1],
             "rewards": [ENDED[-1], *terms],
@@ -95,7 +98,14 @@ class Trainer:
         self._samples = settings.steps_per_iteration * env.num_envs * distributed.size()
         self._read = 0.0
         self.rollout = Replayed(self._rollout, enabled=self._cuda and self.env.capturable)
-        self.update = Replayed(self._update, enabled=self._cuda)
+        self._parts = [Replayed(part, enabled=self._cuda) for part in self.algorithm.parts()]
+        self._gather = Replayed(self._gather_values, enabled=self._cuda)
+
+    def update(self) -> None:
+        """Learn from the rollout, part by part in the order that the algorithm draws; and gather what `row` reads."""
+        for index in self.algorithm.order():
+            self._parts[index]()
+        self._gather()
 
     def iterate(self) -> Report:
         """One rollout and one update; `row` reads its report."""
@@ -115,7 +125,8 @@ class Trainer:
     def close(self) -> None:
         """Let the CUDA graphs go."""
         self.rollout.release()
-        self.update.release()
+        for graph in (*self._parts, self._gather):
+            graph.release()
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -181,12 +192,11 @@ class Trainer:
             columns = faults.mark_columns(stored.observations, observations)
             self._marks.copy_(torch.cat([columns, faults.mark([stored.values, stored.returns])]))
 
-    def _update(self) -> None:
-        """Learns from the rollout, and gathers what `row` reads."""
-        losses = self.algorithm.learn()
+    def _gather_values(self) -> None:
+        """Put together what `row` reads."""
         std = self.algorithm.actor.output_std.detach().mean()
         weights = torch.stack([weight.detach().sum() for _, weight in self._weights()])
-        parts = [self.episodes.take(), losses]
+        parts = [self.episodes.take(), self.algorithm.losses]
         if self.algorithm.constraint is not None:
             parts.append(self.algorithm.constraint.metrics())
         self._values.copy_(torch.cat([*parts, std[None], self._stop, self._marks, weights]))

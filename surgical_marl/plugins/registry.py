@@ -92,7 +92,7 @@ class Registry:
             where = f"the package {point.dist.name}" if point.dist else point.value
             found.setdefault(point.name, []).append(Source(where, point.load))
         for name, cls in self._registered.items():
-            found.setdefault(name, []).append(Source(_where(cls), partial(_same, cls)))
+            found.setdefault(name, []).append(Source(_where(cls), partial(_itself, cls)))
         return found
 
     @cached_property
@@ -111,10 +111,10 @@ class Registry:
         return cls
 
 
+def _itself(cls: type) -> type:
+    return cls
+
+
 def _where(cls: Any) -> str:
     """Return the place of a class that a program defines."""
     return f"{getattr(cls, '__module__', 'this program')}.{getattr(cls, '__qualname__', cls)}"
-
-
-def _same(cls: type) -> type:
-    return cls

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import torch
@@ -15,31 +15,44 @@ if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv
 
 
-class Layout:
-    """How the agents of an environment are stacked into groups.
+FURTHEST = 0.3
+"""Depth beyond this, m, looks the same to a network: an endoscope stands nearer to what it looks at."""
+Grouping = Literal["type", "agent", "joint"]
+GROUPINGS: tuple[Grouping, ...] = ("type", "agent", "joint")
 
-    Each agent type is a group `[..., n, d]`; where a type has several agents, each sees a one-hot
-    of its place among them, since they share one network. With `joint=True` there is one group,
-    "joint", of one agent that observes and moves all arms.
+
+class Layout:
+    """How the agents of an environment are stacked into groups, one network each.
+
+    By "type", agents of an arm type are one group `[..., n, d]`; where a type has several agents, each sees a one-hot
+    of its place among them, since they share one network. By "agent", each agent is a group of its own. "joint" is
+    one group of one agent, which observes and moves all arms.
+
+    Args:
+        env: the environment of the agents.
+        grouping: "type", "agent" or "joint".
 
     Attributes:
-        agents: every arm, in the order of groups; this is the order of the flat joint action.
+        agents: every arm, type by type; this is the order of the flat joint action.
+        groups: the arms of each group.
         counts: agents acting in each group.
         action_sizes: width of the action of one agent of each group.
     """
 
-    def __init__(self, env: BatchedEnv, *, joint: bool = False) -> None:
-        self.joint = joint
-        self.types = {name: list(members) for name, members in env.types.items()}
-        self.agents = [agent for members in self.types.values() for agent in members]
-        self._widths = [int(np.prod(env.action_space(agent).shape)) for agent in self.agents]
-        if joint:
+    def __init__(self, env: BatchedEnv, grouping: Grouping = "type") -> None:
+        self.grouping = grouping
+        types = {name: list(members) for name, members in env.types.items()}
+        self.agents = [agent for members in types.values() for agent in members]
+        widths = {agent: int(np.prod(env.action_space(agent).shape)) for agent in self.agents}
+        self._widths = list(widths.values())
+        if grouping == "joint":
+            self.groups = {"joint": self.agents}
             self.counts = {"joint": 1}
             self.action_sizes = {"joint": sum(self._widths)}
         else:
-            width = dict(zip(self.agents, self._widths, strict=True))
-            self.counts = {name: len(members) for name, members in self.types.items()}
-            self.action_sizes = {name: width[members[0]] for name, members in self.types.items()}
+            self.groups = types if grouping == "type" else {agent: [agent] for agent in self.agents}
+            self.counts = {name: len(members) for name, members in self.groups.items()}
+            self.action_sizes = {name: widths[members[0]] for name, members in self.groups.items()}
 
     @property
     def num_agents(self) -> int:
@@ -52,22 +65,23 @@ class Layout:
         return sum(self._widths)
 
     def stack(self, observations: Mapping[str, Any]) -> dict[str, Tensor]:
-        """Observations of agents `[..., d]` -> groups `[..., n, d]`, and of an agent that sees pictures also a group
-        "<name>_pictures" `[..., 1, 6, H, W]` uint8: what it sees, and what it should see.
+        """Observations of agents `[..., d]` -> groups `[..., n, d]`, and of agents that see pictures also a group
+        "<name>_pictures" `[..., n, C, H, W]`: all pictures of an agent, one behind the other.
 
         Always a copy: an engine may reuse its buffers.
         """
         groups = {}
-        for name, members in ({"joint": self.agents} if self.joint else self.types).items():
+        for name, members in self.groups.items():
             felt = [proprioception(observations[agent]) for agent in members]
-            groups[name] = torch.cat(felt, -1).unsqueeze(-2) if self.joint else self._stack_type(felt)
-            for agent in members:
-                if isinstance(observations[agent], Mapping):
-                    groups[f"{name}_pictures"] = _picture(observations[agent])
+            groups[name] = torch.cat(felt, -1).unsqueeze(-2) if self.grouping == "joint" else self._stack_group(felt)
+            seen = [_pictures(observations[agent]) for agent in members if isinstance(observations[agent], Mapping)]
+            if seen:
+                pictures = torch.cat(seen, -3).unsqueeze(-4) if self.grouping == "joint" else torch.stack(seen, -4)
+                groups[f"{name}_pictures"] = pictures.contiguous()
         return groups
 
     @staticmethod
-    def _stack_type(members: list[Tensor]) -> Tensor:
+    def _stack_group(members: list[Tensor]) -> Tensor:
         stacked = torch.stack(members, -2)
         count = len(members)
         if count == 1:
@@ -82,9 +96,15 @@ class Layout:
     def rewards(self, rewards: Mapping[str, Tensor]) -> Tensor:
         """Rewards of arms `[N]` -> of acting agents `[N, A]`; a joint agent gets the sum."""
         stacked = torch.stack([rewards[agent] for agent in self.agents], -1)
-        return stacked.sum(-1, keepdim=True) if self.joint else stacked
+        return stacked.sum(-1, keepdim=True) if self.grouping == "joint" else stacked
 
 
-def _picture(observation: Mapping[str, Tensor]) -> Tensor:
-    """Both pictures [..., H, W, 3] one behind the other, channels first: [..., 1, 6, H, W]."""
-    return torch.cat([observation["image"], observation["target"]], -1).movedim(-1, -3).unsqueeze(-4).contiguous()
+def _pictures(observation: Mapping[str, Tensor]) -> Tensor:
+    """The pictures [..., H, W, c] of an agent one behind the other, channels first: [..., C, H, W].
+
+    Colours stay uint8. Depth is brought to their scale, 0 to 255 at `FURTHEST`, and all are float32 then.
+    """
+    parts = [picture for name, picture in observation.items() if name != "proprioception"]
+    scaled = [part if part.dtype == torch.uint8 else part.clamp(max=FURTHEST) * (255 / FURTHEST) for part in parts]
+    alike = scaled if len({part.dtype for part in scaled}) == 1 else [part.float() for part in scaled]
+    return torch.cat(alike, -1).movedim(-1, -3)

@@ -107,6 +107,15 @@ class MultiAgentActor(MultiAgentModel):
                 policy.mlp[-1].weight.mul_(OUTPUT_GAIN)
                 policy.mlp[-1].bias.zero_()
 
+    def alone(self, group: str) -> MultiAgentActor:
+        """Return an actor of one group only, with the same network."""
+        actor = MultiAgentActor.__new__(MultiAgentActor)
+        nn.Module.__init__(actor)
+        actor.counts, actor.outputs = {group: self.counts[group]}, {group: self.outputs[group]}
+        actor.models = nn.ModuleDict({group: self.models[group]})
+        actor.is_recurrent = self.is_recurrent
+        return actor
+
     def distribute(
         self, observations: TensorDict, masks: Tensor | None = None, hidden_state: Tensor | None = None
     ) -> None:
@@ -144,11 +153,11 @@ class MultiAgentActor(MultiAgentModel):
 
 
 class Gaussian(GaussianDistribution):
-    """rsl_rl's, in float32 whatever the network computed in."""
+    """rsl_rl's, in float32 at least whatever the network computed in."""
 
     def update(self, mlp_output: Tensor) -> None:
         """Take the mean from the network's output."""
-        super().update(mlp_output.float())
+        super().update(mlp_output.to(torch.promote_types(mlp_output.dtype, torch.float32)))
 
     def sample(self) -> Tensor:
         """As torch's, which has the host look whether a standard deviation is negative."""

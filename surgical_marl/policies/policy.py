@@ -19,7 +19,7 @@ from torch import Tensor
 from surgical_marl.content import content_dir, list_policies
 from surgical_marl.envs.observations import each, proprioception
 from surgical_marl.policies.acting import Policy
-from surgical_marl.policies.layout import Layout
+from surgical_marl.policies.layout import GROUPINGS, Grouping, Layout
 from surgical_marl.policies.networks import MultiAgentActor, actor_config
 from surgical_marl.policies.oracle import oracle
 from surgical_marl.policies.recurrent import cleared
@@ -59,7 +59,7 @@ def load_actor(run: str | Path, env: BatchedEnv) -> tuple[MultiAgentActor, Layou
     folder = find_run(run)
     settings = read_settings(folder)
     trained, state = _read(folder)
-    layout = Layout(env, joint=settings.algo == "joint")
+    layout = _layout(env, trained)
     if (wanted := _groups(env, layout)) != trained:
         raise ValueError(
             f"the policy in {run} was trained in scene {settings.scene!r}, whose agents "
@@ -73,10 +73,16 @@ def load_actor(run: str | Path, env: BatchedEnv) -> tuple[MultiAgentActor, Layou
     return actor, layout
 
 
-def untrained_policy(env: BatchedEnv, settings: Settings | None = None) -> Policy:
-    """The policy that a run with these settings starts from: fresh weights, to compare with."""
+def untrained_policy(env: BatchedEnv, settings: Settings | None = None, grouping: Grouping = "type") -> Policy:
+    """The policy that a run with these settings starts from: fresh weights, to compare with.
+
+    Args:
+        env: the environment that the policy will act in.
+        settings: of the run; they decide the networks.
+        grouping: of the run's algorithm (see `Layout`).
+    """
     settings = settings or Settings()
-    layout = Layout(env, joint=settings.algo == "joint")
+    layout = Layout(env, grouping)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.seed)
         return acting_policy(_actor(settings, env, layout), layout, str(env.device))
@@ -124,6 +130,12 @@ def zeros(space: Any) -> Any:
     if hasattr(space, "spaces"):
         return {name: zeros(part) for name, part in space.spaces.items()}
     return torch.from_numpy(np.zeros((1, *space.shape), space.dtype))
+
+
+def _layout(env: BatchedEnv, trained: Mapping[str, list[int]]) -> Layout:
+    """Return the layout whose groups are those that were trained, or nearest to them."""
+    layouts = [Layout(env, grouping) for grouping in GROUPINGS]
+    return max(layouts, key=lambda layout: (_groups(env, layout) == trained, len(layout.groups.keys() & trained)))
 
 
 def _groups(env: BatchedEnv, layout: Layout) -> dict[str, list[int]]:

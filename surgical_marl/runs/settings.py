@@ -11,6 +11,7 @@ from typing import Any, ClassVar, Literal, get_type_hints
 import yaml
 
 from surgical_marl.content import content_dir, unknown
+from surgical_marl.plugins.algorithms import ALGORITHMS
 from surgical_marl.runtime import has_cuda
 from surgical_marl.tasks.base.options import Checked, Options, as_mapping, number
 
@@ -66,13 +67,12 @@ class NetworkSettings(Checked):
 class Settings(Options):
     """One training run: the options of its environment, and how it learns.
 
-    algo: "mappo" (a critic of the whole state), "ippo" (each critic sees what its agent sees) or
-    "joint" (one agent moves all arms). team_reward: every agent gets the sum of all rewards,
-    instead of its own. precision: of the networks' matrix products on a GPU; on a CPU it is
-    always float32.
+    algo: the name of a learning algorithm (see `list_algorithms`); a run can be read where its algorithm is not
+    installed. team_reward: every agent gets the sum of all rewards, instead of its own. precision: of the networks'
+    matrix products on a GPU; on a CPU it is always float32.
     """
 
-    algo: Literal["mappo", "ippo", "joint"] = "mappo"
+    algo: str = "mappo"
     engine: Literal["auto", "mjx", "fused"] = "auto"
     device: Literal["auto", "cpu", "cuda"] = "auto"
     precision: Literal["float32", "tf32", "bfloat16"] = "bfloat16"
@@ -112,7 +112,7 @@ def load_config(task: str, scene: str, overrides: Iterable[str] = ()) -> Setting
             `ppo.learning_rate=1e-3`.
 
     Raises:
-        ValueError: unknown task or key, or a value of the wrong type or out of range.
+        ValueError: unknown task, algorithm or key, or a value of the wrong type or out of range.
     """
     folder = content_dir("configs")
     path = folder / f"{task}.yaml"
@@ -130,7 +130,9 @@ def load_config(task: str, scene: str, overrides: Iterable[str] = ()) -> Setting
     device = _override(_merge(values, own), overrides).get("device", "auto")
     if (on_gpu or own_on_gpu) and (device == "cuda" or (device == "auto" and has_cuda())):
         values, own = _merge(values, on_gpu), _merge(own, own_on_gpu)
-    return _build({**_override(_merge(values, own), overrides), "task": task, "scene": scene})
+    settings = _build({**_override(_merge(values, own), overrides), "task": task, "scene": scene})
+    ALGORITHMS.check(settings.algo)
+    return settings
 
 
 def read_config(path: Path, overrides: Iterable[str] = ()) -> Settings:

@@ -15,8 +15,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, PercentFormatter
 
 from surgical_marl.evaluation.interval import interval
-from surgical_marl.evaluation.metrics import FOLLOWING, SUCCESS_MM, Metric, metrics, success
+from surgical_marl.evaluation.metrics import SUCCESS_MM, Metric, metrics, success
 from surgical_marl.files import write_atomic
+from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.runs.folder import read_metrics, read_origin, read_settings
 from surgical_marl.studies.study_runs import ALGOS, PLAYED, TASK, WHEN, Job
 
@@ -61,7 +62,7 @@ def describe(jobs: Sequence[Job], out: Path) -> dict[str, Any]:
         raise ValueError(f"the runs of {jobs[0].scene} did not play the same goals: play them anew")
     rows = [read_metrics(out / str(job)) for job in jobs]
     settings = read_settings(out / str(jobs[0]))
-    final = metrics(_stacked(played, "untouched"), TASK in FOLLOWING)
+    final = metrics(_stacked(played, "untouched"), TASKS.load(TASK).follows)
     return {
         "scene": jobs[0].scene,
         "algo": jobs[0].algo,

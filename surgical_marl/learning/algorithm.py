@@ -1,15 +1,14 @@
-"""Multi-agent PPO on rsl_rl (Yu et al. 2022, arXiv 2103.01955).
+"""The base of learning algorithms: multi-agent PPO on rsl_rl (Yu et al. 2022, arXiv 2103.01955).
 
-The agent axis lives inside the tensors. Observations of an agent type are `[N, n, d]`, the joint
+The agent axis lives inside the tensors. Observations of a group of agents are `[N, n, d]`, the joint
 action is flat `[N, sum]`, and log-probabilities, values, rewards and advantages are `[N, A]`. With
 one agent (A = 1) this is PPO, by the same code.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import asdict
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, ClassVar, Self
 
 import torch
 from rsl_rl.algorithms import PPO
@@ -23,33 +22,41 @@ from surgical_marl.learning.constraint import Constraint
 from surgical_marl.learning.normaliser import share_normalisers
 from surgical_marl.learning.storage import MultiAgentStorage
 from surgical_marl.learning.values import ValueScale
-from surgical_marl.policies.networks import (
-    MultiAgentActor,
-    MultiAgentModel,
-    actor_config,
-    make_model,
-    network_config,
-)
+from surgical_marl.policies.layout import Grouping
+from surgical_marl.policies.networks import MultiAgentActor, MultiAgentModel, make_model
 from surgical_marl.policies.recurrent import Memory
-from surgical_marl.runs.settings import Settings
 
 LOSSES = ("value_loss", "surrogate_loss", "entropy", "kl", "learning_rate")
 LEARNING_RATE_RANGE = (1e-5, 1e-2)  # rsl_rl's limits of the adaptive learning rate
 
 
-class MAPPO(PPO):
-    """PPO with a ratio for each agent, and a critic with a value for each agent.
+class Algorithm(PPO):
+    """PPO with a ratio for each agent and a value for each agent; a subclass says what it does otherwise.
+
+    A subclass may set `grouping` and `central_critic`, and override `surrogate`, `policy_loss`, `value_loss`, `loss`,
+    `compute_returns`, or `parts` and `order`. Nothing in them may wait for the device: an update is CUDA graphs.
 
     `update` is not rsl_rl's for two reasons: rsl_rl's squeezes are wrong for A = 1, and it waits
-    for the device some hundred times an update where this never waits: a CUDA graph can hold it
-    (see `learn`).
+    for the device some hundred times an update where this never waits.
 
     Args:
+        actor: networks that act, a `MultiAgentActor`.
+        critic: networks with a value for each agent, or two with a constraint.
+        storage: of a rollout.
         team_reward: give every agent the sum of all agents' rewards, instead of its own.
         normalise_values: the critic predicts returns of unit variance; all else is in units of reward.
         constraint: on a cost; the critic then has two values for each agent, of rewards and of costs.
         ppo: arguments of `rsl_rl.algorithms.PPO`.
+
+    Attributes:
+        grouping: which agents share a network: those of a "type", none ("agent"), or "joint" for one agent that moves
+            all arms (see `surgical_marl.policies.layout.Layout`).
+        central_critic: whether the critic sees the whole state, instead of what each agent sees.
+        losses: `LOSSES` of the last update, `[5]`; always at the same place in memory.
     """
+
+    grouping: ClassVar[Grouping] = "type"
+    central_critic: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -76,13 +83,16 @@ class MAPPO(PPO):
         self._rate = torch.tensor(float(self.learning_rate), device=self.device)
         self._cuda = torch.device(self.device).type == "cuda"
         self.optimizer = torch.optim.Adam(self.parameters(), lr=self._rate, fused=True, capturable=self._cuda)
+        self.losses = torch.zeros(len(LOSSES), device=self.device)
+        # Sums over the mini-batches of an update, of all `LOSSES` but the learning rate.
+        self._sums = torch.zeros(len(LOSSES) - 1, device=self.device)
 
     def act(self, obs: TensorDict) -> Tensor:
         """Sample the flat joint action `[N, sum]`."""
         step, memory = self.transition, self.memory
         if self.storage.step == 0:
             memory.begin()
-        with self._precision():
+        with self.precision():
             step.actions = self.actor(obs, None, memory.actor, stochastic_output=True)
             step.actions_log_prob = self.actor.get_output_log_prob(step.actions)
         step.values = self._values(obs)
@@ -111,30 +121,43 @@ class MAPPO(PPO):
         self.memory.clear(dones)
 
     def loss(self, batch: RolloutStorage.Batch) -> tuple[Tensor, Tensor]:
-        """Loss of a mini-batch; and value loss, surrogate loss, entropy and KL, detached `[4]`."""
-        actor_memory, critic_memory = batch.hidden_states
-        self.actor.distribute(batch.observations, batch.masks, actor_memory)
-        log_prob = self.actor.get_output_log_prob(batch.actions)
+        """Return the loss of a mini-batch; and value loss, surrogate loss, entropy and KL, detached `[4]`."""
+        policy, parts = self.policy_loss(self.actor, batch)
+        value = self.value_loss(batch)
+        return policy + self.value_loss_coef * value, torch.cat([value.detach()[None], parts])
+
+    def policy_loss(self, actor: MultiAgentActor, batch: RolloutStorage.Batch) -> tuple[Tensor, Tensor]:
+        """Return the loss of the networks that act; and surrogate loss, entropy and KL, detached `[3]`."""
+        actor.distribute(batch.observations, batch.masks, batch.hidden_states[0])
+        log_prob = actor.get_output_log_prob(batch.actions)
         with torch.no_grad():
-            params = self.actor.output_distribution_params
-            divergence = self.actor.get_kl_divergence(batch.old_distribution_params, params).mean()
-        entropy = self.actor.output_entropy.mean()
-
+            params = actor.output_distribution_params
+            divergence = actor.get_kl_divergence(batch.old_distribution_params, params).mean()
+        entropy = actor.output_entropy.mean()
         ratio = torch.exp(log_prob - batch.old_actions_log_prob)
-        clipped = ratio.clamp(1 - self.clip_param, 1 + self.clip_param)
-        surrogate = -torch.min(batch.advantages * ratio, batch.advantages * clipped).mean()
+        surrogate = -self.surrogate(ratio, batch.advantages).mean()
+        return surrogate - self.entropy_coef * entropy, torch.stack([surrogate, entropy, divergence]).detach()
 
-        values = self.critic(batch.observations, batch.masks, critic_memory)
+    def surrogate(self, ratio: Tensor, advantages: Tensor) -> Tensor:
+        """Return what each action is worth to be made more likely, `[..., A]`: here the clipped one of PPO.
+
+        Args:
+            ratio: of the new probability to the old one, `[..., A]`.
+            advantages: `[..., A]`.
+        """
+        clipped = ratio.clamp(1 - self.clip_param, 1 + self.clip_param)
+        return torch.min(advantages * ratio, advantages * clipped)
+
+    def value_loss(self, batch: RolloutStorage.Batch) -> Tensor:
+        """Return the mean squared error of the critic, clipped if that was asked for, `[]`."""
+        values = self.critic(batch.observations, batch.masks, batch.hidden_states[1])
         returns = self.scale.normalise(batch.returns)
-        value = (values - returns).square()
+        errors = (values - returns).square()
         if self.use_clipped_value_loss:
             old = self.scale.normalise(batch.values)
             near = old + (values - old).clamp(-self.clip_param, self.clip_param)
-            value = torch.max(value, (near - returns).square())
-        value = value.mean()
-
-        loss = surrogate + self.value_loss_coef * value - self.entropy_coef * entropy
-        return loss, torch.stack([value, surrogate, entropy, divergence]).detach()
+            errors = torch.max(errors, (near - returns).square())
+        return errors.mean()
 
     def compute_returns(self, obs: TensorDict) -> None:
         """Returns and normalised advantages of the stored rollout; `obs` is what comes after it."""
@@ -156,44 +179,76 @@ class MAPPO(PPO):
         return losses
 
     def learn(self) -> Tensor:
-        """What `update` does, without waiting for the device: `LOSSES` as a tensor."""
-        total = torch.zeros(4, device=self.device)
-        for batch in self._batches():
-            with self._precision():
+        """Do what `update` does, without waiting for the device; returns `losses`."""
+        parts = self.parts()
+        for index in self.order():
+            parts[index]()
+        return self.losses
+
+    def parts(self) -> Sequence[Callable[[], None]]:
+        """Return the functions that an update consists of.
+
+        Each becomes a CUDA graph: it works in place, with shapes that are always the same, and doesn't wait for the
+        device. What changes from update to update on the host is `order`.
+        """
+        return [self._learn]
+
+    def order(self) -> Sequence[int]:
+        """Draw the order in which the next update calls its `parts`: the same in all processes."""
+        return [0]
+
+    def _learn(self) -> None:
+        for batch in self.batches():
+            with self.precision():
                 loss, parts = self.loss(batch)
-            self.optimizer.zero_grad()
-            loss.backward()
-            divergence = distributed.average_gradients(self.parameters(), parts[-1])
-            if self.schedule == "adaptive":
-                self._adapt_rate(divergence)
-            for model in (self.actor, self.critic):
-                nn.utils.clip_grad_norm_(model.parameters(), self.max_grad_norm)
-            self.optimizer.step()
-            total += parts
-        observations = self.storage.observations.flatten(0, 1)
-        self.actor.update_normalization(observations)
-        self.critic.update_normalization(observations)
-        count = self.num_mini_batches * self.num_learning_epochs
-        return torch.cat([total / count, self._rate[None]])
+            self.descend(loss, parts[-1])
+            self._sums += parts
+        self.conclude()
 
-    def parameters(self) -> list[nn.Parameter]:
-        """All that the optimiser changes."""
-        return [*self.actor.parameters(), *self.critic.parameters()]
-
-    def _batches(self) -> Iterator[RolloutStorage.Batch]:
+    def batches(self) -> Iterator[RolloutStorage.Batch]:
+        """Yield the mini-batches of the stored rollout, all of them in every epoch."""
         counts = (self.num_mini_batches, self.num_learning_epochs)
         if self.actor.is_recurrent:
             return self.storage.sequences(self.memory.begun, *counts)
         return self.storage.mini_batch_generator(*counts)
 
+    def descend(self, loss: Tensor, divergence: Tensor) -> None:
+        """Take a step of the optimiser down the gradient of a loss, with all processes.
+
+        Args:
+            loss: its gradient may be of some of the networks only; the others stay as they are.
+            divergence: KL of the mini-batch, `[]`, which the learning rate adapts to.
+        """
+        self.optimizer.zero_grad()
+        loss.backward()
+        divergence = distributed.average_gradients(self.parameters(), divergence)
+        if self.schedule == "adaptive":
+            self._adapt_rate(divergence)
+        for model in (self.actor, self.critic):
+            nn.utils.clip_grad_norm_(model.parameters(), self.max_grad_norm)
+        self.optimizer.step()
+
+    def conclude(self) -> None:
+        """End an update: the normalisers learn from its observations, and `losses` are written."""
+        observations = self.storage.observations.flatten(0, 1)
+        self.actor.update_normalization(observations)
+        self.critic.update_normalization(observations)
+        count = self.num_mini_batches * self.num_learning_epochs
+        self.losses.copy_(torch.cat([self._sums / count, self._rate[None]]))
+        self._sums.zero_()
+
+    def parameters(self) -> list[nn.Parameter]:
+        """Return all that the optimiser changes."""
+        return [*self.actor.parameters(), *self.critic.parameters()]
+
     def _values(self, obs: TensorDict) -> Tensor:
         """Values of observations, in units of reward."""
-        with self._precision():
+        with self.precision():
             return self.scale.restore(self.critic(obs, None, self.memory.critic))
 
-    def _precision(self) -> torch.autocast:
-        """bfloat16 for the networks' products if that was asked for; the same when acting and learning, or ratios
-        would not begin at 1."""
+    def precision(self) -> torch.autocast:
+        """Within it the networks compute in bfloat16, if that was asked for: the same when acting and learning, or
+        ratios would not begin at 1."""
         enabled = self.use_mixed_precision and self._cuda
         return torch.autocast("cuda" if self._cuda else "cpu", torch.bfloat16, enabled=enabled)
 
@@ -226,19 +281,27 @@ class MAPPO(PPO):
         group["capturable"] = self._cuda  # the checkpoint may come from another kind of device
         return result
 
-    @staticmethod
-    def construct_algorithm(obs: TensorDict, env: RslRlVecEnv, cfg: dict[str, Any], device: str) -> MAPPO:
+    @classmethod
+    def construct_algorithm(cls, obs: TensorDict, env: RslRlVecEnv, cfg: dict[str, Any], device: str) -> Self:
         """Build the algorithm from an rsl_rl configuration (see `rsl_rl_config`), as rsl_rl's
         runner does it.
+
+        Raises:
+            ValueError: the environment's agents are grouped otherwise than for this algorithm.
         """
         layout = env.layout
+        if layout.grouping != cls.grouping:
+            raise ValueError(
+                f"{cls.__name__} learns with agents grouped by {cls.grouping!r}, not {layout.grouping!r}: "
+                f"make the environment with grouping={cls.grouping!r}"
+            )
         options, constraint = dict(cfg["algorithm"]), None
         if bounds := options.pop("constraint"):
             constraint = Constraint(layout, env.num_envs, **bounds).to(device)
         per_agent = 1 if constraint is None else 2
         num_values = per_agent * layout.num_agents
         actor = MultiAgentActor(obs, layout.action_sizes, **cfg["actor"])
-        if cfg["centralised_critic"]:
+        if cls.central_critic:
             critic: nn.Module = make_model(obs, ["state"], num_values, **cfg["critic"])
         else:
             critic = MultiAgentModel(obs, dict.fromkeys(layout.counts, per_agent), **cfg["critic"])
@@ -248,35 +311,4 @@ class MAPPO(PPO):
         sizes = (layout.num_agents, num_values, env.num_envs, steps)
         storage = MultiAgentStorage(*sizes, obs, env.num_actions, device)
         del options["class_name"]
-        return MAPPO(actor.to(device), critic.to(device), storage, constraint=constraint, device=device, **options)
-
-
-def rsl_rl_config(settings: Settings) -> dict[str, Any]:
-    """The settings as a configuration that rsl_rl's own `OnPolicyRunner` also takes."""
-    network, ppo = settings.network, settings.ppo
-    return {
-        "num_steps_per_env": settings.steps_per_iteration,
-        "save_interval": settings.checkpoint_every,
-        "centralised_critic": settings.algo != "ippo",
-        "actor": actor_config(network),
-        "critic": network_config(network),
-        "algorithm": {
-            "class_name": MAPPO,
-            "team_reward": settings.team_reward,
-            "normalise_values": ppo.normalise_values,
-            "constraint": asdict(settings.constraint) if settings.constraint.cost != "none" else None,
-            "learning_rate": ppo.learning_rate,
-            "schedule": ppo.schedule,
-            "desired_kl": ppo.desired_kl,
-            "gamma": ppo.gamma,
-            "lam": ppo.lam,
-            "clip_param": ppo.clip,
-            "use_clipped_value_loss": ppo.clip_value,
-            "num_learning_epochs": ppo.epochs,
-            "num_mini_batches": ppo.mini_batches,
-            "value_loss_coef": ppo.value_coefficient,
-            "entropy_coef": ppo.entropy_coefficient,
-            "max_grad_norm": ppo.max_gradient_norm,
-            "use_mixed_precision": settings.precision == "bfloat16",
-        },
-    }
+        return cls(actor.to(device), critic.to(device), storage, constraint=constraint, device=device, **options)

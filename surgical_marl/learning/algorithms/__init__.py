@@ -1,0 +1,1 @@
+"""The algorithms that ship, a module each; the module's name is the algorithm's."""
