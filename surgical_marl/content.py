@@ -1,10 +1,18 @@
-"""Where the swappable content lives: arms, scenes, configs and policies, by name or by path."""
+"""Where the swappable content lives: arms, scenes, configs and policies, by name or by path.
+
+What ships lies at the top of the repository. An installed package adds its own in folders of the same names, and names
+itself by an entry point: `my_package = "my_package"` in the group `surgical_marl.content`.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import difflib
+import importlib.util
 import os
 from collections.abc import Sequence
+from functools import cache
+from importlib.metadata import entry_points
 from pathlib import Path
 
 KINDS = ("arms", "scenes", "configs", "policies")
@@ -26,30 +34,41 @@ def content_dir(kind: str) -> Path:
 
 
 def list_arms() -> list[str]:
-    """Names of the arms that ship."""
+    """Return the names of the arms that ship and of those of installed packages."""
     return _names("arms")
 
 
 def list_scenes() -> list[str]:
-    """Names of the scenes that ship."""
+    """Return the names of the scenes that ship and of those of installed packages."""
     return _names("scenes")
 
 
+def list_configs() -> list[str]:
+    """Return the names of tasks that have training settings, likewise."""
+    return _names("configs")
+
+
 def list_policies() -> list[str]:
-    """Names of the trained policies that ship."""
+    """Return the names of the trained policies that ship and of those of installed packages."""
     return _names("policies")
 
 
 def find(kind: str, name_or_path: str | os.PathLike[str]) -> Path:
-    """The file or folder of shipped content by its name, or of a user's own by its path."""
-    folder, suffix = content_dir(kind), _SUFFIX.get(kind, "")
-    names, text = _names(kind), os.fspath(name_or_path)
-    if text in names:
-        return folder / f"{text}{suffix}"
+    """Return the file or folder of content by its name, or of a user's own by its path.
+
+    Raises:
+        ValueError: nothing has that name and lies at that path, or two packages have something of that name.
+    """
+    places, text = _places(kind), os.fspath(name_or_path)
+    if text in places:
+        if len(places[text]) > 1:
+            where = " and ".join(str(path) for path in places[text])
+            raise ValueError(f"the {_NOUNS[kind]} {text!r} is in {where}: name the one that is meant by its path")
+        return places[text][0]
     path = Path(text).expanduser()
-    if text and (path.is_file() if suffix else path.is_dir()):
+    if text and (path.is_file() if kind in _SUFFIX else path.is_dir()):
         return path.resolve()
-    raise unknown(_NOUNS[kind], text, names)
+    raise unknown(_NOUNS[kind], text, list(places))
 
 
 def unknown(noun: str, value: object, good: Sequence[str]) -> ValueError:
@@ -60,10 +79,25 @@ def unknown(noun: str, value: object, good: Sequence[str]) -> ValueError:
 
 
 def _names(kind: str) -> list[str]:
-    folder, suffix = content_dir(kind), _SUFFIX.get(kind)
-    if not folder.is_dir():
-        return []
-    if suffix:
-        return sorted(file.stem for file in folder.glob(f"[!._]*{suffix}"))
-    marker = _MARKER.get(kind, "")
-    return sorted(sub.name for sub in folder.glob("[!._]*") if sub.is_dir() and (sub / marker).exists())
+    return list(_places(kind))
+
+
+def _places(kind: str) -> dict[str, list[Path]]:
+    """Where the content of a kind lies, by name: what ships, and what installed packages have."""
+    found: dict[str, list[Path]] = {}
+    for folder in (content_dir(kind), *(root / kind for root in _plugin_roots())):
+        for path in folder.glob(f"[!._]*{_SUFFIX.get(kind, '')}"):
+            if kind in _SUFFIX or (path / _MARKER[kind]).exists():
+                found.setdefault(path.stem if kind in _SUFFIX else path.name, []).append(path)
+    return dict(sorted(found.items()))
+
+
+@cache
+def _plugin_roots() -> tuple[Path, ...]:
+    """Folders of packages that name themselves in the entry-point group `surgical_marl.content`."""
+    roots = []
+    for point in entry_points(group="surgical_marl.content"):
+        with contextlib.suppress(ImportError, ValueError):  # a package that is broken leaves the others alone
+            spec = importlib.util.find_spec(point.value)
+            roots += [Path(folder) for folder in (spec and spec.submodule_search_locations) or ()]
+    return tuple(roots)

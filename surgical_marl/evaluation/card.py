@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from surgical_marl.content import content_dir, list_policies
+from surgical_marl.content import find, list_policies
 from surgical_marl.evaluation.goal_set import is_standard
 from surgical_marl.evaluation.report import number, title
 from surgical_marl.plugins.tasks import TASKS
@@ -43,7 +43,7 @@ def misses(result: Mapping[str, Any]) -> list[str]:
 
 def table() -> str:
     """All policies that ship, in Markdown: what `surgical-marl list policies -v` prints."""
-    rows = [_row(content_dir("policies") / name) for name in list_policies()]
+    rows = [_row(find("policies", name)) for name in list_policies()]
     widths = [max(map(len, column)) for column in zip(COLUMNS, *rows, strict=True)]
     lines = [COLUMNS, tuple("-" * width for width in widths), *rows]
     cells = ([cell.ljust(width) for cell, width in zip(line, widths, strict=True)] for line in lines)

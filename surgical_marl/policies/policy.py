@@ -16,7 +16,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from surgical_marl.content import content_dir, list_policies
+from surgical_marl.content import find, list_policies
 from surgical_marl.envs.observations import each, proprioception
 from surgical_marl.policies.acting import Policy
 from surgical_marl.policies.layout import GROUPINGS, Grouping, Layout
@@ -104,9 +104,10 @@ def find_run(run: str | Path) -> Path:
 
     ValueError if there is none.
     """
-    for folder in (Path(run), content_dir("policies") / str(run)):
-        if (folder / CONFIG).is_file():
-            return folder
+    if (Path(run) / CONFIG).is_file():
+        return Path(run)
+    if str(run) in list_policies():
+        return find("policies", str(run))
     shipped = ", ".join(list_policies()) or "none yet"
     raise ValueError(f"{str(run)!r} is not a run folder, nor zero, random, oracle or a policy that ships ({shipped})")
 

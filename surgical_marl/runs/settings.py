@@ -10,7 +10,8 @@ from typing import Any, ClassVar, Literal, get_type_hints
 
 import yaml
 
-from surgical_marl.content import content_dir, unknown
+from surgical_marl.content import find, list_configs
+from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.plugins.algorithms import ALGORITHMS
 from surgical_marl.runtime import has_cuda
 from surgical_marl.tasks.base.options import Checked, Options, as_mapping, number
@@ -106,7 +107,7 @@ def load_config(task: str, scene: str, overrides: Iterable[str] = ()) -> Setting
     section, of a section `cuda` in that on a GPU, and overrides; what comes later goes first.
 
     Args:
-        task: the name of a file in `configs/`, without `.yaml`.
+        task: a name of `list_tasks()`. Its file is the one of that name in `configs/`, if there is one.
         scene: a scene's name, or the path of a scene file.
         overrides: `key=value` strings, dotted for sections: `num_envs=512`,
             `ppo.learning_rate=1e-3`.
@@ -114,12 +115,10 @@ def load_config(task: str, scene: str, overrides: Iterable[str] = ()) -> Setting
     Raises:
         ValueError: unknown task, algorithm or key, or a value of the wrong type or out of range.
     """
-    folder = content_dir("configs")
-    path = folder / f"{task}.yaml"
-    if not path.is_file():
-        names = sorted(file.stem for file in folder.glob("*.yaml"))
-        raise unknown("task with training settings", task, names)
-    values = _read_yaml(path)
+    TASKS.check(task)
+    values: dict[str, Any] = {}
+    if task in list_configs():  # a task that has none learns by the defaults
+        values = _read_yaml(find("configs", task))
     scenes = as_mapping("scenes", values.pop("scenes", None) or {})
     own = dict(as_mapping(f"scenes.{scene}", scenes.get(scene) or {}))
     on_gpu = as_mapping("cuda", values.pop("cuda", None) or {})
