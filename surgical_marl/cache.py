@@ -15,7 +15,7 @@ import re
 import tempfile
 import zlib
 from collections.abc import Callable, Iterable, Iterator
-from importlib.metadata import PackageNotFoundError, distribution
+from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 from zipfile import BadZipFile
 
@@ -23,8 +23,6 @@ import numpy as np
 
 from surgical_marl.runtime import cache_dir
 
-LIBRARIES = ("jax", "mujoco", "mujoco-mjx", "numpy", "scipy", "trimesh", "warp-lang", "yourdfpy")
-"""What our computations call: another version may give other numbers."""
 _IMPORT = re.compile(
     r"^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+import[ \t]*(\([^)]*\)|[^\n#]*)|import[ \t]+([\w., \t]+))", re.M
 )
@@ -78,7 +76,8 @@ def locked(path: Path) -> Iterator[None]:
 def _load(path: Path) -> np.ndarray | None:
     """The array in a file of the cache; None if it is not there, or damaged."""
     try:
-        array: np.ndarray = np.load(path)["array"]
+        with path.open("rb") as file, np.load(file) as found:
+            array: np.ndarray = found["array"]
     except (OSError, ValueError, EOFError, KeyError, BadZipFile, zlib.error):
         return None
     return array
@@ -141,15 +140,11 @@ def _folders(package: str) -> tuple[str, ...]:
 
 @functools.cache
 def _versions() -> tuple[str, ...]:
+    """Name and version of each library that this package needs: another version may give other numbers."""
     found = []
-    for name in LIBRARIES:
-        with contextlib.suppress(PackageNotFoundError):
-            found.append(f"{name} {_version(name)}")
+    with contextlib.suppress(PackageNotFoundError):
+        needed = (text for text in requires("surgical-marl") or () if "extra ==" not in text)
+        for name in sorted({re.match(r"[\w.-]+", text)[0] for text in needed}):  # type: ignore[index]
+            with contextlib.suppress(PackageNotFoundError):
+                found.append(f"{name} {version(name)}")
     return tuple(found)
-
-
-def _version(name: str) -> str:
-    """The version of a package, seven times as fast as `importlib.metadata.version`, which reads all the metadata."""
-    installed = distribution(name)
-    metadata = installed.read_text("METADATA") or ""
-    return metadata.partition("\nVersion: ")[2].partition("\n")[0] or installed.version

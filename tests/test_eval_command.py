@@ -28,7 +28,7 @@ from surgical_marl.evaluation.goal_set import (
     standard_hashes,
 )
 from surgical_marl.learning import train
-from surgical_marl.plugins.tasks import list_tasks
+from surgical_marl.plugins.tasks import TASKS, list_tasks
 from surgical_marl.runs.folder import write_config
 from surgical_marl.runs.settings import NetworkSettings, Settings
 from tests.helpers.fake_env import FakeEnv
@@ -36,19 +36,24 @@ from tests.helpers.fake_env import FakeEnv
 SMALL = Settings(num_envs=8, iterations=1, steps_per_iteration=8, network=NetworkSettings(hidden=(8,)))
 
 
-PUBLISHED = [(task, scene) for task, scenes in standard_hashes().items() for scene in scenes]
+PUBLISHED = [
+    (start, task, scene)
+    for start, tasks in standard_hashes().items()
+    for task, scenes in tasks.items()
+    for scene in scenes
+]
 # Tables of paths take minutes to draw where they are not in the cache.
-QUICK = [pytest.param(*pair, marks=[] if pair[0] == "reach" else pytest.mark.slow) for pair in PUBLISHED]
+QUICK = [pytest.param(*one, marks=[] if one[:2] == ("home", "reach") else pytest.mark.slow) for one in PUBLISHED]
 
 
-@pytest.mark.parametrize("task, scene", QUICK)
-def test_the_standard_goals_are_those_that_were_published(task: str, scene: str) -> None:
+@pytest.mark.parametrize("start, task, scene", QUICK)
+def test_the_standard_goals_are_those_that_were_published(start: str, task: str, scene: str) -> None:
     """If this fails, results of this version no longer compare with older ones: see docs/evaluation.md."""
-    env = BatchedEnv(task, scene, num_envs=200, engine="mjx", device="cpu")
+    env = BatchedEnv(task, scene, num_envs=200, engine="mjx", device="cpu", goals="held_out", start=start)
     env.reset(episode_seed(0, 0))
     about = describe_goals(env, 200)
     goals = read_goals(env, 200)
-    assert goal_hash(about, goals) == standard_hashes()[task][scene]
+    assert goal_hash(about, goals) == standard_hashes()[start][task][scene]
     assert is_standard({**about, "goal_set": goal_hash(about, goals)})
     # Rounding noise is no other goal, a hundredth of a millimetre is.
     noisy = [part.astype(float) * (1 + 1e-12) for part in goals]
@@ -59,20 +64,32 @@ def test_the_standard_goals_are_those_that_were_published(task: str, scene: str)
 
 def test_the_page_is_enough_to_compute_a_hash() -> None:
     """As docs/evaluation.md has it, without the code of the evaluation."""
-    env = Env("reach", "bimanual_psm")
+    env = Env("reach", "bimanual_psm", goals="held_out")
     first = jax.random.PRNGKey(int(np.random.SeedSequence([0, 0]).generate_state(1)[0] >> 1))
     keys = [jax.random.fold_in(jax.random.fold_in(first, i), 0) for i in range(200)]
-    goals = np.stack([np.asarray(env.task.start(key).targets, np.float64) for key in keys])
-    about = {"task": "reach", "scene": "bimanual_psm", "control": "position", "difficulty": "default", "episodes": 200}
-    about |= {"max_steps": 100, "control_dt": 0.02, "protocol": 1}
+    goals = np.stack([np.asarray(env.task.start(key).goal.targets, np.float64) for key in keys])
+    about = {"task": "reach", "scene": "bimanual_psm", "control": "position", "difficulty": "default"}
+    about |= {
+        "goals": "held_out",
+        "start": "home",
+        "episodes": 200,
+        "max_steps": 100,
+        "control_dt": 0.02,
+        "protocol": 2,
+    }
     digest = hashlib.sha256(json.dumps(about, sort_keys=True).encode())
     digest.update(b"(200, 2, 3)" + np.round(goals * 1e6).astype("<i8").tobytes())
-    assert digest.hexdigest() == standard_hashes()["reach"]["bimanual_psm"]
+    assert digest.hexdigest() == standard_hashes()["home"]["reach"]["bimanual_psm"]
 
 
 def test_every_scene_has_a_standard_goal_set() -> None:
     looks = {"match_image": ["ecm", "trimanual_psm_ecm"]}  # others run on every scene
-    assert set(PUBLISHED) == {(task, scene) for task in list_tasks() for scene in looks.get(task, list_scenes())}
+    assert set(PUBLISHED) == {
+        (start, task, scene)
+        for task in list_tasks()
+        for start in TASKS.load(task).starts
+        for scene in looks.get(task, list_scenes())
+    }
 
 
 def test_a_baseline_twice_gives_the_same_bytes(capsys: pytest.CaptureFixture[str]) -> None:

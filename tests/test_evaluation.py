@@ -17,7 +17,9 @@ from surgical_marl import load_arm
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.evaluation.evaluate import difference, evaluate, play, summarise
 from surgical_marl.evaluation.report import format_table
+from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.policies.policy import random_policy
+from surgical_marl.tasks.base.options import Options
 
 
 class Shaft:
@@ -53,7 +55,9 @@ class Script:
         self.lengths = np.array([len(episode) for episode in errors[self.agents[0]]])
         self.num_envs, self.max_steps = len(self.lengths), int(self.lengths.max())
         self.control_dt, self.control = 0.1, "position"  # success is judged over two steps
-        self.env = SimpleNamespace(difficulty="default")
+        self.env = SimpleNamespace(options=Options(task, "psm"))
+        self.task = TASKS.load(task).__new__(TASKS.load(task))  # its functions of a goal need no scene
+        self.task.tables = {"paths": np.arange(999.0)}
         arms = {agent: Needle() if agent.startswith("star") else Shaft() for agent in self.agents}
         mounts = {agent: SimpleNamespace(arm=arm) for agent, arm in arms.items()}
         index = {agent: np.array([i]) for i, agent in enumerate(self.agents)}
@@ -79,8 +83,9 @@ class Script:
         self.episode = np.zeros(self.num_envs, int)
         return self._observe(), np.zeros((self.num_envs, 4), np.float32)
 
-    def carry(self) -> dict[str, np.ndarray]:
-        return {".goal": self.goals, ".physics.qpos": self.qpos}
+    @property
+    def goal(self) -> SimpleNamespace:
+        return SimpleNamespace(targets=self.goals, row=np.zeros(self.num_envs, int))
 
     def step(self, actions: dict[str, np.ndarray]) -> Any:
         assert all(actions[agent].shape == (self.num_envs, 1) for agent in self.agents)
@@ -92,7 +97,12 @@ class Script:
             ]
             hit = [(agent, i, step) in self.hits or self.episode[i] > 0 for i, step in enumerate(self.steps)]
             tip_error = np.array(error, np.float32)
-            infos[agent] = {"tip_error": tip_error, "collision": np.array(hit), "min_distance": tip_error + 0.001}
+            infos[agent] = {
+                "tip_error": tip_error,
+                "success": tip_error < 0.002,
+                "collision": np.array(hit),
+                "min_distance": tip_error + 0.001,
+            }
             infos[agent] |= {"reward_distance": -tip_error, "cost_near": tip_error < 0.002}
         self.steps = self.steps + 1
         done = self.steps == self.lengths

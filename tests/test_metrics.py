@@ -27,6 +27,7 @@ def random_trajectory(seed: int, lengths: list[int], arms: int) -> Trajectory:
     return Trajectory(
         lengths=np.array(lengths),
         error=10 ** rng.uniform(-4, -2.3, shape),
+        success=rng.random(shape) < 0.5,
         collision=rng.random(shape) < 0.05,
         distance=rng.normal(0.05, 0.05, shape),
         tip=rng.normal(0.0, 0.01, (*shape, 3)),

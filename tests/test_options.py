@@ -73,7 +73,9 @@ def test_random_starts_are_collision_free_postures(engine: str) -> None:
     assert (apart > 0.009).all() and (env.scene.clearance(q, within=True) > 0).all()
     assert np.allclose(infos["psm_0"]["min_distance"], apart, atol=1e-5)
     away = np.abs(q["psm_1"] - env.scene.mounts["psm_1"].arm.home)
-    assert (away[:, :3].max(0) > 0.1 * (env.scene.mounts["psm_1"].arm.upper - env.scene.mounts["psm_1"].arm.lower)[:3]).all()
+    assert (
+        away[:, :3].max(0) > 0.1 * (env.scene.mounts["psm_1"].arm.upper - env.scene.mounts["psm_1"].arm.lower)[:3]
+    ).all()
     first = env.qpos.copy()
     still = {agent: np.zeros((64, *env.action_space(agent).shape), np.float32) for agent in env.agents}
     step = env.step(still)

@@ -11,8 +11,8 @@ from typing import Any, ClassVar, Literal, get_type_hints
 import yaml
 
 from surgical_marl.content import find, list_configs
-from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.plugins.algorithms import ALGORITHMS
+from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.runtime import has_cuda
 from surgical_marl.tasks.base.options import Checked, Options, as_mapping, number
 

@@ -23,7 +23,7 @@ def mjcf(scene: Scene) -> str:
 
     What a body weighs in a contact has no place in MJCF: MuJoCo takes it from the body's centre of mass. So the
     collision shapes of a link are in a body of their own within it, `<link>/contact`, without mass, whose centre is
-    where the link weighs what it weighs in `scene.model` (`_weigh_shapes` in `scene.py`), or comes nearest to it.
+    where the link weighs what it weighs in `scene.model` (`weigh_shapes` in `scenes/build.py`), or comes nearest to it.
     """
     model = scene.model
     root = Element("mujoco", model=scene.name)

@@ -18,7 +18,7 @@ import surgical_marl.evaluation.goal_set
 from surgical_marl.content import BASELINES, list_scenes
 from surgical_marl.evaluation.command import play_all
 from surgical_marl.evaluation.evaluate import summarise
-from surgical_marl.plugins.tasks import list_tasks
+from surgical_marl.plugins.tasks import TASKS, list_tasks
 
 HASHES = Path(surgical_marl.evaluation.goal_set.__file__).with_name("goal_sets.yaml")
 ERRORS = {"median_error_mm": "median error (mm)", "p95_error_mm": "95th percentile (mm)"}
@@ -34,14 +34,15 @@ def main(tasks: list[str]) -> None:
     comments = [line for line in before.splitlines() if line.startswith("#")]
     hashes = yaml.safe_load(before)
     for task in tasks:
-        rows = []
-        for scene in sorted(scenes(task), key=lambda name: (name.count("_"), name)):
-            for policy in BASELINES:
-                asked = {"task": task, "scene": scene, "control": None, "difficulty": None}
-                result = summarise([play_all([policy], asked, episodes=200, seed=0)[policy]])
-                rows.append([scene, policy, result])
-            hashes.setdefault(task, {})[scene] = result["goal_set"]
-        print(table(rows), flush=True)
+        for start in TASKS.load(task).starts:
+            rows = []
+            for scene in sorted(scenes(task), key=lambda name: (name.count("_"), name)):
+                for policy in BASELINES:
+                    asked = {"task": task, "scene": scene, "start": start}
+                    result = summarise([play_all([policy], asked, episodes=200, seed=0)[policy]])
+                    rows.append([scene, policy, result])
+                hashes.setdefault(start, {}).setdefault(task, {})[scene] = result["goal_set"]
+            print(f"{task} from {start}:\n\n{table(rows)}", flush=True)
     HASHES.write_text("\n".join([*comments, yaml.safe_dump(hashes)]))
 
 

@@ -10,6 +10,9 @@ import torch
 from gymnasium.spaces import Box
 from torch import Tensor
 
+from surgical_marl.plugins.tasks import TASKS
+from surgical_marl.tasks.base.options import Options
+
 
 class Point:
     """An arm whose joints are its tip's coordinates."""
@@ -38,7 +41,8 @@ class FakeEnv:
         mounts = dict.fromkeys(self.agents, SimpleNamespace(arm=Point()))
         ends = np.cumsum(list(self.sizes.values()))
         joints = {a: np.arange(end - self.sizes[a], end) for a, end in zip(self.agents, ends, strict=True)}
-        self.task_name, self.control, self.env = "reach", "position", SimpleNamespace(difficulty="default")
+        self.task_name, self.control, self.env = "reach", "position", SimpleNamespace(options=Options("reach", "psm"))
+        self.task = TASKS.load("reach").__new__(TASKS.load("reach"))  # its functions of a goal need no scene
         self.scene = SimpleNamespace(name="fake", mounts=mounts, qpos_index=joints.__getitem__)
         self.state_space = self._box(2 * sum(self.sizes.values()))
         self.generator = torch.Generator()
@@ -113,13 +117,20 @@ class FakeEnv:
         }
 
     @property
+    def goal(self) -> SimpleNamespace:
+        """Where the arms should be, [N, sum of coordinates]."""
+        return SimpleNamespace(
+            targets=np.concatenate([self.where[a][:, n:].numpy() for a, n in self.sizes.items()], -1)
+        )
+
+    @property
     def qpos(self) -> np.ndarray:
         return np.concatenate([self.where[a][:, :size].numpy() for a, size in self.sizes.items()], -1)
 
     def carry(self) -> dict[str, np.ndarray]:
         state = {"steps": self.steps.copy(), "generator": self.generator.get_state().numpy()}
         state |= {f"where/{agent}": where.numpy() for agent, where in self.where.items()}
-        return state | {f".goal/{a}": self.where[a][:, size:].numpy() for a, size in self.sizes.items()}
+        return state
 
     def set_carry(self, carry: dict[str, np.ndarray]) -> None:
         self.steps = carry["steps"].copy()
