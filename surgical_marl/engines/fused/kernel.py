@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import re
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -50,17 +51,26 @@ def _checked(module: str) -> Iterator[None]:
     """Around the loading of a module: what Warp has of it on disk is removed if it is not what was stored there.
     Warp itself would load a damaged file, whatever that leads to."""
     record = cache_dir() / "kernels" / f"{module}.sha256"
-    folders = list(Path(wp.config.kernel_cache_dir).glob(f"wp_{module}_*"))
+    folders = _folders(module)
     with contextlib.suppress(OSError):
         if record.read_text() != _digest(folders):
             for folder in folders:
                 shutil.rmtree(folder, ignore_errors=True)
     yield
     with contextlib.suppress(OSError):
-        digest = _digest(list(Path(wp.config.kernel_cache_dir).glob(f"wp_{module}_*")))
+        digest = _digest(_folders(module))
         if not record.exists() or record.read_text() != digest:
             record.parent.mkdir(parents=True, exist_ok=True)
             write_atomic(record, lambda path: path.write_text(digest))
+
+
+def _folders(module: str) -> list[Path]:
+    """Where Warp keeps a module, without the folders `..._p<process>_t<thread>` in which processes still compile it."""
+    return [
+        path
+        for path in Path(wp.config.kernel_cache_dir).glob(f"wp_{module}_*")
+        if not re.search(r"_p\d+_t\d+$", path.name)
+    ]
 
 
 def _digest(folders: list[Path]) -> str:
