@@ -122,9 +122,9 @@ class Algorithm(PPO):
 
     def loss(self, batch: RolloutStorage.Batch) -> tuple[Tensor, Tensor]:
         """Return the loss of a mini-batch; and value loss, surrogate loss, entropy and KL, detached `[4]`."""
-        policy, parts = self.policy_loss(self.actor, batch)
+        policy, measured = self.policy_loss(self.actor, batch)
         value = self.value_loss(batch)
-        return policy + self.value_loss_coef * value, torch.cat([value.detach()[None], parts])
+        return policy + self.value_loss_coef * value, torch.cat([value.detach()[None], measured])
 
     def policy_loss(self, actor: MultiAgentActor, batch: RolloutStorage.Batch) -> tuple[Tensor, Tensor]:
         """Return the loss of the networks that act; and surrogate loss, entropy and KL, detached `[3]`."""
@@ -200,9 +200,9 @@ class Algorithm(PPO):
     def _learn(self) -> None:
         for batch in self.batches():
             with self.precision():
-                loss, parts = self.loss(batch)
-            self.descend(loss, parts[-1])
-            self._sums += parts
+                loss, measured = self.loss(batch)
+            self.descend(loss, measured[-1])
+            self._sums += measured
         self.conclude()
 
     def batches(self) -> Iterator[RolloutStorage.Batch]:

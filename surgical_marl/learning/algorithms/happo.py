@@ -65,10 +65,10 @@ class HAPPO(Algorithm):
         actor = self._actors[index]
         for batch in self.batches():
             with self.precision():
-                loss, parts = self.policy_loss(actor, self._own(index, batch))
+                loss, measured = self.policy_loss(actor, self._own(index, batch))
                 value = self.value_loss(batch) if index == 0 else torch.zeros_like(loss)
-            self.descend(loss + self.value_loss_coef * value, parts[-1])
-            self._sums += torch.cat([value.detach()[None], parts / len(self._actors)])
+            self.descend(loss + self.value_loss_coef * value, measured[-1])
+            self._sums += torch.cat([value.detach()[None], measured / len(self._actors)])
         self._weigh(index)
 
     @torch.no_grad()
