@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from surgical_marl.envs.env import Carry, Env, State
-from surgical_marl.physics.simulator import Contacts, Physics
+from surgical_marl.physics.simulator import Contacts, Physics, Touch
 
 
 class PhysicsAlone(Env):
@@ -28,7 +28,8 @@ class PhysicsAlone(Env):
     def step(self, carry: Carry, actions: dict[str, Array]) -> State:
         """One physics step; there are no actions."""
         _, distance = self.simulator._look(carry.physics.qpos)
-        physics, _ = self.simulator._step(carry.physics, distance)
+        nothing = jnp.zeros_like(distance)
+        physics, _ = self.simulator._step(carry.physics, Touch(nothing, nothing))
         return self._state(carry, physics, distance)
 
     def _state(self, carry: Carry, physics: Physics, distance: Array) -> State:
