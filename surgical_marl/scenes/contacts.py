@@ -21,9 +21,9 @@ from surgical_marl.scenes.separation import BOXES, ball, can_meet
 NEAR, NEAR_WITHIN = 0.01, 0.001
 """Geoms of two arms, and of one arm, that can come this near, in m, are a pair. Between arms that is what goals leave
 free between them, so that any smaller `min_distance` is right; in an arm it covers what stops and rounding give."""
-FEWEST, MOST = 2_000, 2_000_000
-"""Boxes that the search of each pair may take in any case, some 10 ms, and what longer ones have together, some 10 s:
-twice what a scene that ships takes. Each takes at most a quarter of what is left, so that no pair takes it all."""
+FEWEST, MOST = 2_000, 1_000_000
+"""Boxes that the search of each pair may take in any case, some 10 ms, and what those of a scene take together before
+that, some 5 s: the scenes that ship take 610,000 at most. None takes more than half of what is left."""
 
 
 def contact_pairs(scene: Scene) -> list[tuple[str, str]]:
@@ -41,7 +41,7 @@ def _candidates(scene: Scene) -> list[tuple[int, int, float]]:
     between = [pair for one, other in combinations(scene.agents, 2) for pair in product(geoms[one], geoms[other])]
     within = [pair for own in geoms.values() for pair in combinations(own, 2) if not neighbours(model, *pair)]
     free = [(a, b) for a, b in within if capsule_distance(at_home[a], at_home[b]) > 0]
-    return [(*pair, NEAR) for pair in between] + [(*pair, NEAR_WITHIN) for pair in free]
+    return [(*pair, NEAR_WITHIN) for pair in free] + [(*pair, NEAR) for pair in between]
 
 
 def neighbours(model: mujoco.MjModel, a: int, b: int) -> bool:
@@ -74,7 +74,7 @@ def _can_meet(scene: Scene, candidates: list[tuple[int, int, float]]) -> np.ndar
         elif np.linalg.norm(one - other) > reach + its_reach + near:
             known[key] = False
         if key not in known:
-            known[key], boxes = can_meet(model, a, b, near, most=max(FEWEST, min(BOXES, left // 4)))
+            known[key], boxes = can_meet(model, a, b, near, most=max(FEWEST, min(BOXES, left // 2)))
             left -= boxes
         found.append(known[key])
     return np.array(found, dtype=bool)
