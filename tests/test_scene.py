@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 
 from surgical_marl import list_scenes, load_scene
 from surgical_marl.content import content_dir
-from surgical_marl.scenes.geometry import segment_distance
 from surgical_marl.scenes.scene import Scene
 
 BIMANUAL = load_scene("bimanual_psm")
@@ -74,18 +73,6 @@ def test_clearance_equals_mujocos_distance(shares: list[float]) -> None:
     clearance = float(BIMANUAL.clearance(joints))
     # where axes cross, MuJoCo's depth is by a rule of its own; before that the two are the same number
     assert clearance == pytest.approx(expected, abs=1e-6) or (clearance < 0 and expected < 0)
-
-
-@settings(max_examples=200, deadline=None)
-@given(st.lists(st.floats(-1, 1), min_size=12, max_size=12))
-def test_segment_distance_is_the_least_over_points(numbers: list[float]) -> None:
-    a, b, c, d = np.reshape(numbers, (4, 3))
-    shares = np.linspace(0, 1, 101)
-    points = a + shares[:, None] * (b - a), c + shares[:, None] * (d - c)
-    sampled = np.linalg.norm(points[0][:, None] - points[1][None], axis=-1).min()
-    exact = float(segment_distance(a, b, c, d))
-    assert exact <= sampled + 1e-7
-    assert sampled - exact < 0.5 * (np.linalg.norm(b - a) + np.linalg.norm(d - c)) / 100 + 1e-7
 
 
 def test_a_scene_of_ones_own_is_a_file_anywhere(tmp_path: Path) -> None:

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from surgical_marl.envs.env import Carry, Env, State
-from surgical_marl.physics.simulator import Physics
-from surgical_marl.physics.views import Contacts
+from surgical_marl.physics.dynamics import Physics
+from surgical_marl.physics.views import Contacts, Touch
 
 
 class PhysicsAlone(Env):
@@ -30,7 +30,8 @@ class PhysicsAlone(Env):
     def step(self, carry: Carry, actions: dict[str, Array], parameters: Any = None) -> State:
         """One physics step; there are no actions."""
         _, distance = self.simulator._look(carry.physics.qpos)
-        physics, _ = self.simulator._step(carry.physics, distance)
+        nothing = jnp.zeros_like(distance)
+        physics, _ = self.simulator._step(carry.physics, Touch(nothing, nothing))
         return self._state(carry, physics, distance)
 
     @property

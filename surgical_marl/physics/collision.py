@@ -1,7 +1,8 @@
 """Distance and contact of capsules in pure JAX, for the pairs of geoms of a scene that can touch.
 
 All collision geoms are capsules or spheres, so that a pair is two line segments with a radius each: their distance is
-exact, and the same as C MuJoCo's. Few pairs touch at a time: only the `SLOTS` deepest become constraint rows.
+exact, and the same as C MuJoCo's. A physics step asks first whether anything touches (`overlap`). Few pairs touch
+at a time: only the `SLOTS` deepest become constraint rows.
 """
 
 from __future__ import annotations
@@ -13,6 +14,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jax import Array
+
+from surgical_marl.scenes.geometry import Capsule, axis_gap
 
 SLOTS = 6
 """Contacts at one time. Arms driven at random with full effort in all six scenes had 4 at most, in 144,000 steps."""
@@ -49,35 +52,41 @@ class Pairs:
         self.count = model.npair
         self._geoms = model.pair_geom1.copy(), model.pair_geom2.copy()
         capsule = mujoco.mjtGeom.mjGEOM_CAPSULE
-        self._half = [
+        self._halves = [
             np.where(model.geom_type[g] == capsule, model.geom_size[g, 1], 0).astype(single) for g in self._geoms
         ]
-        self._first_radius, second = (model.geom_size[g, 0].astype(single) for g in self._geoms)
-        self._radii = self._first_radius + second
+        self._radii = [model.geom_size[g, 0].astype(single) for g in self._geoms]
         bodies = [model.geom_bodyid[geoms] for geoms in self._geoms]
         self._weight = sum(model.body_invweight0[body, 0] for body in bodies).astype(single)
         moved = _moved_bodies(model)
         self._sign = (moved[bodies[1]] - moved[bodies[0]]).astype(single)
         self._roots = model.body_rootid[model.dof_bodyid]
 
+    def overlap(self, geom_xpos: Array, geom_xmat: Array) -> Array:
+        """Return whether any pair overlaps, []: for less than what `distance` costs."""
+        gap = axis_gap(*self._capsules(geom_xpos, geom_xmat))[1]
+        reach = self._radii[0] + self._radii[1]
+        return jnp.min(jnp.sum(gap * gap, -1) - reach * reach, initial=np.inf) < 0
+
+    def distance(self, geom_xpos: Array, geom_xmat: Array) -> Array:
+        """Return the signed distance of every pair, m, [P]; negative where they overlap."""
+        return self.closest(geom_xpos, geom_xmat).distance
+
     def closest(self, geom_xpos: Array, geom_xmat: Array) -> Closest:
-        """From positions [ngeom, 3] and frames [ngeom, 3, 3] of all geoms: Ericson, "Real-time collision detection",
-        2005, section 5.1.9."""
-        one, other = (geom_xpos[geoms] for geoms in self._geoms)
-        along, across = (geom_xmat[geoms][:, :, 2] for geoms in self._geoms)
-        half, reach = self._half
-        between = one - other
-        b, d, e = (jnp.sum(x * y, -1) for x, y in ((along, across), (along, between), (across, between)))
-        # segments one + s along, other + t across; parallel ones may start anywhere
-        s = jnp.clip((b * e - d) / jnp.maximum(1 - b * b, 1e-6), -half, half)
-        t = jnp.clip(e + b * s, -reach, reach)
-        s = jnp.clip(b * t - d, -half, half)
-        way = t[:, None] * across - s[:, None] * along - between
-        length = jnp.sqrt(jnp.maximum(jnp.sum(way * way, -1), 1e-18))
-        normal = way / length[:, None]
-        distance = length - self._radii
-        middle = one + s[:, None] * along + (self._first_radius + distance / 2)[:, None] * normal
-        return Closest(distance, middle, normal)
+        """Return where the pairs are closest, from positions [ngeom, 3] and frames [ngeom, 3, 3] of all geoms."""
+        one, other = self._capsules(geom_xpos, geom_xmat)
+        along, gap = axis_gap(one, other)
+        length = jnp.sqrt(jnp.maximum(jnp.sum(gap * gap, -1), 1e-18))
+        normal = gap / length[:, None]
+        distance = length - (one.radius + other.radius)
+        point = one.centre + along[:, None] * one.axis + (one.radius + distance / 2)[:, None] * normal
+        return Closest(distance, point, normal)
+
+    def _capsules(self, geom_xpos: Array, geom_xmat: Array) -> tuple[Capsule, Capsule]:
+        """The first and the second geoms of all pairs, [P] each."""
+        parts = zip(self._geoms, self._halves, self._radii, strict=True)
+        one, other = (Capsule(geom_xpos[g], geom_xmat[g][:, :, 2], half, radius) for g, half, radius in parts)
+        return one, other
 
     def deepest(self, data: Any, closest: Closest) -> Touching:
         """The contacts that matter. `data` is MJX's, with `cdof` and `subtree_com`."""

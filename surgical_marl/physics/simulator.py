@@ -21,7 +21,7 @@ from jax import Array
 from surgical_marl.physics.collision import Pairs
 from surgical_marl.physics.dynamics import Dynamics, Physics
 from surgical_marl.physics.solver import Rows, solve
-from surgical_marl.physics.views import ArmView, Contacts
+from surgical_marl.physics.views import ArmView, Contacts, Touch
 from surgical_marl.scenes.build import alone
 from surgical_marl.scenes.scene import PAYLOAD, Scene
 from surgical_marl.scenes.timing import DECIMATION
@@ -120,17 +120,13 @@ class Simulator:
         """A control step of physics, and what is seen where it ends. MuJoCo leaves tips and distances one physics step
         behind its `qpos`, so they are computed anew."""
 
-        def substep(state: tuple[Physics, Array, Array], _: None) -> tuple[tuple[Physics, Array, Array], None]:
-            physics, nearest, strongest = state
-            distance = self._look(physics.qpos)[1]
-            physics, force = self._step(physics, distance)
-            return (physics, jnp.minimum(nearest, distance), jnp.maximum(strongest, force)), None
+        def substep(state: tuple[Physics, Touch], _: None) -> tuple[tuple[Physics, Touch], None]:
+            return self._step(*state), None
 
         none = jnp.zeros(self._pairs.count, jnp.float32)
-        start = physics, none, none
-        (physics, nearest, strongest), _ = jax.lax.scan(substep, start, None, length=self.decimation)
+        (physics, touch), _ = jax.lax.scan(substep, (physics, Touch(none, none)), None, length=self.decimation)
         tips, distance = self._look(physics.qpos)
-        contacts = Contacts(distance, -jnp.minimum(nearest, distance), strongest)
+        contacts = Contacts(distance, jnp.maximum(touch.penetration, -distance), touch.force)
         return physics, contacts, self._view(jnp, physics, tips, contacts)
 
     def varied(self, stiffness: Array, damping: Array, friction: Array, payload: Array, offset: Array) -> Simulator:
@@ -170,31 +166,35 @@ class Simulator:
         """Tool tips [arms, 3] in the world and the distance of every pair, at a posture."""
         data = self._together.pose(qpos)
         tips = data.site_xpos[np.array(list(self._sites.values()))]
-        return tips, self._pairs.closest(data.geom_xpos, data.geom_xmat).distance
+        return tips, self._pairs.distance(data.geom_xpos, data.geom_xmat)
 
-    def _step(self, physics: Physics, distance: Array) -> tuple[Physics, Array]:
-        """A physics step, and the normal force of every pair during it. Arms that don't touch anything don't know of
-        each other: each moves on its own."""
+    def _step(self, physics: Physics, touch: Touch) -> tuple[Physics, Touch]:
+        """A physics step, and the hardest touch until its start. Arms that don't touch anything don't know of each
+        other: each moves on its own."""
         if not self._pairs.count:
-            return self._apart(physics)
-        return jax.lax.cond((distance < 0).any(), self._touching_step, self._apart, physics)
+            return self._apart(physics, touch)
+        data = self._together.pose(physics.qpos)
+        overlap = self._pairs.overlap(data.geom_xpos, data.geom_xmat)
+        return jax.lax.cond(overlap, self._touching_step, self._apart, physics, touch)
 
-    def _apart(self, physics: Physics) -> tuple[Physics, Array]:
+    def _apart(self, physics: Physics, touch: Touch) -> tuple[Physics, Touch]:
         for kind in self._kinds:
             physics = kind.step(physics, self._fields)
-        return physics, jnp.zeros(self._pairs.count, jnp.float32)
+        return physics, touch
 
-    def _touching_step(self, physics: Physics) -> tuple[Physics, Array]:
+    def _touching_step(self, physics: Physics, touch: Touch) -> tuple[Physics, Touch]:
         dynamics = self._together.varied(self._fields)
         forces = dynamics.forces(physics)
-        touching = self._pairs.deepest(forces.data, self._pairs.closest(forces.data.geom_xpos, forces.data.geom_xmat))
+        closest = self._pairs.closest(forces.data.geom_xpos, forces.data.geom_xmat)
+        touching = self._pairs.deepest(forces.data, closest)
         contacts = dynamics.contact_rows(touching.jacobian, touching.distance, touching.weight, physics.qvel)
         joined = Rows(*(jnp.concatenate(parts) for parts in zip(forces.rows, contacts, strict=True)))
         start = dynamics.relaxed(forces, physics.qacc_warmstart)
         qacc, force = solve(forces.mass, forces.smooth, joined, start, *TOUCHING_ITERATIONS)
         its_own = touching.pair == np.arange(self._pairs.count)[:, None]
         each = jnp.where(its_own, force[len(forces.rows.low) :], 0.0).sum(-1)
-        return dynamics.moved(physics, forces, qacc), each
+        hardest = Touch(jnp.maximum(touch.penetration, -closest.distance), jnp.maximum(touch.force, each))
+        return dynamics.moved(physics, forces, qacc), hardest
 
     def _view(self, xp: Any, physics: Physics, tips: Any, contacts: Contacts) -> dict[str, ArmView]:
         """Views by the array library `xp` from tool tips [arms, 3] in the world."""

@@ -19,6 +19,16 @@ class Contacts(NamedTuple):
     """The largest normal force during the control step, N."""
 
 
+class Touch(NamedTuple):
+    """The hardest touch of each pair so far in a control step, [P] each. A physics step in which nothing touches leaves
+    it alone."""
+
+    penetration: Array
+    """m"""
+    force: Array
+    """N"""
+
+
 class ArmView(NamedTuple):
     """What a task sees of one arm in the newest state. Base frame; SI units."""
 

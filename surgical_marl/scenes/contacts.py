@@ -1,8 +1,8 @@
-"""Which collision geoms of a scene can touch: found by a sweep over the joint ranges, not by hand.
+"""Which collision geoms of a scene can touch: found from the joint limits, not listed by hand.
 
-MJX computes every pair it is given at every step, so a scene names only those that can meet. Geoms of two arms are a
-pair if any posture of the two arms brings them close; geoms of one arm likewise, unless a joint holds them next to each
-other or they overlap at home, as neighbours in a chain do by design.
+Every pair is looked at in every physics step, so a scene names only those that can meet. Two geoms of two arms are a
+pair unless they are proven to stay apart in all postures (`separation.py`). So are two geoms of one arm, unless a joint
+holds them next to each other or they overlap at home, as neighbours in a chain do by design.
 """
 
 from __future__ import annotations
@@ -16,32 +16,37 @@ from surgical_marl.cache import cached
 from surgical_marl.robots.spec import COLLISION_GROUP
 from surgical_marl.scenes.geometry import capsule_distance
 from surgical_marl.scenes.scene import Scene, collision_geoms
+from surgical_marl.scenes.separation import BOXES, ball, can_meet
 
-SAMPLES = 20_000
 NEAR, NEAR_WITHIN = 0.01, 0.001
-"""Geoms of two arms, and of one arm, that come this close in the sweep, in m, are a pair: it can't try every posture,
-and two arms have more joints between two geoms than one."""
+"""Geoms of two arms, and of one arm, that can come this near, in m, are a pair. Between arms that is what goals leave
+free between them, so that any smaller `min_distance` is right; in an arm it covers what stops and rounding give."""
+FEWEST, MOST = 2_000, 1_000_000
+"""Boxes that the search of each pair may take in any case, some 10 ms, and what those of a scene take together before
+that, some 5 s: the scenes that ship take 610,000 at most. None takes more than half of what is left."""
 
 
 def contact_pairs(scene: Scene) -> list[tuple[str, str]]:
-    """Names of the geoms that can touch, by pairs. Kept on disk by content, so a second call is quick."""
-    model = scene.model
-    candidates = _candidates(scene)
-    near = cached("pairs", lambda: _sweep(scene, candidates), repr(candidates), scene.fingerprint)
-    return [(model.geom(a).name, model.geom(b).name) for (a, b), kept in zip(candidates, near, strict=True) if kept]
+    """Return the names of the geoms that can touch, by pairs. Kept on disk by content, so a second call is quick."""
+    geom, candidates = scene.model.geom, _candidates(scene)
+    kept = cached("pairs", lambda: _can_meet(scene, candidates), repr(candidates), scene.fingerprint)
+    return [(geom(a).name, geom(b).name) for (a, b, _), meet in zip(candidates, kept, strict=True) if meet]
 
 
-def _candidates(scene: Scene) -> list[tuple[int, int]]:
-    """Pairs of geom ids that are neither on one body nor next to each other in a chain."""
-    model = scene.model
+def _candidates(scene: Scene) -> list[tuple[int, int, float]]:
+    """Pairs of geom ids, and how near they are near. None are on one body, next to each other in a chain or, in an
+    arm, overlapping at home."""
+    model, at_home = scene.model, scene.capsules({agent: mount.arm.home for agent, mount in scene.mounts.items()})
     geoms = {agent: collision_geoms(model, agent) for agent in scene.agents}
     between = [pair for one, other in combinations(scene.agents, 2) for pair in product(geoms[one], geoms[other])]
     within = [pair for own in geoms.values() for pair in combinations(own, 2) if not neighbours(model, *pair)]
-    return between + within
+    free = [(a, b) for a, b in within if capsule_distance(at_home[a], at_home[b]) > 0]
+    return [(*pair, NEAR_WITHIN) for pair in free] + [(*pair, NEAR) for pair in between]
 
 
 def neighbours(model: mujoco.MjModel, a: int, b: int) -> bool:
-    """Whether two geoms are on one body, or the way up the tree from one to the other passes nothing that collides."""
+    """Return whether two geoms are on one body, or the way up the tree from one to the other passes nothing that
+    collides."""
     solid = {int(model.body_weldid[model.geom_bodyid[g]]) for g in np.flatnonzero(model.geom_group == COLLISION_GROUP)}
     one, other = (int(model.body_weldid[model.geom_bodyid[geom]]) for geom in (a, b))
     for body, target in ((one, other), (other, one)):
@@ -54,19 +59,22 @@ def neighbours(model: mujoco.MjModel, a: int, b: int) -> bool:
     return False
 
 
-def _sweep(scene: Scene, candidates: list[tuple[int, int]]) -> np.ndarray:
-    """Which candidates come near each other, [candidates] bool."""
-    rng = np.random.default_rng(0)
-    arms = {agent: mount.arm for agent, mount in scene.mounts.items()}
-    postures = {agent: rng.uniform(arm.lower, arm.upper, (SAMPLES, len(arm.lower))) for agent, arm in arms.items()}
-    swept = scene.capsules(postures)
-    home = scene.capsules({agent: arm.home[None] for agent, arm in arms.items()})
-    owner = {geom: agent for agent in scene.agents for geom in collision_geoms(scene.model, agent)}
-    near = []
-    for a, b in candidates:
-        least = capsule_distance(swept[a], swept[b]).min()
-        if owner[a] != owner[b]:
-            near.append(least < NEAR)
-        else:
-            near.append(least < NEAR_WITHIN and capsule_distance(home[a], home[b])[0] > 0)
-    return np.array(near, dtype=bool)
+def _can_meet(scene: Scene, candidates: list[tuple[int, int, float]]) -> np.ndarray:
+    """Which candidates can come near each other, [candidates] bool."""
+    model, left = scene.model, MOST
+    owner = {geom: agent for agent in scene.agents for geom in collision_geoms(model, agent)}
+    balls = {geom: ball(model, geom) for geom in owner}
+    known: dict[object, bool] = {}  # an arm that stands in a scene twice is searched once
+    found = []
+    for a, b, near in candidates:
+        (one, reach), (other, its_reach) = balls[a], balls[b]
+        key: object = (a, b)
+        if owner[a] == owner[b]:
+            key = (scene.mounts[owner[a]].arm.folder, *(model.geom(geom).name.split("/", 1)[1] for geom in (a, b)))
+        elif np.linalg.norm(one - other) > reach + its_reach + near:
+            known[key] = False
+        if key not in known:
+            known[key], boxes = can_meet(model, a, b, near, most=max(FEWEST, min(BOXES, left // 2)))
+            left -= boxes
+        found.append(known[key])
+    return np.array(found, dtype=bool)

@@ -16,9 +16,8 @@ import numpy as np
 
 from surgical_marl.content import unknown
 from surgical_marl.robots.arm import Arm
-from surgical_marl.robots.rotation import matrix_of
 from surgical_marl.robots.spec import COLLISION_GROUP, build_spec
-from surgical_marl.scenes.geometry import Capsule, capsule_distance
+from surgical_marl.scenes.geometry import Capsule, capsule_distance, link_capsule
 from surgical_marl.scenes.randomisation import Randomisation
 
 PAYLOAD = "payload"
@@ -150,19 +149,16 @@ class Scene:
         return np.asarray(least)
 
     def capsules(self, q: dict[str, np.ndarray]) -> dict[int, Capsule]:
-        """Axis ends in the world and radius of every collision geom, by geom id; joints of each agent [..., n]."""
+        """Return every collision geom in the world, by geom id; joints of each agent [..., n]."""
         model, capsules = self.model, {}
         for agent, mount in self.mounts.items():
             geoms = collision_geoms(model, agent)
             links = {geom: model.body(model.geom_bodyid[geom]).name.removeprefix(f"{agent}/") for geom in geoms}
             poses = mount.arm.link_poses(q[agent], tuple(dict.fromkeys(links.values())))
             for geom in geoms:
-                # a sphere has no half length: MuJoCo leaves zero there
-                half = matrix_of(model.geom_quat[geom])[:, 2] * model.geom_size[geom, 1]
-                pose = poses[links[geom]] @ _transform(model.geom_pos[geom])
-                a, b = ((pose[..., :3, :3] @ end + pose[..., :3, 3]) @ mount.rotation.T + mount.position
-                        for end in (-half, half))  # fmt: skip
-                capsules[geom] = (a, b, float(model.geom_size[geom, 0]))
+                pose = poses[links[geom]]
+                on_arm = link_capsule(model, geom).placed(pose[..., :3, :3], pose[..., :3, 3])
+                capsules[geom] = on_arm.placed(mount.rotation, mount.position)
         return capsules
 
 
@@ -188,9 +184,3 @@ def collision_geoms(model: mujoco.MjModel, agent: str) -> list[int]:
     """Ids of the collision geoms of one agent."""
     ids = np.flatnonzero(model.geom_group == COLLISION_GROUP)
     return [int(i) for i in ids if model.geom(int(i)).name.startswith(f"{agent}/")]
-
-
-def _transform(position: np.ndarray) -> np.ndarray:
-    matrix = np.eye(4)
-    matrix[:3, 3] = position
-    return matrix
