@@ -59,7 +59,7 @@ def test_tips_and_distances_are_of_the_new_state() -> None:
     for _ in range(20):
         step = env.step(random_actions(env, rng))
     data = host_data(env)
-    goal = env.goal[0]
+    goal = env.goal.targets[0]
     least = min(
         mujoco.mj_geomDistance(env.scene.model, data, a, b, 1.0, None)
         for a, b in zip(env.scene.model.pair_geom1, env.scene.model.pair_geom2, strict=True)
@@ -74,7 +74,7 @@ def test_tips_and_distances_are_of_the_new_state() -> None:
 def test_an_episode_is_cut_off_and_the_next_begins_in_the_same_step() -> None:
     env, rng = batched(), np.random.default_rng(0)
     first, *_ = env.reset(5)
-    goals = [env.goal]
+    goals = [env.goal.targets]
     for _ in range(2):
         for i in range(env.max_steps):
             step = env.step(random_actions(env, rng))
@@ -84,7 +84,7 @@ def test_an_episode_is_cut_off_and_the_next_begins_in_the_same_step() -> None:
             for agent in env.agents:
                 same = np.array_equal(step.observations[agent], step.final_observations[agent])
                 assert same != ended
-        goals.append(env.goal)
+        goals.append(env.goal.targets)
         assert (env.steps == 0).all()
         np.testing.assert_allclose(env.qpos, np.broadcast_to(env.scene.home, env.qpos.shape), atol=1e-6)
         joints = len(env.scene.mounts["psm_0"].arm.actuated)
@@ -96,11 +96,11 @@ def test_environments_reset_one_by_one() -> None:
     env, rng = batched(), np.random.default_rng(0)
     env.reset(5)
     env.steps = np.array([0, env.max_steps - 1, 3, 0])
-    before = env.goal
+    before = env.goal.targets
     step = env.step(random_actions(env, rng))
     assert step.truncated.tolist() == [False, True, False, False]
     assert env.steps.tolist() == [1, 0, 4, 1]
-    changed = (env.goal != before).any(axis=(1, 2))
+    changed = (env.goal.targets != before).any(axis=(1, 2))
     assert changed.tolist() == [False, True, False, False]
 
 
@@ -112,7 +112,7 @@ def test_episodes_do_not_depend_on_the_number_of_environments(scene: str, num_en
     alone, *_ = one.reset(11)
     among, *_ = many.reset(11)
     for _ in range(2 * one.max_steps):
-        np.testing.assert_array_equal(one.goal[0], many.goal[0])
+        np.testing.assert_array_equal(one.goal.targets[0], many.goal.targets[0])
         for agent in one.agents:
             np.testing.assert_allclose(alone[agent][0], among[agent][0], atol=2e-4, rtol=1e-4)
         actions = random_actions(many, rng)
@@ -135,18 +135,18 @@ def test_one_seed_is_one_series_of_episodes() -> None:
 def test_reset_without_a_seed_goes_on_to_the_next_episode() -> None:
     env, rng = batched(), np.random.default_rng(0)
     env.reset(1)
-    played = [env.goal]
+    played = [env.goal.targets]
     for _ in range(2):
         for _ in range(env.max_steps):
             env.step(random_actions(env, rng))
-        played.append(env.goal)
+        played.append(env.goal.targets)
     env.reset(1)
     env.reset()
-    np.testing.assert_array_equal(env.goal, played[1])
+    np.testing.assert_array_equal(env.goal.targets, played[1])
     for _ in range(env.max_steps):
         env.step(random_actions(env, rng))
     env.reset()  # the third episode began when the second ended: it isn't skipped
-    np.testing.assert_array_equal(env.goal, played[2])
+    np.testing.assert_array_equal(env.goal.targets, played[2])
 
 
 def test_carry_restores_exactly() -> None:
@@ -166,7 +166,7 @@ def test_carry_restores_exactly() -> None:
 
 def test_goals_are_reachable_and_spread_as_in_the_paper() -> None:
     env = batched()
-    table = np.asarray(env.env.task.table)
+    table = env.task.tables["targets"]
     assert np.abs(table.std(axis=0) - 0.05).max() < 0.01  # a little less than 0.05: far draws are not reachable
     assert np.abs(table.mean(axis=0) - [0, 0, -0.11]).max() < 0.01
     from surgical_marl.robots.inverse_kinematics import inverse_kinematics
@@ -299,7 +299,7 @@ def test_no_limit_is_passed_and_nothing_breaks_at_full_effort(scene: str) -> Non
     [
         ({"task": "reech"}, "unknown task 'reech', did you mean 'reach'"),
         ({"scene": "bimanual"}, "unknown scene 'bimanual'"),
-        ({"control": "force"}, "unknown control mode 'force'"),
+        ({"control": "force"}, "control must be one of position, velocity, torque, not 'force'"),
         ({"engine": "warp"}, "unknown engine 'warp'"),
         ({"device": "tpu"}, "unknown device 'tpu'"),
         ({"num_envs": 0}, "num_envs must be a whole number of at least 1, not 0"),

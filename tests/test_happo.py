@@ -12,9 +12,6 @@ from typing import Any
 
 import pytest
 import torch
-from fake_env import FakeEnv
-from runs import COUNTS, SIZES, SMALL, run, same_state
-from test_mappo import SETTINGS, build, roll_out
 from torch import Tensor, nn
 
 from surgical_marl.learning.algorithms.happo import HAPPO
@@ -22,6 +19,9 @@ from surgical_marl.policies.policy import load_actor, load_policy
 from surgical_marl.policies.weights import write_weights
 from surgical_marl.runs.folder import CONFIG, read_checkpoint
 from surgical_marl.runs.settings import ConstraintSettings, Settings
+from tests.helpers.fake_env import FakeEnv
+from tests.helpers.runs import COUNTS, SIZES, SMALL, run, same_state
+from tests.test_mappo import SETTINGS, build, roll_out
 
 TEAM = {"psm": 2, "ecm": 1}
 AGENTS = ["psm_0", "psm_1", "ecm_0"]

@@ -33,8 +33,9 @@ def random_actions(env: BatchedEnv, rng: np.random.Generator) -> dict[str, np.nd
     return {a: rng.uniform(-1, 1, (COUNT, *(env.action_space(a).shape or ()))).astype(np.float32) for a in env.agents}
 
 
-def row(env: BatchedEnv) -> np.ndarray:
-    return np.array(env.engine.read(".goal.row", "numpy"))
+def hidden(env: BatchedEnv) -> np.ndarray:
+    """The postures [N, nq] that the target pictures are taken from now."""
+    return env.task.postures["hidden"][env.goal.row]
 
 
 @pytest.mark.parametrize("scene", SCENES)
@@ -47,14 +48,13 @@ def test_pictures_are_of_the_arms_and_of_the_hidden_posture(scene: str) -> None:
     for step in range(STEPS + 1):
         seen = observations["ecm_0"]
         np.testing.assert_array_equal(seen["image"], eye.render(env.qpos).rgb[:, 0])
-        np.testing.assert_array_equal(seen["target"], eye.render(env.env.task.table[row(env)]).rgb[:, 0])
-        hidden = env.env.task.table[row(env)][:, camera]
-        np.testing.assert_array_equal(state[:, -len(camera) :], hidden.astype(np.float32))
-        before = row(env)
+        np.testing.assert_array_equal(seen["target"], eye.render(hidden(env)).rgb[:, 0])
+        np.testing.assert_array_equal(state[:, -len(camera) :], hidden(env)[:, camera].astype(np.float32))
+        before = env.goal.row
         outcome = env.step(random_actions(env, rng))
         final, info = outcome.final_observations["ecm_0"], outcome.infos["ecm_0"]
         ended = step == STEPS - 1
-        assert outcome.truncated.all() == ended == (not np.array_equal(before, row(env)))
+        assert outcome.truncated.all() == ended == (not np.array_equal(before, env.goal.row))
         np.testing.assert_array_equal(final["target"], seen["target"])
         assert np.array_equal(final["image"], outcome.observations["ecm_0"]["image"]) != ended
         difference = np.abs(final["image"].astype(float) - final["target"]).mean((1, 2, 3))
@@ -75,7 +75,7 @@ def test_errors_are_of_the_camera_and_zero_at_the_hidden_posture(scene: str) -> 
     model, data = env.scene.model, mujoco.MjData(env.scene.model)
     for i in range(COUNT):
         poses = []
-        for qpos in (env.qpos[i], env.env.task.table[row(env)[i]]):
+        for qpos in (env.qpos[i], hidden(env)[i]):
             data.qpos[:] = qpos
             mujoco.mj_kinematics(model, data)
             mujoco.mj_camlight(model, data)
@@ -85,9 +85,9 @@ def test_errors_are_of_the_camera_and_zero_at_the_hidden_posture(scene: str) -> 
         angle = np.arccos((np.trace(turn.T @ wanted) - 1) / 2)
         assert outcome.infos["ecm_0"]["tip_error"][i] == pytest.approx(np.linalg.norm(here - there), abs=1e-5)
         assert outcome.infos["ecm_0"]["angle_error"][i] == pytest.approx(angle, abs=1e-4)
-    env.engine.write(".physics.qpos", env.env.task.table[row(env)].astype(np.float32))
+    env.engine.write(".physics.qpos", hidden(env).astype(np.float32))
     env.engine.write(".physics.qvel", np.zeros((COUNT, model.nv), np.float32))
-    env.engine.write(".physics.ctrl", (env.env.task.table[row(env)] @ env.scene.moment.T).astype(np.float32))
+    env.engine.write(".physics.ctrl", (hidden(env) @ env.scene.moment.T).astype(np.float32))
     still = {a: np.zeros_like(action) for a, action in random_actions(env, np.random.default_rng(0)).items()}
     there = env.step(still).infos["ecm_0"]
     assert there["tip_error"].max() < 1e-4 and there["angle_error"].max() < 2e-3 and there["success"].all()
@@ -125,8 +125,8 @@ def test_nothing_observed_but_the_target_picture_depends_on_the_hidden_pose() ->
     carry, actions = env.carry(), random_actions(env, np.random.default_rng(0))
     seen = []
     for shift in (0, 1):
-        rows = (carry[".goal.row"] + shift) % len(env.env.task.table)
-        targets = np.asarray(env.env.task._tips)[rows]
+        rows = (carry[".goal.row"] + shift) % len(env.task.postures["hidden"])
+        targets = env.task.tables["tips"][rows]
         env.set_carry({**carry, ".goal.row": rows, ".goal.targets": targets})
         seen.append(env.step(actions))
     (one, other) = seen

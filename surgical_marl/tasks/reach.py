@@ -13,7 +13,7 @@ Success       tip within 2 mm of the goal.
 Termination   none; an episode is truncated after 100 control steps (2 s).
 Randomisation goals from a normal distribution about the point in front of each arm, kept only if reachable in
               1.5 s without collision (`surgical_marl/tasks/base/workspace.py`). Arms start at home, or with
-              `start=random` at postures from all of their joints' ranges, from which the goals are reached likewise.
+              `start=random` at postures as far from those at the goals as joints can move in 1.5 s.
 Difficulty    standard deviation of the goals: easy 30 mm, default 50 mm (the paper's), hard 70 mm. Hard: in a quarter
               of the episodes of several arms the straight ways from home, in joint space, collide unless one arm waits.
 """

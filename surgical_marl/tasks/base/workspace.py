@@ -58,8 +58,9 @@ def target_table(scene: Scene, spread: float, crossing: float = 0.0, seed: int =
 def start_table(scene: Scene, spread: float, seed: int = 0) -> dict[str, np.ndarray]:
     """Return postures to begin with, and targets that all arms of a scene can reach from there.
 
-    Every joint but the jaw's is drawn evenly from its whole range. A draw is kept if the arms are apart there, and if
-    they get to their targets as `target_table` asks, from there instead of home.
+    Targets are drawn as for `target_table`. From the posture there every joint but the jaw's is moved away evenly, as
+    far as its range and its speed in `TIME` let it. A draw is kept if the arms are apart, and no arm touches itself, on
+    the straight joint-space path between both.
 
     Args:
         spread: standard deviation of the targets in m, the same along each axis.
@@ -135,16 +136,14 @@ def _draw(scene: Scene, spread: float, crossing: float, seed: int) -> np.ndarray
 
 def _draw_starts(scene: Scene, spread: float, seed: int) -> np.ndarray:
     """Postures and targets of `start_table`, side by side, [TABLE_SIZE, nq + 3 arms]."""
-    rng, arms = np.random.default_rng(seed), {agent: mount.arm for agent, mount in scene.mounts.items()}
+    rng = np.random.default_rng(seed)
 
     def batch(_: bool) -> tuple[np.ndarray, np.ndarray]:
-        starts = {agent: _any_posture(rng, arm) for agent, arm in arms.items()}
-        targets = rng.normal(0.0, spread, (TABLE_SIZE, len(arms), 3))
+        targets = rng.normal(0.0, spread, (TABLE_SIZE, len(scene.agents), 3))
         targets += [mount.workspace for mount in scene.mounts.values()]
-        good = (scene.clearance(starts) > CLEARANCE) & (scene.clearance(starts, within=True) > 0)
-        starts, targets = {agent: q[good] for agent, q in starts.items()}, targets[good]
-        goals, good = _reach(scene, targets, starts)
-        for share in np.linspace(0.0, 1.0, PATH_POINTS + 1)[1:]:
+        goals, good = _reach(scene, targets, np.inf)
+        starts = {agent: _away(rng, mount.arm, goals[agent]) for agent, mount in scene.mounts.items()}
+        for share in np.linspace(0.0, 1.0, PATH_POINTS + 1):
             way = {agent: (1 - share) * starts[agent] + share * q for agent, q in goals.items()}
             good &= (scene.clearance(way) > CLEARANCE) & (scene.clearance(way, within=True) > 0)
         rows = np.concatenate([scene.full_qpos(starts), targets.reshape(len(targets), -1)], -1)[good]
@@ -153,26 +152,23 @@ def _draw_starts(scene: Scene, spread: float, seed: int) -> np.ndarray:
     return choose(scene, batch, TABLE_SIZE, 0.0)
 
 
-def _any_posture(rng: np.random.Generator, arm: Arm) -> np.ndarray:
-    """Joint positions [TABLE_SIZE, n] from all of their ranges, the jaw at home."""
-    q = rng.uniform(arm.lower, arm.upper, (TABLE_SIZE, len(arm.actuated)))
-    jaw = [arm.jaw is not None and joint.name == arm.jaw.joint for joint in arm.actuated]
-    return np.where(jaw, arm.home, q)
+def _away(rng: np.random.Generator, arm: Arm, q: np.ndarray) -> np.ndarray:
+    """Joint positions [N, n] from which an arm comes to `q` in `TIME`; the jaw stays."""
+    jaw = np.array([arm.jaw is not None and joint.name == arm.jaw.joint for joint in arm.actuated])
+    furthest = TIME * arm.speed * ~jaw
+    return rng.uniform(np.maximum(q - furthest, arm.lower), np.minimum(q + furthest, arm.upper))
 
 
-def _reach(
-    scene: Scene, targets: np.ndarray, starts: dict[str, np.ndarray] | None = None
-) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Joint positions [N, n] of each agent at its targets [N, arms, 3], and whether all get there, and in time, [N];
-    from postures [N, n] of each agent, or from home."""
+def _reach(scene: Scene, targets: np.ndarray, time: float = TIME) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Joint positions [N, n] of each agent at its targets [N, arms, 3], and whether all get there from home, in a time
+    in s, [N]."""
     good, goals = np.ones(len(targets), dtype=bool), {}
     for i, agent in enumerate(scene.agents):
         arm = scene.mounts[agent].arm
-        start = arm.home if starts is None else starts[agent]
-        goals[agent] = inverse_kinematics(arm, targets[:, i], start, starts=1)
+        goals[agent] = inverse_kinematics(arm, targets[:, i], starts=1)
         tips = arm.forward_kinematics(goals[agent])[:, :3, 3]
         good &= np.linalg.norm(tips - targets[:, i], axis=-1) < TOLERANCE
-        good &= (np.abs(goals[agent] - start) <= TIME * arm.speed).all(-1)
+        good &= (np.abs(goals[agent] - arm.home) <= time * arm.speed).all(-1)
     return goals, good
 
 
