@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
+import jax
 import mujoco
 import numpy as np
 import pytest
@@ -13,6 +15,9 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 
 from surgical_marl import list_scenes, load_scene
+from surgical_marl.physics.collision import Pairs
+from surgical_marl.physics.dynamics import Dynamics
+from surgical_marl.robots.inverse_kinematics import inverse_kinematics
 from surgical_marl.scenes.contacts import collision_geoms, neighbours
 from surgical_marl.scenes.scene import Scene
 from surgical_marl.scenes.separation import Limb, ball, can_meet
@@ -237,3 +242,27 @@ def carries(model: mujoco.MjModel, body: int, geom: int) -> bool:
     while at not in (0, body):
         at = int(model.body_parentid[at])
     return at == body
+
+
+@pytest.mark.parametrize("name", ["bimanual_psm", "trimanual_psm_ecm", "bimanual_star"])
+def test_whether_anything_overlaps_is_what_distances_say(name: str) -> None:
+    """At random postures, and with tools side by side, where short shapes are taken for spheres first."""
+    scene, rng = load_scene(name), np.random.default_rng(0)
+    dynamics, pairs = Dynamics(scene.model), Pairs(scene.model)
+
+    @jax.jit
+    @jax.vmap
+    def look(qpos: Any) -> Any:
+        data = dynamics.pose(qpos)
+        return pairs.overlap(data.geom_xpos, data.geom_xmat), pairs.distance(data.geom_xpos, data.geom_xmat).min()
+
+    spread = {a: rng.uniform(m.arm.lower, m.arm.upper, (1500, len(m.arm.lower))) for a, m in scene.mounts.items()}
+    meeting = {
+        a: inverse_kinematics(m.arm, (rng.normal(0, 0.006, (1500, 3)) - m.position) @ m.rotation)
+        for a, m in scene.mounts.items()
+    }
+    for postures in (spread, meeting):
+        overlaps, least = look(scene.full_qpos(postures).astype(np.float32))
+        clear = np.abs(least) > 1e-6
+        assert np.array_equal(np.asarray(overlaps)[clear], np.asarray(least < 0)[clear])
+        assert 0.05 < np.mean(overlaps) < 0.999

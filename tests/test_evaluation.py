@@ -227,7 +227,8 @@ def test_the_table_shows_every_number() -> None:
     result = evaluate(env, still, episodes=3, seed=11)
     head, titles, *lines = format_table(result).splitlines()
     assert head.startswith(
-        f"reach in script, default, position control: 3 episodes, seed 11, goal set {result['goal_set'][:12]}"
+        "reach in script, default, position control, training goals, home start: 3 episodes, seed 11, "
+        f"goal set {result['goal_set'][:12]} (not a standard one)"
     )
     assert titles.split() == ["all", "95", "%", "interval", "psm_0", "psm_1"]
     assert len(lines) == len(result["intervals"]) and len({len(line) for line in lines}) == 1

@@ -36,6 +36,18 @@ SIMPLER: dict[str, tuple[Callable[..., Value], Callable[..., Value]]] = {
     "x / 4": (lambda g, x, y: g.div(x, real(g, 4)), lambda g, x, y: g.mul(x, real(g, 0.25))),
     "0 / x": (lambda g, x, y: g.div(g.zero, x), lambda g, x, y: g.zero),
     "1 / 3": (lambda g, x, y: g.div(g.one, real(g, 3)), lambda g, x, y: real(g, np.float32(1) / np.float32(3))),
+    "clip to a point": (
+        lambda g, x, y: g.extreme("min", g.extreme("max", x, real(g, 2)), real(g, 2)),
+        lambda g, x, y: real(g, 2),
+    ),
+    "clip beyond a bound": (
+        lambda g, x, y: g.extreme("max", real(g, 3), g.extreme("min", x, real(g, 1))),
+        lambda g, x, y: real(g, 3),
+    ),
+    "clip within a bound": (
+        lambda g, x, y: g.extreme("min", g.extreme("max", x, real(g, 1)), real(g, 2)),
+        lambda g, x, y: g.binary("min", g.binary("max", x, real(g, 1)), real(g, 2)),
+    ),
     "x < x": (lambda g, x, y: g.compare("lt", x, x), lambda g, x, y: g.false),
     "x <= x": (lambda g, x, y: g.compare("le", x, x), lambda g, x, y: g.true),
     "max(x, x)": (lambda g, x, y: g.extreme("max", x, x), lambda g, x, y: x),

@@ -39,12 +39,16 @@ def capsules(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[Capsule, Capsu
     return one, other
 
 
-def check(model: mujoco.MjModel, data: mujoco.MjData, single: float) -> None:
-    """That numpy and, to `single` m, JAX give C MuJoCo's distance; whichever comes first."""
+def check(model: mujoco.MjModel, data: mujoco.MjData, single: float, over: float = 0.0) -> None:
+    """That numpy and, to `single` m, JAX give C MuJoCo's distance; whichever comes first.
+
+    Args:
+        over: by how much C MuJoCo's may be longer than the least one, m.
+    """
     one, other = capsules(model, data)
     expected = mujoco.mj_geomDistance(model, data, 0, 1, 10.0, None)
-    assert float(capsule_distance(one, other)) == pytest.approx(expected, abs=1e-6)
-    assert float(capsule_distance(other, one)) == pytest.approx(expected, abs=1e-6)
+    for found in (float(capsule_distance(one, other)), float(capsule_distance(other, one))):
+        assert expected - over - 1e-9 <= found <= expected + 1e-9
     pair = [Capsule(*(jnp.asarray(part, jnp.float32) for part in shape)) for shape in (one, other)]
     assert float(compiled_distance(*pair)) == pytest.approx(expected, abs=single)
 
@@ -59,14 +63,18 @@ def test_distances_are_c_mujocos(seed: int, one: str, other: str) -> None:
 @settings(max_examples=200, deadline=None)
 @given(SEEDS, st.sampled_from([0.0, 1e-9, 1e-7, 1e-5, 1e-3]), st.booleans())
 def test_distances_of_parallel_capsules_are_c_mujocos(seed: int, angle: float, ahead: bool) -> None:
-    """Side by side or one ahead of the other. Where nearly parallel ones cross can't be told in float32."""
+    """Side by side or one ahead of the other. Where nearly parallel ones cross can't be told in float32.
+
+    C MuJoCo takes those within about 2e-4 rad for parallel, and the end of one for the closest point even where they
+    cross: that is at most the angle times a segment's length farther.
+    """
     model, data, rng = model_of(("capsule", "capsule"), seed)
     turn = np.array([np.cos(angle / 2), np.sin(angle / 2), 0.0, 0.0])
     mujoco.mju_mulQuat(data.mocap_quat[1], data.mocap_quat[0], turn)
     if ahead:
         mujoco.mj_kinematics(model, data)
         data.mocap_pos[1] = data.mocap_pos[0] + rng.uniform(-0.5, 0.5) * data.geom_xmat[0].reshape(3, 3)[:, 2]
-    check(model, data, single=1e-4)
+    check(model, data, single=1e-4, over=2 * model.geom_size[:, 1].max() * angle if angle < 2e-4 else 0.0)
 
 
 def test_shapes_in_one_place_overlap_by_both_radii() -> None:

@@ -11,7 +11,9 @@ import pytest
 
 import surgical_marl as sm
 from surgical_marl import BatchedEnv
+from surgical_marl.envs.env import Env
 from surgical_marl.tasks.base.options import Options, make_options
+from surgical_marl.vision.endoscope import Endoscope
 
 
 def play(env: Any, steps: int = 5, seed: int = 0) -> list[Any]:
@@ -53,10 +55,17 @@ def test_a_setting_is_an_input_of_the_kernel(options: dict[str, Any], usual: Bat
         assert not np.isclose(usual.goal.targets, other.goal.targets).any(-1).any()
 
 
-@pytest.mark.parametrize(("task", "scene"), [("reach", "bimanual_psm"), ("track", "psm"), ("follow_path", "ecm")])
-def test_held_out_goals_are_none_of_training(task: str, scene: str) -> None:
-    tables = [sm.BatchedEnv(task, scene, goals=goals, engine="mjx").task.tables for goals in ("training", "held_out")]
-    name = "targets" if task == "reach" else "paths"
+@pytest.mark.parametrize(
+    ("task", "scene", "name"),
+    [
+        ("reach", "bimanual_psm", "targets"),
+        ("track", "psm", "paths"),
+        ("follow_path", "ecm", "paths"),
+        ("match_image", "ecm", "joints"),
+    ],
+)
+def test_held_out_goals_are_none_of_training(task: str, scene: str, name: str) -> None:
+    tables = [Env(task, scene, goals=goals).task.tables for goals in ("training", "held_out")]
     trained, held_out = ({row.tobytes() for row in np.round(table[name], 6)} for table in tables)
     assert len(held_out) > 1000 and not trained & held_out
 
@@ -72,10 +81,9 @@ def test_random_starts_are_collision_free_postures(engine: str) -> None:
     apart = env.scene.clearance(q)
     assert (apart > 0.009).all() and (env.scene.clearance(q, within=True) > 0).all()
     assert np.allclose(infos["psm_0"]["min_distance"], apart, atol=1e-5)
-    away = np.abs(q["psm_1"] - env.scene.mounts["psm_1"].arm.home)
-    assert (
-        away[:, :3].max(0) > 0.1 * (env.scene.mounts["psm_1"].arm.upper - env.scene.mounts["psm_1"].arm.lower)[:3]
-    ).all()
+    arm = env.scene.mounts["psm_1"].arm
+    away = np.abs(q["psm_1"] - arm.home).max(0)
+    assert (away > 0.1 * (arm.upper - arm.lower))[:3].all()
     first = env.qpos.copy()
     still = {agent: np.zeros((64, *env.action_space(agent).shape), np.float32) for agent in env.agents}
     step = env.step(still)
@@ -119,6 +127,28 @@ def test_terms_can_be_left_out_and_added() -> None:
     assert env.state_space.shape == (usual.state_space.shape[0] + 1,) == more.shape[1:]
     assert set(np.round(state[0], 5)) <= set(np.round(more[0], 5))
     assert env.types == {"psm": ["psm_0"], "psm-seeing-2": ["psm_1"]}
+
+
+@pytest.mark.parametrize("start", ["home", "random"])
+def test_pictures_are_terms_of_any_task(start: str) -> None:
+    """Over an episode's end, against an endoscope of its own: the next episode's pictures, and the last of this one."""
+    pictures = ["image_right", "ecm_0/depth"]
+    env = BatchedEnv("reach", "ecm", num_envs=3, start=start, max_steps=2, observe={"ecm_0": ["qpos", *pictures]})
+    eye = Endoscope(env.scene, 3, stereo=True, channels=("rgb", "depth"))
+    space = env.observation_space("ecm_0")
+    assert list(env.observation_terms("ecm_0")) == ["qpos"] and set(space) == {"proprioception", *pictures}
+    found, *_ = env.reset(seed=0)
+    for k in range(4):
+        view, seen = eye.render(env.qpos), found["ecm_0"]
+        assert all(space.contains({name: value[i] for name, value in seen.items()}) for i in range(3))
+        np.testing.assert_array_equal(seen["image_right"], view.rgb[:, 1])
+        np.testing.assert_array_equal(seen["ecm_0/depth"], view.depth[:, 0, ..., None])
+        step = play(env, 1, seed=k)[0]
+        found, final = step.observations, step.final_observations["ecm_0"]
+        ended = bool(step.truncated.all())
+        assert ended == bool(step.truncated.any()) == (k % 2 == 1)
+        assert np.array_equal(final["ecm_0/depth"], found["ecm_0"]["ecm_0/depth"]) != ended
+        assert not np.array_equal(final["ecm_0/depth"], seen["ecm_0/depth"])
 
 
 @pytest.mark.parametrize(

@@ -259,7 +259,6 @@ def test_the_example_acts_without_torch(tmp_path: Path) -> None:
 def test_policies_are_listed_by_what_they_do(runs: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     export.export_policy(runs, tmp_path / "policies" / "reach-fake")
     monkeypatch.setattr(content, "content_dir", lambda kind: tmp_path / kind)
-    monkeypatch.setattr(card, "content_dir", lambda kind: tmp_path / kind)
     (tmp_path / "policies" / "unfinished").mkdir()
     assert content.list_policies() == ["reach-fake"]
     header, _, row = card.table().splitlines()

@@ -39,6 +39,7 @@ def runs(tmp_path: Path) -> Path:
             good = np.full((4, 2), 0.001)
             good[: 2 - 2 * seed] = 0.1
             found: dict[str, Any] = {f"untouched/{name}": good for name in MEASURES}
+            found["untouched/success"] = good < 0.002
             found["untouched/collided"] = np.zeros((4, 2), bool)
             for index, arm in enumerate(("psm_0", "psm_1")):
                 for what, itself in (("frozen", 0.1), ("oracle", 0.0)):

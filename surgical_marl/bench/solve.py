@@ -124,7 +124,7 @@ def solve(
     """
     entered = time.perf_counter()
     began = entered if began is None else began
-    training, exam_env = make_training(settings), make_env(settings, EPISODES)
+    training, exam_env = make_training(settings), make_env(replace(settings, goals="held_out"), EPISODES)
     env = training.env.env
     watch, looks = Stopwatch(training), Looks(goal)
     made = time.perf_counter()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import shutil
 import sys
@@ -15,6 +16,7 @@ from surgical_marl.content import find
 from surgical_marl.evaluation.card import CARD, CLIP, EVALUATION, card, misses, worst_median
 from surgical_marl.evaluation.command import play_all
 from surgical_marl.evaluation.evaluate import summarise
+from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.policies.onnx_file import SUFFIX, write_onnx
 from surgical_marl.policies.policy import load_actor, load_policy
 from surgical_marl.policies.weights import write_weights
@@ -33,7 +35,8 @@ def export_policy(runs: Sequence[str], out: Path) -> Path:
     """Make the folder of a policy from the runs of one training with different seeds; it is there whole or not at all.
 
     Every run is evaluated on the standard goals. The weights are those of the run that misses the fewest goals of its
-    task, and among such the one with the least median error of its worst arm; the evaluation and the card tell of all.
+    task, and among such the one with the least median error of its worst arm, or where a task has no such error the one
+    that succeeds most often; the evaluation and the card tell of all.
 
     Raises:
         ValueError: no such run, runs of different trainings or with the same seed, or the folder exists already.
@@ -72,18 +75,32 @@ def _evaluate(runs: Sequence[str], seeds: Sequence[int], name: str) -> tuple[dic
     """What `eval --json` prints of the best run, with `seeds` of all runs beside it; and which run is the best."""
     played = list(play_all(list(runs), {}, EPISODES, SEED).values())
     results = [{"policy": f"seed {seed}", **summarise([run])} for seed, run in zip(seeds, played, strict=True)]
-    best = min(range(len(results)), key=lambda run: (len(misses(results[run])), worst_median(results[run])))
+    best = min(range(len(results)), key=lambda run: _rank(results[run]))
     whole = {"policy": "aggregate", **summarise(played)}
     every = {"best": seeds[best], "runs": results, "aggregate": whole}
-    return {**results[best], "policy": name, "seeds": every}, best
+    return {**results[best], "policy": name, "seeds": every, "also": _also(runs[best])}, best
+
+
+def _also(run: str) -> dict[str, Any]:
+    """What the same weights do on other goals and starts than those of the standard set, by what is other."""
+    asked = {"training goals": {"goals": "training"}}
+    if "random" in TASKS.load(read_settings(find("policies", run)).task).starts:
+        asked["random starts"] = {"start": "random"}
+    return {name: summarise([play_all([run], other, EPISODES, SEED)[run]]) for name, other in asked.items()}
+
+
+def _rank(result: dict[str, Any]) -> tuple[int, float, float]:
+    """Return what makes a run the best of its seeds, where it is the least."""
+    error = worst_median(result)
+    return len(misses(result)), math.inf if error is None else error, -result["success_rate"]
 
 
 def _fill(folder: Path, run: Path, settings: Settings, evaluation: dict[str, Any]) -> None:
     env = make_env(read_settings(run, ["engine=auto", "device=auto"]), num_envs=1)
-    actor, _ = load_actor(run, env)
+    actor, layout = load_actor(run, env)
     write_weights(folder, actor)
     for name, model in actor.models.items():
-        write_onnx(folder / f"{name}{SUFFIX}", model)
+        write_onnx(folder / f"{name}{SUFFIX}", model, layout.pictures[name])
     for name in (CONFIG, METRICS):
         shutil.copyfile(run / name, folder / name)
     (folder / EVALUATION).write_text(json.dumps(evaluation, indent=1) + "\n")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -37,6 +37,7 @@ class Layout:
         groups: the arms of each group.
         counts: agents acting in each group.
         action_sizes: width of the action of one agent of each group.
+        pictures: name -> space of the pictures that one agent of each group sees, in the order that they are stacked in.
     """
 
     def __init__(self, env: BatchedEnv, grouping: Grouping = "type") -> None:
@@ -53,6 +54,9 @@ class Layout:
             self.groups = types if grouping == "type" else {agent: [agent] for agent in self.agents}
             self.counts = {name: len(members) for name, members in self.groups.items()}
             self.action_sizes = {name: widths[members[0]] for name, members in self.groups.items()}
+
+        one_of_each = self.groups if grouping == "joint" else {name: each[:1] for name, each in self.groups.items()}
+        self.pictures = {name: _seen(env, members) for name, members in one_of_each.items()}
 
     @property
     def num_agents(self) -> int:
@@ -74,7 +78,11 @@ class Layout:
         for name, members in self.groups.items():
             felt = [proprioception(observations[agent]) for agent in members]
             groups[name] = torch.cat(felt, -1).unsqueeze(-2) if self.grouping == "joint" else self._stack_group(felt)
-            seen = [_pictures(observations[agent]) for agent in members if isinstance(observations[agent], Mapping)]
+            seen = [
+                stack_pictures([observations[agent][term] for term in _terms(observations[agent])])
+                for agent in members
+                if isinstance(observations[agent], Mapping)
+            ]
             if seen:
                 pictures = torch.cat(seen, -3).unsqueeze(-4) if self.grouping == "joint" else torch.stack(seen, -4)
                 groups[f"{name}_pictures"] = pictures.contiguous()
@@ -99,12 +107,23 @@ class Layout:
         return stacked.sum(-1, keepdim=True) if self.grouping == "joint" else stacked
 
 
-def _pictures(observation: Mapping[str, Tensor]) -> Tensor:
-    """The pictures [..., H, W, c] of an agent one behind the other, channels first: [..., C, H, W].
+def _terms(observation: Mapping[str, Any]) -> list[str]:
+    """The names of an agent's pictures: by name, as spaces sort them and observations do not."""
+    return sorted(name for name in observation if name != "proprioception")
+
+
+def _seen(env: BatchedEnv, agents: Sequence[str]) -> dict[str, Any]:
+    """The spaces of the pictures of some agents; with the agent in their names if several agents see some."""
+    spaces = {agent: getattr(env.observation_space(agent), "spaces", {}) for agent in agents}
+    several = sum(map(bool, spaces.values())) > 1
+    return {f"{agent}/{term}" if several else term: own[term] for agent, own in spaces.items() for term in _terms(own)}
+
+
+def stack_pictures(parts: Sequence[Tensor]) -> Tensor:
+    """Pictures [..., H, W, c] one behind the other, channels first: [..., C, H, W].
 
     Colours stay uint8. Depth is brought to their scale, 0 to 255 at `FURTHEST`, and all are float32 then.
     """
-    parts = [picture for name, picture in observation.items() if name != "proprioception"]
     scaled = [part if part.dtype == torch.uint8 else part.clamp(max=FURTHEST) * (255 / FURTHEST) for part in parts]
     alike = scaled if len({part.dtype for part in scaled}) == 1 else [part.float() for part in scaled]
     return torch.cat(alike, -1).movedim(-1, -3)

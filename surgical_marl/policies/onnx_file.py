@@ -36,11 +36,10 @@ class Graph(nn.Module):
         takes, gives: names of what goes in and comes out.
     """
 
-    def __init__(self, model: Any) -> None:
+    def __init__(self, model: Any, pictures: Mapping[str, Any]) -> None:
         super().__init__()
-        self.model = model
-        self.sees = hasattr(model, "obs_dims_2d")
-        pictures, memory = ["image", "target"] if self.sees else [], ["memory"] if model.is_recurrent else []
+        self.model, self.pictures = model, pictures
+        memory = ["memory"] if model.is_recurrent else []
         self.takes = ["observation", *pictures, *memory]
         self.gives = ["action", *(f"next_{name}" for name in memory)]
 
@@ -49,8 +48,8 @@ class Graph(nn.Module):
         given = dict(zip(self.takes, inputs, strict=True))
         (name,) = self.model.obs_groups
         groups = {name: given["observation"]}
-        if self.sees:
-            pictures = torch.cat([given["image"], given["target"]], -1).movedim(-1, -3)
+        if self.pictures:
+            pictures = stack_pictures([given[name] for name in self.pictures])
             groups[self.model.obs_groups_2d[0]] = pictures.unsqueeze(1)
         action = self.model(groups, None, given.get("memory")).clamp(-1.0, 1.0)
         return (action, self.model.get_hidden_state()) if self.model.is_recurrent else (action,)
@@ -58,17 +57,20 @@ class Graph(nn.Module):
     def example(self) -> tuple[Tensor, ...]:
         """What it takes for two agents, all zero."""
         zeros = {"observation": torch.zeros(2, self.model.obs_dim)}
-        if self.sees:
-            height, width = self.model.obs_dims_2d[0]
-            zeros |= {name: torch.zeros(2, height, width, 3, dtype=torch.uint8) for name in ("image", "target")}
+        for name, space in self.pictures.items():
+            zeros[name] = torch.from_numpy(np.zeros((2, *space.shape), space.dtype))
         if self.model.is_recurrent:
             zeros["memory"] = torch.zeros(2, *self.model.memory_shape)
         return tuple(zeros[name] for name in self.takes)
 
 
-def write_onnx(path: Path, model: Any) -> None:
-    """Write the network of one type of arm, of a `MultiAgentActor` on the CPU."""
-    graph = Graph(model).eval()
+def write_onnx(path: Path, model: Any, pictures: Mapping[str, Any]) -> None:
+    """Write the network of one group of a `MultiAgentActor` on the CPU.
+
+    Args:
+        pictures: what the group sees, of `Layout.pictures`.
+    """
+    graph = Graph(model, pictures).eval()
     batch = {0: torch.export.Dim("N")}
     with _quiet():
         program = torch.onnx.export(

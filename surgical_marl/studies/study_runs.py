@@ -52,7 +52,7 @@ def play(job: Job, out: Path) -> None:
     done = run / PLAYED
     if done.is_file() and done.stat().st_mtime >= (run / METRICS).stat().st_mtime:
         return
-    env = make_env(read_settings(run, ["engine=auto", "device=auto"]), EPISODES)
+    env = make_env(read_settings(run, ["engine=auto", "device=auto", "goals=held_out"]), EPISODES)
     policy, start = load_policy(run, env), round(WHEN / env.control_dt)
     untouched = evaluate.play(env, policy, EPISODES, seed=0)
     found: dict[str, Any] = {f"untouched/{name}": values for name, values in untouched.measures.items()}

@@ -276,7 +276,16 @@ class Graph:
         for x, y in ((a, b), (b, a)):
             if x < 0 and self.kind(x) == "f" and np.isinf(self.constants[~x]):
                 return y if (self.constants[~x] < 0) == (op == "max") else x
+            if x < 0 <= y and self._is_beyond(op, x, y):
+                return x
         return self.binary(op, a, b)
+
+    def _is_beyond(self, op: str, constant: Value, value: Value) -> bool:
+        """Whether a value is never less (of "min"; of "max", more) than a constant, as it was clipped there."""
+        if self.ops[value] != {"min": "max", "max": "min"}[op]:
+            return False
+        limit, bounds = self.constants[~constant], [self.constants[~a] for a in self.args[value] if a < 0]
+        return any(bound >= limit if op == "min" else bound <= limit for bound in bounds)
 
     def select(self, condition: Value, other: Value, chosen: Value) -> Value:
         """`chosen` where `condition` holds."""
