@@ -21,12 +21,6 @@ SLOTS = 6
 """Contacts at one time. Arms driven at random with full effort in all six scenes had 4 at most, in 144,000 steps."""
 
 
-SHORT = 0.006
-"""Capsules with half an axis of no more than this, m, are nearly spheres: jaws and wrists."""
-Lengths = list[np.ndarray]
-"""Of the first and of the second geom of each pair, [P] each."""
-
-
 class Closest(NamedTuple):
     """Where the geoms of each pair are closest, [P]."""
 
@@ -69,25 +63,9 @@ class Pairs:
         self._roots = model.body_rootid[model.dof_bodyid]
 
     def overlap(self, geom_xpos: Array, geom_xmat: Array) -> Array:
-        """Return whether any pair overlaps, []: for less than what `distance` costs.
-
-        Short capsules are first taken for the spheres around them. Where none of these touches anything, nothing does.
-        """
-        short = [half <= SHORT for half in self._halves]
-        halves = [np.where(s, 0, half) for s, half in zip(short, self._halves, strict=True)]
-        radii = [
-            np.where(s, radius + half, radius) for s, half, radius in zip(short, self._halves, self._radii, strict=True)
-        ]
-        near = self._any_overlap(geom_xpos, geom_xmat, halves, radii)
-        if all((rough == half).all() for rough, half in zip(halves, self._halves, strict=True)):
-            return near
-        exactly = lambda: self._any_overlap(geom_xpos, geom_xmat, self._halves, self._radii)  # noqa: E731
-        return jax.lax.cond(near, exactly, lambda: jnp.bool_(False))
-
-    def _any_overlap(self, geom_xpos: Array, geom_xmat: Array, halves: Lengths, radii: Lengths) -> Array:
-        """Whether any pair overlaps, if its capsules had these half lengths and radii."""
-        gap = axis_gap(*self._capsules(geom_xpos, geom_xmat, halves, radii))[1]
-        reach = radii[0] + radii[1]
+        """Return whether any pair overlaps, []: for less than what `distance` costs."""
+        gap = axis_gap(*self._capsules(geom_xpos, geom_xmat))[1]
+        reach = self._radii[0] + self._radii[1]
         return jnp.min(jnp.sum(gap * gap, -1) - reach * reach, initial=np.inf) < 0
 
     def distance(self, geom_xpos: Array, geom_xmat: Array) -> Array:
@@ -96,7 +74,7 @@ class Pairs:
 
     def closest(self, geom_xpos: Array, geom_xmat: Array) -> Closest:
         """Return where the pairs are closest, from positions [ngeom, 3] and frames [ngeom, 3, 3] of all geoms."""
-        one, other = self._capsules(geom_xpos, geom_xmat, self._halves, self._radii)
+        one, other = self._capsules(geom_xpos, geom_xmat)
         along, gap = axis_gap(one, other)
         length = jnp.sqrt(jnp.maximum(jnp.sum(gap * gap, -1), 1e-18))
         normal = gap / length[:, None]
@@ -104,9 +82,9 @@ class Pairs:
         point = one.centre + along[:, None] * one.axis + (one.radius + distance / 2)[:, None] * normal
         return Closest(distance, point, normal)
 
-    def _capsules(self, geom_xpos: Array, geom_xmat: Array, halves: Lengths, radii: Lengths) -> tuple[Capsule, Capsule]:
+    def _capsules(self, geom_xpos: Array, geom_xmat: Array) -> tuple[Capsule, Capsule]:
         """The first and the second geoms of all pairs, [P] each."""
-        parts = zip(self._geoms, halves, radii, strict=True)
+        parts = zip(self._geoms, self._halves, self._radii, strict=True)
         one, other = (Capsule(geom_xpos[g], geom_xmat[g][:, :, 2], half, radius) for g, half, radius in parts)
         return one, other
 
