@@ -55,24 +55,28 @@ def registry(monkeypatch: pytest.MonkeyPatch) -> Registry:
 GOOD = "from surgical_marl.learning.algorithm import Algorithm\nclass Mine(Algorithm):\n    pass\n"
 
 USED = """
+import json
+import math
 import sys
 from dataclasses import replace
 from pathlib import Path
 
 from surgical_marl.cli.main import main
 
-assert main(["list", "algorithms"]) == 0
+assert main(["list"]) == 0
 assert not {"torch", "jax"} & sys.modules.keys()
 assert main(["train", "reach", "--scene", "psm", "--algo", "sop", "--device", "cpu"]) == 2
+"""
 
+ALGORITHM = """
 import torch
 
-from fake_env import FakeEnv
-from runs import COUNTS, SIZES, SMALL, run
 from surgical_marl.plugins.algorithms import ALGORITHMS
 from surgical_marl.policies.policy import load_policy
 from surgical_marl.runs.folder import read_metrics
 from surgical_marl.runs.settings import load_config
+from tests.helpers.fake_env import FakeEnv
+from tests.helpers.runs import COUNTS, SIZES, SMALL, run
 
 assert load_config("reach", "psm", ["algo=spo"]).algo == "spo"
 ratio = torch.linspace(0.5, 1.5, 101)
@@ -86,16 +90,86 @@ assert rows[-1]["tip_error_mm"] < rows[0]["tip_error_mm"]
 load_policy(out, FakeEnv(COUNTS, SIZES))
 """
 
+TASK = """
+import gymnasium
+import pettingzoo
 
-def test_the_example_package_is_listed_trained_and_loaded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+from surgical_marl import salute_v0
+from surgical_marl.interfaces.registration import PACKAGE
+from surgical_marl.policies.policy import load_policy
+from surgical_marl.runs.environment import make_env
+from surgical_marl.runs.folder import read_metrics, read_settings
+
+for make in (
+    salute_v0.parallel_env,
+    salute_v0.env,
+    lambda **options: pettingzoo.make("parallel", f"{PACKAGE}/salute-v0", **options),
+    lambda **options: pettingzoo.make("aec", f"{PACKAGE}/salute-v0", **options),
+):
+    env = make(scene="psm_watched", max_steps=4)
+    assert env.possible_agents == ["psm_0", "ecm_0"]
+    assert env.observation_space("ecm_0").spaces.keys() == {"proprioception", "image"}
+    env.close()
+gymnasium.make(f"{PACKAGE}/Salute-v0", scene="psm_watched", max_steps=4).close()
+
+out = Path(sys.argv[1])
+small = ["num_envs=8", "iterations=2", "steps_per_iteration=4", "max_steps=4", "network.hidden=[8]", "ppo.epochs=1"]
+command = ["train", "salute", "--scene", "psm_watched", "--algo", "spo", "--device", "cpu", "--out", str(out)]
+assert main([*command, *small]) == 0
+rows = read_metrics(out)
+assert [row["iteration"] for row in rows] == [1, 2] and math.isnan(rows[-1]["tip_error_mm"])
+found = json.loads((out / "eval.json").read_text())
+assert [found[key] for key in ("task", "scene", "goals", "episodes")] == ["salute", "psm_watched", "held_out", 200]
+for numbers in (found, *found["agents"].values()):
+    assert numbers["median_error_mm"] is None  # no tip has a target
+    assert numbers["stages"].keys() == {"half", "all"}
+    assert 0 <= numbers["success_rate"] <= numbers["stages"]["all"] <= numbers["stages"]["half"] <= 1
+assert found["agents"].keys() == {"psm_0", "ecm_0"} and (out / "video.mp4").stat().st_size
+
+env = make_env(read_settings(out), 2)
+assert env.task.summary() == "Salute: every arm takes up a posture that it is told."
+actions = load_policy(out, env)(env.reset(0)[0])
+assert {agent: tuple(action.shape) for agent, action in actions.items()} == {
+    agent: (2, *env.action_space(agent).shape) for agent in env.agents
+}
+"""
+
+
+@pytest.fixture
+def example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], subprocess.CompletedProcess[str]]:
+    """Run code in a new process in which the example package is installed; its argument is a folder to write."""
     project = tomllib.loads((EXAMPLE / "pyproject.toml").read_text())["project"]
     write_metadata(tmp_path / "site", project["name"], project["entry-points"])
-    for folder in (TESTS.parent, TESTS, EXAMPLE, tmp_path / "site"):
+    for folder in (TESTS.parent, EXAMPLE, tmp_path / "site"):
         monkeypatch.setenv("PYTHONPATH", str(folder), prepend=":")
-    done = subprocess.run([sys.executable, "-c", USED, str(tmp_path / "run")], capture_output=True, text=True)
-    assert not done.returncode, done.stderr
-    assert done.stdout.split()[:5] == ["happo", "ippo", "joint", "mappo", "spo"]
+
+    def run(code: str) -> subprocess.CompletedProcess[str]:
+        done = subprocess.run([sys.executable, "-c", code, str(tmp_path / "run")], capture_output=True, text=True)
+        assert not done.returncode, done.stderr
+        return done
+
+    return run
+
+
+def test_the_example_algorithm_is_listed_trained_and_loaded(
+    example: Callable[[str], subprocess.CompletedProcess[str]],
+) -> None:
+    done = example(USED + ALGORITHM)
+    listed = dict(line.split(maxsplit=1) for line in done.stdout.splitlines()[:5])
+    assert listed["algorithms"].split(", ") == ["happo", "ippo", "joint", "mappo", "spo"]
+    assert {"salute", "reach"} <= set(listed["tasks"].split(", "))
+    assert {"psm_watched", "psm"} <= set(listed["scenes"].split(", "))
     assert "unknown algorithm 'sop', did you mean 'spo'" in done.stderr
+
+
+def test_the_example_task_and_scene_have_all_that_shipped_ones_have(
+    example: Callable[[str], subprocess.CompletedProcess[str]],
+) -> None:
+    """Ids and a module, the command line, an evaluation and a film, and policies that load: of a package's files
+    alone."""
+    done = example(USED + TASK)
+    assert "salute in psm_watched, default, position control, held_out goals" in done.stdout
+    assert "stage half" in done.stdout and "Warning" not in done.stderr
 
 
 def test_packages_that_are_broken_are_named_and_leave_the_others_alone(install: Install, registry: Registry) -> None:

@@ -43,13 +43,29 @@ SMALL = Settings(
 )
 
 
+COLOURS, DEPTH = Box(0, 255, (64, 64, 3), np.uint8), Box(0, 1, (64, 64, 1), np.float32)
+
+
 class PictureEnv(FakeEnv):
     """One of its agents sees pictures."""
 
+    seen: dict[str, Box] = {"image": COLOURS, "target": COLOURS}  # noqa: RUF012
+
     def observation_space(self, agent: str) -> Any:
         felt = super().observation_space(agent)
-        picture = Box(0, 255, (64, 64, 3), np.uint8)
-        return Dict(proprioception=felt, image=picture, target=picture) if agent == "ecm_0" else felt
+        return Dict(proprioception=felt, **self.seen) if agent == "ecm_0" else felt
+
+
+class DeepEnv(PictureEnv):
+    """It sees depth, in another type than colours."""
+
+    seen = {"image": COLOURS, "depth": DEPTH}  # noqa: RUF012
+
+
+class OneEyedEnv(PictureEnv):
+    """It sees one picture."""
+
+    seen = {"image": COLOURS}  # noqa: RUF012
 
 
 @pytest.fixture
@@ -85,7 +101,13 @@ def test_an_export_is_the_best_of_its_seeds(runs: list[str], tmp_path: Path) -> 
     text = (out / "README.md").read_text()
     for said in (
         *("reach-fake", f"seed {best}", "all training seeds (3)", "trimanual_psm_ecm", "256 environment steps"),
-        *(torch.__version__, "## Limits", "Misses its goal: median error (mm)", "last 2 say which of the 2"),
+        *(
+            torch.__version__,
+            "## Limits",
+            "Misses its goal: median error (mm)",
+            "never drawn in training",
+            "last 2 say which of the 2",
+        ),
     ):
         assert said in text
     origin = read_origin(out)["origin"]
@@ -103,6 +125,14 @@ def test_a_run_that_meets_its_goals_comes_before_one_that_is_more_exact(
     )
     found = json.loads((export.export_policy(runs, tmp_path / "b") / "evaluation.json").read_text())
     assert found["seeds"]["best"] == least_exact and card.worst_median(found) == medians[least_exact]
+
+
+def test_where_no_tip_has_a_target_the_run_that_succeeds_most_is_best() -> None:
+    """As in the tasks of `Task` that are no `TipTask`."""
+    blind = {"task": "reach", "agents": {"psm_0": {"median_error_mm": None}}, "median_error_mm": None}
+    good, bad = ({**blind, "success_2mm": None, "collision_rate": 0.0, "success_rate": share} for share in (0.9, 0.5))
+    assert card.worst_median(good) is None and "median error (mm) is -, not below 1.00" in card.misses(good)
+    assert export._rank(good) < export._rank(bad)
 
 
 def test_what_is_exported_acts_and_measures_as_the_run(runs: list[str], tmp_path: Path) -> None:
@@ -188,6 +218,8 @@ def test_weights_that_are_not_data_or_not_of_this_scene_are_refused(runs: list[s
         (FakeEnv(COUNTS, SIZES), "mappo", "lstm"),
         (PictureEnv(COUNTS, SIZES), "mappo", "none"),
         (PictureEnv(COUNTS, SIZES), "joint", "gru"),
+        (OneEyedEnv(COUNTS, SIZES), "mappo", "none"),
+        (DeepEnv(COUNTS, SIZES), "mappo", "none"),
     ],
 )
 def test_onnx_acts_as_torch_does(env: Any, algo: Any, recurrent: Any, tmp_path: Path) -> None:
@@ -200,7 +232,7 @@ def test_onnx_acts_as_torch_does(env: Any, algo: Any, recurrent: Any, tmp_path: 
         for model in actor.models.values():  # fresh networks hardly act: so that some actions are beyond 1
             model.mlp[-1].weight.mul_(300)
     for name, model in actor.models.items():
-        write_onnx(tmp_path / f"{name}.onnx", model)
+        write_onnx(tmp_path / f"{name}.onnx", model, layout.pictures[name])
     assert len(list(tmp_path.iterdir())) == len(layout.counts)
     for number in (1, 7):
         seen = {agent: _random(env.observation_space(agent), number) for agent in env.agents}
@@ -214,7 +246,8 @@ def test_onnx_acts_as_torch_does(env: Any, algo: Any, recurrent: Any, tmp_path: 
             given = {"observation": groups[name][:, place].numpy()}
             wanted = [actor._split(flat)[list(layout.counts).index(name)][:, place]]
             if f"{name}_pictures" in groups:
-                given |= {key: seen["ecm_0"][key].numpy() for key in ("image", "target")}
+                assert layout.pictures[name].keys() == env.seen.keys()
+                given |= {key: seen["ecm_0"][key].numpy() for key in env.seen}
             if memory is not None and left is not None:
                 given["memory"] = memory[:, index].numpy()
                 wanted.append(left[:, index])
@@ -228,7 +261,7 @@ def _random(space: Any, number: int) -> Any:
         return {name: _random(part, number) for name, part in space.spaces.items()}
     if space.dtype == np.uint8:
         return torch.randint(0, 256, (number, *space.shape), dtype=torch.uint8)
-    return 3 * torch.randn(number, *space.shape)
+    return 3 * torch.randn(number, *space.shape) if len(space.shape) == 1 else torch.rand(number, *space.shape)
 
 
 def test_the_example_acts_without_torch(tmp_path: Path) -> None:
@@ -239,7 +272,7 @@ def test_the_example_acts_without_torch(tmp_path: Path) -> None:
     actor = policy._actor(replace(SMALL, scene="bimanual_psm"), env, Layout(env))
     folder = tmp_path / "policies" / "reach-bimanual_psm"
     folder.mkdir(parents=True)
-    write_onnx(folder / "psm.onnx", actor.models["psm"])
+    write_onnx(folder / "psm.onnx", actor.models["psm"], {})
     code = (
         f"import runpy, sys; runpy.run_path({str(ROOT / 'docs' / 'onnx_policy.py')!r}); print('torch' in sys.modules)"
     )

@@ -8,14 +8,14 @@ from pathlib import Path
 import pytest
 import torch
 
-from surgical_marl.runs import settings as config
-from surgical_marl.runs.settings import NetworkSettings, load_config
+from surgical_marl import content
+from surgical_marl.runs.settings import NetworkSettings, Settings, load_config
 
 
 @pytest.fixture
 def reach(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
     """Replaces the text of `reach.yaml`."""
-    monkeypatch.setattr(config, "content_dir", lambda kind: tmp_path)
+    monkeypatch.setattr(content, "content_dir", lambda kind: tmp_path)
 
     def write(text: str) -> None:
         (tmp_path / "reach.yaml").write_text(text)
@@ -31,6 +31,11 @@ def test_settings_come_from_task_scene_and_overrides(reach: Callable[[str], None
     assert (settings.ppo.gamma, settings.ppo.lam, settings.ppo.learning_rate) == (0.9, 0.7, 1e-4)
     assert settings.network.hidden == (8, 8)
     assert load_config("reach", "ecm", ["num_envs=5", "num_envs=6", "max_steps=null"]).num_envs == 6
+
+
+def test_a_task_without_a_file_has_the_defaults(reach: Callable[[str], None]) -> None:
+    reach("num_envs: 64\n")
+    assert load_config("track", "psm", ["seed=3"]) == Settings(task="track", scene="psm", seed=3)
 
 
 def test_a_gpu_has_settings_of_its_own(reach: Callable[[str], None], monkeypatch: pytest.MonkeyPatch) -> None:

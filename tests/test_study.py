@@ -14,8 +14,9 @@ import pytest
 import torch
 
 from surgical_marl.policies.acting import forget
+from surgical_marl.runs import environment
 from surgical_marl.runs.folder import write_config, write_metrics
-from surgical_marl.runs.settings import load_config
+from surgical_marl.runs.settings import Settings, load_config
 from surgical_marl.studies import study, study_report, study_runs
 
 MEASURES = ("error", "held", "squared", "distance", "center", "path", "time", "smoothness")
@@ -77,6 +78,17 @@ def test_tables_and_files(runs: Path) -> None:
 def test_nothing_to_report(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="no run that was played"):
         study.main(["--only", "report", "--out", str(tmp_path), "--results", str(tmp_path)])
+
+
+def test_what_is_played_are_goals_that_training_never_drew(runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def make_env(settings: Settings, num_envs: int) -> None:
+        raise ValueError(f"{num_envs} episodes of {settings.goals} goals")
+
+    monkeypatch.setattr(environment, "make_env", make_env)
+    job = study_runs.Job("bimanual_psm", "mappo", 0)
+    (runs / str(job) / study_runs.PLAYED).unlink()
+    with pytest.raises(ValueError, match="200 episodes of held_out goals"):
+        study_runs.play(job, runs)
 
 
 def test_an_arm_is_taken_over() -> None:

@@ -12,7 +12,7 @@ from surgical_marl.content import find, list_policies
 from surgical_marl.evaluation.goal_set import is_standard
 from surgical_marl.evaluation.report import number, title
 from surgical_marl.plugins.tasks import TASKS
-from surgical_marl.policies.onnx_file import SUFFIX
+from surgical_marl.policies.onnx_file import SUFFIX, read_pictures
 from surgical_marl.policies.weights import read_weights
 from surgical_marl.runs.folder import CURVE, read_metrics, read_origin, read_settings
 from surgical_marl.runs.settings import Settings
@@ -20,7 +20,7 @@ from surgical_marl.scenes.load import load_scene
 
 CARD, CLIP, EVALUATION = "README.md", "clip.mp4", "evaluation.json"
 SHOWN = ("median_error_mm", "p95_error_mm", "rmse_mm", "success_1mm", "success_2mm", "success_5mm", "team_success_2mm",
-         "collision_rate", "time_to_success_s", "image_error", "angle_error_deg")  # fmt: skip
+         "success_rate", "collision_rate", "time_to_success_s", "image_error", "angle_error_deg")  # fmt: skip
 COLUMNS = (
     *("policy", "median error of the worst arm (mm)", "on training goals (mm)", "RMSE (mm)", "within 2 mm"),
     *("from random starts", "collisions", "median error of each training seed (mm)", "training", "misses"),
@@ -28,17 +28,23 @@ COLUMNS = (
 _HOLDS = {"below": operator.lt, "at least": operator.ge}
 
 
-def worst_median(result: Mapping[str, Any]) -> float:
-    """The median error of the arm that has the largest, mm: arms that only keep still can't hide another's error."""
-    return max(agent["median_error_mm"] for agent in result["agents"].values())
+def worst_median(result: Mapping[str, Any]) -> float | None:
+    """The median error of the arm that has the largest, mm: arms that only keep still can't hide another's error. None
+    in a task whose tool tips have no targets."""
+    errors = (agent["median_error_mm"] for agent in result["agents"].values())
+    return max((error for error in errors if error is not None), default=None)
+
+
+def _worst(result: Mapping[str, Any]) -> str:
+    return number("median_error_mm", worst_median(result))
 
 
 def misses(result: Mapping[str, Any]) -> list[str]:
     """The goals of its task that a result misses, each as "what it has: the goal"."""
     found = []
     for name, (relation, goal) in TASKS.load(result["task"]).wanted.items():
-        value = worst_median(result) if name == "median_error_mm" else result[name]
-        if not _HOLDS[relation](value, goal):
+        value: float | None = worst_median(result) if name == "median_error_mm" else result[name]
+        if value is None or not _HOLDS[relation](value, goal):
             found.append(f"{title(name)} is {number(name, value)}, not {relation} {number(name, goal)}")
     return found
 
@@ -59,13 +65,13 @@ def _row(folder: Path) -> tuple[str, ...]:
     last, origin = _training(folder), read_origin(folder)["origin"]
     return (
         f"[{folder.name}]({folder.name})",
-        f"{worst_median(result):.2f}",
-        f"{worst_median(seen):.2f}" if seen else "-",
+        _worst(result),
+        _worst(seen) if seen else "-",
         number("rmse_mm", result.get("rmse_mm")),
         number("success_2mm", result["success_2mm"]),
         number("success_2mm", elsewhere.get("success_2mm")),
         number("collision_rate", result["collision_rate"]),
-        ", ".join(f"{worst_median(run):.2f}" for run in result["seeds"]["runs"]),
+        ", ".join(_worst(run) for run in result["seeds"]["runs"]),
         f"{last['seconds']:.0f} s, {origin.get('device') or 'unknown device'}",
         "; ".join(misses(result)) or "-",
     )
@@ -101,7 +107,7 @@ def _how_well(result: Mapping[str, Any], name: str) -> str:
     rows += [
         f"| {title(key)} | {_with_interval(key, result)} | {_with_interval(key, every['aggregate'])} |" for key in shown
     ]
-    each = ", ".join(f"{run['policy']}: {worst_median(run):.2f} mm" for run in every["runs"])
+    each = ", ".join(f"{run['policy']}: {_worst(run)} mm" for run in every["runs"])
     goals = "the standard goal set" if is_standard(result) else "goal set"
     return f"""## How well
 
@@ -164,7 +170,7 @@ def _limits(result: Mapping[str, Any], settings: Settings) -> str:
     goals = ", ".join(
         f"{title(name)} {how} {number(name, goal)}" for name, (how, goal) in TASKS.load(settings.task).wanted.items()
     )
-    met = [] if missed else [f"- Meets the goals of its task: {goals}."]
+    met = [] if missed or not goals else [f"- Meets the goals of its task: {goals}."]
     return "\n".join([
         "## Limits\n", *missed, *met, *(none if result["collision_rate"] == 0 else []),
         f"- For {settings.control} control, difficulty `{settings.difficulty}`, and arms that stand as in this scene.",
@@ -174,12 +180,11 @@ def _limits(result: Mapping[str, Any], settings: Settings) -> str:
 
 
 def _files(folder: Path) -> str:
-    groups, state = read_weights(folder)
+    groups, _ = read_weights(folder)
     lines = []
     for name, (count, observation, action) in groups.items():
         one_hot = f", of which the last {count} say which of the {count} it is" if count > 1 else ""
-        sees = any(key.startswith(f"models.{name}.cnns.") for key in state)
-        pictures = " and `image`, `target` [N, 64, 64, 3] uint8" if sees else ""
+        pictures = "".join(f", `{what}` {shape}" for what, shape in read_pictures(folder / f"{name}{SUFFIX}").items())
         lines.append(
             f"- `{name}{SUFFIX}`: `observation` [N, {observation}]{one_hot}{pictures} -> `action` [N, {action}]."
         )

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
 
 ENDED = ("episodes", "error", "success", "collision", "reward")
-"""What `Episodes.take` sums up, before the reward terms. A task without tip errors has none: 0."""
+"""What `Episodes.take` sums up, before the reward terms. A task without tip errors has none: NaN."""
 KNOWN = ("success", "collision")
 
 
@@ -34,7 +35,7 @@ class Episodes:
         """Count one step: rewards `[N]`, dones `[N]`, and the infos of each agent."""
         success, collision = (torch.stack([infos[agent][name] for agent in self.agents]) for name in KNOWN)
         errors = [infos[agent]["tip_error"] for agent in self.agents if "tip_error" in infos[agent]]
-        error = torch.stack(errors) if errors else torch.zeros_like(rewards)[None]
+        error = torch.stack(errors) if errors else torch.full_like(rewards, math.nan)[None]
         self.collided |= collision.any(0)
         # where, not a product: the error of an episode that runs on must not matter, whatever it
         # is.

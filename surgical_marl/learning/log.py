@@ -80,5 +80,6 @@ def _describe(row: Mapping[str, float]) -> str:
     episodes = "no episode ended"
     if row["episodes"]:
         rates = f"success {row['success_rate']:.0%}, collision {row['collision_rate']:.0%}"
-        episodes = f"tip {row['tip_error_mm']:.2f} mm, {rates}"
+        error = row["tip_error_mm"]  # unknown in a task without targets
+        episodes = rates if math.isnan(error) else f"tip {error:.2f} mm, {rates}"
     return f"{episodes}, {row['steps_per_s']:,.0f} steps/s"

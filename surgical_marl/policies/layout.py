@@ -37,7 +37,7 @@ class Layout:
         groups: the arms of each group.
         counts: agents acting in each group.
         action_sizes: width of the action of one agent of each group.
-        pictures: name -> space of the pictures that one agent of each group sees, in the order that they are stacked in.
+        pictures: of each group name -> space of the pictures that one agent sees, in the order of the stack.
     """
 
     def __init__(self, env: BatchedEnv, grouping: Grouping = "type") -> None:

@@ -4,7 +4,7 @@ What such a file takes, for N agents of its type at once:
 
     observation  [N, d + n] float32, what the agent observes; where n > 1 agents share the type, then a one-hot of the
                  agent's place among them ("joint": what all agents observe, type by type)
-    image, target  [N, H, W, 3] uint8, of an agent that sees pictures
+    image, ...   [N, H, W, 3] uint8, each picture that the agent sees, by its name (depth: [N, H, W, 1] float32, m)
     memory       [N, S] float32, of a network that remembers: zeros when an episode begins, then the last `next_memory`
 
 and gives `action` [N, a] float32 in [-1, 1], without exploration noise, and `next_memory` if it remembers. Observations
@@ -15,15 +15,17 @@ from __future__ import annotations
 
 import logging
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from surgical_marl.files import write_atomic
+from surgical_marl.policies.layout import stack_pictures
 
 SUFFIX = ".onnx"
 OPSET = 20
@@ -85,6 +87,19 @@ def write_onnx(path: Path, model: Any, pictures: Mapping[str, Any]) -> None:
         )
     assert program is not None
     write_atomic(path, lambda temporary: program.save(str(temporary)))
+
+
+def read_pictures(path: Path) -> dict[str, str]:
+    """Return the pictures that the network in a file takes: name -> shape and type, in words."""
+    import onnx
+
+    found = {}
+    for each in onnx.load(path, load_external_data=False).graph.input:
+        tensor = each.type.tensor_type
+        if len(tensor.shape.dim) == 4:
+            sizes = ", ".join(["N", *(str(size.dim_value) for size in tensor.shape.dim[1:])])
+            found[each.name] = f"[{sizes}] {onnx.helper.tensor_dtype_to_np_dtype(tensor.elem_type)}"
+    return found
 
 
 @contextmanager
