@@ -1,6 +1,7 @@
 """Trains the policies that ship, one for every task and scene, evaluates them and exports them here.
 
     python policies/train_all.py                                        # all 20, three seeds each, four at a time
+    python policies/train_all.py --evaluate                             # only evaluate those that are here, anew
     python policies/train_all.py --only reach-psm track-psm --seeds 0 1 2 --jobs 4 iterations=500
 
 Runs go to `runs/policies/<task>-<scene>/seed<seed>`. It may be stopped at any time and started again: it goes on with
@@ -53,6 +54,7 @@ def main() -> int:
     parser.add_argument("--jobs", type=int, default=4, metavar="J", help="processes at a time")
     parser.add_argument("--runs", type=Path, default=Path("runs/policies"), metavar="DIR")
     parser.add_argument("--out", type=Path, default=content_dir("policies"), metavar="DIR")
+    parser.add_argument("--evaluate", action="store_true", help="train nothing: evaluate the policies in --out anew")
     arguments, overrides = parser.parse_known_args()
     # `--only a b key=value` leaves overrides among the names.
     names = [name for name in arguments.only if "=" not in name]
@@ -66,7 +68,11 @@ def main() -> int:
     # does little else.
     os.environ.setdefault("OMP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // arguments.jobs)))
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
-    todo = [job for name in names for job in _jobs(name, arguments, overrides)]
+    if arguments.evaluate:
+        logs = arguments.runs / "evaluate"
+        todo = [Job(name, "evaluate", evaluate, (arguments.out / name,), logs / f"{name}.log") for name in names]
+    else:
+        todo = [job for name in names for job in _jobs(name, arguments, overrides)]
     failed = run(todo, arguments.jobs)
     if arguments.out.resolve() == content_dir("policies").resolve():
         write_table(arguments.out / "README.md")
@@ -151,6 +157,13 @@ def export(runs: Sequence[str], out: Path) -> None:
     from surgical_marl.evaluation.export import export_policy
 
     export_policy(runs, out)
+
+
+def evaluate(folder: Path) -> None:
+    """Evaluate a policy anew with the weights that it has."""
+    from surgical_marl.evaluation.export import evaluate_again
+
+    evaluate_again(folder)
 
 
 def write_table(path: Path) -> None:

@@ -304,7 +304,7 @@ class Env:
     def _infos(
         self, task: Task, world: World, before: Array, after: Carry, terms: dict[str, dict[str, Array]]
     ) -> dict[str, dict[str, Array]]:
-        success, stages, metrics = task.success(world), task.stages(world), task.metrics(world)
+        success, stages, metrics = task.success(world), task.reached(world), task.metrics(world)
         speeds, infos = jnp.linalg.norm(after.tips - before, axis=-1) / np.float32(self.control_dt), {}
         for i, (agent, view) in enumerate(world.arms.items()):
             broken = costs(self.scene.mounts[agent].arm, view, speeds[i])

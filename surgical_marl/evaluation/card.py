@@ -101,7 +101,9 @@ The scene: {scene.description}; agents {", ".join(f"`{agent}`" for agent in scen
 
 def _how_well(result: Mapping[str, Any], name: str) -> str:
     every = result["seeds"]
-    together = f"all training seeds ({len(every['runs'])})"
+    together, protocol = f"all training seeds ({len(every['runs'])})", every["aggregate"]["protocol"]
+    if protocol != result["protocol"]:
+        together += f", by protocol {protocol}"
     rows = [f"| | these weights (seed {every['best']}) | {together} |", "|---|---|---|"]
     shown = [key for key in SHOWN if key in result]
     rows += [
@@ -135,6 +137,8 @@ def _elsewhere(result: Mapping[str, Any], shown: Sequence[str]) -> str:
 
 
 def _with_interval(key: str, result: Mapping[str, Any]) -> str:
+    if key not in result:  # an older protocol did not measure it
+        return "-"
     bounds = result["intervals"][key]
     span = "" if bounds is None else f" ({' to '.join(number(key, bound) for bound in bounds)})"
     return f"{number(key, result[key])}{span}"

@@ -36,6 +36,8 @@ class Played(NamedTuple):
     """[E, A] each, see `surgical_marl.evaluation.metrics.measure`."""
     follows: bool = False
     """Whether the task's goals move."""
+    stages: tuple[str, ...] = ()
+    """Of the task, in their order."""
 
 
 def evaluate(
@@ -83,7 +85,7 @@ def play(
     about = describe_goals(env, episodes)
     measures = {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
     found = {**about, "seed": seed, "goal_set": goal_hash(about, goals)}
-    return Played(found, list(env.agents), measures, env.task.follows)
+    return Played(found, list(env.agents), measures, env.task.follows, env.task.stages)
 
 
 def summarise(runs: Sequence[Played]) -> dict[str, Any]:
@@ -97,13 +99,13 @@ def summarise(runs: Sequence[Played]) -> dict[str, Any]:
     measures = {name: np.stack([run.measures[name] for run in runs]) for name in first.measures}
     following = first.follows
     agents = {
-        agent: _numbers(metrics({name: values[..., i : i + 1] for name, values in measures.items()}, following))
+        agent: _numbers(metrics({n: values[..., i : i + 1] for n, values in measures.items()}, following), first.stages)
         for i, agent in enumerate(first.agents)
     }
     for numbers in agents.values():
         for name in [name for name in numbers if name.startswith("team_")]:
             del numbers[name], numbers["intervals"][name]
-    return {**first.about, **_numbers(metrics(measures, following)), "agents": agents}
+    return {**first.about, **_numbers(metrics(measures, following), first.stages), "agents": agents}
 
 
 def difference(result: Mapping[str, Any], other: Mapping[str, Any], name: str) -> dict[str, float | None]:
@@ -117,13 +119,14 @@ def difference(result: Mapping[str, Any], other: Mapping[str, Any], name: str) -
     return {key: None if None in pair else pair[0] - pair[1] for key, pair in values.items()}
 
 
-def _numbers(found: Mapping[str, Metric]) -> dict[str, Any]:
-    """Values of metrics and, under `intervals`, their 95 % intervals; None where there is none."""
+def _numbers(found: Mapping[str, Metric], stages: Sequence[str]) -> dict[str, Any]:
+    """Values of metrics, those of `stages` in their order too, and, under `intervals`, their 95 % intervals; None where
+    there is none."""
     values = {name: float(metric.reduce(metric.values.ravel())) for name, metric in found.items()}
     numbers: dict[str, Any] = {name: value if math.isfinite(value) else None for name, value in values.items()}
     undefined = {name for name, metric in found.items() if metric.extreme or numbers[name] is None}
-    if stages := {name.removeprefix(STAGE): value for name, value in numbers.items() if name.startswith(STAGE)}:
-        numbers["stages"] = stages
+    if stages:
+        numbers["stages"] = {name: numbers[f"{STAGE}{name}"] for name in stages}
     numbers["intervals"] = {n: None if n in undefined else interval(metric) for n, metric in found.items()}
     return numbers
 

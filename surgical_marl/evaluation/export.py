@@ -16,6 +16,7 @@ from surgical_marl.content import find
 from surgical_marl.evaluation.card import CARD, CLIP, EVALUATION, card, misses, worst_median
 from surgical_marl.evaluation.command import play_all
 from surgical_marl.evaluation.evaluate import summarise
+from surgical_marl.files import write_atomic
 from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.policies.onnx_file import SUFFIX, write_onnx
 from surgical_marl.policies.policy import load_actor, load_policy
@@ -79,6 +80,20 @@ def _evaluate(runs: Sequence[str], seeds: Sequence[int], name: str) -> tuple[dic
     whole = {"policy": "aggregate", **summarise(played)}
     every = {"best": seeds[best], "runs": results, "aggregate": whole}
     return {**results[best], "policy": name, "seeds": every, "also": _also(runs[best])}, best
+
+
+def evaluate_again(folder: Path) -> None:
+    """Evaluate a policy that ships once more, with the weights that it has, and write its evaluation and card anew.
+
+    Runs of its other training seeds are not at hand: what was found of them stays, with the protocol that it was found
+    by.
+    """
+    path = folder / EVALUATION
+    before = json.loads(path.read_text())
+    (played,) = play_all([str(folder)], {}, EPISODES, SEED).values()
+    found = {"policy": folder.name, **summarise([played]), "seeds": before["seeds"], "also": _also(str(folder))}
+    write_atomic(path, lambda part: part.write_text(json.dumps(found, indent=1) + "\n"))
+    write_atomic(folder / CARD, lambda part: part.write_text(card(folder, folder.name)))
 
 
 def _also(run: str) -> dict[str, Any]:

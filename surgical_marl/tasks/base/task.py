@@ -78,6 +78,8 @@ class Task:
     """Of each term of `reward_terms`."""
     senses: tuple[str, ...] = ()
     """Numbers that `sense` makes of an environment's pictures after each step, before reward is given."""
+    stages: ClassVar[tuple[str, ...]] = ()
+    """What is reached one after the other on the way to success."""
     follows: ClassVar[bool] = False
     """Whether goals move, so that every step of an episode counts in its evaluation, and not the last ones alone."""
     has_targets: ClassVar[bool] = False
@@ -164,8 +166,8 @@ class Task:
         """Return whether each agent has reached what it is after, [] bool."""
         raise NotImplementedError
 
-    def stages(self, world: World) -> dict[str, dict[str, Array]]:
-        """Return agent -> stage of the task -> whether it is reached now, [] bool; stages in their order."""
+    def reached(self, world: World) -> dict[str, dict[str, Array]]:
+        """Return agent -> each of `stages` -> whether it is reached now, [] bool."""
         return {agent: {} for agent in world.arms}
 
     def metrics(self, world: World) -> dict[str, dict[str, Array]]:

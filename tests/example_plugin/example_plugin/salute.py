@@ -37,6 +37,7 @@ class Salute(sm.Task):
 
     max_steps = 50
     weights = {"posture": -1.0, "clearance": -1.0, "collision": -2.0}  # noqa: RUF012
+    stages = ("half", "all")
     wanted = {"success_rate": ("at least", 0.9)}  # noqa: RUF012
 
     def __init__(self, scene: Scene, options: Options) -> None:
@@ -68,7 +69,7 @@ class Salute(sm.Task):
         """Return whether all joints of an arm are there."""
         return {agent: (self._share(world, agent) < NEAR).all() for agent in world.arms}
 
-    def stages(self, world: World) -> dict[str, dict[str, Any]]:
+    def reached(self, world: World) -> dict[str, dict[str, Any]]:
         """Return whether half of the joints are there, and all of them."""
         there = {agent: self._share(world, agent) < NEAR for agent in world.arms}
         return {agent: {"half": own.mean() >= 0.5, "all": own.all()} for agent, own in there.items()}
