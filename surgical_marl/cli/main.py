@@ -16,6 +16,7 @@ from surgical_marl.content import BASELINES, find, list_arms, list_policies, lis
 from surgical_marl.plugins.algorithms import list_algorithms
 from surgical_marl.plugins.tasks import list_tasks
 from surgical_marl.runtime import defer_compiler
+from surgical_marl.runs.settings import Settings
 from surgical_marl.tasks.base.options import choices
 
 _LISTS = {
@@ -27,8 +28,8 @@ _LISTS = {
 }
 
 _CONTROL = choices("control")
-_DEVICES = ("auto", "cpu", "cuda")
-_ENGINES = ("auto", "fused", "mjx")
+_DEVICES = choices("device", Settings)
+_ENGINES = choices("engine", Settings)
 _BENCHED = ("all", "fused", "mjx", "mujoco")
 _MOTIONS = ("random", "rough")
 
