@@ -15,8 +15,8 @@ from typing import Any, NoReturn
 from surgical_marl.content import BASELINES, find, list_arms, list_policies, list_scenes, unknown
 from surgical_marl.plugins.algorithms import list_algorithms
 from surgical_marl.plugins.tasks import list_tasks
-from surgical_marl.runtime import defer_compiler
 from surgical_marl.runs.settings import Settings
+from surgical_marl.runtime import defer_compiler
 from surgical_marl.tasks.base.options import choices
 
 _LISTS = {
