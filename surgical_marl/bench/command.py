@@ -76,7 +76,8 @@ def _solve(arguments: Namespace) -> int:
 
 def _settings(arguments: Namespace, num_envs: Mapping[str, int] | None = None) -> Settings:
     """Settings of a training: those of `configs/`, so many environments by the device where that is said, flags, and
-    `key=value`."""
+    `key=value`.
+    """
     from surgical_marl.bench.workload import Workload
     from surgical_marl.runs.settings import load_config
 

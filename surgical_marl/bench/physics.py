@@ -14,7 +14,8 @@ from surgical_marl.physics.views import Contacts, Touch
 
 class PhysicsAlone(Env):
     """A step takes a state and gives the next one and the distances of all pairs that can touch. No agent, no reward,
-    no reset; commands are set by `engine.write(".physics.ctrl", ...)`."""
+    no reset; commands are set by `engine.write(".physics.ctrl", ...)`.
+    """
 
     def __init__(self, env: Env) -> None:
         vars(self).update(vars(env))

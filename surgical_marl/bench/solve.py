@@ -187,7 +187,8 @@ class Looks:
 
     def due(self, success: float, learning: float) -> bool:
         """Whether to evaluate after an iteration, with its success rate (NaN if no episode ended), `learning` seconds
-        after learning began."""
+        after learning began.
+        """
         promising = success >= self._promising
         if not self._took:
             return promising
@@ -195,7 +196,8 @@ class Looks:
 
     def add(self, success: float, exam: Exam, learning: float, took: float) -> None:
         """An evaluation at that success rate of training, which ended `learning` seconds after learning began and took
-        so many."""
+        so many.
+        """
         self._ended, self._took = learning, took
         missing = max(0.0, self._goal.success - exam.success_2mm) / max(1 - exam.success_2mm, 1e-9)
         self._promising = success + (1 - success) * min(missing, 1.0)
@@ -223,7 +225,8 @@ def starting(seconds: list[float]) -> float:
 
 def run(settings: Settings, goal: Goal, limit: float, as_json: bool = False) -> tuple[str, bool]:
     """All of `surgical-marl bench solve`, from the start of this process: the text of its table or JSON, and whether it
-    is solved. It is given up after `limit` seconds."""
+    is solved. It is given up after `limit` seconds.
+    """
     began = time.perf_counter() - machine.age()
     with in_memory(settings.num_envs):
         found = solve(settings, goal, lambda seconds, learning: seconds > limit, began)

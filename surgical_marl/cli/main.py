@@ -53,7 +53,8 @@ _TAKE_SETTINGS = ("train", "bench train", "bench solve")
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command; returns 0, 1 if training diverged or `check` found something, 2 for bad input, 130 if
-    interrupted."""
+    interrupted.
+    """
     code = 0
     defer_compiler()
     try:

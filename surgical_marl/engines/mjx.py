@@ -104,14 +104,16 @@ class MjxEngine:
 
     def outcome(self, library: str) -> dict[str, Any]:
         """What the last step or reset led to, as arrays [N, ...] of "numpy", "torch" or "jax": fields of the
-        environment's `State` as dicts."""
+        environment's `State` as dicts.
+        """
         known = {name: value for name, value in self._state._asdict().items() if name != "carry"}
         found = {name: self._present(value, library) for name, value in known.items() if jax.tree.leaves(value)}
         return {**found, "contacts": found["contacts"]._asdict()}
 
     def read(self, name: str, library: str) -> Any:
         """A part of the `Carry`, one of `carry_shapes`, or of what has moved, as in ".moved.carry.physics.qpos"; [N,
-        ...]."""
+        ...].
+        """
         tree, path = self._state.carry, name
         if name.startswith(".moved"):
             tree, path = self._moved, name.removeprefix(".moved")

@@ -29,7 +29,8 @@ class Stepper(Protocol):
     @property
     def parameters(self) -> Any:
         """Numbers that are the same for all environments: a tree of numpy arrays, the last argument of each
-        function."""
+        function.
+        """
 
     @property
     def pauses(self) -> bool:

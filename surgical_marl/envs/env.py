@@ -126,7 +126,8 @@ class Env:
     @property
     def pauses(self) -> bool:
         """Whether someone looks at what has moved before a step is finished: an agent that observes pictures, or a task
-        that senses them."""
+        that senses them.
+        """
         return bool(self.task.senses) or any(seen.pictures for seen in self.observed.values())
 
     @cached_property
@@ -144,7 +145,8 @@ class Env:
     @property
     def content(self) -> bytes:
         """All that a step depends on besides code and `parameters`: the model with its masses and gains, and the
-        options."""
+        options.
+        """
         model = np.empty(mujoco.mj_sizeModel(self.scene.model), np.uint8)
         mujoco.mj_saveModel(self.scene.model, None, model)
         observed = {agent: (seen.names, seen.unseen) for agent, seen in self.observed.items()}
@@ -159,7 +161,8 @@ class Env:
     @cached_property
     def parameters(self) -> dict[str, Any]:
         """Numbers that a step reads as inputs, so that another value of one compiles nothing: `max_steps`, the
-        `weights` of reward terms, and the task's `tables`. A tree of numpy arrays."""
+        `weights` of reward terms, and the task's `tables`. A tree of numpy arrays.
+        """
         return {
             "max_steps": np.int32(self.max_steps),
             "weights": {name: np.float32(weight) for name, weight in self.task.weights.items()},
@@ -183,7 +186,8 @@ class Env:
 
     def num_actions(self, agent: str) -> int:
         """Length of an agent's action: one number a joint, the jaw's open (> 0) or closed command last in joint
-        order."""
+        order.
+        """
         return len(self.scene.mounts[agent].arm.actuated)
 
     def action_space(self, agent: str) -> spaces.Box:

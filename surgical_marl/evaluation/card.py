@@ -30,7 +30,8 @@ _HOLDS = {"below": operator.lt, "at least": operator.ge}
 
 def worst_median(result: Mapping[str, Any]) -> float | None:
     """The median error of the arm that has the largest, mm: arms that only keep still can't hide another's error. None
-    in a task whose tool tips have no targets."""
+    in a task whose tool tips have no targets.
+    """
     errors = (agent["median_error_mm"] for agent in result["agents"].values())
     return max((error for error in errors if error is not None), default=None)
 

@@ -121,7 +121,8 @@ def difference(result: Mapping[str, Any], other: Mapping[str, Any], name: str) -
 
 def _numbers(found: Mapping[str, Metric], stages: Sequence[str]) -> dict[str, Any]:
     """Values of metrics, those of `stages` in their order too, and, under `intervals`, their 95 % intervals; None where
-    there is none."""
+    there is none.
+    """
     values = {name: float(metric.reduce(metric.values.ravel())) for name, metric in found.items()}
     numbers: dict[str, Any] = {name: value if math.isfinite(value) else None for name, value in values.items()}
     undefined = {name for name, metric in found.items() if metric.extreme or numbers[name] is None}

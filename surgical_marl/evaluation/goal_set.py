@@ -46,7 +46,8 @@ def describe_goals(env: BatchedEnv, episodes: int) -> dict[str, Any]:
 
 def read_goals(env: BatchedEnv, count: int) -> list[np.ndarray]:
     """Return what the episodes that the first `count` environments have just begun are after, [count, ...] each: the
-    task says what that is."""
+    task says what that is.
+    """
     goal = {name: values[:count] for name, values in vars(env.goal).items()}
     return env.task.goal_content(SimpleNamespace(**goal))
 
@@ -69,7 +70,8 @@ def is_standard(result: Mapping[str, Any]) -> bool:
 @cache
 def standard_hashes() -> dict[str, dict[str, dict[str, str]]]:
     """Hashes of the standard goal sets by start, task and scene: what `surgical-marl eval` plays if told nothing else,
-    and with `--start random`."""
+    and with `--start random`.
+    """
     found: dict[str, dict[str, dict[str, str]]] = yaml.safe_load(_FILE.read_text())
     return found
 

@@ -25,7 +25,8 @@ from surgical_marl.interfaces.pettingzoo import RENDER_MODES
 class SurgicalEnv(gymnasium.Env[Any, np.ndarray]):
     """One environment. `info` holds tip_error (m, the worst arm's), success (of all), collision (of any), min_distance
     (m), the sums of `reward_<term>`, `cost` and `cost_<name>`, and for several arms also "agents": the same for
-    each."""
+    each.
+    """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012 (Gymnasium's own convention)
 
@@ -73,7 +74,8 @@ class SurgicalEnv(gymnasium.Env[Any, np.ndarray]):
 
 class SurgicalVectorEnv(VectorEnv[Any, np.ndarray, Any]):
     """N environments that restart in the step that ends them; `infos["final_obs"]` then holds their last
-    observation."""
+    observation.
+    """
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
 
@@ -123,7 +125,8 @@ def _joint_spaces(batch: BatchedEnv) -> tuple[spaces.Space[Any], spaces.Box]:
 
 def _joint(batch: BatchedEnv, observations: dict[str, Any], index: int | None = None) -> Any:
     """What all arms observe as one array, in a dict with the pictures if any sees some; of one environment or of
-    all."""
+    all.
+    """
     chosen: Any = slice(None) if index is None else index
     # engines may sort the agents by name
     felt = np.concatenate([proprioception(observations[agent])[chosen] for agent in batch.agents], -1)
@@ -133,7 +136,8 @@ def _joint(batch: BatchedEnv, observations: dict[str, Any], index: int | None = 
 
 def _pictures(observations: dict[str, Any]) -> dict[str, Any]:
     """The pictures of all agents, or their spaces, under their names; of several agents that see some as
-    "<agent>/<name>"."""
+    "<agent>/<name>".
+    """
     own = {agent: dict(part.items()) for agent, part in observations.items() if hasattr(part, "keys")}
     several = len(own) > 1
     return {

@@ -248,7 +248,8 @@ class Algorithm(PPO):
 
     def precision(self) -> torch.autocast:
         """Within it the networks compute in bfloat16, if that was asked for: the same when acting and learning, or
-        ratios would not begin at 1."""
+        ratios would not begin at 1.
+        """
         enabled = self.use_mixed_precision and self._cuda
         return torch.autocast("cuda" if self._cuda else "cpu", torch.bfloat16, enabled=enabled)
 

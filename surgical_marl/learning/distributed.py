@@ -93,7 +93,8 @@ def average(values: Tensor) -> Tensor:
 
 def var_mean(values: Tensor, dim: int | None = None) -> tuple[Tensor, Tensor]:
     """Population variance and mean of the values of all processes, which have equally many; over one dimension, or
-    over all."""
+    over all.
+    """
     var, own = torch.var_mean(values, dim=dim, correction=0)
     if size() == 1:
         return var, own

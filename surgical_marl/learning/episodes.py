@@ -61,7 +61,8 @@ class Episodes:
 
     def take(self) -> Tensor:
         """Sums since the last call: episodes, errors (m), successes, collisions, rewards, and each term's part of
-        the rewards."""
+        the rewards.
+        """
         totals = self._totals.clone()
         self._totals.zero_()
         return totals

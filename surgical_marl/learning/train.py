@@ -111,14 +111,16 @@ def train(settings: Settings, *, out: Path, resume: Path | None = None) -> Path:
 
 def finish(settings: Settings, run: Path) -> None:
     """Train a run to its end from wherever it is, in this process: not begun, stopped before its first checkpoint, or
-    later. One that has its iterations already is left alone. Errors are those of `train`."""
+    later. One that has its iterations already is left alone. Errors are those of `train`.
+    """
     train(settings, out=run, resume=run if has_begun(run) else None)
 
 
 @contextmanager
 def _claimed(out: Path, resume: Path | None, settings: Settings) -> Iterator[None]:
     """The run folder, while the run is made in memory. A new run has its settings there from the start, so that it can
-    be resumed whenever it is killed; if it is refused, there is nothing left of it."""
+    be resumed whenever it is killed; if it is refused, there is nothing left of it.
+    """
     if distributed.rank() > 0:
         yield
         return

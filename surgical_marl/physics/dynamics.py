@@ -115,7 +115,8 @@ class Dynamics:
 
     def _damping(self, data: Any) -> Array:
         """An actuator at its effort limit can't damp any more, so its damping is not in it, as in C MuJoCo; `mjx.step`
-        would brake each joint that moves at full effort."""
+        would brake each joint that moves at full effort.
+        """
         model = self.model
         low, high = model.actuator_forcerange[:, 0], model.actuator_forcerange[:, 1]
         saturated = (data.actuator_force <= low) | (data.actuator_force >= high)

@@ -33,7 +33,8 @@ TOUCHING_ITERATIONS = (6, 6)
 class Kind:
     """The arms of one type in a scene, which move alike wherever they stand, as gravity is off: each is stepped in its
     own base frame, and all by the same code, one after the other: a GPU's instruction cache has no room for a
-    copy for every arm."""
+    copy for every arm.
+    """
 
     def __init__(self, scene: Scene, agents: tuple[str, ...]) -> None:
         model = scene.model
@@ -66,7 +67,8 @@ class Kind:
 
 class Simulator:
     """The physics of one scene, `decimation` physics steps a control step. `home` is what every episode starts with,
-    `home_views` what tasks see there."""
+    `home_views` what tasks see there.
+    """
 
     def __init__(self, scene: Scene, decimation: int = DECIMATION) -> None:
         self.scene = scene
@@ -118,7 +120,8 @@ class Simulator:
 
     def advance(self, physics: Physics) -> tuple[Physics, Contacts, dict[str, ArmView]]:
         """A control step of physics, and what is seen where it ends. MuJoCo leaves tips and distances one physics step
-        behind its `qpos`, so they are computed anew."""
+        behind its `qpos`, so they are computed anew.
+        """
 
         def substep(state: tuple[Physics, Touch], _: None) -> tuple[tuple[Physics, Touch], None]:
             return self._step(*state), None
@@ -132,7 +135,8 @@ class Simulator:
     def varied(self, stiffness: Array, damping: Array, friction: Array, payload: Array, offset: Array) -> Simulator:
         """Other arms of this kind: factors of every actuator's gains [nu] and of every joint's friction [nv], masses
         [arms] at their tool tips if the scene has room for them, and by how much the controllers of joints misread
-        them, [nq]."""
+        them, [nq].
+        """
         model, varied, nominal = self._together.model, copy.copy(self), self.scene.model
         by_position = nominal.actuator_biasprm[:, 1] != 0
         by_velocity = ~by_position & (nominal.actuator_biasprm[:, 2] != 0)
@@ -170,7 +174,8 @@ class Simulator:
 
     def _step(self, physics: Physics, touch: Touch) -> tuple[Physics, Touch]:
         """A physics step, and the hardest touch until its start. Arms that don't touch anything don't know of each
-        other: each moves on its own."""
+        other: each moves on its own.
+        """
         if not self._pairs.count:
             return self._apart(physics, touch)
         data = self._together.pose(physics.qpos)

@@ -43,7 +43,8 @@ class Rows(NamedTuple):
 
 class JointRows(NamedTuple):
     """Friction and limit of each of n joints, [n] each; zeros where a joint has none. As in `Rows`, but signed: a limit
-    pushes towards `side`, -1, 0 or 1."""
+    pushes towards `side`, -1, 0 or 1.
+    """
 
     friction: Array
     """The largest friction force."""
@@ -142,7 +143,8 @@ def _line_search(
     mass: Array, rows: Rows, unbounded: Array, rest: Array, search: Array, iterations: int
 ) -> tuple[Array, Array]:
     """How far to go along `search`, and what `unbounded` is there. The end is the root of the cost's slope, which grows
-    piecewise linearly: Newton's method within a bracket."""
+    piecewise linearly: Newton's method within a bracket.
+    """
     along = rows.jacobian @ search
     fall = rows.impedance * along
     slope_0, slope_1 = search @ rest, search @ (mass @ search)
@@ -164,5 +166,5 @@ def _line_search(
 
 
 def solve_positive(matrix: Array, right: Array) -> Array:
-    """x with matrix @ x = right, for a symmetric positive definite matrix [n, n]."""
+    """X with matrix @ x = right, for a symmetric positive definite matrix [n, n]."""
     return cho_solve((jax.lax.linalg.cholesky(matrix, symmetrize_input=False), True), right)

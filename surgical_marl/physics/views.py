@@ -21,7 +21,8 @@ class Contacts(NamedTuple):
 
 class Touch(NamedTuple):
     """The hardest touch of each pair so far in a control step, [P] each. A physics step in which nothing touches leaves
-    it alone."""
+    it alone.
+    """
 
     penetration: Array
     """m"""

@@ -27,7 +27,8 @@ class Drive:
 @dataclass(frozen=True)
 class Cable:
     """A cable that several joints wind up. Its own drive acts on its length, the sum of coefficient times position of
-    its joints, beside the drives of the joints. Units as of a `Drive`, per unit of that length."""
+    its joints, beside the drives of the joints. Units as of a `Drive`, per unit of that length.
+    """
 
     joints: dict[str, float]
     """Coefficient of each joint."""

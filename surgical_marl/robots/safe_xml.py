@@ -45,7 +45,8 @@ def parse_xml(data: bytes, path: Path, noun: str) -> Document:
 
 def write_xml(root: Element) -> bytes:
     """Return the text of an element. Other parsers get it in place of a file's own text: they may know encodings in
-    which that holds what defusedxml did not see."""
+    which that holds what defusedxml did not see.
+    """
     return tostring(root)
 
 

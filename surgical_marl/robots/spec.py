@@ -203,7 +203,8 @@ def _collision_shape(shape: Shape, folder: Path) -> tuple[dict[str, Any], np.nda
 
 def _bounding_capsule(points: np.ndarray) -> tuple[dict[str, Any], np.ndarray]:
     """The shortest capsule that holds points [n, 3] with its axis through the middle of their bounding box and along
-    its longest side, or the sphere around them if that is smaller; and its place."""
+    its longest side, or the sphere around them if that is smaller; and its place.
+    """
     low, high = points.min(0), points.max(0)
     place = np.eye(4)
     # cyclic permutations are rotations: z of the capsule becomes the longest side

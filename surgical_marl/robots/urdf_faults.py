@@ -53,7 +53,8 @@ def robot_faults(robot: Robot, path: Path) -> list[str]:
 
 def xml_faults(document: Document, path: Path) -> Iterator[str]:
     """Yield tags without what they must have, and numbers that are none. `<gazebo>`, `<transmission>` and such are not
-    read."""
+    read.
+    """
     root = document.root
     if root.tag != "robot" or not root.get("name"):
         yield f"{path} is not a URDF: its root must be <robot name=...>, not <{root.tag}>"

@@ -156,7 +156,8 @@ def format_row(row: Mapping[str, float]) -> list[str]:
 
 def read_metrics(run: Path) -> list[dict[str, float]]:
     """Rows of `metrics.csv`; an empty cell is NaN. No file, no rows; a row that was cut short is none, nor are those
-    after it."""
+    after it.
+    """
     if not (run / METRICS).is_file():
         return []
     rows: list[dict[str, float]] = []

@@ -12,7 +12,8 @@ from surgical_marl.yaml_file import build
 @dataclass(frozen=True)
 class Randomisation:
     """Ranges, all zero unless given. Everything but noise is drawn once an episode, evenly, for every joint or arm of
-    its own; jaws only get other gains and friction. docs/randomisation.md has the sources of sensible values."""
+    its own; jaws only get other gains and friction. docs/randomisation.md has the sources of sensible values.
+    """
 
     offset_angle: float = 0.0
     """A joint's reading is off by up to this, rad; `offset_slide`, m, for joints that slide."""

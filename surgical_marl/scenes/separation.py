@@ -31,7 +31,8 @@ HALVINGS = 8
 @dataclass(frozen=True)
 class _Joint:
     """Turns about or slides along an axis through the origin of its frame. The frame is given in that of the joint
-    before it."""
+    before it.
+    """
 
     rotation: np.ndarray
     position: np.ndarray
@@ -209,7 +210,8 @@ def ball(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, float]:
 
 def _bound(limbs: tuple[Limb, Limb], boxes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """How far apart two geoms are in the middle of boxes [k, 2, n], m, [k], and by how much at most each joint brings
-    them nearer within the boxes, [k, n]."""
+    them nearer within the boxes, [k, n].
+    """
     parts = np.split(boxes, [len(limbs[0].joints)], axis=2)
     (one, speeds), (other, its_speeds) = (limb.place(part[:, 0]) for limb, part in zip(limbs, parts, strict=True))
     gap = axis_gap(one, other)[1]

@@ -56,7 +56,8 @@ def states_in_contact(scene: Scene) -> tuple[Physics, np.ndarray, np.ndarray]:
 
 def random_states(scene: Scene) -> tuple[Physics, np.ndarray]:
     """States of an arm that touches nothing: a third of the joints past a limit, a third at rest, any command, and no
-    acceleration to start from; and C MuJoCo's next velocity [S, nv]."""
+    acceleration to start from; and C MuJoCo's next velocity [S, nv].
+    """
     model, rng = scene.model, np.random.default_rng(0)
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
     low, high = model.jnt_range.T

@@ -44,7 +44,7 @@ def targets(scene: Scene, seed: int = 0) -> np.ndarray:
 
 
 def rollout(model: mujoco.MjModel, scene: Scene, ctrl: np.ndarray) -> tuple[np.ndarray, float]:
-    """qpos at each control step, and the greatest share of a joint's range by which it passed a limit."""
+    """Qpos at each control step, and the greatest share of a joint's range by which it passed a limit."""
     data = mujoco.MjData(model)
     data.qpos[:] = scene.home
     low, high = model.jnt_range.T

@@ -66,7 +66,8 @@ def identified(joint: Joint) -> Linear:
 
 def simulated_response(joint: Joint, timestep: float | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Time [T] in s and the ways [T, n], as shares of the step, of the PSM joint whose target steps and of those that
-    belong with it."""
+    belong with it.
+    """
     scene, linear = load_scene("psm"), identified(joint)
     model, data = scene.model, mujoco.MjData(scene.model)
     model.opt.timestep = timestep or model.opt.timestep

@@ -102,7 +102,8 @@ def curve(runs: Sequence[Sequence[dict[str, float]]], axis: str) -> dict[str, An
 
 def broken(played: Sequence[dict[str, np.ndarray]], agents: Sequence[str], what: str) -> dict[str, Any]:
     """What is left of success where each arm in turn is taken from its policy: of the others, of the arm itself; and
-    collisions. Of a policy that is left alone these are the arms themselves."""
+    collisions. Of a policy that is left alone these are the arms themselves.
+    """
     others, itself, collided = [], [], []
     for index, arm in enumerate(agents):
         measures = _stacked(played, what if what == "untouched" else f"{what} {arm}")

@@ -134,7 +134,8 @@ class Search:
 
     def measure(self, each: list[Settings]) -> tuple[float, float | None]:
         """Mean seconds of learning of some trainings, and what one of them missed in success when it was given up, None
-        if all succeeded; it is given up when all of them can't be faster than the best trial any more."""
+        if all succeeded; it is given up when all of them can't be faster than the best trial any more.
+        """
         left = self.best() * len(each)
         spent = 0.0
         for settings in each:

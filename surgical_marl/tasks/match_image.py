@@ -122,7 +122,8 @@ class Task(TipTask):
 
     def reward_terms(self, world: World) -> dict[str, dict[str, Array]]:
         """Return agent -> reward term -> its value before weighting; the camera's first four and the others'
-        `stray`."""
+        `stray`.
+        """
         errors, known, none = self.tip_errors(world), super().reward_terms(world), jnp.float32(0.0)
         looks = {agent: agent == self.camera for agent in world.arms}
         return {

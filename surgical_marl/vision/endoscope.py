@@ -33,7 +33,8 @@ BACKGROUND = (0.05, 0.02, 0.02)
 @dataclass(frozen=True)
 class View:
     """What the endoscopes of N environments see. Of the library that `render` was given; E eyes, H rows, W columns.
-    What was not asked for is None."""
+    What was not asked for is None.
+    """
 
     rgb: Any = None
     """[N, E, H, W, 3] uint8"""

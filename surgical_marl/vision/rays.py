@@ -158,7 +158,8 @@ def cull(
     counts: wp.array2d[int],
 ):
     """The shapes that rays of a tile may meet, in ascending order: not wholly beyond one of the planes through the eye
-    and a side of the tile, nor behind the eye."""
+    and a side of the tile, nor behind the eye.
+    """
     picture, tile = wp.tid()
     columns = (width + TILE - 1) // TILE
     left = (float(tile % columns * TILE) - 0.5 * float(width)) * pixel

@@ -58,7 +58,8 @@ class Arrays(ABC):
 
     def _cut(self, node: Any, copies: dict[str, Any], library: str) -> Any:
         """A tree's leaves out of copies of the buffers. A method, because a function within a function that calls
-        itself keeps what it sees, here a whole step's arrays, until Python's garbage collector finds it."""
+        itself keeps what it sees, here a whole step's arrays, until Python's garbage collector finds it.
+        """
         if isinstance(node, dict):
             return {name: self._cut(child, copies, library) for name, child in node.items()}
         rows = copies[node.buffer][node.first : node.first + node.size, : self.num_envs]

@@ -56,7 +56,7 @@ def _wave(g: Graph, x: Value, quarter: int) -> Value:
 
 
 def exponential(g: Graph, x: Value) -> Value:
-    """e to the x; 0 and infinity beyond what float32 holds."""
+    """E to the x; 0 and infinity beyond what float32 holds."""
     if x < 0:
         return g.constant(np.exp(g.constants[~x]))
     bounded = g.extreme("max", g.extreme("min", x, _real(g, 88.72)), _real(g, -87.0))
@@ -75,7 +75,8 @@ def exponential(g: Graph, x: Value) -> Value:
 
 def logarithm_of_more(g: Graph, x: Value) -> Value:
     """log(1 + x). What 1 + x rounds away of a small x is made up for: W. Kahan's way, as Goldberg, "What every computer
-    scientist should know about floating-point arithmetic", 1991, has it."""
+    scientist should know about floating-point arithmetic", 1991, has it.
+    """
     more = g.add(g.one, x)
     kept = g.sub(more, g.one)
     scaled = g.mul(g.unary("log", more), g.div(x, kept))
@@ -99,7 +100,7 @@ def polynomial(g: Graph, x: Value, coefficients: tuple[float, ...]) -> Value:
 
 
 def power(g: Graph, x: Value, y: int) -> Value:
-    """x to a whole number, by squaring."""
+    """X to a whole number, by squaring."""
     if y < 0:
         return g.div(g.constant(np.ones((), g.dtype(x))[()]), power(g, x, -y))
     if y == 0:

@@ -112,7 +112,8 @@ class Emitter:
     @contextmanager
     def _side(self, number: int, condition: str) -> Iterator[None]:
         """Within a side of a large branch, names for values from around it that the compiler takes for new ones. It
-        would otherwise compute what both sides need before the branch, and keep it in registers that are not there."""
+        would otherwise compute what both sides need before the branch, and keep it in registers that are not there.
+        """
         self.active.append(condition)
         names, size = dict(self.names), sum(len(self.schedule.regions[r].items) for r in self.schedule.inside[number])
         if size > LARGE and not self.vector:

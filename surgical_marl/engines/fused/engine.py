@@ -97,12 +97,14 @@ class FusedEngine:
 
     def outcome(self, library: str) -> dict[str, Any]:
         """What the last step or reset led to, as arrays [N, ...] of "numpy", "torch" or "jax": fields of
-        the environment's `State` as dicts of dicts. Copies, but on a GPU for "torch" the next step overwrites them."""
+        the environment's `State` as dicts of dicts. Copies, but on a GPU for "torch" the next step overwrites them.
+        """
         return self._arrays.read_tree(self.source.results, library)
 
     def read(self, name: str, library: str) -> Any:
         """A part of the `Carry`, one of `carry_shapes`, or of what has moved, as in ".moved.carry.physics.qpos"; [N,
-        ...], a copy."""
+        ...], a copy.
+        """
         return self._arrays.read(self._leaves[name], library)
 
     def write(self, name: str, values: Any) -> None:

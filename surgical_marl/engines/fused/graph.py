@@ -127,7 +127,8 @@ class Graph:
 
     def open_scope(self) -> None:
         """From here on nodes are shared among themselves only: what a branch computes is computed in the branch, and
-        need not be kept from before it."""
+        need not be kept from before it.
+        """
         self._scopes.append(self._known)
         self._known = {key: value for key, value in self._known.items() if key[0] in ("load", "phi", "out")}
 
@@ -268,7 +269,7 @@ class Graph:
         return self.unary("not", a)
 
     def extreme(self, op: str, a: Value, b: Value) -> Value:
-        """max or min"""
+        """Max or min"""
         if a == b:
             return a
         if self.kind(a) == "b":

@@ -129,7 +129,8 @@ def _choose(
     g: Graph, operand: Traced | Table, sizes: Any, place: Places, starts: dict[int, np.ndarray], fill: Value | None
 ) -> Symbolic:
     """Elements of `operand` at `place + starts`. The starts are values; a window, of `sizes`, that is not inside is
-    `fill`, or moved there."""
+    `fill`, or moved there.
+    """
     shape, lasts = place[0].shape, {axis: operand.shape[axis] - sizes[axis] for axis in starts}
     find: Callable[[list[int], dict[int, Value]], Value]
     if isinstance(operand, Table) or (isinstance(operand, np.ndarray) and operand.size >= LEAST_TABLE):

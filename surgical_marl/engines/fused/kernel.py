@@ -49,7 +49,8 @@ def compile_kernels(bodies: dict[str, str], device: str, max_registers: int | No
 @contextmanager
 def _checked(module: str) -> Iterator[None]:
     """Around the loading of a module: what Warp has of it on disk is removed if it is not what was stored there.
-    Warp itself would load a damaged file, whatever that leads to."""
+    Warp itself would load a damaged file, whatever that leads to.
+    """
     record = cache_dir() / "kernels" / f"{module}.sha256"
     folders = _folders(module)
     with contextlib.suppress(OSError):
@@ -107,7 +108,8 @@ class Kernel:
 
     def launch(self, arrays: list[Any], stride: int, start: int, count: int) -> None:
         """Runs environments `start` to `start + count`, of arrays that have a column for `stride` of them. On a GPU it
-        goes to torch's current stream, and can be captured in a CUDA graph."""
+        goes to torch's current stream, and can be captured in a CUDA graph.
+        """
         cuda = self._device == "cuda"
         lanes = 1 if cuda else LANES
         wp.launch(

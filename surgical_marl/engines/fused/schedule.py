@@ -17,7 +17,8 @@ from surgical_marl.engines.fused.graph import Branch, Graph, Loop, Value
 @dataclass
 class Region:
     """A straight stretch of program. `items` are what it computes, in order: ("node", value), ("group", number), or
-    ("result", k), the k-th result of the region, known from there on."""
+    ("result", k), the k-th result of the region, known from there on.
+    """
 
     parent: int
     depth: int

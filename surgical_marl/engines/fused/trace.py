@@ -38,7 +38,8 @@ class Tracer:
 
     def run(self, closed: Any, args: Sequence[Any]) -> list[Traced]:
         """The results of a closed jaxpr. Unsupported, naming the line of the source, if there is no rule for
-        something in it."""
+        something in it.
+        """
         jaxpr, consts = getattr(closed, "jaxpr", closed), getattr(closed, "consts", ())
         known: dict[Any, Traced] = dict(zip(jaxpr.constvars, map(np.asarray, consts), strict=True))
         known.update(zip(jaxpr.invars, args, strict=True))

@@ -80,7 +80,8 @@ def make_source(env: Stepper, vector: bool) -> Source:
 
 def _parameters(graph: Graph, parameters: Any) -> tuple[list[Traced | Table], dict[str, Leaf]]:
     """What stands for parameters while tracing, and where each is in the joined tables. Few numbers are values; the
-    elements of a table are looked up where they are needed."""
+    elements of a table are looked up where they are needed.
+    """
     given: list[Traced | Table] = []
     places: dict[str, Leaf] = {}
     for path, value in jax.tree_util.tree_flatten_with_path(parameters)[0]:
@@ -152,7 +153,8 @@ def _body(graph: Graph, leaves: list[Leaf], values: list[list[Value]], vector: b
 
 def _share_fields(layout: Fields, shapes: list[Any], values: list[list[Value]], first: list[list[Value]]) -> list[Leaf]:
     """A leaf for each result. One whose values stand in a row in another, in both kernels, shares its fields: a state
-    holds the observations of all agents."""
+    holds the observations of all agents.
+    """
     leaves: dict[int, Leaf] = {}
     for k in sorted(range(len(shapes)), key=lambda k: -len(values[k])):
         size, dtype = len(values[k]), shapes[k].dtype.name

@@ -59,7 +59,8 @@ class PathTask(TipTask):
 
     def along(self, row: Array, time: Array) -> Array:
         """Targets [arms, 3] at a time in s, or [..., arms, 3] at times [...]. At the end of a closed path its next
-        round begins; targets of an open one rest there."""
+        round begins; targets of an open one rest there.
+        """
         near, f = self._near(row, time)
         return (jnp.stack(spline.weights(f), axis=-1)[..., None, None] * near).sum(-3)
 
@@ -80,5 +81,6 @@ class PathTask(TipTask):
 
     def goal_content(self, goal: Any) -> list[np.ndarray]:
         """Return the paths from the table: what comes from them is computed on the device, with another last digit on
-        each."""
+        each.
+        """
         return [self.tables["paths"][goal.row]]

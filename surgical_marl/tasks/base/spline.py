@@ -60,7 +60,8 @@ def through(points: np.ndarray, closed: bool) -> np.ndarray:
 def equal_steps(control: np.ndarray, steps: int, fine: int = 24) -> tuple[np.ndarray, np.ndarray]:
     """Points [..., steps + 1, 3] at equal arc length along curves, from one end to the other, and lengths [...].
 
-    Arc length is that of the polygon through `fine` points a segment."""
+    Arc length is that of the polygon through `fine` points a segment.
+    """
     n = control.shape[-2] - 3
     u, shares = np.linspace(0, n, fine * n + 1), np.linspace(0, 1, steps + 1)
     ways = np.linalg.norm(np.diff(evaluate(control, u), axis=-2), axis=-1)

@@ -198,7 +198,8 @@ class Task:
 
     def goal_content(self, goal: Any) -> list[np.ndarray]:
         """Return the numbers that say what N episodes are after, [N, ...] each: what an evaluation's hash is made
-        of."""
+        of.
+        """
         return [np.asarray(value) for _, value in sorted(vars(goal).items())]
 
 

@@ -161,7 +161,8 @@ def _away(rng: np.random.Generator, arm: Arm, q: np.ndarray) -> np.ndarray:
 
 def _reach(scene: Scene, targets: np.ndarray, time: float = TIME) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Joint positions [N, n] of each agent at its targets [N, arms, 3], and whether all get there from home, in a time
-    in s, [N]."""
+    in s, [N].
+    """
     good, goals = np.ones(len(targets), dtype=bool), {}
     for i, agent in enumerate(scene.agents):
         arm = scene.mounts[agent].arm
