@@ -77,7 +77,7 @@ def locked(path: Path) -> Iterator[None]:
 
 
 def _load(path: Path) -> np.ndarray | None:
-    """The array in a file of the cache; None if it is not there, or damaged."""
+    """Return the array in a file of the cache; None if the file is not there, or is damaged."""
     try:
         with path.open("rb") as file, np.load(file) as found:
             array: np.ndarray = found["array"]
@@ -118,7 +118,7 @@ def _beside_main(module: str, roots: frozenset[str]) -> bool:
 
 @functools.cache
 def _read(path: Path) -> tuple[str, list[str]]:
-    """The hash of a source file and the names that it may import: those of modules and of what is in them."""
+    """Return the hash of a source file, and the names it may import: of modules, and of what is in modules."""
     text = path.read_text()
     return hashlib.sha256(text.encode()).hexdigest(), list(_imported(text))
 
@@ -134,7 +134,7 @@ def _imported(text: str) -> Iterator[str]:
 
 
 def _file(module: str) -> Path | None:
-    """The source file of a module or package; None if it has none or is none."""
+    """Return the source file of a module or package; None if it has no such file, or if there is no such module."""
     if module == "__main__":
         file = getattr(sys.modules["__main__"], "__file__", None)
         return Path(file) if file and Path(file).is_file() else None

@@ -20,7 +20,7 @@ INTEGRATORS = {
 
 
 def prepared(scene: Scene, timestep: float, integrator: str = "implicitfast", gain: float = 1.0) -> mujoco.MjModel:
-    """The scene's model at a physics step, all controller gains scaled."""
+    """Return the scene's model with a given physics step and integrator, and all controller gains scaled by `gain`."""
     model = load_scene(scene.name).model
     model.opt.timestep = timestep
     model.opt.integrator = INTEGRATORS[integrator]

@@ -72,7 +72,7 @@ def equal_steps(control: np.ndarray, steps: int, fine: int = 24) -> tuple[np.nda
 
 
 def curvature(control: np.ndarray, fine: int = 4) -> np.ndarray:
-    """The greatest curvature, 1/m, [...], of `fine` points a segment."""
+    """Return the greatest curvature of each curve, 1/m, [...], at `fine` points a segment."""
     curve, u = _curve(control), np.arange(0, control.shape[-2] - 3, 1 / fine)
     first, second = curve(u, 1), curve(u, 2)
     dot = lambda a, b: np.einsum("...i,...i", a, b)  # noqa: E731
