@@ -1,6 +1,8 @@
-"""`python -m surgical_marl` is the command `surgical-marl`; so starts it torchrun (docs/scaling.md):
+"""Run the command `surgical-marl`; `python -m surgical_marl` is the same, and torchrun starts it in this way.
 
-torchrun --nproc-per-node 4 -m surgical_marl train reach --scene psm
+An example (see docs/scaling.md):
+
+    torchrun --nproc-per-node 4 -m surgical_marl train reach --scene psm
 """
 
 import sys

@@ -12,7 +12,9 @@ import hashlib
 import importlib.util
 import os
 import re
+import sys
 import tempfile
+import uuid
 import zlib
 from collections.abc import Callable, Iterable, Iterator
 from importlib.metadata import PackageNotFoundError, requires, version
@@ -23,6 +25,7 @@ import numpy as np
 
 from surgical_marl.runtime import cache_dir
 
+THIS_PROCESS = uuid.uuid4().hex
 _IMPORT = re.compile(
     r"^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+import[ \t]*(\([^)]*\)|[^\n#]*)|import[ \t]+([\w., \t]+))", re.M
 )
@@ -74,7 +77,7 @@ def locked(path: Path) -> Iterator[None]:
 
 
 def _load(path: Path) -> np.ndarray | None:
-    """The array in a file of the cache; None if it is not there, or damaged."""
+    """Return the array in a file of the cache; None if the file is not there, or is damaged."""
     try:
         with path.open("rb") as file, np.load(file) as found:
             array: np.ndarray = found["array"]
@@ -87,6 +90,9 @@ def _load(path: Path) -> np.ndarray | None:
 def code_digest(roots: frozenset[str]) -> str:
     """Return a hash of the source of modules and of all that they import, directly or not, of their own packages.
 
+    A program that runs as `__main__` is a module too, and the files beside it belong to it. What has no file, as a
+    notebook's cells, is another in each process: nothing that was made by it is found again.
+
     Args:
         roots: names of modules, as in "surgical_marl.tasks.reach".
     """
@@ -94,16 +100,25 @@ def code_digest(roots: frozenset[str]) -> str:
     waiting, seen = sorted(roots), dict[str, str]()
     while waiting:
         name = waiting.pop()
-        if name in seen or name.partition(".")[0] not in packages or not (path := _file(name)):
+        if name in seen or not (name.partition(".")[0] in packages or _beside_main(name, roots)):
             continue
-        seen[name], imported = _read(path)
-        waiting += imported
+        if path := _file(name):
+            seen[name], imported = _read(path)
+            waiting += imported
+        elif name in roots:
+            seen[name] = THIS_PROCESS
     return hashlib.sha256(repr(sorted(seen.items())).encode()).hexdigest()
+
+
+def _beside_main(module: str, roots: frozenset[str]) -> bool:
+    """Whether a module lies beside the program that runs, if that is one of the roots."""
+    main = _file("__main__") if "__main__" in roots else None
+    return main is not None and any((main.parent / f"{module.partition('.')[0]}{end}").exists() for end in ("", ".py"))
 
 
 @functools.cache
 def _read(path: Path) -> tuple[str, list[str]]:
-    """The hash of a source file and the names that it may import: those of modules and of what is in them."""
+    """Return the hash of a source file, and the names it may import: of modules, and of what is in modules."""
     text = path.read_text()
     return hashlib.sha256(text.encode()).hexdigest(), list(_imported(text))
 
@@ -119,7 +134,10 @@ def _imported(text: str) -> Iterator[str]:
 
 
 def _file(module: str) -> Path | None:
-    """The source file of a module or package; None if it has none or is none."""
+    """Return the source file of a module or package; None if it has no such file, or if there is no such module."""
+    if module == "__main__":
+        file = getattr(sys.modules["__main__"], "__file__", None)
+        return Path(file) if file and Path(file).is_file() else None
     top, *inner = module.split(".")
     for folder in _folders(top):
         path = Path(folder, *inner)

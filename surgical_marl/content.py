@@ -26,7 +26,7 @@ _SUFFIX = {"scenes": ".yaml", "configs": ".yaml"}
 
 
 def content_dir(kind: str) -> Path:
-    """The folder of one kind of content: inside the package in a wheel, beside it in a checkout."""
+    """Return the folder of one kind of content: inside the package in a wheel, beside it in a checkout."""
     if kind not in KINDS:
         raise unknown("kind of content", kind, KINDS)
     shipped = _PACKAGE / "content" / kind
@@ -72,7 +72,7 @@ def find(kind: str, name_or_path: str | os.PathLike[str]) -> Path:
 
 
 def unknown(noun: str, value: object, good: Sequence[str]) -> ValueError:
-    """The error for a name that does not exist: the value, the nearest good one, all good ones."""
+    """Return the error for a name that does not exist: it has the value, the nearest good one and all good ones."""
     near = difflib.get_close_matches(str(value), good, n=1)
     hint = f", did you mean {near[0]!r}" if near else ""
     return ValueError(f"unknown {noun} {str(value)!r}{hint} (choose from {', '.join(good) or 'none'})")

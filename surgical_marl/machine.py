@@ -56,12 +56,12 @@ def restart_peak() -> float:
 
 
 def peak() -> float:
-    """The most that this process had since then, bytes."""
+    """Return the most memory this process has had since `restart_peak`, or else since its start, in bytes."""
     return _bytes("/proc/self/status", "VmHWM", 0.0)
 
 
 def free() -> float:
-    """What this machine has left, bytes."""
+    """Return the memory that this machine has left, in bytes."""
     return _bytes("/proc/meminfo", "MemAvailable", math.inf)
 
 

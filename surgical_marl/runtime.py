@@ -76,10 +76,12 @@ def prepare_jax() -> None:
 
 @functools.cache
 def prepare_mjx() -> Any:
-    """Imports MJX, which takes seconds: only what traces physics needs it, and a program in the cache does not.
+    """Import MJX and return it, without what the import prints.
 
-    `import mujoco.mjx` prints two lines to stdout without Warp, and a banner with it. Where there is no NVIDIA GPU, MJX
-    does not get to see Warp, whose kernels it would register.
+    The import takes seconds. Only code that traces physics needs MJX; a program that is in the cache does not.
+
+    `import mujoco.mjx` prints two lines to stdout without Warp, and a banner with it. Where there is no NVIDIA GPU,
+    Warp is hidden from MJX, because MJX would register Warp's kernels.
     """
     prepare_jax()
     hidden = not _has_gpu()
@@ -144,17 +146,19 @@ class _Deferred(types.ModuleType):
 
 
 def defer_compiler() -> None:
-    """For programs that never call `torch.compile`: tensordict and torch's optimisers import its compiler, and SymPy,
-    only to mark what it should not compile. On a GPU that takes longer than to learn a task of one arm.
+    """Put off the import of torch's compiler, for programs that never call `torch.compile`.
 
-    Call it before torch is imported; it does nothing if the compiler is there already.
+    tensordict and torch's optimisers import the compiler, and SymPy with it, only to mark what it should not compile.
+    On a GPU that import takes longer than to learn a task of one arm.
+
+    Call this function before torch is imported. It does nothing if the compiler is imported already.
     """
     sys.modules.setdefault("torch._dynamo", _Deferred("torch._dynamo"))
 
 
 @functools.cache
 def prepare_warp() -> Any:
-    """Imports Warp, and starts it without its banner and without a warning that there is no GPU."""
+    """Import Warp, and start it without its banner and without a warning that there is no GPU."""
     import warp
 
     warp.config.log_level = max(warp.config.log_level, warp.LOG_WARNING)

@@ -20,7 +20,11 @@ class _Loader(yaml.SafeLoader):
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """Reads a YAML mapping; ValueError with the line if it does not parse."""
+    """Read a YAML mapping from a file.
+
+    Raises:
+        ValueError: the file cannot be read, does not parse (the error has the line), or holds no mapping.
+    """
     try:
         text = path.read_text()
     except (OSError, UnicodeDecodeError) as error:
@@ -42,7 +46,11 @@ def check_keys(mapping: dict[str, Any], known: tuple[str, ...], where: Path | st
 
 
 def build(cls: type, mapping: Any, where: Path | str) -> Any:
-    """A dataclass of floats and strings from a mapping; ValueError for keys or numbers that are wrong or missing."""
+    """Return a dataclass of floats and strings, made from a mapping.
+
+    Raises:
+        ValueError: a key or a number is wrong or missing.
+    """
     if not isinstance(mapping, dict):
         raise ValueError(f"{where}: {mapping!r} must be a mapping with the keys of {cls.__name__.lower()}")
     names = tuple(f.name for f in fields(cls))

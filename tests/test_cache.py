@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -83,3 +85,34 @@ def test_a_cache_that_cannot_be_written_is_no_error(tmp_path: Path, monkeypatch:
     (tmp_path / "file").write_text("")
     monkeypatch.setattr(cache, "cache_dir", lambda: tmp_path / "file")
     assert cache.cached("numbers", lambda: np.arange(3), "x").tolist() == [0, 1, 2]
+
+
+PROGRAM = """
+import sys
+from surgical_marl import cache
+import numpy as np
+from beside import VALUE
+
+def compute():
+    print("made", VALUE)
+    return np.array(float(VALUE))
+
+cache.cached("numbers", compute)
+"""
+
+
+def test_a_program_is_code_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a script makes is found again until the script, or a file beside it, changes."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setenv("PYTHONPATH", str(PACKAGE.parent))
+    (tmp_path / "program.py").write_text(PROGRAM)
+
+    def run(*how: str, value: int) -> str:
+        (tmp_path / "beside.py").write_text(f"VALUE = {value}\n")
+        done = subprocess.run([sys.executable, *how], cwd=tmp_path, capture_output=True, text=True, check=True)
+        return done.stdout
+
+    assert [run("program.py", value=value) for value in (1, 1, 2, 2)] == ["made 1\n", "", "made 2\n", ""]
+    (tmp_path / "program.py").write_text(PROGRAM.replace("made", "anew"))
+    assert run("program.py", value=2) == "anew 2\n"
+    assert [run("-c", PROGRAM, value=2) for _ in range(2)] == ["made 2\n"] * 2  # without a file nothing is kept

@@ -36,7 +36,10 @@ def race(clocks: dict[str, Clock], seconds: float = SECONDS, repeats: int = REPE
 
 
 def cpu_clock(step: Callable[[], object], wait: Callable[[], object] = lambda: None) -> Clock:
-    """Times `step`; `wait` returns when all steps so far are done."""
+    """Return a clock that times `step`.
+
+    `wait` has to return only when all steps so far are done.
+    """
 
     def seconds(count: int) -> float:
         start = time.perf_counter()
@@ -49,7 +52,10 @@ def cpu_clock(step: Callable[[], object], wait: Callable[[], object] = lambda: N
 
 
 def cuda_clock(step: Callable[[], object], cycle: int) -> Clock:
-    """Times `step` within a CUDA graph of `cycle` steps: without the time that Python takes to launch kernels."""
+    """Return a clock that times `step` within a CUDA graph of `cycle` steps.
+
+    The time that Python takes to launch kernels is therefore left out.
+    """
     import torch
 
     from surgical_marl.learning.graphs import Replayed

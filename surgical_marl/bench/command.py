@@ -75,8 +75,11 @@ def _solve(arguments: Namespace) -> int:
 
 
 def _settings(arguments: Namespace, num_envs: Mapping[str, int] | None = None) -> Settings:
-    """Settings of a training: those of `configs/`, so many environments by the device where that is said, flags, and
-    `key=value`."""
+    """Return the settings of a training.
+
+    They come from `configs/`, then from `num_envs`, then from the flags, and last from the `key=value` overrides. What
+    comes later takes precedence. `num_envs` gives numbers of environments by device, "cpu" or "cuda".
+    """
     from surgical_marl.bench.workload import Workload
     from surgical_marl.runs.settings import load_config
 

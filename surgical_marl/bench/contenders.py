@@ -45,7 +45,7 @@ class Contender:
 
 
 def prepare(engine: str, workload: Workload, course: Course) -> Contender:
-    """An engine, compiled, on the start of a course.
+    """Return the clocks of an engine that is compiled and stands at the start of a course.
 
     Raises:
         ValueError: an unknown engine, or one that can't run here.
@@ -99,7 +99,7 @@ def _batched(name: str, workload: Workload, course: Course) -> Contender:
 
 
 def _along(physics: Engine, commands: list[Any]) -> Callable[[], None]:
-    """A physics step under the commands of a course."""
+    """Return a function that makes a physics step under the commands of a course, one step further at each call."""
     turn = itertools.count()
 
     def step() -> None:

@@ -40,8 +40,10 @@ class Course(NamedTuple):
 
 
 def make_course(scene: Scene, motion: str = MOTIONS[0], seed: int = 0) -> Course:
-    """Every environment moves from home by random actions of its own, then to and fro. C MuJoCo moves the arms, so that
-    the states are no engine's own."""
+    """Draw a course: every environment moves from home by random actions of its own, then to and fro.
+
+    C MuJoCo moves the arms. The states therefore come from none of this package's own engines.
+    """
     # or JAX would take most of a GPU's memory when it starts, and leave too little for the fused engine
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     import jax

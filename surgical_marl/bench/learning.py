@@ -75,7 +75,7 @@ def measure(settings: Settings, seconds: float = clock.SECONDS, repeats: int = c
 
 
 def _learn(settings: Settings, seconds: float, repeats: int) -> dict[str, Any]:
-    """What is known of the training: part of a `Speed`."""
+    """Train, and return the fields of `Speed` that describe the training."""
     start = time.perf_counter()
     training = make_training(settings)
     env = training.env.env

@@ -13,8 +13,11 @@ from surgical_marl.physics.views import Contacts, Touch
 
 
 class PhysicsAlone(Env):
-    """A step takes a state and gives the next one and the distances of all pairs that can touch. No agent, no reward,
-    no reset; commands are set by `engine.write(".physics.ctrl", ...)`."""
+    """An environment whose step is a physics step alone.
+
+    The step takes a state and gives the next one and the distances of all pairs that can touch. There is no agent, no
+    reward and no reset. Commands are set by `engine.write(".physics.ctrl", ...)`.
+    """
 
     def __init__(self, env: Env) -> None:
         vars(self).update(vars(env))

@@ -86,7 +86,7 @@ def summary(
 
 
 def sweep_summary(workload: Workload, points: Iterable[Point]) -> dict[str, Any]:
-    """A sweep, for JSON."""
+    """Return the results of a sweep in a form that JSON can hold."""
     rows = [{**asdict(point.speed), "bytes_per_env": point.bytes_per_env} for point in points]
     return {"task": workload.task, "scene": workload.scene, **machine(), "points": rows}
 
@@ -117,7 +117,7 @@ def table(found: Mapping[str, Any]) -> str:
 
 
 def describe_machine(found: Mapping[str, Any] | None = None) -> str:
-    """This machine, or what `machine` told of another, in a line."""
+    """Return one line about this machine, or about another one if `found` is what `machine` returned there."""
     found = found or machine()
     return f"{found['cpu']}, {found['threads']} threads" + (f"; {found['gpu']}" if found["gpu"] else "")
 
@@ -132,7 +132,7 @@ def _ratio_lines(found: Mapping[str, Mapping[str, float]]) -> list[str]:
 
 
 def sweep_table(points: Iterable[Point]) -> str:
-    """A sweep for people."""
+    """Return the results of a sweep as a text table for people."""
     cells = [("engine", "device", "environments", "physics steps/s", "environment steps/s", "bytes/environment")]
     for speed, size in points:
         env = f"{speed.env_steps_per_s:,.0f}" if speed.env_steps_per_s else "-"
@@ -155,7 +155,10 @@ def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
 
 
 def draw(points: Sequence[Point], title: str, out: Path) -> None:
-    """A sweep as a picture: physics steps as lines, environment steps dashed; a GPU's with full dots."""
+    """Draw the results of a sweep as a picture and write it to `out`, as PNG.
+
+    Physics steps are solid lines, environment steps dashed ones. Filled dots are of a GPU, white ones of a CPU.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.ticker import EngFormatter

@@ -186,23 +186,33 @@ class Looks:
         self._ended = self._took = 0.0
 
     def due(self, success: float, learning: float) -> bool:
-        """Whether to evaluate after an iteration, with its success rate (NaN if no episode ended), `learning` seconds
-        after learning began."""
+        """Say whether to evaluate after an iteration.
+
+        Args:
+            success: success rate of that iteration in training; NaN if no episode ended.
+            learning: time since learning began, s.
+        """
         promising = success >= self._promising
         if not self._took:
             return promising
         return self._took < (EAGER if promising else PATIENT) * (learning - self._ended)
 
     def add(self, success: float, exam: Exam, learning: float, took: float) -> None:
-        """An evaluation at that success rate of training, which ended `learning` seconds after learning began and took
-        so many."""
+        """Take note of an evaluation.
+
+        Args:
+            success: success rate of training at that time.
+            exam: what the evaluation showed.
+            learning: time from the beginning of learning to the end of the evaluation, s.
+            took: duration of the evaluation, s.
+        """
         self._ended, self._took = learning, took
         missing = max(0.0, self._goal.success - exam.success_2mm) / max(1 - exam.success_2mm, 1e-9)
         self._promising = success + (1 - success) * min(missing, 1.0)
 
 
 def examine(training: Trainer, env: Any) -> Exam:
-    """The frozen evaluation of the policy as it is now, in `EPISODES` environments."""
+    """Run the frozen evaluation of the policy as it is now, in `EPISODES` environments."""
     policy = acting_policy(training.algorithm.actor, training.env.layout, str(env.device))
     return _exam(play(env, policy, EPISODES, SEED))
 
@@ -216,14 +226,19 @@ def _exam(played: Played) -> Exam:
 
 
 def starting(seconds: list[float]) -> float:
-    """What the first iterations took more than the others."""
+    """Return how many seconds the first iterations took beyond the median of the others, 0 if there are no others.
+
+    The first iterations are the first `STARTING` ones.
+    """
     first, others = seconds[:STARTING], seconds[STARTING:]
     return sum(max(0.0, took - statistics.median(others)) for took in first) if others else 0.0
 
 
 def run(settings: Settings, goal: Goal, limit: float, as_json: bool = False) -> tuple[str, bool]:
-    """All of `surgical-marl bench solve`, from the start of this process: the text of its table or JSON, and whether it
-    is solved. It is given up after `limit` seconds."""
+    """Run all of `surgical-marl bench solve`; return the text of its table or JSON, and whether the task is solved.
+
+    The time counts from the start of this process. Training is given up after `limit` seconds.
+    """
     began = time.perf_counter() - machine.age()
     with in_memory(settings.num_envs):
         found = solve(settings, goal, lambda seconds, learning: seconds > limit, began)
@@ -231,7 +246,7 @@ def run(settings: Settings, goal: Goal, limit: float, as_json: bool = False) -> 
 
 
 def summary(settings: Settings, goal: Goal, found: Solution) -> str:
-    """A solution as JSON, with the settings that it is of."""
+    """Return a solution as JSON, with the settings that it was found with."""
     values = {**asdict(found), **asdict(found.times), **asdict(found.exam)}
     about = {name: getattr(settings, name) for name in ("task", "scene", "algo", "seed", "control", "difficulty")}
     del values["times"], values["exam"]
@@ -239,7 +254,7 @@ def summary(settings: Settings, goal: Goal, found: Solution) -> str:
 
 
 def table(settings: Settings, goal: Goal, found: Solution) -> str:
-    """A solution for people."""
+    """Return a solution as a text table for people."""
     exam = found.exam
     parts = {item.name.removesuffix("_s"): getattr(found.times, item.name) for item in fields(Times)}
     cells = [(name, f"{took:.2f} s", f"{took / found.seconds:.0%}") for name, took in parts.items()]

@@ -14,7 +14,7 @@ from surgical_marl.scenes.shared_workspace import shared_workspace
 
 
 def describe(kind: str) -> str:
-    """The names of one kind, with what one wants to know of each."""
+    """Return the names of one kind of content, with the facts that help to choose among them."""
     lines = {
         "tasks": lambda: [_task(name) for name in list_tasks()],
         "scenes": lambda: [_scene(load_scene(name)) for name in list_scenes()],

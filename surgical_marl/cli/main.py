@@ -15,8 +15,8 @@ from typing import Any, NoReturn
 from surgical_marl.content import BASELINES, find, list_arms, list_policies, list_scenes, unknown
 from surgical_marl.plugins.algorithms import list_algorithms
 from surgical_marl.plugins.tasks import list_tasks
-from surgical_marl.runtime import defer_compiler
 from surgical_marl.runs.settings import Settings
+from surgical_marl.runtime import defer_compiler
 from surgical_marl.tasks.base.options import choices
 
 _LISTS = {
@@ -52,8 +52,11 @@ _TAKE_SETTINGS = ("train", "bench train", "bench solve")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command; returns 0, 1 if training diverged or `check` found something, 2 for bad input, 130 if
-    interrupted."""
+    """Run a command, and return its exit code.
+
+    The code is 0 for success, 1 if training diverged or `check` found something, 2 for bad input, and 130 if the user
+    interrupted the command.
+    """
     code = 0
     defer_compiler()
     try:
@@ -193,7 +196,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _bench_parser(kinds: Any, kind: str, what: str, engines: Sequence[str]) -> argparse.ArgumentParser:
-    """The parser of one benchmark, with what all take."""
+    """Return the parser of one benchmark, with the arguments that all benchmarks take."""
     parser: argparse.ArgumentParser = kinds.add_parser(kind, help=what)
     parser.add_argument("--task", default="reach", help=f"one of: {', '.join(list_tasks())}")
     parser.add_argument("--scene", default="psm", help="a name (see `list scenes`) or a .yaml file")

@@ -36,7 +36,7 @@ class Engine(Protocol):
 
 
 def make_engine(env: Stepper, num_envs: int, engine: str = "auto", device: str = "auto") -> Engine:
-    """The engine of that name, or the fastest that can run the environment.
+    """Return the engine of that name, or the fastest one that can run the environment.
 
     Raises:
         ValueError: an unknown engine or device, one that is not there, or an environment that the engine can't run.

@@ -57,7 +57,10 @@ class MjxEngine:
             self._begin(keys, jnp.zeros(self.num_envs, jnp.int32))
 
     def restart(self) -> None:
-        """The next episode of every environment that has not just begun one, in the step that ended the last."""
+        """Begin the next episode of every environment that has not just begun one.
+
+        An environment has just begun one if the last step ended its episode.
+        """
         carry = self._state.carry
         begun = (carry.steps == 0) & self._stepped
         self._begin(carry.key, carry.episode + ~begun)
@@ -86,7 +89,7 @@ class MjxEngine:
         self._stepped = True
 
     def _run(self, function: Any, *given: Any) -> Any:
-        """A function of all environments, each core with its share of them."""
+        """Run a function on all environments, with a share of them on each core."""
         traced = function in self._traced
         # Tracing makes some million objects that all stay: looking for garbage among them takes a quarter of the time.
         with contextlib.nullcontext() if traced else no_collection():
@@ -103,22 +106,27 @@ class MjxEngine:
         return found
 
     def outcome(self, library: str) -> dict[str, Any]:
-        """What the last step or reset led to, as arrays [N, ...] of "numpy", "torch" or "jax": fields of the
-        environment's `State` as dicts."""
+        """Return what the last step or reset led to: fields of the environment's `State` as dicts.
+
+        The arrays are [N, ...] of "numpy", "torch" or "jax".
+        """
         known = {name: value for name, value in self._state._asdict().items() if name != "carry"}
         found = {name: self._present(value, library) for name, value in known.items() if jax.tree.leaves(value)}
         return {**found, "contacts": found["contacts"]._asdict()}
 
     def read(self, name: str, library: str) -> Any:
-        """A part of the `Carry`, one of `carry_shapes`, or of what has moved, as in ".moved.carry.physics.qpos"; [N,
-        ...]."""
+        """Return a part of the `Carry` or of what has moved, [N, ...].
+
+        A part of the `Carry` has a name in `carry_shapes`. A part of what has moved has a name as in
+        ".moved.carry.physics.qpos".
+        """
         tree, path = self._state.carry, name
         if name.startswith(".moved"):
             tree, path = self._moved, name.removeprefix(".moved")
         return self._present(_paths(tree)[path], library)
 
     def write(self, name: str, values: Any) -> None:
-        """Sets a part of the `Carry`."""
+        """Set a part of the `Carry`."""
         parts = _paths(self._state.carry)
         parts[name] = jnp.array(self._take(values), parts[name].dtype)  # a copy: a step gives its carry away
         carry = jax.tree.unflatten(self._tree, list(parts.values()))
@@ -150,7 +158,11 @@ class MjxEngine:
 
 
 def find_device(device: str) -> Any:
-    """The JAX device for "auto", "cpu" or "cuda". ValueError if it is not there."""
+    """Return the JAX device for "auto", "cpu" or "cuda".
+
+    Raises:
+        ValueError: the device is not there.
+    """
     if device == "auto":
         return jax.devices()[0]
     try:

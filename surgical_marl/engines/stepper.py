@@ -28,8 +28,10 @@ class Stepper(Protocol):
 
     @property
     def parameters(self) -> Any:
-        """Numbers that are the same for all environments: a tree of numpy arrays, the last argument of each
-        function."""
+        """Numbers that are the same for all environments.
+
+        They are a tree of numpy arrays, and the last argument of each function.
+        """
 
     @property
     def pauses(self) -> bool:

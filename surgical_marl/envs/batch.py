@@ -114,7 +114,7 @@ class BatchedEnv:
         self._started = False
 
     def __getstate__(self) -> dict[str, Any]:
-        """What makes a copy: the arguments, and where all environments are."""
+        """Return what a copy is made from: the arguments, and where all environments are (None before a reset)."""
         return {"made": self._made, "carry": self.carry() if self._started else None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -149,7 +149,7 @@ class BatchedEnv:
         return self._action_spaces[agent]
 
     def reset(self, seed: int | None = None, first: int = 0) -> tuple[dict[str, Any], Any, dict[str, dict[str, Any]]]:
-        """Starts a new episode in all environments; returns observations, state and infos.
+        """Start a new episode in all environments, and return observations, state and infos.
 
         Args:
             seed: environment i plays the same episodes for the same seed, whatever `num_envs`. None goes on to each

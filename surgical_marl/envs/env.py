@@ -125,8 +125,10 @@ class Env:
 
     @property
     def pauses(self) -> bool:
-        """Whether someone looks at what has moved before a step is finished: an agent that observes pictures, or a task
-        that senses them."""
+        """Whether a step stops halfway, so that pictures can be drawn of what has moved before the step is finished.
+
+        It does so if an agent observes pictures, or if the task senses something in them.
+        """
         return bool(self.task.senses) or any(seen.pictures for seen in self.observed.values())
 
     @cached_property
@@ -143,8 +145,10 @@ class Env:
 
     @property
     def content(self) -> bytes:
-        """All that a step depends on besides code and `parameters`: the model with its masses and gains, and the
-        options."""
+        """All that a step depends on besides code and `parameters`.
+
+        This is the model, with its masses and gains, and the options.
+        """
         model = np.empty(mujoco.mj_sizeModel(self.scene.model), np.uint8)
         mujoco.mj_saveModel(self.scene.model, None, model)
         observed = {agent: (seen.names, seen.unseen) for agent, seen in self.observed.items()}
@@ -158,8 +162,10 @@ class Env:
 
     @cached_property
     def parameters(self) -> dict[str, Any]:
-        """Numbers that a step reads as inputs, so that another value of one compiles nothing: `max_steps`, the
-        `weights` of reward terms, and the task's `tables`. A tree of numpy arrays."""
+        """Numbers that a step reads as inputs, so that nothing is compiled again when one of them changes.
+
+        A tree of numpy arrays: `max_steps`, the `weights` of reward terms, and the task's `tables`.
+        """
         return {
             "max_steps": np.int32(self.max_steps),
             "weights": {name: np.float32(weight) for name, weight in self.task.weights.items()},
@@ -182,8 +188,11 @@ class Env:
         return Plant(self.simulator)
 
     def num_actions(self, agent: str) -> int:
-        """Length of an agent's action: one number a joint, the jaw's open (> 0) or closed command last in joint
-        order."""
+        """Return the length of an agent's action.
+
+        An action has one number for each actuated joint, in joint order. The last one, if the arm has a jaw, is the
+        jaw's command: open (> 0) or closed.
+        """
         return len(self.scene.mounts[agent].arm.actuated)
 
     def action_space(self, agent: str) -> spaces.Box:
@@ -204,7 +213,13 @@ class Env:
         return _box(*map(np.concatenate, zip(*every, strict=True)))
 
     def reset(self, key: Array, episode: Array | int = 0, parameters: Any = None) -> State:
-        """The start of an episode. `key` is raw (uint32 [2], as of `jax.random.PRNGKey`) and numbers its episodes."""
+        """Return the state at the start of an episode.
+
+        Args:
+            key: a raw key (uint32 [2], as `jax.random.PRNGKey` returns it). The episodes of a key are numbered.
+            episode: the number of the episode among those of the key.
+            parameters: a tree like `self.parameters`; None for the environment's own.
+        """
         task, _ = self._bound(parameters)
         carry, contacts, arms = self._start(task, key, jnp.int32(episode))
         observations, state = self._observe(task, carry, contacts, arms)
@@ -228,7 +243,7 @@ class Env:
         return self.finish(self.move(carry, actions, parameters), self._unsensed(), parameters)
 
     def move(self, carry: Carry, actions: dict[str, Array], parameters: Any = None) -> Moved:
-        """The first half of a step: physics, and where goals are afterwards."""
+        """Do the first half of a step: physics, and where goals are afterwards."""
         task, _ = self._bound(parameters)
         physics, hidden = self.plant.command(carry.physics, carry.hidden, actions)
         physics, contacts, arms = self.plant.advance(physics, hidden)
@@ -238,7 +253,7 @@ class Env:
         return Moved(after, carry.tips, contacts, arms)
 
     def finish(self, moved: Moved, sensed: dict[str, Array], parameters: Any = None) -> State:
-        """The second half of a step: observations, reward, and a reset if it ends the episode."""
+        """Do the second half of a step: observations, reward, and a reset if the step ends the episode."""
         task, max_steps = self._bound(parameters)
         carry, contacts = moved.carry, moved.contacts
         arms = {agent: moved.arms[agent] for agent in self.agents}  # JAX sorts them by name
@@ -269,7 +284,10 @@ class Env:
         )
 
     def _bound(self, parameters: Any) -> tuple[Task, Array]:
-        """The task with its parameters, and the time limit; its own where none are given."""
+        """Return the task with the given parameters, and the time limit in steps.
+
+        Where `parameters` is None, the environment's own are used.
+        """
         known = jax.tree.map(jnp.asarray, self.parameters) if parameters is None else parameters
         return self.task.bound(known["weights"], known["tables"]), known["max_steps"]
 
@@ -292,7 +310,7 @@ class Env:
     def _observe(
         self, task: Task, carry: Carry, contacts: Contacts, arms: dict[str, ArmView]
     ) -> tuple[dict[str, Array], Array]:
-        """What policies and critics see of arms that are as in `arms`."""
+        """Return what policies observe, and what critics observe, of arms that are as in `arms`."""
         noise = jax.random.fold_in(jax.random.fold_in(jax.random.fold_in(carry.key, carry.episode), NOISE), carry.steps)
         world = World(self.plant.measure(carry.physics, carry.hidden, contacts, arms, noise), carry.goal)
         observations, every = {}, []
@@ -327,7 +345,7 @@ def _box(low: np.ndarray, high: np.ndarray) -> spaces.Box:
 
 
 def _single(table: np.ndarray) -> np.ndarray:
-    """A table as kernels hold it: floats in float32, all else in int32 or bool."""
+    """Return a table in the types that kernels use: floats as float32, all else as int32 or bool."""
     if table.dtype == bool:
         return table
     return table.astype(np.float32 if table.dtype.kind == "f" else np.int32)

@@ -7,10 +7,10 @@ from typing import Any
 
 
 def each(tree: Any, change: Callable[[Any], Any]) -> Any:
-    """The same with all of its arrays changed."""
+    """Return the same observations, with `change` applied to each array."""
     return {name: change(value) for name, value in tree.items()} if isinstance(tree, dict) else change(tree)
 
 
 def proprioception(tree: Any) -> Any:
-    """What it holds besides pictures: the one array."""
+    """Return the one array that observations hold besides pictures."""
     return tree["proprioception"] if isinstance(tree, dict) else tree

@@ -29,8 +29,11 @@ _HOLDS = {"below": operator.lt, "at least": operator.ge}
 
 
 def worst_median(result: Mapping[str, Any]) -> float | None:
-    """The median error of the arm that has the largest, mm: arms that only keep still can't hide another's error. None
-    in a task whose tool tips have no targets."""
+    """Return the median error of the arm that has the largest one, in mm.
+
+    With this number, arms that only keep still can't hide the error of another arm. None in a task whose tool tips have
+    no targets.
+    """
     errors = (agent["median_error_mm"] for agent in result["agents"].values())
     return max((error for error in errors if error is not None), default=None)
 
@@ -40,7 +43,7 @@ def _worst(result: Mapping[str, Any]) -> str:
 
 
 def misses(result: Mapping[str, Any]) -> list[str]:
-    """The goals of its task that a result misses, each as "what it has: the goal"."""
+    """Return the goals of its task that a result misses, each as a text that names the value and the goal."""
     found = []
     for name, (relation, goal) in TASKS.load(result["task"]).wanted.items():
         value: float | None = worst_median(result) if name == "median_error_mm" else result[name]
@@ -78,10 +81,11 @@ def _row(folder: Path) -> tuple[str, ...]:
 
 
 def card(folder: Path, name: str) -> str:
-    """The card of the policy in a folder, in Markdown.
+    """Return the card of the policy in a folder, in Markdown.
 
     Args:
-        name: of the policy; a folder that is being written has another one.
+        folder: of the policy.
+        name: of the policy. It is not taken from the folder, which has another name while it is being written.
     """
     settings = read_settings(folder)
     result = json.loads((folder / EVALUATION).read_text())
@@ -162,7 +166,7 @@ By `{command}`; `config.yaml` holds all settings that it then had.
 
 
 def _training(folder: Path) -> dict[str, float]:
-    """The last row of metrics, with the seconds of all rows."""
+    """Return the last row of metrics, with the seconds of all rows added up."""
     rows = read_metrics(folder)
     return {**rows[-1], "seconds": sum(row["seconds"] for row in rows)}
 

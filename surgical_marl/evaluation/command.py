@@ -94,7 +94,10 @@ def report(
 
 
 def judge(run: Path) -> None:
-    """What `surgical-marl train` does after training: evaluate on the standard goals, say how it went, and film it."""
+    """Do what `surgical-marl train` does after training.
+
+    Evaluate the run on the standard goals, write and print the result, and film the policy.
+    """
     print("evaluating 200 episodes", file=sys.stderr)
     env = make_env(read_settings(run, ["engine=auto", "device=auto", "goals=held_out"]), num_envs=200)
     policy = load_policy(run, env)
@@ -111,9 +114,11 @@ def judge(run: Path) -> None:
 
 
 def read_result(path: Path) -> dict[str, Any]:
-    """A result that `surgical-marl eval --json` or a training run wrote; of several runs, all together.
+    """Read a result that `surgical-marl eval --json` or a training run wrote.
 
-    ValueError if it is none.
+    If the file holds several runs, this is the result of all of them together.
+
+    ValueError if the file is no such result.
     """
     try:
         result = json.loads(path.read_text())

@@ -67,7 +67,7 @@ def play(
     episodes: int,
     seed: int,
 ) -> Played:
-    """The episodes of `evaluate`, not summed up yet.
+    """Play the episodes of `evaluate`, and return their measures without summing them up.
 
     The first episode of each environment counts, however long it takes, so that short episodes are not
     over-represented. More episodes than environments are played in blocks, each from its own seed.
@@ -120,8 +120,11 @@ def difference(result: Mapping[str, Any], other: Mapping[str, Any], name: str) -
 
 
 def _numbers(found: Mapping[str, Metric], stages: Sequence[str]) -> dict[str, Any]:
-    """Values of metrics, those of `stages` in their order too, and, under `intervals`, their 95 % intervals; None where
-    there is none."""
+    """Return the values of metrics by name, and their 95 % intervals under `intervals`.
+
+    A value or an interval that does not exist is None. If there are `stages`, their values also stand under `stages`,
+    in their order.
+    """
     values = {name: float(metric.reduce(metric.values.ravel())) for name, metric in found.items()}
     numbers: dict[str, Any] = {name: value if math.isfinite(value) else None for name, value in values.items()}
     undefined = {name for name, metric in found.items() if metric.extreme or numbers[name] is None}
@@ -134,7 +137,7 @@ def _numbers(found: Mapping[str, Metric], stages: Sequence[str]) -> dict[str, An
 def _first_episodes(
     env: BatchedEnv, policy: Callable[..., Mapping[str, Any]], observations: Mapping[str, Any], count: int
 ) -> Trajectory:
-    """The first episodes of the first `count` environments, which have just been reset."""
+    """Play the first episodes of the first `count` environments, which have just been reset."""
     lengths = np.zeros(count, int)
     starts, infos, unknown = [], [], np.full(count, np.nan)
     for number in range(1, env.max_steps + 1):
@@ -172,5 +175,5 @@ def _kinematics(env: BatchedEnv, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def _numpy(values: Any, count: int) -> np.ndarray:
-    """A copy of the first `count` values: the engine may write into its own again."""
+    """Return a copy of the first `count` values, since the engine may overwrite its own arrays later."""
     return np.array((values.cpu().numpy() if isinstance(values, torch.Tensor) else values)[:count])

@@ -73,7 +73,10 @@ def _settings(runs: Sequence[str]) -> list[Settings]:
 
 
 def _evaluate(runs: Sequence[str], seeds: Sequence[int], name: str) -> tuple[dict[str, Any], int]:
-    """What `eval --json` prints of the best run, with `seeds` of all runs beside it; and which run is the best."""
+    """Evaluate the runs; return the result for the best of them, and which one that is.
+
+    The result is what `eval --json` prints of the best run. `seeds` in it holds the results of all runs.
+    """
     played = list(play_all(list(runs), {}, EPISODES, SEED).values())
     results = [{"policy": f"seed {seed}", **summarise([run])} for seed, run in zip(seeds, played, strict=True)]
     best = min(range(len(results)), key=lambda run: _rank(results[run]))
@@ -97,7 +100,10 @@ def evaluate_again(folder: Path) -> None:
 
 
 def _also(run: str) -> dict[str, Any]:
-    """What the same weights do on other goals and starts than those of the standard set, by what is other."""
+    """Evaluate the same weights on other goals and starts than those of the standard set.
+
+    The results are named after what differs: "training goals", and "random starts" where the task has them.
+    """
     asked = {"training goals": {"goals": "training"}}
     if "random" in TASKS.load(read_settings(find("policies", run)).task).starts:
         asked["random starts"] = {"start": "random"}

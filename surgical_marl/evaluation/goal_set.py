@@ -24,12 +24,15 @@ _FILE = Path(__file__).with_name("goal_sets.yaml")
 
 
 def episode_seed(seed: int, block: int) -> int:
-    """The environments' seed for one block of episodes, apart from those of other seeds, blocks and of training."""
+    """Return the environments' seed for one block of episodes.
+
+    It differs from the seeds of other blocks, from those of other `seed`, and from those of training.
+    """
     return int(np.random.SeedSequence([seed, block]).generate_state(1)[0] >> 1)
 
 
 def describe_goals(env: BatchedEnv, episodes: int) -> dict[str, Any]:
-    """What a goal set depends on beside its goals; `control_dt` in s."""
+    """Return what a goal set depends on beside its goals; `control_dt` is in s."""
     return {
         "task": env.task_name,
         "scene": env.scene.name,
@@ -45,8 +48,10 @@ def describe_goals(env: BatchedEnv, episodes: int) -> dict[str, Any]:
 
 
 def read_goals(env: BatchedEnv, count: int) -> list[np.ndarray]:
-    """Return what the episodes that the first `count` environments have just begun are after, [count, ...] each: the
-    task says what that is."""
+    """Return the goals of the episodes that the first `count` environments have just begun, [count, ...] each.
+
+    The task says what these are.
+    """
     goal = {name: values[:count] for name, values in vars(env.goal).items()}
     return env.task.goal_content(SimpleNamespace(**goal))
 
@@ -68,8 +73,10 @@ def is_standard(result: Mapping[str, Any]) -> bool:
 
 @cache
 def standard_hashes() -> dict[str, dict[str, dict[str, str]]]:
-    """Hashes of the standard goal sets by start, task and scene: what `surgical-marl eval` plays if told nothing else,
-    and with `--start random`."""
+    """Return the hashes of the standard goal sets by start, task and scene.
+
+    These are the goal sets that `surgical-marl eval` plays if no option chooses others, and with `--start random`.
+    """
     found: dict[str, dict[str, dict[str, str]]] = yaml.safe_load(_FILE.read_text())
     return found
 

@@ -14,15 +14,15 @@ RESAMPLES = 2000
 
 
 def interval(metric: Metric) -> list[float] | None:
-    """The 95 % percentile interval of a metric over R runs of E episodes, with the same goals in every run.
+    """Return the 95 % percentile interval of a metric over R runs of E episodes, with the same goals in every run.
 
     Runs and episodes are resampled independently, each drawn run with each drawn episode (Owen, The pigeonhole
-    bootstrap, Ann. Appl. Stat. 1(2), 2007); the arms of an episode stay together. One run alone is kept as it is: the
-    interval then says what other goals would change, not what another training seed would.
+    bootstrap, Ann. Appl. Stat. 1(2), 2007). The arms of an episode stay together. If there is only one run, only
+    episodes are resampled: the interval then says what other goals would change, not what another training seed would.
 
     Returns:
-        [low, high]; None for a single episode, or where a resample leaves the metric undefined. The same for the same
-        values.
+        [low, high]; None for a single episode, or where a resample leaves the metric undefined. The same values always
+        give the same interval.
     """
     runs, episodes, _ = metric.values.shape
     if episodes < 2:

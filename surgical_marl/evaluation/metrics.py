@@ -103,7 +103,7 @@ def _reduced(name: str, values: np.ndarray, going: np.ndarray, final: Callable[[
 
 
 def metrics(measures: Mapping[str, np.ndarray], following: bool) -> dict[str, Metric]:
-    """What `surgical-marl eval` reports, from `measure` of R runs, [R, E, A] each.
+    """Return the metrics that `surgical-marl eval` reports, from what `measure` gave for R runs, [R, E, A] each.
 
     `following` adds the root mean square error of tasks whose goal moves.
     """
@@ -136,7 +136,10 @@ def metrics(measures: Mapping[str, np.ndarray], following: bool) -> dict[str, Me
 
 
 def success(held: np.ndarray, threshold: float) -> Metric:
-    """The share of arms whose held error [R, E, A] is below a threshold of the same unit; NaN where it is."""
+    """Return the share of arms whose held error [R, E, A] is below a threshold of the same unit.
+
+    Where the held error is NaN, so is the value of that arm.
+    """
     return Metric(np.where(np.isnan(held), np.nan, held < threshold), _mean)
 
 

@@ -29,10 +29,11 @@ ABOUT = (
 
 
 def format_table(result: Mapping[str, Any], others: Mapping[str, Mapping[str, Any]] | None = None) -> str:
-    """What `evaluate` returned, as plain text: a line a metric, with its 95 % interval.
+    """Return what `evaluate` returned as plain text: one line for each metric, with its 95 % interval.
 
     Args:
-        others: columns to stand beside it, metrics by title; the agents if None.
+        result: what `evaluate` returned.
+        others: further columns to show beside it, metrics by title; if None, one column for each agent.
     """
     columns = result["agents"] if others is None else others
     words = "{task} in {scene}, {difficulty}, {control} control, {goals} goals, {start} start: {episodes} episodes"
@@ -49,9 +50,10 @@ def format_table(result: Mapping[str, Any], others: Mapping[str, Mapping[str, An
 
 
 def write_csv(path: Path, results: Sequence[Mapping[str, Any]]) -> None:
-    """A row for all agents together and one for each agent of every result; an empty cell is an undefined number.
+    """Write a CSV file with a row for all agents together and a row for each agent, of every result.
 
-    A result's `policy` is the name of a run. Columns `<metric>_low` and `<metric>_high` bound its 95 % interval.
+    An empty cell is an undefined number. A result's `policy` is the name of a run. Columns `<metric>_low` and
+    `<metric>_high` bound its 95 % interval.
     """
     rows = [_csv_row(result, agent) for result in results for agent in (None, *result["agents"])]
 
@@ -79,7 +81,7 @@ UNITS = {"_mm": " (mm)", "_s": " (s)", "_deg": " (degrees)", "image_error": "ima
 
 
 def title(name: str) -> str:
-    """A metric in words, with its unit."""
+    """Return the name of a metric in words, with its unit."""
     name = name.replace("p95_", "95th-percentile_")
     for end, unit in UNITS.items():
         name = name.removesuffix(end) + unit if name.endswith(end) else name
@@ -89,7 +91,7 @@ def title(name: str) -> str:
 
 
 def number(name: str, value: float | None) -> str:
-    """The value of a metric: a rate in percent, all else with two decimals."""
+    """Return the value of a metric as text: a rate in percent with one decimal, all else with two, "-" for None."""
     if value is None:
         return "-"
     rate = name.endswith("_rate") or name.startswith(("success_", "team_success_", "cost_"))

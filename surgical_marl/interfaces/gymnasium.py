@@ -23,9 +23,12 @@ from surgical_marl.interfaces.pettingzoo import RENDER_MODES
 
 
 class SurgicalEnv(gymnasium.Env[Any, np.ndarray]):
-    """One environment. `info` holds tip_error (m, the worst arm's), success (of all), collision (of any), min_distance
-    (m), the sums of `reward_<term>`, `cost` and `cost_<name>`, and for several arms also "agents": the same for
-    each."""
+    """A single environment for Gymnasium, in which one action moves all arms.
+
+    `info` holds tip_error (m, the worst arm's), success (of all arms), collision (of any arm), min_distance (m), and
+    the sums over the arms of `reward_<term>`, `cost` and `cost_<name>`. With several arms it also holds "agents": the
+    same values for each arm.
+    """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012 (Gymnasium's own convention)
 
@@ -42,7 +45,10 @@ class SurgicalEnv(gymnasium.Env[Any, np.ndarray]):
         self._over = True
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Starts an episode. With a seed the same one each time; without, the next of the last seed's episodes."""
+        """Start an episode.
+
+        With a seed it is the same episode each time. Without one it is the next episode that the last seed leads to.
+        """
         super().reset(seed=seed)
         observations, _, infos = self.batch.reset(seed)
         self._over = False
@@ -59,7 +65,7 @@ class SurgicalEnv(gymnasium.Env[Any, np.ndarray]):
         return _joint(self.batch, step.final_observations, 0), reward, terminated, truncated, _joint_info(step.infos, 0)
 
     def render(self) -> np.ndarray | None:
-        """A picture [H, W, 3] uint8 with render_mode="rgb_array", else None."""
+        """Return a picture [H, W, 3] uint8 with render_mode="rgb_array", else None."""
         if self.render_mode is None:
             return None
         from surgical_marl.view.record import ScenePicture
@@ -72,8 +78,10 @@ class SurgicalEnv(gymnasium.Env[Any, np.ndarray]):
 
 
 class SurgicalVectorEnv(VectorEnv[Any, np.ndarray, Any]):
-    """N environments that restart in the step that ends them; `infos["final_obs"]` then holds their last
-    observation."""
+    """N environments, each of which restarts in the same step in which its episode ends.
+
+    `infos["final_obs"]` then holds the last observation of the episode that ended.
+    """
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
 
@@ -93,7 +101,7 @@ class SurgicalVectorEnv(VectorEnv[Any, np.ndarray, Any]):
         self.action_space = batch_space(self.single_action_space, num_envs)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Starts all environments anew."""
+        """Start a new episode in all environments."""
         observations, _, infos = self.batch.reset(seed)
         return _joint(self.batch, observations), _joint_info(infos)
 
@@ -122,8 +130,10 @@ def _joint_spaces(batch: BatchedEnv) -> tuple[spaces.Space[Any], spaces.Box]:
 
 
 def _joint(batch: BatchedEnv, observations: dict[str, Any], index: int | None = None) -> Any:
-    """What all arms observe as one array, in a dict with the pictures if any sees some; of one environment or of
-    all."""
+    """Return what all arms observe as one array, of one environment or of all.
+
+    If any arm sees pictures, the result is a dict of that array and the pictures.
+    """
     chosen: Any = slice(None) if index is None else index
     # engines may sort the agents by name
     felt = np.concatenate([proprioception(observations[agent])[chosen] for agent in batch.agents], -1)
@@ -132,8 +142,10 @@ def _joint(batch: BatchedEnv, observations: dict[str, Any], index: int | None = 
 
 
 def _pictures(observations: dict[str, Any]) -> dict[str, Any]:
-    """The pictures of all agents, or their spaces, under their names; of several agents that see some as
-    "<agent>/<name>"."""
+    """Return the pictures of all agents, or the spaces of the pictures, under their names.
+
+    If several agents see pictures, the names are "<agent>/<name>".
+    """
     own = {agent: dict(part.items()) for agent, part in observations.items() if hasattr(part, "keys")}
     several = len(own) > 1
     return {
@@ -153,7 +165,7 @@ def _split(batch: BatchedEnv, actions: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def _joint_info(infos: dict[str, dict[str, Any]], index: int | None = None) -> dict[str, Any]:
-    """The team's info, of all environments or of one as plain Python numbers."""
+    """Return the team's info: of all environments as arrays, or of one as plain Python numbers."""
     shared = [key for key in next(iter(infos.values())) if all(key in info for info in infos.values())]
     stacked = {key: np.stack([info[key] for info in infos.values()]) for key in shared}
     team: dict[str, Any] = {

@@ -56,7 +56,10 @@ class SurgicalParallelEnv(ParallelEnv[str, Any, Any]):
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
-        """Starts an episode. With a seed the same one each time; without, the next of the last seed's episodes."""
+        """Start an episode.
+
+        With a seed it is the same episode each time. Without one it is the next episode that the last seed leads to.
+        """
         observations, state, infos = self.batch.reset(seed)
         self.agents = list(self.possible_agents)
         self._state = self._first(state)
@@ -85,13 +88,13 @@ class SurgicalParallelEnv(ParallelEnv[str, Any, Any]):
         return outcome
 
     def state(self) -> Any:
-        """The whole state [S] that a centralised critic sees."""
+        """Return the whole state [S] that a centralised critic sees."""
         if self._state is None:
             raise ValueError("no state yet: call reset() first")
         return self._state
 
     def render(self) -> np.ndarray | None:
-        """A picture [H, W, 3] uint8 of the scene with render_mode="rgb_array", else None."""
+        """Return a picture [H, W, 3] uint8 of the scene with render_mode="rgb_array", else None."""
         if self.render_mode is None:
             return None
         from surgical_marl.view.record import ScenePicture
@@ -143,7 +146,7 @@ class SurgicalBatchedParallelEnv(ParallelEnv[str, Any, Any]):
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
-        """Starts all environments anew."""
+        """Start a new episode in all environments."""
         observations, self._state, infos = self.batch.reset(seed)
         return observations, infos
 
@@ -163,7 +166,7 @@ class SurgicalBatchedParallelEnv(ParallelEnv[str, Any, Any]):
         )
 
     def state(self) -> Any:
-        """The whole state [N, S]."""
+        """Return the whole state [N, S]."""
         if self._state is None:
             raise ValueError("no state yet: call reset() first")
         return self._state
@@ -216,7 +219,7 @@ def parallel_env(
 
 
 def aec_env(task: str = "reach", **kwargs: Any) -> Any:
-    """The same environment, agents taking turns (PettingZoo's AEC API)."""
+    """Make the same environment with agents that take turns (PettingZoo's AEC API)."""
     from pettingzoo.utils import parallel_to_aec
 
     return parallel_to_aec(parallel_env(task, **kwargs))

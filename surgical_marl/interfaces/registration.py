@@ -1,5 +1,7 @@
-"""Names under which clients find the tasks: `surgical_marl/Reach-v0` for Gymnasium, `surgical_marl/reach-v0` for
-PettingZoo, and a module for each, as PettingZoo has it: `from surgical_marl import reach_v0`.
+"""Names under which Gymnasium and PettingZoo find the tasks.
+
+Gymnasium has `surgical_marl/Reach-v0`, and PettingZoo has `surgical_marl/reach-v0`. Each task also has a module, as
+is the custom in PettingZoo: `from surgical_marl import reach_v0`.
 
 Importing `surgical_marl` registers all of them.
 """
@@ -63,7 +65,7 @@ def _pettingzoo(task: str) -> None:
 
 
 def _module(task: str) -> None:
-    """A module such as `surgical_marl.reach_v0`, with `parallel_env`, `env` and `raw_env`."""
+    """Add a module such as `surgical_marl.reach_v0`, with `parallel_env`, `env` and `raw_env`."""
     name = f"{task}_v0"
     if f"{PACKAGE}.{name}" in sys.modules:
         return

@@ -60,7 +60,7 @@ class RslRlVecEnv(VecEnv):
         self.env.steps = steps.cpu().numpy()
 
     def get_observations(self) -> TensorDict:
-        """The observations that the next action answers."""
+        """Return the observations that the next action responds to."""
         return self._observations
 
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict[str, Any]]:
@@ -87,7 +87,7 @@ class RslRlVecEnv(VecEnv):
         return self._observations, rewards.mean(-1), step.terminated | step.truncated, extras
 
     def carry(self) -> dict[str, dict[str, Tensor]]:
-        """What `set_carry` needs to continue bit for bit, as plain dicts of tensors."""
+        """Return what `set_carry` needs to continue bit for bit, as plain dicts of tensors."""
         env = {name: _tensor(value) for name, value in self.env.carry().items()}
         return {"env": env, "observations": self._observations.to_dict()}
 

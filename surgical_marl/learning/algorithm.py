@@ -160,7 +160,10 @@ class Algorithm(PPO):
         return errors.mean()
 
     def compute_returns(self, obs: TensorDict) -> None:
-        """Returns and normalised advantages of the stored rollout; `obs` is what comes after it."""
+        """Compute the returns and normalised advantages of the stored rollout.
+
+        `obs` is the observation that comes after the rollout.
+        """
         storage = self.storage
         storage.compute_returns(self._values(obs), self.gamma, self.lam)
         if "scale" in self.options:
@@ -247,8 +250,10 @@ class Algorithm(PPO):
             return self.scale.restore(self.critic(obs, None, self.memory.critic))
 
     def precision(self) -> torch.autocast:
-        """Within it the networks compute in bfloat16, if that was asked for: the same when acting and learning, or
-        ratios would not begin at 1."""
+        """Return a context in which the networks compute in bfloat16, if that was asked for.
+
+        It must be the same when acting and when learning. Otherwise the ratios would not begin at 1.
+        """
         enabled = self.use_mixed_precision and self._cuda
         return torch.autocast("cuda" if self._cuda else "cpu", torch.bfloat16, enabled=enabled)
 
@@ -283,8 +288,7 @@ class Algorithm(PPO):
 
     @classmethod
     def construct_algorithm(cls, obs: TensorDict, env: RslRlVecEnv, cfg: dict[str, Any], device: str) -> Self:
-        """Build the algorithm from an rsl_rl configuration (see `rsl_rl_config`), as rsl_rl's
-        runner does it.
+        """Build the algorithm from an rsl_rl configuration (see `rsl_rl_config`), as rsl_rl's runner does it.
 
         Raises:
             ValueError: the environment's agents are grouped otherwise than for this algorithm.

@@ -17,8 +17,9 @@ from torch import Tensor
 
 
 def claim_gpu(device: str) -> None:
-    """Within torchrun on a machine with GPUs: let this process see its own GPU only, before anything starts CUDA.
-    "cuda" then means that one, to torch, Warp and JAX alike.
+    """Let this process see its own GPU only, within torchrun on a machine with GPUs.
+
+    It must be called before anything starts CUDA. After it, "cuda" means that GPU to torch, Warp and JAX alike.
 
     Raises:
         ValueError: the machine has fewer GPUs than processes.
@@ -67,7 +68,7 @@ def size() -> int:
 
 
 def agreed(text: str) -> str:
-    """The text that rank 0 has."""
+    """Return the text that rank 0 has."""
     texts = [text]
     if size() > 1:
         dist.broadcast_object_list(texts)
@@ -75,12 +76,12 @@ def agreed(text: str) -> str:
 
 
 def own_seed(seed: int, *more: int) -> int:
-    """A seed of this process alone, from the run's; whatever `more` is, another one."""
+    """Derive a seed for this process alone from the seed of the run. Each choice of `more` gives another one."""
     return int(np.random.SeedSequence((seed, rank(), *more)).generate_state(1)[0])
 
 
 def total(values: Tensor) -> Tensor:
-    """Sums over the processes, in place."""
+    """Sum the values over the processes, in place."""
     if size() > 1:
         dist.all_reduce(values)
     return values
@@ -92,8 +93,10 @@ def average(values: Tensor) -> Tensor:
 
 
 def var_mean(values: Tensor, dim: int | None = None) -> tuple[Tensor, Tensor]:
-    """Population variance and mean of the values of all processes, which have equally many; over one dimension, or
-    over all."""
+    """Return the population variance and the mean of the values of all processes.
+
+    They are taken over one dimension, or over all. Every process must have equally many values.
+    """
     var, own = torch.var_mean(values, dim=dim, correction=0)
     if size() == 1:
         return var, own
@@ -102,7 +105,7 @@ def var_mean(values: Tensor, dim: int | None = None) -> tuple[Tensor, Tensor]:
 
 
 def standardised(values: Tensor) -> Tensor:
-    """The values with mean 0 and variance 1 over all processes, which have equally many."""
+    """Return the values with mean 0 and variance 1 over all processes, each of which has equally many."""
     var, mean = var_mean(values)
     count = values.numel() * size()
     return (values - mean) / ((var * (count / max(count - 1, 1))).sqrt() + 1e-8)

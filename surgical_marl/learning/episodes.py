@@ -60,8 +60,10 @@ class Episodes:
         return torch.stack(terms).mean(-1).unflatten(0, (len(self.terms), -1)).sum(-1) / self._acting
 
     def take(self) -> Tensor:
-        """Sums since the last call: episodes, errors (m), successes, collisions, rewards, and each term's part of
-        the rewards."""
+        """Return the sums since the last call, and start again from zero.
+
+        The sums are: episodes, errors (m), successes, collisions, rewards, and each term's part of the rewards.
+        """
         totals = self._totals.clone()
         self._totals.zero_()
         return totals

@@ -51,9 +51,12 @@ def column_names(observations: TensorDict) -> list[str]:
 
 
 def mark_columns(stored: TensorDict, after: TensorDict) -> Tensor:
-    """For each column of the groups `[T, N, ..., d]` of a rollout, and of those `[N, ..., d]` after it: 0, or NaN if a
-    value in it is not finite in the first step in which any is not. From then on, faults spread. Pictures have no
-    columns."""
+    """Mark the columns of observations in which the first values that are not finite appear.
+
+    The columns are those of the groups `[T, N, ..., d]` of a rollout, and of the groups `[N, ..., d]` after it. Each
+    column gets 0 or NaN. It gets NaN if one of its values is not finite in the first step in which any value is not
+    finite. Later steps don't count, because faults spread from then on. Pictures have no columns.
+    """
     rows = [_numbers(stored), [(name, group.unsqueeze(0)) for name, group in _numbers(after)]]
     finite = [torch.cat([group.flatten(1, -2).isfinite().all(1) for _, group in groups], -1) for groups in rows]
     bad = ~torch.cat(finite)

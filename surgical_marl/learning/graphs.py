@@ -43,7 +43,7 @@ class Replayed:
             self._graph.reset()
 
     def _warm_up(self) -> None:
-        """The first call is an ordinary one: libraries get their memory, and the optimiser its moments.
+        """Make the first call an ordinary one, so that libraries get their memory, and the optimiser its moments.
 
         It goes to a stream of its own, as capturing does, so that what it leaves behind can be used there.
         """

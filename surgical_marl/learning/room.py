@@ -19,9 +19,12 @@ _SIGNS = ("out of memory", "can't allocate memory", "resource_exhausted")
 
 
 def rollout_bytes(settings: Settings, env: BatchedEnv) -> int:
-    """What a stored rollout takes of memory for one environment: its steps, each with the observations and the state;
-    actions, their means and deviations; and of each agent log-probability and advantage, and of its reward, and cost if
-    that is bounded, value and return."""
+    """Return how many bytes of memory a stored rollout takes for one environment.
+
+    Each step stores the observations and the state, and the actions with their means and deviations. For each agent it
+    also stores a log-probability and an advantage, and a reward with its value and return. If the cost is bounded, it
+    also stores the cost of each agent with its value and return.
+    """
     layout = Layout(env, ALGORITHMS.load(settings.algo).grouping)
     seen = layout.stack({agent: zeros(env.observation_space(agent)) for agent in layout.agents})
     parts = [*seen.values(), zeros(env.state_space)]

@@ -62,7 +62,7 @@ FIXED = {"ppo.normalise_values", "constraint.cost"}
 
 
 def make_training(settings: Settings) -> Trainer:
-    """A run in memory. ValueError if it has no room there."""
+    """Make a run in memory. ValueError if there is not enough memory for it."""
     with distributed.in_turn():
         env = make_env(settings)
     check_room(settings, env)
@@ -110,15 +110,21 @@ def train(settings: Settings, *, out: Path, resume: Path | None = None) -> Path:
 
 
 def finish(settings: Settings, run: Path) -> None:
-    """Train a run to its end from wherever it is, in this process: not begun, stopped before its first checkpoint, or
-    later. One that has its iterations already is left alone. Errors are those of `train`."""
+    """Train a run to its end, in this process, from wherever it is.
+
+    The run may not have begun, may have been stopped before its first checkpoint, or may have been stopped later. A run
+    that already has all its iterations is left alone. The errors are those of `train`.
+    """
     train(settings, out=run, resume=run if has_begun(run) else None)
 
 
 @contextmanager
 def _claimed(out: Path, resume: Path | None, settings: Settings) -> Iterator[None]:
-    """The run folder, while the run is made in memory. A new run has its settings there from the start, so that it can
-    be resumed whenever it is killed; if it is refused, there is nothing left of it."""
+    """Prepare the run folder, and clean it up if the run is refused while it is made in memory.
+
+    A new run has its settings in the folder from the start, so that it can be resumed whenever it is killed. If a new
+    run is refused, nothing of it is left.
+    """
     if distributed.rank() > 0:
         yield
         return
@@ -146,7 +152,10 @@ def _same(out: Path, resume: Path | None) -> bool:
 
 
 def _save(training: Trainer, out: Path) -> None:
-    """A checkpoint of all processes. The others write first: what rank 0 writes stands for a whole."""
+    """Save a checkpoint of all processes.
+
+    The other processes write before rank 0, because the file of rank 0 stands for a complete checkpoint.
+    """
     state, rank = training.state(), distributed.rank()
     iteration, processes = training.iteration, distributed.size()
     if rank > 0:
@@ -187,7 +196,7 @@ def _run(training: Trainer, out: Path) -> None:
 
 
 def _read_resumed(settings: Settings, run: Path, goes_on: bool) -> dict[str, Any] | None:
-    """What this process resumes; None if the run was stopped before its first checkpoint."""
+    """Return what this process resumes, or None if the run was stopped before its first checkpoint."""
     asked = _dotted(settings)
     for name, before in _dotted(read_settings(run)).items():
         fixed = name in FIXED or name.partition(".")[0] not in CHANGEABLE
@@ -211,7 +220,7 @@ def _read_resumed(settings: Settings, run: Path, goes_on: bool) -> dict[str, Any
 
 
 def _dotted(settings: Any) -> dict[str, Any]:
-    """Settings by their names, such as "ppo.gamma"."""
+    """Return the settings by their dotted names, such as "ppo.gamma"."""
     named: dict[str, Any] = {}
     for item in fields(settings):
         value = getattr(settings, item.name)
@@ -221,7 +230,10 @@ def _dotted(settings: Any) -> dict[str, Any]:
 
 
 def _own(state: dict[str, Any], run: Path) -> dict[str, Any]:
-    """A checkpoint with the environments of this process, or with none if it was written by more or fewer processes."""
+    """Return a checkpoint with the environments of this process.
+
+    It comes without any environments if it was written by more or fewer processes, or if their file is missing.
+    """
     rank, processes = distributed.rank(), state["processes"]
     own = state if rank == 0 else read_environments(run, state["iteration"], rank, processes)
     if processes == distributed.size() and own is not None:

@@ -141,7 +141,7 @@ class Trainer:
         )
 
     def row(self, report: Report) -> dict[str, float]:
-        """The metrics of an iteration (see `columns`), when it is done.
+        """Return the metrics of an iteration (see `columns`); this waits until the iteration is done.
 
         Raises:
             Diverged: something of it is not finite.
@@ -210,7 +210,7 @@ class Trainer:
         ]
 
     def state(self) -> dict[str, Any]:
-        """What `set_state` needs to continue bit for bit, as tensors and plain values."""
+        """Return what `set_state` needs to continue bit for bit, as tensors and plain values."""
         actor, constraint = self.algorithm.actor, self.algorithm.constraint
         return {
             "iteration": self.iteration,

@@ -49,5 +49,5 @@ class ValueScale(nn.Module):
         return (values - self.mean) / self.std
 
     def restore(self, predicted: Tensor) -> Tensor:
-        """What the critic predicts, `[..., W]`, in units of reward."""
+        """Return what the critic predicts, `[..., W]`, in units of reward."""
         return predicted * self.std + self.mean

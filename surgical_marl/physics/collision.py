@@ -83,13 +83,16 @@ class Pairs:
         return Closest(distance, point, normal)
 
     def _capsules(self, geom_xpos: Array, geom_xmat: Array) -> tuple[Capsule, Capsule]:
-        """The first and the second geoms of all pairs, [P] each."""
+        """Return the capsules of the first and of the second geoms of all pairs, [P] each."""
         parts = zip(self._geoms, self._halves, self._radii, strict=True)
         one, other = (Capsule(geom_xpos[g], geom_xmat[g][:, :, 2], half, radius) for g, half, radius in parts)
         return one, other
 
     def deepest(self, data: Any, closest: Closest) -> Touching:
-        """The contacts that matter. `data` is MJX's, with `cdof` and `subtree_com`."""
+        """Return the contacts of the deepest pairs, at most `SLOTS` of them.
+
+        `data` is MJX's data, with `cdof` and `subtree_com`. The Jacobian of a pair that does not overlap is zero.
+        """
         distance, pair = jax.lax.top_k(-closest.distance, min(SLOTS, self.count))
         point, normal = closest.point[pair], closest.normal[pair]
         offset = point[:, None] - data.subtree_com[self._roots]

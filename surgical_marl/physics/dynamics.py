@@ -62,7 +62,7 @@ class Dynamics:
         self._rubbing, self._limited = np.flatnonzero(model.dof_frictionloss), model.jnt_dofadr[model.jnt_limited > 0]
 
     def varied(self, fields: dict[str, Array]) -> Dynamics:
-        """A model with other values in some fields."""
+        """Return a copy of these dynamics whose model has other values in some fields."""
         varied = copy.copy(self)
         varied.model = self.model.tree_replace(fields)
         return varied
@@ -84,14 +84,14 @@ class Dynamics:
         return relax(forces.mass, forces.smooth, self._joint_rows(forces.rows), qacc)
 
     def step(self, physics: Physics) -> Physics:
-        """A physics step without contacts."""
+        """Return the state after one physics step without contacts."""
         forces = self.forces(physics)
         qacc = self.relaxed(forces, physics.qacc_warmstart)
         qacc, _ = solve(forces.mass, forces.smooth, forces.rows, qacc, *ITERATIONS)
         return self.moved(physics, forces, qacc)
 
     def moved(self, physics: Physics, forces: Forces, qacc: Array) -> Physics:
-        """The state a step later, implicit in what velocity costs."""
+        """Return the state one step later. The integration is implicit in the forces that depend on velocity."""
         change = solve_positive(forces.mass + self.dt * forces.damping, forces.mass @ qacc)
         qvel = physics.qvel + self.dt * change
         return Physics(physics.qpos + self.dt * qvel, qvel, qacc, physics.ctrl)
@@ -114,8 +114,11 @@ class Dynamics:
         )
 
     def _damping(self, data: Any) -> Array:
-        """An actuator at its effort limit can't damp any more, so its damping is not in it, as in C MuJoCo; `mjx.step`
-        would brake each joint that moves at full effort."""
+        """Return the damping matrix [n, n] of joints and actuators, without actuators at their effort limit.
+
+        An actuator at its effort limit can't damp any more, so its damping is left out, as in C MuJoCo. `mjx.step`
+        keeps it in, which would brake each joint that moves at full effort.
+        """
         model = self.model
         low, high = model.actuator_forcerange[:, 0], model.actuator_forcerange[:, 1]
         saturated = (data.actuator_force <= low) | (data.actuator_force >= high)
@@ -135,8 +138,8 @@ class Dynamics:
 
 
 def _internal(data: Any) -> Any:
-    """What MJX computes besides what its data shows: mass matrix, rows of constraints, moment of actuators.
+    """Return what MJX computes but keeps private: mass matrix, rows of constraints, moment of actuators.
 
-    MJX's own errors name this way to them. Nothing else here reads names that MJX keeps to itself.
+    MJX's own error messages point to `_impl` for these. Nothing else in this module reads private names of MJX.
     """
     return data._impl

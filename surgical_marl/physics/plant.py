@@ -63,7 +63,11 @@ class Plant:
         self._backlash = each(r.backlash_angle, r.backlash_slide) * self._positions
 
     def start(self, key: Array, qpos: Array | None = None) -> Hidden | None:
-        """What an episode draws, by a key of its own, for arms that begin at `qpos` [nq], or at home."""
+        """Draw the hidden values of one episode.
+
+        `key` is used for nothing else. The arms begin at `qpos` [nq], or at home if it is None. Return None if the
+        scene randomises nothing.
+        """
         r, simulator, scene = self._ranges, self._simulator, self._simulator.scene
         if not r:
             return None
@@ -93,7 +97,10 @@ class Plant:
     def command(
         self, physics: Physics, hidden: Hidden | None, actions: dict[str, Array]
     ) -> tuple[Physics, Hidden | None]:
-        """What actions make the motors do, in time or late, and the motors the joints."""
+        """Return the state and the hidden values after actions have set the commands.
+
+        The actions command the motors, at once or after the latency. The motors move the targets of the joints.
+        """
         simulator = self._simulator
         if hidden is None:
             return simulator.command(physics, actions), None
@@ -109,7 +116,7 @@ class Plant:
         return physics._replace(ctrl=jnp.matmul(simulator.moment, target)), hidden
 
     def advance(self, physics: Physics, hidden: Hidden | None) -> tuple[Physics, Contacts, Views]:
-        """A control step of physics, as `Simulator.advance`."""
+        """Advance physics by one control step, as `Simulator.advance` does, with the drawn values in place."""
         simulator = self._simulator
         if hidden is not None:
             simulator = simulator.varied(
@@ -118,7 +125,10 @@ class Plant:
         return simulator.advance(physics)
 
     def measure(self, physics: Physics, hidden: Hidden | None, contacts: Contacts, views: Views, key: Array) -> Views:
-        """What encoders say of arms that are as in `views`, by a key of the step's own."""
+        """Return the views as the encoders report them, for arms whose true views are `views`.
+
+        `key` is for this step alone.
+        """
         if hidden is None:
             return views
         noise = jax.random.normal(key, self._noise.shape) * self._noise
@@ -126,7 +136,7 @@ class Plant:
         return self._simulator.view(physics._replace(qpos=read, ctrl=hidden.motor), contacts)
 
     def _delay(self, actions: dict[str, Array], hidden: Hidden) -> tuple[dict[str, Array], Array]:
-        """The actions that act now, and those to remember."""
+        """Return the actions that act now, and those to remember for later steps."""
         agents = self._simulator.scene.agents
         newest = jnp.concatenate([jnp.clip(actions[agent], -1.0, 1.0) for agent in agents])
         known = jnp.concatenate([newest[None], hidden.pending])

@@ -31,9 +31,12 @@ TOUCHING_ITERATIONS = (6, 6)
 
 
 class Kind:
-    """The arms of one type in a scene, which move alike wherever they stand, as gravity is off: each is stepped in its
-    own base frame, and all by the same code, one after the other: a GPU's instruction cache has no room for a
-    copy for every arm."""
+    """The arms of one type in a scene.
+
+    Arms of one type move alike wherever they stand, as gravity is off. So each is stepped in its own base frame, and
+    the same code steps all of them, one after the other. The instruction cache of a GPU has no room for one copy of the
+    code per arm.
+    """
 
     def __init__(self, scene: Scene, agents: tuple[str, ...]) -> None:
         model = scene.model
@@ -48,7 +51,10 @@ class Kind:
         )
 
     def step(self, physics: Physics, fields: dict[str, Array]) -> Physics:
-        """The physics of the scene after a step of these arms. `fields` of the scene's model may be others."""
+        """Return the physics of the scene after one step of these arms.
+
+        `fields` replaces values of some fields of the scene's model.
+        """
         dofs, actuators = self._dofs, self._actuators
         own = Physics(physics.qpos[dofs], physics.qvel[dofs], physics.qacc_warmstart[dofs], physics.ctrl[actuators])
         where = {"actuator": actuators, "dof": dofs, "body": np.insert(self._bodies, 0, 0, axis=1)}
@@ -65,8 +71,11 @@ class Kind:
 
 
 class Simulator:
-    """The physics of one scene, `decimation` physics steps a control step. `home` is what every episode starts with,
-    `home_views` what tasks see there."""
+    """The physics of one scene.
+
+    One control step is `decimation` physics steps. `home` is the state that every episode starts with, and `home_views`
+    is what tasks see there.
+    """
 
     def __init__(self, scene: Scene, decimation: int = DECIMATION) -> None:
         self.scene = scene
@@ -89,18 +98,21 @@ class Simulator:
         return Physics(qpos, still, still, self._holding(qpos))
 
     def _holding(self, qpos: Any) -> Any:
-        """The commands [nu] that keep arms where they are."""
+        """Return the commands [nu] that keep the arms where they are."""
         joints = qpos[self.address]
         if self.scene.control != "position":
             joints = joints * self.jaws  # a jaw is told where to be in every mode
         return self.moment @ joints
 
     def command(self, physics: Physics, actions: dict[str, Array], measured: Array | None = None) -> Physics:
-        """The next command of every actuator, from the joints' positions, or from what is `measured` of them, [nq]. A
-        jaw moves to open or closed at its speed, whatever the mode; a cable follows its joints' commands.
+        """Return the physics with the next command of every actuator.
 
-        A position target leads its joint by no more than full effort at full speed takes: one that is held up would
-        wind up its target, and race after it once free.
+        Commands start from the joints' positions, or from `measured` [nq] if it is given. A jaw moves to open or closed
+        at its speed, whatever the control mode. A cable follows the commands of its joints.
+
+        A position target leads its joint by no more than full effort at full speed takes. Without this limit, the
+        target of a joint that is held up would move further and further ahead, and the joint would race after it once
+        free.
         """
         ctrl, own = physics.ctrl[self.drives], jnp.zeros(self.scene.model.nu, jnp.float32)
         for agent in self.scene.agents:
@@ -117,8 +129,10 @@ class Simulator:
         return physics._replace(ctrl=jnp.matmul(self.moment, jnp.where(self.jaws, jaw, command)))
 
     def advance(self, physics: Physics) -> tuple[Physics, Contacts, dict[str, ArmView]]:
-        """A control step of physics, and what is seen where it ends. MuJoCo leaves tips and distances one physics step
-        behind its `qpos`, so they are computed anew."""
+        """Advance physics by one control step, and return it with the contacts and views at its end.
+
+        MuJoCo leaves tips and distances one physics step behind its `qpos`, so they are computed anew.
+        """
 
         def substep(state: tuple[Physics, Touch], _: None) -> tuple[tuple[Physics, Touch], None]:
             return self._step(*state), None
@@ -130,9 +144,15 @@ class Simulator:
         return physics, contacts, self._view(jnp, physics, tips, contacts)
 
     def varied(self, stiffness: Array, damping: Array, friction: Array, payload: Array, offset: Array) -> Simulator:
-        """Other arms of this kind: factors of every actuator's gains [nu] and of every joint's friction [nv], masses
-        [arms] at their tool tips if the scene has room for them, and by how much the controllers of joints misread
-        them, [nq]."""
+        """Return a copy of this simulator whose arms differ from their models.
+
+        Args:
+            stiffness: factors of the stiffness of every actuator, [nu].
+            damping: factors of the damping of every actuator, [nu].
+            friction: factors of the friction of every joint, [nv].
+            payload: masses at the tool tips, [arms], kg; used only if the scene has room for them.
+            offset: by how much the controllers of joints misread their positions, [nq], rad or m.
+        """
         model, varied, nominal = self._together.model, copy.copy(self), self.scene.model
         by_position = nominal.actuator_biasprm[:, 1] != 0
         by_velocity = ~by_position & (nominal.actuator_biasprm[:, 2] != 0)
@@ -158,7 +178,10 @@ class Simulator:
         return contacts, self._view(jnp, physics, tips, contacts)
 
     def view(self, physics: Physics, contacts: Contacts) -> dict[str, ArmView]:
-        """What tasks see at a posture, apart from contacts, which are those of the step before."""
+        """Return what tasks see at a posture.
+
+        Distances are computed anew. Penetrations and forces are those in `contacts`, from the step before.
+        """
         tips, distance = self._look(physics.qpos)
         return self._view(jnp, physics, tips, contacts._replace(distance=distance))
 
@@ -169,8 +192,10 @@ class Simulator:
         return tips, self._pairs.distance(data.geom_xpos, data.geom_xmat)
 
     def _step(self, physics: Physics, touch: Touch) -> tuple[Physics, Touch]:
-        """A physics step, and the hardest touch until its start. Arms that don't touch anything don't know of each
-        other: each moves on its own."""
+        """Return the state after one physics step, and the hardest touch up to the start of that step.
+
+        Arms that touch nothing do not affect each other, so each is stepped on its own.
+        """
         if not self._pairs.count:
             return self._apart(physics, touch)
         data = self._together.pose(physics.qpos)
@@ -197,7 +222,7 @@ class Simulator:
         return dynamics.moved(physics, forces, qacc), hardest
 
     def _view(self, xp: Any, physics: Physics, tips: Any, contacts: Contacts) -> dict[str, ArmView]:
-        """Views by the array library `xp` from tool tips [arms, 3] in the world."""
+        """Return the views, from tool tips [arms, 3] in the world, computed with the array library `xp`."""
         views = {}
         for i, agent in enumerate(self.scene.agents):
             mount, touching = self.scene.mounts[agent], self._touching[agent]

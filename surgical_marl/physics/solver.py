@@ -42,8 +42,10 @@ class Rows(NamedTuple):
 
 
 class JointRows(NamedTuple):
-    """Friction and limit of each of n joints, [n] each; zeros where a joint has none. As in `Rows`, but signed: a limit
-    pushes towards `side`, -1, 0 or 1."""
+    """Friction and limit of each of n joints, [n] each; zeros where a joint has none.
+
+    The columns are as in `Rows`, but signed: a limit pushes towards `side`, which is -1, 0 or 1.
+    """
 
     friction: Array
     """The largest friction force."""
@@ -104,11 +106,13 @@ def relax(mass: Array, smooth: Array, joints: JointRows, qacc: Array) -> Array:
 def solve(
     mass: Array, smooth: Array, rows: Rows, start: Array, iterations: int, line_search: int
 ) -> tuple[Array, Array]:
-    """Acceleration [n] and the force of each row [r], for a mass matrix [n, n] and the sum of all other forces [n], by
-    Newton steps from `start`, each with so many steps of line search.
+    """Return the acceleration [n] and the force of each row [r].
 
-    There are at most `iterations` of them. A step over which no row changes sides ends at the solution, and a second
-    one clears its rounding error: then it is settled.
+    They are found for a mass matrix [n, n] and the sum `smooth` [n] of all other forces, by Newton steps from `start`.
+    Each Newton step has `line_search` steps of line search.
+
+    There are at most `iterations` Newton steps. A step over which no row changes sides ends at the solution, and a
+    second such step removes its rounding error. After that the search stops.
     """
 
     def newton(qacc: Array) -> tuple[Array, Array]:
@@ -141,8 +145,11 @@ def solve(
 def _line_search(
     mass: Array, rows: Rows, unbounded: Array, rest: Array, search: Array, iterations: int
 ) -> tuple[Array, Array]:
-    """How far to go along `search`, and what `unbounded` is there. The end is the root of the cost's slope, which grows
-    piecewise linearly: Newton's method within a bracket."""
+    """Return how far to go along `search`, and the value of `unbounded` there.
+
+    The best length is the root of the slope of the cost, which grows piecewise linearly. It is found by Newton's method
+    within a bracket.
+    """
     along = rows.jacobian @ search
     fall = rows.impedance * along
     slope_0, slope_1 = search @ rest, search @ (mass @ search)
@@ -164,5 +171,5 @@ def _line_search(
 
 
 def solve_positive(matrix: Array, right: Array) -> Array:
-    """x with matrix @ x = right, for a symmetric positive definite matrix [n, n]."""
+    """X with matrix @ x = right, for a symmetric positive definite matrix [n, n]."""
     return cho_solve((jax.lax.linalg.cholesky(matrix, symmetrize_input=False), True), right)

@@ -20,8 +20,10 @@ class Contacts(NamedTuple):
 
 
 class Touch(NamedTuple):
-    """The hardest touch of each pair so far in a control step, [P] each. A physics step in which nothing touches leaves
-    it alone."""
+    """The hardest touch of each pair so far in a control step, [P] each.
+
+    A physics step in which nothing touches does not change it.
+    """
 
     penetration: Array
     """m"""

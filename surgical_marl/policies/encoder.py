@@ -20,7 +20,7 @@ class PictureModel(CNNModel):
     """rsl_rl's CNN model, for uint8 pictures [..., C, H, W] beside vectors [..., d], with any leading axes."""
 
     def get_latent(self, obs: TensorDict, masks: Tensor | None = None, hidden_state: Any = None) -> Tensor:
-        """The normalised vector, then the features of the pictures."""
+        """Return the normalised vector, followed by the features of the pictures."""
         vector = MLPModel.get_latent(self, obs)
         (group,) = self.obs_groups_2d
         # while they are bytes, the channels of a pixel side by side: cuDNN then has nothing to turn round

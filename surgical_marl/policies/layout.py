@@ -69,8 +69,10 @@ class Layout:
         return sum(self._widths)
 
     def stack(self, observations: Mapping[str, Any]) -> dict[str, Tensor]:
-        """Observations of agents `[..., d]` -> groups `[..., n, d]`, and of agents that see pictures also a group
-        "<name>_pictures" `[..., n, C, H, W]`: all pictures of an agent, one behind the other.
+        """Stack the observations of agents `[..., d]` into groups `[..., n, d]`.
+
+        If agents of a group see pictures, there is also a group "<name>_pictures" `[..., n, C, H, W]`. It holds all
+        pictures of an agent, one behind the other.
 
         Always a copy: an engine may reuse its buffers.
         """
@@ -108,12 +110,15 @@ class Layout:
 
 
 def _terms(observation: Mapping[str, Any]) -> list[str]:
-    """The names of an agent's pictures: by name, as spaces sort them and observations do not."""
+    """Return the names of an agent's pictures, sorted by name: spaces sort them so, and observations do not."""
     return sorted(name for name in observation if name != "proprioception")
 
 
 def _seen(env: BatchedEnv, agents: Sequence[str]) -> dict[str, Any]:
-    """The spaces of the pictures of some agents; with the agent in their names if several agents see some."""
+    """Return the spaces of the pictures of some agents, by the names of the pictures.
+
+    If several agents see pictures, the names are "<agent>/<name>".
+    """
     spaces = {agent: getattr(env.observation_space(agent), "spaces", {}) for agent in agents}
     several = sum(map(bool, spaces.values())) > 1
     return {f"{agent}/{term}" if several else term: own[term] for agent, own in spaces.items() for term in _terms(own)}

@@ -58,7 +58,7 @@ class MultiAgentModel(nn.Module):
         hidden_state: Tensor | None = None,
         stochastic_output: bool = False,
     ) -> Tensor:
-        """Outputs of all agents, flat: `[N, sum]`, by type and then by agent.
+        """Compute the outputs of all agents, flat: `[N, sum]`, by type and then by agent.
 
         Args:
             observations: of one step; or of several, `[T, N]`, if there are masks.
@@ -75,7 +75,7 @@ class MultiAgentModel(nn.Module):
             model.update_normalization({name: observations[name].flatten(0, -2)})
 
     def get_hidden_state(self) -> Tensor | None:
-        """What the networks remember after the last step, `[N, A, S]`, if they do."""
+        """Return what the networks remember after the last step, `[N, A, S]`, or None if they have no memory."""
         return torch.cat([model.get_hidden_state() for model in self._models()], -2) if self.is_recurrent else None
 
     def _memories(self, hidden_state: Tensor | None) -> Iterable[Tensor | None]:
@@ -119,7 +119,7 @@ class MultiAgentActor(MultiAgentModel):
     def distribute(
         self, observations: TensorDict, masks: Tensor | None = None, hidden_state: Tensor | None = None
     ) -> None:
-        """A forward pass that draws no actions."""
+        """Update the distributions by a forward pass that draws no actions."""
         for model, memory in zip(self._models(), self._memories(hidden_state), strict=True):
             model.distribution.update(model.mlp(model.get_latent(observations, masks, memory)))
 
@@ -167,7 +167,7 @@ class Gaussian(GaussianDistribution):
 def make_model(
     observations: TensorDict, groups: list[str], width: int, recurrent: str = "none", **model: Any
 ) -> nn.Module:
-    """An MLP, with an encoder before it where there are pictures, and a memory where that is asked for.
+    """Make an MLP, with an encoder before it if there are pictures, and with a memory if that is asked for.
 
     Args:
         observations: a sample of the groups, vectors [N, d] and pictures [N, C, H, W].

@@ -57,7 +57,7 @@ class Graph(nn.Module):
         return (action, self.model.get_hidden_state()) if self.model.is_recurrent else (action,)
 
     def example(self) -> tuple[Tensor, ...]:
-        """What it takes for two agents, all zero."""
+        """Return example inputs for two agents, all zero: one tensor for each name in `takes`."""
         zeros = {"observation": torch.zeros(2, self.model.obs_dim)}
         for name, space in self.pictures.items():
             zeros[name] = torch.from_numpy(np.zeros((2, *space.shape), space.dtype))

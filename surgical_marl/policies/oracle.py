@@ -25,7 +25,7 @@ ITERATIONS = 8
 
 
 def oracle(env: BatchedEnv, agents: Sequence[str] | None = None) -> Callable[[Mapping[str, Any]], dict[str, Any]]:
-    """The oracle of an environment with control "position", for all of its tasks.
+    """Make the oracle of an environment with control "position", for all of its tasks.
 
     Joints follow straight lines in joint space, all arms at the same pace: the way that `tasks/base/workspace.py`
     has checked. Where a target moves, joints are sent ahead by the time that they lag behind: a control step, and
@@ -89,7 +89,7 @@ def _numpy(values: Any) -> np.ndarray:
 
 
 def _like(example: Any, action: np.ndarray) -> Any:
-    """An action as float32 of the example's library."""
+    """Return an action as float32 of the example's library."""
     if hasattr(example, "new_tensor"):
         return example.new_tensor(action)
     return np.asarray(action, np.float32)

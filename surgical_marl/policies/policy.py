@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 
 def load_policy(run: str | Path, env: BatchedEnv) -> Policy:
-    """The deterministic policy of a run for the agents of an environment.
+    """Load the deterministic policy of a run for the agents of an environment.
 
     Args:
         run: a run folder, or the name of a policy that ships, or "zero", "random" or "oracle".
@@ -52,7 +52,7 @@ def load_policy(run: str | Path, env: BatchedEnv) -> Policy:
 
 
 def load_actor(run: str | Path, env: BatchedEnv) -> tuple[MultiAgentActor, Layout]:
-    """The networks of a run or of a policy that ships, on the CPU, and how agents are stacked for them.
+    """Load the networks of a run or of a policy that ships, on the CPU, and how agents are stacked for them.
 
     ValueError as for `load_policy`.
     """
@@ -74,7 +74,7 @@ def load_actor(run: str | Path, env: BatchedEnv) -> tuple[MultiAgentActor, Layou
 
 
 def untrained_policy(env: BatchedEnv, settings: Settings | None = None, grouping: Grouping = "type") -> Policy:
-    """The policy that a run with these settings starts from: fresh weights, to compare with.
+    """Make the policy that a run with these settings starts from: fresh weights, to compare with.
 
     Args:
         env: the environment that the policy will act in.
@@ -89,18 +89,18 @@ def untrained_policy(env: BatchedEnv, settings: Settings | None = None, grouping
 
 
 def zero_policy(env: BatchedEnv) -> Policy:
-    """The policy that never acts."""
+    """Make the policy that never acts."""
     return _by_agent(env, lambda shape: np.zeros(shape, np.float32))
 
 
 def random_policy(env: BatchedEnv, seed: int = 0) -> Policy:
-    """The policy of uniform random actions in [-1, 1]."""
+    """Make the policy of uniform random actions in [-1, 1]."""
     generator = np.random.default_rng(seed)
     return _by_agent(env, lambda shape: generator.uniform(-1, 1, shape).astype(np.float32))
 
 
 def find_run(run: str | Path) -> Path:
-    """The folder of a run, by its path, or of a policy that ships, by its name.
+    """Find the folder of a run, by its path, or of a policy that ships, by its name.
 
     ValueError if there is none.
     """
@@ -154,7 +154,10 @@ def _actor(settings: Settings, env: BatchedEnv, layout: Layout) -> MultiAgentAct
 
 
 def acting_policy(actor: MultiAgentActor, layout: Layout, device: str) -> Policy:
-    """The deterministic policy of networks, as they are whenever it acts: they may still learn."""
+    """Make the deterministic policy of some networks.
+
+    Each action comes from the networks as they are at that time, so they may still learn.
+    """
     return _Acting(actor, layout, device)
 
 

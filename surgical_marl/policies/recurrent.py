@@ -43,7 +43,7 @@ class RecurrentModel(MLPModel):
         self._memory: Tensor | None = None
 
     def get_latent(self, obs: TensorDict, masks: Tensor | None = None, hidden_state: Any = None) -> Tensor:
-        """What the cell makes of observations and memory, `[..., H]`.
+        """Return what the cell computes from observations and memory, `[..., H]`.
 
         Args:
             obs: of one step; or of T steps of B environments, `[T, B, ...]`, if there are masks.
@@ -61,7 +61,7 @@ class RecurrentModel(MLPModel):
         return torch.stack(made)
 
     def get_hidden_state(self) -> Tensor:
-        """The memory after the last step."""
+        """Return the memory after the last step."""
         assert self._memory is not None
         return self._memory
 
@@ -100,7 +100,7 @@ class Memory(nn.Module):
         self.begun = (torch.zeros_like(self.actor), torch.zeros_like(self.critic))
 
     def begin(self) -> None:
-        """A rollout begins."""
+        """Keep the memory as it is now, where a rollout begins."""
         for kept, memory in zip(self.begun, self.buffers(), strict=True):
             kept.copy_(memory)
 
@@ -117,5 +117,5 @@ class Memory(nn.Module):
 
 
 def cleared(memory: Tensor, where: Tensor) -> Tensor:
-    """The memory `[N, ...]` with nothing in it `where` [N] says."""
+    """Return the memory `[N, ...]`, set to zero for the environments that `where` `[N]` marks."""
     return torch.where(where.reshape(-1, *[1] * (memory.dim() - 1)), 0.0, memory)

@@ -31,7 +31,7 @@ def write_weights(folder: Path, actor: MultiAgentActor) -> None:
 
 
 def read_weights(folder: Path) -> tuple[dict[str, list[int]], dict[str, Tensor]]:
-    """The widths of each type of arm (see `WIDTHS`) and the state of a `MultiAgentActor`, on the CPU.
+    """Read the widths of each type of arm (see `WIDTHS`) and the state of a `MultiAgentActor`, on the CPU.
 
     ValueError if a file is truncated, a pickle, or anything else but what `write_weights` wrote.
     """

@@ -136,10 +136,11 @@ class Arm:
         return self.link_poses(q, (self.tool_tip,))[self.tool_tip]
 
     def jacobian(self, q: Any) -> Any:
-        """Geometric Jacobian [..., 6, n] of the tool tip: linear over angular velocity in the base frame, per joint
-        rate.
+        """Return the geometric Jacobian [..., 6, n] of the tool tip, per joint rate.
 
-        `q` as in `forward_kinematics`; n counts all of `actuated`, and joints that don't move the tip have zero
+        The upper three rows are linear velocity, the lower three angular velocity, both in the base frame.
+
+        `q` is as in `forward_kinematics`. n counts all of `actuated`, and joints that don't move the tip have zero
         columns.
         """
         chain = [joint for joint in self._chain(self.tool_tip) if joint.type in MOVING]
@@ -208,10 +209,11 @@ class Arm:
 
 
 def load_arm(name: str | Path) -> Arm:
-    """Reads an arm by a shipped name (`list_arms()`) or the path of a folder that holds `arm.yaml`.
+    """Read an arm by a shipped name (`list_arms()`) or the path of a folder that holds `arm.yaml`.
 
     Raises:
-        ValueError: unknown name, or a URDF or `arm.yaml` that does not hold what it must; mostly `Faults`, a list.
+        ValueError: if the name is unknown, or a URDF or `arm.yaml` does not hold what it must. Mostly the error is a
+            `Faults`, which lists all that is wrong.
     """
     folder = find("arms", name)
     where = folder / "arm.yaml"

@@ -26,8 +26,11 @@ class Drive:
 
 @dataclass(frozen=True)
 class Cable:
-    """A cable that several joints wind up. Its own drive acts on its length, the sum of coefficient times position of
-    its joints, beside the drives of the joints. Units as of a `Drive`, per unit of that length."""
+    """A cable that several joints wind up.
+
+    The length of the cable is the sum of coefficient times position of its joints. Its own drive acts on this length,
+    in addition to the drives of the joints. Units are those of a `Drive`, per unit of that length.
+    """
 
     joints: dict[str, float]
     """Coefficient of each joint."""
@@ -38,7 +41,11 @@ class Cable:
 
 
 def read_drives(drives: Any, joints: list[str], where: Path, keep: Callable[..., Any]) -> dict[str, Drive]:
-    """The drive of each of `joints`; what is wrong is kept."""
+    """Return the drive of each of `joints`.
+
+    `keep` calls each reader and collects what is wrong. Only a `drives` that is not a mapping raises ValueError at
+    once.
+    """
     if not isinstance(drives, dict):
         raise ValueError(f"{where}: joints must be a mapping from joint name to drive")
     keep(check_keys, drives, tuple(joints), f"{where}, joints")
@@ -60,7 +67,10 @@ def _check_signs(drive: Drive | Cable, positive: str, where: str) -> None:
 
 
 def read_cables(cables: Any, joints: list[str], where: Path, keep: Callable[..., Any]) -> tuple[Cable, ...]:
-    """The cables, which may wind on `joints`; what is wrong is kept."""
+    """Return the cables, which may wind only on `joints`.
+
+    `keep` calls each reader and collects what is wrong. Only a `cables` that is not a list raises ValueError at once.
+    """
     if not isinstance(cables, list):
         raise ValueError(f"{where}: cables must be a list, not {cables!r}")
     return tuple(keep(_cable, cable, joints, f"{where}, cable {number}") for number, cable in enumerate(cables))

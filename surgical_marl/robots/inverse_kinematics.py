@@ -133,7 +133,11 @@ def _seeds(arm: Arm, targets: Any, begin: Any, starts: int, length: float) -> An
 
 
 def _residual(arm: Arm, q: Any, targets: Any, length: float) -> tuple[Any, Any]:
-    """What is missing to the targets, [..., 3] or [..., 6] with rotation vectors times `length`, and its Jacobian."""
+    """Return what is missing to the targets, and the Jacobian that belongs to it.
+
+    What is missing is [..., 3] for target points. For target poses it is [..., 6], and the last three are rotation
+    vectors times `length`.
+    """
     pose, jacobian = arm.forward_kinematics(q), arm.jacobian(q)
     xp = pose.__array_namespace__()
     if targets.shape[-1] == 3:
@@ -176,7 +180,7 @@ def _step(share: Any, error: Any, jacobian: Any, pull: Any) -> Any:
 
 
 def _repeat(step: Callable[[Any, Any], Any], state: Any, times: int, xp: Any) -> Any:
-    """Applies `step(i, state)` so many times; in JAX as one loop, which compiles in the time of a single step."""
+    """Apply `step(i, state)` `times` times; in JAX as one loop, which compiles in the time of a single step."""
     if xp is np:
         for i in range(times):
             state = step(i, state)
@@ -188,14 +192,17 @@ def _repeat(step: Callable[[Any, Any], Any], state: Any, times: int, xp: Any) ->
 
 @lru_cache(maxsize=64)
 def _halton(count: int, dimensions: int) -> np.ndarray:
-    """The first points of the Halton sequence after the origin, [count, dimensions] in (0, 1)."""
+    """Return the first points of the Halton sequence after the origin, [count, dimensions] in (0, 1)."""
     from scipy.stats import qmc  # takes 0.3 s to import, and most searches start from one place
 
     return np.asarray(qmc.Halton(dimensions, scramble=False).fast_forward(1).random(count))
 
 
 def _candidates(arm: Arm) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Configurations [m, n] in shares of the ranges, with positions [m, 3] and rotations [m, 9] of the tool tip."""
+    """Return configurations of the arm, with the position and the rotation of the tool tip in each.
+
+    Configurations [m, n] are shares of the joint ranges. Positions are [m, 3], rotations [m, 9].
+    """
     shares = _halton(CANDIDATES, len(arm.actuated))
     poses = arm.forward_kinematics(arm.lower + shares * (arm.upper - arm.lower))
     return shares, poses[:, :3, 3], poses[:, :3, :3].reshape(-1, 9)

@@ -44,8 +44,11 @@ def parse_xml(data: bytes, path: Path, noun: str) -> Document:
 
 
 def write_xml(root: Element) -> bytes:
-    """Return the text of an element. Other parsers get it in place of a file's own text: they may know encodings in
-    which that holds what defusedxml did not see."""
+    """Return the text of an element.
+
+    Other parsers are given this text in place of the file's own text. They may know encodings that defusedxml does not,
+    and read something in the file's own text that defusedxml did not see.
+    """
     return tostring(root)
 
 

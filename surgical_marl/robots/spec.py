@@ -28,7 +28,10 @@ DEFAULT_RGBA = (0.7, 0.7, 0.72, 1.0)
 
 
 def build_spec(arm: Arm, control: str = "position") -> mujoco.MjSpec:
-    """A new MjSpec of the arm. ValueError for an unknown control mode or a mesh that can't be read."""
+    """Return a new MjSpec of the arm.
+
+    Raises ValueError for an unknown control mode or a mesh that can't be read.
+    """
     if control not in CONTROL_MODES:
         raise ValueError(f"unknown control mode {control!r}; the modes are {', '.join(CONTROL_MODES)}")
     spec = mujoco.MjSpec()
@@ -67,12 +70,16 @@ def build_spec(arm: Arm, control: str = "position") -> mujoco.MjSpec:
 
 
 def _mode(arm: Arm, joint: Joint, control: str) -> str:
-    """A jaw is told where to be, in every mode."""
+    """Return the control mode of a joint. A jaw is under position control in every mode."""
     return "position" if arm.jaw and joint.leader == arm.jaw.joint else control
 
 
 def _add_joint(body: Any, joint: Joint, axis: Vector, control: str) -> None:
-    """A joint under torque has the speed-torque line of a motor: at its speed nothing is left of the full effort."""
+    """Add a joint to a body.
+
+    A joint under torque control has the speed-torque line of a motor: at its greatest speed nothing is left of the full
+    effort.
+    """
     drag = joint.effort / joint.drive.speed if control == "torque" else 0.0
     body.add_joint(
         name=joint.name,
@@ -91,10 +98,10 @@ def _add_joint(body: Any, joint: Joint, axis: Vector, control: str) -> None:
 
 
 def _add_cable(spec: mujoco.MjSpec, name: str, cable: Cable, joints: dict[str, Joint], control: str) -> None:
-    """A fixed tendon with an actuator of its own.
+    """Add a cable as a fixed tendon with an actuator of its own.
 
-    Under torque control it only carries inertia: a commanded torque is that of all the motors together, which share it
-    among them as the cables have it.
+    Under torque control the tendon only carries inertia and has no actuator. A commanded torque is then that of all the
+    motors together, which share it among them as the cables demand.
     """
     tendon = spec.add_tendon(name=name, armature=cable.armature)
     for joint, coefficient in cable.joints.items():
@@ -105,7 +112,7 @@ def _add_cable(spec: mujoco.MjSpec, name: str, cable: Cable, joints: dict[str, J
 
 
 def _commands(joint: Joint, control: str) -> np.ndarray:
-    """The least and the greatest command of a joint."""
+    """Return the least and the greatest command of a joint, [2]."""
     high = joint.drive.speed if control == "velocity" else joint.effort
     return np.array([joint.lower, joint.upper] if control == "position" else [-high, high])
 
@@ -119,10 +126,10 @@ def _add_actuator(
     commands: np.ndarray,
     transmission: mujoco.mjtTrn = mujoco.mjtTrn.mjTRN_JOINT,
 ) -> None:
-    """The actuator of a joint, or of a cable: force = gain * command + bias, clamped to the effort.
+    """Add the actuator of a joint or of a cable: force = gain * command + bias, clamped to the effort.
 
-    Position: the dVRK's PD law, stiffness * (target - q) - damping * qd. Velocity: damping * (command - qd). Torque:
-    the command itself.
+    Position control is the dVRK's PD law, stiffness * (target - q) - damping * qd. Velocity control is damping *
+    (command - qd). Torque control is the command itself.
     """
     laws: dict[str, tuple[float, list[float]]] = {
         "position": (drive.stiffness, [0, -drive.stiffness, -drive.damping]),
@@ -190,7 +197,7 @@ def _visual_shape(spec: mujoco.MjSpec, shape: Shape, name: str, folder: Path) ->
 
 
 def _collision_shape(shape: Shape, folder: Path) -> tuple[dict[str, Any], np.ndarray]:
-    """A capsule or a sphere, and its place [4, 4] in the frame of the shape."""
+    """Return a capsule or a sphere, and its place [4, 4] in the frame of the shape."""
     if shape.kind == "sphere":
         return _sphere(shape.size[0]), np.eye(4)
     if shape.kind == "cylinder":
@@ -202,8 +209,11 @@ def _collision_shape(shape: Shape, folder: Path) -> tuple[dict[str, Any], np.nda
 
 
 def _bounding_capsule(points: np.ndarray) -> tuple[dict[str, Any], np.ndarray]:
-    """The shortest capsule that holds points [n, 3] with its axis through the middle of their bounding box and along
-    its longest side, or the sphere around them if that is smaller; and its place."""
+    """Return a capsule that holds points [n, 3], or a sphere if that is smaller, and its place [4, 4].
+
+    The capsule is the shortest one whose axis passes through the middle of the points' bounding box, along the longest
+    side of the box.
+    """
     low, high = points.min(0), points.max(0)
     place = np.eye(4)
     # cyclic permutations are rotations: z of the capsule becomes the longest side
@@ -220,7 +230,7 @@ def _bounding_capsule(points: np.ndarray) -> tuple[dict[str, Any], np.ndarray]:
 
 
 def _capsule(radius: float, half: float) -> dict[str, Any]:
-    """A capsule whose axis is `2 * half` long; a sphere if that is nothing."""
+    """Return a capsule whose axis is `2 * half` long, or a sphere if `half` is zero."""
     if half == 0:
         return _sphere(radius)
     return {"type": mujoco.mjtGeom.mjGEOM_CAPSULE, "size": [radius, half, 0]}

@@ -81,7 +81,7 @@ def _parse(data: bytes, path: Path) -> Robot:
 
 
 def _plain(robot: yourdf.Robot) -> Robot:
-    """The same as plain data."""
+    """Return the same robot as plain data."""
     colors = {material.name: material.color.rgba for material in robot.materials if material.color is not None}
     return Robot(robot.name, tuple(_link(link, colors) for link in robot.links), tuple(map(_joint, robot.joints)))
 
@@ -110,7 +110,10 @@ def _shape(part: yourdf.Visual | yourdf.Collision, rgba: Vector | None) -> Shape
 
 
 def _color(material: yourdf.Material | None, colors: Mapping[str, Any]) -> Vector | None:
-    """The colour of a material, which may stand elsewhere in the URDF under its name."""
+    """Return the colour of a material, or None if it has none.
+
+    The colour may be given elsewhere in the URDF, under the material's name.
+    """
     if material is None:
         return None
     rgba = material.color.rgba if material.color is not None else colors.get(material.name)

@@ -52,8 +52,10 @@ def robot_faults(robot: Robot, path: Path) -> list[str]:
 
 
 def xml_faults(document: Document, path: Path) -> Iterator[str]:
-    """Yield tags without what they must have, and numbers that are none. `<gazebo>`, `<transmission>` and such are not
-    read."""
+    """Yield tags that lack what they must have, and values that must be numbers but are not valid ones.
+
+    Tags such as `<gazebo>` and `<transmission>` are not read.
+    """
     root = document.root
     if root.tag != "robot" or not root.get("name"):
         yield f"{path} is not a URDF: its root must be <robot name=...>, not <{root.tag}>"
@@ -96,7 +98,7 @@ def _number_fault(tag: str, key: str, text: str) -> str | None:
 
 
 def _tree_faults(robot: Robot) -> Iterator[str]:
-    """What keeps links and joints from being one tree."""
+    """Yield what keeps links and joints from being one tree."""
     links = [link.name for link in robot.links]
     for noun, names in (("link", links), ("joint", [joint.name for joint in robot.joints])):
         for name, count in Counter(names).items():
@@ -120,7 +122,7 @@ def _tree_faults(robot: Robot) -> Iterator[str]:
 
 
 def _looped(parents: dict[str, str]) -> str | None:
-    """A link that one comes back to on the way from child to parent."""
+    """Return a link that is its own ancestor, going from child to parent, or None if there is none."""
     clear: set[str] = set()
     for start in parents:
         way: set[str] = set()

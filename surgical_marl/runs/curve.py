@@ -49,7 +49,7 @@ def draw_curve(run: Path, title: str) -> None:
 
 
 def _smooth(values: np.ndarray) -> np.ndarray:
-    """Running mean over a fiftieth of the curve, with shorter windows at the ends."""
+    """Return the running mean over a fiftieth of the curve, with shorter windows at the ends."""
     half = len(values) // 100
     sums = np.concatenate([[0.0], np.cumsum(values)])
     middle = np.arange(len(values))

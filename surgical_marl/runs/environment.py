@@ -10,7 +10,7 @@ from surgical_marl.tasks.base.options import Options
 
 
 def make_env(settings: Settings, num_envs: int | None = None) -> BatchedEnv:
-    """The environment of a run, with torch tensors; `num_envs` replaces the setting."""
+    """Make the environment of a run, with torch tensors; `num_envs` replaces the setting."""
     options = {item.name: getattr(settings, item.name) for item in fields(Options)}
     return BatchedEnv(
         **options,

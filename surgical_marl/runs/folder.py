@@ -1,5 +1,8 @@
-"""A run folder: `config.yaml`, `checkpoint.pt`, `metrics.csv`, `curve.png` and `tensorboard/`; beside the checkpoint
-`environments-*.pt` of further processes, and `diverged.json` where training ended so.
+"""The files of a run folder, and how they are read and written.
+
+A run folder holds `config.yaml`, `checkpoint.pt`, `metrics.csv`, `curve.png` and `tensorboard/`. If there were
+several processes, `environments-*.pt` of the further ones lie beside the checkpoint. If training diverged, there is
+also `diverged.json`.
 
 A policy that ships has safetensors instead of the checkpoint (`export.py`). Every write is atomic, but that
 `metrics.csv` grows by rows.
@@ -71,7 +74,7 @@ def write_config(run: Path, settings: Settings) -> None:
 
 
 def read_origin(run: Path) -> dict[str, dict[str, str | None]]:
-    """What `write_config` noted beside the settings: `versions` and `origin`; empty where a run has none."""
+    """Return the `versions` and `origin` that `write_config` noted beside the settings; empty where a run has none."""
     notes = yaml.safe_load((run / CONFIG).read_text())
     return {name: notes.get(name) or {} for name in ("versions", "origin")}
 
@@ -82,7 +85,7 @@ def has_begun(run: Path) -> bool:
 
 
 def read_settings(run: str | Path, overrides: Iterable[str] = ()) -> Settings:
-    """Settings of a run or of a shipped policy, with `key=value` overrides.
+    """Read the settings of a run or of a shipped policy, with `key=value` overrides.
 
     ValueError if it is not a run folder.
     """
@@ -103,7 +106,7 @@ def holds_weights(folder: Path) -> bool:
 
 
 def read_checkpoint(run: str | Path) -> dict[str, Any]:
-    """The checkpoint of a run, on the CPU. ValueError if there is none or it is damaged."""
+    """Read the checkpoint of a run, on the CPU. ValueError if there is none or it is damaged."""
     path = Path(run) / CHECKPOINT
     if not path.is_file() and holds_weights(Path(run)):
         raise ValueError(f"{run} holds an exported policy, which can be evaluated but not resumed")
@@ -125,7 +128,7 @@ def write_environments(run: Path, iteration: int, rank: int, processes: int, sta
 
 
 def read_environments(run: Path, iteration: int, rank: int, processes: int) -> dict[str, Any] | None:
-    """What `write_environments` wrote, on the CPU; None if it is not there or damaged."""
+    """Read what `write_environments` wrote, on the CPU; None if it is not there or damaged."""
     try:
         state = torch.load(_environments(run, iteration, rank, processes), map_location="cpu", weights_only=True)
     except Exception:  # as in `read_checkpoint`
@@ -155,8 +158,10 @@ def format_row(row: Mapping[str, float]) -> list[str]:
 
 
 def read_metrics(run: Path) -> list[dict[str, float]]:
-    """Rows of `metrics.csv`; an empty cell is NaN. No file, no rows; a row that was cut short is none, nor are those
-    after it."""
+    """Read the rows of `metrics.csv`. An empty cell is NaN.
+
+    If there is no file, there are no rows. A row that was cut short is left out, and so are the rows after it.
+    """
     if not (run / METRICS).is_file():
         return []
     rows: list[dict[str, float]] = []
@@ -179,7 +184,10 @@ def write_metrics(run: Path, columns: Iterable[str], rows: Iterable[Mapping[str,
 
 
 def _commit() -> str | None:
-    """The commit of the checkout that runs; `GIT_COMMIT` where that is a copy without git; else unknown."""
+    """Return the commit of the code that runs, or None if it is unknown.
+
+    It is `GIT_COMMIT` where that is set, as for a copy without git, and else the commit of the checkout.
+    """
     root = Path(__file__).parents[2]
     if told := os.environ.get("GIT_COMMIT"):
         return told

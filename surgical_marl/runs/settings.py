@@ -103,8 +103,15 @@ class Settings(Options):
 
 
 def load_config(task: str, scene: str, overrides: Iterable[str] = ()) -> Settings:
-    """Settings for a task in a scene: those of its file, of the file's section `cuda` on a GPU, of the scene's own
-    section, of a section `cuda` in that on a GPU, and overrides; what comes later goes first.
+    """Load the settings for a task in a scene.
+
+    They come from the parts below. Where two parts differ, the later one counts:
+
+    1. the task's file
+    2. on a GPU, the section `cuda` of that file
+    3. the scene's own section in that file
+    4. on a GPU, the section `cuda` in the scene's section
+    5. the overrides
 
     Args:
         task: a name of `list_tasks()`. Its file is the one of that name in `configs/`, if there is one.
@@ -135,7 +142,7 @@ def load_config(task: str, scene: str, overrides: Iterable[str] = ()) -> Setting
 
 
 def read_config(path: Path, overrides: Iterable[str] = ()) -> Settings:
-    """Settings from the `config.yaml` of a run, with overrides as for `load_config`."""
+    """Read the settings from the `config.yaml` of a run, with overrides as for `load_config`."""
     values = _read_yaml(path)
     for note in ("versions", "origin"):
         values.pop(note, None)
@@ -147,7 +154,7 @@ def read_config(path: Path, overrides: Iterable[str] = ()) -> Settings:
 
 
 def config_text(settings: Settings, notes: Mapping[str, Mapping[str, Any]]) -> str:
-    """The `config.yaml` of a run: what `read_config` reads, and notes that it passes over."""
+    """Return the text of a run's `config.yaml`: what `read_config` reads, and notes that it ignores."""
     values = asdict(settings)
     values["network"]["hidden"] = list(settings.network.hidden)
     values["observe"] = {agent: list(names) for agent, names in settings.observe.items()}

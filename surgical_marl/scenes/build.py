@@ -17,7 +17,7 @@ from surgical_marl.scenes.timing import TIMESTEP
 
 
 def set_physics(spec: mujoco.MjSpec) -> None:
-    """The physics options of every scene."""
+    """Set the physics options that every scene has."""
     option = spec.option
     option.timestep = TIMESTEP
     # Implicit in velocity: the stiff wrist controllers stay stable even at 5 ms. docs/physics.md compares.
@@ -49,10 +49,10 @@ def compile_scene(spec: mujoco.MjSpec) -> mujoco.MjModel:
 
 
 def weigh_shapes(model: mujoco.MjModel, home: np.ndarray) -> mujoco.MjModel:
-    """Sets what a body weighs in a contact (`body_invweight0`, 1/kg) to what it weighs where its shapes are.
+    """Set the inverse weight of a body in a contact (`body_invweight0`, 1/kg) to its value where its shapes are.
 
-    MuJoCo takes the centre of mass. A balanced link has it at the pivot, where nothing can move it: its contacts would
-    be infinitely stiff, and throw the arms about.
+    MuJoCo takes the value at the centre of mass. A balanced link has its centre of mass at the pivot, where no force
+    can move it. Its contacts would be infinitely stiff, and throw the arms about.
     """
     data = mujoco.MjData(model)
     data.qpos[:] = home
@@ -69,7 +69,7 @@ def weigh_shapes(model: mujoco.MjModel, home: np.ndarray) -> mujoco.MjModel:
 
 
 def alone(scene: Scene, agent: str) -> mujoco.MjModel:
-    """The model of one arm of a scene, its base frame at the origin."""
+    """Return the model of one arm of a scene, with its base frame at the origin."""
     mount = replace(scene.mounts[agent], position=np.zeros(3), rotation=np.eye(3))
 
     def compute() -> mujoco.MjModel:

@@ -39,7 +39,7 @@ GROWTH = 1e-3
 
 
 def check(source: str | Path) -> list[str]:
-    """Findings about an arm or a scene, empty if nothing is wrong.
+    """Return findings about an arm or a scene, an empty list if nothing is wrong.
 
     Args:
         source: the name of a shipped arm or scene (of both, if both have it), an arm's folder or a scene's YAML file.
@@ -57,7 +57,7 @@ def check(source: str | Path) -> list[str]:
 
 
 def summary(source: str | Path) -> str:
-    """What was checked, in a few words: "7 joints, 4 collision shapes; scene of 1 arm"."""
+    """Return what was checked, in a few words: "7 joints, 4 collision shapes; scene of 1 arm"."""
     folder, path = _find(source)
     words = []
     if folder is not None:
@@ -74,7 +74,7 @@ def _count(number: int, noun: str) -> str:
 
 
 def _find(source: str | Path) -> tuple[Path | None, Path | None]:
-    """The folder of an arm and the file of a scene that go by this name; one may be None."""
+    """Return the folder of the arm and the file of the scene that have this name; one may be None."""
     text = os.fspath(source)
     arm, scene = text in list_arms(), text in list_scenes()
     if arm or scene:
@@ -149,7 +149,7 @@ def _remote_center_findings(arm: Arm) -> Iterator[str]:
 
 
 def _model(arm: Arm) -> mujoco.MjModel:
-    """The arm alone, under the physics of a scene."""
+    """Return the model of the arm alone, under the physics of a scene."""
     spec = build_spec(arm, "position")
     set_physics(spec)
     try:
@@ -185,7 +185,7 @@ def _meet_by_design(arm: Arm, model: mujoco.MjModel, a: int, b: int) -> bool:
 
 
 def _at(arm: Arm, model: mujoco.MjModel, q: np.ndarray) -> mujoco.MjData:
-    """The arm at rest at joint positions [n], where its position targets are too."""
+    """Return the arm at rest at joint positions [n], with its position targets there too."""
     data = mujoco.MjData(model)
     values = dict(zip((joint.name for joint in arm.actuated), q, strict=True))
     for joint in arm.joints:
@@ -198,9 +198,10 @@ def _at(arm: Arm, model: mujoco.MjModel, q: np.ndarray) -> mujoco.MjData:
 
 
 def _controller_findings(arm: Arm, model: mujoco.MjModel) -> Iterator[str]:
-    """Steps C MuJoCo from slightly disturbed postures: a disturbance of a stable arm does not grow.
+    """Yield a finding if a slight disturbance grows in a step of C MuJoCo, at home or at other postures.
 
-    Joint limits, dry friction and effort limits only bound a disturbance that grows, as chatter, so they are left out.
+    In a stable arm it does not grow. Joint limits, dry friction and effort limits are left out. They would only turn a
+    disturbance that grows into chatter.
     """
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
     model.actuator_forcelimited[:], model.jnt_actfrclimited[:] = 0, 0

@@ -34,8 +34,11 @@ def contact_pairs(scene: Scene) -> list[tuple[str, str]]:
 
 
 def _candidates(scene: Scene) -> list[tuple[int, int, float]]:
-    """Pairs of geom ids, and how near they are near. None are on one body, next to each other in a chain or, in an
-    arm, overlapping at home."""
+    """Return pairs of geom ids that may touch, each with the distance in m that counts as near.
+
+    Left out are geoms on one body, and geoms next to each other in a chain. So are geoms of one arm that overlap at
+    home.
+    """
     model, at_home = scene.model, scene.capsules({agent: mount.arm.home for agent, mount in scene.mounts.items()})
     geoms = {agent: collision_geoms(model, agent) for agent in scene.agents}
     between = [pair for one, other in combinations(scene.agents, 2) for pair in product(geoms[one], geoms[other])]
@@ -45,8 +48,10 @@ def _candidates(scene: Scene) -> list[tuple[int, int, float]]:
 
 
 def neighbours(model: mujoco.MjModel, a: int, b: int) -> bool:
-    """Return whether two geoms are on one body, or the way up the tree from one to the other passes nothing that
-    collides."""
+    """Return whether two geoms are on one body or next to each other in a chain.
+
+    They are next to each other if nothing that collides lies on the way up the tree from one to the other.
+    """
     solid = {int(model.body_weldid[model.geom_bodyid[g]]) for g in np.flatnonzero(model.geom_group == COLLISION_GROUP)}
     one, other = (int(model.body_weldid[model.geom_bodyid[geom]]) for geom in (a, b))
     for body, target in ((one, other), (other, one)):

@@ -30,7 +30,7 @@ from surgical_marl.yaml_file import check_keys, read_yaml
 
 
 def load_scene(name: str | Path, control: str = "position") -> Scene:
-    """Reads a scene by a shipped name (`list_scenes()`) or the path of a YAML file.
+    """Read a scene by a shipped name (`list_scenes()`) or the path of a YAML file.
 
     Raises:
         ValueError: unknown name or control mode, or a file that does not hold what a scene must.

@@ -19,11 +19,14 @@ from surgical_marl.scenes.scene import Scene
 
 
 def mjcf(scene: Scene) -> str:
-    """The text of an MJCF file: same `qpos`, options, pairs and actuators as `scene.model`, and a keyframe `home`.
+    """Return the text of an MJCF file of a scene.
 
-    What a body weighs in a contact has no place in MJCF: MuJoCo takes it from the body's centre of mass. So the
-    collision shapes of a link are in a body of their own within it, `<link>/contact`, without mass, whose centre is
-    where the link weighs what it weighs in `scene.model` (`weigh_shapes` in `scenes/build.py`), or comes nearest to it.
+    The file has the same `qpos`, options, pairs and actuators as `scene.model`, and a keyframe `home`.
+
+    MJCF has no place for the weight of a body in a contact: MuJoCo takes it from the body's centre of mass. So the
+    collision shapes of a link are in a body of their own within it, `<link>/contact`, which has no mass. The centre of
+    that body is the point where the link's weight is the one in `scene.model` (`weigh_shapes` in `scenes/build.py`), or
+    comes nearest to it.
     """
     model = scene.model
     root = Element("mujoco", model=scene.name)
@@ -53,7 +56,7 @@ def mjcf(scene: Scene) -> str:
 
 
 def _add(parent: Element, tag: str, **attributes: Any) -> Element:
-    """A child element; an attribute of None is left out."""
+    """Add a child element and return it; an attribute of None is left out."""
     given = {key: value for key, value in attributes.items() if value is not None}
     texts = {key.rstrip("_"): value if isinstance(value, str) else _numbers(value) for key, value in given.items()}
     return SubElement(parent, tag, texts)
@@ -65,7 +68,7 @@ def _numbers(value: Any) -> str:
 
 
 def _word(value: Any) -> str:
-    """What MJCF calls a value of an enumeration: mjINT_IMPLICITFAST is implicitfast."""
+    """Return what MJCF calls a value of an enumeration: mjINT_IMPLICITFAST is implicitfast."""
     return str(value.name.split("_")[1].lower())
 
 
@@ -85,7 +88,7 @@ def _add_body(parent: Element, model: mujoco.MjModel, body: int) -> Element:
 
 
 def _add_parts(element: Element, model: mujoco.MjModel, body: int) -> None:
-    """What is fixed to a body: shapes, sites, cameras, lights."""
+    """Add what is fixed to a body: shapes, sites, cameras, lights."""
     shapes = np.flatnonzero(model.geom_bodyid == body)
     collides = model.geom_group[shapes] == COLLISION_GROUP
     touching = element
@@ -111,9 +114,10 @@ def _add_parts(element: Element, model: mujoco.MjModel, body: int) -> None:
 
 
 def _contact_center(model: mujoco.MjModel, body: int, geoms: np.ndarray) -> np.ndarray:
-    """The point of a link, in its frame, where it weighs `body_invweight0` (1/kg) with all joints at zero, [3].
+    """Return the point of a link where its inverse weight is `body_invweight0` (1/kg), in the link's frame, [3].
 
-    What a link weighs at a point is quadratic: the point lies on the line from where it is least through the shapes.
+    All joints are at zero. The inverse weight is a quadratic function of the point. So the point lies on the line from
+    where the function is least through the shapes.
     """
     data = mujoco.MjData(model)
     mujoco.mj_fwdPosition(model, data)

@@ -11,8 +11,11 @@ from surgical_marl.yaml_file import build
 
 @dataclass(frozen=True)
 class Randomisation:
-    """Ranges, all zero unless given. Everything but noise is drawn once an episode, evenly, for every joint or arm of
-    its own; jaws only get other gains and friction. docs/randomisation.md has the sources of sensible values."""
+    """Ranges of what is randomised, all zero unless given.
+
+    All values but noise are drawn once an episode, evenly, and separately for every joint or arm. Jaws only get other
+    gains and friction. docs/randomisation.md has the sources of sensible values.
+    """
 
     offset_angle: float = 0.0
     """A joint's reading is off by up to this, rad; `offset_slide`, m, for joints that slide."""
@@ -38,7 +41,10 @@ class Randomisation:
 
 
 def read_randomisation(settings: Any, path: Path) -> Randomisation:
-    """The ranges in a scene file. ValueError for an unknown key or a value out of range."""
+    """Return the ranges in a scene file.
+
+    Raises ValueError for an unknown key or a value out of range.
+    """
     where = f"{path}, randomisation"
     found: Randomisation = build(Randomisation, {} if settings is None else settings, where)
     for item in fields(found):

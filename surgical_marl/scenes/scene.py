@@ -75,7 +75,10 @@ class Scene:
         return found
 
     def find_camera(self, agent: str | None = None) -> str:
-        """The agent whose camera that is: the first that has one, or the one that is named. ValueError without any."""
+        """Return the agent whose camera is used: `agent` if it is given, otherwise the first that has a camera.
+
+        Raises ValueError if no agent has a camera, or the one given has none.
+        """
         found = [name for name, mount in self.mounts.items() if mount.arm.camera is not None]
         if not found:
             raise ValueError(f"scene {self.name!r} has no endoscope: no arm of {', '.join(self.agents)} has a camera")

@@ -30,8 +30,10 @@ HALVINGS = 8
 
 @dataclass(frozen=True)
 class _Joint:
-    """Turns about or slides along an axis through the origin of its frame. The frame is given in that of the joint
-    before it."""
+    """A joint that turns about or slides along an axis through the origin of its frame.
+
+    The frame is given in that of the joint before it.
+    """
 
     rotation: np.ndarray
     position: np.ndarray
@@ -189,7 +191,10 @@ def _descend(limbs: tuple[Limb, Limb], q: np.ndarray, near: float) -> bool:
 
 
 def _at(capsule: Capsule, where: np.ndarray, speeds: np.ndarray) -> np.ndarray:
-    """The speeds [k, n, 3] of points that far [k] along a capsule's axis, from those of its ends [k, n, 2, 3]."""
+    """Return the speeds [k, n, 3] of points on a capsule's axis, from those of its ends [k, n, 2, 3].
+
+    `where` [k] is how far along the axis the points are, in m from its middle.
+    """
     share = (0.5 + 0.5 * where / max(capsule.half, 1e-9))[:, None, None]
     return (1 - share) * speeds[:, :, 0] + share * speeds[:, :, 1]
 
@@ -208,8 +213,11 @@ def ball(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, float]:
 
 
 def _bound(limbs: tuple[Limb, Limb], boxes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """How far apart two geoms are in the middle of boxes [k, 2, n], m, [k], and by how much at most each joint brings
-    them nearer within the boxes, [k, n]."""
+    """Return the distance of two geoms in the middle of boxes [k, 2, n], and how much each joint can reduce it.
+
+    The distances are in m, [k]. The second array [k, n] is by how much at most each joint brings the geoms nearer
+    within the boxes.
+    """
     parts = np.split(boxes, [len(limbs[0].joints)], axis=2)
     (one, speeds), (other, its_speeds) = (limb.place(part[:, 0]) for limb, part in zip(limbs, parts, strict=True))
     gap = axis_gap(one, other)[1]
@@ -233,7 +241,10 @@ def _halved(boxes: np.ndarray, joint: np.ndarray) -> np.ndarray:
 
 
 def _carriers(model: mujoco.MjModel, geom: int, root: int = 0) -> list[int]:
-    """The bodies between one that carries a geom and the geom, its own included, the nearest to the root first."""
+    """Return the bodies from `root`, which is left out, to the body of the geom, which is included.
+
+    The body nearest to `root` comes first.
+    """
     bodies = [int(model.geom_bodyid[geom])]
     while bodies[-1] not in (0, root):
         bodies.append(int(model.body_parentid[bodies[-1]]))

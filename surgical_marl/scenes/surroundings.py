@@ -24,7 +24,10 @@ TISSUE_SHAPES = {
 
 
 def add_surroundings(spec: mujoco.MjSpec, mounts: dict[str, Mount], view: Any, path: Path) -> None:
-    """What a picture needs: the operating field, a trocar at each remote center, light, a camera. Nothing collides."""
+    """Add what a picture needs: the operating field, a trocar at each remote center, light, a camera.
+
+    Nothing of this collides.
+    """
     spec.worldbody.add_geom(
         name="field", type=mujoco.mjtGeom.mjGEOM_ELLIPSOID, size=[0.22, 0.16, 0.04], pos=[0, 0, -0.075],
         rgba=[0.72, 0.34, 0.31, 1], **STILL,
@@ -48,7 +51,7 @@ def add_surroundings(spec: mujoco.MjSpec, mounts: dict[str, Mount], view: Any, p
 
 
 def add_tissue(spec: mujoco.MjSpec, name: str, settings: Any, where: str) -> None:
-    """A coloured piece for an endoscope to look at. It belongs to the world and never moves."""
+    """Add a coloured piece for an endoscope to look at. It belongs to the world and never moves."""
     settings = read_mapping(settings, where)
     check_keys(settings, ("shape", "size", "position", "tilt", "colour"), where)
     if settings.get("shape") not in TISSUE_SHAPES:

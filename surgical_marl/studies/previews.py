@@ -22,7 +22,7 @@ DIRECTION = np.array([0.75, 0.60, 0.30])
 
 
 def picture(scene: Scene, width: int, height: int) -> np.ndarray:
-    """The scene at home, [height, width, 3] uint8."""
+    """Draw the scene with its arms at home, [height, width, 3] uint8."""
     data = mujoco.MjData(scene.model)
     data.qpos[:] = scene.home
     mujoco.mj_forward(scene.model, data)

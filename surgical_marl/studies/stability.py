@@ -20,7 +20,7 @@ INTEGRATORS = {
 
 
 def prepared(scene: Scene, timestep: float, integrator: str = "implicitfast", gain: float = 1.0) -> mujoco.MjModel:
-    """The scene's model at a physics step, all controller gains scaled."""
+    """Return the scene's model with a given physics step and integrator, and all controller gains scaled by `gain`."""
     model = load_scene(scene.name).model
     model.opt.timestep = timestep
     model.opt.integrator = INTEGRATORS[integrator]
@@ -44,7 +44,7 @@ def targets(scene: Scene, seed: int = 0) -> np.ndarray:
 
 
 def rollout(model: mujoco.MjModel, scene: Scene, ctrl: np.ndarray) -> tuple[np.ndarray, float]:
-    """qpos at each control step, and the greatest share of a joint's range by which it passed a limit."""
+    """Qpos at each control step, and the greatest share of a joint's range by which it passed a limit."""
     data = mujoco.MjData(model)
     data.qpos[:] = scene.home
     low, high = model.jnt_range.T

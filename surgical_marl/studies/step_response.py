@@ -43,7 +43,7 @@ class Linear(NamedTuple):
         return np.sqrt(stiffness / inertia), damping / (2 * np.sqrt(stiffness * inertia))
 
     def response(self, time: np.ndarray, joint: str) -> np.ndarray:
-        """The joints' ways [T, n] when the target of one goes from 0 to 1."""
+        """Return the movements of the joints [T, n] when the target of one goes from 0 to 1."""
         n = len(self.joints)
         inverse, target = np.linalg.inv(self.inertia), np.eye(n)[self.joints.index(joint)]
         system = np.block([[np.zeros((n, n)), np.eye(n)], [-inverse @ self.stiffness, -inverse @ self.damping]])
@@ -53,7 +53,11 @@ class Linear(NamedTuple):
 
 
 def identified(joint: Joint) -> Linear:
-    """The dVRK's gains on the identified arm; at the wrist on its motors, through the cable coupling."""
+    """Return the linear model of the identified arm with the dVRK's gains, for a joint.
+
+    A joint of the wrist is modelled together with the others of the wrist. There the gains act on the motors, and the
+    cable coupling passes them on to the joints.
+    """
     if joint.name in INERTIA:
         parts = INERTIA[joint.name], joint.drive.damping + joint.viscous, joint.drive.stiffness
         return Linear((joint.name,), *(np.array([[part]]) for part in parts))
@@ -65,8 +69,11 @@ def identified(joint: Joint) -> Linear:
 
 
 def simulated_response(joint: Joint, timestep: float | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Time [T] in s and the ways [T, n], as shares of the step, of the PSM joint whose target steps and of those that
-    belong with it."""
+    """Simulate a step of the target of one PSM joint.
+
+    Returns:
+        Time [T] in s, and the movements [T, n] of that joint and of the joints coupled to it, as shares of the step.
+    """
     scene, linear = load_scene("psm"), identified(joint)
     model, data = scene.model, mujoco.MjData(scene.model)
     model.opt.timestep = timestep or model.opt.timestep

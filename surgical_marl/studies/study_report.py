@@ -32,7 +32,10 @@ BEGIN, END = "<!-- study begin -->", "<!-- study end -->"
 
 
 def report(jobs: Sequence[Job], out: Path, results: Path) -> None:
-    """Writes study.json, study.csv and study.png, and the tables in study.md. ValueError if there is nothing yet."""
+    """Write study.json, study.csv and study.png, and the tables in study.md.
+
+    ValueError if there is nothing to report yet.
+    """
     if not jobs:
         raise ValueError(f"{out} holds no run that was played: nothing to report")
     groups = groupby(sorted(jobs, key=lambda job: (jobs_order(job), job.seed)), key=lambda job: (job.scene, job.algo))
@@ -55,7 +58,10 @@ def jobs_order(job: Job) -> tuple[str, int]:
 
 
 def describe(jobs: Sequence[Job], out: Path) -> dict[str, Any]:
-    """What the R runs of one scene and algorithm came to: numbers are [value, low, high], None where unknown."""
+    """Summarise the R runs of one scene and algorithm.
+
+    Numbers with an interval are [value, low, high], with None where unknown.
+    """
     played = [dict(np.load(out / str(job) / PLAYED)) for job in jobs]
     abouts = [json.loads(str(each["about"])) for each in played]
     if len({each["goal_set"] for each in abouts}) > 1:
@@ -101,8 +107,11 @@ def curve(runs: Sequence[Sequence[dict[str, float]]], axis: str) -> dict[str, An
 
 
 def broken(played: Sequence[dict[str, np.ndarray]], agents: Sequence[str], what: str) -> dict[str, Any]:
-    """What is left of success where each arm in turn is taken from its policy: of the others, of the arm itself; and
-    collisions. Of a policy that is left alone these are the arms themselves."""
+    """Return what is left of success when each arm in turn is taken from its policy, and the collisions.
+
+    `others` is the success of the remaining arms, and `itself` that of the arm that was taken. If `what` is
+    "untouched", no arm is taken: the numbers are then those of the same arms under their own policy.
+    """
     others, itself, collided = [], [], []
     for index, arm in enumerate(agents):
         measures = _stacked(played, what if what == "untouched" else f"{what} {arm}")
@@ -122,7 +131,7 @@ def number(metric: Metric) -> list[float | None]:
 
 
 def about(found: Sequence[dict[str, Any]]) -> str:
-    """What was run, in a sentence."""
+    """Return a sentence that says what was run."""
     first = found[0]
     seeds = sorted({len(each["seeds"]) for each in found})
     scenes: dict[tuple[int, int, int], dict[str, None]] = {}  # of each size, in order
@@ -139,7 +148,7 @@ def about(found: Sequence[dict[str, Any]]) -> str:
 
 
 def final_table(found: Sequence[dict[str, Any]]) -> str:
-    """The frozen evaluation, and how long it took to learn, as Markdown."""
+    """Return the results of the frozen evaluation, and how long it took to learn, as a Markdown table."""
     level = f"{LEVEL:.0%} in training"
     head = ["scene", "algorithm", f"within {SUCCESS_MM} mm", "all arms", "median error (mm)", "collisions",
             f"M samples to {level}", f"seconds to {level}", "seconds in all"]  # fmt: skip
@@ -153,7 +162,7 @@ def final_table(found: Sequence[dict[str, Any]]) -> str:
 
 
 def broken_table(found: Sequence[dict[str, Any]]) -> str:
-    """What breaks when an arm is taken from its policy, as Markdown."""
+    """Return what breaks when an arm is taken from its policy, as a Markdown table."""
     head = ["scene", "algorithm", f"one arm, after {WHEN:g} s", "other arms", "that arm", "collisions"]
     rows = [
         [f"`{each['scene']}`", NAMES[each["algo"]], {"oracle": "moved by the oracle"}.get(what, what)]
@@ -197,7 +206,7 @@ def _stacked(played: Sequence[dict[str, np.ndarray]], what: str) -> dict[str, np
 
 
 def _over_runs(values: Any) -> Metric:
-    """The mean over runs; its interval resamples them."""
+    """Return a metric that is the mean over runs; its interval resamples the runs."""
     return Metric(np.asarray(values, float)[None, :, None], lambda drawn: drawn.mean(-1))
 
 

@@ -71,11 +71,14 @@ def taken_over(
     instead: Callable[[Mapping[str, Any]], Mapping[str, Any]],
     start: int,
 ) -> Callable[[Mapping[str, Any]], dict[str, Any]]:
-    """A policy whose arm another one moves from control step `start` of each episode on.
+    """Return a policy in which another policy moves one arm, from control step `start` of each episode on.
 
     Args:
-        env: with torch arrays; what both act in.
-        instead: `zero_policy` freezes the arm: it stays where it was sent.
+        policy: moves all arms until then, and the other arms afterwards.
+        env: the environment in which both act, with torch arrays.
+        arm: the arm that is taken over.
+        instead: moves that arm. `zero_policy` freezes the arm: it stays where it was sent.
+        start: control step of an episode.
     """
     import torch
 
@@ -100,7 +103,7 @@ def _save(path: Path, **arrays: Any) -> None:
 
 
 def work(part: str, job: Job, out: Path, overrides: list[str]) -> tuple[Job, str]:
-    """A part of a job in a process of its own; returns what went wrong, if anything."""
+    """Do one part of a job in a process of its own; return the job and what went wrong, "" if nothing did."""
     log = out / f"{job}.log"
     # or progress bars of several runs would overwrite each other
     with log.open("a") as file, contextlib.redirect_stderr(file):

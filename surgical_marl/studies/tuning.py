@@ -56,7 +56,7 @@ class Knob(NamedTuple):
 
 
 def knobs(where: str, fixed: Sequence[str] = ()) -> dict[str, Knob]:
-    """What is searched on a "cpu" or "cuda", without the settings that are fixed, `key=value`."""
+    """Return the settings to search on a "cpu" or "cuda", without those that are fixed, `key=value`."""
     power: dict[str, Any] = {"value": lambda power: 2**power, "point": lambda value: value.bit_length() - 1}
     found = {
         "learning_rate": Knob("ppo.learning_rate", FloatDistribution(1e-4, 1e-2, log=True)),
@@ -106,7 +106,7 @@ class Search:
             )
 
     def values(self, params: Mapping[str, Any]) -> dict[str, Any]:
-        """The settings of a trial."""
+        """Return the settings of a trial, from its parameters."""
         return {self.knobs[name].setting: self.knobs[name].value(point) for name, point in params.items()}
 
     def settings(self, found: list[str], seed: int = 0) -> Settings:
@@ -133,8 +133,15 @@ class Search:
             self.say(trial.number, seconds, missing)
 
     def measure(self, each: list[Settings]) -> tuple[float, float | None]:
-        """Mean seconds of learning of some trainings, and what one of them missed in success when it was given up, None
-        if all succeeded; it is given up when all of them can't be faster than the best trial any more."""
+        """Train with each of some settings, and measure how long learning takes.
+
+        The trial is given up as soon as all trainings together can no longer be faster than the best trial.
+
+        Returns:
+            Mean seconds of learning, and None, if all trainings succeeded. Otherwise the seconds of learning until the
+            trial was given up, and by how much the success of its last training missed the goal. This is the whole goal
+            if that training diverged or had no room.
+        """
         left = self.best() * len(each)
         spent = 0.0
         for settings in each:
@@ -147,7 +154,10 @@ class Search:
         return spent / len(each), None
 
     def learn(self, settings: Settings, limit: float) -> Solution | None:
-        """A training, given up `limit` seconds after its first iteration; None if it diverged or had no room."""
+        """Train until the goal is met, or give up `limit` seconds after the first iteration.
+
+        None if training diverged or there was no room for it.
+        """
         began: list[float] = []
 
         def give_up(_: float, learning: float) -> bool:
@@ -167,16 +177,19 @@ class Search:
         return min((seconds for _, seconds in self.solved()), default=self.arguments.limit)
 
     def solved(self) -> list[tuple[int, float]]:
-        """Number and seconds of the trials that met the goal."""
+        """Return number and seconds of the trials that met the goal."""
         trials = self.study.get_trials(states=(TrialState.COMPLETE,))
         return [(trial.number, trial.value) for trial in trials if trial.value is not None]
 
     def done(self) -> list[FrozenTrial]:
-        """These, and what was pruned."""
+        """Return the trials that met the goal and those that were pruned."""
         return self.study.get_trials(states=(TrialState.COMPLETE, TrialState.PRUNED))
 
     def confirm(self) -> dict[str, Any]:
-        """The best settings and the shipped ones, with seconds from fresh seeds, None where the goal was missed."""
+        """Train with the best settings and with the shipped ones, from fresh seeds.
+
+        Return both settings and the seconds of learning of each training, None where the goal was missed.
+        """
         best = self.values(self.study.best_params)
         shipped = {knob.setting: _setting(self.shipped, knob.setting) for knob in self.knobs.values()}
         seconds: dict[str, list[float | None]] = {}

@@ -121,8 +121,11 @@ class Task(TipTask):
         return {"image_error": (torch.maximum(seen, wanted) - torch.minimum(seen, wanted)).float().mean((1, 2, 3))}
 
     def reward_terms(self, world: World) -> dict[str, dict[str, Array]]:
-        """Return agent -> reward term -> its value before weighting; the camera's first four and the others'
-        `stray`."""
+        """Return agent -> reward term -> its value before weighting.
+
+        `image`, `distance`, `precision` and `angle` count for the camera's agent and are 0 for the others. `stray`
+        counts for the others and is 0 for the camera's agent. `clearance` and `collision` count for all.
+        """
         errors, known, none = self.tip_errors(world), super().reward_terms(world), jnp.float32(0.0)
         looks = {agent: agent == self.camera for agent in world.arms}
         return {

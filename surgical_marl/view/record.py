@@ -62,7 +62,7 @@ def _poses(
     episodes: int,
     seed: int,
 ) -> Iterator[Pose]:
-    """What the pictures of `frames` show."""
+    """Yield the poses that the pictures of `frames` show."""
     every = max(1, round(1 / (FPS * env.control_dt)))
     observations, *_ = env.reset(seed)
     forget(policy)
@@ -90,7 +90,10 @@ class ScenePicture:
         self._renderer = Renderer(env.scene.model, width, height)
 
     def draw(self, pose: Pose | None = None) -> NDArray[np.uint8]:
-        """The picture [height, width, 3] of the environment as it stands, or as it stood."""
+        """Return a picture [height, width, 3] of the environment.
+
+        It shows the environment as it was at `pose`, or as it is now if there is no `pose`.
+        """
         qpos, balls = pose or self.pose()
         data = mujoco.MjData(model := self._env.scene.model)
         data.qpos[:] = qpos

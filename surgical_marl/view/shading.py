@@ -21,7 +21,7 @@ _DEFAULT_RGBA = np.array([0.5, 0.5, 0.5, 1.0], np.float32)
 
 
 def background(rays: Array) -> Array:
-    """The room [n, 3] in linear light: sky above the horizon, blue-green drapes below it."""
+    """Return the room [n, 3] in linear light: sky above the horizon, blue-green drapes below it."""
     height = rays[:, 2:3]
     up = np.sqrt(np.clip(height, 0.0, 1.0))
     down = np.clip(-1.6 * height, 0.0, 1.0) ** 0.7
@@ -100,6 +100,9 @@ class Look:
 
 
 def _round_length(length: float) -> float:
-    """The nearest of 1, 2, 5 times a power of ten: tiles whose size can be told in words."""
+    """Return the nearest of 1, 2 and 5 times a power of ten.
+
+    Tiles of such a length have a size that is easy to tell in words.
+    """
     power = 10 ** np.floor(np.log10(length))
     return float(power * min((1, 2, 5, 10), key=lambda step: abs(step - length / power)))

@@ -32,8 +32,11 @@ BACKGROUND = (0.05, 0.02, 0.02)
 
 @dataclass(frozen=True)
 class View:
-    """What the endoscopes of N environments see. Of the library that `render` was given; E eyes, H rows, W columns.
-    What was not asked for is None."""
+    """What the endoscopes of N environments see.
+
+    The arrays are of the library (numpy or torch) whose array `render` was given. In their shapes, E is the number of
+    eyes, H of rows and W of columns. A channel that was not asked for is None.
+    """
 
     rgb: Any = None
     """[N, E, H, W, 3] uint8"""
@@ -104,10 +107,13 @@ class Endoscope:
         self._warp.synchronize_device(device)  # what made the arrays ran on a stream of Warp's own
 
     def render(self, qpos: Any) -> View:
-        """What the endoscopes see at joint positions [N, nq] of the whole scene: numpy for numpy, and torch for torch.
+        """Return what the endoscopes see at joint positions [N, nq] of the whole scene.
 
-        On a GPU it follows what torch's current stream has to do, and given torch nothing waits or passes through the
-        host: after a first call it can be captured in a CUDA graph.
+        The pictures are numpy arrays for a numpy array, and torch tensors for a torch tensor.
+
+        On a GPU, drawing comes after the work that is already on torch's current stream. For a torch tensor, nothing
+        waits for the GPU and nothing passes through the host, so that after a first call `render` can be captured in a
+        CUDA graph.
         """
         if tuple(qpos.shape) != tuple(self._qpos.shape):
             raise ValueError(f"qpos of shape {tuple(qpos.shape)} must be {tuple(self._qpos.shape)}")

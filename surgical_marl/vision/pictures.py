@@ -93,7 +93,7 @@ def _endoscope(scene: Scene, camera: str, terms: list[Any], num_envs: int, devic
 
 
 def _draw_table(scene: Scene, term: Any, postures: np.ndarray, device: str) -> Tensor:
-    """The picture of each posture, [rows, H, W, C]."""
+    """Draw the picture of each posture, and return the pictures, [rows, H, W, C]."""
     endoscope = _endoscope(scene, term.camera, [term], AT_ONCE, device)
     drawn = []
     for first in range(0, len(postures), AT_ONCE):

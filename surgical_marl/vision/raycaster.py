@@ -71,10 +71,15 @@ class RayCaster:
         self._draw = make_draw(bool(self._meshes))
 
     def draw(self, data: Any, rgb: torch.Tensor, depth: torch.Tensor, segmentation: torch.Tensor) -> None:
-        """Writes pictures [N * C, height, width], of colour [..., 3]; of a channel that is empty, none.
+        """Write pictures into arrays [N * C, height, width], or [N * C, height, width, 3] for colour.
+
+        C is the number of cameras. A channel whose array is empty is not drawn.
 
         Args:
             data: MuJoCo Warp's, with `kinematics` and `camlight` done.
+            rgb: colour; may be empty.
+            depth: distance along the optical axis, m; may be empty.
+            segmentation: ids of geoms; may be empty.
         """
         cameras, placed = [data.cam_xpos, data.cam_xmat, self._cameras], [self._turns, self._eyes]
         listed = [self._listed, self._counts]

@@ -41,7 +41,7 @@ class Light:
 
 @wp.func
 def ball(p: wp.vec3, v: wp.vec3):
-    """The depths between which p + t v is in the unit ball; the first is greater if nowhere."""
+    """Return the depths t between which p + t v is in the unit ball; the first is greater if there are none."""
     a = wp.max(wp.dot(v, v), 1e-12)
     middle = -wp.dot(p, v) / a
     nearest = p + middle * v
@@ -52,7 +52,7 @@ def ball(p: wp.vec3, v: wp.vec3):
 
 @wp.func
 def slab(p: float, v: float, size: float):
-    """The depths between which |p + t v| < size."""
+    """Return the depths t between which |p + t v| < size."""
     scale = 1.0 / wp.where(wp.abs(v) > TINY, v, TINY)
     return wp.vec2(-p * scale - size * wp.abs(scale), -p * scale + size * wp.abs(scale))
 
@@ -64,7 +64,7 @@ def both(a: wp.vec2, b: wp.vec2):
 
 @wp.func
 def span(kind: int, size: wp.vec3, p: wp.vec3, v: wp.vec3):
-    """The depths between which p + t v is in a shape; the first is greater if nowhere."""
+    """Return the depths t between which p + t v is in a shape; the first is greater if there are none."""
     if kind == BOX:
         return both(both(slab(p[0], v[0], size[0]), slab(p[1], v[1], size[1])), slab(p[2], v[2], size[2]))
     if kind == ELLIPSOID:
@@ -87,7 +87,10 @@ def span(kind: int, size: wp.vec3, p: wp.vec3, v: wp.vec3):
 
 @wp.func
 def outwards(kind: int, size: wp.vec3, p: wp.vec3):
-    """A vector that stands on a shape at a point p of its surface."""
+    """Return a vector that is normal to the surface of a shape at a point p of it, and points out of the shape.
+
+    Its length is not 1 in general.
+    """
     if kind == BOX:
         away = wp.abs(p) - size
         if away[0] >= away[1] and away[0] >= away[2]:
@@ -106,7 +109,7 @@ def outwards(kind: int, size: wp.vec3, p: wp.vec3):
 
 @wp.func
 def reach(kind: int, size: wp.vec3, n: wp.vec3):
-    """The greatest n . x of a shape's points x."""
+    """Return the greatest value of n . x over all points x of a shape."""
     if kind == BOX or kind == MESH:  # a mesh is in its box
         return wp.dot(size, wp.abs(n))
     if kind == ELLIPSOID:
@@ -118,7 +121,7 @@ def reach(kind: int, size: wp.vec3, n: wp.vec3):
 
 @wp.func
 def shine(light: wp.vec3, normal: wp.vec3, view: wp.vec3, colour: wp.vec3, diffuse: wp.vec3, specular: wp.vec3):
-    """What comes to the eye from one light, as in MuJoCo where nothing is said of a geom's material."""
+    """Return what comes to the eye from one light, as in MuJoCo for a geom without settings of its material."""
     facing = wp.dot(normal, light)
     if facing <= 0.0:
         return wp.vec3(0.0)
@@ -157,8 +160,11 @@ def cull(
     listed: wp.array3d[wp.uint16],
     counts: wp.array2d[int],
 ):
-    """The shapes that rays of a tile may meet, in ascending order: not wholly beyond one of the planes through the eye
-    and a side of the tile, nor behind the eye."""
+    """List the shapes that rays of a tile may meet, in ascending order.
+
+    A shape is left out if it is wholly behind the eye, or wholly beyond one of the planes through the eye and a side of
+    the tile.
+    """
     picture, tile = wp.tid()
     columns = (width + TILE - 1) // TILE
     left = (float(tile % columns * TILE) - 0.5 * float(width)) * pixel
@@ -189,7 +195,7 @@ def cull(
 
 @cache
 def make_draw(meshes: bool) -> Any:
-    """The last kernel; without meshes it needs fewer registers."""
+    """Return the last kernel, `draw`; without meshes it needs fewer registers."""
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options={"fast_math": True})
     def draw(

@@ -46,19 +46,22 @@ class Arrays(ABC):
 
     @abstractmethod
     def write(self, leaf: Leaf, values: Any) -> None:
-        """Sets a leaf to [N, *shape] of any library."""
+        """Set a leaf to values of shape [N, *shape], from an array of any library."""
 
     @abstractmethod
     def read(self, leaf: Leaf, library: str) -> Any:
-        """A leaf as [N, *shape] of "numpy", "torch" or "jax"; a copy."""
+        """Return a copy of a leaf, of shape [N, *shape], as an array of "numpy", "torch" or "jax"."""
 
     @abstractmethod
     def read_tree(self, tree: dict[str, Any], library: str) -> dict[str, Any]:
         """Leaves of a dict of dicts, of one copy of the whole."""
 
     def _cut(self, node: Any, copies: dict[str, Any], library: str) -> Any:
-        """A tree's leaves out of copies of the buffers. A method, because a function within a function that calls
-        itself keeps what it sees, here a whole step's arrays, until Python's garbage collector finds it."""
+        """Return a tree's leaves, taken out of copies of the buffers.
+
+        This is a method, not a function within a function. Such a function that calls itself keeps what it sees until
+        Python's garbage collector finds it. Here that would be the arrays of a whole step.
+        """
         if isinstance(node, dict):
             return {name: self._cut(child, copies, library) for name, child in node.items()}
         rows = copies[node.buffer][node.first : node.first + node.size, : self.num_envs]
@@ -77,7 +80,10 @@ class Arrays(ABC):
     def _warp(self, array: Any) -> Any: ...
 
     def rows(self, leaf: Leaf) -> Any:
-        """The fields of a leaf, [size, N], of the device's own library: a view."""
+        """Return the fields of a leaf, of shape [size, N], as an array of the device's own library.
+
+        It is a view, not a copy.
+        """
         return self._buffers[leaf.buffer][leaf.first : leaf.first + leaf.size, : self.num_envs]
 
 

@@ -56,7 +56,7 @@ def _wave(g: Graph, x: Value, quarter: int) -> Value:
 
 
 def exponential(g: Graph, x: Value) -> Value:
-    """e to the x; 0 and infinity beyond what float32 holds."""
+    """E to the x; 0 and infinity beyond what float32 holds."""
     if x < 0:
         return g.constant(np.exp(g.constants[~x]))
     bounded = g.extreme("max", g.extreme("min", x, _real(g, 88.72)), _real(g, -87.0))
@@ -74,8 +74,11 @@ def exponential(g: Graph, x: Value) -> Value:
 
 
 def logarithm_of_more(g: Graph, x: Value) -> Value:
-    """log(1 + x). What 1 + x rounds away of a small x is made up for: W. Kahan's way, as Goldberg, "What every computer
-    scientist should know about floating-point arithmetic", 1991, has it."""
+    """Return log(1 + x), also accurate for small x.
+
+    Rounding 1 + x loses digits of a small x. The result is corrected for that loss with W. Kahan's method, given in
+    Goldberg, "What every computer scientist should know about floating-point arithmetic", 1991.
+    """
     more = g.add(g.one, x)
     kept = g.sub(more, g.one)
     scaled = g.mul(g.unary("log", more), g.div(x, kept))
@@ -83,7 +86,7 @@ def logarithm_of_more(g: Graph, x: Value) -> Value:
 
 
 def inverse_error(g: Graph, x: Value) -> Value:
-    """The inverse of the error function, as XLA computes it."""
+    """Return the inverse of the error function, as XLA computes it."""
     w = g.neg(g.unary("log", g.mul(g.sub(g.one, x), g.add(g.one, x))))
     small = polynomial(g, g.sub(w, _real(g, 2.5)), _ERFINV_SMALL)
     large = polynomial(g, g.sub(g.unary("sqrt", w), _real(g, 3.0)), _ERFINV_LARGE)
@@ -99,7 +102,7 @@ def polynomial(g: Graph, x: Value, coefficients: tuple[float, ...]) -> Value:
 
 
 def power(g: Graph, x: Value, y: int) -> Value:
-    """x to a whole number, by squaring."""
+    """X to a whole number, by squaring."""
     if y < 0:
         return g.div(g.constant(np.ones((), g.dtype(x))[()]), power(g, x, -y))
     if y == 0:

@@ -54,7 +54,7 @@ class Emitter:
         return "\n".join(self.lines)
 
     def _postpone_stores(self) -> None:
-        """Puts each store after the last load of the same field."""
+        """Put each store after the last load of the same field."""
         items = self.schedule.regions[0].items
         after = {field: at + 0.5 for at, item in enumerate(items) for field in self._loads(*item)}
         places = [
@@ -111,8 +111,11 @@ class Emitter:
 
     @contextmanager
     def _side(self, number: int, condition: str) -> Iterator[None]:
-        """Within a side of a large branch, names for values from around it that the compiler takes for new ones. It
-        would otherwise compute what both sides need before the branch, and keep it in registers that are not there."""
+        """Give values from outside a large branch new names while one of its sides is written.
+
+        The compiler takes these names for new values. Without them it would compute before the branch what both sides
+        need, and keep it in more registers than there are.
+        """
         self.active.append(condition)
         names, size = dict(self.names), sum(len(self.schedule.regions[r].items) for r in self.schedule.inside[number])
         if size > LARGE and not self.vector:
@@ -182,7 +185,7 @@ class Emitter:
 
 
 def literal(value: Any) -> str:
-    """A numpy scalar as C of its type."""
+    """Return a numpy scalar as a C literal of its type."""
     kind = value.dtype.kind
     if kind == "b":
         return "SPLATB(1)" if value else "SPLATB(0)"

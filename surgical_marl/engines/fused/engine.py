@@ -71,7 +71,7 @@ class FusedEngine:
         self._stepped = False
 
     def restart(self) -> None:
-        """The next episode of every environment that has not just begun one."""
+        """Begin the next episode of every environment that has not just begun one."""
         begun = (self.read(".steps", "numpy") == 0) & self._stepped
         self.write(".episode", (self.read(".episode", "numpy") + ~begun).astype(np.int32))
         self._launch("reset")
@@ -96,22 +96,28 @@ class FusedEngine:
         self._stepped = True
 
     def outcome(self, library: str) -> dict[str, Any]:
-        """What the last step or reset led to, as arrays [N, ...] of "numpy", "torch" or "jax": fields of
-        the environment's `State` as dicts of dicts. Copies, but on a GPU for "torch" the next step overwrites them."""
+        """Return what the last step or reset led to: fields of the environment's `State` as dicts of dicts.
+
+        The arrays are [N, ...] of "numpy", "torch" or "jax". They are copies, but on a GPU the next step overwrites
+        those for "torch".
+        """
         return self._arrays.read_tree(self.source.results, library)
 
     def read(self, name: str, library: str) -> Any:
-        """A part of the `Carry`, one of `carry_shapes`, or of what has moved, as in ".moved.carry.physics.qpos"; [N,
-        ...], a copy."""
+        """Return a copy, [N, ...], of a part of the `Carry` or of what has moved.
+
+        A part of the `Carry` has a name in `carry_shapes`. A part of what has moved has a name as in
+        ".moved.carry.physics.qpos".
+        """
         return self._arrays.read(self._leaves[name], library)
 
     def write(self, name: str, values: Any) -> None:
-        """Sets a part of the `Carry`."""
+        """Set a part of the `Carry`."""
         self._arrays.write(self._leaves[name], values)
         self._stepped = True
 
     def _filled_tables(self) -> dict[str, np.ndarray]:
-        """The constant tables with the parameters in their places."""
+        """Return the constant tables with the parameters in their places."""
         filled = {dtype: table.copy() for dtype, table in self.source.tables.items()}
         for name, values in _paths(self.env.parameters).items():
             leaf = self.source.parameters[name]

@@ -98,7 +98,7 @@ class Graph:
     # -- values
 
     def constant(self, value: Any) -> Value:
-        """The constant of a numpy scalar."""
+        """Return the constant of a numpy scalar."""
         kind = KINDS[value.dtype.name]
         key = (kind, "nan" if value != value else value.item() if value != 0 else 0)  # -0 is 0
         found = self._constant_ids.get(key)
@@ -111,7 +111,7 @@ class Graph:
         return self.kinds[value] if value >= 0 else KINDS[self.constants[~value].dtype.name]
 
     def node(self, op: str, *args: Any, kind: str) -> Value:
-        """A node as it is, shared with an equal one."""
+        """Return a node as it is, not simplified; equal nodes are shared."""
         key = (op, kind, *args)
         found = self._known.get(key)
         if found is None:
@@ -119,15 +119,18 @@ class Graph:
         return found
 
     def fresh(self, op: str, *args: Any, kind: str) -> Value:
-        """A node of its own, equal to no other."""
+        """Return a new node that is never shared, even with one that looks the same."""
         self.ops.append(op)
         self.args.append(args)
         self.kinds.append(kind)
         return len(self.ops) - 1
 
     def open_scope(self) -> None:
-        """From here on nodes are shared among themselves only: what a branch computes is computed in the branch, and
-        need not be kept from before it."""
+        """Share the nodes made from here on only among themselves.
+
+        What a branch computes is then computed in the branch, and need not be kept from before it. Nodes of the kinds
+        "load", "phi" and "out" from before are still shared.
+        """
         self._scopes.append(self._known)
         self._known = {key: value for key, value in self._known.items() if key[0] in ("load", "phi", "out")}
 
@@ -139,7 +142,10 @@ class Graph:
             return self.constant(np.asarray(FOLD[op](*(self.constants[~a] for a in args)))[()])
 
     def reads(self, value: Value) -> list[Value]:
-        """The nodes that a node reads, constants left out; those of a group are the group's."""
+        """Return the nodes that a node reads, without constants.
+
+        What a group reads is not counted for the nodes that stand for its values, but for the group.
+        """
         op, args = self.ops[value], self.args[value]
         if op in ("load", "phi", "out"):
             return []
@@ -268,7 +274,7 @@ class Graph:
         return self.unary("not", a)
 
     def extreme(self, op: str, a: Value, b: Value) -> Value:
-        """max or min"""
+        """Return the larger of two values if `op` is "max", the smaller if it is "min"."""
         if a == b:
             return a
         if self.kind(a) == "b":
@@ -307,14 +313,17 @@ class Graph:
         return self.node("select", condition, other, chosen, kind=kind)
 
     def table(self, table: np.ndarray) -> int:
-        """The number of a constant float32 or int32 table, [n]; equal ones are kept once."""
+        """Return the number of a constant float32 or int32 table, [n]; equal tables are kept once."""
         number = self._table_numbers.setdefault((table.dtype.name, table.tobytes()), len(self.tables))
         if number == len(self.tables):
             self.tables.append(table)
         return number
 
     def input_table(self, example: np.ndarray) -> int:
-        """The number of a new table of this size and type, whose values are given when the program runs."""
+        """Return the number of a new table whose values are given when the program runs.
+
+        The table has the size and type of `example`.
+        """
         self.tables.append(example)
         self.inputs.add(len(self.tables) - 1)
         return len(self.tables) - 1
@@ -327,5 +336,5 @@ class Graph:
         return self.node("lookup", number, index, kind=KINDS[table.dtype.name])
 
     def dtype(self, value: Value) -> type:
-        """The numpy type of a value."""
+        """Return the numpy type of a value."""
         return DTYPES[self.kind(value)]

@@ -25,7 +25,7 @@ Places = list[np.ndarray]
 
 
 def gather(g: Graph, shape: Any, params: Any, operand: Traced | Table, indices: Traced) -> Traced:
-    """`lax.gather`"""
+    """Do what `lax.gather` does."""
     numbers, sizes = params["dimension_numbers"], params["slice_sizes"]
     grid = np.indices(shape)
     batch = [grid[axis] for axis in range(len(shape)) if axis not in numbers.offset_dims]
@@ -48,7 +48,7 @@ def gather(g: Graph, shape: Any, params: Any, operand: Traced | Table, indices: 
 
 
 def dynamic_slice(g: Graph, shape: Any, params: Any, operand: Traced | Table, *starts: Traced) -> Traced:
-    """`lax.dynamic_slice`"""
+    """Do what `lax.dynamic_slice` does."""
     place, moving = list(np.indices(shape)), {}
     for axis, start in enumerate(starts):
         if isinstance(start, Symbolic):
@@ -59,7 +59,7 @@ def dynamic_slice(g: Graph, shape: Any, params: Any, operand: Traced | Table, *s
 
 
 def dynamic_update_slice(g: Graph, shape: Any, params: Any, operand: Traced, update: Traced, *starts: Traced) -> Traced:
-    """`lax.dynamic_update_slice`"""
+    """Do what `lax.dynamic_update_slice` does."""
     out, new = lift(g, operand).copy(), lift(g, update)
     lasts = [size - length for size, length in zip(shape, new.shape, strict=True)]
     corner = [_bounded(g, int(lift(g, start)), last) for start, last in zip(starts, lasts, strict=True)]
@@ -128,8 +128,11 @@ def _take(g: Graph, operand: Traced | Table, place: Places) -> Traced:
 def _choose(
     g: Graph, operand: Traced | Table, sizes: Any, place: Places, starts: dict[int, np.ndarray], fill: Value | None
 ) -> Symbolic:
-    """Elements of `operand` at `place + starts`. The starts are values; a window, of `sizes`, that is not inside is
-    `fill`, or moved there."""
+    """Return the elements of `operand` at `place + starts`, where the starts are values.
+
+    A window has the size `sizes`. If it is not all inside the operand, its elements are `fill`. Without a `fill` the
+    window is moved inside.
+    """
     shape, lasts = place[0].shape, {axis: operand.shape[axis] - sizes[axis] for axis in starts}
     find: Callable[[list[int], dict[int, Value]], Value]
     if isinstance(operand, Table) or (isinstance(operand, np.ndarray) and operand.size >= LEAST_TABLE):
@@ -149,7 +152,7 @@ def _choose(
 
 
 def look_up(g: Graph, operand: np.ndarray | Table, fixed: list[int], moving: dict[int, Value]) -> Value:
-    """The element of a table at `fixed` places, plus `moving` ones on some axes."""
+    """Return the element of a table at the places `fixed`, plus the values `moving` on some axes."""
     kind = KINDS[operand.dtype.name]
     if isinstance(operand, Table):
         number = operand.number
@@ -192,7 +195,7 @@ def _all_equal(g: Graph, starts: Sequence[Value], corner: tuple[int, ...]) -> Va
 
 
 def _bounded(g: Graph, start: Value, last: int) -> Value:
-    """A start moved into 0 ... last."""
+    """Return a start moved into the range from 0 to `last`, both included."""
     return g.extreme("min", g.extreme("max", start, _like(g, start, 0)), _like(g, start, last))
 
 
@@ -201,7 +204,7 @@ def _like(g: Graph, value: Value, number: int) -> Value:
 
 
 def _fill(g: Graph, params: Any, operand: Traced | Table) -> Value:
-    """What stands for elements outside."""
+    """Return the value that stands for elements outside the operand."""
     dtype = np.dtype(g.dtype(int(operand.ids.flat[0])) if isinstance(operand, Symbolic) else operand.dtype)
     given = params.get("fill_value")
     if given is None:

@@ -48,8 +48,11 @@ def compile_kernels(bodies: dict[str, str], device: str, max_registers: int | No
 
 @contextmanager
 def _checked(module: str) -> Iterator[None]:
-    """Around the loading of a module: what Warp has of it on disk is removed if it is not what was stored there.
-    Warp itself would load a damaged file, whatever that leads to."""
+    """Remove a module's files from Warp's cache before it is loaded, if they are damaged.
+
+    Files are damaged if they are not what was stored there. Warp itself would load a damaged file, whatever that leads
+    to. The loading of the module belongs inside this context; after it, a digest of the files is recorded.
+    """
     record = cache_dir() / "kernels" / f"{module}.sha256"
     folders = _folders(module)
     with contextlib.suppress(OSError):
@@ -106,8 +109,11 @@ class Kernel:
         self._kernel, self._device = kernel, device
 
     def launch(self, arrays: list[Any], stride: int, start: int, count: int) -> None:
-        """Runs environments `start` to `start + count`, of arrays that have a column for `stride` of them. On a GPU it
-        goes to torch's current stream, and can be captured in a CUDA graph."""
+        """Run the environments from `start` up to, but without, `start + count`.
+
+        The arrays have one column for each of `stride` environments. On a GPU the work goes to torch's current stream,
+        and can be captured in a CUDA graph.
+        """
         cuda = self._device == "cuda"
         lanes = 1 if cuda else LANES
         wp.launch(

@@ -14,12 +14,12 @@ from surgical_marl.engines.fused.traced import Rule, Symbolic, Traced, each, kin
 
 
 def least(dtype: np.dtype) -> Any:
-    """The least that a dtype holds: the largest of no elements."""
+    """Return the least value that a dtype holds. It is the maximum of no elements."""
     return np.iinfo(dtype).min if dtype.kind in "iu" else {"f": -np.inf, "b": False}[dtype.kind]
 
 
 def most(dtype: np.dtype) -> Any:
-    """The most that a dtype holds: the smallest of no elements."""
+    """Return the greatest value that a dtype holds. It is the minimum of no elements."""
     return np.iinfo(dtype).max if dtype.kind in "iu" else {"f": np.inf, "b": True}[dtype.kind]
 
 
@@ -154,7 +154,7 @@ def triangular_solve(g: Graph, shape: Any, params: Any, x: Traced, y: Traced) ->
 
 
 def _less_products(g: Graph, value: Value, a: list[Value], b: list[Value]) -> Value:
-    """`value - a . b`"""
+    """Return `value - a . b`."""
     for p, q in zip(a, b, strict=True):
         value = g.sub(value, g.mul(p, q))
     return value

@@ -15,8 +15,9 @@ from surgical_marl.engines.stepper import Stepper
 
 
 def load_source(env: Stepper, vector: bool, announce: Callable[[], None] = lambda: None) -> Source:
-    """The source of an environment's kernels: for a CPU, with vectors, or for CUDA. Kept on disk; `announce` is called
-    before it is made.
+    """Return the source of an environment's kernels: for a CPU, with vectors, or for CUDA.
+
+    The source is kept on disk. `announce` is called before it is made.
 
     Raises:
         Unsupported: the environment can't be traced.

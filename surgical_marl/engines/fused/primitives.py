@@ -37,7 +37,7 @@ def _bitcast(g: Graph, shape: Any, params: Any, x: Traced) -> Traced:
 
 
 def _move(function: Callable[..., np.ndarray]) -> Rule:
-    """A rule that only moves elements: `function(shape, params, array)`."""
+    """Return a rule that only moves elements, as `function(shape, params, array)` does."""
 
     def rule(g: Graph, shape: Any, params: Any, x: Traced, *rest: Traced) -> Traced:
         if isinstance(x, Symbolic):
@@ -121,7 +121,7 @@ def _threefry(g: Graph, shape: Any, params: Any, *xs: Traced) -> list[Traced]:
 
 
 def _iota_pair(g: Graph, shape: Any, params: Any) -> list[Traced]:
-    """The high and low words of each element's number."""
+    """Return the high and the low words of each element's number."""
     count = np.arange(int(np.prod(shape)), dtype=np.uint32).reshape(shape)
     return [np.zeros_like(count), count]
 
@@ -188,7 +188,11 @@ _KNOWN: dict[str, Callable[..., Any]] = {
 
 
 def apply(g: Graph, name: str, avals: list[Any], params: dict[str, Any], xs: list[Traced]) -> list[Traced]:
-    """The results of a primitive. Unsupported if it has no rule."""
+    """Return the results of a primitive.
+
+    Raises:
+        Unsupported: the primitive has no rule.
+    """
     shape, dtype = avals[0].shape, avals[0].dtype
     if all(not np.prod(aval.shape, dtype=int) for aval in avals):
         return [np.zeros(aval.shape, aval.dtype) for aval in avals]

@@ -35,7 +35,10 @@ def _remainder(g: Graph, a: Value, b: Value) -> Value:
 
 
 def _divide_whole(g: Graph, op: str, a: Value, b: Value) -> Value:
-    """What XLA defines and stops a CPU: x / 0 is -1 and leaves x, and the least number / -1 is that number."""
+    """Divide whole numbers as XLA does, also where a CPU would stop with an error.
+
+    Dividing x by 0 gives -1, and the remainder is x. Dividing the least number by -1 gives that number.
+    """
     zero, one = (g.constant(g.dtype(a)(k)) for k in (0, 1))
     by_zero = odd = g.compare("eq", b, zero)
     if g.kind(a) == "i":
@@ -83,7 +86,10 @@ def _shift(name: str) -> Callable[..., Value]:
 
 
 def _shift_as(name: str, kind: str) -> Callable[..., Value]:
-    """A shift of the bits as if they were of this kind, which tells what comes in from the left."""
+    """Return a function that shifts the bits of a value as if it were of this kind.
+
+    The kind determines which bits come in from the left.
+    """
 
     def shift(g: Graph, a: Value, b: Value) -> Value:
         return convert(g, _shift(name)(g, convert(g, a, kind), b), g.kind(a))
@@ -110,7 +116,10 @@ def _select_n(g: Graph, which: Value, *cases: Value) -> Value:
 
 
 def convert(g: Graph, a: Value, to: str) -> Value:
-    """A value as another kind. Of a number that the kind doesn't hold it is, as in XLA, the nearest that it does."""
+    """Return a value as another kind.
+
+    A number that the kind can't hold becomes the nearest number that it can hold, as in XLA.
+    """
     kind = g.kind(a)
     if kind == to:
         return a
@@ -127,7 +136,7 @@ def convert(g: Graph, a: Value, to: str) -> Value:
 
 
 def bitcast(g: Graph, a: Value, to: str) -> Value:
-    """The bits of a value as another kind."""
+    """Return the bits of a value as another kind."""
     kind = g.kind(a)
     if kind == to:
         return a

@@ -16,8 +16,11 @@ from surgical_marl.engines.fused.graph import Branch, Graph, Loop, Value
 
 @dataclass
 class Region:
-    """A straight stretch of program. `items` are what it computes, in order: ("node", value), ("group", number), or
-    ("result", k), the k-th result of the region, known from there on."""
+    """A straight stretch of program.
+
+    `items` are what it computes, in order. Each is ("node", value), ("group", number), or ("result", k). The last says
+    that the k-th result of the region is known from there on.
+    """
 
     parent: int
     depth: int
@@ -258,7 +261,7 @@ class Scheduler:
         return self.graph.reads(number) if kind == "node" else self._all_reads(number)
 
     def _all_reads(self, number: int) -> list[Value]:
-        """What a group and everything in it reads from outside it."""
+        """Return what a group and everything in it read from outside the group."""
         if number in self._outside:
             return self._outside[number]
         found: dict[Value, None] = dict.fromkeys(self._group_reads(number))

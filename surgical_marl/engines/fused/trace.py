@@ -37,8 +37,11 @@ class Tracer:
         self._around = 0  # the loops that are being traced, as bits
 
     def run(self, closed: Any, args: Sequence[Any]) -> list[Traced]:
-        """The results of a closed jaxpr. Unsupported, naming the line of the source, if there is no rule for
-        something in it."""
+        """Return the results of a closed jaxpr.
+
+        Raises:
+            Unsupported: there is no rule for something in it. The error names the line of the source.
+        """
         jaxpr, consts = getattr(closed, "jaxpr", closed), getattr(closed, "consts", ())
         known: dict[Any, Traced] = dict(zip(jaxpr.constvars, map(np.asarray, consts), strict=True))
         known.update(zip(jaxpr.invars, args, strict=True))
@@ -85,7 +88,7 @@ class Tracer:
         return apply(self.graph, name, avals, params, xs)
 
     def _keys(self, name: str, avals: list[Any], params: Any, xs: list[Traced], are_keys: list[bool]) -> list[Traced]:
-        """Moves random keys, whose words are the last axis of their arrays."""
+        """Move random keys with a primitive. The words of a key are the last axis of its array."""
         raw = [jax.ShapeDtypeStruct(aval.shape, np.uint32) for aval in avals]
         keys = [lift(self.graph, x) for x, is_key in zip(xs, are_keys, strict=True) if is_key]
         moved = []
@@ -260,7 +263,10 @@ class Tracer:
 
 
 def _expanded(primitive: Any) -> Any:
-    """The jaxpr of what a primitive of jax 0.12 or later that has rules of its own for derivatives computes."""
+    """Return the jaxpr of what a primitive computes that has rules of its own for derivatives.
+
+    Such primitives are part of jax 0.12 and later.
+    """
 
     def flat(*arguments: Any) -> list[Any]:
         return jax.tree.leaves(primitive.expand(*jax.tree.unflatten(primitive.in_tree, arguments)))

@@ -51,7 +51,11 @@ class Unsupported(ValueError):
 
 
 def kind_of(dtype: Any) -> str:
-    """The kind of values of a dtype. Unsupported if there is none."""
+    """Return the kind of values of a dtype.
+
+    Raises:
+        Unsupported: there is no kind for this dtype.
+    """
     name = np.dtype(dtype).name
     if name not in KINDS:
         raise Unsupported(f"arrays of {name}")
@@ -59,7 +63,7 @@ def kind_of(dtype: Any) -> str:
 
 
 def lift(graph: Graph, array: Traced | Table) -> np.ndarray:
-    """The values of a traced array, known or not."""
+    """Return the values of a traced array, whether they are known or not."""
     if isinstance(array, Symbolic):
         return array.ids
     if isinstance(array, Table):
@@ -71,7 +75,7 @@ def lift(graph: Graph, array: Traced | Table) -> np.ndarray:
 
 
 def lower(graph: Graph, ids: np.ndarray, dtype: Any) -> Traced:
-    """A numpy array if all values are constants."""
+    """Return a numpy array if all values are constants, and otherwise a `Symbolic`."""
     if ids.size and ids.max() >= 0:
         return Symbolic(ids)
     flat = [graph.constants[~i] for i in ids.ravel().tolist()]

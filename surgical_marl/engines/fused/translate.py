@@ -27,7 +27,7 @@ class Fields:
         self.sizes = {"state": 0, "counts": 0, "actions": 0, "outs": 0, "flags": 0}
 
     def place(self, tree: Any, reals: str) -> Any:
-        """A tree of `Leaf`s for a tree of arrays or their shapes; float32 goes to the array `reals`."""
+        """Return a tree of `Leaf`s for a tree of arrays or their shapes; float32 goes to the array `reals`."""
         return jax.tree.map(lambda x: self.leaf(x.shape, np.dtype(x.dtype).name, reals), tree)
 
     def leaf(self, shape: tuple[int, ...], dtype: str, reals: str) -> Leaf:
@@ -79,8 +79,11 @@ def make_source(env: Stepper, vector: bool) -> Source:
 
 
 def _parameters(graph: Graph, parameters: Any) -> tuple[list[Traced | Table], dict[str, Leaf]]:
-    """What stands for parameters while tracing, and where each is in the joined tables. Few numbers are values; the
-    elements of a table are looked up where they are needed."""
+    """Return what stands for the parameters while tracing, and where each is in the joined tables.
+
+    A parameter of fewer than `LEAST_TABLE` numbers becomes values. A larger one stays a table, whose elements are
+    looked up where they are needed.
+    """
     given: list[Traced | Table] = []
     places: dict[str, Leaf] = {}
     for path, value in jax.tree_util.tree_flatten_with_path(parameters)[0]:
@@ -109,13 +112,16 @@ def trace(
     given: Sequence[Traced | Table] = (),
     extra: Any = None,
 ) -> tuple[list[list[Value]], Any]:
-    """Runs a function on trees of `Leaf`s: the values of each leaf of its result, and the result's tree of shapes.
+    """Run a function on trees of `Leaf`s.
 
     Args:
         graph: where the values go.
-        function: of the arguments, and of one more if there is `extra`.
+        function: takes the arguments, and one more if there is `extra`.
         arguments: trees of leaves.
         given: what stands for the leaves of the last argument, the tree of shapes `extra`.
+
+    Returns:
+        The values of each leaf of the function's result, and the result's tree of shapes.
 
     Raises:
         Unsupported: for something that has no kernel code, with the line of the source that uses it.
@@ -133,7 +139,7 @@ def trace(
 
 
 def tables(graph: Graph) -> dict[str, np.ndarray]:
-    """The constant tables of a graph, joined by dtype."""
+    """Return the constant tables of a graph, joined by dtype."""
     return {
         dtype: np.concatenate([t.ravel() for t in graph.tables if t.dtype == dtype] or [np.zeros(1, dtype)])
         for dtype in ("float32", "int32")
@@ -151,8 +157,11 @@ def _body(graph: Graph, leaves: list[Leaf], values: list[list[Value]], vector: b
 
 
 def _share_fields(layout: Fields, shapes: list[Any], values: list[list[Value]], first: list[list[Value]]) -> list[Leaf]:
-    """A leaf for each result. One whose values stand in a row in another, in both kernels, shares its fields: a state
-    holds the observations of all agents."""
+    """Return a leaf for each result.
+
+    If the values of a result stand in a row in another result, in both kernels, the two share fields. For example, a
+    state holds the observations of all agents.
+    """
     leaves: dict[int, Leaf] = {}
     for k in sorted(range(len(shapes)), key=lambda k: -len(values[k])):
         size, dtype = len(values[k]), shapes[k].dtype.name
@@ -170,7 +179,7 @@ def _share_fields(layout: Fields, shapes: list[Any], values: list[list[Value]], 
 
 
 def _nest(paths: list[Any], leaves: list[Leaf]) -> dict[str, Any]:
-    """A dict of dicts of leaves by their paths in a tree."""
+    """Return a dict of dicts of leaves, arranged by their paths in a tree."""
     tree: dict[str, Any] = {}
     for path, leaf in zip(paths, leaves, strict=True):
         *outer, last = [str(getattr(key, "name", getattr(key, "key", getattr(key, "idx", "")))) for key in path]

@@ -1,5 +1,6 @@
-"""The options of an environment, declared once: what `Env`, `BatchedEnv`, every face, training settings and the command
-line take and pass on.
+"""The options of an environment, declared once.
+
+`Env`, `BatchedEnv`, every face, training settings and the command line all take these options and pass them on.
 
     Options(task="reach", scene="bimanual_psm", difficulty="hard")
 """

@@ -53,13 +53,15 @@ class PathTask(TipTask):
         return Start(PathGoal(self.along(row, time), row, time))
 
     def advance(self, goal: PathGoal, dt: float) -> PathGoal:
-        """The targets `dt` seconds further on their paths."""
+        """Return the goal with its targets `dt` seconds further on their paths."""
         time = goal.time + np.float32(dt)
         return PathGoal(self.along(goal.row, time), goal.row, time)
 
     def along(self, row: Array, time: Array) -> Array:
-        """Targets [arms, 3] at a time in s, or [..., arms, 3] at times [...]. At the end of a closed path its next
-        round begins; targets of an open one rest there."""
+        """Return the targets [arms, 3] at a time in s, or [..., arms, 3] at times [...].
+
+        At the end of a closed path, the targets start its next round. At the end of an open path, they rest.
+        """
         near, f = self._near(row, time)
         return (jnp.stack(spline.weights(f), axis=-1)[..., None, None] * near).sum(-3)
 
@@ -71,7 +73,11 @@ class PathTask(TipTask):
         return jnp.where(rests, 0.0, (slopes[..., None, None] * (near[1:] - near[:-1])).sum(-3))
 
     def _near(self, row: Array, time: Array) -> tuple[Array, Array]:
-        """The four control points [..., 4, arms, 3] of the segment at a time, and the share of it that has passed."""
+        """Return the control points near a time, and how much of the segment has passed.
+
+        The four control points [..., 4, arms, 3] are those of the segment at that time. The second result is the share
+        of the segment that has passed, from 0 to 1.
+        """
         u = time * np.float32(1 / KNOT)
         around = u - SEGMENTS * jnp.floor(u / np.float32(SEGMENTS))
         u = jnp.where(self.tables["closed"][row], around, jnp.minimum(u, np.float32(SEGMENTS)))
@@ -79,6 +85,8 @@ class PathTask(TipTask):
         return self.tables["paths"][row, k[..., None] + np.arange(4)], u - k.astype(jnp.float32)
 
     def goal_content(self, goal: Any) -> list[np.ndarray]:
-        """Return the paths from the table: what comes from them is computed on the device, with another last digit on
-        each."""
+        """Return the paths from the table.
+
+        The targets that follow from the paths are computed on the device, and their last digit differs between devices.
+        """
         return [self.tables["paths"][goal.row]]

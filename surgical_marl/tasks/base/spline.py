@@ -60,7 +60,8 @@ def through(points: np.ndarray, closed: bool) -> np.ndarray:
 def equal_steps(control: np.ndarray, steps: int, fine: int = 24) -> tuple[np.ndarray, np.ndarray]:
     """Points [..., steps + 1, 3] at equal arc length along curves, from one end to the other, and lengths [...].
 
-    Arc length is that of the polygon through `fine` points a segment."""
+    Arc length is that of the polygon through `fine` points a segment.
+    """
     n = control.shape[-2] - 3
     u, shares = np.linspace(0, n, fine * n + 1), np.linspace(0, 1, steps + 1)
     ways = np.linalg.norm(np.diff(evaluate(control, u), axis=-2), axis=-1)
@@ -71,7 +72,7 @@ def equal_steps(control: np.ndarray, steps: int, fine: int = 24) -> tuple[np.nda
 
 
 def curvature(control: np.ndarray, fine: int = 4) -> np.ndarray:
-    """The greatest curvature, 1/m, [...], of `fine` points a segment."""
+    """Return the greatest curvature of each curve, 1/m, [...], at `fine` points a segment."""
     curve, u = _curve(control), np.arange(0, control.shape[-2] - 3, 1 / fine)
     first, second = curve(u, 1), curve(u, 2)
     dot = lambda a, b: np.einsum("...i,...i", a, b)  # noqa: E731

@@ -197,8 +197,10 @@ class Task:
         raise NotImplementedError
 
     def goal_content(self, goal: Any) -> list[np.ndarray]:
-        """Return the numbers that say what N episodes are after, [N, ...] each: what an evaluation's hash is made
-        of."""
+        """Return the numbers that say what the goals of N episodes are, [N, ...] each.
+
+        The hash of an evaluation is made from these numbers.
+        """
         return [np.asarray(value) for _, value in sorted(vars(goal).items())]
 
 

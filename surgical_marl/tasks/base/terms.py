@@ -75,8 +75,11 @@ def arm_terms(scene: Scene, agent: str) -> dict[str, Term]:
 
 
 def picture_terms(scene: Scene, agent: str) -> dict[str, Picture]:
-    """Return the pictures that any agent of a scene may observe: `image`, `image_right`, `depth` and `depth_right` of
-    its own endoscope, or else of the scene's first; those of any endoscope as `<its agent>/image` and so on."""
+    """Return the pictures that an agent of a scene may observe, by name.
+
+    `image`, `image_right`, `depth` and `depth_right` are of the agent's own endoscope; if it has none, they are of the
+    scene's first. The pictures of any endoscope are there too, as `<its agent>/image` and so on.
+    """
     cameras = [name for name, mount in scene.mounts.items() if mount.arm.camera is not None]
     own = agent if agent in cameras else next(iter(cameras), None)
     found: dict[str, Picture] = {}

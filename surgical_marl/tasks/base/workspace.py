@@ -160,8 +160,16 @@ def _away(rng: np.random.Generator, arm: Arm, q: np.ndarray) -> np.ndarray:
 
 
 def _reach(scene: Scene, targets: np.ndarray, time: float = TIME) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Joint positions [N, n] of each agent at its targets [N, arms, 3], and whether all get there from home, in a time
-    in s, [N]."""
+    """Return the joint positions at targets, and whether all agents get there from home in time.
+
+    Args:
+        scene: the scene of the agents.
+        targets: [N, arms, 3], each in its arm's base frame, m.
+        time: how long the way from home may take, s.
+
+    Returns:
+        Joint positions [N, n] of each agent at its targets, and [N] bool: whether all agents get to theirs in `time`.
+    """
     good, goals = np.ones(len(targets), dtype=bool), {}
     for i, agent in enumerate(scene.agents):
         arm = scene.mounts[agent].arm
