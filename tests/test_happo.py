@@ -14,6 +14,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from surgical_marl.learning import train
 from surgical_marl.learning.algorithms.happo import HAPPO
 from surgical_marl.policies.policy import load_actor, load_policy
 from surgical_marl.policies.weights import write_weights
@@ -174,6 +175,13 @@ def test_orders_are_random_and_go_on_from_a_checkpoint() -> None:
     assert [first.order() for _ in range(20)] == [third.order() for _ in range(20)]
 
 
+@pytest.fixture
+def fakes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Undo what `run` patches, once a test is over."""
+    monkeypatch.setattr(train, "make_env", train.make_env)
+
+
+@pytest.mark.usefixtures("fakes")
 def test_a_run_resumes_bit_for_bit(tmp_path: Path) -> None:
     settings = replace(SMALL, algo="happo")
     run(settings, tmp_path / "whole")
@@ -182,6 +190,7 @@ def test_a_run_resumes_bit_for_bit(tmp_path: Path) -> None:
     assert same_state(tmp_path / "whole", tmp_path / "half")
 
 
+@pytest.mark.usefixtures("fakes")
 def test_a_policy_of_own_networks_loads_without_its_algorithm(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     run(replace(SMALL, algo="happo", iterations=1), folder)
