@@ -5,12 +5,13 @@ from __future__ import annotations
 import importlib.util
 import sys
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol, get_args
 
 from surgical_marl.engines.stepper import Stepper
 
-ENGINES = ("auto", "fused", "mjx")
-DEVICES = ("auto", "cpu", "cuda")
+EngineName = Literal["auto", "fused", "mjx"]
+DeviceName = Literal["auto", "cpu", "cuda"]
+ENGINES, DEVICES = get_args(EngineName), get_args(DeviceName)
 
 
 class Engine(Protocol):

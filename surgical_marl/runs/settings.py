@@ -11,6 +11,7 @@ from typing import Any, ClassVar, Literal, get_type_hints
 import yaml
 
 from surgical_marl.content import find, list_configs
+from surgical_marl.engines.choose import DeviceName, EngineName
 from surgical_marl.plugins.algorithms import ALGORITHMS
 from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.runtime import has_cuda
@@ -74,8 +75,8 @@ class Settings(Options):
     """
 
     algo: str = "mappo"
-    engine: Literal["auto", "mjx", "fused"] = "auto"
-    device: Literal["auto", "cpu", "cuda"] = "auto"
+    engine: EngineName = "auto"
+    device: DeviceName = "auto"
     precision: Literal["float32", "tf32", "bfloat16"] = "bfloat16"
     seed: int = number(0, 0, 2**31 - 1)
     num_envs: int = number(4096, 1, 2**24)
