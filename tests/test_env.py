@@ -14,6 +14,7 @@ from surgical_marl import list_scenes
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.physics.simulator import Physics
 from surgical_marl.scenes.timing import DECIMATION, TIMESTEP
+from tests.helpers.actions import random_actions
 
 SCENES = ("psm", "bimanual_psm")
 
@@ -21,13 +22,6 @@ SCENES = ("psm", "bimanual_psm")
 @cache
 def batched(scene: str = "bimanual_psm", num_envs: int = 4, max_steps: int = 25) -> BatchedEnv:
     return BatchedEnv("reach", scene, num_envs=num_envs, max_steps=max_steps)
-
-
-def random_actions(env: BatchedEnv, rng: np.random.Generator) -> dict[str, np.ndarray]:
-    return {
-        agent: rng.uniform(-1, 1, (env.num_envs, *env.action_space(agent).shape)).astype(np.float32)
-        for agent in env.agents
-    }
 
 
 def host_data(env: BatchedEnv, index: int = 0) -> mujoco.MjData:

@@ -30,9 +30,9 @@ from surgical_marl.policies.policy import load_policy
 from surgical_marl.runs.folder import read_origin
 from surgical_marl.runs.settings import NetworkSettings, PPOSettings, Settings
 from tests.helpers.fake_env import FakeEnv
+from tests.helpers.runs import COUNTS, SIZES
 
 ROOT = Path(__file__).parents[1]
-COUNTS, SIZES = {"psm": 2, "ecm": 1}, {"psm": 3, "ecm": 2}
 SMALL = Settings(
     scene="trimanual_psm_ecm",
     num_envs=16,

@@ -26,6 +26,7 @@ from surgical_marl.tasks.base import spline
 from surgical_marl.tasks.base.paths import KNOT, SEGMENTS
 from surgical_marl.tasks.base.task import APPROACH, PRECISION
 from surgical_marl.tasks.base.world import World
+from tests.helpers.actions import random_actions
 
 # match_image, whose observations are pictures, has tests of its own
 TASKS, SCENES = [task for task in sm.list_tasks() if task != "match_image"], sm.list_scenes()
@@ -41,13 +42,6 @@ CASES = [
 @cache
 def batched(task: str, scene: str, num_envs: int = 50) -> BatchedEnv:
     return BatchedEnv(task, scene, num_envs=num_envs)
-
-
-def random_actions(env: BatchedEnv, rng: np.random.Generator) -> dict[str, np.ndarray]:
-    return {
-        agent: rng.uniform(-1, 1, (env.num_envs, *env.action_space(agent).shape)).astype(np.float32)
-        for agent in env.agents
-    }
 
 
 @pytest.mark.parametrize(("task", "scene"), CASES)
