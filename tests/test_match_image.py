@@ -19,6 +19,7 @@ from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.envs.env import Env
 from surgical_marl.tasks.base.task import FAR
 from surgical_marl.vision.endoscope import SIZE, Endoscope
+from tests.helpers.actions import random_actions
 
 SCENES = ("ecm", "trimanual_psm_ecm")
 COUNT, STEPS = 3, 4
@@ -27,10 +28,6 @@ COUNT, STEPS = 3, 4
 @cache
 def batched(scene: str = "ecm", arrays: str = "numpy", engine: str = "fused") -> BatchedEnv:
     return BatchedEnv("match_image", scene, num_envs=COUNT, max_steps=STEPS, arrays=arrays, engine=engine)
-
-
-def random_actions(env: BatchedEnv, rng: np.random.Generator) -> dict[str, np.ndarray]:
-    return {a: rng.uniform(-1, 1, (COUNT, *(env.action_space(a).shape or ()))).astype(np.float32) for a in env.agents}
 
 
 def hidden(env: BatchedEnv) -> np.ndarray:
