@@ -75,11 +75,12 @@ class Pairs:
     def closest(self, geom_xpos: Array, geom_xmat: Array) -> Closest:
         """Return where the pairs are closest, from positions [ngeom, 3] and frames [ngeom, 3, 3] of all geoms."""
         one, other = self._capsules(geom_xpos, geom_xmat)
-        along, gap = axis_gap(one, other)
+        where, gap = axis_gap(one, other)
         length = jnp.sqrt(jnp.maximum(jnp.sum(gap * gap, -1), 1e-18))
         normal = gap / length[:, None]
         distance = length - (one.radius + other.radius)
-        point = one.centre + along[:, None] * one.axis + (one.radius + distance / 2)[:, None] * normal
+        segment = one.segment()
+        point = segment.start + where[:, None] * segment.extent + (one.radius + distance / 2)[:, None] * normal
         return Closest(distance, point, normal)
 
     def _capsules(self, geom_xpos: Array, geom_xmat: Array) -> tuple[Capsule, Capsule]:

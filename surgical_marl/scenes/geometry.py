@@ -30,6 +30,29 @@ class Capsule(NamedTuple):
         centre, axis = ((rotation @ vector[..., None])[..., 0] for vector in (self.centre, self.axis))
         return Capsule(centre + position, axis, self.half, self.radius)
 
+    def segment(self) -> Segment:
+        """Return the capsule's segment, in the same batches."""
+        xp = self.axis.__array_namespace__()
+        half = xp.asarray(self.half, dtype=self.axis.dtype)
+        per_length = xp.where(half > 0, 0.5 / xp.maximum(half, xp.finfo(half.dtype).tiny), 0.0)
+        start = self.centre - half[..., None] * self.axis
+        return Segment(start, 2 * half[..., None] * self.axis, per_length[..., None] * self.axis, 2 * half, per_length)
+
+
+class Segment(NamedTuple):
+    """The segment of a capsule. Of a sphere, which has none, all but the start is zero."""
+
+    start: Any
+    """Where it begins, m, [..., 3]."""
+    extent: Any
+    """The way from its start to its end, m, [..., 3]."""
+    dual: Any
+    """The vector that turns a way into its share of the segment's length by a dot product, 1/m, [..., 3]."""
+    length: Any
+    """m, [...]."""
+    per_length: Any
+    """1 / length, 1/m, [...]."""
+
 
 def capsule_distance(one: Capsule, other: Capsule) -> Any:
     """Return the signed distance of two capsules, m, [...]; negative where they overlap."""
@@ -44,18 +67,25 @@ def axis_gap(one: Capsule, other: Capsule) -> tuple[Any, Any]:
     The closest points of the two lines are clamped to one segment and then to the other (C. Ericson, "Real-Time
     Collision Detection", 2005, section 5.1.9). Of parallel segments any closest points may be found.
 
+    Positions along a segment are shares of its length: a GPU clamps a number to 0 and 1 in the instruction that
+    computes it.
+
     Returns:
-        How far along its axis the point of the first is from its centre, m, [...], and the vector from there to the
-        point of the second, m, [..., 3].
+        Where on its segment the point of the first is, from 0 at the start to 1 at the end, [...], and the vector from
+        there to the point of the second, m, [..., 3].
     """
-    between = one.centre - other.centre
+    own, its = one.segment(), other.segment()
+    between = own.start - its.start
     xp = between.__array_namespace__()
-    b, d, e = (xp.sum(x * y, -1) for x, y in ((one.axis, other.axis), (one.axis, between), (other.axis, between)))
-    parallel = 8 * xp.finfo(between.dtype).eps  # below this 1 - b^2 is rounding
-    s = xp.clip((b * e - d) / xp.maximum(1 - b * b, parallel), -one.half, one.half)
-    t = xp.clip(e + b * s, -other.half, other.half)
-    s = xp.clip(b * t - d, -one.half, one.half)
-    return s, t[..., None] * other.axis - s[..., None] * one.axis - between
+    # parallel capsules of a body have one axis: by its cosines, and not by extents, they share the root's denominator
+    cosine = xp.sum(one.axis * other.axis, -1)
+    parallel = 8 * xp.finfo(between.dtype).eps  # below this the squared sine is rounding
+    b, back = cosine * (its.length * own.per_length), cosine * (own.length * its.per_length)
+    d, e = xp.sum(own.dual * between, -1), xp.sum(its.dual * between, -1)
+    s = xp.clip((b * e - d) / xp.maximum(1 - cosine * cosine, parallel), 0.0, 1.0)
+    t = xp.clip(e + back * s, 0.0, 1.0)
+    s = xp.clip(b * t - d, 0.0, 1.0)
+    return s, t[..., None] * its.extent - s[..., None] * own.extent - between
 
 
 def link_capsule(model: mujoco.MjModel, geom: int) -> Capsule:

@@ -180,8 +180,8 @@ def _descend(limbs: tuple[Limb, Limb], q: np.ndarray, near: float) -> bool:
             return True
         normal = gap / length[:, None]
         slopes = [
-            sign * np.einsum("kj,knj->kn", normal, _at(capsule, where, by_joint))
-            for sign, capsule, where, by_joint in ((-1, one, here, speeds), (1, other, there, its_speeds))
+            sign * np.einsum("kj,knj->kn", normal, _at(where, by_joint))
+            for sign, where, by_joint in ((-1, here, speeds), (1, there, its_speeds))
         ]
         slope = np.concatenate(slopes, axis=1)
         slope[((q <= low) & (slope > 0)) | ((q >= high) & (slope < 0))] = 0.0
@@ -190,12 +190,12 @@ def _descend(limbs: tuple[Limb, Limb], q: np.ndarray, near: float) -> bool:
     return False
 
 
-def _at(capsule: Capsule, where: np.ndarray, speeds: np.ndarray) -> np.ndarray:
-    """Return the speeds [k, n, 3] of points on a capsule's axis, from those of its ends [k, n, 2, 3].
+def _at(where: np.ndarray, speeds: np.ndarray) -> np.ndarray:
+    """Return the speeds [k, n, 3] of points on a capsule's segment, from those of its ends [k, n, 2, 3].
 
-    `where` [k] is how far along the axis the points are, in m from its middle.
+    `where` [k] is the point's share of the way from the first end to the second.
     """
-    share = (0.5 + 0.5 * where / max(capsule.half, 1e-9))[:, None, None]
+    share = where[:, None, None]
     return (1 - share) * speeds[:, :, 0] + share * speeds[:, :, 1]
 
 
