@@ -16,12 +16,12 @@ from surgical_marl import machine
 from surgical_marl.bench import contenders, render, report, sim
 from surgical_marl.bench.clock import race
 from surgical_marl.bench.contenders import Contender
-from surgical_marl.bench.course import HOLD, LAPS, MOTIONS, full_state, make_course
+from surgical_marl.bench.course import HOLD, LAPS, full_state, make_course
 from surgical_marl.bench.physics import PhysicsAlone
 from surgical_marl.bench.render import measure_rendering
 from surgical_marl.bench.report import QUOTED, draw, ratios, sweep_table
 from surgical_marl.bench.sim import Point, Speed, measure, sweep
-from surgical_marl.bench.workload import Workload
+from surgical_marl.bench.workload import MOTIONS, Workload
 from surgical_marl.cli.main import main
 from surgical_marl.engines.choose import make_engine
 from surgical_marl.envs.env import Env
@@ -159,7 +159,7 @@ def test_a_sweep_that_is_stopped_leaves_its_picture(
 
     monkeypatch.setattr(report, "sweep", stopped)
     with pytest.raises(KeyboardInterrupt):
-        report.run({"device": "cpu"}, ("fused",), sweeping=True, out=tmp_path / "sweep.png")
+        report.run(Workload(device="cpu"), ("fused",), sweeping=True, out=tmp_path / "sweep.png")
     assert (tmp_path / "sweep.png").read_bytes().startswith(b"\x89PNG")
 
 

@@ -9,22 +9,23 @@ import os
 import tempfile
 from argparse import Namespace
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING
 
+from surgical_marl.bench.workload import NUM_ENVS, Workload
 from surgical_marl.content import find, unknown
 from surgical_marl.plugins.tasks import list_tasks
-
-if TYPE_CHECKING:
-    from surgical_marl.runs.settings import Settings
+from surgical_marl.runs.settings import Settings
 
 
 def run(arguments: Namespace) -> int:
-    """One benchmark; returns the exit code. `arguments` are those of its parser in `surgical_marl/cli/main.py`."""
+    """One benchmark; returns the exit code. `arguments` are those of its parser in `surgical_marl/cli/main.py`.
+
+    `arguments.given` are the options of what is measured, as far as flags gave them.
+    """
     find("scenes", arguments.scene)
     if arguments.kind == "render":
         from surgical_marl.bench.render import run
 
-        print(run(arguments.scene, arguments.num_envs, arguments.device, arguments.json))
+        print(run(arguments.scene, arguments.num_envs, arguments.device or "auto", arguments.json))
         return 0
     if arguments.task not in list_tasks():
         raise unknown("task", arguments.task, list_tasks())
@@ -46,14 +47,13 @@ def _sim(arguments: Namespace) -> int:
     from surgical_marl.bench.report import run
 
     engines = ENGINES if arguments.engine == "all" else (arguments.engine,)
-    keys = ("task", "scene", "num_envs", "device", "decimation", "motion")
-    print(run({k: getattr(arguments, k) for k in keys}, engines, arguments.sweep, arguments.json, arguments.out))
+    workload = Workload(task=arguments.task, scene=arguments.scene, **arguments.given)
+    print(run(workload, engines, arguments.sweep, arguments.json, arguments.out))
     return 0
 
 
 def _train(arguments: Namespace) -> int:
     from surgical_marl.bench.learning import run
-    from surgical_marl.bench.workload import NUM_ENVS
 
     print(run(_settings(arguments, NUM_ENVS), arguments.json))
     return 0
@@ -80,17 +80,12 @@ def _settings(arguments: Namespace, num_envs: Mapping[str, int] | None = None) -
     They come from `configs/`, then from `num_envs`, then from the flags, and last from the `key=value` overrides. What
     comes later takes precedence. `num_envs` gives numbers of environments by device, "cpu" or "cuda".
     """
-    from surgical_marl.bench.workload import Workload
     from surgical_marl.runs.settings import load_config
 
-    where = Workload(device=arguments.device).where  # says so if there is no such device
-    keys = ("num_envs", "algo", "seed", "engine")
-    given = [
-        ("num_envs", (num_envs or {}).get(where)),
-        ("device", where),
-        *((key, getattr(arguments, key)) for key in keys),
-    ]
-    flags = [f"{key}={value}" for key, value in given if value is not None]
+    where = Workload(device=arguments.device or "auto").where  # says so if there is no such device
+    values = {"num_envs": num_envs[where]} if num_envs else {}
+    values |= arguments.given | {"device": where}
+    flags = [f"{key}={value}" for key, value in values.items()]
     return load_config(arguments.task, arguments.scene, [*flags, *arguments.overrides])
 
 

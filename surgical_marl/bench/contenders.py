@@ -70,8 +70,7 @@ def _batched(name: str, workload: Workload, course: Course) -> Contender:
     actions = [{agent: give(tile(rows, count)) for agent, rows in lap.items()} for lap in course.actions]
 
     start = time.perf_counter()
-    batch = BatchedEnv(workload.task, workload.scene, num_envs=count, engine=name, device=workload.where,
-                       decimation=workload.decimation, arrays=library)  # fmt: skip
+    batch = BatchedEnv(**workload.of_environment(), num_envs=count, engine=name, device=workload.where, arrays=library)
     batch.reset(seed=0)
     batch.step(actions[0])
     _wait(batch.engine)
@@ -117,7 +116,7 @@ def _mujoco(workload: Workload, course: Course) -> Contender:
     state = full_state(tile(course.qpos, count), tile(course.qvel, count))
     control = tile(course.commands.astype(float).repeat(HOLD, 0).swapaxes(0, 1), count)
     start = time.perf_counter()
-    model = load_scene(workload.scene).model
+    model = load_scene(workload.scene, workload.control).model
     data, pool = [mujoco.MjData(model) for _ in range(threads)], rollout.Rollout(nthread=threads)
     pool.rollout(model, data, state[:1], control[:1, :1])
     compile_s = time.perf_counter() - start

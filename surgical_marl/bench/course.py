@@ -19,10 +19,9 @@ LAPS = 4
 """Actions after which a course begins again. The last half takes back what the first did, so nothing drifts away."""
 DISTINCT = 256
 """Environments that differ; more of them repeat these, fewer are the first of these."""
-MOTIONS = ("random", "rough")
-"""What came before the start. random: a new action every control step, as when training begins. rough: one action all
-the time, so that arms cross their ranges, and each other's way."""
-_AWAY = {"random": 50, "rough": 25}  # control steps, 1 and 0.5 s
+_AWAY = {"random": 50, "rough": 25}
+"""Control steps before the start, 1 and 0.5 s. random: a new action every control step, as when training begins. rough:
+one action all the time, so that arms cross their ranges, and each other's way."""
 
 
 class Course(NamedTuple):
@@ -39,7 +38,7 @@ class Course(NamedTuple):
     """Share of the environments in which something touches at the start, from 0 to 1."""
 
 
-def make_course(scene: Scene, motion: str = MOTIONS[0], seed: int = 0) -> Course:
+def make_course(scene: Scene, motion: str = "random", seed: int = 0) -> Course:
     """Draw a course: every environment moves from home by random actions of its own, then to and fro.
 
     C MuJoCo moves the arms. The states therefore come from none of this package's own engines.

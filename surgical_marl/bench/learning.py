@@ -68,7 +68,7 @@ def measure(settings: Settings, seconds: float = clock.SECONDS, repeats: int = c
     with in_memory(settings.num_envs):
         learning = _learn(settings, seconds, repeats)
     machine.restart_peak()  # gives the training's memory back
-    workload = Workload(settings.task, settings.scene, settings.num_envs, learning["device"], learning["decimation"])
+    workload = Workload(**settings.of_environment(), num_envs=settings.num_envs, device=learning["device"])
     found, _ = sim.measure(workload, (learning.pop("engine"),), seconds=seconds, repeats=repeats)
     (alone,) = found.values()
     return Speed(**{**asdict(alone), **learning})

@@ -31,14 +31,13 @@ _COLORS = {"fused": "#1f6f8b", "mjx": "#b23a48", "mujoco": "#7a7a7a"}
 
 
 def run(
-    settings: Mapping[str, Any],
+    workload: Workload,
     engines: Sequence[str],
     sweeping: bool = False,
     as_json: bool = False,
     out: Path | None = None,
 ) -> str:
-    """All of `surgical-marl bench sim`: the text of its table or JSON. `settings` are those of `Workload`."""
-    workload = Workload(**settings)
+    """All of `surgical-marl bench sim`: the text of its table or JSON."""
     if sweeping:
         points, title = [], f"{workload.task} on {workload.scene}; {describe_machine()}"
         for point in sweep(workload, engines):
@@ -48,7 +47,7 @@ def run(
         if not points:
             raise ValueError(f"nothing to show: {', '.join(engines)} can't run here")
         return json.dumps(sweep_summary(workload, points)) if as_json else sweep_table(points)
-    course = make_course(load_scene(workload.scene), workload.motion)
+    course = make_course(load_scene(workload.scene, workload.control), workload.motion)
     speeds, left_out = measure(workload, engines, course)
     if as_json and len(engines) == 1:
         return json.dumps(asdict(speeds[engines[0]]))

@@ -18,6 +18,7 @@ from surgical_marl.bench import clock
 from surgical_marl.bench.contenders import ENGINES, MOST_ROLLED, Contender, prepare
 from surgical_marl.bench.course import Course, make_course
 from surgical_marl.bench.workload import Workload
+from surgical_marl.engines.choose import DeviceName
 from surgical_marl.scenes.load import load_scene
 from surgical_marl.scenes.timing import TIMESTEP
 
@@ -61,7 +62,7 @@ def measure(
         ValueError: the one engine asked for can't run here, or has no room.
     """
     contenders, left_out = _contenders(
-        workload, engines, course or make_course(load_scene(workload.scene), workload.motion)
+        workload, engines, course or make_course(load_scene(workload.scene, workload.control), workload.motion)
     )
     if not contenders:
         raise ValueError("; ".join(left_out.values()))
@@ -123,8 +124,10 @@ def sweep(
 
     An engine ends where the next number has no room or would take too long a step, and says so.
     """
-    course = make_course(load_scene(workload.scene), workload.motion)
-    devices = ("cuda", "cpu") if workload.device == "auto" and workload.where == "cuda" else (workload.where,)
+    course = make_course(load_scene(workload.scene, workload.control), workload.motion)
+    devices: list[DeviceName] = [workload.where]
+    if workload.device == "auto" and workload.where == "cuda":
+        devices.append("cpu")
     for device in devices:
         for name in engines:
             if name != "mujoco" or device == "cpu":  # it has no GPU to run on

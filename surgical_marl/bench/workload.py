@@ -3,50 +3,45 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
-from surgical_marl.bench.course import MOTIONS
-from surgical_marl.content import find, unknown
-from surgical_marl.engines.choose import DEVICES
-from surgical_marl.plugins.tasks import list_tasks
+from surgical_marl.content import find
+from surgical_marl.engines.choose import DeviceName
+from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.runtime import has_cuda
+from surgical_marl.tasks.base.options import Options, choice, choices, number
 
 NUM_ENVS = {"cpu": 4096, "cuda": 131072}
 """Environments on each device, unless told."""
+BENCHED = ("all", "fused", "mjx", "mujoco")
+"""What `bench sim` can time: this package's engines, and C MuJoCo."""
 
 
 @dataclass(frozen=True)
-class Workload:
+class Workload(Options):
     """So many environments of a task on a scene.
 
     Raises:
         ValueError: naming what is unknown, out of range or not there.
     """
 
-    task: str = "reach"
     scene: str = "psm"
-    num_envs: int | None = None
-    """`NUM_ENVS` of the device if None."""
-    device: str = "auto"
-    decimation: int = 1
-    """Physics steps an environment step."""
-    motion: str = MOTIONS[0]
+    decimation: int = number(1, 1, 1_000_000, "physics steps an environment step")
+    num_envs: int | None = number(None, 1, 2**24, "environments that run side by side (default: by the device)")
+    device: DeviceName = choice("auto", "where it runs")
+    motion: Literal["random", "rough"] = choice(
+        "random", "random: a new action every control step; rough: arms cross each other's way"
+    )
 
     def __post_init__(self) -> None:
-        if self.task not in list_tasks():
-            raise unknown("task", self.task, list_tasks())
+        super().__post_init__()
+        TASKS.check(self.task)
         find("scenes", self.scene)
-        if self.device not in DEVICES:
-            raise unknown("device", self.device, DEVICES)
-        if self.motion not in MOTIONS:
-            raise unknown("motion", self.motion, MOTIONS)
-        for name, value in (("num_envs", self.num_envs), ("decimation", self.decimation)):
-            if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < 1):
-                raise ValueError(f"{name} must be a whole number of at least 1, not {value!r}")
         if self.device == "cuda" and not has_cuda():
             raise ValueError("device 'cuda' is not there: PyTorch finds no CUDA device; the other is cpu")
 
     @property
-    def where(self) -> str:
+    def where(self) -> DeviceName:
         """The device, "cpu" or "cuda"."""
         return self.device if self.device != "auto" else "cuda" if has_cuda() else "cpu"
 
@@ -54,3 +49,7 @@ class Workload:
     def count(self) -> int:
         """Environments."""
         return self.num_envs or NUM_ENVS[self.where]
+
+
+MOTIONS = choices("motion", Workload)
+"""What came before the start of a course (`surgical_marl/bench/course.py`)."""

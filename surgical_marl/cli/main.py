@@ -8,16 +8,18 @@ import argparse
 import os
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
+from surgical_marl.bench.workload import BENCHED, Workload
+from surgical_marl.cli.flags import add_flags, flagged, given, one_of, whole
 from surgical_marl.content import BASELINES, find, list_arms, list_policies, list_scenes, unknown
 from surgical_marl.plugins.algorithms import list_algorithms
 from surgical_marl.plugins.tasks import list_tasks
 from surgical_marl.runs.settings import Settings
 from surgical_marl.runtime import defer_compiler
-from surgical_marl.tasks.base.options import choices
+from surgical_marl.tasks.base.options import Options, choices
 
 _LISTS = {
     "tasks": list_tasks,
@@ -28,25 +30,6 @@ _LISTS = {
 }
 
 _CONTROL = choices("control")
-_DEVICES = choices("device", Settings)
-_ENGINES = choices("engine", Settings)
-_BENCHED = ("all", "fused", "mjx", "mujoco")
-_MOTIONS = ("random", "rough")
-
-_ALGO = "learning algorithm (see `list algorithms`)"
-
-# Flags of `train` that are short for `key=value`: key, good values or a placeholder, help.
-_SETTINGS: tuple[tuple[str, str | tuple[str, ...], str], ...] = (
-    ("algo", "NAME", _ALGO),
-    ("num_envs", "N", "environments that run side by side"),
-    ("iterations", "K", "rounds of acting and learning"),
-    ("seed", "S", "seed of everything random"),
-    ("engine", _ENGINES, "what runs the physics"),
-    ("device", _DEVICES, "where it runs"),
-    ("control", _CONTROL, "what an action commands"),
-    ("difficulty", "LEVEL", "how far, how fast, how crowded: easy, default or hard, or a level of the task's own"),
-    ("start", choices("start"), "postures that episodes begin with"),
-)
 _TAKE_SETTINGS = ("train", "bench train", "bench solve")
 """Commands that take `key=value`."""
 
@@ -114,9 +97,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     train.add_argument("task", nargs="?", metavar="TASK", help=f"one of: {', '.join(list_tasks())}")
     train.add_argument("--scene", help="a name (see `list scenes`) or a .yaml file")
-    for key, good, text in _SETTINGS:
-        flag, check = f"--{key.replace('_', '-')}", str if isinstance(good, str) else _one_of(good)
-        train.add_argument(flag, type=check, metavar=good if isinstance(good, str) else "|".join(good), help=text)
+    add_flags(train, Settings)
     train.add_argument("--out", type=Path, metavar="DIR", help="run folder (default: runs/...)")
     train.add_argument(
         "--resume", type=Path, metavar="DIR", help="run folder to go on with, or to start in with TASK and --scene"
@@ -128,10 +109,8 @@ def _parser() -> argparse.ArgumentParser:
     evaluate.add_argument("policies", nargs="+", metavar="RUN_OR_POLICY", help=what)
     evaluate.add_argument("--task", help="of a policy that is not trained")
     evaluate.add_argument("--scene", help="likewise: a name (see `list scenes`) or a .yaml file")
-    evaluate.add_argument("--control", type=_one_of(_CONTROL), metavar="|".join(_CONTROL), help="likewise")
-    evaluate.add_argument("--difficulty", metavar="LEVEL", help="of the goals (default: the policy's own)")
-    for key, text in (("start", "default: the policy's own"), ("goals", "default: held_out")):
-        evaluate.add_argument(f"--{key}", type=_one_of(choices(key)), metavar="|".join(choices(key)), help=text)
+    add_flags(evaluate, Options, ("control", "difficulty", "start"), default="the policy's own")
+    add_flags(evaluate, Options, ("goals",), default="held_out")
     evaluate.add_argument("--episodes", type=whole(1, 1_000_000), default=200, metavar="N")
     evaluate.add_argument("--seed", type=whole(0), default=0, metavar="S")
     evaluate.add_argument("--against", type=Path, metavar="FILE.json", help="an older result to compare with")
@@ -141,7 +120,7 @@ def _parser() -> argparse.ArgumentParser:
     evaluate.set_defaults(command=_eval, name="eval")
 
     names = commands.add_parser("list", help="list tasks, scenes, arms, algorithms and policies")
-    names.add_argument("kind", nargs="?", type=_one_of(tuple(_LISTS)), metavar="|".join(_LISTS))
+    names.add_argument("kind", nargs="?", type=one_of(tuple(_LISTS)), metavar="|".join(_LISTS))
     names.add_argument("-v", "--verbose", action="store_true", help="what each one is")
     names.set_defaults(command=_list, name="list")
 
@@ -153,9 +132,9 @@ def _parser() -> argparse.ArgumentParser:
     kinds = export.add_subparsers(required=True, metavar="{scene,policy}")
     scene = kinds.add_parser("scene", help="a scene as one file for MuJoCo")
     scene.add_argument("source", metavar="NAME_OR_PATH", help="a scene's name or .yaml file")
-    scene.add_argument("--format", type=_one_of(("mjcf",)), default="mjcf", metavar="mjcf", help="MuJoCo's XML")
+    scene.add_argument("--format", type=one_of(("mjcf",)), default="mjcf", metavar="mjcf", help="MuJoCo's XML")
     scene.add_argument("--out", type=Path, metavar="FILE", help="default: <scene>.xml in the current folder")
-    scene.add_argument("--control", type=_one_of(_CONTROL), default=_CONTROL[0], metavar="|".join(_CONTROL))
+    scene.add_argument("--control", type=one_of(_CONTROL), default=_CONTROL[0], metavar="|".join(_CONTROL))
     scene.set_defaults(command=_export_scene, name="export scene")
     policy = kinds.add_parser("policy", help="a trained policy as a folder: ONNX, safetensors, evaluation, card, clip")
     policy.add_argument(
@@ -168,17 +147,13 @@ def _parser() -> argparse.ArgumentParser:
 
     bench = commands.add_parser("bench", help="measure how fast this machine simulates, learns and draws")
     kinds = bench.add_subparsers(required=True, metavar="{sim,train,solve,render}")
-    sim = _bench_parser(kinds, "sim", "steps/s of the engines and of C MuJoCo", _BENCHED)
-    sim.add_argument("--decimation", type=whole(1), default=1, metavar="K", help="physics steps an environment step")
-    sim.add_argument("--motion", type=_one_of(_MOTIONS), default=_MOTIONS[0], metavar="|".join(_MOTIONS),
-                     help="random: a new action every control step; rough: arms cross each other's way")  # fmt: skip
+    sim = _bench_parser(kinds, "sim", "steps/s of the engines and of C MuJoCo", Workload)
+    sim.add_argument("--engine", type=one_of(BENCHED), default=BENCHED[0], metavar="|".join(BENCHED))
     sim.add_argument("--sweep", action="store_true", help="from 1 to 4 million environments, as far as memory goes")
     sim.add_argument("--out", type=Path, metavar="FILE.png", help="picture of a sweep")
     for kind, what in (("train", "steps/s with learning"), ("solve", "seconds until a policy is good")):
-        learns = _bench_parser(kinds, kind, what, _ENGINES)
+        learns = _bench_parser(kinds, kind, what, Settings)
         learns.usage = "%(prog)s [options] [key=value ...]"
-        learns.add_argument("--algo", metavar="NAME", help=_ALGO)
-        learns.add_argument("--seed", type=whole(0), metavar="S", help="seed of everything random")
     learns.add_argument("--success", type=float, default=0.95, metavar="SHARE", help="wanted within 2 mm")
     learns.add_argument("--collisions", type=float, default=0.01, metavar="SHARE", help="of episodes, to stay below")
     learns.add_argument("--limit", type=float, default=600.0, metavar="SECONDS", help="then it is given up")
@@ -186,26 +161,24 @@ def _parser() -> argparse.ArgumentParser:
     draws = kinds.add_parser("render", help="pictures/s of the endoscope")
     draws.add_argument("--scene", default="ecm", help="a scene with an endoscope, or a .yaml file")
     draws.add_argument("--num-envs", type=whole(1), metavar="N", help="default: 64 on a CPU, 8192 on a GPU")
-    draws.add_argument("--device", type=_one_of(_DEVICES), default="auto", metavar="|".join(_DEVICES))
+    add_flags(draws, Settings, ("device",))
     draws.add_argument("--json", action="store_true", help="one JSON object instead of a table")
-    draws.set_defaults(command=_bench, name="bench render", kind="render")
+    draws.set_defaults(command=_bench, name="bench render", kind="render", of=Settings)
 
     doctor = commands.add_parser("doctor", help="check this machine and this installation")
     doctor.set_defaults(command=_doctor, name="doctor")
     return parser
 
 
-def _bench_parser(kinds: Any, kind: str, what: str, engines: Sequence[str]) -> argparse.ArgumentParser:
-    """Return the parser of one benchmark, with the arguments that all benchmarks take."""
+def _bench_parser(kinds: Any, kind: str, what: str, of: type) -> argparse.ArgumentParser:
+    """Return the parser of one benchmark: the flags of what it measures, and those that all benchmarks take."""
     parser: argparse.ArgumentParser = kinds.add_parser(kind, help=what)
     parser.add_argument("--task", default="reach", help=f"one of: {', '.join(list_tasks())}")
     parser.add_argument("--scene", default="psm", help="a name (see `list scenes`) or a .yaml file")
-    parser.add_argument("--num-envs", type=whole(1), metavar="N", help="default: by the device (docs/benchmarks.md)")
-    parser.add_argument("--engine", type=_one_of(engines), default=engines[0], metavar="|".join(engines))
-    parser.add_argument("--device", type=_one_of(_DEVICES), default="auto", metavar="|".join(_DEVICES))
+    add_flags(parser, of, [name for name in flagged(of) if name != "iterations"])
     parser.add_argument("--cold", action="store_true", help="start without caches")
     parser.add_argument("--json", action="store_true", help="one JSON object instead of a table")
-    parser.set_defaults(command=_bench, kind=kind, name=f"bench {kind}")
+    parser.set_defaults(command=_bench, kind=kind, name=f"bench {kind}", of=of)
     return parser
 
 
@@ -263,6 +236,7 @@ def _export_scene(arguments: argparse.Namespace) -> None:
 def _bench(arguments: argparse.Namespace) -> int:
     from surgical_marl.bench.command import run
 
+    arguments.given = given(arguments, arguments.of)
     return run(arguments)
 
 
@@ -280,8 +254,7 @@ def _train(arguments: argparse.Namespace) -> None:
         find("scenes", arguments.scene)
     if not arguments.resume and None in (arguments.task, arguments.scene):
         raise ValueError(f"train needs TASK ({', '.join(list_tasks())}) and --scene ({', '.join(list_scenes())})")
-    given = ((key, getattr(arguments, key)) for key, _, _ in _SETTINGS)
-    flags = [f"{key}={value}" for key, value in given if value is not None]
+    flags = [f"{key}={value}" for key, value in given(arguments, Settings).items()]
 
     from surgical_marl.learning.distributed import claim_gpu, is_first
     from surgical_marl.runs.folder import has_begun, read_settings
@@ -339,27 +312,6 @@ def _eval(arguments: argparse.Namespace) -> None:
 def _run_folder(settings: Any) -> Path:
     name = f"{settings.task}-{Path(settings.scene).stem}-{settings.algo}-seed{settings.seed}"
     return Path("runs") / f"{name}-{time.strftime('%Y%m%d-%H%M%S')}"
-
-
-def _one_of(good: Sequence[str]) -> Callable[[str], str]:
-    def check(text: str) -> str:
-        if text not in good:
-            raise argparse.ArgumentTypeError(str(unknown("choice", text, good)))
-        return text
-
-    return check
-
-
-def whole(least: int, most: int | None = None) -> Callable[[str], int]:
-    """Of `add_argument(type=...)`: a whole number within these."""
-    good = f"of {least} or more" if most is None else f"from {least} to {most}"
-
-    def check(text: str) -> int:
-        if not text.isdecimal() or int(text) < least or (most is not None and int(text) > most):
-            raise argparse.ArgumentTypeError(f"must be a whole number {good}, not {text!r}")
-        return int(text)
-
-    return check
 
 
 def _version() -> str:

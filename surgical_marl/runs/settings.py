@@ -15,7 +15,7 @@ from surgical_marl.engines.choose import DeviceName, EngineName
 from surgical_marl.plugins.algorithms import ALGORITHMS
 from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.runtime import has_cuda
-from surgical_marl.tasks.base.options import Checked, Options, as_mapping, number
+from surgical_marl.tasks.base.options import Checked, Options, as_mapping, choice, number
 
 
 @dataclass(frozen=True)
@@ -74,13 +74,13 @@ class Settings(Options):
     matrix products on a GPU; on a CPU it is always float32.
     """
 
-    algo: str = "mappo"
-    engine: EngineName = "auto"
-    device: DeviceName = "auto"
+    algo: str = choice("mappo", "learning algorithm (see `list algorithms`)")
+    engine: EngineName = choice("auto", "what runs the physics")
+    device: DeviceName = choice("auto", "where it runs")
     precision: Literal["float32", "tf32", "bfloat16"] = "bfloat16"
-    seed: int = number(0, 0, 2**31 - 1)
-    num_envs: int = number(4096, 1, 2**24)
-    iterations: int = number(500, 1, 10_000_000)
+    seed: int = number(0, 0, 2**31 - 1, "seed of everything random")
+    num_envs: int = number(4096, 1, 2**24, "environments that run side by side (default: by task and device)")
+    iterations: int = number(500, 1, 10_000_000, "rounds of acting and learning")
     steps_per_iteration: int = number(24, 1, 100_000)
     checkpoint_every: int = number(50, 1, 10_000_000)
     team_reward: bool = False

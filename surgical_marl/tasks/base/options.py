@@ -71,6 +71,10 @@ class Options(Checked):
     reward: Mapping[str, float] = field(default_factory=dict)
     observe: Mapping[str, Sequence[str]] = field(default_factory=dict)
 
+    def of_environment(self) -> dict[str, Any]:
+        """Return the environment's options by name, without what a subclass adds to them."""
+        return {item.name: getattr(self, item.name) for item in fields(Options)}
+
 
 def make_options(task: str, scene: str, options: Mapping[str, Any]) -> Options:
     """Return options from keyword arguments.
