@@ -40,7 +40,10 @@ def test_pictures_are_of_the_arms_and_of_the_hidden_posture(scene: str) -> None:
     """Over an episode's end: what is seen is the new state, the next episode begins at home with the next target."""
     env, rng = batched(scene), np.random.default_rng(0)
     eye = Endoscope(env.scene, COUNT)
-    observations, state, _ = env.reset(5)
+    observations, state, infos = env.reset(5)
+    first = observations["ecm_0"]
+    difference = np.abs(first["image"].astype(float) - first["target"]).mean((1, 2, 3))
+    np.testing.assert_allclose(infos["ecm_0"]["image_error"], difference, rtol=1e-5)
     camera = env.scene.qpos_index("ecm_0")
     for step in range(STEPS + 1):
         seen = observations["ecm_0"]

@@ -55,8 +55,13 @@ class Sight:
         return found
 
     def begin(self, found: dict[str, Any]) -> None:
-        """Put pictures into the observations of environments that have just been reset."""
+        """Put pictures into what is known of environments that have just been reset, and what is sensed in them."""
         seen = self._draw("")
+        sensed = {name: self._present(value) for name, value in self._env.task.sense(seen).items()}
+        found["infos"] = {
+            agent: {name: sensed.get(name, value) for name, value in info.items()}
+            for agent, info in found["infos"].items()
+        }
         for kind in ("observations", "final_observations"):
             found[kind] = self._with(found[kind], seen)
 

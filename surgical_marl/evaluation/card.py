@@ -95,7 +95,11 @@ def card(folder: Path, name: str) -> str:
 
 def _what(settings: Settings, name: str, folder: Path) -> str:
     scene, task = load_scene(settings.scene), TASKS.load(settings.task).summary().partition(": ")[2]
-    clip = f"\n[A clip of two episodes]({CLIP}): balls are the goals.\n" if (folder / CLIP).is_file() else ""
+    clip = (
+        f"\n[A clip of two episodes]({CLIP}) on held-out goals, which are the balls.\n"
+        if (folder / CLIP).is_file()
+        else ""
+    )
     return f"""# {name}
 
 Plays the task `{settings.task}` in the scene `{settings.scene}`: {task}

@@ -117,7 +117,7 @@ def _rank(result: dict[str, Any]) -> tuple[int, float, float]:
 
 
 def _fill(folder: Path, run: Path, settings: Settings, evaluation: dict[str, Any]) -> None:
-    env = make_env(read_settings(run, ["engine=auto", "device=auto"]), num_envs=1)
+    env = make_env(read_settings(run, ["engine=auto", "device=auto", "goals=held_out"]), num_envs=1)
     actor, layout = load_actor(run, env)
     write_weights(folder, actor)
     for name, model in actor.models.items():

@@ -179,7 +179,9 @@ class Task:
         return jnp.bool_(False)
 
     def sense(self, pictures: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-        """Return what `senses` names, [N] float32, from the pictures that agents see after a step.
+        """Return what `senses` names, [N] float32, from the pictures that agents see after a reset or a step.
+
+        A metric of the same name must be the number itself: a reset puts it into the infos as it is.
 
         Args:
             pictures: agent -> term -> torch tensor [N, H, W, C].
