@@ -1,4 +1,4 @@
-"""What is said of a shipped policy: its card (`README.md`) and its row in the table of all, both from its files."""
+"""Texts about a shipped policy, from its files: its card (`README.md`) and its row in the table of all policies."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ _HOLDS = {"below": operator.lt, "at least": operator.ge}
 def worst_median(result: Mapping[str, Any]) -> float | None:
     """Return the median error of the arm that has the largest one, in mm.
 
-    With this number, arms that only keep still can't hide the error of another arm. None in a task whose tool tips have
-    no targets.
+    Arms that only keep still can't hide the error of another arm in this number. Return None in a task whose tool tips
+    have no targets.
     """
     errors = (agent["median_error_mm"] for agent in result["agents"].values())
     return max((error for error in errors if error is not None), default=None)
@@ -53,7 +53,7 @@ def misses(result: Mapping[str, Any]) -> list[str]:
 
 
 def table() -> str:
-    """All policies that ship, in Markdown: what `surgical-marl list policies -v` prints."""
+    """Return the table of all shipped policies in Markdown, as `surgical-marl list policies -v` prints it."""
     rows = [_row(find("policies", name)) for name in list_policies()]
     widths = [max(map(len, column)) for column in zip(COLUMNS, *rows, strict=True)]
     lines = [COLUMNS, tuple("-" * width for width in widths), *rows]
@@ -95,14 +95,11 @@ def card(folder: Path, name: str) -> str:
 
 def _what(settings: Settings, name: str, folder: Path) -> str:
     scene, task = load_scene(settings.scene), TASKS.load(settings.task).summary().partition(": ")[2]
-    clip = (
-        f"\n[A clip of two episodes]({CLIP}) on held-out goals, which are the balls.\n"
-        if (folder / CLIP).is_file()
-        else ""
-    )
+    clip = f"\n[A video of two episodes]({CLIP}) on held-out goals. Balls mark the goals.\n"
+    clip = clip if (folder / CLIP).is_file() else ""
     return f"""# {name}
 
-Plays the task `{settings.task}` in the scene `{settings.scene}`: {task}
+This policy plays the task `{settings.task}` in the scene `{settings.scene}`. The task: {task}
 The scene: {scene.description}; agents {", ".join(f"`{agent}`" for agent in scene.agents)}.
 {clip}"""
 
@@ -121,18 +118,20 @@ def _how_well(result: Mapping[str, Any], name: str) -> str:
     goals = "the standard goal set" if is_standard(result) else "goal set"
     return f"""## How well
 
-`surgical-marl eval {name}` repeats this: {result["episodes"]} episodes on {goals} `{result["goal_set"]:.12}`, without
-exploration noise. In brackets the 95 % interval: of these weights over episodes, of the seeds over both
-([docs/evaluation.md](../../docs/evaluation.md)). `{EVALUATION}` has all metrics, of each arm and of each seed.
+`surgical-marl eval {name}` repeats this evaluation: {result["episodes"]} episodes on {goals}
+`{result["goal_set"]:.12}`, without exploration noise. Brackets hold 95 % intervals: over episodes for these weights,
+over episodes and training seeds for all seeds ([docs/evaluation.md](../../docs/evaluation.md)). `{EVALUATION}` has
+all metrics, of each arm and of each seed.
 
 {chr(10).join(rows)}
 
-Median error of the worst arm, by training seed: {each}. The weights are those of the best.
+Median error of the worst arm, by training seed: {each}. The weights here are those of
+the best seed.
 {_elsewhere(result, shown)}"""
 
 
 def _elsewhere(result: Mapping[str, Any], shown: Sequence[str]) -> str:
-    """How the weights do on goals that training did draw, and from other starts."""
+    """Return the section on goals that training did draw, and on other starts; empty without such results."""
     also = result.get("also") or {}
     if not also:
         return ""
@@ -159,7 +158,7 @@ def _how_trained(folder: Path, settings: Settings) -> str:
     steps = f"{last['env_steps']:,.0f} environment steps in {last['seconds']:,.0f} s of rollouts and updates"
     return f"""## How it was trained
 
-By `{command}`; `config.yaml` holds all settings that it then had.
+With `{command}`. `config.yaml` holds all settings of that training.
 
 - {settings.algo}, {settings.num_envs:,} environments, {last["iteration"]:,.0f} iterations: {steps}.
 - On {device}, started {started}, commit `{commit}`.
@@ -178,16 +177,16 @@ def _training(folder: Path) -> dict[str, float]:
 def _limits(result: Mapping[str, Any], settings: Settings) -> str:
     missed = [f"- Misses its goal: {text}." for text in misses(result)]
     rare = 3 / result["episodes"]  # Hanley and Lippman-Hand, JAMA 249(13), 1983
-    none = [f"- No collision in {result['episodes']} episodes leaves room for a rate of up to {rare:.1%}."]
+    none = [f"- No collision in {result['episodes']} episodes is compatible with a collision rate of up to {rare:.1%}."]
     goals = ", ".join(
         f"{title(name)} {how} {number(name, goal)}" for name, (how, goal) in TASKS.load(settings.task).wanted.items()
     )
     met = [] if missed or not goals else [f"- Meets the goals of its task: {goals}."]
     return "\n".join([
         "## Limits\n", *missed, *met, *(none if result["collision_rate"] == 0 else []),
-        f"- For {settings.control} control, difficulty `{settings.difficulty}`, and arms that stand as in this scene.",
-        "- The goals of the evaluation were never drawn in training; they are of the same distribution.",
-        "- Learnt in simulation and tried in simulation only. Not fit for use on a patient or near one.\n",
+        f"- Made for {settings.control} control, difficulty `{settings.difficulty}` and the arm poses of this scene.",
+        "- The goals of the evaluation were never drawn in training, but they are of the same distribution.",
+        "- Trained and tested in simulation only. Not fit for use on a patient or near one.\n",
     ])  # fmt: skip
 
 
@@ -195,7 +194,7 @@ def _files(folder: Path) -> str:
     groups, _ = read_weights(folder)
     lines = []
     for name, (count, observation, action) in groups.items():
-        one_hot = f", of which the last {count} say which of the {count} it is" if count > 1 else ""
+        one_hot = f", of which the last {count} say which of the {count} agents it is" if count > 1 else ""
         pictures = "".join(f", `{what}` {shape}" for what, shape in read_pictures(folder / f"{name}{SUFFIX}").items())
         lines.append(
             f"- `{name}{SUFFIX}`: `observation` [N, {observation}]{one_hot}{pictures} -> `action` [N, {action}]."
@@ -204,5 +203,6 @@ def _files(folder: Path) -> str:
     return f"""## Files
 
 {text}
-- The same weights in `.safetensors` for `surgical-marl eval`; [how to act with the ONNX files](../README.md).
+- The `.safetensors` files hold the same weights, for `surgical-marl eval`.
+- [How to run the ONNX files](../README.md#running-a-policy-without-torch).
 """
