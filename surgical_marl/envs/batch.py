@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import numbers
 import secrets
+from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -18,7 +19,9 @@ import numpy as np
 from gymnasium import spaces
 
 from surgical_marl.engines.choose import ENGINES, make_engine
+from surgical_marl.engines.fused.threefry import episode_keys
 from surgical_marl.envs.env import Env
+from surgical_marl.envs.observations import each
 from surgical_marl.physics.views import Contacts
 
 if TYPE_CHECKING:
@@ -112,6 +115,8 @@ class BatchedEnv:
             self._sight = Sight(self.env, self.engine, num_envs, arrays)
             self._observation_spaces |= self._sight.spaces(self._observation_spaces)
         self._started = False
+        self._fresh = np.zeros(num_envs, bool)
+        """Where a reset began the episode, and no step has followed."""
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy is made from: the arguments, and where all environments are (None before a reset)."""
@@ -148,26 +153,74 @@ class BatchedEnv:
         """Of one environment."""
         return self._action_spaces[agent]
 
-    def reset(self, seed: int | None = None, first: int = 0) -> tuple[dict[str, Any], Any, dict[str, dict[str, Any]]]:
-        """Start a new episode in all environments, and return observations, state and infos.
+    def reset(
+        self, seed: int | Sequence[int | None] | None = None, first: int = 0, mask: np.ndarray | None = None
+    ) -> tuple[dict[str, Any], Any, dict[str, dict[str, Any]]]:
+        """Start a new episode in all environments, or in some, and return observations, state and infos.
 
         Args:
             seed: environment i plays the same episodes for the same seed, whatever `num_envs`. None goes on to each
-                environment's next episode, or draws a seed if there was none yet.
+                environment's next episode, or draws a seed if there was none yet. A list holds one of these for each
+                environment: with a seed it plays what an environment alone plays with that seed.
             first: the number of the first environment, where several processes share the environments of a seed.
+            mask: [N] bool, the environments that start a new episode. The others stay as they are, and what is
+                returned is of those in the mask alone, in their order. None for all.
+
+        Raises:
+            ValueError: a bad seed, a list or a mask of the wrong length, or a mask before the first reset of all.
         """
-        whole = isinstance(seed, numbers.Integral) and not isinstance(seed, bool)
-        if seed is not None and not (whole and 0 <= seed < 2**63):
-            raise ValueError(f"seed must be a whole number from 0 to 2**63 - 1, not {seed!r}")
-        if seed is None and self._started:
-            self.engine.restart()
+        if mask is None and not isinstance(seed, Sequence | np.ndarray):
+            whole = _whole(seed)
+            if whole is None and self._started:
+                self.engine.restart()
+            else:
+                self.engine.reset(secrets.randbits(63) if whole is None else whole, first)
         else:
-            self.engine.reset(secrets.randbits(63) if seed is None else int(seed), first)
+            mask = np.ones(self.num_envs, bool) if mask is None else np.asarray(mask)
+            self._begin(seed, first, mask)
         self._started = True
+        self._fresh[... if mask is None else mask] = True
         found = self.engine.outcome(self.arrays)
         if self._sight is not None:
             self._sight.begin(found)
+        if mask is not None and not mask.all():
+            rows = np.flatnonzero(mask)
+            of_agents = lambda tree: {agent: each(own, lambda part: part[rows]) for agent, own in tree.items()}  # noqa: E731
+            return of_agents(found["observations"]), found["state"][rows], of_agents(found["infos"])
         return found["observations"], found["state"], found["infos"]
+
+    def _begin(self, seed: Any, first: int, mask: np.ndarray) -> None:
+        """Begin the first episode of the environments of a mask that have a seed, and the next one of the others."""
+        if mask.shape != (self.num_envs,) or mask.dtype != bool:
+            raise ValueError(f"mask of shape {mask.shape} and type {mask.dtype} must be [{self.num_envs}] bool")
+        seeded, keys = self._keys(seed, first)
+        if not self._started:
+            if not mask.all():
+                raise ValueError("mask before the first reset: call reset() for all environments first")
+            self.engine.reset(secrets.randbits(63))
+            self._started = True
+        before = None if mask.all() else self.carry()
+        begun = (self.engine.read(".steps", "numpy") == 0) & ~self._fresh  # by the step that ended the last episode
+        self.engine.write(".key", np.where(seeded[:, None], keys, self.engine.read(".key", "numpy")))
+        self.engine.write(".episode", np.where(seeded, -1, self.engine.read(".episode", "numpy")))
+        self.engine.write(".steps", (seeded | ~begun).astype(np.int32))
+        self.engine.restart()
+        if before is not None:
+            self.set_carry(before, ~mask)
+
+    def _keys(self, seed: Any, first: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return which environments get a seed, [N] bool, and the keys that the seeds lead to, [N, 2]."""
+        if not isinstance(seed, Sequence | np.ndarray):
+            one = _whole(seed)
+            return np.full(self.num_envs, one is not None), episode_keys(one or 0, self.num_envs, first)
+        if len(seed) != self.num_envs:
+            raise ValueError(
+                f"a list of {len(seed)} seeds does not fit {self.num_envs} environments: give one for each"
+            )
+        seeds = [_whole(own) for own in seed]
+        return np.array([own is not None for own in seeds]), np.concatenate(
+            [episode_keys(own or 0, 1) for own in seeds]
+        )
 
     def step(self, actions: dict[str, Any]) -> BatchStep:
         """One control step of all environments.
@@ -182,6 +235,7 @@ class BatchedEnv:
             raise ValueError("step before reset: call reset() first")
         checked = self._check(actions)
         self.engine.step(checked, None if self._sight is None else self._sight.sense)
+        self._fresh[:] = False
         found = self.engine.outcome(self.arrays)
         if self._sight is not None:
             self._sight.show(found)
@@ -214,8 +268,12 @@ class BatchedEnv:
         self._part(".steps", "numpy")
         return {name: np.array(self.engine.read(name, "numpy")) for name in self.engine.carry_shapes}
 
-    def set_carry(self, carry: dict[str, Any]) -> None:
-        """Goes on from what `carry()` returned. ValueError if it is of another scene, task or `num_envs`."""
+    def set_carry(self, carry: dict[str, Any], mask: np.ndarray | None = None) -> None:
+        """Go on from what `carry()` returned, in all environments or in those of a mask [N].
+
+        Raises:
+            ValueError: it is of another scene, task or `num_envs`.
+        """
         values = {name: np.asarray(carry.get(name)) for name in self.engine.carry_shapes}
         for name, shape in self.engine.carry_shapes.items():
             if values[name].shape != (self.num_envs, *shape):
@@ -225,6 +283,9 @@ class BatchedEnv:
         if not self._started:
             self.engine.reset(0)
         for name, value in values.items():
+            if mask is not None:
+                own = mask.reshape(-1, *[1] * (value.ndim - 1))
+                value = np.where(own, value, self.engine.read(name, "numpy"))
             self.engine.write(name, value)
         self._started = True
 
@@ -250,3 +311,11 @@ class BatchedEnv:
                     raise ValueError(f"action of {agent!r} holds a value that is not finite")
             checked[agent] = action
         return checked
+
+
+def _whole(seed: Any) -> int | None:
+    """Return a seed as an int, or None for none; ValueError if it is no whole number in range."""
+    whole = isinstance(seed, numbers.Integral) and not isinstance(seed, bool)
+    if seed is not None and not (whole and 0 <= seed < 2**63):
+        raise ValueError(f"seed must be a whole number from 0 to 2**63 - 1, not {seed!r}")
+    return None if seed is None else int(seed)
