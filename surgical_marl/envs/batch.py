@@ -18,13 +18,16 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from gymnasium import spaces
 
+from surgical_marl.content import unknown
 from surgical_marl.engines.choose import ENGINES, make_engine
 from surgical_marl.engines.fused.threefry import episode_keys
+from surgical_marl.envs.actions import check_actions
 from surgical_marl.envs.env import Env
 from surgical_marl.envs.observations import each
 from surgical_marl.physics.views import Contacts
 
 if TYPE_CHECKING:
+    from surgical_marl.engines.choose import Engine
     from surgical_marl.envs.sight import Sight
 
 ARRAYS = ("numpy", "torch", "jax")
@@ -84,8 +87,9 @@ class BatchedEnv:
         arrays: str = "numpy",
         **options: Any,
     ) -> None:
-        if isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1:
+        if not _is_whole(num_envs) or num_envs < 1:
             raise ValueError(f"num_envs must be a whole number of at least 1, not {num_envs!r}")
+        num_envs = int(num_envs)
         if engine not in ENGINES:
             raise ValueError(f"unknown engine {engine!r}; the engines are {', '.join(ENGINES)}")
         if arrays not in ARRAYS:
@@ -93,7 +97,7 @@ class BatchedEnv:
         self._made = {"task": task, "scene": scene, "num_envs": num_envs, "engine": engine, "device": device,
                       "arrays": arrays, **options}  # fmt: skip
         self.env = Env(task, scene, **options)
-        self.engine = make_engine(self.env, num_envs, engine, device)
+        self._engine: Engine | None = make_engine(self.env, num_envs, engine, device)
         self.num_envs, self.arrays = num_envs, arrays
         self.agents = list(self.env.agents)
         self.types = self._types()
@@ -105,27 +109,48 @@ class BatchedEnv:
         )
         self.max_steps, self.control_dt = self.env.max_steps, self.env.control_dt
         self.device = self.engine.device
-        self._action_spaces = {agent: self.env.action_space(agent) for agent in self.agents}
-        self._observation_spaces: dict[str, spaces.Space[Any]] = {a: self.env.observation_space(a) for a in self.agents}
+        self.action_spaces = {agent: self.env.action_space(agent) for agent in self.agents}
+        self.observation_spaces: dict[str, spaces.Space[Any]] = {a: self.env.observation_space(a) for a in self.agents}
+        self._action_shapes = {agent: (num_envs, *space.shape) for agent, space in self.action_spaces.items()}
         self.state_space = self.env.state_space
         self._sight: Sight | None = None
         if self.env.pauses:
             from surgical_marl.envs.sight import Sight  # imports torch
 
             self._sight = Sight(self.env, self.engine, num_envs, arrays)
-            self._observation_spaces |= self._sight.spaces(self._observation_spaces)
+            self.observation_spaces |= self._sight.spaces(self.observation_spaces)
         self._started = False
         self._fresh = np.zeros(num_envs, bool)
         """Where a reset began the episode, and no step has followed."""
 
+    @property
+    def engine(self) -> Engine:
+        """What runs the environments. ValueError after `close`."""
+        self.check_open()
+        return self._engine  # type: ignore[return-value]
+
+    def check_open(self) -> None:
+        """Raise a ValueError after `close`."""
+        if self._engine is None:
+            raise ValueError("the environment is closed: make a new one")
+
+    def close(self) -> None:
+        """Free the memory and the threads of all environments. They can't be used any more; a second call is fine."""
+        if self._engine is not None:
+            self._engine.close()
+        self._engine = self._sight = None
+
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy is made from: the arguments, and where all environments are (None before a reset)."""
-        return {"made": self._made, "carry": self.carry() if self._started else None}
+        closed = self._engine is None
+        return {"made": self._made, "closed": closed, "carry": self.carry() if self._started and not closed else None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__init__(**state["made"])  # type: ignore[misc]
         if state["carry"] is not None:
             self.set_carry(state["carry"])
+        if state["closed"]:
+            self.close()
 
     def _types(self) -> dict[str, list[str]]:
         """Agents whose arms are alike and that observe alike, by the name of their arms' type."""
@@ -146,12 +171,16 @@ class BatchedEnv:
         return dict(self.env.observed[agent].slices)
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
-        """Of one environment: a Box, or a Dict for an agent that sees pictures."""
-        return self._observation_spaces[agent]
+        """Of one environment: a Box, or a Dict for an agent that sees pictures; the same object each time."""
+        if agent not in self.observation_spaces:
+            raise unknown("agent", agent, self.agents)
+        return self.observation_spaces[agent]
 
     def action_space(self, agent: str) -> spaces.Box:
-        """Of one environment."""
-        return self._action_spaces[agent]
+        """Of one environment: Box [-1, 1]; the same object each time."""
+        if agent not in self.action_spaces:
+            raise unknown("agent", agent, self.agents)
+        return self.action_spaces[agent]
 
     def reset(
         self, seed: int | Sequence[int | None] | None = None, first: int = 0, mask: np.ndarray | None = None
@@ -169,18 +198,19 @@ class BatchedEnv:
         Raises:
             ValueError: a bad seed, a list or a mask of the wrong length, or a mask before the first reset of all.
         """
+        engine = self.engine
         if mask is None and not isinstance(seed, Sequence | np.ndarray):
-            whole = _whole(seed)
+            whole = _seed(seed)
             if whole is None and self._started:
-                self.engine.restart()
+                engine.restart()
             else:
-                self.engine.reset(secrets.randbits(63) if whole is None else whole, first)
+                engine.reset(secrets.randbits(63) if whole is None else whole, first)
         else:
             mask = np.ones(self.num_envs, bool) if mask is None else np.asarray(mask)
             self._begin(seed, first, mask)
         self._started = True
         self._fresh[... if mask is None else mask] = True
-        found = self.engine.outcome(self.arrays)
+        found = engine.outcome(self.arrays)
         if self._sight is not None:
             self._sight.begin(found)
         if mask is not None and not mask.all():
@@ -211,32 +241,33 @@ class BatchedEnv:
     def _keys(self, seed: Any, first: int) -> tuple[np.ndarray, np.ndarray]:
         """Return which environments get a seed, [N] bool, and the keys that the seeds lead to, [N, 2]."""
         if not isinstance(seed, Sequence | np.ndarray):
-            one = _whole(seed)
+            one = _seed(seed)
             return np.full(self.num_envs, one is not None), episode_keys(one or 0, self.num_envs, first)
         if len(seed) != self.num_envs:
             raise ValueError(
                 f"a list of {len(seed)} seeds does not fit {self.num_envs} environments: give one for each"
             )
-        seeds = [_whole(own) for own in seed]
-        return np.array([own is not None for own in seeds]), np.concatenate(
-            [episode_keys(own or 0, 1) for own in seeds]
-        )
+        seeds = [_seed(own) for own in seed]
+        keys = np.concatenate([episode_keys(own or 0, 1) for own in seeds])
+        return np.array([own is not None for own in seeds]), keys
 
     def step(self, actions: dict[str, Any]) -> BatchStep:
         """One control step of all environments.
 
         Args:
-            actions: agent -> [N, n] in [-1, 1], of any array library; larger values are clipped.
+            actions: agent -> [N, n] in [-1, 1], of any array library, or lists; larger values are clipped.
 
         Raises:
-            ValueError: an agent is missing or unknown, a shape is wrong, or a value is not finite (numpy only).
+            ValueError: an agent is missing or unknown, a shape is wrong, a value is not a finite number, no episode has
+                begun, or the environment is closed. Nothing has changed then.
         """
+        engine = self.engine
         if not self._started:
             raise ValueError("step before reset: call reset() first")
-        checked = self._check(actions)
-        self.engine.step(checked, None if self._sight is None else self._sight.sense)
+        checked = check_actions(actions, self._action_shapes)
+        engine.step(checked, None if self._sight is None else self._sight.sense)
         self._fresh[:] = False
-        found = self.engine.outcome(self.arrays)
+        found = engine.outcome(self.arrays)
         if self._sight is not None:
             self._sight.show(found)
         return BatchStep(**{**found, "contacts": Contacts(**found["contacts"])})
@@ -290,32 +321,19 @@ class BatchedEnv:
         self._started = True
 
     def _part(self, name: str, library: str) -> Any:
+        engine = self.engine
         if not self._started:
             raise ValueError("no episode yet: call reset() first")
-        return self.engine.read(name, library)
-
-    def _check(self, actions: dict[str, Any]) -> dict[str, Any]:
-        for agent in actions:
-            if agent not in self._action_spaces:
-                raise ValueError(f"action for {agent!r}, which is not an agent of the scene ({', '.join(self.agents)})")
-        checked = {}
-        for agent in self.agents:
-            if agent not in actions:
-                raise ValueError(f"no action for agent {agent!r}")
-            action, shape = actions[agent], (self.num_envs, *self._action_spaces[agent].shape)
-            if tuple(np.shape(action)) != shape:
-                raise ValueError(f"action of {agent!r} has shape {tuple(np.shape(action))}, it must be {shape}")
-            if isinstance(action, np.ndarray | list | tuple):
-                action = np.asarray(action, np.float32)
-                if not np.isfinite(action).all():
-                    raise ValueError(f"action of {agent!r} holds a value that is not finite")
-            checked[agent] = action
-        return checked
+        return engine.read(name, library)
 
 
-def _whole(seed: Any) -> int | None:
+def _seed(seed: Any) -> int | None:
     """Return a seed as an int, or None for none; ValueError if it is no whole number in range."""
-    whole = isinstance(seed, numbers.Integral) and not isinstance(seed, bool)
-    if seed is not None and not (whole and 0 <= seed < 2**63):
+    if seed is not None and not (_is_whole(seed) and 0 <= seed < 2**63):
         raise ValueError(f"seed must be a whole number from 0 to 2**63 - 1, not {seed!r}")
     return None if seed is None else int(seed)
+
+
+def _is_whole(value: Any) -> bool:
+    """Whether a value is a whole number, of Python or of numpy."""
+    return isinstance(value, numbers.Integral) and not isinstance(value, bool)

@@ -19,7 +19,8 @@ from gymnasium.vector.utils import batch_space
 
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.envs.observations import each, proprioception
-from surgical_marl.interfaces.pettingzoo import RENDER_MODES
+
+RENDER_MODES = (None, "rgb_array")
 
 
 class SurgicalEnv(gymnasium.Env[Any, np.ndarray]):

@@ -11,6 +11,7 @@ the pictures with C MuJoCo's ray caster.
 
 from __future__ import annotations
 
+import numbers
 from dataclasses import dataclass
 from typing import Any
 
@@ -79,7 +80,7 @@ class Endoscope:
         agent: str | None = None,
     ) -> None:
         for name, value in (("num_envs", num_envs), ("width", width), ("height", height)):
-            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+            if isinstance(value, bool) or not isinstance(value, numbers.Integral) or value < 1:
                 raise ValueError(f"{name} must be a whole number of at least 1, not {value!r}")
         for channel in channels:
             if channel not in CHANNELS:

@@ -116,6 +116,11 @@ class FusedEngine:
         self._arrays.write(self._leaves[name], values)
         self._stepped = True
 
+    def close(self) -> None:
+        """End the threads. The arrays are freed with the engine."""
+        if self._pool is not None:
+            self._pool.shutdown()
+
     def _filled_tables(self) -> dict[str, np.ndarray]:
         """Return the constant tables with the parameters in their places."""
         filled = {dtype: table.copy() for dtype, table in self.source.tables.items()}
