@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 from surgical_marl.content import unknown
-from surgical_marl.runtime import prepare_mjx, prepare_warp
+from surgical_marl.runtime import let_torch_fork, prepare_mjx, prepare_warp
 from surgical_marl.scenes.scene import Scene
 
 SIZE = 64
@@ -92,6 +92,7 @@ class Endoscope:
         self.eyes = EYES if stereo else EYES[:1]
         self.labels, self.label_names = _labels(scene)
         self._shape = num_envs, len(self.eyes), height, width
+        let_torch_fork()
         prepare_mjx()
         self._warp = prepare_warp()
         from mujoco.mjx.third_party import mujoco_warp
