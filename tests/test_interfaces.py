@@ -169,7 +169,7 @@ def test_a_vector_env_restarts_in_the_step_that_ends() -> None:
         assert truncated.all() == (step == STEPS - 1) and not terminated.any()
     assert infos["_final_obs"].all()
     np.testing.assert_allclose(alone, infos["final_obs"][0], atol=2e-4, rtol=1e-4)
-    assert not np.allclose(observations, infos["final_obs"])
+    assert not np.allclose(observations, np.stack(infos["final_obs"]))
 
 
 def test_pictures_are_for_one_environment() -> None:

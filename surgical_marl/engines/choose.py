@@ -35,6 +35,8 @@ class Engine(Protocol):
 
     def write(self, name: str, values: Any) -> None: ...
 
+    def close(self) -> None: ...
+
 
 def make_engine(env: Stepper, num_envs: int, engine: str = "auto", device: str = "auto") -> Engine:
     """Return the engine of that name, or the fastest one that can run the environment.

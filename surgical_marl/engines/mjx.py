@@ -132,6 +132,10 @@ class MjxEngine:
         carry = jax.tree.unflatten(self._tree, list(parts.values()))
         self._state, self._stepped = self._state._replace(carry=carry), True
 
+    def close(self) -> None:
+        """End the threads. The arrays are freed with the engine."""
+        self._pool.shutdown()
+
     def _run_share(self, function: Any, share: tuple[Any, ...]) -> Any:
         with jax.default_device(self._on):  # of this thread
             found = function(*share, self._parameters)

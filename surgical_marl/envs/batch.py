@@ -11,17 +11,23 @@ from __future__ import annotations
 
 import numbers
 import secrets
+from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
 
+from surgical_marl.content import unknown
 from surgical_marl.engines.choose import ENGINES, make_engine
+from surgical_marl.engines.fused.threefry import episode_keys
+from surgical_marl.envs.actions import check_actions
 from surgical_marl.envs.env import Env
+from surgical_marl.envs.observations import each
 from surgical_marl.physics.views import Contacts
 
 if TYPE_CHECKING:
+    from surgical_marl.engines.choose import Engine
     from surgical_marl.envs.sight import Sight
 
 ARRAYS = ("numpy", "torch", "jax")
@@ -81,8 +87,9 @@ class BatchedEnv:
         arrays: str = "numpy",
         **options: Any,
     ) -> None:
-        if isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1:
+        if not _is_whole(num_envs) or num_envs < 1:
             raise ValueError(f"num_envs must be a whole number of at least 1, not {num_envs!r}")
+        num_envs = int(num_envs)
         if engine not in ENGINES:
             raise ValueError(f"unknown engine {engine!r}; the engines are {', '.join(ENGINES)}")
         if arrays not in ARRAYS:
@@ -90,7 +97,7 @@ class BatchedEnv:
         self._made = {"task": task, "scene": scene, "num_envs": num_envs, "engine": engine, "device": device,
                       "arrays": arrays, **options}  # fmt: skip
         self.env = Env(task, scene, **options)
-        self.engine = make_engine(self.env, num_envs, engine, device)
+        self._engine: Engine | None = make_engine(self.env, num_envs, engine, device)
         self.num_envs, self.arrays = num_envs, arrays
         self.agents = list(self.env.agents)
         self.types = self._types()
@@ -102,25 +109,48 @@ class BatchedEnv:
         )
         self.max_steps, self.control_dt = self.env.max_steps, self.env.control_dt
         self.device = self.engine.device
-        self._action_spaces = {agent: self.env.action_space(agent) for agent in self.agents}
-        self._observation_spaces: dict[str, spaces.Space[Any]] = {a: self.env.observation_space(a) for a in self.agents}
+        self.action_spaces = {agent: self.env.action_space(agent) for agent in self.agents}
+        self.observation_spaces: dict[str, spaces.Space[Any]] = {a: self.env.observation_space(a) for a in self.agents}
+        self._action_shapes = {agent: (num_envs, *space.shape) for agent, space in self.action_spaces.items()}
         self.state_space = self.env.state_space
         self._sight: Sight | None = None
         if self.env.pauses:
             from surgical_marl.envs.sight import Sight  # imports torch
 
             self._sight = Sight(self.env, self.engine, num_envs, arrays)
-            self._observation_spaces |= self._sight.spaces(self._observation_spaces)
+            self.observation_spaces |= self._sight.spaces(self.observation_spaces)
         self._started = False
+        self._fresh = np.zeros(num_envs, bool)
+        """Where a reset began the episode, and no step has followed."""
+
+    @property
+    def engine(self) -> Engine:
+        """What runs the environments. ValueError after `close`."""
+        self.check_open()
+        return self._engine  # type: ignore[return-value]
+
+    def check_open(self) -> None:
+        """Raise a ValueError after `close`."""
+        if self._engine is None:
+            raise ValueError("the environment is closed: make a new one")
+
+    def close(self) -> None:
+        """Free the memory and the threads of all environments. They can't be used any more; a second call is fine."""
+        if self._engine is not None:
+            self._engine.close()
+        self._engine = self._sight = None
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy is made from: the arguments, and where all environments are (None before a reset)."""
-        return {"made": self._made, "carry": self.carry() if self._started else None}
+        closed = self._engine is None
+        return {"made": self._made, "closed": closed, "carry": self.carry() if self._started and not closed else None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__init__(**state["made"])  # type: ignore[misc]
         if state["carry"] is not None:
             self.set_carry(state["carry"])
+        if state["closed"]:
+            self.close()
 
     def _types(self) -> dict[str, list[str]]:
         """Agents whose arms are alike and that observe alike, by the name of their arms' type."""
@@ -141,48 +171,103 @@ class BatchedEnv:
         return dict(self.env.observed[agent].slices)
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
-        """Of one environment: a Box, or a Dict for an agent that sees pictures."""
-        return self._observation_spaces[agent]
+        """Of one environment: a Box, or a Dict for an agent that sees pictures; the same object each time."""
+        if agent not in self.observation_spaces:
+            raise unknown("agent", agent, self.agents)
+        return self.observation_spaces[agent]
 
     def action_space(self, agent: str) -> spaces.Box:
-        """Of one environment."""
-        return self._action_spaces[agent]
+        """Of one environment: Box [-1, 1]; the same object each time."""
+        if agent not in self.action_spaces:
+            raise unknown("agent", agent, self.agents)
+        return self.action_spaces[agent]
 
-    def reset(self, seed: int | None = None, first: int = 0) -> tuple[dict[str, Any], Any, dict[str, dict[str, Any]]]:
-        """Start a new episode in all environments, and return observations, state and infos.
+    def reset(
+        self, seed: int | Sequence[int | None] | None = None, first: int = 0, mask: np.ndarray | None = None
+    ) -> tuple[dict[str, Any], Any, dict[str, dict[str, Any]]]:
+        """Start a new episode in all environments, or in some, and return observations, state and infos.
 
         Args:
             seed: environment i plays the same episodes for the same seed, whatever `num_envs`. None goes on to each
-                environment's next episode, or draws a seed if there was none yet.
+                environment's next episode, or draws a seed if there was none yet. A list holds one of these for each
+                environment: with a seed it plays what an environment alone plays with that seed.
             first: the number of the first environment, where several processes share the environments of a seed.
+            mask: [N] bool, the environments that start a new episode. The others stay as they are, and what is
+                returned is of those in the mask alone, in their order. None for all.
+
+        Raises:
+            ValueError: a bad seed, a list or a mask of the wrong length, or a mask before the first reset of all.
         """
-        whole = isinstance(seed, numbers.Integral) and not isinstance(seed, bool)
-        if seed is not None and not (whole and 0 <= seed < 2**63):
-            raise ValueError(f"seed must be a whole number from 0 to 2**63 - 1, not {seed!r}")
-        if seed is None and self._started:
-            self.engine.restart()
+        engine = self.engine
+        if mask is None and not isinstance(seed, Sequence | np.ndarray):
+            whole = _seed(seed)
+            if whole is None and self._started:
+                engine.restart()
+            else:
+                engine.reset(secrets.randbits(63) if whole is None else whole, first)
         else:
-            self.engine.reset(secrets.randbits(63) if seed is None else int(seed), first)
+            mask = np.ones(self.num_envs, bool) if mask is None else np.asarray(mask)
+            self._begin(seed, first, mask)
         self._started = True
-        found = self.engine.outcome(self.arrays)
+        self._fresh[... if mask is None else mask] = True
+        found = engine.outcome(self.arrays)
         if self._sight is not None:
             self._sight.begin(found)
+        if mask is not None and not mask.all():
+            rows = np.flatnonzero(mask)
+            of_agents = lambda tree: {agent: each(own, lambda part: part[rows]) for agent, own in tree.items()}  # noqa: E731
+            return of_agents(found["observations"]), found["state"][rows], of_agents(found["infos"])
         return found["observations"], found["state"], found["infos"]
+
+    def _begin(self, seed: Any, first: int, mask: np.ndarray) -> None:
+        """Begin the first episode of the environments of a mask that have a seed, and the next one of the others."""
+        if mask.shape != (self.num_envs,) or mask.dtype != bool:
+            raise ValueError(f"mask of shape {mask.shape} and type {mask.dtype} must be [{self.num_envs}] bool")
+        seeded, keys = self._keys(seed, first)
+        if not self._started:
+            if not mask.all():
+                raise ValueError("mask before the first reset: call reset() for all environments first")
+            self.engine.reset(secrets.randbits(63))
+            self._started = True
+        before = None if mask.all() else self.carry()
+        begun = (self.engine.read(".steps", "numpy") == 0) & ~self._fresh  # by the step that ended the last episode
+        self.engine.write(".key", np.where(seeded[:, None], keys, self.engine.read(".key", "numpy")))
+        self.engine.write(".episode", np.where(seeded, -1, self.engine.read(".episode", "numpy")))
+        self.engine.write(".steps", (seeded | ~begun).astype(np.int32))
+        self.engine.restart()
+        if before is not None:
+            self.set_carry(before, ~mask)
+
+    def _keys(self, seed: Any, first: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return which environments get a seed, [N] bool, and the keys that the seeds lead to, [N, 2]."""
+        if not isinstance(seed, Sequence | np.ndarray):
+            one = _seed(seed)
+            return np.full(self.num_envs, one is not None), episode_keys(one or 0, self.num_envs, first)
+        if len(seed) != self.num_envs:
+            raise ValueError(
+                f"a list of {len(seed)} seeds does not fit {self.num_envs} environments: give one for each"
+            )
+        seeds = [_seed(own) for own in seed]
+        keys = np.concatenate([episode_keys(own or 0, 1) for own in seeds])
+        return np.array([own is not None for own in seeds]), keys
 
     def step(self, actions: dict[str, Any]) -> BatchStep:
         """One control step of all environments.
 
         Args:
-            actions: agent -> [N, n] in [-1, 1], of any array library; larger values are clipped.
+            actions: agent -> [N, n] in [-1, 1], of any array library, or lists; larger values are clipped.
 
         Raises:
-            ValueError: an agent is missing or unknown, a shape is wrong, or a value is not finite (numpy only).
+            ValueError: an agent is missing or unknown, a shape is wrong, a value is not a finite number, no episode has
+                begun, or the environment is closed. Nothing has changed then.
         """
+        engine = self.engine
         if not self._started:
             raise ValueError("step before reset: call reset() first")
-        checked = self._check(actions)
-        self.engine.step(checked, None if self._sight is None else self._sight.sense)
-        found = self.engine.outcome(self.arrays)
+        checked = check_actions(actions, self._action_shapes)
+        engine.step(checked, None if self._sight is None else self._sight.sense)
+        self._fresh[:] = False
+        found = engine.outcome(self.arrays)
         if self._sight is not None:
             self._sight.show(found)
         return BatchStep(**{**found, "contacts": Contacts(**found["contacts"])})
@@ -214,8 +299,12 @@ class BatchedEnv:
         self._part(".steps", "numpy")
         return {name: np.array(self.engine.read(name, "numpy")) for name in self.engine.carry_shapes}
 
-    def set_carry(self, carry: dict[str, Any]) -> None:
-        """Goes on from what `carry()` returned. ValueError if it is of another scene, task or `num_envs`."""
+    def set_carry(self, carry: dict[str, Any], mask: np.ndarray | None = None) -> None:
+        """Go on from what `carry()` returned, in all environments or in those of a mask [N].
+
+        Raises:
+            ValueError: it is of another scene, task or `num_envs`.
+        """
         values = {name: np.asarray(carry.get(name)) for name in self.engine.carry_shapes}
         for name, shape in self.engine.carry_shapes.items():
             if values[name].shape != (self.num_envs, *shape):
@@ -225,28 +314,26 @@ class BatchedEnv:
         if not self._started:
             self.engine.reset(0)
         for name, value in values.items():
+            if mask is not None:
+                own = mask.reshape(-1, *[1] * (value.ndim - 1))
+                value = np.where(own, value, self.engine.read(name, "numpy"))
             self.engine.write(name, value)
         self._started = True
 
     def _part(self, name: str, library: str) -> Any:
+        engine = self.engine
         if not self._started:
             raise ValueError("no episode yet: call reset() first")
-        return self.engine.read(name, library)
+        return engine.read(name, library)
 
-    def _check(self, actions: dict[str, Any]) -> dict[str, Any]:
-        for agent in actions:
-            if agent not in self._action_spaces:
-                raise ValueError(f"action for {agent!r}, which is not an agent of the scene ({', '.join(self.agents)})")
-        checked = {}
-        for agent in self.agents:
-            if agent not in actions:
-                raise ValueError(f"no action for agent {agent!r}")
-            action, shape = actions[agent], (self.num_envs, *self._action_spaces[agent].shape)
-            if tuple(np.shape(action)) != shape:
-                raise ValueError(f"action of {agent!r} has shape {tuple(np.shape(action))}, it must be {shape}")
-            if isinstance(action, np.ndarray | list | tuple):
-                action = np.asarray(action, np.float32)
-                if not np.isfinite(action).all():
-                    raise ValueError(f"action of {agent!r} holds a value that is not finite")
-            checked[agent] = action
-        return checked
+
+def _seed(seed: Any) -> int | None:
+    """Return a seed as an int, or None for none; ValueError if it is no whole number in range."""
+    if seed is not None and not (_is_whole(seed) and 0 <= seed < 2**63):
+        raise ValueError(f"seed must be a whole number from 0 to 2**63 - 1, not {seed!r}")
+    return None if seed is None else int(seed)
+
+
+def _is_whole(value: Any) -> bool:
+    """Whether a value is a whole number, of Python or of numpy."""
+    return isinstance(value, numbers.Integral) and not isinstance(value, bool)

@@ -16,42 +16,86 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from gymnasium import spaces
+from gymnasium.utils.seeding import np_random
 from pettingzoo import ParallelEnv
+
+from surgical_marl.envs.actions import check_actions
+from surgical_marl.interfaces.rendering import MODES, Rendering, check_mode
 
 if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv, BatchStep
 
-RENDER_MODES = (None, "rgb_array")
 
+class _Face(ParallelEnv[str, Any, Any]):
+    """What both parallel environments are."""
 
-class SurgicalParallelEnv(ParallelEnv[str, Any, Any]):
-    """One environment, numpy in and out; `agents` is empty once the episode is over, until `reset`."""
-
-    def __init__(self, batch: BatchedEnv, render_mode: str | None = None) -> None:
+    def __init__(self, batch: BatchedEnv, render_mode: str | None, render_modes: list[str]) -> None:
         self.batch = batch
-        self.render_mode = render_mode
         self.metadata = {
             "name": f"{batch.task_name}_v0",
-            "render_modes": ["rgb_array"],
+            "render_modes": render_modes,
             "render_fps": round(1 / batch.control_dt),
             "is_parallelizable": True,
         }
         self.possible_agents = list(batch.agents)
-        self.agents: list[str] = []
-        self.observation_spaces = {agent: batch.observation_space(agent) for agent in batch.agents}
-        self.action_spaces = {agent: batch.action_space(agent) for agent in batch.agents}
+        self.observation_spaces = batch.observation_spaces
+        self.action_spaces = batch.action_spaces
         self.state_space = batch.state_space
         self.max_cycles = batch.max_steps
+        self._rendering = Rendering(batch, render_mode)
+        self._random: np.random.Generator | None = None
         self._state: Any = None
-        self._picture: Any = None
+
+    @property
+    def render_mode(self) -> str | None:
+        """What `render` does: "human", "rgb_array", or None for nothing."""
+        return self._rendering.mode
+
+    @property
+    def np_random(self) -> np.random.Generator:
+        """For wrappers that draw numbers of their own; `reset` with a seed begins it anew. Episodes do not use it."""
+        if self._random is None:
+            self._random, _ = np_random()
+        return self._random
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
-        """Box of an agent's observations, or Dict of one that sees pictures; the same object each time."""
-        return self.observation_spaces[agent]
+        """Return an agent's Box, or Dict if it sees pictures, of one environment; the same object each time."""
+        return self.batch.observation_space(agent)
 
     def action_space(self, agent: str) -> spaces.Box:
-        """Box [-1, 1] of an agent's actions; the same object each time."""
-        return self.action_spaces[agent]
+        """Return an agent's Box [-1, 1], of one environment; the same object each time."""
+        return self.batch.action_space(agent)
+
+    def state(self) -> Any:
+        """Return the whole state that a centralised critic sees: [S], with `num_envs` [N, S]."""
+        self.batch.check_open()
+        if self._state is None:
+            raise ValueError("no state yet: call reset() first")
+        return self._state
+
+    def render(self) -> np.ndarray | None:
+        """Return a picture [H, W, 3] uint8 with render_mode "rgb_array"; show it in a window with "human"."""
+        return self._rendering.render()
+
+    def close(self) -> None:
+        """Free the memory, threads and window. A later step, reset, state or picture is a ValueError."""
+        self._rendering.close()
+        self.batch.close()
+
+    def _restart(self, seed: int | None) -> tuple[Any, Any, Any]:
+        found = self.batch.reset(seed)
+        if seed is not None:
+            self._random, _ = np_random(int(seed))
+        return found
+
+
+class SurgicalParallelEnv(_Face):
+    """One environment, numpy in and out; `agents` is empty once the episode is over, until `reset`."""
+
+    def __init__(self, batch: BatchedEnv, render_mode: str | None = None) -> None:
+        super().__init__(batch, render_mode, list(MODES))
+        self.agents: list[str] = []
+        self._shapes = {agent: space.shape for agent, space in batch.action_spaces.items()}
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
@@ -60,94 +104,55 @@ class SurgicalParallelEnv(ParallelEnv[str, Any, Any]):
 
         With a seed it is the same episode each time. Without one it is the next episode that the last seed leads to.
         """
-        observations, state, infos = self.batch.reset(seed)
+        observations, state, infos = self._restart(seed)
         self.agents = list(self.possible_agents)
-        self._state = self._first(state)
-        return self._firsts(observations), self._firsts(infos)
+        self._state = state[0].copy()
+        self._rendering.follow()
+        return _first(observations), _first(infos)
 
     def step(self, actions: dict[str, Any]) -> tuple[dict[str, Any], ...]:
         """One control step: observations, rewards, terminations, truncations, infos.
 
         Raises:
-            ValueError: an agent that does not exist or has no action, a wrong shape, or a value that is not finite.
+            ValueError: an agent that does not exist or has no action, a wrong shape, a value that is not a finite
+                number, an episode that is over, or a closed environment. Nothing has changed then.
         """
+        self.batch.check_open()
         if not self.agents:
             raise ValueError("no episode is under way: call reset() before step()")
-        step = self.batch.step({agent: np.asarray(action)[None] for agent, action in actions.items()})
+        checked = check_actions(actions, self._shapes)
+        step = self.batch.step({agent: action[None] for agent, action in checked.items()})
         terminated, truncated = bool(step.terminated[0]), bool(step.truncated[0])
-        self._state = self._first(step.final_state)
+        self._state = step.final_state[0].copy()
         outcome = (
-            self._firsts(step.final_observations),
-            {agent: float(reward[0]) for agent, reward in step.rewards.items()},
+            _first(step.final_observations),
+            _first(step.rewards),
             dict.fromkeys(self.agents, terminated),
             dict.fromkeys(self.agents, truncated),
-            self._firsts(step.infos),
+            _first(step.infos),
         )
         if terminated or truncated:
             self.agents = []
+        self._rendering.follow()
         return outcome
 
-    def state(self) -> Any:
-        """Return the whole state [S] that a centralised critic sees."""
-        if self._state is None:
-            raise ValueError("no state yet: call reset() first")
-        return self._state
 
-    def render(self) -> np.ndarray | None:
-        """Return a picture [H, W, 3] uint8 of the scene with render_mode="rgb_array", else None."""
-        if self.render_mode is None:
-            return None
-        from surgical_marl.view.record import ScenePicture
-
-        self._picture = self._picture or ScenePicture(self.batch)
-        return self._picture.draw()
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**vars(self), "_picture": None}
-
-    def _first(self, value: Any) -> Any:
-        return np.array(value[0])
-
-    def _firsts(self, tree: dict[str, Any]) -> dict[str, Any]:
-        return {
-            key: self._firsts(value) if isinstance(value, dict) else self._scalar(value[0])
-            for key, value in tree.items()
-        }
-
-    @staticmethod
-    def _scalar(value: Any) -> Any:
-        return value.item() if np.ndim(value) == 0 else np.array(value)
-
-
-class SurgicalBatchedParallelEnv(ParallelEnv[str, Any, Any]):
+class SurgicalBatchedParallelEnv(_Face):
     """N environments behind the same five dicts. What ended starts anew in the same step.
 
     `infos[agent]` also holds "final_observation" [N, d]: the last observation of this step's episode.
     """
 
     def __init__(self, batch: BatchedEnv) -> None:
-        self.batch = batch
+        super().__init__(batch, None, [])
         self.num_envs = batch.num_envs
-        self.render_mode = None
-        self.metadata = {"name": f"{batch.task_name}_v0", "render_modes": [], "is_parallelizable": True}
-        self.possible_agents = list(batch.agents)
         self.agents = list(batch.agents)
-        self.state_space = batch.state_space
-        self._state: Any = None
-
-    def observation_space(self, agent: str) -> spaces.Space[Any]:
-        """Box of one environment's observation, or Dict of an agent that sees pictures."""
-        return self.batch.observation_space(agent)
-
-    def action_space(self, agent: str) -> spaces.Box:
-        """Box of one environment's action."""
-        return self.batch.action_space(agent)
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
         """Start a new episode in all environments."""
-        observations, self._state, infos = self.batch.reset(seed)
+        observations, self._state, infos = self._restart(seed)
         return observations, infos
 
     def step(self, actions: dict[str, Any]) -> tuple[dict[str, Any], ...]:
@@ -165,11 +170,13 @@ class SurgicalBatchedParallelEnv(ParallelEnv[str, Any, Any]):
             infos,
         )
 
-    def state(self) -> Any:
-        """Return the whole state [N, S]."""
-        if self._state is None:
-            raise ValueError("no state yet: call reset() first")
-        return self._state
+
+def _first(tree: dict[str, Any]) -> dict[str, Any]:
+    """Return the first environment's part of arrays [N, ...]: copies, and plain Python numbers."""
+    return {
+        key: _first(value) if isinstance(value, dict) else value[0].copy() if value.ndim > 1 else value[0].item()
+        for key, value in tree.items()
+    }
 
 
 def parallel_env(
@@ -194,7 +201,7 @@ def parallel_env(
         num_envs: None for one environment, N for the same dicts with a leading N.
         max_cycles: PettingZoo's name for the option `max_steps`.
         arrays: with `num_envs`, the library of the arrays: "numpy", "torch" or "jax".
-        render_mode: None or "rgb_array" (one environment).
+        render_mode: of one environment: None, "rgb_array" for pictures, or "human" for a window that follows.
         options: `control` ("position", "velocity" or "torque"), `difficulty` (a level of the task), `start` ("home" or
             "random"), `max_steps` (control steps until truncation), `decimation` (physics steps a control step),
             `reward` (weights of reward terms, as in {"collision": -5}) and `observe` (terms that agents see, as in
@@ -205,8 +212,7 @@ def parallel_env(
     """
     from surgical_marl.envs.batch import BatchedEnv
 
-    if render_mode not in RENDER_MODES:
-        raise ValueError(f"unknown render_mode {render_mode!r}; the modes are None and 'rgb_array'")
+    check_mode(render_mode)
     if render_mode and num_envs is not None:
         raise ValueError(f"render_mode {render_mode!r} is for one environment: leave num_envs {num_envs} out")
     if num_envs is None and arrays != "numpy":

@@ -3,7 +3,8 @@
 Gymnasium has `surgical_marl/Reach-v0`, and PettingZoo has `surgical_marl/reach-v0`. Each task also has a module, as
 is the custom in PettingZoo: `from surgical_marl import reach_v0`.
 
-Importing `surgical_marl` registers all of them.
+Importing `surgical_marl` registers all of them. Where nothing has imported it, as in a process that a library started,
+the package stands in Gymnasium's id: `surgical_marl:surgical_marl/Reach-v0`.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ def _gymnasium(task: str) -> None:
         register(
             name,
             entry_point=f"{FACES}.gymnasium:SurgicalEnv",
-            vector_entry_point=f"{FACES}.gymnasium:SurgicalVectorEnv",
+            vector_entry_point=f"{FACES}.gymnasium_vector:SurgicalVectorEnv",
             kwargs={"task": task},
         )
 

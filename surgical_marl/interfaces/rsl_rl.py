@@ -86,6 +86,10 @@ class RslRlVecEnv(VecEnv):
         }
         return self._observations, rewards.mean(-1), step.terminated | step.truncated, extras
 
+    def close(self) -> None:
+        """Free the memory and the threads of the environments. A later step is a ValueError."""
+        self.env.close()
+
     def carry(self) -> dict[str, dict[str, Tensor]]:
         """Return what `set_carry` needs to continue bit for bit, as plain dicts of tensors."""
         env = {name: _tensor(value) for name, value in self.env.carry().items()}

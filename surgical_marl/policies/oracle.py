@@ -45,18 +45,24 @@ def oracle(env: BatchedEnv, agents: Sequence[str] | None = None) -> Callable[[Ma
         raise ValueError(f"the task {env.task_name!r} has no target for tool tips that an oracle could move to")
     if env.control != "position":
         raise ValueError(f"the oracle moves position targets: control must be 'position', not {env.control!r}")
-    moved = env.agents if agents is None else agents
-    arms = {agent: _Guide(env, agent, index) for index, agent in enumerate(env.agents) if agent in moved}
+    return _Oracle(env, env.agents if agents is None else agents)
 
-    def policy(observations: Mapping[str, Any]) -> dict[str, Any]:
+
+class _Oracle:
+    """The policy of `oracle`."""
+
+    def __init__(self, env: BatchedEnv, moved: Sequence[str]) -> None:
+        self._env = env
+        self._arms = {agent: _Guide(env, agent, index) for index, agent in enumerate(env.agents) if agent in moved}
+
+    def __call__(self, observations: Mapping[str, Any]) -> dict[str, Any]:
+        env, arms = self._env, self._arms
         targets, began = np.asarray(env.task.targets(env.goal), float), _numpy(env.steps) == 0
         seen = {agent: proprioception(observations[agent]) for agent in arms}
         moves = {agent: arm.move(targets, began, _numpy(seen[agent])) for agent, arm in arms.items()}
         furthest = np.max([np.abs(move).max(-1) for move in moves.values()], axis=0)
         pace = 1 / np.maximum(furthest, 1)[:, None]
         return {agent: _like(seen[agent], pace * move) for agent, move in moves.items()}
-
-    return policy
 
 
 class _Guide:

@@ -8,6 +8,7 @@ episodes begin (`surgical_marl/policies/acting.py`).
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -90,13 +91,12 @@ def untrained_policy(env: BatchedEnv, settings: Settings | None = None, grouping
 
 def zero_policy(env: BatchedEnv) -> Policy:
     """Make the policy that never acts."""
-    return _by_agent(env, lambda shape: np.zeros(shape, np.float32))
+    return _Heedless(env, partial(np.zeros, dtype=np.float32))
 
 
 def random_policy(env: BatchedEnv, seed: int = 0) -> Policy:
     """Make the policy of uniform random actions in [-1, 1]."""
-    generator = np.random.default_rng(seed)
-    return _by_agent(env, lambda shape: generator.uniform(-1, 1, shape).astype(np.float32))
+    return _Heedless(env, partial(_uniform, np.random.default_rng(seed)))
 
 
 def find_run(run: str | Path) -> Path:
@@ -197,19 +197,22 @@ class _Acting:
         return self._memory
 
 
-def _by_agent(env: BatchedEnv, act: Callable[[tuple[int, ...]], np.ndarray]) -> Policy:
-    widths = {agent: env.action_space(agent).shape for agent in env.agents}
+class _Heedless:
+    """A policy that observes nothing but the shapes of what it is shown."""
 
-    def policy(observations: Mapping[str, Any]) -> dict[str, Any]:
-        return {
-            agent: _like(
-                observations[agent],
-                torch.from_numpy(act((*proprioception(observations[agent]).shape[:-1], *(width or ())))),
-            )
-            for agent, width in widths.items()
-        }
+    def __init__(self, env: BatchedEnv, act: Callable[[tuple[int, ...]], np.ndarray]) -> None:
+        self._widths, self._act = {agent: env.action_space(agent).shape for agent in env.agents}, act
 
-    return policy
+    def __call__(self, observations: Mapping[str, Any]) -> dict[str, Any]:
+        actions = {}
+        for agent, width in self._widths.items():
+            shape = (*proprioception(observations[agent]).shape[:-1], *(width or ()))
+            actions[agent] = _like(observations[agent], torch.from_numpy(self._act(shape)))
+        return actions
+
+
+def _uniform(generator: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+    return generator.uniform(-1, 1, shape).astype(np.float32)
 
 
 def _like(example: Any, action: Tensor) -> Any:

@@ -69,6 +69,7 @@ class Task(TipTask):
         "image": -10.0, "distance": 0.0, "precision": 0.0, "angle": 0.0, "stray": -10.0, "clearance": -1.0,
         "collision": -2.0,
     }  # fmt: skip
+    default_scene = "ecm"
     senses = ("image_error",)
     wanted = {"median_error_mm": ("below", 2.0)}  # noqa: RUF012
 

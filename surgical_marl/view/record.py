@@ -83,7 +83,10 @@ class Pose(NamedTuple):
 
 
 class ScenePicture:
-    """Draws the first environment of `env`, with a ball at each arm's goal. Threads may draw at the same time."""
+    """Draws an environment of `env`, the first one unless asked otherwise, with a ball at each arm's goal.
+
+    Threads may draw at the same time.
+    """
 
     def __init__(self, env: BatchedEnv, width: int = 480, height: int = 360) -> None:
         self._env = env
@@ -101,12 +104,12 @@ class ScenePicture:
         mujoco.mj_camlight(model, data)
         return self._renderer.render(data, spheres=balls)
 
-    def pose(self) -> Pose:
-        """How the environment stands now."""
+    def pose(self, index: int = 0) -> Pose:
+        """How an environment stands now: the first one, or that of a number."""
         balls: list[Sphere] = []
         env = self._env
-        targets = env.task.targets(env.goal)[0] if env.task.has_targets else []
-        for index, (mount, target) in enumerate(zip(env.scene.mounts.values(), targets, strict=False)):
+        targets = env.task.targets(env.goal)[index] if env.task.has_targets else []
+        for number, (mount, target) in enumerate(zip(env.scene.mounts.values(), targets, strict=False)):
             place = mount.rotation @ target + mount.position  # the task has it in its arm's base frame
-            balls.append((tuple(place), GOAL_RADIUS, COLOURS[index % len(COLOURS)]))
-        return Pose(np.array(self._env.qpos[0], float), balls)
+            balls.append((tuple(place), GOAL_RADIUS, COLOURS[number % len(COLOURS)]))
+        return Pose(np.array(self._env.qpos[index], float), balls)

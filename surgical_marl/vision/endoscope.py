@@ -11,6 +11,7 @@ the pictures with C MuJoCo's ray caster.
 
 from __future__ import annotations
 
+import numbers
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,7 +19,7 @@ import numpy as np
 import torch
 
 from surgical_marl.content import unknown
-from surgical_marl.runtime import prepare_mjx, prepare_warp
+from surgical_marl.runtime import let_torch_fork, prepare_mjx, prepare_warp
 from surgical_marl.scenes.scene import Scene
 
 SIZE = 64
@@ -79,7 +80,7 @@ class Endoscope:
         agent: str | None = None,
     ) -> None:
         for name, value in (("num_envs", num_envs), ("width", width), ("height", height)):
-            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+            if isinstance(value, bool) or not isinstance(value, numbers.Integral) or value < 1:
                 raise ValueError(f"{name} must be a whole number of at least 1, not {value!r}")
         for channel in channels:
             if channel not in CHANNELS:
@@ -91,6 +92,7 @@ class Endoscope:
         self.eyes = EYES if stereo else EYES[:1]
         self.labels, self.label_names = _labels(scene)
         self._shape = num_envs, len(self.eyes), height, width
+        let_torch_fork()
         prepare_mjx()
         self._warp = prepare_warp()
         from mujoco.mjx.third_party import mujoco_warp

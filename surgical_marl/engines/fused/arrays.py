@@ -14,6 +14,8 @@ from surgical_marl.runtime import prepare_warp
 wp = prepare_warp()
 
 _TYPES = {"state": np.float32, "counts": np.int32, "actions": np.float32, "outs": np.float32, "flags": np.uint8}
+_VIEWS = {"bool": np.bool_, "uint32": np.uint32}
+"""Types of leaves that are not the type of their buffer: the same bits, seen as another type."""
 _READ = ("outs", "flags", "counts")
 """Buffers that a step's results are in."""
 
@@ -114,8 +116,12 @@ class CpuArrays(Arrays):
         return self._cut(tree, {name: self._buffers[name].copy() for name in _READ}, library)
 
     def _present(self, leaf: Leaf, rows: np.ndarray, library: str) -> Any:
-        rows = rows.view(bool) if leaf.dtype == "bool" else rows.view(leaf.dtype)
-        array = rows.T.reshape(self.num_envs, *leaf.shape)
+        if leaf.dtype in _VIEWS:
+            rows = rows.view(_VIEWS[leaf.dtype])
+        dimensions = len(leaf.shape)
+        array = rows[0] if dimensions == 0 else rows.T
+        if dimensions > 1:
+            array = array.reshape(self.num_envs, *leaf.shape)
         if library == "torch":
             import torch
 

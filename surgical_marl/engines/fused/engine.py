@@ -10,6 +10,7 @@ The state of all environments stays in four arrays on the device, [field, enviro
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
@@ -60,7 +61,8 @@ class FusedEngine:
         self._shares = [(a, b - a) for a, b in pairwise(edges)]
         if shares == 1:
             self._shares = [(0, num_envs if self.device == "cuda" else self._stride)]
-        self._pool = ThreadPoolExecutor(shares, "surgical_marl") if shares > 1 else None
+        self._pool: ThreadPoolExecutor | None = None
+        self._process = 0
         self._stepped = False
 
     def reset(self, seed: int, first: int = 0) -> None:
@@ -116,6 +118,12 @@ class FusedEngine:
         self._arrays.write(self._leaves[name], values)
         self._stepped = True
 
+    def close(self) -> None:
+        """End the threads. The arrays are freed with the engine."""
+        if self._pool is not None and self._process == os.getpid():
+            self._pool.shutdown()
+        self._pool = None
+
     def _filled_tables(self) -> dict[str, np.ndarray]:
         """Return the constant tables with the parameters in their places."""
         filled = {dtype: table.copy() for dtype, table in self.source.tables.items()}
@@ -126,10 +134,16 @@ class FusedEngine:
 
     def _launch(self, name: str) -> None:
         launch = lambda share: self._kernels[name].launch(self._arrays.all, self._stride, *share)  # noqa: E731
-        if self._pool is None:
+        if len(self._shares) == 1:
             launch(self._shares[0])
         else:
-            list(self._pool.map(launch, self._shares))
+            list(self._threads().map(launch, self._shares))
+
+    def _threads(self) -> ThreadPoolExecutor:
+        """Return the threads of this process: one that was forked has none of its parent's."""
+        if self._pool is None or self._process != os.getpid():
+            self._pool, self._process = ThreadPoolExecutor(len(self._shares), "surgical_marl"), os.getpid()
+        return self._pool
 
 
 def flatten(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:

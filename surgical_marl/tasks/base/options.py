@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import numbers
 import types
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
@@ -121,6 +122,8 @@ def check(name: str, value: Any, kind: Any, metadata: Mapping[str, Any]) -> Any:
         if not isinstance(value, (list, tuple)) or not value:
             raise ValueError(f"{name} must be a list of whole numbers such as [256, 128, 64], not {value!r}")
         return tuple(check(name, part, int, metadata) for part in value)
+    if kind is int and isinstance(value, numbers.Integral) and not isinstance(value, bool):
+        value = int(value)  # numpy's whole numbers too
     if kind is float:
         value = _as_float(value)  # YAML reads 1e-3 as a string
     good = isinstance(value, kind) and not (kind is not bool and isinstance(value, bool))
@@ -139,7 +142,7 @@ def as_mapping(name: str, value: Any) -> Mapping[str, Any]:
 
 
 def _as_float(value: Any) -> Any:
-    if isinstance(value, bool) or not isinstance(value, (int, float, str)):
+    if isinstance(value, bool) or not isinstance(value, (numbers.Real, str)):
         return value
     try:
         number = float(value)

@@ -73,6 +73,8 @@ class Task:
     levels: ClassVar[Mapping[str, Any]] = {"default": None}
     starts: ClassVar[tuple[str, ...]] = ("home",)
     """What episodes may begin with: see `Options.start`."""
+    default_scene: ClassVar[str | None] = None
+    """The scene of an environment that is made without one; None where any scene will do."""
     max_steps: int = 100
     weights: Mapping[str, float] = {}
     """Of each term of `reward_terms`."""

@@ -1,0 +1,104 @@
+"""Actions that a caller gives, checked before an engine takes them: bad ones end in one sentence and change nothing."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+_NUMBERS = "fiu"
+"""Kinds of numpy's types that are numbers: floating point, signed and unsigned whole ones."""
+
+
+def check_actions(actions: Any, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Any]:
+    """Return the actions of all agents as arrays of finite numbers, in the order of `shapes`.
+
+    What is in the host's memory becomes a numpy array, without a copy where none is needed. What is on a GPU stays
+    there, as an array of its own library. To know whether it is finite, the host waits for the GPU once, for all
+    agents together; while a CUDA graph is captured nothing may wait, and these values are not looked at.
+
+    Args:
+        actions: agent -> array of numpy, torch (a gradient is left behind) or JAX, or nested lists of numbers.
+        shapes: agent -> shape of its action.
+
+    Raises:
+        ValueError: it is no dict, an agent is missing or unknown, a shape is wrong, or a value is not a finite number.
+    """
+    if not isinstance(actions, Mapping):
+        raise ValueError(f"actions must be a dict of agents to arrays, not {_shown(actions)}")
+    for agent in actions:
+        if agent not in shapes:
+            raise ValueError(f"action for {agent!r}, which is not an agent of the scene ({', '.join(shapes)})")
+    checked, away = {}, {}
+    for agent, shape in shapes.items():
+        if agent not in actions:
+            raise ValueError(f"no action for agent {agent!r}")
+        action = _array(agent, actions[agent])
+        if tuple(action.shape) != shape:
+            raise ValueError(f"action of {agent!r} has shape {tuple(action.shape)}, it must be {shape}")
+        if not isinstance(action, np.ndarray):
+            away[agent] = action
+        elif not np.isfinite(action).all():
+            raise _not_finite(agent)
+        checked[agent] = action if action.dtype == np.float32 or agent in away else _single(action)
+    if away:
+        _check_finite(away)
+    return checked
+
+
+def _array(agent: str, given: Any) -> Any:
+    """Return an action as an array of numbers: of numpy, or of its own library if it is on a GPU."""
+    torch, jax = sys.modules.get("torch"), sys.modules.get("jax")
+    array = given
+    if torch is not None and isinstance(given, torch.Tensor):
+        if given.dtype == torch.bool or given.is_complex():
+            raise _no_numbers(agent, given.dtype)
+        array = given.detach()
+        if given.device.type != "cpu":
+            return array
+        return array.float().numpy() if given.dtype == torch.bfloat16 else array.numpy()
+    if jax is not None and isinstance(given, jax.Array):
+        if given.dtype == jax.numpy.bfloat16:
+            given = given.astype(np.float32)
+        array = np.asarray(given) if given.devices() <= set(jax.devices("cpu")) else given
+    elif not isinstance(given, np.ndarray):
+        try:
+            array = np.asarray(given)
+        except (ValueError, TypeError, RuntimeError):  # lists of different lengths, or what has a fault of its own
+            raise _no_numbers(agent, given) from None
+    if array.dtype.kind not in _NUMBERS:
+        raise _no_numbers(agent, given if array.dtype.kind == "O" else array.dtype)
+    return array
+
+
+def _single(action: np.ndarray) -> np.ndarray:
+    return np.clip(action, -1.0, 1.0).astype(np.float32)  # clipped first: there are larger numbers than float32 holds
+
+
+def _check_finite(actions: dict[str, Any]) -> None:
+    """Raise a ValueError if a value of an array on a GPU is not finite."""
+    torch = sys.modules.get("torch")
+    tensors = {agent: a for agent, a in actions.items() if torch is not None and isinstance(a, torch.Tensor)}
+    if tensors and not torch.cuda.is_current_stream_capturing():  # type: ignore[union-attr]
+        every = torch.cat([tensor.flatten() for tensor in tensors.values()])  # type: ignore[union-attr]
+        if not every.isfinite().all():
+            raise _not_finite(next(agent for agent, tensor in tensors.items() if not tensor.isfinite().all()))
+    for agent in actions.keys() - tensors.keys():
+        if not sys.modules["jax"].numpy.isfinite(actions[agent]).all():
+            raise _not_finite(agent)
+
+
+def _not_finite(agent: str) -> ValueError:
+    return ValueError(f"action of {agent!r} holds a value that is not finite")
+
+
+def _no_numbers(agent: str, found: Any) -> ValueError:
+    return ValueError(f"action of {agent!r} must hold real numbers, not {_shown(found)}")
+
+
+def _shown(value: Any) -> str:
+    """Return a value as a message shows it: short, in one line."""
+    text = " ".join(repr(value).split())
+    return text if len(text) <= 60 else f"{text[:57]}..."

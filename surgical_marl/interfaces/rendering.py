@@ -1,0 +1,85 @@
+"""What `render_mode` means: pictures of an environment as arrays, or in a window."""
+
+from __future__ import annotations
+
+import os
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from surgical_marl.envs.batch import BatchedEnv
+
+MODES = ("human", "rgb_array")
+
+
+def check_mode(mode: str | None) -> None:
+    """Raise a ValueError if a render mode is unknown, or is "human" where no window can be opened."""
+    if mode is not None and mode not in MODES:
+        raise ValueError(f"unknown render_mode {mode!r}; the modes are None, 'human' and 'rgb_array'")
+    if mode == "human":
+        from matplotlib import get_backend
+
+        # Without a display matplotlib itself chooses "agg", which draws on nothing. Who asks for it gets it.
+        if get_backend().lower() == "agg" and os.environ.get("MPLBACKEND", "").lower() != "agg":
+            raise ValueError("render_mode 'human' needs a display, and there is none: use render_mode='rgb_array'")
+
+
+class Rendering:
+    """Pictures of the first environment of a batch, as `mode` says.
+
+    A copy has the same mode, and a window of its own.
+    """
+
+    def __init__(self, batch: BatchedEnv, mode: str | None) -> None:
+        check_mode(mode)
+        self.batch, self.mode = batch, mode
+        self._picture: Any = None
+        self._window: Any = None
+
+    def render(self) -> np.ndarray | None:
+        """Return a picture [H, W, 3] uint8 with mode "rgb_array", show it with "human", do nothing with None.
+
+        Raises:
+            ValueError: no episode has begun, or the environment is closed.
+        """
+        self.batch.check_open()
+        if self.mode is None:
+            return None
+        from surgical_marl.view.record import ScenePicture
+
+        self._picture = self._picture or ScenePicture(self.batch)
+        drawn = self._picture.draw()
+        if self.mode == "rgb_array":
+            return drawn
+        self._show(drawn)
+        return None
+
+    def follow(self) -> None:
+        """Show what has just happened, with mode "human"."""
+        if self.mode == "human":
+            self.render()
+
+    def close(self) -> None:
+        """Close the window."""
+        if self._window is not None:
+            from matplotlib import pyplot
+
+            pyplot.close(self._window.figure)
+        self._picture = self._window = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "_picture": None, "_window": None}
+
+    def _show(self, drawn: np.ndarray) -> None:
+        from matplotlib import pyplot
+
+        if self._window is None:
+            figure = pyplot.figure(self.batch.env.title, frameon=False)
+            axes = figure.add_axes((0, 0, 1, 1))
+            axes.set_axis_off()
+            self._window = axes.imshow(drawn)
+            pyplot.show(block=False)
+        self._window.set_data(drawn)
+        self._window.figure.canvas.draw_idle()
+        self._window.figure.canvas.flush_events()

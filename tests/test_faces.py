@@ -1,0 +1,252 @@
+"""The parallel faces: PettingZoo's own tests, equal numbers behind every face, and what is freed at the end."""
+
+from __future__ import annotations
+
+import gc
+import itertools
+import sys
+import threading
+import weakref
+from collections.abc import Callable
+from importlib import import_module
+from typing import Any
+
+import matplotlib
+import numpy as np
+import pettingzoo.test
+import pytest
+import torch
+from rsl_rl.runners import OnPolicyRunner
+
+import surgical_marl as sm
+from surgical_marl.envs.batch import BatchedEnv
+from surgical_marl.interfaces.rsl_rl import RslRlVecEnv
+
+STEPS = 6
+CONTROLS = ("position", "velocity", "torque")
+QUICK = {("reach", "psm", "position"), ("track", "bimanual_star", "velocity"), ("match_image", "ecm", "position")}
+
+
+def combinations() -> list[Any]:
+    """Every task on every scene that it has, in every control mode: a few at once, all of them with `-m slow`."""
+    every = itertools.product(sm.list_tasks(), sm.list_scenes(), CONTROLS)
+    return [pytest.param(*c, marks=[] if c in QUICK else pytest.mark.slow, id="-".join(c)) for c in every]
+
+
+def makers(task: str, scene: str, control: str) -> list[Callable[..., Any]]:
+    """`parallel_env`, `env` and `raw_env` of the task's module; a skip if the task does not go with the scene."""
+    try:
+        sm.parallel_env(task, scene=scene, control=control).close()
+    except ValueError as error:
+        pytest.skip(str(error))
+    module = getattr(sm, f"{task}_v0")
+    functions = (module.parallel_env, module.env, module.raw_env)
+    return [lambda f=f, **o: f(**{"scene": scene, "control": control, "max_cycles": STEPS, **o}) for f in functions]
+
+
+@pytest.mark.parametrize(("task", "scene", "control"), combinations())
+def test_pettingzoo_accepts_every_task_scene_and_control(task: str, scene: str, control: str) -> None:
+    parallel_env, env, raw_env = makers(task, scene, control)
+    pettingzoo.test.parallel_api_test(parallel_env(), num_cycles=3 * STEPS)
+    pettingzoo.test.parallel_seed_test(parallel_env, num_cycles=STEPS)
+    for make in (env, raw_env):
+        pettingzoo.test.api_test(make(), num_cycles=3 * STEPS)
+    pettingzoo.test.seed_test(env, num_cycles=STEPS)
+    module = type("Module", (), {"parallel_env": staticmethod(parallel_env), "env": staticmethod(env)})
+    pettingzoo.test.max_cycles_test(module)
+
+
+def test_pettingzoo_accepts_both_ways_to_render(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    pettingzoo.test.render_test(lambda render_mode: sm.reach_v0.env(scene="psm", render_mode=render_mode))
+
+
+def test_a_window_follows_the_episode(monkeypatch: pytest.MonkeyPatch) -> None:
+    from matplotlib import pyplot
+
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    before = set(pyplot.get_fignums())
+    env = sm.parallel_env("reach", scene="psm", render_mode="human")
+    pictures = sm.parallel_env("reach", scene="psm", render_mode="rgb_array")
+    for each in (env, pictures):
+        each.reset(seed=0)
+    (number,) = set(pyplot.get_fignums()) - before
+    (shown,) = pyplot.figure(number).axes[0].images
+    for _ in range(2):
+        np.testing.assert_array_equal(shown.get_array(), pictures.render())
+        for each in (env, pictures):
+            each.step({"psm_0": np.ones(7)})
+    assert env.render() is None and env.metadata["render_modes"] == ["human", "rgb_array"]
+    env.close()
+    assert set(pyplot.get_fignums()) == before
+
+
+def test_without_a_display_a_window_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("MPLBACKEND", raising=False)
+    monkeypatch.setattr(matplotlib, "get_backend", lambda: "agg")
+    with pytest.raises(ValueError, match="render_mode 'human' needs a display, and there is none: use"):
+        sm.parallel_env("reach", scene="psm", render_mode="human")
+    with pytest.raises(ValueError, match="unknown render_mode 'ansi'; the modes are None, 'human' and 'rgb_array'"):
+        sm.parallel_env("reach", scene="psm", render_mode="ansi")
+
+
+def test_wrappers_find_random_numbers_that_a_seed_begins_anew() -> None:
+    env, other = (sm.parallel_env("reach", scene="psm", **form) for form in ({}, {"num_envs": 2}))
+    drawn = []
+    for each in (env, env, other):
+        each.reset(seed=4)
+        drawn.append(each.np_random.integers(0, 1000, 5).tolist())
+        each.reset()
+    assert drawn[0] == drawn[1] == drawn[2]
+    assert env.np_random.integers(0, 1000, 5).tolist() != drawn[0]
+
+
+@pytest.mark.parametrize("form", [{}, {"num_envs": 2}, {"num_envs": 2, "arrays": "torch"}])
+def test_spaces_are_there_as_dicts_too(form: dict[str, Any]) -> None:
+    env = sm.parallel_env("reach", scene="trimanual_psm_ecm", **form)
+    for spaces, space in ((env.observation_spaces, env.observation_space), (env.action_spaces, env.action_space)):
+        assert list(spaces) == env.possible_agents
+        assert all(spaces[agent] is space(agent) for agent in spaces)
+
+
+SCENE, AGENTS, WIDTH = "bimanual_psm", ("psm_0", "psm_1"), 7
+
+
+def numbers_of_batch(arrays: str, actions: np.ndarray) -> list[np.ndarray]:
+    env = BatchedEnv("reach", SCENE, num_envs=1, arrays=arrays, max_steps=STEPS, engine="fused")
+    seen = [env.reset(11)[1]]
+    for action in actions:
+        seen.append(env.step({a: action[None, i] for i, a in enumerate(AGENTS)}).final_state)
+    return [np.asarray(state)[0] for state in seen]
+
+
+def numbers_of_parallel(actions: np.ndarray, make: Any = None) -> list[np.ndarray]:
+    env = (make or sm.reach_v0.parallel_env)(scene=SCENE, max_steps=STEPS, engine="fused")
+    observations, _ = env.reset(seed=11)
+    seen = [observations]
+    for action in actions:
+        seen.append(env.step(dict(zip(AGENTS, action, strict=True)))[0])
+    return [np.concatenate([own[agent] for agent in AGENTS]) for own in seen]
+
+
+def numbers_of_many(actions: np.ndarray) -> list[np.ndarray]:
+    env = sm.parallel_env("reach", scene=SCENE, num_envs=1, max_steps=STEPS, engine="fused")
+    observations, _ = env.reset(seed=11)
+    seen = [observations]
+    for action in actions:
+        infos = env.step({a: action[None, i] for i, a in enumerate(AGENTS)})[-1]
+        seen.append({agent: info["final_observation"] for agent, info in infos.items()})
+    return [np.concatenate([own[agent][0] for agent in AGENTS]) for own in seen]
+
+
+def numbers_of_turns(actions: np.ndarray) -> list[np.ndarray]:
+    env = sm.reach_v0.env(scene=SCENE, max_steps=STEPS, engine="fused")
+    env.reset(seed=11)
+    seen = []
+    for action in [*actions, None]:
+        seen.append(np.concatenate([env.observe(agent) for agent in AGENTS]))
+        for i in range(len(AGENTS)):
+            env.step(None if action is None else action[i])
+    return seen
+
+
+def numbers_of_rsl_rl(actions: np.ndarray) -> list[np.ndarray]:
+    batch = BatchedEnv("reach", SCENE, num_envs=1, arrays="torch", max_steps=STEPS, engine="fused")
+    env = RslRlVecEnv(batch, grouping="agent", seed=11)
+    seen = [env.get_observations()]
+    for action in actions:
+        seen.append(env.step(torch.from_numpy(action).reshape(1, -1))[-1]["final_obs"])
+    return [np.concatenate([own[agent][0, 0] for agent in AGENTS]) for own in seen]
+
+
+def numbers_of_torchrl(actions: np.ndarray) -> list[np.ndarray]:
+    pytest.importorskip("torchrl")
+    from surgical_marl.interfaces.torchrl import TorchRLEnv
+
+    env = TorchRLEnv(BatchedEnv("reach", SCENE, num_envs=1, arrays="torch", max_steps=STEPS, engine="fused"))
+    env.set_seed(11)
+    data, seen = env.reset(), []
+    seen.append(data)
+    for action in actions:
+        data["psm", "action"] = torch.from_numpy(action)[None]
+        stepped, data = env.step_and_maybe_reset(data)
+        seen.append(stepped["next"])
+    return [own["psm", "observation"].reshape(-1).numpy() for own in seen]
+
+
+FACES: dict[str, Callable[[np.ndarray], list[np.ndarray]]] = {
+    "torch": lambda actions: numbers_of_batch("torch", actions),
+    "jax": lambda actions: numbers_of_batch("jax", actions),
+    "parallel": numbers_of_parallel,
+    "many": numbers_of_many,
+    "turns": numbers_of_turns,
+    "rsl_rl": numbers_of_rsl_rl,
+    "torchrl": numbers_of_torchrl,
+}
+
+
+@pytest.mark.parametrize("face", FACES)
+def test_one_seed_and_the_same_actions_give_the_same_numbers_through_every_face(face: str) -> None:
+    actions = np.random.default_rng(1).uniform(-1, 1, (STEPS, len(AGENTS), WIDTH)).astype(np.float32)
+    expected, found = numbers_of_batch("numpy", actions), FACES[face](actions)
+    assert len(found) == STEPS + 1 and not np.array_equal(expected[0], expected[-1])
+    np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize("scene", ["psm", "trimanual_psm_ecm"])
+def test_rsl_rls_own_runner_trains_untouched(scene: str) -> None:
+    batch = BatchedEnv("reach", scene, num_envs=8, max_steps=STEPS, arrays="torch", engine="fused")
+    env = RslRlVecEnv(batch, seed=0)
+    network = {"class_name": "MLPModel", "hidden_dims": [16], "activation": "elu", "obs_normalization": True}
+    noise = {"distribution_cfg": {"class_name": "GaussianDistribution", "init_std": 1.0}}
+    config = {
+        "num_steps_per_env": 2 * STEPS,
+        "save_interval": 10,
+        "obs_groups": {"actor": ["state"], "critic": ["state"]},
+        "actor": {**network, **noise},
+        "critic": network,
+        "algorithm": {"class_name": "PPO"},
+    }
+    runner = OnPolicyRunner(env, config, device=env.device)
+    before = {name: value.clone() for name, value in runner.alg.actor.state_dict().items()}
+    runner.learn(3, init_at_random_ep_len=True)
+    after = runner.alg.actor.state_dict()
+    assert all(value.isfinite().all() for value in after.values())
+    assert any(not torch.equal(value, before[name]) for name, value in after.items())
+    env.close()
+    with pytest.raises(ValueError, match="the environment is closed"):
+        env.step(torch.zeros(8, env.num_actions))
+
+
+@pytest.mark.parametrize(
+    ("task", "scene", "options"),
+    [("reach", "psm", {}), ("reach", "psm", {"num_envs": 128}), ("match_image", "ecm", {})],
+)
+@pytest.mark.parametrize("closes", [True, False])
+def test_environments_leave_nothing_behind(task: str, scene: str, options: dict[str, Any], closes: bool) -> None:
+    """Neither threads nor arrays, closed or only forgotten."""
+    threads, gone = threading.active_count(), []
+    for _ in range(3):
+        env = sm.parallel_env(task, scene=scene, engine="fused", **options)
+        env.reset(seed=0)
+        env.step({a: np.zeros((*((128,) if options else ()), *env.action_space(a).shape)) for a in env.agents})
+        gone.append(weakref.ref(env.batch.engine._arrays))
+        if closes:
+            env.close()
+            gc.collect()
+            assert gone[-1]() is None
+    del env
+    gc.collect()
+    assert [reference() for reference in gone] == [None] * 3
+    for thread in threading.enumerate():
+        if thread.name.startswith("surgical_marl"):
+            thread.join(10)
+    assert threading.active_count() <= threads
+
+
+def test_without_torchrl_its_face_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "torchrl", None)
+    monkeypatch.setitem(sys.modules, "torchrl.data", None)
+    monkeypatch.delitem(sys.modules, "surgical_marl.interfaces.torchrl", raising=False)
+    with pytest.raises(ImportError, match="the TorchRL face needs torchrl"):
+        import_module("surgical_marl.interfaces.torchrl")
