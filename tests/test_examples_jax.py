@@ -22,7 +22,7 @@ def run(name: str, pattern: str) -> list[float]:
 
 def test_a_trajectory_is_optimised_by_gradient() -> None:
     errors = run("jax_trajectory.py", r"ends ([\d.]+) mm")
-    assert errors[0] > 20 and errors[-1] < 1
+    assert errors[0] > 20 and errors[-1] < 2
 
 
 def test_ppo_earns_more_than_at_first() -> None:
