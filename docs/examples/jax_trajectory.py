@@ -12,7 +12,7 @@ import time
 import surgical_marl as sm
 from surgical_marl.runtime import jax, jnp
 
-STEPS, HELD, EFFORT, RATE = 25, 5, 1e-5, 0.1
+STEPS, HELD, EFFORT, RATE = 25, 5, 1e-4, 0.1
 WAY = (0.01, 0.015, -0.01)  # from where the tip is at first to its target, m, in the arm's base frame
 
 
