@@ -19,6 +19,7 @@ from surgical_marl.plugins.tasks import list_tasks
 
 if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv
+    from surgical_marl.interfaces.jax_env import jax_env
     from surgical_marl.interfaces.pettingzoo import parallel_env
     from surgical_marl.robots.arm import load_arm
     from surgical_marl.scenes.load import load_scene
@@ -28,6 +29,7 @@ __version__ = "0.1.0"
 
 _LAZY = {
     "BatchedEnv": "surgical_marl.envs.batch",
+    "jax_env": "surgical_marl.interfaces.jax_env",
     "load_arm": "surgical_marl.robots.arm",
     "load_scene": "surgical_marl.scenes.load",
     "Task": "surgical_marl.tasks.base.task",
@@ -39,6 +41,7 @@ __all__ = [
     "BatchedEnv",
     "Task",
     "TipTask",
+    "jax_env",
     "list_algorithms",
     "list_arms",
     "list_policies",

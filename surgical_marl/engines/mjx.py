@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from functools import lru_cache, partial
 from typing import Any
 
 import jax
@@ -12,12 +14,55 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from surgical_marl.engines.stepper import Stepper, announce
+from surgical_marl.engines.stepper import MOST_KEPT, Stepper, announce, representative
 from surgical_marl.machine import cores
 from surgical_marl.runtime import no_collection
 
 LEAST_SHARE = 32
 """Environments that are worth a thread."""
+
+
+@dataclass
+class Functions:
+    """An environment's functions for a number of environments. All engines for such environments share them."""
+
+    reset: Any
+    step: Any
+    move: Any
+    finish: Any
+    carry: Any
+    """Shapes of one environment's `Carry`."""
+    traced: set[str] = field(default_factory=set)
+    """Which were called before, and so are compiled."""
+
+
+@lru_cache(MOST_KEPT)
+def _functions(env: Stepper, num_envs: int) -> Functions:
+    every = lambda function, axes: jax.jit(jax.vmap(function, (*axes, None)))  # noqa: E731
+    key, number = jax.ShapeDtypeStruct((2,), jnp.uint32), jax.ShapeDtypeStruct((), jnp.int32)
+    return Functions(
+        reset=every(env.reset, (0, 0)),
+        step=jax.jit(jax.vmap(env.step, (0, 0, None)), donate_argnums=0),
+        move=every(env.move, (0, 0)),
+        finish=every(env.finish, (0, 0)),
+        carry=jax.eval_shape(env.reset, key, number, env.parameters).carry,
+    )
+
+
+@jax.jit
+def _first_keys(key: Array, numbers: Array) -> Array:
+    return jax.vmap(jax.random.fold_in, (None, 0))(key, numbers)
+
+
+@partial(jax.jit, static_argnums=1)
+def _split(tree: Any, shares: int) -> list[Any]:
+    """Return `shares` trees of arrays, each with an equal part of the environments."""
+    return [jax.tree.map(lambda x, i=i: jnp.split(x, shares)[i], tree) for i in range(shares)]
+
+
+@jax.jit
+def _join(*parts: Any) -> Any:
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
 
 
 class MjxEngine:
@@ -30,30 +75,21 @@ class MjxEngine:
         self._on = find_device(device)
         self.device = "cpu" if self._on.platform == "cpu" else "cuda"
         self._parameters = jax.device_put(env.parameters, self._on)
-        every = lambda function, axes: jax.jit(jax.vmap(function, (*axes, None)))  # noqa: E731
-        self._first_keys = jax.jit(jax.vmap(jax.random.fold_in, (None, 0)))
-        self._reset = every(env.reset, (0, 0))
-        self._step = jax.jit(jax.vmap(env.step, (0, 0, None)), donate_argnums=0)
-        self._move, self._finish = every(env.move, (0, 0)), every(env.finish, (0, 0))
+        self._functions = _functions(representative(env), num_envs)
         # XLA runs a step on one CPU core: every core takes a share of the environments
         shares = min(cores(), num_envs // LEAST_SHARE) if self.device == "cpu" else 1
         self._shares = next(n for n in range(max(shares, 1), 0, -1) if num_envs % n == 0)
         self._pool = ThreadPoolExecutor(self._shares, "surgical_marl")
-        self._split = jax.jit(lambda tree: [jax.tree.map(share, tree) for share in self._slices()])
-        self._join = jax.jit(lambda *parts: jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts))
         self._state: Any = None
         self._moved: Any = None
-        self._announced = self._stepped = False
-        self._traced: set[Any] = set()
-        key, number = jax.ShapeDtypeStruct((2,), jnp.uint32), jax.ShapeDtypeStruct((), jnp.int32)
-        shapes = jax.eval_shape(env.reset, key, number, env.parameters).carry
-        self._tree = jax.tree.structure(shapes)
-        self.carry_shapes = {name: leaf.shape for name, leaf in _paths(shapes).items()}
+        self._stepped = False
+        self._tree = jax.tree.structure(self._functions.carry)
+        self.carry_shapes = {name: leaf.shape for name, leaf in _paths(self._functions.carry).items()}
 
     def reset(self, seed: int, first: int = 0) -> None:
         """First episodes. Environment i depends on `seed` and `first` + i alone, not on how many there are."""
         with jax.default_device(self._on):
-            keys = self._first_keys(jax.random.PRNGKey(seed), jnp.arange(first, first + self.num_envs))
+            keys = _first_keys(jax.random.PRNGKey(seed), jnp.arange(first, first + self.num_envs))
             self._begin(keys, jnp.zeros(self.num_envs, jnp.int32))
 
     def restart(self) -> None:
@@ -66,11 +102,11 @@ class MjxEngine:
         self._begin(carry.key, carry.episode + ~begun)
 
     def _begin(self, keys: Array, episodes: Array) -> None:
-        if not self._announced:
+        if not self._functions.traced:
             announce(self.env, self.name, self.device)
-            self._announced = True
+            self._functions.traced.add("reset")
         with jax.default_device(self._on):
-            self._state, self._stepped = self._reset(keys, episodes, self._parameters), False
+            self._state, self._stepped = self._functions.reset(keys, episodes, self._parameters), False
 
     def step(self, actions: dict[str, Any], sense: Callable[[], dict[str, Any]] | None = None) -> None:
         """One control step of all environments.
@@ -81,28 +117,28 @@ class MjxEngine:
         """
         given = {agent: self._take(action).astype(jnp.float32) for agent, action in actions.items()}
         if self.env.pauses:
-            self._moved = self._run(self._move, self._state.carry, given)
+            self._moved = self._run("move", self._state.carry, given)
             sensed = {name: self._take(values) for name, values in (sense() if sense else {}).items()}
-            self._state = self._run(self._finish, self._moved, sensed)
+            self._state = self._run("finish", self._moved, sensed)
         else:
-            self._state = self._run(self._step, self._state.carry, given)
+            self._state = self._run("step", self._state.carry, given)
         self._stepped = True
 
-    def _run(self, function: Any, *given: Any) -> Any:
+    def _run(self, name: str, *given: Any) -> Any:
         """Run a function on all environments, with a share of them on each core."""
-        traced = function in self._traced
+        function, traced = getattr(self._functions, name), name in self._functions.traced
         # Tracing makes some million objects that all stay: looking for garbage among them takes a quarter of the time.
         with contextlib.nullcontext() if traced else no_collection():
             if self._shares == 1:
                 found = self._run_share(function, given)
             else:
-                shares = self._split(given)
+                shares = _split(given, self._shares)
                 first = (
                     [] if traced else [self._run_share(function, shares.pop(0))]
                 )  # compiles once, not in each thread
                 rest = self._pool.map(lambda share: self._run_share(function, share), shares)
-                found = self._join(*first, *rest)
-        self._traced.add(function)
+                found = _join(*first, *rest)
+        self._functions.traced.add(name)
         return found
 
     def outcome(self, library: str) -> dict[str, Any]:
@@ -140,10 +176,6 @@ class MjxEngine:
         with jax.default_device(self._on):  # of this thread
             found = function(*share, self._parameters)
             return jax.block_until_ready(found) if self._shares > 1 else found
-
-    def _slices(self) -> list[Callable[[Array], Array]]:
-        size = self.num_envs // self._shares
-        return [lambda x, i=i: x[i * size : (i + 1) * size] for i in range(self._shares)]  # type: ignore[misc]
 
     def _take(self, values: Any) -> Array:
         """Values of any array library, on the engine's device."""

@@ -2,8 +2,17 @@
 
 from __future__ import annotations
 
+import hashlib
 import sys
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any, Protocol
+
+import numpy as np
+
+MOST_KEPT = 16
+"""Steppers, and what was compiled for them, that a process keeps for later ones that are alike."""
 
 
 class Stepper(Protocol):
@@ -23,8 +32,12 @@ class Stepper(Protocol):
         """All that the functions depend on besides code and the values of `parameters`."""
 
     @property
+    def classes(self) -> tuple[type, ...]:
+        """Classes whose code the functions run."""
+
+    @property
     def roots(self) -> tuple[str, ...]:
-        """Modules whose code the functions run, with all that these import."""
+        """Modules of these classes: their code and all that they import is what the functions run."""
 
     @property
     def parameters(self) -> Any:
@@ -41,6 +54,8 @@ class Stepper(Protocol):
     def senses(self) -> tuple[str, ...]:
         """Names of numbers that are measured outside, between `move` and `finish`."""
 
+    def __hash__(self) -> int: ...
+
     def num_actions(self, agent: str) -> int: ...
 
     def reset(self, key: Any, episode: Any, parameters: Any) -> Any: ...
@@ -50,6 +65,36 @@ class Stepper(Protocol):
     def move(self, carry: Any, actions: dict[str, Any], parameters: Any) -> Any: ...
 
     def finish(self, moved: Any, sensed: dict[str, Any], parameters: Any) -> Any: ...
+
+
+def representative(stepper: Stepper) -> Stepper:
+    """Return the first stepper of this process that steps as this one does.
+
+    Parameters of the two may differ in their values. What JAX traces and compiles for the one serves the other.
+    """
+    known = hashlib.sha256(f"{describe(stepper.parameters)} ".encode() + stepper.content).digest()
+    return _first(_Alike(known, stepper.classes, stepper))
+
+
+@dataclass(frozen=True)
+class _Alike:
+    """Equal for steppers that step alike."""
+
+    digest: bytes
+    classes: tuple[type, ...]
+    stepper: Stepper = field(compare=False)
+
+
+@lru_cache(maxsize=MOST_KEPT)
+def _first(alike: _Alike) -> Stepper:
+    return alike.stepper
+
+
+def describe(parameters: Any) -> str:
+    """Return names, shapes and types of parameters: their values are inputs of what is compiled."""
+    if isinstance(parameters, Mapping):
+        return repr({name: describe(value) for name, value in sorted(parameters.items())})
+    return f"{np.shape(parameters)} {parameters.dtype.name}"
 
 
 def announce(stepper: Stepper, engine: str, device: str) -> None:

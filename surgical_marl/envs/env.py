@@ -156,9 +156,14 @@ class Env:
         return self.scene.fingerprint + f"{self.task_name} {how}".encode() + model.tobytes()
 
     @property
+    def classes(self) -> tuple[type, ...]:
+        """Classes whose code a step runs."""
+        return type(self), type(self.task)
+
+    @property
     def roots(self) -> tuple[str, ...]:
         """Modules whose code a step runs, with all that these import."""
-        return type(self).__module__, type(self.task).__module__
+        return tuple(cls.__module__ for cls in self.classes)
 
     @cached_property
     def parameters(self) -> dict[str, Any]:

@@ -1,1 +1,1 @@
-"""Thin faces of the batched environment: PettingZoo, Gymnasium, rsl_rl."""
+"""Thin faces of the environment: PettingZoo, Gymnasium, rsl_rl, JAX."""

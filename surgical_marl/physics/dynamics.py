@@ -11,6 +11,7 @@ from __future__ import annotations
 import copy
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -81,7 +82,8 @@ class Dynamics:
 
     def relaxed(self, forces: Forces, qacc: Array) -> Array:
         """Acceleration [n] near to what friction and limits allow, from a guess."""
-        return relax(forces.mass, forces.smooth, self._joint_rows(forces.rows), qacc)
+        # where `solve` begins: no derivative goes through it
+        return relax(*jax.lax.stop_gradient((forces.mass, forces.smooth, self._joint_rows(forces.rows), qacc)))
 
     def step(self, physics: Physics) -> Physics:
         """Return the state after one physics step without contacts."""

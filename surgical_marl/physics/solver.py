@@ -13,7 +13,8 @@ sides changes the whole step.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -103,6 +104,7 @@ def relax(mass: Array, smooth: Array, joints: JointRows, qacc: Array) -> Array:
     return jnp.stack(found)
 
 
+@partial(jax.custom_jvp, nondiff_argnums=(4, 5))
 def solve(
     mass: Array, smooth: Array, rows: Rows, start: Array, iterations: int, line_search: int
 ) -> tuple[Array, Array]:
@@ -113,6 +115,8 @@ def solve(
 
     There are at most `iterations` Newton steps. A step over which no row changes sides ends at the solution, and a
     second such step removes its rounding error. After that the search stops.
+
+    Its derivative is that of the solution (`_differentiate`), whatever the way there.
     """
 
     def newton(qacc: Array) -> tuple[Array, Array]:
@@ -139,7 +143,35 @@ def solve(
         qacc = newton(start)[0]
     else:
         qacc, _, _ = jax.lax.while_loop(unsettled, iterate, (start, jnp.int32(0), jnp.int32(0)))
-    return qacc, jnp.clip(rows.impedance * (rows.reference - rows.jacobian @ qacc), rows.low, rows.high)
+    return qacc, _force(rows, qacc)
+
+
+@solve.defjvp
+def _differentiate(
+    iterations: int, line_search: int, primals: tuple[Any, ...], tangents: tuple[Any, ...]
+) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    """Return the solution and its derivative, by the implicit function theorem.
+
+    At the solution all forces balance the inertia, and each row stays on its side. So the derivative takes one linear
+    system, which is never degenerate. The way to the solution is no use: at rest it divides zero by zero.
+    """
+    mass, smooth, rows, _ = primals
+    qacc, force = solve(*primals, iterations, line_search)
+
+    def excess(mass: Array, smooth: Array, rows: Rows) -> Array:
+        return smooth + rows.jacobian.T @ _force(rows, qacc) - mass @ qacc
+
+    _, pull = jax.jvp(excess, (mass, smooth, rows), tangents[:3])
+    unbounded = rows.impedance * (rows.reference - rows.jacobian @ qacc)
+    gives = jnp.where((unbounded > rows.low) & (unbounded < rows.high), rows.impedance, 0.0)
+    change = solve_positive(mass + rows.jacobian.T @ (gives[:, None] * rows.jacobian), pull)
+    _, push = jax.jvp(_force, (rows, qacc), (tangents[2], change))
+    return (qacc, force), (change, push)
+
+
+def _force(rows: Rows, qacc: Array) -> Array:
+    """Return the force of each row [r] at an acceleration [n]."""
+    return jnp.clip(rows.impedance * (rows.reference - rows.jacobian @ qacc), rows.low, rows.high)
 
 
 def _line_search(

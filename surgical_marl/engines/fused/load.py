@@ -11,7 +11,7 @@ import numpy as np
 
 from surgical_marl.cache import cached
 from surgical_marl.engines.fused.program import TREES, Leaf, Source
-from surgical_marl.engines.stepper import Stepper
+from surgical_marl.engines.stepper import Stepper, describe
 
 
 def load_source(env: Stepper, vector: bool, announce: Callable[[], None] = lambda: None) -> Source:
@@ -29,18 +29,11 @@ def load_source(env: Stepper, vector: bool, announce: Callable[[], None] = lambd
         announce()
         return np.frombuffer(json.dumps(asdict(make_source(env, vector)), default=np.ndarray.tolist).encode(), np.uint8)
 
-    settings = f"vector={vector} {_describe(env.parameters)}"
+    settings = f"vector={vector} {describe(env.parameters)}"
     found = json.loads(cached("fused", compute, settings, env.content, roots=env.roots).tobytes())
     tables = {dtype: np.array(table, dtype) for dtype, table in found.pop("tables").items()}
     trees = {name: _leaves(found.pop(name)) for name in TREES}
     return Source(tables=tables, **trees, **found)
-
-
-def _describe(parameters: Any) -> str:
-    """Names, shapes and types of parameters, without JAX: their values are inputs of the kernels."""
-    if isinstance(parameters, dict):
-        return repr({name: _describe(value) for name, value in sorted(parameters.items())})
-    return f"{np.shape(parameters)} {parameters.dtype.name}"
 
 
 def _leaves(tree: Any) -> Any:

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import copy
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import cache
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from surgical_marl.content import unknown
-from surgical_marl.runtime import jnp
+from surgical_marl.runtime import jax, jnp
 from surgical_marl.tasks.base.options import Options
 from surgical_marl.tasks.base.terms import FAR, Picture, Term, arm_terms, picture_terms
 from surgical_marl.tasks.base.world import World
@@ -226,9 +227,7 @@ class TipTask(Task):
     def tip_errors(self, world: World) -> dict[str, Array]:
         """Return the distance of tool tip and target in m."""
         targets = world.goal.targets
-        return {
-            agent: jnp.linalg.norm(targets[i] - view.tool_tip) for i, (agent, view) in enumerate(world.arms.items())
-        }
+        return {agent: _length()(targets[i] - view.tool_tip) for i, (agent, view) in enumerate(world.arms.items())}
 
     def terms(self, agent: str) -> dict[str, Term | Picture]:
         """Return those of every task, `target` [3], and `to_target` [3] from the tip."""
@@ -263,3 +262,14 @@ class TipTask(Task):
     def targets(self, goal: Any) -> np.ndarray:
         """Return where tool tips should be, [N, arms, 3], each in its arm's base frame, m."""
         return np.asarray(goal.targets)
+
+
+@cache
+def _length() -> Callable[[Array], Array]:
+    """Return what computes the length of a vector [3], with derivative zero at zero, where it has none.
+
+    That of `jnp.linalg.norm` is NaN there: one tip at its target would spoil the derivative of a whole episode.
+    """
+    length = jax.custom_jvp(lambda vector: jnp.linalg.norm(vector))
+    length.defjvps(lambda change, length, vector: vector @ change / jnp.maximum(length, 1e-12))
+    return length
