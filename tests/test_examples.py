@@ -61,9 +61,6 @@ def notebook() -> dict[str, Any]:
 def test_the_notebooks_cells_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     display = ModuleType("IPython.display")
     display.Video = lambda path, embed: Path(path).stat().st_size  # type: ignore[attr-defined]
-    ipython = ModuleType("IPython")
-    ipython.get_ipython = lambda: None  # type: ignore[attr-defined]  (matplotlib asks)
-    monkeypatch.setitem(sys.modules, "IPython", ipython)
     monkeypatch.setitem(sys.modules, "IPython.display", display)
     monkeypatch.setenv("MPLBACKEND", "agg")
     monkeypatch.syspath_prepend(EXAMPLES)
