@@ -22,7 +22,7 @@ import surgical_marl as sm
 def make_envs(scene: str, count: int, **options):
     """Return `count` scenes as one vector environment of all their arms."""
     env = sm.parallel_env("reach", scene=scene, **options)
-    env = supersuit.pad_action_space_v0(supersuit.pad_observations_v0(supersuit.black_death_v3(env)))
+    env = supersuit.pad_action_space_v0(supersuit.pad_observations_v0(env))
     env = supersuit.pettingzoo_env_to_vec_env_v1(env)
     return VecMonitor(supersuit.concat_vec_envs_v1(env, count, num_cpus=0, base_class="stable_baselines3"))
 
