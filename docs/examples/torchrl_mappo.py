@@ -3,8 +3,8 @@
     pip install torchrl
     python docs/examples/torchrl_mappo.py [steps]
 
-`PettingZooWrapper` groups arms of a kind, here both PSMs as "psm". The error halves in 100,000 steps, some five
-minutes on two CPU cores: TorchRL spends milliseconds of its own on a step of one scene.
+`PettingZooWrapper` groups arms of a kind, here both PSMs as "psm". The error falls from 105 mm to less than 60 mm in
+25,000 steps, some two minutes of one CPU core: TorchRL spends milliseconds of its own on each step of one scene.
 """
 
 import sys
@@ -51,7 +51,7 @@ def make_networks(env: TransformedEnv):
     return policy, TensorDictModule(value, [(GROUP, "observation")], [(GROUP, "state_value")])
 
 
-def main(steps: int = 100_000) -> float:
+def main(steps: int = 30_000) -> float:
     """Train, and return the median error of the last episodes, with exploration, in mm."""
     torch.manual_seed(0)
     torch.set_num_threads(1)  # networks this small are no faster with more
