@@ -4,8 +4,8 @@
     python docs/examples/sb3_supersuit.py [steps] [scene]
 
 SuperSuit makes each arm of each environment one environment of a vector. Arms of different kinds, as in
-`trimanual_psm_ecm`, observe and act in vectors of different lengths: padding makes them alike. Two PSMs end within some
-millimetres after 400,000 steps, in five minutes on two CPU cores.
+`trimanual_psm_ecm`, observe and act in vectors of different lengths: padding makes them alike. Two PSMs are at a median
+error of 29 mm after 200,000 steps, some two minutes of one CPU core, from 76 mm untrained.
 """
 
 import sys
@@ -27,7 +27,7 @@ def make_envs(scene: str, count: int, **options):
     return VecMonitor(supersuit.concat_vec_envs_v1(env, count, num_cpus=0, base_class="stable_baselines3"))
 
 
-def main(steps: int = 400_000, scene: str = "bimanual_psm") -> float:
+def main(steps: int = 200_000, scene: str = "bimanual_psm") -> float:
     """Train, and return the median error of all arms on goals that training never drew, in mm."""
     torch.set_num_threads(1)  # networks this small are no faster with more
     envs = VecNormalize(make_envs(scene, 8))

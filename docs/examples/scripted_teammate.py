@@ -3,7 +3,7 @@
     python docs/examples/scripted_teammate.py [steps] [seed]
 
 Needs nothing but this package: the controller is that of `jacobian_control.py`, PPO that of `cleanrl_ppo.py`. To the
-learner the other arm is a part of the world. It ends within a millimetre or two of its target after 2,000,000 steps, in
+learner the other arm is a part of the world. It ends within a millimetre of its target after 2,000,000 steps, in
 two minutes on two CPU cores.
 """
 
