@@ -6,6 +6,7 @@ import copy
 import pickle
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 
@@ -169,13 +170,19 @@ def test_pictures_are_terms_of_any_task(start: str) -> None:
         ({"reward": {"collision": float("nan")}}, "reward.collision must be a number"),
         ({"max_steps": 0}, "max_steps must be a whole number from 1"),
         ({"decimation": 0}, "decimation must be a whole number from 1"),
-        ({"dificulty": "hard"}, r"unknown option 'dificulty', did you mean 'difficulty'"),
+        ({"dificulty": "hard"}, r"unexpected keyword argument 'dificulty', did you mean 'difficulty'"),
     ],
 )
 def test_bad_options_are_one_sentence(options: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message) as caught:
         sm.parallel_env(**{"task": "reach", "scene": "psm", **options})
     assert "\n" not in str(caught.value)
+
+
+def test_an_unknown_option_is_a_type_error_too_as_for_any_function() -> None:
+    """TorchRL's GymEnv tries `frameskip`, and goes without it where these words come back."""
+    with pytest.raises(TypeError, match="unexpected keyword argument 'frameskip'"):
+        gymnasium.make("surgical_marl/Reach-v0", scene="psm", frameskip=1)
 
 
 def test_options_are_plain_data() -> None:

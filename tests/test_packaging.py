@@ -81,6 +81,12 @@ def test_every_import_is_declared() -> None:
     assert not [name for name in imported if not declared & set(map(plain, distributions.get(name, [name])))]
 
 
+def test_a_pettingzoo_without_ids_of_its_own_will_do() -> None:
+    hide = "import sys\nfor part in ('', '.registration'):\n    sys.modules['pettingzoo.env_registry' + part] = None\n"
+    found = run_python(hide + "import surgical_marl\nprint(surgical_marl.reach_v0.__name__)")
+    assert found == "surgical_marl.reach_v0\n"
+
+
 def plain(name: str) -> str:
     """The name of a distribution as registries compare it."""
     return re.sub(r"[-_.]+", "-", name).lower()

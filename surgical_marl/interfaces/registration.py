@@ -56,8 +56,10 @@ def _gymnasium(task: str) -> None:
 
 
 def _pettingzoo(task: str) -> None:
-    from pettingzoo.env_registry.registration import aec_registry, parallel_registry, register
-
+    try:
+        from pettingzoo.env_registry.registration import aec_registry, parallel_registry, register
+    except ModuleNotFoundError:  # PettingZoo has ids since 1.27; the modules work with all
+        return
     name = f"{PACKAGE}/{task}-v0"
     if name not in parallel_registry:
         register("parallel", name, f"{FACES}.pettingzoo:parallel_env", kwargs={"task": task})

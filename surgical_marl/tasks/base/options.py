@@ -77,18 +77,27 @@ class Options(Checked):
         return {item.name: getattr(self, item.name) for item in fields(Options)}
 
 
+class UnknownOption(TypeError, ValueError):
+    """A keyword that is no option.
+
+    It is a TypeError, as Python raises for keywords that a function does not take: clients that try one, as TorchRL's
+    `GymEnv` tries `frameskip`, look for it. It is a ValueError, as for every other bad value.
+    """
+
+
 def make_options(task: str, scene: str, options: Mapping[str, Any]) -> Options:
     """Return options from keyword arguments.
 
     Raises:
-        ValueError: a keyword that is no option, or a bad value.
+        UnknownOption: a keyword that is no option.
+        ValueError: a bad value.
     """
     known = [item.name for item in fields(Options)]
     for name in options:
         if name not in known:
             near = difflib.get_close_matches(name, known, 1)
             hint = f", did you mean {near[0]!r}" if near else ""
-            raise ValueError(f"unknown option {name!r}{hint} (the options are {', '.join(known)})")
+            raise UnknownOption(f"unexpected keyword argument {name!r}{hint} (the options are {', '.join(known)})")
     given = {name: value for name, value in options.items() if value is not None}
     return Options(**{"task": task, "scene": str(scene), **given})
 

