@@ -1,6 +1,6 @@
 """The macros under the code that `emit.py` writes: scalars for CUDA, vectors of environments for Clang.
 
-Division and square root are CUDA's approximate ones, right to two units in the last place.
+Division and square root are CUDA's approximate ones, exact to two units in the last place.
 That division gives 0 for a divisor above 2^126.
 """
 
@@ -143,4 +143,4 @@ MACROS = sorted(
     {line.split("(")[0].split()[1] for code in (CUDA, CPU) for line in code.splitlines() if "#define" in line}
 )
 UNDEFINE = "\n".join(f"#undef {name}" for name in MACROS)
-"""They end with the function: the rest of the program has names of its own."""
+"""Undefines the macros after the function, so that they don't affect the rest of the program."""
