@@ -1,4 +1,4 @@
-"""What `surgical-marl bench` does."""
+"""Runs `surgical-marl bench`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def run(arguments: Namespace) -> int:
-    """One benchmark; returns the exit code. `arguments` are those of its parser in `surgical_marl/cli/main.py`."""
+    """Run one benchmark; return the exit code. `arguments` are those of its parser in `surgical_marl/cli/main.py`."""
     find("scenes", arguments.scene)
     if arguments.kind == "render":
         from surgical_marl.bench.render import run
@@ -83,7 +83,7 @@ def _settings(arguments: Namespace, num_envs: Mapping[str, int] | None = None) -
     from surgical_marl.bench.workload import Workload
     from surgical_marl.runs.settings import load_config
 
-    where = Workload(device=arguments.device).where  # says so if there is no such device
+    where = Workload(device=arguments.device).where  # raises an error if there is no such device
     keys = ("num_envs", "algo", "seed", "engine")
     given = [
         ("num_envs", (num_envs or {}).get(where)),
@@ -96,7 +96,7 @@ def _settings(arguments: Namespace, num_envs: Mapping[str, int] | None = None) -
 
 @contextlib.contextmanager
 def _no_caches() -> Iterator[None]:
-    """Compilers find their caches empty, and what they leave there is gone afterwards."""
+    """Give compilers empty caches, which are removed afterwards."""
     with tempfile.TemporaryDirectory() as folder:
         os.environ["XDG_CACHE_HOME"] = folder
         for name in ("WARP_CACHE_PATH", "JAX_COMPILATION_CACHE_DIR"):

@@ -1,4 +1,4 @@
-"""What is timed."""
+"""The workload of a benchmark."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from surgical_marl.plugins.tasks import list_tasks
 from surgical_marl.runtime import has_cuda
 
 NUM_ENVS = {"cpu": 4096, "cuda": 131072}
-"""Environments on each device, unless told."""
+"""Default number of environments on each device."""
 
 
 @dataclass(frozen=True)
 class Workload:
-    """So many environments of a task on a scene.
+    """A number of environments of a task on a scene.
 
     Raises:
         ValueError: naming what is unknown, out of range or not there.
