@@ -1,4 +1,4 @@
-"""Multi-agent reinforcement learning for surgical robots: every arm an agent.
+"""Multi-agent reinforcement learning for surgical robots: every arm is an agent.
 
     import surgical_marl as sm
 

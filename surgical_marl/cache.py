@@ -1,4 +1,4 @@
-"""Arrays that take a while to compute, kept on disk by all that they were computed from.
+"""Arrays that take a while to compute, kept on disk, keyed by everything that they were computed from.
 
 What an array was computed from is data, code and the versions of the libraries that the code calls. The code is found
 by following imports from the module that computes: no list of modules is kept by hand.
@@ -38,7 +38,7 @@ def cached(
 
     Args:
         kind: folder within the cache.
-        compute: the work. Its array appears on disk whole or not at all; a cache that fails is no error.
+        compute: the work. Its array appears on disk completely or not at all. If the cache fails, that is no error.
         content: data that the result depends on.
         roots: modules whose code `compute` runs, besides the module that it is defined in and all that they import.
     """
@@ -50,7 +50,7 @@ def cached(
     if (array := _load(path)) is not None:
         return array
     with locked(path):
-        if (array := _load(path)) is not None:  # another process has made it meanwhile
+        if (array := _load(path)) is not None:  # another process has made the file meanwhile
             return array
         array = compute()
         with contextlib.suppress(OSError):
@@ -63,9 +63,9 @@ def cached(
 
 @contextlib.contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Hold a lock that belongs to a path of the cache, so that of several processes one does the work.
+    """Hold a lock that belongs to a path of the cache, so that only one of several processes does the work.
 
-    A process that dies lets it go. Where no lock can be made, there is none.
+    The lock of a process that dies is released. Where the system can't make a lock, nothing is locked.
     """
     from filelock import FileLock
 
@@ -90,8 +90,8 @@ def _load(path: Path) -> np.ndarray | None:
 def code_digest(roots: frozenset[str]) -> str:
     """Return a hash of the source of modules and of all that they import, directly or not, of their own packages.
 
-    A program that runs as `__main__` is a module too, and the files beside it belong to it. What has no file, as a
-    notebook's cells, is another in each process: nothing that was made by it is found again.
+    A program that runs as `__main__` is a module too, and the files beside it belong to it. Code without a file, such
+    as a notebook's cells, counts as different in each process, so its results are never found again.
 
     Args:
         roots: names of modules, as in "surgical_marl.tasks.reach".
@@ -111,14 +111,14 @@ def code_digest(roots: frozenset[str]) -> str:
 
 
 def _beside_main(module: str, roots: frozenset[str]) -> bool:
-    """Whether a module lies beside the program that runs, if that is one of the roots."""
+    """Return whether a module lies beside the program that runs, if the program is one of the roots."""
     main = _file("__main__") if "__main__" in roots else None
     return main is not None and any((main.parent / f"{module.partition('.')[0]}{end}").exists() for end in ("", ".py"))
 
 
 @functools.cache
 def _read(path: Path) -> tuple[str, list[str]]:
-    """Return the hash of a source file, and the names it may import: of modules, and of what is in modules."""
+    """Return the hash of a source file, and the names that it may import: of modules, and of objects in modules."""
     text = path.read_text()
     return hashlib.sha256(text.encode()).hexdigest(), list(_imported(text))
 
@@ -149,7 +149,10 @@ def _file(module: str) -> Path | None:
 
 @functools.cache
 def _folders(package: str) -> tuple[str, ...]:
-    """Where the modules of a package lie; of a module that is none, where its file lies without its ending."""
+    """Return the folder of a package's modules.
+
+    For a module that is no package, return its file's path without the suffix.
+    """
     spec = importlib.util.find_spec(package)
     if spec is None or spec.origin is None:
         return ()
@@ -158,7 +161,7 @@ def _folders(package: str) -> tuple[str, ...]:
 
 @functools.cache
 def _versions() -> tuple[str, ...]:
-    """Name and version of each library that this package needs: another version may give other numbers."""
+    """Return name and version of each library that this package needs: other versions may give other numbers."""
     found = []
     with contextlib.suppress(PackageNotFoundError):
         needed = (text for text in requires("surgical-marl") or () if "extra ==" not in text)

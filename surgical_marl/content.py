@@ -1,7 +1,7 @@
 """Where the swappable content lives: arms, scenes, configs and policies, by name or by path.
 
-What ships lies at the top of the repository. An installed package adds its own in folders of the same names, and names
-itself by an entry point: `my_package = "my_package"` in the group `surgical_marl.content`.
+Shipped content is at the top of the repository. An installed package adds its own content in folders of the same names,
+and registers itself with an entry point: `my_package = "my_package"` in the group `surgical_marl.content`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pathlib import Path
 
 KINDS = ("arms", "scenes", "configs", "policies")
 BASELINES = ("zero", "random", "oracle")
-"""Policies that need no learning, and so have no task and scene of their own."""
+"""Policies that need no learning. They have no task and scene of their own."""
 
 _PACKAGE = Path(__file__).resolve().parent
 _NOUNS = {"arms": "arm", "scenes": "scene", "configs": "config", "policies": "run or policy"}
@@ -44,7 +44,7 @@ def list_scenes() -> list[str]:
 
 
 def list_configs() -> list[str]:
-    """Return the names of tasks that have training settings, likewise."""
+    """Return the names of the tasks that have training settings, shipped or in installed packages."""
     return _names("configs")
 
 
@@ -57,7 +57,7 @@ def find(kind: str, name_or_path: str | os.PathLike[str]) -> Path:
     """Return the file or folder of content by its name, or of a user's own by its path.
 
     Raises:
-        ValueError: nothing has that name and lies at that path, or two packages have something of that name.
+        ValueError: nothing has that name or is at that path, or two packages have something of that name.
     """
     places, text = _places(kind), os.fspath(name_or_path)
     if text in places:
@@ -72,7 +72,7 @@ def find(kind: str, name_or_path: str | os.PathLike[str]) -> Path:
 
 
 def unknown(noun: str, value: object, good: Sequence[str]) -> ValueError:
-    """Return the error for a name that does not exist: it has the value, the nearest good one and all good ones."""
+    """Return the error for a name that does not exist: it names the value, the nearest good one and all good ones."""
     near = difflib.get_close_matches(str(value), good, n=1)
     hint = f", did you mean {near[0]!r}" if near else ""
     return ValueError(f"unknown {noun} {str(value)!r}{hint} (choose from {', '.join(good) or 'none'})")
@@ -83,7 +83,7 @@ def _names(kind: str) -> list[str]:
 
 
 def _places(kind: str) -> dict[str, list[Path]]:
-    """Where the content of a kind lies, by name: what ships, and what installed packages have."""
+    """Return the files or folders of a kind of content by name, both shipped ones and those of installed packages."""
     found: dict[str, list[Path]] = {}
     for folder in (content_dir(kind), *(root / kind for root in _plugin_roots())):
         for path in folder.glob(f"[!._]*{_SUFFIX.get(kind, '')}"):
@@ -94,10 +94,10 @@ def _places(kind: str) -> dict[str, list[Path]]:
 
 @cache
 def _plugin_roots() -> tuple[Path, ...]:
-    """Folders of packages that name themselves in the entry-point group `surgical_marl.content`."""
+    """Return the folders of packages that register in the entry-point group `surgical_marl.content`."""
     roots = []
     for point in entry_points(group="surgical_marl.content"):
-        with contextlib.suppress(ImportError, ValueError):  # a package that is broken leaves the others alone
+        with contextlib.suppress(ImportError, ValueError):  # a broken package must not affect the others
             spec = importlib.util.find_spec(point.value)
             roots += [Path(folder) for folder in (spec and spec.submodule_search_locations) or ()]
     return tuple(roots)

@@ -1,4 +1,4 @@
-"""Files that are there whole or not at all."""
+"""Files that are written completely or not at all."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from pathlib import Path
 def write_atomic(path: Path, write: Callable[[Path], object]) -> None:
     """Let `write` fill a temporary file next to `path`, then put it in place in one step.
 
-    What was there before, or what is new, survives a power loss whole: the new file is on disk before it gets its name.
+    After a power loss the old or the new file is there, and it is complete, because the new file is on disk before it
+    gets its name.
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
@@ -23,14 +24,14 @@ def write_atomic(path: Path, write: Callable[[Path], object]) -> None:
             _flush(path.parent, os.O_RDONLY)
     except OSError as error:
         if error.filename == str(temporary):
-            error.filename = str(path)  # the name that whoever asked for it knows
+            error.filename = str(path)  # name the file that the caller asked for
         raise
     finally:
         temporary.unlink(missing_ok=True)
 
 
 def remove_temporaries(folder: Path) -> None:
-    """Remove what `write_atomic` leaves in a folder if the process is killed meanwhile."""
+    """Remove temporary files that `write_atomic` leaves in a folder if its process is killed."""
     for temporary in folder.glob(".*.tmp"):
         if re.fullmatch(r"\..+\.\d+\.tmp", temporary.name):
             temporary.unlink(missing_ok=True)

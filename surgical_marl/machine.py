@@ -1,4 +1,4 @@
-"""What this machine is called, and its memory. Where a system does not tell, nothing is used and all is free."""
+"""Names and memory of this machine. Where a system does not report memory, none counts as used and all as free."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from typing import Any
 
 
 def machine() -> dict[str, Any]:
-    """`cpu`, `threads` and `gpu`, None without one, by name."""
+    """Return `cpu`, `threads` and `gpu` of this machine; `gpu` is None without one."""
     names = _values("/proc/cpuinfo", "model name")
     return {"cpu": names[0] if names else platform.processor() or platform.machine(), "threads": cores(), "gpu": _gpu()}
 
 
 def free_memory(device: str) -> int | None:
-    """Bytes of memory that are free on "cuda" or "cpu"; None if nobody knows."""
+    """Return the bytes of memory that are free on "cuda" or "cpu"; None if that is unknown."""
     if device == "cuda":
         import torch
 
@@ -33,12 +33,12 @@ def free_memory(device: str) -> int | None:
 
 
 def cores() -> int:
-    """CPU cores that this process may use."""
+    """Return how many CPU cores this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def age() -> float:
-    """Seconds since this process started; since Python measures its own time where a system does not tell."""
+    """Return the seconds since this process started, or since Python's clock started where the system does not say."""
     with contextlib.suppress(OSError, AttributeError, ValueError):
         started = Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19]
         return time.clock_gettime(time.CLOCK_BOOTTIME) - int(started) / os.sysconf("SC_CLK_TCK")
@@ -46,7 +46,7 @@ def age() -> float:
 
 
 def restart_peak() -> float:
-    """Forgets the most that this process ever had; returns what it has now, bytes."""
+    """Reset the peak memory of this process; return what it uses now, in bytes."""
     gc.collect()
     if "torch" in sys.modules and sys.modules["torch"].cuda.is_available():
         sys.modules["torch"].cuda.empty_cache()
@@ -76,7 +76,7 @@ def _bytes(file: str, name: str, otherwise: float) -> float:
 
 
 def _values(file: str, name: str) -> list[str]:
-    """Of the lines `name: value`."""
+    """Return a value from lines of the form `name: value`."""
     with contextlib.suppress(OSError):
         lines = [line.split(":", 1) for line in Path(file).read_text().splitlines() if ":" in line]
         return [value.strip() for key, value in lines if key.strip() == name]

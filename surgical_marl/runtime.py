@@ -1,4 +1,4 @@
-"""How JAX is started: compile cache, precision, and the way around a fault of XLA on CPUs."""
+"""How JAX is started: compile cache, precision, and workarounds for faults of XLA on CPUs."""
 
 from __future__ import annotations
 
@@ -20,19 +20,20 @@ from typing import TYPE_CHECKING, Any
 import platformdirs
 
 FLAG = "--xla_cpu_use_fusion_emitters"
-"""XLA's fusion emitter on CPUs computes a serial chain of rotations again for each link that uses it, so that an arm
-costs some three times more with every joint: `surgical-marl doctor` measures it."""
+"""XLA's fusion emitter on CPUs computes a serial chain of rotations again for each link that uses it, so the cost of an
+arm grows some three times with every joint. `surgical-marl doctor` measures this."""
 
 THREADS_FLAG = "--xla_cpu_multi_thread_eigen"
 """Sharing the small operations of an environment step among threads costs more than it gains: on two cores 512
 environments of two arms run at 9,500 steps/s without and at 4,600 with it."""
 
-# The jaxlib versions that know each flag, the last excluded. XLA aborts the process over a flag that it does not know.
+# The jaxlib versions that know each flag, as a half-open range. XLA aborts the process over a flag that it does not
+# know.
 _KNOWN = {FLAG: ((0, 7), (0, 11)), THREADS_FLAG: ((0, 7), (0, 12))}
 
-# XLA's pool on a CPU has a thread a core. With two, a batched step of two arms blocks for ever
-# within some twenty steps: both wait for work that only another thread could do. One thread or
-# four never did so, and more threads than cores cost nothing that can be measured.
+# XLA's thread pool on a CPU has one thread for each core. With two threads, a batched step of two arms deadlocks within
+# some twenty steps, because both threads wait for work that only another thread could do. This never happened with one
+# thread or four, and more threads than cores cost nothing that can be measured.
 _LEAST_THREADS = 8
 
 
@@ -42,7 +43,7 @@ def cache_dir() -> Path:
 
 
 def knows_flag(flag: str = FLAG) -> bool:
-    """Whether the installed jaxlib accepts a flag, told without importing it."""
+    """Whether the installed jaxlib accepts a flag, without importing it."""
     try:
         version = importlib.metadata.version("jaxlib")
     except importlib.metadata.PackageNotFoundError:
@@ -53,7 +54,7 @@ def knows_flag(flag: str = FLAG) -> bool:
 
 @functools.cache
 def prepare_jax() -> None:
-    """Set JAX up for this package, once; call it before JAX starts. A user's own settings stay."""
+    """Set JAX up for this package, once. Call this before JAX starts. Settings of the user's own stay."""
     flags = os.environ.get("XLA_FLAGS", "")
     ours = [flag for flag in _KNOWN if knows_flag(flag) and flag not in flags]
     if FLAG in ours and _backend_started() and _on_cpu():
@@ -68,7 +69,7 @@ def prepare_jax() -> None:
         os.environ["PJRT_NPROC"] = str(max(_LEAST_THREADS, os.cpu_count() or 1))
     _set_option("jax_compilation_cache_dir", str(cache_dir() / "xla"))
     _set_option("jax_persistent_cache_min_compile_time_secs", 0)
-    # JAX would take three quarters of a GPU's memory, which torch has more use for.
+    # JAX would reserve three quarters of a GPU's memory, which torch needs.
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     # TF32, the default of newer GPUs, has a 10-bit mantissa: too little for physics.
     _set_option("jax_default_matmul_precision", "highest")
@@ -103,10 +104,10 @@ def prepare_mjx() -> Any:
 
 
 class _Lazy(types.ModuleType):
-    """A module of JAX that is imported, after `prepare_jax`, when something of it is first asked for."""
+    """A module of JAX that is imported, after `prepare_jax`, when one of its attributes is first used."""
 
     def __getattr__(self, name: str) -> Any:
-        if name.startswith("__") and name != "__version__":  # who asks all modules for their `__file__` means no harm
+        if name.startswith("__") and name != "__version__":  # asked of all modules by some tools
             raise AttributeError(name)
         prepare_jax()
         return getattr(importlib.import_module(self.__name__), name)
@@ -121,10 +122,10 @@ else:
 
 
 class _Deferred(types.ModuleType):
-    """Stands in for `torch._dynamo` until something asks for more than to be left alone by it."""
+    """Stands in for `torch._dynamo`, and imports it when something needs more than `disable` and the like."""
 
     def __getattr__(self, name: str) -> Any:
-        if name.startswith("__") and name != "__path__":  # who asks all modules for their `__file__` means no harm
+        if name.startswith("__") and name != "__path__":  # asked of all modules by some tools
             raise AttributeError(name)
         if sys.modules.get(self.__name__) is self:
             del sys.modules[self.__name__]
@@ -181,7 +182,7 @@ def prepare_warp() -> Any:
 
 @contextlib.contextmanager
 def no_collection() -> Iterator[None]:
-    """Python doesn't look for objects in cycles that nothing uses any more."""
+    """Pause Python's garbage collection of reference cycles."""
     enabled = gc.isenabled()
     gc.disable()
     try:
@@ -192,7 +193,7 @@ def no_collection() -> Iterator[None]:
 
 
 def has_cuda() -> bool:
-    """Whether PyTorch, whose arrays the fused engine works on there, finds a CUDA device."""
+    """Return whether PyTorch, whose arrays the fused engine uses on a GPU, finds a CUDA device."""
     import torch
 
     return bool(torch.cuda.is_available())
@@ -204,7 +205,7 @@ def _has_gpu() -> bool:
 
 @contextlib.contextmanager
 def _silence() -> Iterator[None]:
-    """Nothing on stderr, not even from compiled code."""
+    """Suppress stderr, also that of compiled code."""
     sys.stderr.flush()
     kept = os.dup(2)
     with open(os.devnull, "w") as nowhere:

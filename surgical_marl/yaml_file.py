@@ -1,4 +1,4 @@
-"""YAML files that people write: one mapping, only keys that somebody reads, numbers that are finite."""
+"""YAML files that people write: one mapping with known keys and finite numbers."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 
 def check_keys(mapping: dict[str, Any], known: tuple[str, ...], where: Path | str) -> None:
-    """ValueError if the mapping has a key that nobody reads."""
+    """Raise ValueError if the mapping has an unknown key."""
     for key in mapping:
         if key not in known:
             raise ValueError(f"{where}: unknown key {key!r}; the keys are {', '.join(known)}")

@@ -1,1 +1,1 @@
-"""How fast each engine is, on the same machine, from the same states, under the same commands."""
+"""Benchmarks of the engines, on the same machine, from the same states, under the same commands."""

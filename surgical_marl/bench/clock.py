@@ -1,4 +1,4 @@
-"""Seconds a step takes: on a CPU by the clock, on a GPU by CUDA's events."""
+"""Measures the seconds of a step: on a CPU by the clock, on a GPU by CUDA events."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ import time
 from collections.abc import Callable
 
 Clock = Callable[[int], float]
-"""Seconds that so many steps take."""
+"""Function from a number of steps to the seconds that they take."""
 
 SECONDS = 0.5
-"""What a repeat takes at least."""
+"""Least duration of a repeat, s."""
 REPEATS = 5
 
 
 def race(clocks: dict[str, Clock], seconds: float = SECONDS, repeats: int = REPEATS) -> dict[str, float]:
-    """Seconds a step, by each clock: the best of the repeats, since other work on a machine only ever makes one slower.
+    """Return the seconds per step by each clock: the best repeat, because other work only makes a repeat slower.
 
-    The clocks take turns, so that such work meets all of them alike.
+    The clocks take turns, so that other work affects all of them alike.
     """
     counts, best = {}, dict.fromkeys(clocks, math.inf)
     for key, clock in clocks.items():

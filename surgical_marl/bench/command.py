@@ -1,4 +1,4 @@
-"""What `surgical-marl bench` does."""
+"""Runs `surgical-marl bench`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from surgical_marl.runs.settings import Settings
 
 
 def run(arguments: Namespace) -> int:
-    """One benchmark; returns the exit code. `arguments` are those of its parser in `surgical_marl/cli/main.py`.
+    """Run one benchmark; return the exit code. `arguments` are those of its parser in `surgical_marl/cli/main.py`.
 
     `arguments.given` are the options of what is measured, as far as flags gave them.
     """
@@ -91,7 +91,7 @@ def _settings(arguments: Namespace, num_envs: Mapping[str, int] | None = None) -
 
 @contextlib.contextmanager
 def _no_caches() -> Iterator[None]:
-    """Compilers find their caches empty, and what they leave there is gone afterwards."""
+    """Give compilers empty caches, which are removed afterwards."""
     with tempfile.TemporaryDirectory() as folder:
         os.environ["XDG_CACHE_HOME"] = folder
         for name in ("WARP_CACHE_PATH", "JAX_COMPILATION_CACHE_DIR"):

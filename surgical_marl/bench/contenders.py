@@ -24,7 +24,8 @@ from surgical_marl.scenes.load import load_scene
 
 ENGINES = ("fused", "mjx", "mujoco")
 MOST_ROLLED = 4096
-"""Environments for which C MuJoCo gets memory. It steps one after the other on each core: more make it no faster."""
+"""Environments for which C MuJoCo gets memory. It steps environments one after the other on each core, so more don't
+make it faster."""
 
 
 @dataclass(frozen=True)
@@ -34,14 +35,14 @@ class Contender:
     num_envs: int
     device: str
     compile_s: float
-    """From nothing but imported packages to the end of the first step, s."""
+    """Time from imported packages to the end of the first step, s."""
     physics: Clock
     env: Clock | None
-    """Of environment steps; C MuJoCo has none."""
+    """Clock of environment steps; C MuJoCo has none."""
     stride: int = 1
     """Physics steps that the clock of physics counts as one."""
     bytes_per_env: int | None = None
-    """Of the arrays that the fused engine's kernel works on."""
+    """Bytes of the arrays of the fused engine's kernel."""
 
 
 def prepare(engine: str, workload: Workload, course: Course) -> Contender:
@@ -75,7 +76,7 @@ def _batched(name: str, workload: Workload, course: Course) -> Contender:
     batch.step(actions[0])
     _wait(batch.engine)
     compile_s = time.perf_counter() - start
-    # or all episodes would end in the same step
+    # otherwise all episodes would end in the same step
     batch.steps = give(np.random.default_rng(0).integers(0, batch.max_steps, count, dtype=np.int32))
 
     hold, turn = max(1, HOLD // workload.decimation), itertools.count()

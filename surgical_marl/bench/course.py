@@ -1,4 +1,4 @@
-"""What the arms do while they are timed."""
+"""The motion of the arms while engines are timed."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from surgical_marl.scenes.timing import DECIMATION
 HOLD = DECIMATION
 """Physics steps for which an action is held: a control step of training, whatever is timed."""
 LAPS = 4
-"""Actions after which a course begins again. The last half takes back what the first did, so nothing drifts away."""
+"""Actions after which a course begins again. The second half reverses the first, so that no joint drifts away."""
 DISTINCT = 256
-"""Environments that differ; more of them repeat these, fewer are the first of these."""
+"""Number of different environments. A larger batch repeats them, a smaller one is the first of them."""
 _AWAY = {"random": 50, "rough": 25}
 """Control steps before the start, 1 and 0.5 s. random: a new action every control step, as when training begins. rough:
 one action all the time, so that arms cross their ranges, and each other's way."""
 
 
 class Course(NamedTuple):
-    """Random actions, and where they lead, for n = DISTINCT environments."""
+    """Random actions and the states that they lead to, for n = DISTINCT environments."""
 
     qpos: np.ndarray
     """[n, nq], in the middle of a motion; `qvel` [n, nv] beside it."""
@@ -43,7 +43,7 @@ def make_course(scene: Scene, motion: str = "random", seed: int = 0) -> Course:
 
     C MuJoCo moves the arms. The states therefore come from none of this package's own engines.
     """
-    # or JAX would take most of a GPU's memory when it starts, and leave too little for the fused engine
+    # otherwise JAX would reserve most of a GPU's memory, and leave too little for the fused engine
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     import jax
 

@@ -1,7 +1,7 @@
 """Throughput of training: samples a second, updates included, and where the time goes.
 
     found = measure(load_config("reach", "psm", ["num_envs=4096"]))
-    found.train_env_steps_per_s / found.env_steps_per_s     # what learning leaves of the simulator's speed
+    found.train_env_steps_per_s / found.env_steps_per_s     # share of the simulator's speed that is left with learning
 
 docs/benchmarks.md says what is timed, and how.
 """
@@ -38,7 +38,7 @@ on an 8 GB Quadro RTX 4000."""
 
 @dataclass(frozen=True)
 class Speed(sim.Speed):
-    """What a training does in a second, beside what its simulator does alone.
+    """The speed of a training, and of its simulator alone.
 
     `compile_s` is what starting takes: from nothing but imported packages to the end of the second iteration, less two
     iterations.
@@ -47,7 +47,7 @@ class Speed(sim.Speed):
     train_env_steps_per_s: float
     """Environment steps, acted and learned from."""
     rollout_s: float
-    """Of an iteration; `update_s` and `rest_s` beside it."""
+    """Of an iteration, as `update_s` and `rest_s`."""
     update_s: float
     rest_s: float
 
@@ -67,7 +67,7 @@ def measure(settings: Settings, seconds: float = clock.SECONDS, repeats: int = c
     """
     with in_memory(settings.num_envs):
         learning = _learn(settings, seconds, repeats)
-    machine.restart_peak()  # gives the training's memory back
+    machine.restart_peak()  # frees the training's memory
     workload = Workload(**settings.of_environment(), num_envs=settings.num_envs, device=learning["device"])
     found, _ = sim.measure(workload, (learning.pop("engine"),), seconds=seconds, repeats=repeats)
     (alone,) = found.values()

@@ -1,4 +1,4 @@
-"""A physics step and nothing else, as an environment, so that any engine can run it."""
+"""A physics step alone as an environment, so that any engine can run it."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ class PhysicsAlone(Env):
         self.parameters = {}
 
     def reset(self, key: Array, episode: Array | int = 0, parameters: Any = None) -> State:
-        """At home."""
+        """Return the state at home."""
         carry = Carry(self.simulator.home, (), key, jnp.int32(episode), jnp.int32(0))
         return self._state(carry, carry.physics, self.simulator.home_contacts.distance)
 
     def step(self, carry: Carry, actions: dict[str, Array], parameters: Any = None) -> State:
-        """One physics step; there are no actions."""
+        """Do one physics step; there are no actions."""
         _, distance = self.simulator._look(carry.physics.qpos)
         nothing = jnp.zeros_like(distance)
         physics, _ = self.simulator._step(carry.physics, Touch(nothing, nothing))
@@ -39,7 +39,7 @@ class PhysicsAlone(Env):
 
     @property
     def pauses(self) -> bool:
-        """Never: nobody looks."""
+        """Always False: there are no pictures."""
         return False
 
     def _state(self, carry: Carry, physics: Physics, distance: Array) -> State:

@@ -19,7 +19,7 @@ from surgical_marl.scenes.scene import Scene
 from surgical_marl.vision.endoscope import SIZE, Endoscope
 
 NUM_ENVS = {"cpu": 64, "cuda": 8192}
-"""Environments on each device, unless told."""
+"""Default number of environments on each device."""
 NEAR = 0.2
 """Part of every joint's range about home that postures are drawn from: there is much to see."""
 CYCLE = 4
@@ -28,7 +28,7 @@ CYCLE = 4
 
 @dataclass(frozen=True)
 class Rendering:
-    """What is drawn in a second."""
+    """The speed of drawing."""
 
     frames_per_s: float
     """Pictures of one eye, in all of the channels."""

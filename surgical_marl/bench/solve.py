@@ -30,15 +30,15 @@ from surgical_marl.runs.environment import make_env
 from surgical_marl.runs.settings import Settings
 
 EPISODES, SEED = 200, 0
-"""Of the standard goal sets."""
+"""Episodes and seed of the standard goal sets."""
 EAGER, PATIENT = 1 / 3, 0.05
-"""Share of the time since the last evaluation that one may take: where training's own success promises the goal, and
-elsewhere."""
+"""Greatest duration of an evaluation as a share of the time since the last one: if training's own success predicts the
+goal, and otherwise."""
 
 
 @dataclass(frozen=True)
 class Goal:
-    """What a policy has to show. ValueError unless both are rates."""
+    """The goal of a training. ValueError unless both are rates."""
 
     success: float = 0.95
     """Least share of tips that stay within 2 mm of their goals."""
@@ -53,7 +53,7 @@ class Goal:
 
 @dataclass(frozen=True)
 class Exam:
-    """What a policy showed in the frozen evaluation."""
+    """The results of a policy in the frozen evaluation."""
 
     success_2mm: float
     collision_rate: float
@@ -63,13 +63,13 @@ class Exam:
     """Whether this is the goal set that this version publishes."""
 
     def passes(self, goal: Goal) -> bool:
-        """Whether that is enough."""
+        """Return whether the results meet a goal."""
         return self.success_2mm >= goal.success and self.collision_rate < goal.collisions
 
 
 @dataclass(frozen=True)
 class Times:
-    """Where the seconds went."""
+    """The seconds of a training by part."""
 
     imports_s: float
     """From the start of the process until its packages are imported."""
@@ -83,7 +83,7 @@ class Times:
 
 @dataclass(frozen=True)
 class Solution:
-    """How a training went until it showed the goal, or was given up."""
+    """The course of a training until it met the goal, or was given up."""
 
     solved: bool
     seconds: float
@@ -93,7 +93,7 @@ class Solution:
     env_steps: int
     evaluations: int
     exam: Exam
-    """The last one."""
+    """The last evaluation."""
     num_envs: int
     engine: str
     device: str
@@ -110,12 +110,12 @@ def solve(
     give_up: Callable[[float, float], bool] = lambda seconds, learning: False,
     began: float | None = None,
 ) -> Solution:
-    """Trains until the frozen evaluation shows the goal.
+    """Train until the frozen evaluation meets the goal.
 
     Args:
         settings: all but `iterations` counts.
-        goal: what has to be shown.
-        give_up: is asked after each iteration, with the seconds from the start and those since learning began.
+        goal: what the evaluation has to show.
+        give_up: called after each iteration with the seconds from the start and those since learning began.
         began: the start, by `time.perf_counter`; now if None.
 
     Raises:
@@ -173,12 +173,12 @@ def _times(began: float, entered: float, made: float, watch: Stopwatch, examinin
 
 
 class Looks:
-    """When to evaluate, since that takes time as well.
+    """Decides when to evaluate, because evaluations take time too.
 
-    Training's own success, of actions with noise, is less than what the evaluation will show: at first a quarter of the
-    goal is worth a look. Once both are known for some iteration, a line from there to where both are 1 says at what
-    training success the goal may be met. Above that an evaluation may take a third of the time since the last one;
-    below, a twentieth, lest the line be wrong.
+    Training's own success, of actions with noise, is lower than that of an evaluation, so the first evaluation comes at
+    a quarter of the goal. From then on a straight line to the point where both rates are 1 predicts at which success of
+    training the goal will be met. Above that value an evaluation may take a third of the time since the last one. Below
+    it, a twentieth, in case the prediction is wrong.
     """
 
     def __init__(self, goal: Goal) -> None:

@@ -1,4 +1,4 @@
-"""Seconds that the parts of a training take, while they go on as they do without it."""
+"""Measures the seconds of a training's parts without slowing them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ STARTING = 2
 class Stopwatch:
     """Takes the time of each rollout and update of a training.
 
-    On a GPU it puts events into the queue of work, so that nothing waits for the device.
+    On a GPU it records CUDA events in the stream, so that nothing waits for the device.
     """
 
     def __init__(self, training: Trainer) -> None:
@@ -34,7 +34,7 @@ class Stopwatch:
         return [end - start for start, end in self._marks[name]]
 
     def wait(self) -> None:
-        """Until all work so far is done."""
+        """Wait until all work so far is done."""
         if self._cuda:
             torch.cuda.synchronize()
 
@@ -57,7 +57,7 @@ class Stopwatch:
 
 
 def rows(training: Trainer) -> Iterator[dict[str, float]]:
-    """Metrics of one iteration after the other, without end.
+    """Yield the metrics of one iteration after the other, without end.
 
     On a GPU a row is read when the next iteration is under way, as `train` does, so that the device always has
     something to do.

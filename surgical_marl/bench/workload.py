@@ -1,4 +1,4 @@
-"""What is timed."""
+"""The workload of a benchmark."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from surgical_marl.runtime import has_cuda
 from surgical_marl.tasks.base.options import Options, choice, choices, number
 
 NUM_ENVS = {"cpu": 4096, "cuda": 131072}
-"""Environments on each device, unless told."""
+"""Default number of environments on each device."""
 BENCHED = ("all", "fused", "mjx", "mujoco")
 """What `bench sim` can time: this package's engines, and C MuJoCo."""
 
 
 @dataclass(frozen=True)
 class Workload(Options):
-    """So many environments of a task on a scene.
+    """A number of environments of a task on a scene.
 
     Raises:
         ValueError: naming what is unknown, out of range or not there.

@@ -1,4 +1,4 @@
-"""What `surgical-marl list -v` says of scenes, arms, tasks, algorithms and policies."""
+"""Describes scenes, arms, tasks, algorithms and policies for `surgical-marl list -v`."""
 
 from __future__ import annotations
 
@@ -55,12 +55,12 @@ def _policies() -> list[str]:
 def _task(name: str) -> str:
     try:
         return f"{name:14} {TASKS.load(name).summary()}"
-    except ValueError as error:  # one that can't be imported keeps no one from the others
+    except ValueError as error:  # an algorithm that can't be imported must not hide the others
         return f"{name:14} {error}"
 
 
 def _algorithm(name: str) -> str:
-    """Return what an algorithm is, or why it cannot be had: a package that is broken leaves the others alone."""
+    """Return the description of an algorithm, or why it can't be imported."""
     try:
         documentation = inspect.getdoc(ALGORITHMS.load(name)) or ""
     except ValueError as error:

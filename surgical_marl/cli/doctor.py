@@ -1,4 +1,4 @@
-"""What this machine offers: versions, devices, caches, rendering, and XLA's fault on CPUs."""
+"""Checks this machine: versions, devices, caches, rendering, and XLA's fault on CPUs."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ _PACKAGES = (
     "surgical-marl", "mujoco", "mujoco-mjx", "warp-lang", "jax", "jaxlib", "torch", "rsl-rl-lib",
     "tensordict", "numpy", "gymnasium", "pettingzoo", "yourdfpy", "imageio-ffmpeg",
 )  # fmt: skip
-_LINKS = (7, 9, 11)  # chain lengths: long enough for the fault to show, short enough to wait for
-_FAULTY_GROWTH = 1.8  # time a link adds; honest code grows by a tenth
+_LINKS = (7, 9, 11)  # chain lengths: long enough for the fault to show, short enough to measure quickly
+_FAULTY_GROWTH = 1.8  # factor in time per link; without the fault it is about 1.1
 
 
 def report() -> Iterator[tuple[str, str]]:
-    """Lines of (what, finding), each as soon as it is known."""
+    """Yield lines of (what, finding), each as soon as it is known."""
     yield "Python", f"{platform.python_version()} ({sys.executable})"
     yield "system", f"{platform.platform()}, {os.cpu_count()} CPUs"
     for package in _PACKAGES:
@@ -39,7 +39,7 @@ def report() -> Iterator[tuple[str, str]]:
 
 
 def chain_seconds(links: int) -> float:
-    """Seconds that 16 serial chains of rotations take, as a jitted function."""
+    """Return the seconds that 16 serial chains of rotations take, as a jitted function."""
     import jax
     import jax.numpy as jnp
 
@@ -146,7 +146,7 @@ def _xla_fault() -> Iterator[tuple[str, str]]:
 
 
 def _growth(flag: str | None) -> float | None:
-    """By how much a link of a serial chain multiplies its time on this CPU, in a fresh process."""
+    """Return the factor by which a link of a serial chain multiplies its time on this CPU, in a fresh process."""
     own = {"XLA_FLAGS": flag or "", "JAX_PLATFORMS": "cpu", "JAX_ENABLE_COMPILATION_CACHE": "0"}
     command = [sys.executable, "-c", "from surgical_marl.cli.doctor import probe; probe()"]
     try:

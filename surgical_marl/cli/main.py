@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-# Only light imports up here: `list` and a typing error should answer at once. What needs torch or
-# JAX is imported by the command that needs it.
+# Only light imports here, so that `list` and a mistyped command respond at once. torch and JAX are imported by the
+# commands that need them.
 import argparse
 import os
 import sys
@@ -56,7 +56,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print("surgical-marl: interrupted", file=sys.stderr)
         return 130
     except BrokenPipeError:
-        # The reader (`| head`) has left. Point stdout away so that Python's exit does not complain.
+        # The reader (`| head`) is gone. Redirect stdout, so that Python's exit reports no error.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     return code
 
@@ -72,7 +72,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
-    # argparse cannot take `key=value` after a flag as a positional: collect what it leaves over.
+    # argparse can't take `key=value` after a flag as a positional argument, so collect its leftovers.
     arguments, rest = _parser().parse_known_args(argv)
     if arguments.command is _train and "=" in (arguments.task or ""):
         arguments.task, rest = None, [arguments.task, *rest]
@@ -261,10 +261,10 @@ def _train(arguments: argparse.Namespace) -> None:
     from surgical_marl.runs.settings import load_config
 
     overrides, resume = [*flags, *arguments.overrides], arguments.resume
-    claim_gpu("cpu" if "device=cpu" in overrides else "auto")  # first: to look for a GPU is to start CUDA
+    claim_gpu("cpu" if "device=cpu" in overrides else "auto")  # first, because looking for a GPU starts CUDA
     in_place = resume and (arguments.out or resume).resolve() == resume.resolve()
     if in_place and None not in (arguments.task, arguments.scene) and not has_begun(resume):
-        resume = None  # the same command starts a run and goes on with it, however early it was killed
+        resume = None  # the same command starts a run and resumes it, however early it was killed
     if resume:
         settings = read_settings(resume, overrides)
         for key, own in (("task", settings.task), ("scene", settings.scene)):

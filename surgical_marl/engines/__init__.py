@@ -1,1 +1,1 @@
-"""What runs environments: `mjx` is the reference."""
+"""Engines, which run many environments at once: `mjx` is the reference, `fused` the fast one."""

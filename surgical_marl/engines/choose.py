@@ -1,4 +1,4 @@
-"""Which engine runs an environment."""
+"""Chooses the engine that runs an environment."""
 
 from __future__ import annotations
 

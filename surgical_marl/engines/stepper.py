@@ -1,4 +1,4 @@
-"""What an engine runs."""
+"""The interface of an environment that an engine runs."""
 
 from __future__ import annotations
 
@@ -16,20 +16,22 @@ MOST_KEPT = 16
 
 
 class Stepper(Protocol):
-    """One environment as pure JAX functions. An engine runs them for many, and knows nothing else of it.
+    """One environment as pure JAX functions.
 
-    A step is `finish(move(carry, actions), sensed)`. Where nothing is to be sensed in between, `step` is both.
+    An engine runs these functions for many environments, and uses nothing else of an environment.
+
+    A step is `finish(move(carry, actions), sensed)`. If nothing is sensed in between, `step` does both.
     """
 
     agents: tuple[str, ...]
 
     @property
     def title(self) -> str:
-        """What people call it, as in "reach on psm"."""
+        """Name for messages, such as "reach on psm"."""
 
     @property
     def content(self) -> bytes:
-        """All that the functions depend on besides code and the values of `parameters`."""
+        """Everything that the functions depend on except code and the values of `parameters`."""
 
     @property
     def classes(self) -> tuple[type, ...]:
@@ -48,7 +50,7 @@ class Stepper(Protocol):
 
     @property
     def pauses(self) -> bool:
-        """Whether `move` and `finish` are run apart, so that what has moved can be looked at in between."""
+        """Whether `move` and `finish` are run separately, so that pictures can be drawn in between."""
 
     @property
     def senses(self) -> tuple[str, ...]:
@@ -98,7 +100,7 @@ def describe(parameters: Any) -> str:
 
 
 def announce(stepper: Stepper, engine: str, device: str) -> None:
-    """Say on stderr why nothing happens for a while."""
+    """Say on stderr that a compilation takes a while."""
     print(
         f"surgical-marl: compiling {stepper.title} ({engine}, {device}); a second start takes it from the cache",
         file=sys.stderr,

@@ -4,7 +4,7 @@
     state = env.reset(jax.random.PRNGKey(0))
     state = env.step(state.carry, {agent: jnp.zeros(env.num_actions(agent)) for agent in env.agents})
 
-This is the one place where a step is written. Engines run it for many environments; interfaces show it to others. An
+A step is defined only here. Engines run it for many environments, and interfaces present it to users. An
 environment that ends is reset within the same step: `observations` then belong to the new episode,
 `final_observations` to the one that ended.
 """
@@ -36,11 +36,12 @@ if TYPE_CHECKING:
     from surgical_marl.physics.views import ArmView, Contacts
 
 HIDDEN, NOISE = 2**31 - 1, 2**31 - 2
-"""What the episode's key is folded with for what a scene's randomisation draws: far from what tasks take."""
+"""Folded into an episode's key for the draws of a scene's randomisation, so that they are independent of a task's
+draws."""
 
 
 class Carry(NamedTuple):
-    """What the next step reads. Random numbers come from `key` and the `episode` counter alone."""
+    """The state that is carried to the next step. Random numbers depend on `key` and the `episode` counter alone."""
 
     physics: Physics
     goal: Any
@@ -48,9 +49,9 @@ class Carry(NamedTuple):
     episode: Array
     steps: Array
     tips: Any = ()
-    """Tool tips [arms, 3], each in its arm's base frame, m: the next step has their speed from it."""
+    """Tool tips [arms, 3], each in its arm's base frame, m: the next step computes their speed from it."""
     hidden: Hidden | None = None
-    """What the episode drew for the arms (`surgical_marl/physics/plant.py`)."""
+    """Values that were drawn for the arms in this episode (`surgical_marl/physics/plant.py`)."""
 
 
 class State(NamedTuple):
@@ -60,13 +61,13 @@ class State(NamedTuple):
     observations: dict[str, Array]
     """[d] each, of the new episode where one ended."""
     state: Array
-    """What a centralised critic sees: all observations, what agents were not shown of them, and `Task.privileged`."""
+    """The global state for a centralised critic: all observations, terms left out of them, and `Task.privileged`."""
     rewards: dict[str, Array]
     terminated: Array
     truncated: Array
     """The time limit was reached and the episode did not terminate."""
     final_observations: dict[str, Array]
-    """Of this step's episode, even if it ended."""
+    """That of this step's episode, even if the episode ended."""
     final_state: Array
     infos: dict[str, dict[str, Array]]
     """success, collision, min_distance (m), contact_force (N); `stage_<name>` and the task's own metrics, such as
@@ -77,7 +78,7 @@ class State(NamedTuple):
 
 
 class Moved(NamedTuple):
-    """What `Env.move` leaves for `Env.finish`."""
+    """The result of `Env.move`, which `Env.finish` continues from."""
 
     carry: Carry
     """After the step, before a reset."""
@@ -120,14 +121,14 @@ class Env:
 
     @property
     def title(self) -> str:
-        """What people call it."""
+        """Name for messages."""
         return f"{self.task_name} on {self.scene.name}"
 
     @property
     def pauses(self) -> bool:
-        """Whether a step stops halfway, so that pictures can be drawn of what has moved before the step is finished.
+        """Whether a step pauses after the physics, so that pictures can be drawn before it is finished.
 
-        It does so if an agent observes pictures, or if the task senses something in them.
+        This is so if an agent observes pictures, or if the task computes numbers from them.
         """
         return bool(self.task.senses) or any(seen.pictures for seen in self.observed.values())
 
@@ -140,7 +141,7 @@ class Env:
 
     @property
     def senses(self) -> tuple[str, ...]:
-        """Numbers that are measured outside, between `move` and `finish`."""
+        """Names of numbers that are measured outside, between `move` and `finish`."""
         return self.task.senses
 
     @property
@@ -187,7 +188,7 @@ class Env:
 
     @cached_property
     def plant(self) -> Plant:
-        """The physics behind motors and encoders, as good or bad as the scene has them."""
+        """The physics with motors and encoders, randomised as the scene says."""
         from surgical_marl.physics.plant import Plant
 
         return Plant(self.simulator)
@@ -244,11 +245,14 @@ class Env:
         )
 
     def step(self, carry: Carry, actions: dict[str, Array], parameters: Any = None) -> State:
-        """One control step, and a reset if it ends the episode. What a task senses in pictures is 0 here."""
+        """Do one control step, and a reset if it ends the episode.
+
+        Numbers that a task senses in pictures are 0 here.
+        """
         return self.finish(self.move(carry, actions, parameters), self._unsensed(), parameters)
 
     def move(self, carry: Carry, actions: dict[str, Array], parameters: Any = None) -> Moved:
-        """Do the first half of a step: physics, and where goals are afterwards."""
+        """Do the first half of a step: physics, and the goals after it."""
         task, _ = self._bound(parameters)
         physics, hidden = self.plant.command(carry.physics, carry.hidden, actions)
         physics, contacts, arms = self.plant.advance(physics, hidden)
@@ -300,7 +304,7 @@ class Env:
         return {name: jnp.float32(0.0) for name in self.senses}
 
     def _start(self, task: Task, key: Array, episode: Array) -> tuple[Carry, Contacts, dict[str, ArmView]]:
-        """How an episode begins, and what is seen of the arms there."""
+        """Return how an episode starts, and the views of the arms there."""
         own = jax.random.fold_in(key, episode)
         start = task.start(own)
         hidden = self.plant.start(jax.random.fold_in(own, HIDDEN), start.qpos)

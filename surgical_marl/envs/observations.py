@@ -1,4 +1,4 @@
-"""Observations: one array each, or a dict of arrays where `surgical_marl/envs/pictures.py` adds pictures."""
+"""Observations: one array each, or a dict of arrays where `surgical_marl/envs/sight.py` adds pictures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What one agent observes: the terms that the task, the scene or the call chose, as a vector and as pictures."""
+"""The observation of one agent: the terms that the task, the scene or the call chose, as a vector and as pictures."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ class Observed:
     """The observation terms of an agent.
 
     Args:
-        task: which declares the terms.
+        task: declares the terms.
         agent: whose they are.
         chosen: names of terms, in the order of the vector; the task's own choice if None.
 
     Attributes:
         names: terms of the vector that the agent observes.
         pictures: its pictures, by name.
-        unseen: terms of the task's own choice that the agent is not shown: critics see them.
+        unseen: terms of the task's own choice that are left out of the agent's observation; critics see them.
 
     Raises:
         ValueError: a name that is no term, or twice; or no term that is a vector.

@@ -1,4 +1,4 @@
-"""What agents see: pictures as terms of their observations, between and after the halves of a step."""
+"""Pictures as terms of agents' observations, drawn between and after the halves of a step."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Sight:
         self._matched = ".goal.row" in engine.carry_shapes
         self._seen: Seen = {}
         self._home: Seen = {}
-        if env.begins_at_home:  # which looks the same in all episodes
+        if env.begins_at_home:  # home looks the same in all episodes
             home = torch.from_numpy(np.repeat(env.scene.home[None], num_envs, 0)).to(engine.device)
             rows = torch.zeros(num_envs, dtype=torch.long, device=engine.device) if self._matched else None
             drawn = self._pictures.draw(home, rows)
@@ -66,7 +66,7 @@ class Sight:
             found[kind] = self._with(found[kind], seen)
 
     def sense(self) -> dict[str, Any]:
-        """Draw what is seen where a step has moved to, and return what the task senses of it, [N] each."""
+        """Draw the pictures after the first half of a step, and return what the task senses in them, [N] each."""
         self._seen = self._draw(".moved.carry")
         return self._env.task.sense(self._seen)
 

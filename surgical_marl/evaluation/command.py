@@ -1,4 +1,4 @@
-"""What `surgical-marl eval` does."""
+"""Runs `surgical-marl eval`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from surgical_marl.runs.folder import read_settings
 from surgical_marl.runs.settings import Settings
 
 OWN, CHOSEN = ("task", "scene", "control"), ("difficulty", "start", "goals")
-"""What an evaluation plays that a trained policy determines, and what may be asked of any."""
+"""Options that a trained policy determines, and options that can be chosen for any policy."""
 
 
 def play_all(policies: Sequence[str], asked: Mapping[str, str | None], episodes: int, seed: int) -> dict[str, Played]:
@@ -27,12 +27,11 @@ def play_all(policies: Sequence[str], asked: Mapping[str, str | None], episodes:
 
     Args:
         policies: runs or shipped policies of one task and scene, or one of `BASELINES` alone.
-        asked: of `OWN` and `CHOSEN`, where it is not None. Goals are held-out ones unless asked otherwise; of all else
-            a
-            trained policy has its own, and no others of `OWN`.
+        asked: options of `OWN` and `CHOSEN`; None leaves an option out. Goals are held-out ones by default; all other
+            defaults are those of the trained policy, which also refuses other values of `OWN`.
 
     Raises:
-        ValueError: naming what is unknown, or does not go together.
+        ValueError: something is unknown, or does not fit together.
     """
     if len(set(policies)) < len(policies):
         raise ValueError(f"{max(policies, key=policies.count)!r} is named twice")
@@ -68,7 +67,7 @@ def report(
         older: name of a result to compare with, and the result.
 
     Raises:
-        ValueError: that result is of other goals, or a file cannot be written.
+        ValueError: the older result is of other goals, or a file cannot be written.
     """
     runs = [{"policy": name, **summarise([run])} for name, run in played.items()]
     several = len(runs) > 1

@@ -1,4 +1,4 @@
-"""Playing a policy's episodes and summing them up.
+"""Plays a policy's episodes and computes their metrics.
 
 env = BatchedEnv("reach", "psm", num_envs=200)
 result = evaluate(env, load_policy("zero", env), episodes=200, seed=0)
@@ -27,7 +27,7 @@ INFOS = ("tip_error", "success", "collision", "min_distance")
 
 
 class Played(NamedTuple):
-    """What a policy did."""
+    """The measures of a policy's episodes."""
 
     about: dict[str, Any]
     """task, scene, control, difficulty, episodes, seed, max_steps, control_dt (s), protocol and goal_set (its hash)."""
@@ -37,7 +37,7 @@ class Played(NamedTuple):
     follows: bool = False
     """Whether the task's goals move."""
     stages: tuple[str, ...] = ()
-    """Of the task, in their order."""
+    """Stages of the task, in order."""
 
 
 def evaluate(
@@ -49,9 +49,9 @@ def evaluate(
     """Run a policy for a number of episodes.
 
     Args:
-        env: the environment, with NumPy or torch arrays, of `min(episodes, MAX_BATCH)` environments; fewer play more
-            blocks, with other goals and so another hash.
-        policy: maps the observations of agents to their actions (see `learning.policy`).
+        env: the environment, with NumPy or torch arrays, of `min(episodes, MAX_BATCH)` environments; with fewer
+            environments there are more blocks, with other goals and so another hash.
+        policy: maps the observations of agents to their actions (see `surgical_marl.policies.policy`).
         episodes: number of episodes, 1 or more.
         seed: seed of the goals.
 
@@ -67,7 +67,7 @@ def play(
     episodes: int,
     seed: int,
 ) -> Played:
-    """Play the episodes of `evaluate`, and return their measures without summing them up.
+    """Play the episodes of `evaluate`, and return their measures without metrics.
 
     The first episode of each environment counts, however long it takes, so that short episodes are not
     over-represented. More episodes than environments are played in blocks, each from its own seed.
@@ -89,7 +89,7 @@ def play(
 
 
 def summarise(runs: Sequence[Played]) -> dict[str, Any]:
-    """Metrics of one run, or of the episodes of several together, over all agents and for each.
+    """Return the metrics of one run, or of the episodes of several runs together, over all agents and for each.
 
     ValueError if the runs did not play the same goals.
     """
@@ -109,7 +109,7 @@ def summarise(runs: Sequence[Played]) -> dict[str, Any]:
 
 
 def difference(result: Mapping[str, Any], other: Mapping[str, Any], name: str) -> dict[str, float | None]:
-    """Each metric of a result minus that of another.
+    """Return each metric of a result minus that of another.
 
     ValueError if the other one, called `name`, was not on the same goals.
     """
@@ -165,7 +165,7 @@ def _first_episodes(
 
 
 def _kinematics(env: BatchedEnv, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Tips [T, E, A, 3] and remote center errors [T, E, A] of joint positions [T, E, nq], in float64."""
+    """Return tips [T, E, A, 3] and remote center errors [T, E, A] of joint positions [T, E, nq], in float64."""
     tips, centers = [], []
     for agent in env.agents:
         arm, q = env.scene.mounts[agent].arm, qpos[..., env.scene.qpos_index(agent)]

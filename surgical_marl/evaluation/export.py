@@ -1,4 +1,4 @@
-"""A policy that ships: a folder with what is needed to use, judge and repeat it (`policies/README.md`)."""
+"""Makes the folder of a shipped policy, with all that is needed to use, judge and repeat it (`policies/README.md`)."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ from surgical_marl.runs.settings import Settings
 from surgical_marl.view.record import record
 
 EPISODES, SEED = 200, 0
-"""Those of the standard goal sets."""
+"""Episodes and seed of the standard goal sets."""
 MAY_DIFFER = {"seed", "engine", "device"}
 
 
 def export_policy(runs: Sequence[str], out: Path) -> Path:
-    """Make the folder of a policy from the runs of one training with different seeds; it is there whole or not at all.
+    """Make the folder of a policy, completely or not at all, from the runs of one training with different seeds.
 
     Every run is evaluated on the standard goals. The weights are those of the run that misses the fewest goals of its
-    task, and among such the one with the least median error of its worst arm, or where a task has no such error the one
-    that succeeds most often; the evaluation and the card tell of all.
+    task, and, if several miss equally many, the one with the least median error of its worst arm; in a task without
+    such errors it is the one that succeeds most often. The evaluation and the card report all runs.
 
     Raises:
         ValueError: no such run, runs of different trainings or with the same seed, or the folder exists already.
@@ -60,7 +60,7 @@ def export_policy(runs: Sequence[str], out: Path) -> Path:
 
 
 def _settings(runs: Sequence[str]) -> list[Settings]:
-    """Of each run. ValueError if more than their seeds differ, or less."""
+    """Return the settings of each run. ValueError if more than their seeds differ, or if seeds are equal."""
     settings = [read_settings(find("policies", run)) for run in runs]
     for run, other in zip(runs[1:], settings[1:], strict=True):
         for name in (item.name for item in fields(Settings) if item.name not in MAY_DIFFER):
@@ -86,10 +86,9 @@ def _evaluate(runs: Sequence[str], seeds: Sequence[int], name: str) -> tuple[dic
 
 
 def evaluate_again(folder: Path) -> None:
-    """Evaluate a policy that ships once more, with the weights that it has, and write its evaluation and card anew.
+    """Evaluate the weights of a shipped policy again, and write its evaluation and card anew.
 
-    Runs of its other training seeds are not at hand: what was found of them stays, with the protocol that it was found
-    by.
+    Runs of its other training seeds are not available. Their old results stay, with the protocol of that time.
     """
     path = folder / EVALUATION
     before = json.loads(path.read_text())
@@ -111,7 +110,7 @@ def _also(run: str) -> dict[str, Any]:
 
 
 def _rank(result: dict[str, Any]) -> tuple[int, float, float]:
-    """Return what makes a run the best of its seeds, where it is the least."""
+    """Return the sort key of a run: the run with the least key is the best of its seeds."""
     error = worst_median(result)
     return len(misses(result)), math.inf if error is None else error, -result["success_rate"]
 

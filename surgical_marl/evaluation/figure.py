@@ -1,4 +1,4 @@
-"""A picture of an evaluation: how many succeed at which threshold, and how the errors are spread."""
+"""A picture of an evaluation: success against threshold, and the distribution of errors."""
 
 from __future__ import annotations
 

@@ -17,9 +17,10 @@ if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv
 
 PROTOCOL = 2
-"""Raised when the goals are drawn or a metric is computed in another way: older results don't compare then."""
+"""Increased when goals are drawn or a metric is computed in another way; results of different protocols don't
+compare."""
 ROUNDING = 1e-6
-"""Goals are hashed as whole multiples of this, m: digits that another machine may compute otherwise are left out."""
+"""Goals are hashed as whole multiples of this, m, without digits that may differ between machines."""
 _FILE = Path(__file__).with_name("goal_sets.yaml")
 
 
@@ -57,7 +58,7 @@ def read_goals(env: BatchedEnv, count: int) -> list[np.ndarray]:
 
 
 def goal_hash(about: Mapping[str, Any], goals: Iterable[np.ndarray]) -> str:
-    """SHA-256 of `describe_goals` and of the goals of all episodes, in hexadecimal."""
+    """Return the SHA-256 of `describe_goals` and of the goals of all episodes, in hexadecimal."""
     digest = hashlib.sha256(json.dumps(about, sort_keys=True).encode())
     for part in goals:
         whole = np.rint(part.astype(np.float64) / ROUNDING).astype("<i8")
@@ -82,10 +83,10 @@ def standard_hashes() -> dict[str, dict[str, dict[str, str]]]:
 
 
 def check_same(result: Mapping[str, Any], other: Mapping[str, Any], name: str) -> None:
-    """ValueError unless both results are of the same goals.
+    """Raise ValueError unless both results are of the same goals.
 
     Args:
-        name: what to call the other one.
+        name: name of the other result, for the message.
     """
     if other["goal_set"] != result["goal_set"]:
         raise ValueError(

@@ -14,17 +14,17 @@ THRESHOLDS_MM = (1, 2, 5)
 SUCCESS_MM = 2
 """The threshold of team success and of the time to success."""
 TERMS = ("reward_", "cost")
-"""How names of reward terms and costs begin in `infos`."""
+"""Prefixes of the names of reward terms and costs in `infos`."""
 STAGE = "stage_"
-"""How names of a task's stages begin there."""
+"""Prefix of the names of a task's stages there."""
 LAST = {"angle_error": ("angle_error_deg", 180 / math.pi), "image_error": ("image_error", 1.0)}
-"""Of infos that only some agents have, the last step counts: how it is reported, and in what unit."""
+"""Infos of some agents whose value after the last step counts: name -> name and unit factor of the metric."""
 STILL = 1e-3
-"""A tip that moved less than this, in m, has no smoothness: what is left is noise."""
+"""A tip that moved less than this, in m, has no smoothness, because its motion is noise."""
 
 
 class Trajectory(NamedTuple):
-    """E episodes of A arms, step by step; what comes after an episode's own length is ignored."""
+    """E episodes of A arms, step by step. Steps after an episode's own length are ignored."""
 
     lengths: np.ndarray
     """[E], steps of each episode."""
@@ -46,18 +46,18 @@ class Trajectory(NamedTuple):
 
 
 class Metric(NamedTuple):
-    """A number over R runs of E episodes, reduced from one number an episode and arm."""
+    """A number over R runs of E episodes, reduced from one number per episode and arm."""
 
     values: np.ndarray
-    """[R, E, A], or [R, E, 1] for what belongs to a whole episode."""
+    """[R, E, A], or [R, E, 1] for a value of a whole episode."""
     reduce: Callable[[np.ndarray], np.ndarray]
     """[..., n] -> [...]"""
     extreme: bool = False
-    """The worst value seen: a bootstrap cannot give an interval for it."""
+    """Whether the metric is the worst value seen, for which a bootstrap can't give an interval."""
 
 
 def measure(trajectory: Trajectory, dt: float, following: bool) -> dict[str, np.ndarray]:
-    """One number an episode and arm.
+    """Return one number per episode and arm.
 
     Args:
         dt: time of a step, s.
@@ -95,7 +95,7 @@ def measure(trajectory: Trajectory, dt: float, following: bool) -> dict[str, np.
 
 
 def _reduced(name: str, values: np.ndarray, going: np.ndarray, final: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    """One number an episode and arm: of a stage whether it was ever reached, of `LAST` the last, else the mean."""
+    """Reduce over steps: whether a stage was ever reached, the last value of `LAST`, or else the mean."""
     if name in LAST:
         return final(values)
     kept = np.where(going, values, 0.0)
@@ -144,7 +144,7 @@ def success(held: np.ndarray, threshold: float) -> Metric:
 
 
 def spectral_arc_length(speed: np.ndarray, dt: float) -> float:
-    """Smoothness of a movement: minus the length of its speed's normalised amplitude spectrum, no unit, at most 0.
+    """Return the smoothness of a movement: minus the arc length of its speed's normalised spectrum, at most 0.
 
     A movement in one even stroke has about -1.4; each further stroke, stop or tremor makes it more negative. This is
     SPARC of Balasubramanian et al., J. NeuroEngineering Rehabil. 12:112 (2015), with its published parameters: the
@@ -189,7 +189,7 @@ def _percentile_95(values: np.ndarray) -> np.ndarray:
 
 
 def _mean_of_known(values: np.ndarray) -> np.ndarray:
-    """NaN where no value is known."""
+    """Return the mean of the known values; NaN if there are none."""
     known = ~np.isnan(values)
     with np.errstate(invalid="ignore"):
         return np.where(known, values, 0.0).sum(-1) / known.sum(-1)

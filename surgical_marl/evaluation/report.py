@@ -77,7 +77,7 @@ def _csv_row(result: Mapping[str, Any], agent: str | None) -> dict[str, Any]:
 
 
 UNITS = {"_mm": " (mm)", "_s": " (s)", "_deg": " (degrees)", "image_error": "image error (grey levels)"}
-"""Of metrics, by how their names end."""
+"""Units of metrics, by the suffix of their names."""
 
 
 def title(name: str) -> str:

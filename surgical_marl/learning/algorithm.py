@@ -31,13 +31,14 @@ LEARNING_RATE_RANGE = (1e-5, 1e-2)  # rsl_rl's limits of the adaptive learning r
 
 
 class Algorithm(PPO):
-    """PPO with a ratio for each agent and a value for each agent; a subclass says what it does otherwise.
+    """PPO with a ratio for each agent and a value for each agent; a subclass overrides what differs.
 
     A subclass may set `grouping` and `central_critic`, and override `surrogate`, `policy_loss`, `value_loss`, `loss`,
-    `compute_returns`, or `parts` and `order`. Nothing in them may wait for the device: an update is CUDA graphs.
+    `compute_returns`, or `parts` and `order`. Nothing in them may wait for the device, because an update becomes CUDA
+    graphs.
 
-    `update` is not rsl_rl's for two reasons: rsl_rl's squeezes are wrong for A = 1, and it waits
-    for the device some hundred times an update where this never waits.
+    `update` is not rsl_rl's for two reasons: rsl_rl's squeezes are wrong for A = 1, and it waits for the device some
+    hundred times per update, while this `update` never does.
 
     Args:
         actor: networks that act, a `MultiAgentActor`.
@@ -73,13 +74,13 @@ class Algorithm(PPO):
         self.storage: MultiAgentStorage = storage
         self.team_reward = team_reward
         self.scale = ValueScale(storage.values.shape[-1]).to(self.device)
-        # What learns beside the networks: it stands in checkpoints.
+        # Modules that learn besides the networks. Checkpoints contain them.
         self.options = nn.ModuleDict({"scale": self.scale} if normalise_values else {})
         self.memory = Memory(storage.num_envs, actor, critic, self.device)
         self.constraint = constraint
         if constraint is not None:
             self.options["constraint"] = constraint
-        # As a tensor the learning rate adapts without the host having to read the divergence.
+        # As a tensor, so that the learning rate adapts without a transfer of the divergence to the host.
         self._rate = torch.tensor(float(self.learning_rate), device=self.device)
         self._cuda = torch.device(self.device).type == "cuda"
         self.optimizer = torch.optim.Adam(self.parameters(), lr=self._rate, fused=True, capturable=self._cuda)
@@ -104,7 +105,7 @@ class Algorithm(PPO):
     def process_env_step(self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: dict[str, Any]) -> None:
         """Store one step.
 
-        A time-out is worth the value of the state it was cut off in: gamma * V(final state).
+        Where an episode is cut off by the time limit, gamma * V(final state) is added to the reward.
         """
         parts = [extras["agent_rewards"]]
         if self.constraint is not None:
@@ -139,7 +140,7 @@ class Algorithm(PPO):
         return surrogate - self.entropy_coef * entropy, torch.stack([surrogate, entropy, divergence]).detach()
 
     def surrogate(self, ratio: Tensor, advantages: Tensor) -> Tensor:
-        """Return what each action is worth to be made more likely, `[..., A]`: here the clipped one of PPO.
+        """Return the surrogate objective of each action, `[..., A]`: here the clipped one of PPO.
 
         Args:
             ratio: of the new probability to the old one, `[..., A]`.
@@ -175,7 +176,7 @@ class Algorithm(PPO):
         storage.advantages.copy_(distributed.standardised(advantages))
 
     def update(self) -> dict[str, float]:
-        """Learn from the stored rollout; returns mean losses, KL and the learning rate (see `LOSSES`)."""
+        """Learn from the stored rollout; return mean losses, KL and the learning rate (see `LOSSES`)."""
         losses = dict(zip(LOSSES, self.learn().tolist(), strict=True))
         self.storage.clear()
         self.learning_rate = losses["learning_rate"]
@@ -192,7 +193,7 @@ class Algorithm(PPO):
         """Return the functions that an update consists of.
 
         Each becomes a CUDA graph: it works in place, with shapes that are always the same, and doesn't wait for the
-        device. What changes from update to update on the host is `order`.
+        device. Only `order` may change from update to update.
         """
         return [self._learn]
 

@@ -1,4 +1,4 @@
-"""A limit on how many episodes have a cost, held by a Lagrange multiplier that a PID controller moves."""
+"""A limit on the share of episodes with a cost, by a Lagrange multiplier that a PID controller adapts."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ METRICS = ("cost_rate", "lagrange_multiplier")
 class Constraint(nn.Module):
     """The multiplier of a cost (Stooke et al. 2020, arXiv 2007.03964, algorithm 2).
 
-    What is held is the share of episodes in which any agent had the cost in any step: of `collision` that is the
-    `collision_rate` of the metrics. Agents pay for every step with the cost, `multiplier` times, as if that were a
-    weight of their reward. All state stays in place and nothing asks the host, so that a CUDA graph can repeat it.
+    The limit is on the share of episodes in which any agent had the cost in any step; for `collision` this is the
+    `collision_rate` of the metrics. `multiplier` is subtracted from the reward in every step with the cost. All state
+    stays in place and nothing waits for the host, so that a CUDA graph can repeat it.
 
     Args:
         layout: of the environment, which stacks costs as it does rewards.
         num_envs: N.
         cost: "collision", or the name of a limit in `surgical_marl/envs/costs.py`.
         limit: the share of episodes that may have it, 0 to 1.
-        kp, ki, kd: what the multiplier grows by for an excess of 1 over the limit, for its sum over iterations, and
-            for its growth since the last iteration.
+        kp, ki, kd: gains of the controller: for the excess over the limit, for its sum over iterations, and for its
+            growth since the last iteration.
 
     Attributes:
-        multiplier: rewards that a step's cost is worth, [].
+        multiplier: weight of a step's cost, in units of reward, [].
         integral: sum of the excess over iterations, never below 0, [].
         rate: share of episodes that had the cost, of those that ended in the last iteration in which any did, [].
         broken: whether the running episode of each environment had the cost so far, [N] bool.
@@ -56,7 +56,7 @@ class Constraint(nn.Module):
         self.register_buffer("_ended", torch.zeros(2), persistent=False)
 
     def add(self, infos: Mapping[str, Mapping[str, Tensor]], dones: Tensor) -> Tensor:
-        """Count a step of all environments; returns the costs of acting agents `[N, A]`."""
+        """Count a step of all environments; return the costs of acting agents `[N, A]`."""
         costs = self._layout.rewards({agent: info[self._info].float() for agent, info in infos.items()})
         self.broken |= (costs > 0).any(-1)
         self._ended += torch.stack([dones, dones & self.broken]).float().sum(-1)
@@ -64,7 +64,7 @@ class Constraint(nn.Module):
         return costs
 
     def update(self) -> None:
-        """Move the multiplier by the episodes of all processes that ended since the last call; none, and it stays."""
+        """Adapt the multiplier to the episodes of all processes that ended since the last call, if there were any."""
         ended, broken = distributed.total(self._ended)
         rate = broken / ended.clamp(min=1.0)
         excess, growth = rate - self.limit, (rate - self.rate).clamp(min=0.0)
@@ -75,9 +75,9 @@ class Constraint(nn.Module):
         self._ended.zero_()
 
     def weigh(self, advantages: Tensor) -> Tensor:
-        """Advantages `[..., 2]` of reward and of cost -> those of the Lagrangian, `[...]`.
+        """Return the advantages of the Lagrangian, `[...]`, from those of reward and of cost, `[..., 2]`.
 
-        Divided by 1 + multiplier, so that a large one does not stand for a large step.
+        They are divided by 1 + multiplier, so that a large multiplier does not cause a large step.
         """
         reward, cost = advantages.unbind(-1)
         return (reward - self.multiplier * cost) / (1.0 + self.multiplier)

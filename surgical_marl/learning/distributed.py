@@ -1,6 +1,6 @@
-"""Several processes that learn as one, a GPU each, as torchrun starts them.
+"""Training in several processes with one GPU each, as torchrun starts them.
 
-A process that is alone has rank 0 of size 1, and all of this leaves its numbers as they are. Nothing here waits for the
+A single process has rank 0 of size 1, and none of these functions changes its numbers. Nothing here waits for the
 device, so that a CUDA graph can repeat it, except `wait`.
 """
 
@@ -53,17 +53,17 @@ def joined(device: str) -> Iterator[None]:
     except (FloatingPointError, KeyboardInterrupt, SystemExit):
         dist.destroy_process_group()
         raise  # the processes stop together
-    # After any other error this process leaves at once, without a word to the others: torchrun ends them.
+    # After any other error this process exits at once; torchrun then ends the others.
     dist.destroy_process_group()
 
 
 def rank() -> int:
-    """Which process this is. Rank 0 writes and prints."""
+    """Return the rank of this process. Rank 0 writes and prints."""
     return dist.get_rank() if dist.is_initialized() else 0
 
 
 def size() -> int:
-    """How many processes there are."""
+    """Return the number of processes."""
     return dist.get_world_size() if dist.is_initialized() else 1
 
 
@@ -88,7 +88,7 @@ def total(values: Tensor) -> Tensor:
 
 
 def average(values: Tensor) -> Tensor:
-    """Means over the processes, in place."""
+    """Average the values over the processes, in place."""
     return total(values).div_(size()) if size() > 1 else values
 
 

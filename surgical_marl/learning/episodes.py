@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 ENDED = ("episodes", "error", "success", "collision", "reward")
-"""What `Episodes.take` sums up, before the reward terms. A task without tip errors has none: NaN."""
+"""Sums that `Episodes.take` returns before the reward terms. Errors are NaN in a task without tip errors."""
 KNOWN = ("success", "collision")
 
 
@@ -19,7 +19,7 @@ class Episodes:
     Args:
         agents: names of the arms.
         terms: names of reward terms in the infos, such as "reward_distance".
-        acting: how many agents act, which is what the mean reward of a step is over: one for all arms in `joint`.
+        acting: number of acting agents, over which the mean reward of a step is taken; 1 with `joint`.
 
     Attributes:
         collided: `[N]` bool, whether the running episode of each environment had a collision so

@@ -1,4 +1,4 @@
-"""Where an iteration stopped being finite. Faults are found on the device, and read with the metrics."""
+"""Finds what is not finite in an iteration. Faults are detected on the device, and read with the metrics."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 KINDS = ("observations", "rewards", "values", "losses", "weights")
-"""What can be at fault, in the order in which a fault spreads."""
+"""Kinds of values that can be at fault, in the order in which a fault spreads."""
 
 
 class Diverged(FloatingPointError):

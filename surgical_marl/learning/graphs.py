@@ -13,7 +13,7 @@ class Replayed:
     """A function without arguments that works in place, as a CUDA graph from its second call on.
 
     All that it reads from and writes to between calls must stay where it is in memory, nothing in it may wait for the
-    device, and what it does in Python alone happens in its first two calls only.
+    device, and its Python code runs in the first two calls only.
 
     Args:
         function: what to repeat.
@@ -26,7 +26,7 @@ class Replayed:
         self._warm = False
 
     def __call__(self) -> None:
-        """Enqueues the work; on a GPU it returns before that is done."""
+        """Enqueue the work; on a GPU return before it is done."""
         if not self._enabled:
             self._function()
         elif self._graph is not None:
@@ -38,7 +38,7 @@ class Replayed:
             self._graph.replay()
 
     def release(self) -> None:
-        """Let the graph go; NCCL does not end before graphs that use it."""
+        """Release the graph, because NCCL does not shut down before graphs that use it."""
         if self._graph is not None:
             self._graph.reset()
 

@@ -1,4 +1,4 @@
-"""What a run says of itself while it trains: `metrics.csv`, tensorboard and a progress bar."""
+"""The log of a training: `metrics.csv`, tensorboard and a progress bar."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from surgical_marl.runs.folder import METRICS, format_row
 
 
 class Reports:
-    """Reads an iteration's report when the next one is under way, so that a GPU has always something to do."""
+    """Reads an iteration's report when the next one is under way, so that a GPU is never idle."""
 
     def __init__(self, training: Trainer, write: Callable[[dict[str, float]], None]) -> None:
         self._training, self._write, self._waiting = training, write, deque[Report]()
@@ -72,7 +72,7 @@ class Log:
         self._bar.update()
 
     def keep(self) -> None:
-        """Return when what was written would survive a power loss."""
+        """Flush to disk, so that what was written survives a power loss."""
         os.fsync(self._csv.fileno())
 
 

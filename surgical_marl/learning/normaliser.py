@@ -9,7 +9,7 @@ from surgical_marl.learning import distributed
 
 
 class Normaliser(EmpiricalNormalization):
-    """rsl_rl's, whose update stays in place and asks the host for nothing, so that a CUDA graph can repeat it."""
+    """rsl_rl's normaliser, with an update in place that a CUDA graph can repeat."""
 
     def update(self, x: Tensor) -> None:
         """Learn from the batches `[B, d]` of all processes while training."""

@@ -1,4 +1,4 @@
-"""Whether a batch fits into memory, said before it fails where that is known, and in one sentence where it is not."""
+"""Checks whether a batch fits into memory, and turns a lack of memory into an error of one sentence."""
 
 from __future__ import annotations
 
@@ -34,7 +34,10 @@ def rollout_bytes(settings: Settings, env: BatchedEnv) -> int:
 
 
 def check_room(settings: Settings, env: BatchedEnv) -> None:
-    """ValueError if a rollout alone has no room. Learning takes more, which shows when it runs out: `in_memory`."""
+    """Raise ValueError if a rollout alone does not fit.
+
+    Learning needs more memory; `in_memory` reports a lack of that.
+    """
     each, room = rollout_bytes(settings, env), free_memory(str(env.device))
     if room is not None and each * env.num_envs > room:
         steps = settings.steps_per_iteration
@@ -46,7 +49,7 @@ def check_room(settings: Settings, env: BatchedEnv) -> None:
 
 @contextlib.contextmanager
 def in_memory(num_envs: int) -> Iterator[None]:
-    """Within it, memory that is used up is a ValueError that names `num_envs`."""
+    """Turn a lack of memory within this context into a ValueError that names `num_envs`."""
     try:
         yield
     except (RuntimeError, MemoryError) as error:

@@ -1,4 +1,4 @@
-"""What a rollout leaves for the update to learn from."""
+"""The storage of a rollout, from which an update learns."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class MultiAgentStorage(RolloutStorage):
     def sequences(
         self, begun: tuple[Tensor, Tensor], num_mini_batches: int, num_epochs: int
     ) -> Iterator[RolloutStorage.Batch]:
-        """Mini-batches `[T, B]` for networks that remember: whole rollouts of B environments each.
+        """Yield mini-batches `[T, B]` for recurrent networks: whole rollouts of B environments each.
 
         Args:
             begun: memories of actor and critic where the rollout began, `[N, ...]` each.

@@ -46,7 +46,7 @@ from surgical_marl.runs.settings import Settings
 if TYPE_CHECKING:
     pass
 
-# What may change when a run goes on; everything else shapes the checkpoint or the problem.
+# Settings that may change when a run is resumed; all others shape the checkpoint or the problem.
 CHANGEABLE = {
     "engine",
     "device",
@@ -57,7 +57,7 @@ CHANGEABLE = {
     "ppo",
     "constraint",
 }
-# Except these, which say what stands in a checkpoint.
+# Except these, which determine the content of a checkpoint.
 FIXED = {"ppo.normalise_values", "constraint.cost"}
 
 
@@ -110,10 +110,10 @@ def train(settings: Settings, *, out: Path, resume: Path | None = None) -> Path:
 
 
 def finish(settings: Settings, run: Path) -> None:
-    """Train a run to its end, in this process, from wherever it is.
+    """Train a run to its end, in this process, from its current state.
 
     The run may not have begun, may have been stopped before its first checkpoint, or may have been stopped later. A run
-    that already has all its iterations is left alone. The errors are those of `train`.
+    that already has all its iterations is not changed. The errors are those of `train`.
     """
     train(settings, out=run, resume=run if has_begun(run) else None)
 
@@ -123,7 +123,7 @@ def _claimed(out: Path, resume: Path | None, settings: Settings) -> Iterator[Non
     """Prepare the run folder, and clean it up if the run is refused while it is made in memory.
 
     A new run has its settings in the folder from the start, so that it can be resumed whenever it is killed. If a new
-    run is refused, nothing of it is left.
+    run is refused, its folder is removed.
     """
     if distributed.rank() > 0:
         yield
@@ -255,7 +255,8 @@ def _say(what: str, by: int = 0) -> None:
 def _signals(training: Trainer) -> Iterator[list[int]]:
     """Collect Ctrl-C and SIGTERM, so that the iteration ends and is saved.
 
-    A second one stops at once, but not one process of several: the others would wait for it.
+    A second signal stops a single process at once. It does not stop one of several processes, because the others would
+    wait for it.
     """
     received: list[int] = []
     if threading.current_thread() is not threading.main_thread():  # only the main thread may set handlers

@@ -1,4 +1,4 @@
-"""A training run in memory: the environment, the algorithm, and the rollouts and updates that alternate."""
+"""A training run in memory: the environment, the algorithm, and alternating rollouts and updates."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ OWN = ("env", "collided", "random", "random_cuda")
 
 
 class Report(NamedTuple):
-    """What an iteration leaves to be read, on its way from the device."""
+    """The report of an iteration, while it is copied from the device."""
 
     iteration: int
     env_steps: int
@@ -108,7 +108,7 @@ class Trainer:
         self._gather()
 
     def iterate(self) -> Report:
-        """One rollout and one update; `row` reads its report."""
+        """Do one rollout and one update; return the report, which `row` reads."""
         started = time.perf_counter()
         self.rollout()
         self._stop.fill_(self.stop_wanted)
@@ -123,7 +123,7 @@ class Trainer:
         return Report(self.iteration, self.env_steps, started, host, arrived)
 
     def close(self) -> None:
-        """Let the CUDA graphs go."""
+        """Release the CUDA graphs."""
         self.rollout.release()
         for graph in (*self._parts, self._gather):
             graph.release()
@@ -143,8 +143,7 @@ class Trainer:
     def row(self, report: Report) -> dict[str, float]:
         """Return the metrics of an iteration (see `columns`); this waits until the iteration is done.
 
-        Raises:
-            Diverged: something of it is not finite.
+        Raises: Diverged: something in it is not finite.
         """
         if report.arrived is not None:
             report.arrived.synchronize()

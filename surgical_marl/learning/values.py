@@ -1,4 +1,4 @@
-"""The scale of values: a critic that predicts returns of unit variance, whatever the reward's unit."""
+"""Value normalisation: the critic predicts returns of unit variance, whatever the reward's unit."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from torch import Tensor, nn
 from surgical_marl.learning import distributed
 
 DECAY = 0.99
-"""What an iteration's returns count of the next one's: the statistics are of about the last hundred iterations."""
+"""Decay of the weights of older iterations: the statistics are of about the last hundred iterations."""
 LEAST_STD = 0.01
-"""Returns that hardly differ are not blown up beyond this, in units of reward."""
+"""Least standard deviation of returns, in units of reward, so that returns that hardly differ are not amplified."""
 
 
 class ValueScale(nn.Module):
     """Mean and standard deviation of each value's returns (value normalisation, Yu et al. 2022, arXiv 2103.01955).
 
-    Until `learn` is called it changes nothing. What it learns stays in place and asks the host for nothing, so that a
-    CUDA graph can repeat it.
+    Until `learn` is called it changes nothing. Its update is in place and never waits for the host, so that a CUDA
+    graph can repeat it.
 
     Args:
         width: how many values there are, W.
@@ -36,7 +36,7 @@ class ValueScale(nn.Module):
         self.register_buffer("std", torch.ones(width))
 
     def learn(self, returns: Tensor) -> None:
-        """Take in the returns `[B, W]` of an iteration, as an exponential average whose first one counts in full."""
+        """Update the exponential averages with the returns `[B, W]` of an iteration."""
         self.weight.mul_(DECAY).add_(1.0)
         variance, mean = distributed.var_mean(returns, dim=0)
         ahead = mean - self.mean
@@ -45,7 +45,7 @@ class ValueScale(nn.Module):
         self.std.copy_(self.variance.sqrt().clamp(min=LEAST_STD))
 
     def normalise(self, values: Tensor) -> Tensor:
-        """Values or returns `[..., W]` in units of reward, as the critic is to predict them."""
+        """Return values or returns `[..., W]`, given in units of reward, as the critic should predict them."""
         return (values - self.mean) / self.std
 
     def restore(self, predicted: Tensor) -> Tensor:

@@ -1,1 +1,1 @@
-"""How a scene moves, in pure JAX."""
+"""The dynamics of a scene, in pure JAX."""

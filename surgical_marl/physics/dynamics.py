@@ -1,9 +1,9 @@
-"""How a model moves while nothing touches, and what it takes to say how it moves if something does: pure JAX, by MJX.
+"""The dynamics of a model without contacts, and the terms that contacts are solved with: pure JAX, by MJX.
 
     dynamics = Dynamics(model)
     physics = dynamics.step(physics)
 
-This is the one module that knows MJX. docs/physics.md says how a step is computed and compares it with C MuJoCo.
+This is the only module that calls MJX. docs/physics.md says how a step is computed and compares it with C MuJoCo.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ ITERATIONS = (1, 1)
 
 
 class Physics(NamedTuple):
-    """What MuJoCo needs to go on. All that lives between two steps: everything else follows from it."""
+    """The physics state: all that is kept between two steps. Everything else follows from it."""
 
     qpos: Array
     qvel: Array
@@ -36,18 +36,18 @@ class Physics(NamedTuple):
 
 
 class Forces(NamedTuple):
-    """Where a model is, and what acts on it, for n degrees of freedom."""
+    """Position-dependent quantities of a model and the forces on it, for n degrees of freedom."""
 
     data: Any
-    """MJX's, with positions, Jacobians and mass matrix."""
+    """MJX's data with positions, Jacobians and mass matrix."""
     mass: Array
     """[n, n]"""
     smooth: Array
-    """Sum of all forces but those of constraints, [n]."""
+    """Sum of all forces except constraint forces, [n]."""
     damping: Array
-    """What velocity costs, [n, n]: the implicit part of a step."""
+    """Damping matrix [n, n] for the implicit part of a step."""
     rows: Rows
-    """Friction of some joints, then the limits of all that have one."""
+    """Constraint rows: friction of joints, then limits of joints."""
 
 
 class Dynamics:
@@ -56,7 +56,7 @@ class Dynamics:
     def __init__(self, model: mujoco.MjModel) -> None:
         mjx = self._mjx = prepare_mjx()
         smooth = copy.copy(model)
-        smooth.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT  # that is for `collision.py`
+        smooth.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT  # `collision.py` detects collisions
         self.model, self._data = mjx.put_model(smooth), mjx.make_data(smooth)
         self.dt = np.float32(model.opt.timestep)
         self._stop = [jnp.asarray(of[0], jnp.float32) for of in (model.pair_solref, model.pair_solimp) if model.npair]
@@ -69,11 +69,11 @@ class Dynamics:
         return varied
 
     def pose(self, qpos: Array) -> Any:
-        """MJX's data with the poses of all bodies, geoms and sites."""
+        """Return MJX's data with the poses of all bodies, geoms and sites."""
         return self._mjx.kinematics(self.model, self._data.replace(qpos=qpos))
 
     def forces(self, physics: Physics) -> Forces:
-        """All of `mjx.forward` but collision and solver."""
+        """Compute all of `mjx.forward` except collision and solver."""
         data = self._data.replace(**physics._asdict())
         for stage in ("fwd_position", "fwd_velocity", "fwd_actuation"):
             data = getattr(self._mjx, stage)(self.model, data)
@@ -81,7 +81,7 @@ class Dynamics:
         return Forces(data, _internal(data).M, smooth, self._damping(data), self._rows(data))
 
     def relaxed(self, forces: Forces, qacc: Array) -> Array:
-        """Acceleration [n] near to what friction and limits allow, from a guess."""
+        """Return the acceleration [n] from a guess, relaxed with regard to friction and limits."""
         # where `solve` begins: no derivative goes through it
         return relax(*jax.lax.stop_gradient((forces.mass, forces.smooth, self._joint_rows(forces.rows), qacc)))
 
@@ -106,7 +106,7 @@ class Dynamics:
         return Rows(rows.efc_J, rows.efc_D, rows.efc_aref, low, high)
 
     def _joint_rows(self, rows: Rows) -> JointRows:
-        """Rows, each of which concerns one joint, by joint."""
+        """Return constraint rows by joint; each row concerns one joint."""
         n, k = rows.jacobian.shape[1], len(self._rubbing)
         friction, limit = (jnp.zeros(n).at[where].set for where in (self._rubbing, self._limited))
         side = rows.jacobian[np.arange(k, k + len(self._limited)), self._limited]
@@ -119,7 +119,7 @@ class Dynamics:
         """Return the damping matrix [n, n] of joints and actuators, without actuators at their effort limit.
 
         An actuator at its effort limit can't damp any more, so its damping is left out, as in C MuJoCo. `mjx.step`
-        keeps it in, which would brake each joint that moves at full effort.
+        keeps it, which would slow each joint that moves at full effort.
         """
         model = self.model
         low, high = model.actuator_forcerange[:, 0], model.actuator_forcerange[:, 1]
@@ -129,7 +129,7 @@ class Dynamics:
         return moment.T @ (own[:, None] * moment) + jnp.diag(model.dof_damping)
 
     def contact_rows(self, jacobian: Array, distance: Array, weight: Array, qvel: Array) -> Rows:
-        """Rows of frictionless contacts (condim 1), along their normals: jacobian [k, n], distance and weight [k]."""
+        """Return rows of frictionless contacts (condim 1) along normals: jacobian [k, n], distance and weight [k]."""
         solref, solimp = self._stop
         stiffness, damping, impedance = response(solref, solimp, distance, self.dt)
         resistance = jnp.maximum(weight * (1 - impedance) / impedance, mujoco.mjMINVAL)

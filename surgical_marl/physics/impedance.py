@@ -1,4 +1,4 @@
-"""How a constraint answers a violation: MuJoCo's `solref` and `solimp`, as its documentation defines them.
+"""The response of a constraint to a violation: MuJoCo's `solref` and `solimp`, as its documentation defines them.
 
 https://mujoco.readthedocs.io/en/stable/modeling.html#solver-parameters
 """
@@ -20,7 +20,7 @@ class Response(NamedTuple):
     damping: Array
     """1/s, []."""
     impedance: Array
-    """From 0 to 1, of the shape of the violation."""
+    """Impedance from 0 to 1, a function of the violation."""
 
 
 def response(solref: Any, solimp: Any, violation: Array, timestep: Any) -> Response:
@@ -41,7 +41,7 @@ def response(solref: Any, solimp: Any, violation: Array, timestep: Any) -> Respo
 
 
 def _rise(solimp: Any, violation: Array) -> Array:
-    """From 0 without a violation to 1 at `width`: two powers that meet at the midpoint, [...]."""
+    """Return 0 without a violation, rising to 1 at `width`, [...]: two powers that meet at the midpoint."""
     width, power = jnp.maximum(solimp[2], mujoco.mjMINVAL), jnp.maximum(solimp[4], 1.0)
     middle = jnp.clip(solimp[3], mujoco.mjMINIMP, mujoco.mjMAXIMP)
     x = jnp.minimum(jnp.abs(violation) / width, 1.0)

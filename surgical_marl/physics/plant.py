@@ -1,4 +1,4 @@
-"""The arms as they are, which physics moves, and as they are measured, which is what policies see.
+"""The true state of arms, which physics moves, and the measured state, which policies observe.
 
     plant = Plant(simulator)
     hidden = plant.start(key)
@@ -6,7 +6,8 @@
     physics, contacts, views = plant.advance(physics, hidden)
     seen = plant.measure(physics, hidden, contacts, views, key)
 
-In a scene without randomisation it is the simulator: `hidden` is None, and what is measured is what is.
+In a scene without randomisation the plant is the simulator itself: `hidden` is None, and measured values are the true
+ones.
 """
 
 from __future__ import annotations
@@ -26,10 +27,10 @@ Views = dict[str, ArmView]
 
 
 class Hidden(NamedTuple):
-    """What an episode drew and what it remembers. No policy sees it."""
+    """Values that were drawn for an episode, and the memory of motors and latency. No policy observes them."""
 
     offset: Array
-    """What each joint's reading adds, [nq], rad or m."""
+    """Offset of each joint's reading, [nq], rad or m."""
     backlash: Array
     """Play of each joint, [nq], rad or m."""
     stiffness: Array
@@ -42,7 +43,7 @@ class Hidden(NamedTuple):
     latency: Array
     """Control steps until an action acts, []."""
     motor: Array
-    """The newest commands, as the motors follow them, on their side of the play, [nu]."""
+    """The newest commands of the motors, on the motors' side of the play, [nu]."""
     pending: Array
     """The last actions of all agents, newest first, [greatest latency, n]."""
 
@@ -85,12 +86,12 @@ class Plant:
             payload=even(arms, 0.0, r.payload),
             latency=jax.random.randint(next(keys), (), 0, r.latency + 1),
             motor=(simulator.home if qpos is None else simulator.at(qpos)).ctrl
-            + believed,  # to stay where the arms are
+            + believed,  # so that the arms stay where they are
             pending=jnp.zeros((r.latency, sum(len(mount.arm.actuated) for mount in scene.mounts.values()))),
         )
 
     def at_rest(self, hidden: Hidden | None, qpos: Array | None = None) -> Physics:
-        """All arms at rest at joint positions [nq] of the whole scene, or at home."""
+        """Return all arms at rest at joint positions [nq] of the whole scene, or at home."""
         physics = self._simulator.home if qpos is None else self._simulator.at(qpos)
         return physics if hidden is None else physics._replace(ctrl=hidden.motor)
 
@@ -127,7 +128,7 @@ class Plant:
     def measure(self, physics: Physics, hidden: Hidden | None, contacts: Contacts, views: Views, key: Array) -> Views:
         """Return the views as the encoders report them, for arms whose true views are `views`.
 
-        `key` is for this step alone.
+        `key` is used for this step alone.
         """
         if hidden is None:
             return views
@@ -136,7 +137,7 @@ class Plant:
         return self._simulator.view(physics._replace(qpos=read, ctrl=hidden.motor), contacts)
 
     def _delay(self, actions: dict[str, Array], hidden: Hidden) -> tuple[dict[str, Array], Array]:
-        """Return the actions that act now, and those to remember for later steps."""
+        """Return the actions that act now, and those that are stored for later steps."""
         agents = self._simulator.scene.agents
         newest = jnp.concatenate([jnp.clip(actions[agent], -1.0, 1.0) for agent in agents])
         known = jnp.concatenate([newest[None], hidden.pending])
@@ -145,7 +146,7 @@ class Plant:
         return dict(zip(agents, now, strict=True)), known[:-1]
 
     def _play(self, physics: Physics, hidden: Hidden) -> Array:
-        """How far motors are ahead of their joints, [nq]."""
+        """Return how far motors are ahead of their joints, [nq]."""
         simulator, ahead = self._simulator, jnp.zeros(len(self._backlash))
         if not self._backlash.any():
             return ahead

@@ -33,9 +33,9 @@ TOUCHING_ITERATIONS = (6, 6)
 class Kind:
     """The arms of one type in a scene.
 
-    Arms of one type move alike wherever they stand, as gravity is off. So each is stepped in its own base frame, and
-    the same code steps all of them, one after the other. The instruction cache of a GPU has no room for one copy of the
-    code per arm.
+    Arms of one type move in the same way wherever they stand, because gravity is off. So each arm is stepped in its own
+    base frame, and the same code steps all of them, one after the other. The instruction cache of a GPU has no room for
+    one copy of the code per arm.
     """
 
     def __init__(self, scene: Scene, agents: tuple[str, ...]) -> None:
@@ -89,11 +89,11 @@ class Simulator:
 
     @property
     def home(self) -> Physics:
-        """All arms at home, at rest."""
+        """Return all arms at home, at rest."""
         return self.at(jnp.asarray(self.scene.home, jnp.float32))
 
     def at(self, qpos: Array) -> Physics:
-        """All arms at rest at joint positions [nq] of the whole scene, with the commands that keep them there."""
+        """Return all arms at rest at joint positions [nq] of the scene, with the commands that keep them there."""
         still = jnp.zeros(self.scene.model.nv, jnp.float32)
         return Physics(qpos, still, still, self._holding(qpos))
 
@@ -101,7 +101,7 @@ class Simulator:
         """Return the commands [nu] that keep the arms where they are."""
         joints = qpos[self.address]
         if self.scene.control != "position":
-            joints = joints * self.jaws  # a jaw is told where to be in every mode
+            joints = joints * self.jaws  # a jaw is under position control in every mode
         return self.moment @ joints
 
     def command(self, physics: Physics, actions: dict[str, Array], measured: Array | None = None) -> Physics:
@@ -111,8 +111,8 @@ class Simulator:
         at its speed, whatever the control mode. A cable follows the commands of its joints.
 
         A position target leads its joint by no more than full effort at full speed takes. Without this limit, the
-        target of a joint that is held up would move further and further ahead, and the joint would race after it once
-        free.
+        target of a joint that is held in place would move further and further ahead, and the joint would race after it
+        once free.
         """
         ctrl, own = physics.ctrl[self.drives], jnp.zeros(self.scene.model.nu, jnp.float32)
         for agent in self.scene.agents:
@@ -175,7 +175,7 @@ class Simulator:
         return varied
 
     def look(self, physics: Physics) -> tuple[Contacts, dict[str, ArmView]]:
-        """Contacts and views of arms at rest, which nothing has pressed yet."""
+        """Return contacts and views of arms at rest, without penetrations and forces."""
         tips, distance = self._look(physics.qpos)
         contacts = Contacts(distance, jnp.maximum(-distance, 0.0), jnp.zeros_like(distance))
         return contacts, self._view(jnp, physics, tips, contacts)
@@ -189,7 +189,7 @@ class Simulator:
         return self._view(jnp, physics, tips, contacts._replace(distance=distance))
 
     def _look(self, qpos: Array) -> tuple[Array, Array]:
-        """Tool tips [arms, 3] in the world and the distance of every pair, at a posture."""
+        """Return tool tips [arms, 3] in the world and the distance of every pair, at a posture."""
         data = self._together.pose(qpos)
         tips = data.site_xpos[np.array(list(self._sites.values()))]
         return tips, self._pairs.distance(data.geom_xpos, data.geom_xmat)
@@ -236,7 +236,7 @@ class Simulator:
             near = self._between[agent]
             views[agent] = ArmView(
                 qpos=physics.qpos[self._joints[agent]],
-                qvel=physics.qvel[self._joints[agent]],  # one velocity a position: the indices agree
+                qvel=physics.qvel[self._joints[agent]],  # each position has one velocity, so the indices agree
                 command=physics.ctrl[self._actuators[agent]],
                 tool_tip=(tips[i] - mount.position.astype(tips.dtype)) @ mount.rotation.astype(tips.dtype),
                 nearest_tip=nearest @ mount.rotation.astype(tips.dtype),
@@ -247,10 +247,10 @@ class Simulator:
         return views
 
     def _index_joints(self) -> None:
-        """Where each agent's joints and sites stand in the model's arrays, and what an action does to a command."""
+        """Index each agent's joints and sites in the model's arrays, and scale actions to commands."""
         scene, model = self.scene, self.scene.model
         names = [model.actuator(i).name for i in range(model.nu)]
-        # actuators of joints: they stand in the URDF's order, `qpos` in that of the tree
+        # actuators of joints are in the URDF's order, `qpos` is in that of the tree
         self.drives = np.flatnonzero(model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT)
         self.address = model.jnt_qposadr[model.actuator_trnid[self.drives, 0]]
         self.moment = np.asarray(scene.moment[:, self.address], np.float32)
@@ -263,7 +263,7 @@ class Simulator:
         self._leaders, self.jaws = np.array([row[0] for row in rows]), np.array([row[1] for row in rows])
         self._speed = np.array([joint.drive.speed for _, _, joint, _ in rows], single)
         self._effort = np.array([joint.effort for _, _, joint, _ in rows], single)
-        # what a joint feels that moves alone: its own gains and its cables'
+        # gains on a joint that moves alone: its own and those of its cables
         gains = np.array([model.actuator_gainprm[:, 0], -model.actuator_biasprm[:, 2]], single)
         stiffness, damping = gains @ self.moment**2
         self._lead = (self._effort + damping * self._speed) / stiffness
@@ -279,7 +279,7 @@ class Simulator:
         self._sites = {agent: model.site(f"{agent}/tool_tip").id for agent in scene.agents}
 
     def _index_pairs(self) -> None:
-        """Which pairs concern each agent."""
+        """Index the pairs that concern each agent."""
         owners = [tuple(name.split("/")[0] for name in pair) for pair in self.scene.pairs]
         self._touching = {a: np.flatnonzero([a in pair for pair in owners]) for a in self.scene.agents}
         self._between = {
@@ -287,7 +287,7 @@ class Simulator:
         }
 
     def _measure_home(self) -> tuple[Contacts, dict[str, ArmView]]:
-        """Contacts and views at home, by C MuJoCo: constants, so that a reset within a step computes no second pose."""
+        """Compute contacts and views at home with C MuJoCo: as constants they cost nothing in a reset."""
         model = self.scene.model
         data = mujoco.MjData(model)
         data.qpos[:] = self.scene.home

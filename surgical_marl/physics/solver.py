@@ -1,14 +1,14 @@
-"""MuJoCo's constraint problem, solved in few steps.
+"""A solver of MuJoCo's constraint problem in few steps.
 
 The acceleration of a system with limits, friction and contacts minimises a convex function: half the square of its
 distance to the smooth acceleration in the metric of the mass matrix, plus a piecewise quadratic cost of each constraint
 row (https://mujoco.readthedocs.io/en/stable/computation/index.html#the-optimization-problem). Rows without an elliptic
 cone all have one form: the force is `clip(impedance * (reference - J qacc), low, high)`, with bounds (0, inf) for a
-limit or a contact and (-f, f) for friction f. `solve` is Newton's method with a line search, as in MuJoCo, with the
-search in a fixed number of steps, so that many environments take it together. For rows that concern one joint alone
-`relax` comes first: it solves one joint after the other, exactly, and so finds nearly always which rows hold and which
-slip or are free. Newton's method alone goes astray among them: friction and limits are stiff, and a row that changes
-sides changes the whole step.
+limit or a contact and (-f, f) for friction f. `solve` is Newton's method with a line search, as in MuJoCo, with a fixed
+number of line search steps, so that many environments can be solved together. For rows that concern one joint alone
+`relax` comes first: it solves one joint after the other exactly (projected Gauss-Seidel), and so nearly always finds
+which rows hold and which slip or are free. Newton's method alone often fails on such rows: friction and limits are
+stiff, and a row that changes sides changes the whole step.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from jax import Array
 from jax.scipy.linalg import cho_solve
 
 RELAXATION = 1.15
-"""How far each joint goes, of the way to the root of its equation: a little beyond it is where coupled joints meet
-soonest (successive over-relaxation, Young, 1950)."""
+"""Relaxation factor: a little more than 1 makes coupled joints converge soonest (successive over-relaxation, Young,
+1950)."""
 SWEEPS = 6
-"""Rounds of `relax` over all joints of an arm."""
+"""Sweeps of `relax` over all joints of an arm."""
 
 
 class Rows(NamedTuple):
@@ -36,7 +36,7 @@ class Rows(NamedTuple):
     impedance: Array
     """MuJoCo's efc_D."""
     reference: Array
-    """Acceleration that the row asks for, efc_aref."""
+    """Reference acceleration of the row, efc_aref."""
     low: Array
     """Least force."""
     high: Array
@@ -58,10 +58,10 @@ class JointRows(NamedTuple):
 
 
 def relax(mass: Array, smooth: Array, joints: JointRows, qacc: Array) -> Array:
-    """Acceleration [n] nearer to the solution: `SWEEPS` times, each joint's is set to what solves its own equation.
+    """Return an acceleration [n] nearer to the solution, by `SWEEPS` sweeps that solve one joint's equation at a time.
 
-    That equation has one unknown, and a sum of forces that falls with it, piecewise linearly. The sign of what is left
-    over at each corner says on which piece the root lies.
+    The equation has one unknown, and its sum of forces falls with the unknown, piecewise linearly. The sign of the
+    residual at each corner says on which piece the root lies.
     """
     n = len(qacc)
     slack = joints.friction / jnp.where(joints.friction > 0, joints.friction_impedance, 1.0)
@@ -203,5 +203,5 @@ def _line_search(
 
 
 def solve_positive(matrix: Array, right: Array) -> Array:
-    """X with matrix @ x = right, for a symmetric positive definite matrix [n, n]."""
+    """Return x with matrix @ x = right, for a symmetric positive definite matrix [n, n]."""
     return cho_solve((jax.lax.linalg.cholesky(matrix, symmetrize_input=False), True), right)

@@ -1,4 +1,4 @@
-"""What others see of the physics: contacts, and each arm."""
+"""Outputs of the physics: contacts, and a view of each arm."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Touch(NamedTuple):
 
 
 class ArmView(NamedTuple):
-    """What a task sees of one arm in the newest state. Base frame; SI units."""
+    """The newest state of one arm, as tasks see it. Base frame; SI units."""
 
     qpos: Array
     """Positions of the actuated joints, [n]."""

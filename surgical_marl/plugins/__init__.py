@@ -1,1 +1,1 @@
-"""What is swapped by a name in code: classes that ship, of installed packages, or registered by a program."""
+"""Tasks and algorithms by name: shipped classes, classes of installed packages, and registered ones."""

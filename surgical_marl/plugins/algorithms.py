@@ -1,4 +1,4 @@
-"""Learning algorithms by name: the only place that finds them."""
+"""Finds learning algorithms by name; no other module does."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ ALGORITHMS = Registry(
 
 
 def list_algorithms() -> list[str]:
-    """Return the names of all learning algorithms: those that ship, of installed packages, and registered ones."""
+    """Return the names of all learning algorithms: shipped ones, those of installed packages, and registered ones."""
     return ALGORITHMS.names()
 
 
 def register_algorithm(name: str, cls: type) -> None:
     """Make a subclass of `surgical_marl.learning.algorithm.Algorithm` known by a name, in this program.
 
-    A package declares its own by the entry-point group `surgical_marl.algorithms` instead (docs/algorithms.md).
+    A package declares its algorithms in the entry-point group `surgical_marl.algorithms` instead (docs/algorithms.md).
 
     Raises:
         ValueError: the name belongs to another class, or the class is not a subclass of `Algorithm`.

@@ -1,4 +1,4 @@
-"""Find classes by name: those that ship, those of installed packages, and those that a program registers."""
+"""Finds classes by name: shipped ones, those of installed packages, and those that a program registers."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from surgical_marl.content import unknown
 
 
 class Source(NamedTuple):
-    """Where a class comes from."""
+    """The origin of a class."""
 
     where: str
     load: Callable[[], Any]
 
 
 class Registry:
-    """Classes by name. Names are found without importing what they stand for.
+    """Classes by name. Names are found without importing the classes.
 
     Args:
-        noun: what one of them is, for messages.
-        package: the package of those that ship: a module each, of their name, with one subclass of `base`.
-        group: the entry-point group in which an installed package declares its own as `name = "module:Class"`.
+        noun: word for one of the classes, for messages.
+        package: the package of the shipped classes: for each name a module with one subclass of `base`.
+        group: the entry-point group in which an installed package declares its classes as `name = "module:Class"`.
         base: "module:Class", which all of them are subclasses of.
     """
 
@@ -38,7 +38,7 @@ class Registry:
         return sorted(self._sources())
 
     def check(self, name: str) -> None:
-        """Raise a ValueError that names the good ones if there is no such name."""
+        """Raise a ValueError that names the known ones if there is no such name."""
         if name not in (names := self.names()):
             raise unknown(self.noun, name, names)
 
@@ -57,7 +57,7 @@ class Registry:
         (source,) = sources
         try:
             found = source.load()
-        except Exception as error:  # whatever the module of a stranger raises
+        except Exception as error:  # a module of another package may raise anything
             reason = f"{type(error).__name__}: {error}"
             raise ValueError(f"the {self.noun} {name!r} of {source.where} cannot be imported: {reason}") from error
         self._check_class(name, source.where, found)
@@ -116,5 +116,5 @@ def _itself(cls: type) -> type:
 
 
 def _where(cls: Any) -> str:
-    """Return the place of a class that a program defines."""
+    """Return the origin of a class that a program defines."""
     return f"{getattr(cls, '__module__', 'this program')}.{getattr(cls, '__qualname__', cls)}"

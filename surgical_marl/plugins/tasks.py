@@ -1,4 +1,4 @@
-"""Tasks by name: the only place that finds them."""
+"""Finds tasks by name; no other module does."""
 
 from __future__ import annotations
 
@@ -13,5 +13,5 @@ TASKS = Registry(
 
 
 def list_tasks() -> list[str]:
-    """Return the names of all tasks: those that ship, of installed packages, and registered ones."""
+    """Return the names of all tasks: shipped ones, those of installed packages, and registered ones."""
     return TASKS.names()

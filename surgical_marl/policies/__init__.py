@@ -1,1 +1,1 @@
-"""What acts: networks, the oracle and policies that need no learning."""
+"""Policies: networks, the oracle and policies that need no learning."""

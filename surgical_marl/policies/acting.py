@@ -1,4 +1,4 @@
-"""What a policy is to those who play it."""
+"""The interface of a policy."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 Policy = Callable[[Mapping[str, Any]], dict[str, Any]]
-"""Maps the observations of all agents to their actions. One that remembers has a method `reset` (see `forget`)."""
+"""Maps the observations of all agents to their actions. A recurrent policy has a method `reset` (see `forget`)."""
 
 
 def forget(policy: Callable[..., Any], ended: Any = None) -> None:
-    """Tell a policy that episodes begin: in all environments, or where the last one `ended`, [N] bool.
+    """Reset a policy's hidden state: in all environments, or where an episode has `ended`, [N] bool.
 
-    A policy that remembers nothing does not mind.
+    For a policy without a hidden state this does nothing.
     """
     reset = getattr(policy, "reset", None)
     if reset is not None:

@@ -1,4 +1,4 @@
-"""What a network sees of pictures: a small convolutional encoder before the MLP, both rsl_rl's."""
+"""The encoder of pictures: a small convolutional network before the MLP, both rsl_rl's."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 PICTURES = "_pictures"
-"""What the group of an agent type's pictures is called after its name."""
+"""Suffix of the name of the group of an agent type's pictures."""
 ENCODER = {"output_channels": [32, 64, 64], "kernel_size": [4, 4, 3], "stride": [4, 2, 1], "activation": "elu"}
 """Of 64 x 64 pixels it makes 1600 features. Its first layer sees patches that don't overlap: on an H200 learning
 then takes a third less time than with the 8 x 8 pixels that are usual."""
@@ -23,7 +23,7 @@ class PictureModel(CNNModel):
         """Return the normalised vector, followed by the features of the pictures."""
         vector = MLPModel.get_latent(self, obs)
         (group,) = self.obs_groups_2d
-        # while they are bytes, the channels of a pixel side by side: cuDNN then has nothing to turn round
+        # channels last while they are still bytes, so that cuDNN needs no transposition
         pictures = obs[group].flatten(0, -4).contiguous(memory_format=torch.channels_last)
         features = self.cnns[group](pictures.float() / 255 - 0.5)
         return torch.cat([vector, features.reshape(*vector.shape[:-1], -1)], dim=-1)

@@ -1,4 +1,4 @@
-"""How the dict of agents is stacked for networks that several agents share."""
+"""Stacks the agents' arrays for networks that several agents share."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ if TYPE_CHECKING:
 
 
 FURTHEST = 0.3
-"""Depth beyond this, m, looks the same to a network: an endoscope stands nearer to what it looks at."""
+"""Depth is clipped to this for networks, m; endoscopes are nearer to what they look at."""
 Grouping = Literal["type", "agent", "joint"]
 GROUPINGS: tuple[Grouping, ...] = ("type", "agent", "joint")
 
 
 class Layout:
-    """How the agents of an environment are stacked into groups, one network each.
+    """The grouping of an environment's agents: one network for each group.
 
-    By "type", agents of an arm type are one group `[..., n, d]`; where a type has several agents, each sees a one-hot
-    of its place among them, since they share one network. By "agent", each agent is a group of its own. "joint" is
-    one group of one agent, which observes and moves all arms.
+    By "type", agents of an arm type are one group `[..., n, d]`; if a type has several agents, the observation of each
+    ends with a one-hot of its position among them, because they share one network. By "agent", each agent is a group of
+    its own. "joint" is one group of one agent, which observes and moves all arms.
 
     Args:
         env: the environment of the agents.
         grouping: "type", "agent" or "joint".
 
     Attributes:
-        agents: every arm, type by type; this is the order of the flat joint action.
+        agents: every arm, type by type, in the order of the flat joint action.
         groups: the arms of each group.
         counts: agents acting in each group.
         action_sizes: width of the action of one agent of each group.
@@ -72,9 +72,9 @@ class Layout:
         """Stack the observations of agents `[..., d]` into groups `[..., n, d]`.
 
         If agents of a group see pictures, there is also a group "<name>_pictures" `[..., n, C, H, W]`. It holds all
-        pictures of an agent, one behind the other.
+        pictures of an agent, stacked along channels.
 
-        Always a copy: an engine may reuse its buffers.
+        The result is always a copy, because an engine may reuse its buffers.
         """
         groups = {}
         for name, members in self.groups.items():
@@ -125,9 +125,9 @@ def _seen(env: BatchedEnv, agents: Sequence[str]) -> dict[str, Any]:
 
 
 def stack_pictures(parts: Sequence[Tensor]) -> Tensor:
-    """Pictures [..., H, W, c] one behind the other, channels first: [..., C, H, W].
+    """Stack pictures [..., H, W, c] along channels, channels first: [..., C, H, W].
 
-    Colours stay uint8. Depth is brought to their scale, 0 to 255 at `FURTHEST`, and all are float32 then.
+    Colours stay uint8. If there is depth, it is scaled to 0 to 255 at `FURTHEST`, and all pictures become float32.
     """
     scaled = [part if part.dtype == torch.uint8 else part.clamp(max=FURTHEST) * (255 / FURTHEST) for part in parts]
     alike = scaled if len({part.dtype for part in scaled}) == 1 else [part.float() for part in scaled]

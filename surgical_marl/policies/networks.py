@@ -29,14 +29,14 @@ class MultiAgentModel(nn.Module):
         model: further arguments of `make_model`.
 
     Attributes:
-        is_recurrent: whether the networks remember; then `hidden_state` is their memory, `[N, A, S]`.
+        is_recurrent: whether the networks are recurrent; `hidden_state` is then `[N, A, S]`.
     """
 
     def __init__(self, observations: TensorDict, outputs: Mapping[str, int], **model: Any) -> None:
         super().__init__()
         self.counts = {name: observations[name].shape[-2] for name in outputs}
         self.outputs = dict(outputs)
-        # The networks want to be built from one agent's [N, d], and run with any leading axes.
+        # Networks are built from one agent's [N, d], and run with any leading axes.
         seen = {name: [group for group in (name, name + PICTURES) if group in observations] for name in outputs}
         sample = TensorDict(
             {group: observations[group][:, 0] for groups in seen.values() for group in groups},
@@ -62,8 +62,8 @@ class MultiAgentModel(nn.Module):
 
         Args:
             observations: of one step; or of several, `[T, N]`, if there are masks.
-            masks: where an episode begins, `[T, N]` bool, for networks that remember.
-            hidden_state: what they remember before the first step, `[N, A, S]`.
+            masks: where an episode begins, `[T, N]` bool, for recurrent networks.
+            hidden_state: hidden state before the first step, `[N, A, S]`.
             stochastic_output: draw from the distribution, if there is one.
         """
         memories = zip(self._models(), self._memories(hidden_state), strict=True)
@@ -75,7 +75,7 @@ class MultiAgentModel(nn.Module):
             model.update_normalization({name: observations[name].flatten(0, -2)})
 
     def get_hidden_state(self) -> Tensor | None:
-        """Return what the networks remember after the last step, `[N, A, S]`, or None if they have no memory."""
+        """Return the hidden state after the last step, `[N, A, S]`, or None if the networks are not recurrent."""
         return torch.cat([model.get_hidden_state() for model in self._models()], -2) if self.is_recurrent else None
 
     def _memories(self, hidden_state: Tensor | None) -> Iterable[Tensor | None]:
@@ -153,25 +153,25 @@ class MultiAgentActor(MultiAgentModel):
 
 
 class Gaussian(GaussianDistribution):
-    """rsl_rl's, in float32 at least whatever the network computed in."""
+    """rsl_rl's distribution, in float32 at least, whatever precision the network has."""
 
     def update(self, mlp_output: Tensor) -> None:
         """Take the mean from the network's output."""
         super().update(mlp_output.to(torch.promote_types(mlp_output.dtype, torch.float32)))
 
     def sample(self) -> Tensor:
-        """As torch's, which has the host look whether a standard deviation is negative."""
+        """Draw as torch does, but without its check for negative deviations, which waits for the device."""
         return self.mean + self.std * torch.randn_like(self.mean)
 
 
 def make_model(
     observations: TensorDict, groups: list[str], width: int, recurrent: str = "none", **model: Any
 ) -> nn.Module:
-    """Make an MLP, with an encoder before it if there are pictures, and with a memory if that is asked for.
+    """Make an MLP, with an encoder before it if there are pictures, and with a recurrent cell if that is asked for.
 
     Args:
         observations: a sample of the groups, vectors [N, d] and pictures [N, C, H, W].
-        groups: what the network sees of them.
+        groups: names of the groups that the network sees.
         width: of its output.
         recurrent: "gru", "lstm" or "none".
         model: further arguments of rsl_rl's models.

@@ -1,14 +1,14 @@
 """Policies for other programs: `<type>.onnx` for each type of arm, to act without torch and without this package.
 
-What such a file takes, for N agents of its type at once:
+The inputs of such a file, for N agents of its type at once:
 
     observation  [N, d + n] float32, what the agent observes; where n > 1 agents share the type, then a one-hot of the
                  agent's place among them ("joint": what all agents observe, type by type)
     image, ...   [N, H, W, 3] uint8, each picture that the agent sees, by its name (depth: [N, H, W, 1] float32, m)
-    memory       [N, S] float32, of a network that remembers: zeros when an episode begins, then the last `next_memory`
+    memory       [N, S] float32, of a recurrent network: zeros when an episode begins, then the last `next_memory`
 
-and gives `action` [N, a] float32 in [-1, 1], without exploration noise, and `next_memory` if it remembers. Observations
-are normalised inside.
+and gives `action` [N, a] float32 in [-1, 1], without exploration noise, and `next_memory` if it is recurrent.
+Observations are normalised inside.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ OPSET = 20
 
 
 class Graph(nn.Module):
-    """What an agent of one type does, from the arrays that the environment gives to the action it takes.
+    """The policy of one agent type, from the environment's arrays to the action.
 
     Attributes:
-        takes, gives: names of what goes in and comes out.
+        takes, gives: names of inputs and outputs.
     """
 
     def __init__(self, model: Any, pictures: Mapping[str, Any]) -> None:
@@ -46,7 +46,7 @@ class Graph(nn.Module):
         self.gives = ["action", *(f"next_{name}" for name in memory)]
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
-        """All of `takes`, a batch each, to all of `gives`."""
+        """Map all of `takes`, a batch each, to all of `gives`."""
         given = dict(zip(self.takes, inputs, strict=True))
         (name,) = self.model.obs_groups
         groups = {name: given["observation"]}
@@ -104,7 +104,7 @@ def read_pictures(path: Path) -> dict[str, str]:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Without what the exporter tells of torchvision, which nobody needs here, and of its own deprecations."""
+    """Suppress the exporter's warnings about torchvision, which is not needed, and about its own deprecations."""
     logger = logging.getLogger("torch.onnx")
     level = logger.level
     logger.setLevel(logging.ERROR)

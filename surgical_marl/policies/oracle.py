@@ -1,10 +1,10 @@
-"""The scripted policy that knows the answer: inverse kinematics of the targets, at the joints' speeds.
+"""The oracle, a scripted policy that knows the goals: inverse kinematics of the targets, at the joints' speeds.
 
     policy = oracle(env)            # the same as load_policy("oracle", env)
     actions = policy(observations)
 
-It bounds what a policy can be asked for: where it fails, a task is unfair. It needs no learning and no observation, but
-the environment's goals.
+Its results show what is possible: a goal that it can't reach may be impossible. It needs no learning, but reads the
+environment's goals.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ ITERATIONS = 8
 def oracle(env: BatchedEnv, agents: Sequence[str] | None = None) -> Callable[[Mapping[str, Any]], dict[str, Any]]:
     """Make the oracle of an environment with control "position", for all of its tasks.
 
-    Joints follow straight lines in joint space, all arms at the same pace: the way that `tasks/base/workspace.py`
-    has checked. Where a target moves, joints are sent ahead by the time that they lag behind: a control step, and
-    damping over stiffness of their drives.
+    Joints follow straight lines in joint space, all arms at the same pace; `tasks/base/workspace.py` has checked these
+    paths. For moving targets, commands lead by the joints' lag: a control step, plus damping over stiffness of their
+    drives.
 
     Args:
-        agents: those it moves, where others have a policy of their own: what an arm waits for then are only these.
+        agents: the agents that the oracle moves, if others have another policy. Only these are kept at the same pace.
 
     Returns:
         A policy: observations {agent: [N, d]} of `env` as it stands -> actions {agent: [N, a]} of the same library, of
@@ -80,7 +80,7 @@ class _Guide:
             raise ValueError(f"the oracle needs to observe {' and '.join(sorted(missing))} of {agent!r}")
 
     def move(self, targets: np.ndarray, began: np.ndarray, observation: np.ndarray) -> np.ndarray:
-        """How far the commands have to go, [N, n], in what an action of 1 does, to targets [N, arms, 3]."""
+        """Return how far the commands have to move to targets [N, arms, 3], in units of an action of 1, [N, n]."""
         before = np.where(began[:, None], observation[:, self.terms["qpos"]], self.q)
         iterations = 20 if began.any() else ITERATIONS
         self.q = inverse_kinematics(self.arm, targets[:, self.index], before, starts=1, iterations=iterations)

@@ -1,8 +1,8 @@
 """Policies that act: trained, untrained, zero and random.
 
-A policy maps the observations of all agents `{agent: [..., d]}` to their actions `{agent: [...,
-a]}` in [-1, 1]; it answers NumPy arrays with NumPy arrays and tensors with tensors. A recurrent one is to be told where
-episodes begin (`surgical_marl/policies/acting.py`).
+A policy maps the observations of all agents `{agent: [..., d]}` to their actions `{agent: [..., a]}` in [-1, 1]. It
+returns NumPy arrays for NumPy arrays and tensors for tensors. A recurrent policy must be told where episodes begin
+(`surgical_marl/policies/acting.py`).
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def load_actor(run: str | Path, env: BatchedEnv) -> tuple[MultiAgentActor, Layou
 
 
 def untrained_policy(env: BatchedEnv, settings: Settings | None = None, grouping: Grouping = "type") -> Policy:
-    """Make the policy that a run with these settings starts from: fresh weights, to compare with.
+    """Make the policy that a run with these settings starts from: fresh weights, for comparison.
 
     Args:
         env: the environment that the policy will act in.
@@ -90,7 +90,7 @@ def untrained_policy(env: BatchedEnv, settings: Settings | None = None, grouping
 
 
 def zero_policy(env: BatchedEnv) -> Policy:
-    """Make the policy that never acts."""
+    """Make the policy whose actions are always zero."""
     return _Heedless(env, partial(np.zeros, dtype=np.float32))
 
 
@@ -162,7 +162,7 @@ def acting_policy(actor: MultiAgentActor, layout: Layout, device: str) -> Policy
 
 
 class _Acting:
-    """A policy of networks, with a memory of its own if they have one."""
+    """A policy of networks, with a hidden state if they are recurrent."""
 
     def __init__(self, actor: MultiAgentActor, layout: Layout, device: str) -> None:
         self._actor, self._layout, self._device = actor.to(device), layout, device
@@ -182,7 +182,7 @@ class _Acting:
         return {agent: _like(observations[agent], action) for agent, action in self._layout.split(flat).items()}
 
     def reset(self, ended: Any = None) -> None:
-        """Forget everything, or the episodes that `ended`, [N] bool."""
+        """Clear the hidden state of all episodes, or of those that `ended`, [N] bool."""
         if ended is None or self._memory is None:
             self._memory = None
         else:
@@ -192,7 +192,7 @@ class _Acting:
         if not self._actor.is_recurrent:
             return None
         shape = (*batch, *self._actor.memory_shape)
-        if self._memory is None or self._memory.shape != shape:  # another batch is of other episodes
+        if self._memory is None or self._memory.shape != shape:  # a batch of another size belongs to other episodes
             self._memory = torch.zeros(shape, device=self._device)
         return self._memory
 

@@ -1,8 +1,8 @@
-"""Networks that remember: a GRU or LSTM cell between what is seen and the MLP.
+"""Recurrent networks: a GRU or LSTM cell before the MLP.
 
-rsl_rl's recurrent networks cut a rollout where episodes end, into sequences whose number and length nobody knows
-beforehand. Here a sequence is a whole rollout of an environment, whose memory is cleared where an episode begins:
-every shape is known, and a CUDA graph can hold it.
+rsl_rl's recurrent networks cut a rollout where episodes end, into sequences whose number and length are not known in
+advance. Here a sequence is a whole rollout of an environment, whose hidden state is cleared where an episode begins. So
+every shape is known, and the work can be a CUDA graph.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from torch import Tensor, nn
 from surgical_marl.policies.encoder import PictureModel
 
 CELLS = {"gru": (nn.GRUCell, 1), "lstm": (nn.LSTMCell, 2)}
-"""Cells, and how many vectors as wide as their output they remember."""
+"""Cells, and the number of vectors in their hidden state, each as wide as the output."""
 
 
 class RecurrentModel(MLPModel):
     """rsl_rl's MLP model behind a cell as wide as its first layer.
 
-    It keeps no memory: that is an argument, and `get_hidden_state` is what became of it. A memory is `[..., S]`, with S
-    the width of the cell, or twice that for an LSTM (output, then cell).
+    It is stateless: the hidden state (memory) is an argument, and `get_hidden_state` returns the next one. A memory is
+    `[..., S]`, with S the width of the cell, or twice that for an LSTM (output, then cell).
 
     Args:
         model: arguments of the model, as of rsl_rl's.
@@ -79,9 +79,9 @@ class RecurrentPictureModel(RecurrentModel, PictureModel):
 
 
 class Memory(nn.Module):
-    """What the networks of N environments remember, at one place for CUDA graphs.
+    """The hidden states of the networks of N environments, at a fixed place in memory for CUDA graphs.
 
-    Networks without a memory have one of no numbers.
+    Networks that are not recurrent have an empty memory.
 
     Attributes:
         actor, critic: `[N, ..., S]`, now.
@@ -100,18 +100,18 @@ class Memory(nn.Module):
         self.begun = (torch.zeros_like(self.actor), torch.zeros_like(self.critic))
 
     def begin(self) -> None:
-        """Keep the memory as it is now, where a rollout begins."""
+        """Store the current memory as that of the rollout's start."""
         for kept, memory in zip(self.begun, self.buffers(), strict=True):
             kept.copy_(memory)
 
     def step(self) -> None:
-        """Take over what the networks remember after a step."""
+        """Copy the hidden states of the networks after a step."""
         for name, model in self._models.items():
             if model.is_recurrent:
                 getattr(self, name).copy_(model.get_hidden_state())
 
     def clear(self, ended: Tensor) -> None:
-        """Forget the episodes that `ended`, `[N]` bool."""
+        """Clear the memory of the episodes that `ended`, `[N]` bool."""
         for memory in self.buffers():
             memory.copy_(cleared(memory, ended))
 

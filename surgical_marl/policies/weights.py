@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from surgical_marl.policies.networks import MultiAgentActor
 
 WIDTHS = ("agents", "observation", "action")
-"""What a file says of its type: how many agents, and the widths of what one of them sees and does."""
+"""Metadata of a file: number of agents of the type, and widths of an agent's observation and action."""
 
 
 def write_weights(folder: Path, actor: MultiAgentActor) -> None:
@@ -33,7 +33,7 @@ def write_weights(folder: Path, actor: MultiAgentActor) -> None:
 def read_weights(folder: Path) -> tuple[dict[str, list[int]], dict[str, Tensor]]:
     """Read the widths of each type of arm (see `WIDTHS`) and the state of a `MultiAgentActor`, on the CPU.
 
-    ValueError if a file is truncated, a pickle, or anything else but what `write_weights` wrote.
+    ValueError if a file is truncated, a pickle, or anything else that `write_weights` did not write.
     """
     groups: dict[str, list[int]] = {}
     state: dict[str, Tensor] = {}

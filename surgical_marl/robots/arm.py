@@ -3,7 +3,7 @@
     arm = load_arm("psm")
     arm.forward_kinematics(arm.home)            # tool tip in the base frame, 4 x 4
 
-Every number of a shipped arm and its source stands in `arms/<name>/README.md`.
+`arms/<name>/README.md` has every number of a shipped arm with its source.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ KEYS = ("description", "urdf", "tool_tip", "remote_center", "camera", "joints", 
 
 @dataclass(frozen=True)
 class Jaw:
-    """The jaw is one command, open or closed, that moves `joint` and the joints that mimic it."""
+    """A jaw. One command, open or closed, moves `joint` and the joints that mimic it."""
 
     joint: str
     open: float
@@ -56,11 +56,11 @@ class Joint:
     name: str
     slides: bool
     lower: float
-    """Where its stops stand: the URDF's limits, less the drive's `margin`."""
+    """Joint limits of the simulation: those of the URDF, reduced by the drive's `margin`."""
     upper: float
     velocity: float
     effort: float
-    """All that drives the joint, cables too, puts no more than this on it."""
+    """Limit of the total effort on the joint, of its own actuator and of cables."""
     viscous: float
     """Viscous friction, effort per velocity."""
     coulomb: float
@@ -91,7 +91,10 @@ class Arm:
 
     @property
     def content(self) -> tuple[bytes, ...]:
-        """All that a model of the arm is made from, meshes included, wherever its folder lies: a key for caches."""
+        """Everything that a model of the arm is made from, meshes included, wherever its folder is.
+
+        It is a key for caches.
+        """
         said = repr((replace(self, folder=Path()), self.urdf)).encode()
         return said, *(read_bytes(self.folder / name, MAX_MESH) for name in mesh_files(self.urdf))
 
@@ -117,11 +120,11 @@ class Arm:
 
     @property
     def speed(self) -> np.ndarray:
-        """How fast a full action moves each joint's target, shape [n], rad/s (m/s for joints that slide)."""
+        """How fast an action of 1 moves each joint's target, shape [n], rad/s (m/s for prismatic joints)."""
         return np.array([joint.drive.speed for joint in self.actuated])
 
     def forward_kinematics(self, q: Any) -> Any:
-        """Pose of the tool tip in the base frame.
+        """Return the pose of the tool tip in the base frame.
 
         Args:
             q: joint positions, shape [..., n], in the order of `actuated`; joints that don't move the tip (the jaw)
@@ -158,7 +161,7 @@ class Arm:
         return xp.stack(list(columns.values()), -1)
 
     def link_poses(self, q: Any, links: tuple[str, ...]) -> dict[str, Any]:
-        """Poses [..., 4, 4] of some links in the base frame; `q` as in `forward_kinematics`."""
+        """Return the poses [..., 4, 4] of some links in the base frame; `q` as in `forward_kinematics`."""
         if not hasattr(q, "__array_namespace__"):
             q = np.asarray(q, dtype=float)
         xp = q.__array_namespace__()
@@ -187,7 +190,7 @@ class Arm:
         return {link: xp.broadcast_to(known[link], (*q.shape[:-1], 4, 4)) for link in links}
 
     def remote_center_error(self, q: Any) -> Any:
-        """Distance of the shaft's axis from the remote center of motion in m, [...]; `q` as in `forward_kinematics`.
+        """Return the distance [...] in m of the shaft's axis from the remote center; `q` is as in `forward_kinematics`.
 
         Raises:
             ValueError: for an arm without a remote center.
@@ -212,8 +215,8 @@ def load_arm(name: str | Path) -> Arm:
     """Read an arm by a shipped name (`list_arms()`) or the path of a folder that holds `arm.yaml`.
 
     Raises:
-        ValueError: if the name is unknown, or a URDF or `arm.yaml` does not hold what it must. Mostly the error is a
-            `Faults`, which lists all that is wrong.
+        ValueError: if the name is unknown, or a URDF or `arm.yaml` lacks something or has a bad value. In most cases
+            the error is a `Faults`, which lists everything that is wrong.
     """
     folder = find("arms", name)
     where = folder / "arm.yaml"
@@ -274,7 +277,7 @@ def _urdf_path(folder: Path, name: Any) -> Path:
 
 def _joint(joint: RobotJoint, drives: dict[str, Drive], where: Path) -> Joint:
     limit, mimic = joint.limit, joint.mimic
-    assert limit is not None  # or else `robot_faults` had said so
+    assert limit is not None  # `robot_faults` has checked this
     leader = mimic.joint if mimic else joint.name
     margin = drives[leader].margin
     if not 2 * margin < limit.upper - limit.lower:
@@ -301,7 +304,7 @@ def _unit(axis: Vector) -> np.ndarray:
 
 
 def _motion(value: Any, axis: Vector, slides: bool) -> Any:
-    """Transform [..., 4, 4] of a joint: a slide along its axis, or a turn about it (Rodrigues' formula)."""
+    """Return the transform [..., 4, 4] of a joint: a translation along its axis, or a rotation (Rodrigues' formula)."""
     xp = value.__array_namespace__()
     value, (x, y, z) = value[..., None, None], _unit(axis)
     if slides:

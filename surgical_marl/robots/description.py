@@ -1,4 +1,4 @@
-"""What a URDF says of an arm, as plain data: links, joints and shapes, with lengths in m and angles in rad.
+"""The content of a URDF as plain data: links, joints and shapes, with lengths in m and angles in rad.
 
 All numbers are tuples, so two descriptions compare with `==`, and `from_json(to_json(robot)) == robot`.
 """
@@ -30,7 +30,7 @@ class Inertial:
 
 @dataclass(frozen=True)
 class Shape:
-    """Something of a link to see or to collide with."""
+    """A visual or collision shape of a link."""
 
     kind: str
     """One of `SHAPES`."""
@@ -57,7 +57,7 @@ class Link:
 
 @dataclass(frozen=True)
 class Limit:
-    """Range, greatest speed and greatest effort of a joint: rad, rad/s and N m, or m, m/s and N if it slides."""
+    """Range, greatest speed and greatest effort of a joint: rad, rad/s and N m (prismatic: m, m/s and N)."""
 
     lower: float
     upper: float
@@ -76,11 +76,11 @@ class Mimic:
 
 @dataclass(frozen=True)
 class RobotJoint:
-    """What ties a link to its parent."""
+    """The joint between a link and its parent."""
 
     name: str
     type: str
-    """One of `MOVING`, or "fixed"; a URDF may hold others, which no arm may."""
+    """One of `MOVING`, or "fixed"; a URDF may have others, but an arm may not."""
     parent: str
     child: str
     origin: Matrix

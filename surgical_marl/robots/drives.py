@@ -1,4 +1,4 @@
-"""How the joints of an arm are driven, read from `arm.yaml`: each by a drive of its own, some by a cable they share."""
+"""How the joints of an arm are driven, read from `arm.yaml`: each by its own drive, some also by a shared cable."""
 
 from __future__ import annotations
 
@@ -21,12 +21,13 @@ class Drive:
     armature: float = 0.0
     home: float = 0.0
     margin: float = 0.0
-    """How far inside the URDF's limits the stops stand. What is light and struck at speed goes a little past a stop."""
+    """How far the joint limits lie inside those of the URDF. A light joint that is struck goes a little past its
+    limit."""
 
 
 @dataclass(frozen=True)
 class Cable:
-    """A cable that several joints wind up.
+    """A cable that couples several joints.
 
     The length of the cable is the sum of coefficient times position of its joints. Its own drive acts on this length,
     in addition to the drives of the joints. Units are those of a `Drive`, per unit of that length.
@@ -67,7 +68,7 @@ def _check_signs(drive: Drive | Cable, positive: str, where: str) -> None:
 
 
 def read_cables(cables: Any, joints: list[str], where: Path, keep: Callable[..., Any]) -> tuple[Cable, ...]:
-    """Return the cables, which may wind only on `joints`.
+    """Return the cables, which may couple only `joints`.
 
     `keep` calls each reader and collects what is wrong. Only a `cables` that is not a list raises ValueError at once.
     """
@@ -81,7 +82,7 @@ def _cable(mapping: Any, joints: list[str], where: str) -> Cable:
     if not isinstance(cable.joints, dict) or len(cable.joints) < 2:
         raise ValueError(f"{where}: joints must map two joints or more to coefficients, not {cable.joints!r}")
     for name, value in cable.joints.items():
-        if name not in joints:  # a jaw is told where to be in every mode, so no cable pulls it
+        if name not in joints:  # a jaw is under position control in every mode, so no cable may drive it
             raise ValueError(f"{where}: joint {name!r} is not one of {', '.join(joints)}")
         if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or value == 0:
             raise ValueError(f"{where}: the coefficient of {name!r} must be a finite number but 0, not {value!r}")

@@ -18,26 +18,26 @@ import numpy as np
 from surgical_marl.robots.arm import Arm
 
 LENGTH = 0.05
-"""What a radian of orientation error weighs against position, m/rad: 0.1 degrees count about as much as 0.1 mm."""
+"""Weight of an orientation error relative to a position error, m/rad: 0.1 degrees count about as much as 0.1 mm."""
 CLOSE = 1e-5
 """Below this error (m, or rad times `LENGTH`) solutions are equally good, and the one nearest the start is taken."""
 PULL = 0.2
 """Share of the way back to the start that a step takes where the target leaves the joints free."""
 STEP = 0.2
-"""The longest step of a joint, a share of its range: beyond it the linear model of the arm misleads."""
+"""The longest step of a joint, a share of its range: for longer steps the linear model of the arm is wrong."""
 FAR = 0.5
 """A longer error (m) counts as this long: far targets make the steps oscillate (S. Buss and J. Kim, Selectively damped
 least squares for inverse kinematics, 2005)."""
 LEAST_DAMPING = 1e-7
-"""m2. Keeps steps finite at a singularity, and is too little to slow the last ones."""
+"""Damping in m2. It keeps steps finite at a singularity, and is too small to slow the last steps."""
 CANDIDATES = 1024
-"""Configurations spread over the joint ranges; a target is also tried from those nearest to it."""
+"""Number of configurations spread over the joint ranges. A search also starts from those nearest to the target."""
 
 
 def inverse_kinematics(
     arm: Arm, targets: Any, start: Any = None, *, starts: int = 8, iterations: int = 20, length: float = LENGTH
 ) -> Any:
-    """Joint positions within the limits that bring the tool tip to `targets`.
+    """Return joint positions within the limits that bring the tool tip to `targets`.
 
     Damped least squares (S. Buss, "Introduction to inverse kinematics with Jacobian transpose, pseudoinverse and
     damped least squares methods", 2004) in joint coordinates that are shares of their ranges. The damping falls with
@@ -49,18 +49,18 @@ def inverse_kinematics(
     Args:
         arm: the arm.
         targets: positions [..., 3] of the tool tip in m or its poses [..., 4, 4], in the base frame. A numpy or a JAX
-            array, of which the result is another.
-        start: joint positions [n] or [..., n] in rad (m for joints that slide) to start from; `arm.home` by default.
+            array; the result is of the same kind.
+        start: joint positions [n] or [..., n] in rad (m for prismatic joints) to start from; `arm.home` by default.
             For positions the joints stay near it where they can.
-        starts: from how many configurations to search, `start` among them. With 1 the solution is the one that a
-            short way leads to, which suits targets near `start` and nearly all positions; the time grows with it.
+        starts: from how many configurations to search, `start` among them. 1 is enough for targets near `start` and for
+            nearly all positions. The time is proportional to this number.
         iterations: steps from each.
-        length: what an error in orientation weighs against one in position, m/rad.
+        length: weight of an orientation error relative to a position error, m/rad.
 
     Returns:
-        Joint positions [..., n] in the order of `arm.actuated`: of solutions that are equally good the one nearest
-        `start`. Joints that don't move the tip stay at `start`. A target out of reach ends near the best that a search
-        led to: compare `forward_kinematics` with the target.
+        Joint positions [..., n] in the order of `arm.actuated`: the solution nearest to `start` among those that are
+        equally good. Joints that don't move the tip stay at `start`. For a target out of reach the result is close to
+        the best that a search found: compare `forward_kinematics` with the target.
 
     Raises:
         ValueError: if targets or start have a shape that does not fit, or fewer than one start is asked for.
@@ -76,14 +76,15 @@ def inverse_kinematics(
 
     def step(i: Any, share: Any) -> Any:
         error, jacobian = _residual(arm, lower + share * scale, targets, length)
-        rest = pull * (2 * i < iterations) * (begin[..., None, :] - share)  # the last half only has to arrive
+        # the last half of the steps only has to reach the target
+        rest = pull * (2 * i < iterations) * (begin[..., None, :] - share)
         return _step(share, error, jacobian * scale, rest).astype(share.dtype)
 
     shares = _repeat(step, seeds, iterations, xp)
     error, _ = _residual(arm, lower + shares * scale, targets, length)
     error = xp.linalg.vector_norm(error, axis=-1)
     away = xp.linalg.vector_norm(shares - begin[..., None, :], axis=-1)
-    # Less than 1 for a solution whatever its distance, and more than 1 for what is none.
+    # Less than 1 for a solution at any distance from the start, more than 1 for anything else.
     rank = xp.where(error < CLOSE, away / (1 + away), 1 + error)
     best = xp.argmin(rank, axis=-1)[..., None, None]
     q = lower + scale * xp.take_along_axis(shares, best, axis=-2)[..., 0, :]
@@ -91,7 +92,7 @@ def inverse_kinematics(
 
 
 def _check(arm: Arm, targets: Any, start: Any) -> tuple[Any, Any, Any]:
-    """Targets and start [..., n] as arrays of floats of one kind, and the namespace of that kind."""
+    """Return targets and start [..., n] as float arrays of one kind, and the namespace of that kind."""
     start = arm.home if start is None else start
     arrays = [x if hasattr(x, "__array_namespace__") else np.asarray(x, dtype=float) for x in (targets, start)]
     xp = next((x.__array_namespace__() for x in arrays if not isinstance(x, np.ndarray)), np)
@@ -113,7 +114,7 @@ def _check(arm: Arm, targets: Any, start: Any) -> tuple[Any, Any, Any]:
 
 
 def _seeds(arm: Arm, targets: Any, begin: Any, starts: int, length: float) -> Any:
-    """Where to search from, [..., starts, n] in shares of the ranges: `begin` and the candidates nearest the target."""
+    """Return the starts of searches [..., starts, n], in shares of the ranges: `begin` and the best candidates."""
     xp = begin.__array_namespace__()
     first = begin[..., None, :]
     if starts == 1:
@@ -124,7 +125,7 @@ def _seeds(arm: Arm, targets: Any, begin: Any, starts: int, length: float) -> An
     if targets.shape[-1] == 4:
         turn = targets[..., :3, :3]
         wanted = xp.concatenate([targets[..., :3, 3], length * turn.reshape(*turn.shape[:-2], 9)], -1)
-    # Square of the distance, less what is the same for all candidates.
+    # Squared distance without the terms that are the same for all candidates.
     distance = np.sum(known**2, -1) - 2 * wanted @ known.T
     near = xp.argsort(distance, axis=-1)[..., : starts - 1]
     moves = np.any(arm.jacobian(arm.home) != 0, axis=0)
@@ -133,10 +134,10 @@ def _seeds(arm: Arm, targets: Any, begin: Any, starts: int, length: float) -> An
 
 
 def _residual(arm: Arm, q: Any, targets: Any, length: float) -> tuple[Any, Any]:
-    """Return what is missing to the targets, and the Jacobian that belongs to it.
+    """Return the error from the tip to the targets, and its Jacobian.
 
-    What is missing is [..., 3] for target points. For target poses it is [..., 6], and the last three are rotation
-    vectors times `length`.
+    The error is [..., 3] for target points. For target poses it is [..., 6], and the last three are rotation vectors
+    times `length`.
     """
     pose, jacobian = arm.forward_kinematics(q), arm.jacobian(q)
     xp = pose.__array_namespace__()
@@ -148,28 +149,32 @@ def _residual(arm: Arm, q: Any, targets: Any, length: float) -> tuple[Any, Any]:
 
 
 def _rotation_vector(turn: Any) -> Any:
-    """Axis times angle in rad, [..., 3], of rotation matrices [..., 3, 3]; at half a turn the axis may be wrong."""
+    """Return axis times angle in rad, [..., 3], of rotation matrices [..., 3, 3].
+
+    At half a turn the axis may be wrong.
+    """
     xp = turn.__array_namespace__()
-    # The chord gives the angle in float32 too, where the cosine of a small one and the sine of a large one do not.
+    # The chord is exact in float32 too. The cosine is not for small angles, and the sine is not for angles near half a
+    # turn.
     chord = xp.linalg.vector_norm(turn - np.eye(3), axis=(-2, -1), keepdims=True)[..., 0]
     angle = 2 * xp.arcsin(xp.clip(chord / 8**0.5, 0.0, 1.0))
     axis = xp.stack(
         [turn[..., 2, 1] - turn[..., 1, 2], turn[..., 0, 2] - turn[..., 2, 0], turn[..., 1, 0] - turn[..., 0, 1]], -1
     )
-    axis = axis + 1e-6 * (angle > 3)  # at half a turn nothing is left of it, and any axis leads away from there
+    axis = axis + 1e-6 * (angle > 3)  # at half a turn the vector vanishes; any axis reduces the error from there
     return angle * axis / xp.maximum(xp.linalg.vector_norm(axis, axis=-1, keepdims=True), 1e-12)
 
 
 def _step(share: Any, error: Any, jacobian: Any, pull: Any) -> Any:
-    """One step of damped least squares from joint coordinates `share` in [0, 1]."""
+    """Return joint coordinates after one step of damped least squares from joint coordinates `share` in [0, 1]."""
     xp = share.__array_namespace__()
     transposed = xp.matrix_transpose(jacobian)
     downhill = (transposed @ error[..., None])[..., 0]
-    # Joints that press against a limit are left out, so that the others do without them.
+    # Joints that press against a limit are left out, so that the other joints take over their part.
     held = ((share <= 0) & (downhill < 0)) | ((share >= 1) & (downhill > 0))
     jacobian = xp.where(held[..., None, :], 0.0, jacobian)
     transposed = xp.matrix_transpose(jacobian)
-    # Besides Sugihara's, the damping that keeps the matrix regular in spite of rounding (in float32 it counts).
+    # In addition to Sugihara's damping, one that keeps the matrix regular in spite of rounding (needed in float32).
     least = LEAST_DAMPING + share.shape[-1] * xp.finfo(share.dtype).eps * xp.sum(jacobian**2, axis=(-2, -1))
     error = error * xp.minimum(1.0, FAR / xp.maximum(xp.linalg.vector_norm(error, axis=-1, keepdims=True), 1e-12))
     damping = least + 0.5 * xp.sum(error**2, axis=-1)
@@ -193,7 +198,7 @@ def _repeat(step: Callable[[Any, Any], Any], state: Any, times: int, xp: Any) ->
 @lru_cache(maxsize=64)
 def _halton(count: int, dimensions: int) -> np.ndarray:
     """Return the first points of the Halton sequence after the origin, [count, dimensions] in (0, 1)."""
-    from scipy.stats import qmc  # takes 0.3 s to import, and most searches start from one place
+    from scipy.stats import qmc  # scipy takes 0.3 s to import, and most searches start from one place
 
     return np.asarray(qmc.Halton(dimensions, scramble=False).fast_forward(1).random(count))
 

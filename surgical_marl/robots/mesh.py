@@ -1,4 +1,4 @@
-"""Mesh files of an arm: where they lie, and the vertices and triangles in them."""
+"""Mesh files of an arm: their paths, and the vertices and triangles in them."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ MAX_MESH = 50_000_000
 def resolve_meshes(robot: Robot, path: Path, folder: Path) -> tuple[Robot, list[str]]:
     """Find the files of all meshes.
 
-    A relative name starts at the URDF; of `package://name/rest`, `rest` starts at the arm's folder, or at its
-    subfolder `name`.
+    A relative name is relative to the URDF. The `rest` of `package://name/rest` is relative to the arm's folder, or to
+    its subfolder `name`.
 
     Args:
         robot: with meshes named as in the URDF.
@@ -29,7 +29,7 @@ def resolve_meshes(robot: Robot, path: Path, folder: Path) -> tuple[Robot, list[
 
     Returns:
         The robot with the paths of meshes relative to the arm's folder, and a sentence for each mesh that is missing,
-        lies outside or is of an unknown kind; the name of such a one stays.
+        lies outside or is of an unknown kind. The name of such a mesh is not changed.
     """
     faults: dict[str, None] = {}
 
@@ -56,7 +56,7 @@ def mesh_files(robot: Robot) -> list[str]:
 
 
 def read_mesh(path: Path, scale: Vector | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices [n, 3] in m and triangles [m, 3] of an STL, OBJ or DAE file. Materials and textures stay unread.
+    """Return vertices [n, 3] in m and triangles [m, 3] of an STL, OBJ or DAE file. Materials and textures are not read.
 
     Raises:
         ValueError: not a mesh, nothing in it, numbers that are not finite, or too large.
@@ -68,18 +68,18 @@ def read_mesh(path: Path, scale: Vector | None = None) -> tuple[np.ndarray, np.n
     if kind == "dae":
         data = write_xml(parse_xml(data, path, "mesh").root)
     try:
-        # From memory and without a resolver: what the file refers to is not opened.
+        # From memory and without a resolver, so that files that the mesh refers to are not opened.
         scene = trimesh.load_scene(io.BytesIO(data), file_type=kind, skip_materials=True, process=False)
         mesh = scene.to_mesh()
         finite = bool(np.isfinite(mesh.vertices).all())
-        mesh.merge_vertices()  # an STL repeats each once a triangle
-        if kind == "dae":  # the one of the three that says what a unit is
+        mesh.merge_vertices()  # an STL repeats a vertex for each of its triangles
+        if kind == "dae":  # only this format of the three declares a unit
             unit, _, _ = str(scene.units).rpartition(" * ")  # "meters" or "0.001 * meters"
             mesh.apply_scale(float(unit or 1))
         if scale is not None:
             mesh.apply_scale(scale)
         vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces, int)
-    except Exception as error:  # trimesh lets through whatever its readers raise
+    except Exception as error:  # trimesh passes on any exception of its readers
         raise ValueError(f"{path} is not a mesh that can be read: {' '.join(str(error).split())}") from None
     if not finite:
         raise ValueError(f"{path} has vertices that are not finite numbers")
@@ -89,7 +89,10 @@ def read_mesh(path: Path, scale: Vector | None = None) -> tuple[np.ndarray, np.n
 
 
 def _mesh_path(filename: str, start: Path, folder: Path) -> str:
-    """Where a mesh lies in the arm's folder; ValueError with the end of a sentence if it must not or can't be read."""
+    """Return the path of a mesh in the arm's folder.
+
+    Raise ValueError, with the end of a sentence, if it must not or can't be read.
+    """
     package, _, rest = filename.removeprefix("package://").partition("/")
     if filename.startswith("package://"):
         candidates = [folder / rest, folder / package / rest]
@@ -98,12 +101,12 @@ def _mesh_path(filename: str, start: Path, folder: Path) -> str:
     home, inside = folder.resolve(), []
     for candidate in candidates:
         try:
-            path = candidate.resolve()  # follows links and `..`, so that what is compared is what is opened
+            path = candidate.resolve()  # resolves links and `..`: the path that is compared is opened
             if path.is_relative_to(home):
                 inside.append(path)
                 if path.is_file():
                     break
-        except (OSError, RuntimeError, ValueError):  # a name no file can have, or links in a circle
+        except (OSError, RuntimeError, ValueError):  # an impossible file name, or a cycle of links
             continue
     else:
         if len(inside) < len(candidates):

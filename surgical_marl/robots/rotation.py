@@ -1,6 +1,6 @@
-"""Rotation matrices, quaternions (w, x, y, z) and angles into each other, by MuJoCo, as its models have them.
+"""Conversions between rotation matrices, quaternions (w, x, y, z) and angles, by MuJoCo's functions.
 
-SciPy's `Rotation` does the same, but to import it takes 0.3 s of CPU time, as long as all else that loads a scene.
+SciPy's `Rotation` does the same, but its import takes 0.3 s of CPU time, as long as the rest of loading a scene.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""XML that anybody may have written: read by defusedxml, which refuses what could expand or name other files."""
+"""Reads untrusted XML with defusedxml, which refuses entities and references to other files."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 from xml.etree.ElementTree import Element, TreeBuilder, tostring
 
 MAX_DEPTH = 256
-"""Of elements within each other; libxml2 has the same limit."""
+"""Greatest depth of nested elements; libxml2 has the same limit."""
 
 
 class Document(NamedTuple):
@@ -19,7 +19,7 @@ class Document(NamedTuple):
 
 
 def parse_xml(data: bytes, path: Path, noun: str) -> Document:
-    """Parse XML that has no DOCTYPE: only there can entities be defined or other files be named.
+    """Parse XML without a DOCTYPE. Only a DOCTYPE can define entities or name other files.
 
     Args:
         data: the text.
@@ -53,7 +53,7 @@ def write_xml(root: Element) -> bytes:
 
 
 def read_bytes(path: Path, most: int) -> bytes:
-    """Return what a file holds; ValueError if it can't be read or holds more than `most` bytes."""
+    """Return the content of a file; ValueError if it can't be read or holds more than `most` bytes."""
     try:
         with path.open("rb") as file:
             data = file.read(most + 1)
@@ -70,7 +70,7 @@ def shown(text: str) -> str:
 
 
 class _Lines(TreeBuilder):
-    """Builds a tree that is not too deep for recursion and keeps the line of each element."""
+    """Builds a tree of limited depth and keeps the line of each element."""
 
     expat: Any
 

@@ -1,9 +1,9 @@
-"""From an `Arm` to a `mujoco.MjSpec`: bodies, joints, geoms, actuators, the tool tip as a site.
+"""Builds a `mujoco.MjSpec` from an `Arm`: bodies, joints, geoms, actuators, the tool tip as a site.
 
 Visual geoms come from the URDF's primitives and meshes as they are. Every `<collision>` becomes a capsule or a sphere,
-the cheapest shapes to collide. A cylinder becomes the capsule of the same length and radius, so that slender tools lose
-nothing; a box or a mesh the capsule around it, along the longest side of its bounding box, or the sphere around it if
-that is smaller. Collision geoms collide only through the explicit pairs that a scene makes of them.
+the cheapest shapes to collide. A cylinder becomes the capsule of the same length and radius, so that slender tools keep
+their shape. A box or a mesh becomes the capsule around it, along the longest side of its bounding box, or the sphere
+around it if that is smaller. Collision geoms collide only through the explicit pairs that a scene makes of them.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from surgical_marl.robots.rotation import quaternion
 
 VISUAL_GROUP, COLLISION_GROUP = 2, 3
 SOLREF = (0.005, 1.0)
-"""Time constant in s and damping ratio of joint stops and contacts: as stiff as a step of 2.5 ms lets them be."""
+"""Time constant in s and damping ratio of joint limits and contacts: as stiff as a step of 2.5 ms allows."""
 DEFAULT_RGBA = (0.7, 0.7, 0.72, 1.0)
 
 
@@ -77,8 +77,8 @@ def _mode(arm: Arm, joint: Joint, control: str) -> str:
 def _add_joint(body: Any, joint: Joint, axis: Vector, control: str) -> None:
     """Add a joint to a body.
 
-    A joint under torque control has the speed-torque line of a motor: at its greatest speed nothing is left of the full
-    effort.
+    A joint under torque control has the speed-torque line of a motor: its available effort falls linearly to zero at
+    its greatest speed.
     """
     drag = joint.effort / joint.drive.speed if control == "torque" else 0.0
     body.add_joint(
@@ -100,8 +100,8 @@ def _add_joint(body: Any, joint: Joint, axis: Vector, control: str) -> None:
 def _add_cable(spec: mujoco.MjSpec, name: str, cable: Cable, joints: dict[str, Joint], control: str) -> None:
     """Add a cable as a fixed tendon with an actuator of its own.
 
-    Under torque control the tendon only carries inertia and has no actuator. A commanded torque is then that of all the
-    motors together, which share it among them as the cables demand.
+    Under torque control the tendon only has inertia and no actuator. A commanded torque is then the sum of the torques
+    of all motors, however they share it.
     """
     tendon = spec.add_tendon(name=name, armature=cable.armature)
     for joint, coefficient in cable.joints.items():
@@ -153,7 +153,7 @@ def _add_actuator(
 
 
 def _add_link(spec: mujoco.MjSpec, body: Any, link: Link, folder: Path) -> None:
-    if link.inertial is not None and np.any(link.inertial.inertia):  # all zeros say as much as no <inertial>
+    if link.inertial is not None and np.any(link.inertial.inertia):  # all zeros mean the same as no <inertial>
         origin = np.array(link.inertial.origin)
         tensor = origin[:3, :3] @ np.array(link.inertial.inertia) @ origin[:3, :3].T
         body.explicitinertial = True
@@ -166,7 +166,7 @@ def _add_link(spec: mujoco.MjSpec, body: Any, link: Link, folder: Path) -> None:
         _add_geom(body, shape, np.array(visual.origin), rgba=rgba, group=VISUAL_GROUP)
     for i, collision in enumerate(link.collisions):
         name = collision.name or f"{link.name}_{i}"
-        if spec.geom(name) is not None:  # URDF lets shapes of two links have one name, MuJoCo does not
+        if spec.geom(name) is not None:  # in a URDF shapes of two links may have the same name, in MuJoCo they may not
             name = f"{link.name}_{i}_{name}"
         shape, place = _collision_shape(collision, folder)
         place = np.array(collision.origin) @ place
@@ -186,7 +186,7 @@ def _visual_shape(spec: mujoco.MjSpec, shape: Shape, name: str, folder: Path) ->
     if shape.kind == "box":
         return {"type": mujoco.mjtGeom.mjGEOM_BOX, "size": np.array(shape.size) / 2}
     vertices, faces = read_mesh(folder / str(shape.mesh), shape.size)
-    # As a shell a mesh may be open or inside out: its volume, which nothing here needs, is not computed.
+    # As a shell a mesh may be open or inside out: its volume, which is not needed here, is not computed.
     spec.add_mesh(
         name=name,
         uservert=vertices.ravel(),
@@ -197,7 +197,7 @@ def _visual_shape(spec: mujoco.MjSpec, shape: Shape, name: str, folder: Path) ->
 
 
 def _collision_shape(shape: Shape, folder: Path) -> tuple[dict[str, Any], np.ndarray]:
-    """Return a capsule or a sphere, and its place [4, 4] in the frame of the shape."""
+    """Return a capsule or a sphere, and its pose [4, 4] in the frame of the shape."""
     if shape.kind == "sphere":
         return _sphere(shape.size[0]), np.eye(4)
     if shape.kind == "cylinder":
@@ -209,7 +209,7 @@ def _collision_shape(shape: Shape, folder: Path) -> tuple[dict[str, Any], np.nda
 
 
 def _bounding_capsule(points: np.ndarray) -> tuple[dict[str, Any], np.ndarray]:
-    """Return a capsule that holds points [n, 3], or a sphere if that is smaller, and its place [4, 4].
+    """Return a capsule that holds points [n, 3], or a sphere if that is smaller, and its pose [4, 4].
 
     The capsule is the shortest one whose axis passes through the middle of the points' bounding box, along the longest
     side of the box.

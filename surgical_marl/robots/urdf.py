@@ -1,4 +1,4 @@
-"""Reads URDFs, which anybody may have written: plain data, nothing outside the arm's folder, no surprises.
+"""Reads untrusted URDFs as plain data, without opening anything outside the arm's folder.
 
     robot = read_urdf(folder / "arm.urdf")
 
@@ -40,7 +40,10 @@ MAX_URDF = 10_000_000
 
 
 class Faults(ValueError):
-    """All that keeps an arm from loading, one sentence each in `faults`; as an error it says the first."""
+    """Everything that keeps an arm from loading, one sentence each in `faults`.
+
+    The error's message is the first one.
+    """
 
     def __init__(self, faults: Iterable[str]) -> None:
         self.faults = list(faults)
@@ -50,12 +53,13 @@ class Faults(ValueError):
 def read_urdf(path: Path) -> Robot:
     """Read a URDF file; lengths in m, angles in rad, meshes by the names that it gives them.
 
-    A link called "world", the name MuJoCo keeps for the ground, becomes "world_link". What yourdfpy made of the file
-    is kept on disk by content: to import yourdfpy takes longer than all else that loads a scene.
+    A link called "world", the name that MuJoCo reserves for the ground, becomes "world_link". The result of yourdfpy is
+    kept on disk, keyed by the content of the file, because importing yourdfpy takes longer than the rest of loading a
+    scene.
 
     Raises:
-        ValueError: not there, too large, no XML, a DOCTYPE (so entities never expand), or a tag that lacks what it
-            must have or holds a number that is none. `Faults` if that is more than one thing.
+        ValueError: not there, too large, no XML, a DOCTYPE (so entities never expand), or a tag that lacks something or
+            has an invalid number. If more than one thing is wrong, the error is a `Faults`.
     """
     if not path.is_file():
         raise ValueError(f"there is no URDF file {path}")
@@ -76,7 +80,7 @@ def _parse(data: bytes, path: Path) -> Robot:
     try:
         text = io.BytesIO(write_xml(document.root))
         return _plain(yourdfpy.URDF.load(text, build_scene_graph=False, load_meshes=False).robot)
-    except Exception as error:  # yourdfpy lets through whatever float() or its own code raises
+    except Exception as error:  # yourdfpy passes on any exception of float() and of its own code
         raise ValueError(f"{path} is not a URDF that can be read: {' '.join(str(error).split())}") from None
 
 

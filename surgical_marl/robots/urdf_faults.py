@@ -1,4 +1,4 @@
-"""What keeps a URDF from being an arm's: one sentence for each thing that is wrong."""
+"""Checks whether a URDF can be an arm: one sentence for each thing that is wrong."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from surgical_marl.robots.description import MOVING, SHAPES, Robot
 from surgical_marl.robots.safe_xml import Document, shown
 
 LEAST = 1e-15
-"""Masses (kg) and moments of inertia (kg m2) up to here are zero to MuJoCo."""
+"""MuJoCo treats masses (kg) and moments of inertia (kg m2) up to this value as zero."""
 
 _ANY, _NOT_NEGATIVE, _POSITIVE = "finite", "finite and not negative", "finite and above 0"
 # Numbers of a URDF by tag and attribute: how many there must be, and of what kind.
@@ -98,7 +98,7 @@ def _number_fault(tag: str, key: str, text: str) -> str | None:
 
 
 def _tree_faults(robot: Robot) -> Iterator[str]:
-    """Yield what keeps links and joints from being one tree."""
+    """Yield the reasons why links and joints are not one tree."""
     links = [link.name for link in robot.links]
     for noun, names in (("link", links), ("joint", [joint.name for joint in robot.joints])):
         for name, count in Counter(names).items():
@@ -161,7 +161,7 @@ def _joint_faults(robot: Robot) -> Iterator[str]:
 
 
 def _inertia_faults(robot: Robot) -> Iterator[str]:
-    """Masses and inertias that no body can have: MuJoCo compiles none of them."""
+    """Yield masses and inertias that are not physically possible; MuJoCo refuses to compile them."""
     masses = {}
     for link in robot.links:
         masses[link.name] = mass = 0.0 if link.inertial is None else link.inertial.mass
@@ -179,7 +179,7 @@ def _inertia_faults(robot: Robot) -> Iterator[str]:
     for joint in robot.joints:
         if joint.type not in MOVING:
             continue
-        welded = {joint.child}  # a link without mass is fine where a fixed joint ties it to one with mass
+        welded = {joint.child}  # a link without mass is fine if a fixed joint connects it to one with mass
         while more := {j.child for j in fixed if j.parent in welded} - welded:
             welded |= more
         if sum(masses[name] for name in welded) <= LEAST:

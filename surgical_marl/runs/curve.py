@@ -58,6 +58,6 @@ def _smooth(values: np.ndarray) -> np.ndarray:
 
 
 def _log_limits(values: np.ndarray) -> tuple[float, float]:
-    """From 1 to 100, and further where the values go further."""
+    """Return limits from 1 to 100, extended to further values."""
     positive = values[values > 0]
     return float(min([1.0, *positive / 1.2])), float(max([100.0, *positive * 1.2]))

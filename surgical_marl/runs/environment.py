@@ -1,4 +1,4 @@
-"""The environment that a run learns in."""
+"""Makes the environment of a run."""
 
 from __future__ import annotations
 

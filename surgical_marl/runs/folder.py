@@ -1,11 +1,11 @@
 """The files of a run folder, and how they are read and written.
 
 A run folder holds `config.yaml`, `checkpoint.pt`, `metrics.csv`, `curve.png` and `tensorboard/`. If there were
-several processes, `environments-*.pt` of the further ones lie beside the checkpoint. If training diverged, there is
+several processes, `environments-*.pt` of the other ranks are beside the checkpoint. If training diverged, there is
 also `diverged.json`.
 
-A policy that ships has safetensors instead of the checkpoint (`export.py`). Every write is atomic, but that
-`metrics.csv` grows by rows.
+A shipped policy has safetensors instead of the checkpoint (`surgical_marl/evaluation/export.py`). Every write is
+atomic, except that `metrics.csv` grows by rows.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from surgical_marl.runs.settings import Settings, config_text, read_config
 CONFIG, CHECKPOINT, METRICS, CURVE = "config.yaml", "checkpoint.pt", "metrics.csv", "curve.png"
 DIVERGED = "diverged.json"
 WEIGHTS = ".safetensors"
-"""How the files end that hold the weights of a policy that ships."""
+"""Suffix of the weight files of a shipped policy."""
 PACKAGES = ("surgical-marl", "torch", "rsl-rl-lib", "jax", "mujoco", "mujoco-mjx", "numpy")
 
 
@@ -46,7 +46,7 @@ def claim_folder(out: Path) -> None:
 
 
 def check_writable(out: Path) -> None:
-    """Make the folder where it is missing. ValueError if it cannot be written."""
+    """Make the folder if it is missing. ValueError if it cannot be written."""
     try:
         out.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=out):
@@ -56,7 +56,7 @@ def check_writable(out: Path) -> None:
 
 
 def write_config(run: Path, settings: Settings) -> None:
-    """Write the settings, and what makes the run: versions of packages, device, commit, time of this start."""
+    """Write the settings, and the origin of the run: versions of packages, device, commit, time of this start."""
     versions = {"python": platform.python_version()}
     for name in PACKAGES:
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
@@ -74,13 +74,13 @@ def write_config(run: Path, settings: Settings) -> None:
 
 
 def read_origin(run: Path) -> dict[str, dict[str, str | None]]:
-    """Return the `versions` and `origin` that `write_config` noted beside the settings; empty where a run has none."""
+    """Return the `versions` and `origin` that `write_config` noted beside the settings; empty if a run has none."""
     notes = yaml.safe_load((run / CONFIG).read_text())
     return {name: notes.get(name) or {} for name in ("versions", "origin")}
 
 
 def has_begun(run: Path) -> bool:
-    """Whether there is a run in a folder, which has its settings from the start."""
+    """Return whether a folder holds a run; a run has its settings from the start."""
     return (run / CONFIG).is_file()
 
 
@@ -101,7 +101,7 @@ def write_checkpoint(run: Path, checkpoint: Mapping[str, Any]) -> None:
 
 
 def holds_weights(folder: Path) -> bool:
-    """Whether a policy ships in this folder."""
+    """Return whether this folder holds a shipped policy."""
     return any(folder.glob(f"[!.]*{WEIGHTS}"))
 
 
@@ -113,9 +113,9 @@ def read_checkpoint(run: str | Path) -> dict[str, Any]:
     if not path.is_file():
         raise ValueError(f"{run} is not a run folder: it has no {CHECKPOINT}")
     try:
-        with warnings.catch_warnings(action="ignore"):  # what torch says of a file that is none of its own
+        with warnings.catch_warnings(action="ignore"):  # torch's error for a file of another format
             checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception:  # torch.load raises many types for a damaged file, and all mean the same here
+    except Exception:  # torch.load raises many types of errors for a damaged file
         checkpoint = None
     if not isinstance(checkpoint, dict) or not {"iteration", "groups", "algorithm"} <= checkpoint.keys():
         raise ValueError(f"{path} is damaged, or not a checkpoint of this program: restore it from a copy")
@@ -123,7 +123,7 @@ def read_checkpoint(run: str | Path) -> dict[str, Any]:
 
 
 def write_environments(run: Path, iteration: int, rank: int, processes: int, state: Mapping[str, Any]) -> None:
-    """Write what the checkpoint of an iteration needs of one further process."""
+    """Write the part of an iteration's checkpoint that belongs to one further process."""
     write_atomic(_environments(run, iteration, rank, processes), lambda path: torch.save(dict(state), path))
 
 
@@ -137,7 +137,7 @@ def read_environments(run: Path, iteration: int, rank: int, processes: int) -> d
 
 
 def remove_environments(run: Path, iteration: int, processes: int) -> None:
-    """Remove what no longer belongs to the checkpoint, which is of this iteration and of so many processes."""
+    """Remove files that don't belong to the checkpoint of this iteration and this number of processes."""
     kept = {_environments(run, iteration, rank, processes) for rank in range(1, processes)}
     for path in set(run.glob("environments-*.pt")) - kept:
         path.unlink(missing_ok=True)
@@ -153,7 +153,7 @@ def write_divergence(run: Path, divergence: Mapping[str, Any]) -> None:
 
 
 def format_row(row: Mapping[str, float]) -> list[str]:
-    """Cells of a row of metrics. A rate over no episodes (NaN) is an empty cell."""
+    """Return the cells of a row of metrics. A rate over no episodes (NaN) is an empty cell."""
     return ["" if math.isnan(value) else format(value, ".9g") for value in row.values()]
 
 

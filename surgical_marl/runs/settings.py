@@ -1,4 +1,4 @@
-"""Training settings: typed, checked, from `configs/<task>.yaml` and `key=value` overrides."""
+"""Training settings, typed and checked, from `configs/<task>.yaml` and `key=value` overrides."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from surgical_marl.tasks.base.options import Checked, Options, as_mapping, choic
 
 @dataclass(frozen=True)
 class PPOSettings(Checked):
-    """How the algorithm learns from a rollout."""
+    """Settings of the algorithm: how it learns from a rollout."""
 
     prefix: ClassVar[str] = "ppo."
 
@@ -41,7 +41,7 @@ class PPOSettings(Checked):
 
 @dataclass(frozen=True)
 class ConstraintSettings(Checked):
-    """A cost that few episodes may have, instead of a weight of a reward term (see `learning/constraint.py`)."""
+    """A limit on the share of episodes with a cost, instead of a reward weight (see `learning/constraint.py`)."""
 
     prefix: ClassVar[str] = "constraint."
 
@@ -54,7 +54,7 @@ class ConstraintSettings(Checked):
 
 @dataclass(frozen=True)
 class NetworkSettings(Checked):
-    """Actor and critic: one MLP each of this shape, which a GRU or LSTM cell may come before."""
+    """Actor and critic: an MLP of this shape for each, with an optional GRU or LSTM cell before it."""
 
     prefix: ClassVar[str] = "network."
 
@@ -69,7 +69,7 @@ class NetworkSettings(Checked):
 class Settings(Options):
     """One training run: the options of its environment, and how it learns.
 
-    algo: the name of a learning algorithm (see `list_algorithms`); a run can be read where its algorithm is not
+    algo: the name of a learning algorithm (see `list_algorithms`); a run can be read even if its algorithm is not
     installed. team_reward: every agent gets the sum of all rewards, instead of its own. precision: of the networks'
     matrix products on a GPU; on a CPU it is always float32.
     """
@@ -106,7 +106,7 @@ class Settings(Options):
 def load_config(task: str, scene: str, overrides: Iterable[str] = ()) -> Settings:
     """Load the settings for a task in a scene.
 
-    They come from the parts below. Where two parts differ, the later one counts:
+    They come from the following parts; a later part overrides an earlier one:
 
     1. the task's file
     2. on a GPU, the section `cuda` of that file
@@ -125,7 +125,7 @@ def load_config(task: str, scene: str, overrides: Iterable[str] = ()) -> Setting
     """
     TASKS.check(task)
     values: dict[str, Any] = {}
-    if task in list_configs():  # a task that has none learns by the defaults
+    if task in list_configs():  # a task without settings uses the defaults
         values = _read_yaml(find("configs", task))
     scenes = as_mapping("scenes", values.pop("scenes", None) or {})
     own = dict(as_mapping(f"scenes.{scene}", scenes.get(scene) or {}))
@@ -210,7 +210,7 @@ def _reject_unknown(values: Mapping[str, Any], without: tuple[str, ...] = ()) ->
 
 
 def _suggestion(name: str, known: list[str]) -> str:
-    # A setting is often asked for without its section, so compare the last parts as well.
+    # People often leave the section of a setting out, so compare the last parts as well.
     last = {key.rpartition(".")[2]: key for key in known}
     near = difflib.get_close_matches(name, known, 1) or [
         last[match] for match in difflib.get_close_matches(name.rpartition(".")[2], list(last), 1)

@@ -1,4 +1,4 @@
-"""From mounted arms to a MuJoCo model."""
+"""Builds a MuJoCo model from mounted arms."""
 
 from __future__ import annotations
 

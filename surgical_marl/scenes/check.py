@@ -1,4 +1,4 @@
-"""What is wrong with an arm or a scene, one sentence each: what keeps it from loading, then what it does once loaded.
+"""Finds faults of an arm or a scene, one sentence each: faults of its files, then faults of its behaviour once loaded.
 
     for finding in check("my_arm"):
         print(finding)
@@ -35,7 +35,8 @@ CENTER = 1e-4
 POSTURES = 20
 """Postures, besides home, in which the controller must be stable."""
 GROWTH = 1e-3
-"""A disturbance may grow by this share in a physics step: undamped joints neither grow nor fall, up to rounding."""
+"""A disturbance may grow by this share in a physics step. That of undamped joints stays the same except for
+rounding."""
 
 
 def check(source: str | Path) -> list[str]:
@@ -175,7 +176,7 @@ def _collision_findings(arm: Arm, model: mujoco.MjModel) -> Iterator[str]:
 
 
 def _meet_by_design(arm: Arm, model: mujoco.MjModel, a: int, b: int) -> bool:
-    """Whether two geoms are on one body, are neighbours with no collision geom between them, or are jaw fingers."""
+    """Return whether two geoms are on one body, are neighbours with no collision geom between, or are jaw fingers."""
     if neighbours(model, a, b):
         return True
     one, other = (int(model.body_weldid[model.geom_bodyid[geom]]) for geom in (a, b))
@@ -200,8 +201,8 @@ def _at(arm: Arm, model: mujoco.MjModel, q: np.ndarray) -> mujoco.MjData:
 def _controller_findings(arm: Arm, model: mujoco.MjModel) -> Iterator[str]:
     """Yield a finding if a slight disturbance grows in a step of C MuJoCo, at home or at other postures.
 
-    In a stable arm it does not grow. Joint limits, dry friction and effort limits are left out. They would only turn a
-    disturbance that grows into chatter.
+    In a stable arm it does not grow. Joint limits, dry friction and effort limits are left out. They would only bound a
+    growing disturbance, which then becomes chatter.
     """
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
     model.actuator_forcelimited[:], model.jnt_actfrclimited[:] = 0, 0
@@ -210,7 +211,7 @@ def _controller_findings(arm: Arm, model: mujoco.MjModel) -> Iterator[str]:
         data, step = _at(arm, model, q), np.zeros((2 * model.nv, 2 * model.nv))
         with _no_log():
             mujoco.mjd_transitionFD(model, data, 1e-6, True, step, None, None, None)
-        if data.warning.number.any() or not np.isfinite(step).all():  # beyond all numbers in a single step
+        if data.warning.number.any() or not np.isfinite(step).all():  # overflow in a single step
             name = max(arm.joints, key=lambda joint: joint.drive.stiffness).name
         else:
             growth, modes = np.linalg.eig(step)
@@ -227,7 +228,7 @@ def _controller_findings(arm: Arm, model: mujoco.MjModel) -> Iterator[str]:
 
 @contextmanager
 def _no_log() -> Iterator[None]:
-    """MuJoCo writes MUJOCO_LOG.TXT into the working folder when numbers run away; here that is a finding instead."""
+    """Suppress MUJOCO_LOG.TXT, which MuJoCo writes if numbers diverge; here that is a finding instead."""
     before = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(lambda _: None)
     try:

@@ -1,8 +1,8 @@
 """Which collision geoms of a scene can touch: found from the joint limits, not listed by hand.
 
-Every pair is looked at in every physics step, so a scene names only those that can meet. Two geoms of two arms are a
-pair unless they are proven to stay apart in all postures (`separation.py`). So are two geoms of one arm, unless a joint
-holds them next to each other or they overlap at home, as neighbours in a chain do by design.
+Every pair is checked in every physics step, so a scene has only the pairs that can meet. Two geoms of two arms are a
+pair unless they are proven to stay apart in all postures (`separation.py`). So are two geoms of one arm, unless they
+are next to each other in the chain, or overlap at home as neighbours in a chain do by design.
 """
 
 from __future__ import annotations
@@ -19,11 +19,12 @@ from surgical_marl.scenes.scene import Scene, collision_geoms
 from surgical_marl.scenes.separation import BOXES, ball, can_meet
 
 NEAR, NEAR_WITHIN = 0.01, 0.001
-"""Geoms of two arms, and of one arm, that can come this near, in m, are a pair. Between arms that is what goals leave
-free between them, so that any smaller `min_distance` is right; in an arm it covers what stops and rounding give."""
+"""Distances in m below which geoms of two arms, or of one arm, are a pair. Between arms it is the clearance that goals
+leave, so that any smaller `min_distance` is exact. Within an arm it covers rounding and how far joints pass their
+limits."""
 FEWEST, MOST = 2_000, 1_000_000
-"""Boxes that the search of each pair may take in any case, some 10 ms, and what those of a scene take together before
-that, some 5 s: the scenes that ship take 610,000 at most. None takes more than half of what is left."""
+"""Boxes that the search of each pair may take in any case (some 10 ms), and boxes that all searches of a scene share
+before that (some 5 s); shipped scenes take 610,000 at most. No search takes more than half of the remaining ones."""
 
 
 def contact_pairs(scene: Scene) -> list[tuple[str, str]]:
@@ -34,7 +35,7 @@ def contact_pairs(scene: Scene) -> list[tuple[str, str]]:
 
 
 def _candidates(scene: Scene) -> list[tuple[int, int, float]]:
-    """Return pairs of geom ids that may touch, each with the distance in m that counts as near.
+    """Return pairs of geom ids that may touch, each with the distance in m below which it is near.
 
     Left out are geoms on one body, and geoms next to each other in a chain. So are geoms of one arm that overlap at
     home.
@@ -65,11 +66,11 @@ def neighbours(model: mujoco.MjModel, a: int, b: int) -> bool:
 
 
 def _can_meet(scene: Scene, candidates: list[tuple[int, int, float]]) -> np.ndarray:
-    """Which candidates can come near each other, [candidates] bool."""
+    """Return which candidates can come near each other, [candidates] bool."""
     model, left = scene.model, MOST
     owner = {geom: agent for agent in scene.agents for geom in collision_geoms(model, agent)}
     balls = {geom: ball(model, geom) for geom in owner}
-    known: dict[object, bool] = {}  # an arm that stands in a scene twice is searched once
+    known: dict[object, bool] = {}  # an arm that is in a scene twice is searched once
     found = []
     for a, b, near in candidates:
         (one, reach), (other, its_reach) = balls[a], balls[b]

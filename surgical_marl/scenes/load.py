@@ -2,7 +2,7 @@
 
     scene = load_scene("bimanual_psm")
 
-A scene file names each agent's arm, where its base frame stands, and the point its targets are drawn around. Which
+A scene file names each agent's arm, the pose of its base frame, and the point around which its targets are drawn. Which
 geoms can touch is found by `surgical_marl/scenes/contacts.py`.
 """
 
@@ -33,7 +33,7 @@ def load_scene(name: str | Path, control: str = "position") -> Scene:
     """Read a scene by a shipped name (`list_scenes()`) or the path of a YAML file.
 
     Raises:
-        ValueError: unknown name or control mode, or a file that does not hold what a scene must.
+        ValueError: unknown name or control mode, or a file that is not a valid scene.
     """
     path = find("scenes", name)
     settings = read_yaml(path)

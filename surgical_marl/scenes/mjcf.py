@@ -1,9 +1,10 @@
-"""A scene as MJCF, for plain MuJoCo: one text that steps as `Scene.model` does.
+"""Writes a scene as MJCF for plain MuJoCo: one text whose model steps as `Scene.model` does.
 
     Path("psm.xml").write_text(mjcf(load_scene("psm")))
     model = mujoco.MjModel.from_xml_path("psm.xml")
 
-It is written from the compiled model, with all digits: `MjSpec.to_xml` rounds to six. Meshes stand in it as numbers.
+The text is written from the compiled model with all digits, because `MjSpec.to_xml` rounds to six. Meshes are included
+as numbers.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ def mjcf(scene: Scene) -> str:
 
     The file has the same `qpos`, options, pairs and actuators as `scene.model`, and a keyframe `home`.
 
-    MJCF has no place for the weight of a body in a contact: MuJoCo takes it from the body's centre of mass. So the
+    MJCF can't store the inverse weight of a body in a contact: MuJoCo computes it at the body's centre of mass. So the
     collision shapes of a link are in a body of their own within it, `<link>/contact`, which has no mass. The centre of
     that body is the point where the link's weight is the one in `scene.model` (`weigh_shapes` in `scenes/build.py`), or
     comes nearest to it.
@@ -63,12 +64,12 @@ def _add(parent: Element, tag: str, **attributes: Any) -> Element:
 
 
 def _numbers(value: Any) -> str:
-    """Numbers that read back as the same ones."""
+    """Return numbers as text that reads back as the same numbers."""
     return " ".join(repr(number) for number in np.ravel(value).tolist())
 
 
 def _word(value: Any) -> str:
-    """Return what MJCF calls a value of an enumeration: mjINT_IMPLICITFAST is implicitfast."""
+    """Return MJCF's name for a value of an enumeration: mjINT_IMPLICITFAST is implicitfast."""
     return str(value.name.split("_")[1].lower())
 
 
@@ -94,7 +95,7 @@ def _add_parts(element: Element, model: mujoco.MjModel, body: int) -> None:
     touching = element
     if collides.any() and model.body_weldid[body] > 0:
         touching = _add(element, "body", name=f"{model.body(body).name}/contact")
-        # its axes are the link's: MuJoCo takes them for those of a shape that is turned alike
+        # with the link's axes, MuJoCo keeps the orientation of its shapes
         _add(touching, "inertial", pos=_contact_center(model, body, shapes[collides]), quat=model.body_iquat[body],
              mass=0, diaginertia=np.zeros(3))  # fmt: skip
     for geom, touches in zip(shapes, collides, strict=True):
@@ -138,7 +139,7 @@ def _contact_center(model: mujoco.MjModel, body: int, geoms: np.ndarray) -> np.n
     slope = np.array([weight(shapes + way) - weight(shapes - way) for way in np.eye(3)]) / 2
     least = shapes - np.linalg.pinv(curvature, rcond=1e-9) @ slope / 2
     way, lightest = shapes - least, weight(least)
-    if weight(shapes) - lightest <= 1e-6 * lightest:  # the shapes are there themselves
+    if weight(shapes) - lightest <= 1e-6 * lightest:  # the shapes are at that point already
         way = np.linalg.eigh(curvature)[1][:, 2]
     grown = weight(least + way) - lightest
     share = max(model.body_invweight0[body, 0] - lightest, 0.0) / grown if grown > 0 else 1.0

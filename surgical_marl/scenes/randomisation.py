@@ -13,15 +13,15 @@ from surgical_marl.yaml_file import build
 class Randomisation:
     """Ranges of what is randomised, all zero unless given.
 
-    All values but noise are drawn once an episode, evenly, and separately for every joint or arm. Jaws only get other
-    gains and friction. docs/randomisation.md has the sources of sensible values.
+    All values except noise are drawn once per episode, uniformly, and separately for every joint or arm. Jaws get only
+    other gains and friction. docs/randomisation.md has the sources of sensible values.
     """
 
     offset_angle: float = 0.0
-    """A joint's reading is off by up to this, rad; `offset_slide`, m, for joints that slide."""
+    """A joint's reading is off by up to this, rad; `offset_slide`, m, for prismatic joints."""
     offset_slide: float = 0.0
     backlash_angle: float = 0.0
-    """Play between a motor, which holds the encoder, and its joint, up to this, rad. Under position control."""
+    """Greatest play between a joint and its motor, which has the encoder, rad. Only under position control."""
     backlash_slide: float = 0.0
     noise_angle: float = 0.0
     """Standard deviation of a reading at each step, rad."""
@@ -30,11 +30,11 @@ class Randomisation:
     """Gains of the controllers are off by up to this share of their value."""
     damping: float = 0.0
     friction: float = 0.0
-    """So is friction, viscous and Coulomb."""
+    """Viscous and Coulomb friction are off by up to this share of their value."""
     payload: float = 0.0
-    """Mass at the tool tip, up to this, kg."""
+    """Greatest mass at the tool tip, kg."""
     latency: int = 0
-    """Control steps, up to this many, until an action acts."""
+    """Greatest number of control steps until an action acts."""
 
     def __bool__(self) -> bool:
         return any(getattr(self, item.name) for item in fields(self))

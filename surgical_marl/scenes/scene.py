@@ -21,7 +21,7 @@ from surgical_marl.scenes.geometry import Capsule, capsule_distance, link_capsul
 from surgical_marl.scenes.randomisation import Randomisation
 
 PAYLOAD = "payload"
-"""The body at an arm's tool tip that stands for what it carries, where that is randomised: `<agent>/payload`."""
+"""The body at an arm's tool tip that represents a payload, if payloads are randomised: `<agent>/payload`."""
 
 
 @dataclass(frozen=True)
@@ -34,12 +34,12 @@ class Mount:
     rotation: np.ndarray
     """Axes of the base frame in the world, shape [3, 3]."""
     workspace: np.ndarray
-    """The point in front of the arm that targets are drawn around, base frame, m, shape [3]."""
+    """The point in front of the arm around which targets are drawn, base frame, m, shape [3]."""
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Arms in a world. `model` holds them all; `control` is how their actuators read commands."""
+    """Arms in a world. `model` holds all of them; `control` is the control mode of their actuators."""
 
     name: str
     description: str
@@ -47,9 +47,9 @@ class Scene:
     mounts: dict[str, Mount]
     model: mujoco.MjModel = field(repr=False)
     randomisation: Randomisation
-    """How far arms are from the model and from what is measured; not at all unless the file says so."""
+    """Ranges of domain randomisation; all zero unless the scene file sets them."""
     observe: dict[str, list[str]] = field(default_factory=dict)
-    """Agent -> names of the observation terms that it sees, instead of the task's own choice."""
+    """Agent -> names of the observation terms that it observes, instead of the task's own choice."""
 
     @property
     def agents(self) -> tuple[str, ...]:
@@ -58,9 +58,9 @@ class Scene:
 
     @cached_property
     def types(self) -> dict[str, tuple[str, ...]]:
-        """Agents by what their arms are, whatever their folders are called: {"psm": ("psm_0", "psm_1")}.
+        """Agents by type, which is the content of their arm's model: {"psm": ("psm_0", "psm_1")}.
 
-        A type has the name of its first arm's folder; where another type has it already, a number follows.
+        A type has the name of its first arm's folder. If another type already has that name, a number follows.
         """
         groups: list[list[str]] = []
         for agent, mount in self.mounts.items():
@@ -88,16 +88,16 @@ class Scene:
 
     @property
     def home(self) -> np.ndarray:
-        """`qpos` with every arm at its home, shape [nq]."""
+        """Return `qpos` with every arm at its home, shape [nq]."""
         return self.full_qpos({agent: mount.arm.home for agent, mount in self.mounts.items()})
 
     def qpos_index(self, agent: str) -> np.ndarray:
-        """Where the actuated joints of an agent stand in `qpos`, shape [n]."""
+        """Return the indices of an agent's actuated joints in `qpos`, shape [n]."""
         names = [joint.name for joint in self.mounts[agent].arm.actuated]
         return np.array([self.model.joint(f"{agent}/{name}").qposadr[0] for name in names])
 
     def full_qpos(self, q: dict[str, np.ndarray]) -> np.ndarray:
-        """`qpos` [..., nq] from each agent's actuated joints [..., n]: joints that mimic another follow it."""
+        """Return `qpos` [..., nq] from each agent's actuated joints [..., n]; joints that mimic another follow it."""
         batch = np.broadcast_shapes(*(np.shape(value)[:-1] for value in q.values()))
         qpos = np.zeros((*batch, self.model.nq))
         for agent, mount in self.mounts.items():
@@ -109,9 +109,10 @@ class Scene:
 
     @cached_property
     def moment(self) -> np.ndarray:
-        """What the actuators act on, [nu, nv]: 1 at a joint's own, the coefficients of a cable's joints at a cable's.
+        """Moments of the actuators, [nu, nv]: 1 for a joint's own actuator, the joints' coefficients for a cable's.
 
-        `moment @ qpos` commands a posture to position control, `moment @ qvel` velocities to velocity control.
+        `moment @ qpos` are the commands of a posture under position control, `moment @ qvel` those of velocities under
+        velocity control.
         """
         data, moment = mujoco.MjData(self.model), np.zeros((self.model.nu, self.model.nv))
         mujoco.mj_fwdPosition(self.model, data)
@@ -128,18 +129,18 @@ class Scene:
 
     @property
     def fingerprint(self) -> bytes:
-        """What kinematics and shapes come from: equal for scenes that move and touch alike."""
+        """A fingerprint of kinematics and shapes, equal for scenes that move and touch in the same way."""
         m = self.model
         numbers = (m.body_parentid, m.body_pos, m.body_quat, m.jnt_axis, m.jnt_pos, m.jnt_range, m.jnt_type, m.site_pos,
                    m.geom_bodyid, m.geom_group, m.geom_type, m.geom_size, m.geom_pos, m.geom_quat, self.home,
                    *(mount.workspace for mount in self.mounts.values()))  # fmt: skip
         joints = {
             agent: mount.arm.joints for agent, mount in self.mounts.items()
-        }  # what mimics what is not in the model
+        }  # the model does not have the mimic relations
         return repr(joints).encode() + b"".join(np.ascontiguousarray(number).tobytes() for number in numbers)
 
     def clearance(self, q: dict[str, np.ndarray], within: bool = False) -> np.ndarray:
-        """Least distance in m of any two arms, or of parts within one arm; inf if there is no such pair.
+        """Return the least distance in m of any two arms, or of parts within one arm; inf if there is no such pair.
 
         `q` holds each agent's joints [..., n]; the result is [...].
         """
@@ -184,6 +185,6 @@ def _model_content(arm: Arm) -> bytes:
 
 
 def collision_geoms(model: mujoco.MjModel, agent: str) -> list[int]:
-    """Ids of the collision geoms of one agent."""
+    """Return the ids of the collision geoms of one agent."""
     ids = np.flatnonzero(model.geom_group == COLLISION_GROUP)
     return [int(i) for i in ids if model.geom(int(i)).name.startswith(f"{agent}/")]

@@ -1,11 +1,12 @@
-"""Whether two geoms of a model can come near each other anywhere within the joint limits: proven, not sampled.
+"""Proves whether two geoms of a model can come near each other anywhere within the joint limits.
 
-Branch and bound over the ranges of the joints between the two geoms. Of a box of joint positions two things are known:
-how far apart the geoms are in its middle, and how far the joints can move them from there within the box. A box in
-which they can't come near is dropped. Others are halved across the joint that moves the geoms most, those first whose
-geoms are nearest. That ends when a posture is found in which they are near, or when no box is left, which proves that
-there is none. Now and then the nearest postures go downhill, which finds most that are near after few boxes. A search
-that takes too long counts as found: to watch a pair in vain costs little, an overlap that nobody sees costs more.
+The method is branch and bound over the ranges of the joints between the two geoms. For a box of joint positions two
+things are known: the distance of the geoms in its middle, and how far the joints can move them from there within the
+box. A box in which the geoms can't come near is dropped. Other boxes are halved across the joint that moves the geoms
+most; boxes with the nearest geoms come first. The search ends when it finds a posture in which the geoms are near, or
+when no box is left, which proves that there is no such posture. From time to time a descent starts from the nearest
+postures, which finds most pairs that can come near after few boxes. A pair whose search takes too long counts as one
+that can come near, because watching a pair for nothing costs little, and a missed overlap costs more.
 """
 
 from __future__ import annotations
@@ -23,9 +24,9 @@ box takes longer."""
 BOXES = 400_000
 """Boxes of the longest search. Pairs of the shipped scenes take up to 313,000, one or two seconds."""
 WALKERS, STEPS = 32, 40
-"""Postures that go downhill, the nearest of a search, and how many steps they take."""
+"""How many of the nearest postures of a search a descent starts from, and how many steps it takes."""
 HALVINGS = 8
-"""How often the range of a geom is halved to find the ball that it stays in."""
+"""How often a geom's range is halved to find the ball in which the geom stays."""
 
 
 @dataclass(frozen=True)
@@ -113,7 +114,8 @@ class Limb:
             a joint gives the geom anywhere in its box.
         """
         moves, levers, moved = np.empty_like(half), np.linalg.norm(speeds, axis=-1).max(-1), np.zeros(len(half))
-        # from the geom on back: joints beyond one have moved the geom already, nearer to its axis or farther off
+        # from the geom towards the root: joints nearer to the geom have already moved it nearer to an axis or farther
+        # off
         for k in reversed(range(len(self.joints))):
             if self.joints[k].slides:
                 moves[:, k] = half[:, k]
@@ -167,7 +169,7 @@ def can_meet(model: mujoco.MjModel, one: int, other: int, near: float, most: int
 
 
 def _descend(limbs: tuple[Limb, Limb], q: np.ndarray, near: float) -> bool:
-    """Whether projected Newton steps from postures [k, n] bring two geoms as near as that."""
+    """Return whether projected Newton steps from postures [k, n] bring two geoms as near as that."""
     limits = np.concatenate([limb.limits()[0] for limb in limbs], axis=1)
     low, high = limits[0] - limits[1], limits[0] + limits[1]
     for _ in range(STEPS):
@@ -232,7 +234,7 @@ def _bound(limbs: tuple[Limb, Limb], boxes: np.ndarray) -> tuple[np.ndarray, np.
 
 
 def _halved(boxes: np.ndarray, joint: np.ndarray) -> np.ndarray:
-    """Both halves of boxes [k, 2, n], each cut across one joint [k]."""
+    """Return both halves of boxes [k, 2, n], each cut across one joint [k]."""
     rows, halves = np.arange(len(boxes)), np.stack([boxes, boxes])
     step = boxes[rows, 1, joint] / 2
     halves[:, rows, 1, joint] = step

@@ -16,7 +16,7 @@ REACHED = 1e-3
 
 
 def shared_workspace(scene: Scene) -> float:
-    """Share of the points that one arm reaches which another one reaches too: the mean over all pairs of arms.
+    """Return the share of points within one arm's reach that another arm reaches too: the mean over all pairs of arms.
 
     Points are tool tips at random joint positions. NaN for a single arm.
     """

@@ -1,4 +1,4 @@
-"""What stands in a scene beside its arms, for the eye: the operating field, tissue, light and the overview camera."""
+"""The visual surroundings of the arms in a scene: the operating field, tissue, light and the overview camera."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from surgical_marl.scenes.vectors import read_mapping, read_vector
 from surgical_marl.yaml_file import check_keys
 
 STILL = {"contype": 0, "conaffinity": 0, "group": 1}
-"""Of geoms for the eye alone: nothing collides with them."""
+"""Attributes of geoms that are only visible: nothing collides with them."""
 TISSUE_SHAPES = {
     "ellipsoid": (mujoco.mjtGeom.mjGEOM_ELLIPSOID, 3, "three semi-axes"),
     "box": (mujoco.mjtGeom.mjGEOM_BOX, 3, "three half sides"),
     "capsule": (mujoco.mjtGeom.mjGEOM_CAPSULE, 2, "radius and half length along z"),
 }
-"""What `size` of a piece of tissue holds: how many lengths in m, and which."""
+"""The content of `size` for each shape of tissue: how many lengths in m, and which."""
 
 
 def add_surroundings(spec: mujoco.MjSpec, mounts: dict[str, Mount], view: Any, path: Path) -> None:
     """Add what a picture needs: the operating field, a trocar at each remote center, light, a camera.
 
-    Nothing of this collides.
+    None of these geoms collides.
     """
     spec.worldbody.add_geom(
         name="field", type=mujoco.mjtGeom.mjGEOM_ELLIPSOID, size=[0.22, 0.16, 0.04], pos=[0, 0, -0.075],
@@ -51,7 +51,7 @@ def add_surroundings(spec: mujoco.MjSpec, mounts: dict[str, Mount], view: Any, p
 
 
 def add_tissue(spec: mujoco.MjSpec, name: str, settings: Any, where: str) -> None:
-    """Add a coloured piece for an endoscope to look at. It belongs to the world and never moves."""
+    """Add a coloured piece of tissue for an endoscope to look at. It is fixed in the world."""
     settings = read_mapping(settings, where)
     check_keys(settings, ("shape", "size", "position", "tilt", "colour"), where)
     if settings.get("shape") not in TISSUE_SHAPES:

@@ -1,6 +1,6 @@
-"""How time passes in every scene."""
+"""Time steps of every scene."""
 
 TIMESTEP = 0.0025
-"""Physics step in s. docs/physics.md has the stability test that chose it."""
+"""Physics step in s. docs/physics.md has the stability test behind this choice."""
 DECIMATION = 8
-"""Physics steps a control step unless told otherwise: control at 50 Hz."""
+"""Default number of physics steps per control step: control at 50 Hz."""

@@ -1,4 +1,4 @@
-"""What the commands of the studies share: their options, and how they end."""
+"""Options and error handling that the commands of the studies share."""
 
 from __future__ import annotations
 

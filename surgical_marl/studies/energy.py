@@ -1,4 +1,4 @@
-"""Kinetic energy of every scene's arms that coast without actuators, friction and limits: what the integrator adds.
+"""Kinetic energy of every scene's arms that coast without actuators, friction and limits: the error of the integrator.
 
 Run: python -m surgical_marl.studies.energy --results docs; it writes docs/energy.png.
 """

@@ -36,7 +36,7 @@ def targets(scene: Scene, seed: int = 0) -> np.ndarray:
     low, high = scene.model.jnt_range.T
     now, walk = scene.home.copy(), []
     for step in range(round(SECONDS / CONTROL)):
-        if step % 25 == 0:  # half a second one way, so that limits are reached
+        if step % 25 == 0:  # half a second in one direction, so that limits are reached
             way = rng.uniform(-1, 1, len(speed))
         now = np.clip(now + way * speed * CONTROL, low, high)
         walk.append(scene.moment @ now)
@@ -55,7 +55,7 @@ def rollout(model: mujoco.MjModel, scene: Scene, ctrl: np.ndarray) -> tuple[np.n
         for _ in range(round(CONTROL / model.opt.timestep)):
             mujoco.mj_step(model, data)
             passed = max(passed, float(np.max(np.maximum(data.qpos - high, low - data.qpos) / (high - low))))
-        if data.warning.number.any():  # MuJoCo resets what became unstable
+        if data.warning.number.any():  # MuJoCo resets unstable states
             return np.array(found), np.inf
         found.append(data.qpos.copy())
     return np.array(found), passed

@@ -1,4 +1,4 @@
-"""Each joint's answer to a small step of its target, beside that of the identified linear model.
+"""Each joint's response to a small step of its target, beside that of the identified linear model.
 
 Run: python -m surgical_marl.studies.step_response --results docs; it writes docs/step_response.png.
 """
@@ -17,7 +17,7 @@ from surgical_marl.scenes.timing import TIMESTEP
 from surgical_marl.studies.command import results_folder
 
 SHARE = 0.5
-"""Of the step that takes full effort: below it the law is linear."""
+"""Size of the step as a share of the one that needs full effort; below that the controller is linear."""
 SECONDS = 0.4
 STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
 

@@ -1,11 +1,11 @@
-"""MAPPO against IPPO and joint PPO on scenes of several arms, for docs/study.md: trains, evaluates, breaks, reports.
+"""MAPPO against IPPO and joint PPO on scenes of several arms, for docs/study.md: trains, evaluates, disturbs, reports.
 
     python -m surgical_marl.studies.study                 # all of it; a second call goes on where the first stopped
     python -m surgical_marl.studies.study --out runs/other iterations=60   # with other settings than those of configs/
     python -m surgical_marl.studies.study --only report --results docs     # tables and figures of what there is
 
 Every scene, algorithm and seed is a run of its own, as `surgical-marl train` makes it, in a folder of --out. Seconds
-only mean something where runs don't share a machine's cores or GPU: leave --jobs at 1 for them.
+are meaningful only if runs don't share a machine's cores or GPU: use --jobs 1 for them.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def main(argv: list[str] | None = None) -> int:
     failed: dict[str, str] = {}
     for part in [part for part in PARTS[:2] if part in arguments.only]:
         ready = [job for job in jobs if str(job) not in failed]
-        # processes of their own: a GPU's context does not survive a fork
+        # spawned processes, because a GPU's context does not survive a fork
         with multiprocessing.get_context("spawn").Pool(arguments.jobs) as pool:
             one = partial(work, part, out=arguments.out, overrides=arguments.settings)
             for number, (job, wrong) in enumerate(pool.imap_unordered(one, ready), 1):

@@ -26,7 +26,7 @@ COLORS = {"mappo": "#1f6f8b", "ippo": "#b23a48", "joint": "#7a7a7a"}
 FINAL = (f"success_{SUCCESS_MM}mm", f"team_success_{SUCCESS_MM}mm", "median_error_mm", "collision_rate")
 BROKEN = ("untouched", "frozen", "oracle")
 LEVEL = 0.8
-"""Of training's own success, whose samples and seconds the table gives."""
+"""Level of training's own success for which the table gives samples and seconds."""
 POINTS = 60
 BEGIN, END = "<!-- study begin -->", "<!-- study end -->"
 

@@ -1,4 +1,4 @@
-"""The runs of the study: each trains, then plays the standard goals, untouched and with one arm taken away."""
+"""The runs of the study: each trains, then plays the standard goals, with all arms and without one arm's policy."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Job(NamedTuple):
 
 
 def learn(job: Job, out: Path, overrides: list[str]) -> None:
-    """Trains a run, or goes on with it; nothing if it is done."""
+    """Train a run, or resume it; do nothing if it is complete."""
     from surgical_marl.learning.train import finish
     from surgical_marl.runs.settings import load_config
 
@@ -39,7 +39,7 @@ def learn(job: Job, out: Path, overrides: list[str]) -> None:
 
 
 def play(job: Job, out: Path) -> None:
-    """Plays the standard goal set with a run's policy: untouched, and with each arm frozen or moved by the oracle."""
+    """Play the standard goal set with a run's policy: untouched, and with each arm frozen or moved by the oracle."""
     from surgical_marl.evaluation import evaluate
     from surgical_marl.files import write_atomic
     from surgical_marl.machine import machine
@@ -77,7 +77,7 @@ def taken_over(
         policy: moves all arms until then, and the other arms afterwards.
         env: the environment in which both act, with torch arrays.
         arm: the arm that is taken over.
-        instead: moves that arm. `zero_policy` freezes the arm: it stays where it was sent.
+        instead: moves that arm. `zero_policy` freezes the arm: it holds its position target.
         start: control step of an episode.
     """
     import torch
@@ -98,14 +98,14 @@ def taken_over(
 
 
 def _save(path: Path, **arrays: Any) -> None:
-    with path.open("wb") as file:  # or numpy would append .npz to the name
+    with path.open("wb") as file:  # otherwise numpy would append .npz to the name
         np.savez_compressed(file, **arrays)
 
 
 def work(part: str, job: Job, out: Path, overrides: list[str]) -> tuple[Job, str]:
     """Do one part of a job in a process of its own; return the job and what went wrong, "" if nothing did."""
     log = out / f"{job}.log"
-    # or progress bars of several runs would overwrite each other
+    # otherwise progress bars of several runs would overwrite each other
     with log.open("a") as file, contextlib.redirect_stderr(file):
         try:
             learn(job, out, overrides) if part == "train" else play(job, out)

@@ -7,7 +7,7 @@
 What is tuned are seconds of learning as `surgical-marl bench solve` counts them, without imports and compilation. All
 trials run in one process, one after the other, so that engines compile once and trials don't share the device. A trial
 that is slower than the best so far is pruned. In the end the best settings and those of configs/ learn anew from seeds
-that the search has not seen, since the best of many trials is also the luckiest.
+that the search has not seen, because the best of many trials was also lucky.
 """
 
 from __future__ import annotations
@@ -50,9 +50,9 @@ class Knob(NamedTuple):
     setting: str
     range: FloatDistribution | IntDistribution
     value: Callable[[Any], Any] = lambda point: point
-    """Of the setting, at a point of the range."""
+    """Value of the setting at a point of the range."""
     point: Callable[[Any], Any] = lambda value: value
-    """The other way round."""
+    """Point of the range for a value of the setting."""
 
 
 def knobs(where: str, fixed: Sequence[str] = ()) -> dict[str, Knob]:
@@ -89,7 +89,7 @@ class Search:
         self.where = Workload(device=arguments.device).where
         self.name = f"{arguments.task}-{arguments.scene}-{arguments.algo}-{self.where}"
         self.shipped = self.settings([])
-        make_env(self.shipped, 1)  # what only an environment refuses would look like a trial that failed
+        make_env(self.shipped, 1)  # settings that only an environment refuses would otherwise look like failed trials
         self.knobs = knobs(self.where, arguments.settings)
         self.results = arguments.results or arguments.out
         for folder in (arguments.out, self.results):
@@ -110,14 +110,14 @@ class Search:
         return {self.knobs[name].setting: self.knobs[name].value(point) for name, point in params.items()}
 
     def settings(self, found: list[str], seed: int = 0) -> Settings:
-        """Of `configs/`, with what was found and what the command sets."""
+        """Return the settings of `configs/` with those that were found and those of the command."""
         a = self.arguments
         return load_config(
             a.task, a.scene, [f"algo={a.algo}", f"device={self.where}", f"seed={seed}", *found, *a.settings]
         )
 
     def run(self) -> None:
-        """Trials until there are as many as asked for, or time is over."""
+        """Run trials until there are enough or time is over."""
         end = time.monotonic() + self.arguments.timeout
         while len(self.done()) < self.arguments.trials and time.monotonic() < end:
             trial = self.study.ask({name: knob.range for name, knob in self.knobs.items()})
@@ -128,7 +128,7 @@ class Search:
             if missing is None:
                 self.study.tell(trial, seconds)
             else:
-                trial.report(missing, step=0)  # by which the sampler ranks what was pruned
+                trial.report(missing, step=0)  # the sampler ranks pruned trials by this
                 self.study.tell(trial, state=TrialState.PRUNED)
             self.say(trial.number, seconds, missing)
 
@@ -164,7 +164,7 @@ class Search:
             began.append(learning)
             return learning - began[0] > limit
 
-        machine.restart_peak()  # gives the last trial's memory back
+        machine.restart_peak()  # frees the last trial's memory
         try:
             with in_memory(settings.num_envs):
                 return solve(settings, self.goal, give_up)

@@ -32,11 +32,11 @@ if TYPE_CHECKING:
     from jax import Array
 
 AHEAD = (0.1, 0.2, 0.4)
-"""How much later the points of the path are reached that an arm sees, s."""
+"""Times of the path's points that an agent observes, s ahead of the reference point."""
 
 
 class Task(PathTask):
-    """Targets that pass closed and open splines."""
+    """Path following along closed and open splines."""
 
     draw = staticmethod(loops_and_lines)
     levels = {  # noqa: RUF012

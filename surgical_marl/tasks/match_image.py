@@ -43,26 +43,26 @@ if TYPE_CHECKING:
     from surgical_marl.scenes.scene import Scene
 
 POSTURES = 1024
-"""How many hidden postures there are; each has a picture of 12 KiB."""
+"""Number of hidden postures; each has a target picture of 12 KiB."""
 NEAREST = 0.02
 """The camera's least distance from what it sees, m."""
 IN_VIEW = 0.2
 """Least share of a target picture that shows pieces of tissue, and not just the field around them."""
 RAYS = 8
-"""Along each side of a picture, to find out what it shows."""
+"""Rays along each side of a picture, to find out what it shows."""
 
 
 class PictureGoal(NamedTuple):
-    """Where the camera should be."""
+    """The goal: the pose where the camera should be."""
 
     targets: Array
     """Tool tips: the camera's at the hidden pose, the others' at home; [arms, 3], m, each in its arm's base frame."""
     row: Array
-    """Of the tables."""
+    """Row of the tables."""
 
 
 class Task(TipTask):
-    """Hidden postures, and how far from them the camera is."""
+    """Image matching: goals are hidden postures of the endoscope."""
 
     levels = {"easy": Level(0.01, 0.0), "default": Level(0.02, 0.0), "hard": Level(0.04, 0.0)}  # noqa: RUF012
     weights = {  # noqa: RUF012
@@ -100,7 +100,7 @@ class Task(TipTask):
         return {**terms, "target": Picture(self.camera, table="hidden")}
 
     def observes(self, agent: str) -> tuple[str, ...]:
-        """Return what an arm knows of itself and of the others; for the camera's agent both pictures too."""
+        """Return the terms of every arm, and for the camera's agent both pictures too."""
         vector = tuple(name for name in super().observes(agent) if name not in ("target", "to_target"))
         return (*vector, "image", "target") if agent == self.camera else vector
 
@@ -118,7 +118,7 @@ class Task(TipTask):
         import torch
 
         seen, wanted = pictures[self.camera]["image"], pictures[self.camera]["target"]
-        # in bytes as long as it goes: this reads and writes more memory than drawing does
+        # in bytes as long as possible, because this moves more memory than drawing does
         return {"image_error": (torch.maximum(seen, wanted) - torch.minimum(seen, wanted)).float().mean((1, 2, 3))}
 
     def reward_terms(self, world: World) -> dict[str, dict[str, Array]]:

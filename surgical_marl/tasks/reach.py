@@ -15,7 +15,7 @@ Randomisation goals from a normal distribution about the point in front of each 
               1.5 s without collision (`surgical_marl/tasks/base/workspace.py`). Arms start at home, or with
               `start=random` at postures as far from those at the goals as joints can move in 1.5 s.
 Difficulty    standard deviation of the goals: easy 30 mm, default 50 mm (the paper's), hard 70 mm. Hard: in a quarter
-              of the episodes of several arms the straight ways from home, in joint space, collide unless one arm waits.
+of the episodes of several arms the straight joint-space paths from home collide unless one arm waits.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 
 class Task(TipTask):
-    """Goals that stay where they are."""
+    """Target reaching with fixed goals."""
 
     levels = {"easy": Level(0.03, 0.0), "default": Level(0.05, 0.0), "hard": Level(0.07, 0.25)}  # noqa: RUF012
     starts = ("home", "random")
@@ -52,7 +52,7 @@ class Task(TipTask):
             self.tables |= start_table(scene, self.level.extent, self.seed)
 
     def start(self, key: Array) -> Start:
-        """Return goals of all arms, and postures where these are drawn too."""
+        """Return goals of all arms, and postures if these are drawn too."""
         row = jax.random.randint(key, (), 0, len(self.tables["targets"]))
         postures = self.tables.get("postures")
         return Start(Goal(self.tables["targets"][row]), None if postures is None else postures[row])

@@ -1,4 +1,4 @@
-"""Active tracking: every arm keeps its tool tip on a target that wanders, and no two arms touch.
+"""Active tracking: every arm keeps its tool tip on a target that moves at random, and no two arms touch.
 
 Agents        every arm of the scene.
 Observation   as in `reach`, with the target's place now for the goal, and the target's velocity. Base frame, SI units.
@@ -25,7 +25,7 @@ from surgical_marl.tasks.base.terms import Picture, Term
 
 
 class Task(PathTask):
-    """Targets on random walks."""
+    """Active tracking of targets on random walks."""
 
     draw = staticmethod(walks)
     levels = {  # noqa: RUF012

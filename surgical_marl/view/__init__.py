@@ -1,1 +1,1 @@
-"""Pictures and films, without OpenGL."""
+"""Pictures and videos, without OpenGL."""

@@ -1,4 +1,4 @@
-"""Films of a policy at work: the arms of one environment, and its goals as coloured balls."""
+"""Videos of a policy: the arms of one environment, and its goals as coloured balls."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 FPS = 25
 GOAL_RADIUS = 0.004
-"""In m: a ball that a tip can be seen to touch, at the size of the films."""
+"""Radius of a goal's ball in m, large enough to see a tip touch it."""
 COLOURS = ((0.10, 0.60, 0.42, 1.0), (0.95, 0.60, 0.10, 1.0), (0.35, 0.40, 0.90, 1.0))
 
 
@@ -33,7 +33,7 @@ def record(
     episodes: int = 2,
     seed: int = 0,
 ) -> Path:
-    """Film the first environment of `env` for some episodes; returns the path of the video."""
+    """Film the first environment of `env` for some episodes; return the path of the video."""
     return write_video(path, frames(env, policy, episodes, seed), FPS)
 
 
@@ -43,10 +43,10 @@ def frames(
     episodes: int,
     seed: int,
 ) -> Iterator[NDArray[np.uint8]]:
-    """Pictures of the first environment, `FPS` of them for a second of simulated time."""
+    """Yield pictures of the first environment, `FPS` of them for a second of simulated time."""
     picture, most = ScenePicture(env), cores()
     drawn: deque[Future[NDArray[np.uint8]]] = deque()
-    with ThreadPoolExecutor(most) as threads:  # a picture takes half a second of a core, and leaves Python to others
+    with ThreadPoolExecutor(most) as threads:  # a picture takes half a second of a core, without holding Python's lock
         for pose in _poses(env, policy, picture, episodes, seed):
             drawn.append(threads.submit(picture.draw, pose))
             if len(drawn) > most:
@@ -75,11 +75,11 @@ def _poses(
 
 
 class Pose(NamedTuple):
-    """What a picture shows."""
+    """The content of a picture."""
 
     qpos: NDArray[np.float64]
     balls: list[Sphere]
-    """One at each arm's goal."""
+    """A ball at each arm's goal."""
 
 
 class ScenePicture:
@@ -105,7 +105,7 @@ class ScenePicture:
         return self._renderer.render(data, spheres=balls)
 
     def pose(self, index: int = 0) -> Pose:
-        """How an environment stands now: the first one, or that of a number."""
+        """Return the current pose of an environment, by its number in the batch."""
         balls: list[Sphere] = []
         env = self._env
         targets = env.task.targets(env.goal)[index] if env.task.has_targets else []

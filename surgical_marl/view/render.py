@@ -1,4 +1,4 @@
-"""Pictures of a MuJoCo model without OpenGL: C MuJoCo's ray caster and a little shading.
+"""Pictures of a MuJoCo model without OpenGL: C MuJoCo's ray caster and simple shading.
 
     renderer = Renderer(model, width=480, height=360)
     image = renderer.render(data, camera=View(lookat=(0, 0, 0), distance=0.5))
@@ -26,7 +26,7 @@ Sphere = tuple[Sequence[float], float, Sequence[float]]
 
 _VISIBLE_GROUPS = np.array([1, 1, 1, 0, 0, 0], np.uint8)
 _FAR = 1e10
-_EDGE = 0.03  # a step in colour, of 1, that asks for finer rays
+_EDGE = 0.03  # difference in colour, of 1, above which finer rays are cast
 _FINER = 3  # finer rays along each side of a pixel
 
 
@@ -41,7 +41,7 @@ class View:
     fovy: float = 40.0
 
     def pose(self) -> tuple[Array, Array]:
-        """Position and the axes right, up, back as columns."""
+        """Return the position, and the axes right, up, back as columns."""
         azimuth, elevation = np.deg2rad((self.azimuth, self.elevation))
         level = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
         forward = np.cos(elevation) * level + np.array([0.0, 0.0, np.sin(elevation)])
@@ -65,7 +65,7 @@ class Renderer:
         camera: str | View | None = None,
         spheres: Sequence[Sphere] = (),
     ) -> NDArray[np.uint8]:
-        """One picture [height, width, 3] of the pose in `data`, as `mj_forward` left it.
+        """Return a picture [height, width, 3] of the pose in `data`, after `mj_forward`.
 
         `camera` is a camera of the model by name or a free `View`; without one the model's first
         camera looks, or a free view of the whole model. `spheres` are drawn besides the model.
@@ -105,7 +105,7 @@ class Renderer:
         return data.cam_xpos[index], axes, float(model.cam_fovy[index])
 
     def _colours(self, data: mujoco.MjData, origin: Array, rays: Array, spheres: Sequence[Sphere]) -> Array:
-        """Colours [n, 3], from 0 to 1, that rays from one origin see."""
+        """Return the colours [n, 3], from 0 to 1, of rays from one origin."""
         distance, geom, normal = self._cast(data, origin, rays)
         image = shading.background(rays)
         hit = np.flatnonzero(geom >= 0)
@@ -130,7 +130,7 @@ class Renderer:
         return np.clip(image, 0.0, 1.0) ** (1 / shading.GAMMA)
 
     def _light(self, data: mujoco.MjData, points: Array, spheres: Sequence[Sphere]) -> Array:
-        """How much of the lamp each point sees. The lamp is one point: one cast serves all."""
+        """Return how much of the lamp each point sees. The lamp is a point, so one cast serves all."""
         rays = points - self._look.lamp
         length = np.linalg.norm(rays, axis=1)
         rays /= length[:, None]
@@ -143,7 +143,7 @@ class Renderer:
         return light
 
     def _cast(self, data: mujoco.MjData, origin: Array, rays: Array) -> tuple[Array, NDArray[np.int32], Array]:
-        """Distance, geom (-1: none) and the normal towards the viewer, of each ray's first hit."""
+        """Return distance, geom (-1: none) and the normal towards the viewer of each ray's first hit."""
         count = len(rays)
         geom = np.empty(count, np.int32)
         distance, normal = np.empty(count), np.empty((count, 3))
@@ -166,7 +166,7 @@ class Renderer:
 
 
 def _sphere_distance(origin: Array, rays: Array, centre: Array, radius: float) -> Array:
-    """Distance along unit rays to a sphere, infinite where they miss it."""
+    """Return the distance along unit rays to a sphere, infinite where they miss it."""
     towards = centre - origin
     along = rays @ towards
     inside = radius**2 - (towards @ towards - along**2)
@@ -175,7 +175,7 @@ def _sphere_distance(origin: Array, rays: Array, centre: Array, radius: float) -
 
 
 def _edges(image: Array) -> NDArray[np.bool_]:
-    """Pixels that differ from the one beside, above or below them."""
+    """Return which pixels differ from the one beside, above or below them."""
     edge = np.zeros(image.shape[:2], bool)
     across = np.abs(np.diff(image, axis=1)).max(axis=2) > _EDGE
     down = np.abs(np.diff(image, axis=0)).max(axis=2) > _EDGE

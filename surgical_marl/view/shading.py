@@ -1,4 +1,4 @@
-"""The look of the renderer's pictures: colours of geoms, one lamp, a bright room around."""
+"""The look of the renderer's pictures: colours of geoms, one lamp, a bright room around them."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def background(rays: Array) -> Array:
 
 @dataclass(frozen=True)
 class Look:
-    """What the shading knows of a model: colours in linear light, gloss, planes and the lamp."""
+    """The look of a model: colours in linear light, gloss, planes and the lamp."""
 
     colour: Array
     gloss: Array
@@ -41,13 +41,13 @@ class Look:
 
     @classmethod
     def of(cls, model: mujoco.MjModel) -> Look:
-        """Read a model's look; a geom's own rgba goes before its material's, as in MuJoCo."""
+        """Read a model's look; a geom's own rgba overrides its material's, as in MuJoCo."""
         rgba = model.geom_rgba.copy()
         painted = (model.geom_matid >= 0) & (rgba == _DEFAULT_RGBA).all(axis=1)
         rgba[painted] = model.mat_rgba[model.geom_matid[painted]]
         colour = rgba[:, :3].astype(float)
         plane = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
-        # Greys are steel here and mirror the room; colours are plastic or tissue and hardly do.
+        # Greys are rendered as steel, which reflects the room; colours as plastic or tissue, which hardly do.
         saturation = np.ptp(colour, axis=1) / np.maximum(colour.max(axis=1), 1e-6)
         gloss = np.where(plane, 0.0, 0.05 + 0.45 * np.clip(1 - 3 * saturation, 0.0, 1.0))
         extent = float(model.stat.extent)
@@ -55,7 +55,7 @@ class Look:
         return cls(colour**GAMMA, gloss, plane, extent, _round_length(extent / 8), lamp)
 
     def base_colour(self, data: mujoco.MjData, geom: NDArray[np.int32], points: Array) -> Array:
-        """Colours of points on geoms, before light; planes have quiet square tiles."""
+        """Return the colours of points on geoms, before light; planes have faint square tiles."""
         base = self.colour[geom]
         for index in np.unique(geom[self.plane[geom]]):
             on = np.flatnonzero(geom == index)
@@ -73,7 +73,7 @@ class Look:
         points: Array,
         light: Array,
     ) -> Array:
-        """Lambert's law under the lamp and the room, and a mirror image of both on top."""
+        """Return lit colours: Lambert's law under the lamp and the room, plus reflections of both."""
         to_lamp = self.lamp - points
         to_lamp /= np.linalg.norm(to_lamp, axis=1, keepdims=True)
         lambert = np.clip(np.einsum("ij,ij->i", normal, to_lamp), 0.0, None) * light
@@ -85,7 +85,7 @@ class Look:
 
         mirrored = rays + 2 * facing[:, None] * normal
         spot = np.clip(np.einsum("ij,ij->i", mirrored, to_lamp), 0.0, 1.0) ** 40 * light
-        # The mirror strengthens at grazing angles (Schlick), which draws a rim round each shape.
+        # Reflection grows at grazing angles (Schlick), which gives each shape a bright rim.
         gloss = np.where(geom >= 0, self.gloss[geom], 0.06)
         rim = np.where((geom >= 0) & self.plane[geom], 0.0, (1 - facing) ** 4 * 0.5)
         mirror = (gloss + (1 - gloss) * rim)[:, None]
@@ -93,7 +93,7 @@ class Look:
         return base * diffuse * (1 - 0.6 * mirror) + mirror * shine
 
     def fade(self, colour: Array, room: Array, geom: NDArray[np.int32], distance: Array) -> Array:
-        """Let planes dissolve into the horizon, where their tiles would flicker."""
+        """Blend planes into the horizon, where their tiles would flicker."""
         far = np.clip(distance / self.extent / 4 - 0.5, 0.0, 1.0)
         mist = np.where(self.plane[geom], far * far * (3 - 2 * far), 0.0)[:, None]
         return colour + mist * (np.maximum(room, _HORIZON) - colour)

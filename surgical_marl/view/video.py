@@ -19,8 +19,8 @@ Frames = Iterable[NDArray[np.uint8]]
 def write_video(path: str | os.PathLike[str], frames: Frames, fps: float) -> Path:
     """Write frames [height, width, 3] as a video and return its path.
 
-    A `.gif` stays a gif. Anything else becomes an mp4, or a gif beside it where ffmpeg cannot run.
-    The file appears whole or not at all.
+    A path with `.gif` becomes a gif. Any other becomes an mp4, or a gif beside it where ffmpeg cannot run.
+    The file is written completely or not at all.
     """
     if not fps > 0:
         raise ValueError(f"a video of {fps!r} frames a second never moves on: use more than 0")
@@ -42,7 +42,7 @@ def write_video(path: str | os.PathLike[str], frames: Frames, fps: float) -> Pat
 
 
 def ffmpeg_runs() -> bool:
-    """Whether an mp4 can be written here."""
+    """Return whether an mp4 can be written here."""
     try:
         import imageio_ffmpeg
 
@@ -72,7 +72,7 @@ def _write_mp4(path: Path, shape: tuple[int, ...], frames: Frames, fps: float) -
         [*command, *target.split(), str(path)],
         stdin=subprocess.PIPE,
         stderr=subprocess.PIPE,
-        start_new_session=True,  # Ctrl-C is for us: ffmpeg then still ends its file
+        start_new_session=True,  # in a session of its own, so that ffmpeg finishes its file after Ctrl-C
     ) as ffmpeg:
         assert ffmpeg.stdin and ffmpeg.stderr
         try:
@@ -80,7 +80,7 @@ def _write_mp4(path: Path, shape: tuple[int, ...], frames: Frames, fps: float) -
                 ffmpeg.stdin.write(np.ascontiguousarray(frame).data)
             ffmpeg.stdin.close()
         except BrokenPipeError:
-            pass  # ffmpeg gave up: it says why below
+            pass  # ffmpeg failed; its message is shown below
         except BaseException:
             ffmpeg.kill()
             raise

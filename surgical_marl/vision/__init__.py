@@ -1,1 +1,1 @@
-"""What endoscopes see."""
+"""Pictures of endoscopes."""

@@ -4,9 +4,9 @@
     view = endoscope.render(env.qpos)           # joint positions [N, nq], numpy or torch
     view.rgb                                    # [N, eyes, 64, 64, 3] uint8
 
-Pictures follow from joint positions alone, which any engine has: there is no second physics. MuJoCo Warp finds where
-the bodies are and `vision/raycaster.py` draws them, on a GPU or a CPU by the same code; docs/rendering.md compares
-the pictures with C MuJoCo's ray caster.
+Pictures depend on joint positions alone, which any engine has, so no second physics is needed. MuJoCo Warp computes the
+poses of the bodies, and `vision/raycaster.py` draws them, on a GPU or a CPU with the same code; docs/rendering.md
+compares the pictures with C MuJoCo's ray caster.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ EYES = ("left", "right")
 CHANNELS = ("rgb", "depth", "segmentation")
 _TYPES = {"rgb": torch.uint8, "depth": torch.float32, "segmentation": torch.int32}
 BACKGROUND = (0.05, 0.02, 0.02)
-"""What no geom covers: the dark of a body cavity."""
+"""Background colour: the dark of a body cavity."""
 
 
 @dataclass(frozen=True)
 class View:
-    """What the endoscopes of N environments see.
+    """The pictures of the endoscopes of N environments.
 
     The arrays are of the library (numpy or torch) whose array `render` was given. In their shapes, E is the number of
     eyes, H of rows and W of columns. A channel that was not asked for is None.
@@ -42,16 +42,17 @@ class View:
     rgb: Any = None
     """[N, E, H, W, 3] uint8"""
     depth: Any = None
-    """[N, E, H, W] float32: distance along the optical axis, m; 0 where nothing is."""
+    """[N, E, H, W] float32: distance along the optical axis, m; 0 where there is no geom."""
     segmentation: Any = None
-    """[N, E, H, W] int32: the geom's id in `scene.model`, -1 where nothing is. `Endoscope.labels` says whose it is."""
+    """[N, E, H, W] int32: the geom's id in `scene.model`, -1 where there is none. `Endoscope.labels` maps it to its
+    owner."""
 
 
 class Endoscope:
     """The camera of one agent, in N copies of its scene.
 
-    Visual geoms only (groups 0 to 2), as in all pictures. A pixel takes 3 bytes of colour, 4 of depth and 4 of
-    segmentation: 64 x 64 in all channels 44 KiB an eye.
+    Only visual geoms (groups 0 to 2) are drawn, as in all pictures. A pixel takes 3 bytes of colour, 4 of depth and 4
+    of segmentation: 64 x 64 pixels in all channels take 44 KiB per eye.
 
     Args:
         scene: a scene of which an arm has a `camera`.
@@ -106,7 +107,7 @@ class Endoscope:
             self._data = mujoco_warp.make_data(scene.model, num_envs, nconmax=0, njmax=0)
             self._caster = RayCaster(scene.model, cameras, num_envs, width, height, BACKGROUND)
         self._qpos = self._warp.to_torch(self._data.qpos)
-        self._warp.synchronize_device(device)  # what made the arrays ran on a stream of Warp's own
+        self._warp.synchronize_device(device)  # the arrays were made on Warp's own stream
 
     def render(self, qpos: Any) -> View:
         """Return what the endoscopes see at joint positions [N, nq] of the whole scene.
@@ -139,7 +140,7 @@ class Endoscope:
     def _stream(self) -> Any:
         if self.device == "cpu":
             return self._warp.ScopedDevice("cpu")
-        # Nothing is left to do on Warp's own stream, and to wait for it would break a capture.
+        # No work is left on Warp's own stream, and waiting for it would break a capture.
         stream = self._warp.stream_from_torch(torch.cuda.current_stream())
         return self._warp.ScopedStream(stream, sync_enter=False)
 

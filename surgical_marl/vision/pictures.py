@@ -1,7 +1,7 @@
-"""Pictures as observation terms: what the agents of N environments see, and what they should see.
+"""Pictures as observation terms: the current pictures and the target pictures of N environments.
 
-Each endoscope is drawn once, whoever looks at it. Pictures that are to be matched are drawn once for all episodes, one
-for each row of the table of postures: when an episode begins there is one to look up.
+The picture of an endoscope is drawn once, for all agents that observe it. Target pictures are drawn once for all
+episodes, one for each row of the table of postures; an episode looks its picture up.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from surgical_marl.scenes.scene import Scene
 from surgical_marl.vision.endoscope import EYES, SIZE, Endoscope, View
 
 AT_ONCE = 256
-"""Pictures to be matched that are drawn together."""
+"""Number of target pictures that are drawn at once."""
 
 
 class Pictures:
@@ -80,7 +80,7 @@ class Pictures:
 
 
 def picture_space(term: Any) -> spaces.Box:
-    """Return the space of a picture: colours uint8 [H, W, 3], depth float32 [H, W, 1] in m, 0 where nothing is."""
+    """Return the space of a picture: colours uint8 [H, W, 3], depth float32 [H, W, 1] in m, 0 without a geom."""
     if term.channel == "depth":
         return spaces.Box(0.0, np.inf, (SIZE, SIZE, 1), np.float32)
     return spaces.Box(0, 255, (SIZE, SIZE, 3), np.uint8)

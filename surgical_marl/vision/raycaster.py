@@ -1,4 +1,4 @@
-"""Draws a scene's cameras for many environments at once, from where its bodies are."""
+"""Draws a scene's cameras for many environments at once, from the poses of its bodies."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class RayCaster:
         meshes = np.where(kinds == MESH, model.geom_dataid[geoms], -1)
         pictures, tiles = num_envs * len(cameras), -(-width // TILE) * -(-height // TILE)
         pixel = float(2 * np.tan(np.radians(model.cam_fovy[cameras[0]]) / 2) / height)
-        self._meshes = {mesh: _mesh(model, mesh) for mesh in set(meshes) - {-1}}  # a handle alone keeps none alive
+        self._meshes = {mesh: _mesh(model, mesh) for mesh in set(meshes) - {-1}}  # handles keep no mesh alive
         self._handles = wp.array([self._meshes[m].id if m >= 0 else 0 for m in meshes], dtype=wp.uint64)
         self._first_faces = wp.array(np.append(model.mesh_faceadr, 0)[meshes], dtype=int)
         self._normals = wp.array(_normals(model), dtype=wp.vec3)
@@ -94,7 +94,7 @@ class RayCaster:
 
 
 def _sizes(model: mujoco.MjModel, geoms: np.ndarray) -> np.ndarray:
-    """As `raycast` wants them: of a ball three radii, of a mesh the box about its origin that holds it."""
+    """Return sizes for the kernels: three radii of an ellipsoid, the bounding box about its origin of a mesh."""
     sizes = model.geom_size[geoms]
     balls, meshes = (
         model.geom_type[geoms] == kind for kind in (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_MESH)

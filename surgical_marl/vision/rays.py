@@ -1,8 +1,8 @@
 """Casts a ray through every pixel of many cameras' pictures, in three kernels.
 
-Every shape of a scene but a mesh is convex: a ray is inside of it from one depth to another. `place` puts the shapes
+Every shape except a mesh is convex, so a ray is inside it between two depths. `place` puts the shapes
 into the cameras' frames, `cull` lists for every tile of a picture the shapes that some of its rays may meet, and `draw`
-asks only those. Threads of a warp share a tile, so they ask the same shapes at the same time.
+tests only those. Threads of a warp share a tile, so they test the same shapes at the same time.
 """
 
 # Kernels are Warp's language, which only looks like Python. Annotations are read as they are, without a
@@ -248,7 +248,7 @@ def make_draw(meshes: bool) -> Any:
                 depths = span(kind, sizes[shape], p, v)
                 if depths[0] <= depths[1]:
                     t = wp.where(depths[0] >= 0.0, depths[0], depths[1])  # from inside, its far side
-            if t >= 0.0 and t <= best * 1.000001:  # of two in one place the later, as in MuJoCo
+            if t >= 0.0 and t <= best * 1.000001:  # of two geoms at the same depth the later one, as in MuJoCo
                 best, hit = t, shape
         if depth.shape[0] > 0:
             depth[picture, row, column] = wp.where(hit >= 0, best, 0.0)

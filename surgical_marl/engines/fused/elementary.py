@@ -1,8 +1,8 @@
-"""Functions made of a graph's operations: sine, cosine, exponential and others, right to a few units in the last place.
+"""Functions made of a graph's operations: sine, cosine, exponential and others, exact to a few units in the last place.
 
-They cost the same on all devices, need no library, and what two of them have in common is shared: a sine and a cosine
-of one angle reduce it once. Polynomials are those of Cephes (S. L. Moshier, single precision) and of M. Giles,
-"Approximating the erfinv function", 2010.
+They cost the same on all devices and need no library. Common parts are shared: a sine and a cosine of one angle share
+its reduction. Polynomials are those of Cephes (S. L. Moshier, single precision) and of M. Giles, "Approximating the
+erfinv function", 2010.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""From a scheduled graph to C that CUDA and Clang both take: one environment a thread, or a vector of them.
+"""Writes C for CUDA and for Clang from a scheduled graph: one environment per thread, or a vector of them.
 
 `F I U B` are float, int, unsigned and bool: scalars in CUDA, vectors of environments on a CPU, where a branch is taken
-if any of them takes it, and its results are blended. What differs is in two short preludes of macros.
+if any of them takes it, and its results are blended. The differences are in two short preludes of macros.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from surgical_marl.engines.fused.graph import Branch, Graph, Loop, Value
 from surgical_marl.engines.fused.schedule import Schedule, Scheduler
 
 LARGE = 500
-"""Operations in a branch from which on it is kept apart."""
+"""Least number of operations in a branch whose inputs are hidden from the compiler (`HIDEF`)."""
 
 TYPES = {"f": "F", "i": "I", "u": "U", "b": "B"}
 
@@ -46,7 +46,7 @@ class Emitter:
         self.lines: list[str] = []
         self.names: dict[Value, str] = {}
         self.active: list[str] = []
-        """Of a vector, the environments that the code is for: those for which all of this holds."""
+        """Conditions of the code's branch: it applies to the environments of a vector for which all of them hold."""
 
     def body(self) -> str:
         self._postpone_stores()
@@ -113,8 +113,8 @@ class Emitter:
     def _side(self, number: int, condition: str) -> Iterator[None]:
         """Give values from outside a large branch new names while one of its sides is written.
 
-        The compiler takes these names for new values. Without them it would compute before the branch what both sides
-        need, and keep it in more registers than there are.
+        The compiler takes these names for new values. Without new names it would compute before the branch what both
+        sides need, which causes register spills.
         """
         self.active.append(condition)
         names, size = dict(self.names), sum(len(self.schedule.regions[r].items) for r in self.schedule.inside[number])
@@ -174,7 +174,7 @@ class Emitter:
             code = _CODE[op].format(self._name(args[0]), kind.upper(), self._name(args[1]))
         elif op == "abs":
             code = _CODE[op].format(self._name(args[0]), kind.upper())
-        elif kind == "i" and op in ("add", "sub", "mul", "neg", "shl"):  # wraps around, which C leaves undefined for I
+        elif kind == "i" and op in ("add", "sub", "mul", "neg", "shl"):  # overflow of I is undefined in C
             code = f"(I)({_CODE[op].format(*(f'(U){self._name(a)}' for a in args))})"
         else:
             code = _CODE[op].format(*(self._name(a) for a in args))

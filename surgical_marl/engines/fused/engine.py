@@ -28,7 +28,7 @@ from surgical_marl.engines.stepper import Stepper, announce
 from surgical_marl.machine import cores
 
 LEAST_SHARE = 32
-"""Environments that are worth a thread."""
+"""Least number of environments per thread."""
 
 
 class FusedEngine:
@@ -66,7 +66,7 @@ class FusedEngine:
         self._stepped = False
 
     def reset(self, seed: int, first: int = 0) -> None:
-        """First episodes. Environment i depends on `seed` and `first` + i alone, not on how many there are."""
+        """Start first episodes. Environment i depends on `seed` and `first` + i alone, and not on `num_envs`."""
         self.write(".key", episode_keys(seed, self.num_envs, first))
         self.write(".episode", np.zeros(self.num_envs, np.int32))
         self._launch("reset")
@@ -80,11 +80,11 @@ class FusedEngine:
         self._stepped = False
 
     def step(self, actions: dict[str, Any], sense: Callable[[], dict[str, Any]] | None = None) -> None:
-        """One control step of all environments.
+        """Do one control step of all environments.
 
         Args:
             actions: [N, n] by agent, of any array library.
-            sense: returns what the environment senses, [N] each, once everything has moved: `.moved` can be read then.
+            sense: called after the physics, when `.moved` can be read; returns the sensed numbers, [N] each.
         """
         for agent, action in actions.items():
             self._arrays.write(self.source.actions[agent], action)

@@ -1,12 +1,11 @@
-"""The scalar program of the fused engine: a graph of values, folded and shared while it is built.
+"""The scalar program of the fused engine: a graph of values, simplified while it is built.
 
 A value is an int. A negative one is a constant, `constants[~value]`; others are nodes: an operation, the values it
 reads and a kind, one of "f" (float32), "i" (int32), "u" (uint32), "b" (bool). Equal nodes are made once. Branches and
-loops are groups: what comes out of them are nodes that name the group. Nodes have no place of their own; `schedule.py`
-finds it.
+loops are groups, whose results are nodes that name the group. `schedule.py` decides where a node is computed.
 
-Algebra is that of finite numbers: 0 * x is 0 even where x might be infinite, zero has no sign, and of NaN only `x != x`
-and `isfinite` tell.
+Simplifications assume finite numbers: 0 * x is 0 even if x might be infinite, zero has no sign, and only `x != x` and
+`isfinite` detect NaN.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ class Branch:
 class Loop:
     """`phis` start as `starts` and become `nexts` at the end of each round; `outs` are what they are after the last.
 
-    Rounds go on while `condition`, a value of the phis, holds; or `length` times if there is none.
+    The loop continues while `condition`, a value of the phis, holds, or for `length` rounds if there is no condition.
     """
 
     starts: list[Value]
@@ -47,7 +46,7 @@ class Loop:
     condition: Value | None = None
     length: int = 0
     around: int = 0
-    """The loops that it stands in, as bits."""
+    """The loops around it, as bits."""
 
 
 COMMUTATIVE = {"add", "mul", "min", "max", "and", "or", "xor", "eq", "ne"}
@@ -87,7 +86,7 @@ class Graph:
         self.groups: list[Branch | Loop] = []
         self.tables: list[np.ndarray] = []
         self.inputs: set[int] = set()
-        """Tables whose values are not known: parameters."""
+        """Tables whose values are not known while tracing: parameters."""
         self._constant_ids: dict[tuple[str, Any], Value] = {}
         self._table_numbers: dict[tuple[str, bytes], int] = {}
         self._known: dict[tuple[Any, ...], Value] = {}
@@ -234,7 +233,7 @@ class Graph:
     def compare(self, op: str, a: Value, b: Value) -> Value:
         if self.kind(a) == "b":
             return self._compare_truths(op, a, b)
-        if a == b and a >= 0 and not (self.kinds[a] == "f" and op in ("eq", "ne")):  # these ask for NaN
+        if a == b and a >= 0 and not (self.kinds[a] == "f" and op in ("eq", "ne")):  # these are tests for NaN
             return self.true if op in ("le", "ge", "eq") else self.false
         for x, y, flipped in ((a, b, False), (b, a, True)):
             # a choice between constants, compared with a constant: the choice itself

@@ -1,7 +1,7 @@
 """Gather, scatter and slices at traced places, as arithmetic on indices.
 
-Places that are known while tracing cost nothing: elements are moved. A place that is not becomes a lookup, if the array
-is a table of constants, or a choice among the elements it may point to.
+Indices that are known while tracing cost nothing: elements are moved. Another index becomes a lookup if the array is a
+table of constants, or else a selection among the elements that it may point to.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from surgical_marl.engines.fused.scalars import convert
 from surgical_marl.engines.fused.traced import Symbolic, Table, Traced, Unsupported, lift
 
 LEAST_TABLE = 16
-"""Constants from this many on are looked up in memory rather than chosen one by one."""
+"""Least number of constants that are looked up in memory instead of being selected one by one."""
 
 Places = list[np.ndarray]
 """For each axis of an array, where on it each element of a result comes from."""
@@ -122,7 +122,7 @@ def _take(g: Graph, operand: Traced | Table, place: Places) -> Traced:
     return np.asarray(operand[tuple(place)])
 
 
-# -- at places that are not known
+# -- at indices that are not known while tracing
 
 
 def _choose(

@@ -32,15 +32,18 @@ _bytes: Any = wp.array(dtype=wp.uint8)
 
 
 def compile_kernels(bodies: dict[str, str], device: str, max_registers: int | None = None) -> dict[str, Kernel]:
-    """Kernels of C function bodies by name, in one module. What was compiled before comes from Warp's cache on disk."""
+    """Compile C function bodies into kernels by name, in one module.
+
+    Warp keeps compiled modules in its cache on disk.
+    """
     prelude = CUDA if device == "cuda" else CPU
     sources = {name: f"{prelude}\n{body}\n{UNDEFINE}\n" for name, body in bodies.items()}
     digest = hashlib.sha256("\0".join(sources.values()).encode()).hexdigest()[:16]
     module = wp.get_module(f"surgical_marl_{digest}")
-    # contraction: a * b + c is one operation, as on a GPU
+    # contraction: a * b + c is one rounding, as on a GPU
     module.options.update(enable_backward=False, cpu_compiler_flags="-march=native -ffp-contract=fast")
     made = {name: _make(f"{name}_{digest}", source, module, max_registers) for name, source in sources.items()}
-    # Warp itself has no way for two processes to compile the same module at a time
+    # Warp itself does not protect a module from two processes that compile it at the same time
     with locked(cache_dir() / "kernels" / module.name), _checked(module.name):
         module.load(wp.get_device(device), block_dim=BLOCK if device == "cuda" else 1)
     return {name: Kernel(kernel, device) for name, kernel in made.items()}
@@ -50,8 +53,8 @@ def compile_kernels(bodies: dict[str, str], device: str, max_registers: int | No
 def _checked(module: str) -> Iterator[None]:
     """Remove a module's files from Warp's cache before it is loaded, if they are damaged.
 
-    Files are damaged if they are not what was stored there. Warp itself would load a damaged file, whatever that leads
-    to. The loading of the module belongs inside this context; after it, a digest of the files is recorded.
+    Files are damaged if their digest has changed. Warp itself would load a damaged file. The loading of the module
+    belongs inside this context; after it, a digest of the files is recorded.
     """
     record = cache_dir() / "kernels" / f"{module}.sha256"
     folders = _folders(module)
@@ -77,7 +80,7 @@ def _folders(module: str) -> list[Path]:
 
 
 def _digest(folders: list[Path]) -> str:
-    """Of the compiled files in folders."""
+    """Return a digest of the compiled files in folders."""
     files = sorted(file for folder in folders for file in folder.glob("*") if file.suffix in (".o", ".cubin", ".ptx"))
     return "\n".join(f"{file.name} {hashlib.sha256(file.read_bytes()).hexdigest()}" for file in files)
 

@@ -1,4 +1,4 @@
-"""Programs from the cache on disk, or made anew."""
+"""Loads programs from the cache on disk, or makes them."""
 
 from __future__ import annotations
 

@@ -145,4 +145,4 @@ MACROS = sorted(
     {line.split("(")[0].split()[1] for code in (CUDA, CPU) for line in code.splitlines() if "#define" in line}
 )
 UNDEFINE = "\n".join(f"#undef {name}" for name in MACROS)
-"""They end with the function: the rest of the program has names of its own."""
+"""Undefines the macros after the function, so that they don't affect the rest of the program."""

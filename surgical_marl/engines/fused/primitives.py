@@ -1,7 +1,7 @@
 """What each JAX primitive does to traced arrays.
 
-Arithmetic goes element by element through the graph (`scalars.py`, `linear.py`); what moves elements about is numpy
-indexing on the values (here and in `indexing.py`).
+Arithmetic goes element by element through the graph (`scalars.py`, `linear.py`); primitives that move elements are
+numpy indexing on the values (here and in `indexing.py`).
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ class Leaf:
 
 @dataclass(frozen=True)
 class Source:
-    """The kernels of an environment in C, and where everything is."""
+    """The kernels of an environment in C, and the layout of their data."""
 
     bodies: dict[str, str]
     """C by the name of the kernel: "reset" and "step", or "move" and "finish" instead of that."""
@@ -48,5 +48,5 @@ class Source:
     parameters: dict[str, Any]
     """Where each parameter stands in the tables, by its path: leaves whose buffer is "float32" or "int32"."""
     moved: dict[str, Any]
-    """Leaves of what is between both halves of a step, and of what is `sensed` there; none if a step is one kernel."""
+    """Leaves of the state between both halves of a step, and of the `sensed` numbers; none if a step is one kernel."""
     sensed: dict[str, Any]

@@ -1,9 +1,9 @@
-"""Where and in what order a graph's values are computed.
+"""Decides where and in what order a graph's values are computed.
 
 A value belongs to the innermost region (the body of a loop, a side of a branch, or the whole program) that holds all
 its uses, moved out of each loop that it does not depend on: Click, "Global code motion, global value numbering", 1995.
-Within a region values are computed depth first from the results, the part that needs more room first (Sethi and Ullman,
-1970), so that few of them are alive at once.
+Within a region values are computed depth first from the results, the operand with the higher register pressure first
+(Sethi and Ullman, 1970), so that few values have overlapping live ranges.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from surgical_marl.engines.fused.graph import Branch, Graph, Loop, Value
 
 @dataclass
 class Region:
-    """A straight stretch of program.
+    """A region of the program without branches and loops of its own.
 
     `items` are what it computes, in order. Each is ("node", value), ("group", number), or ("result", k). The last says
     that the k-th result of the region is known from there on.
@@ -119,7 +119,7 @@ class Scheduler:
                 number = g.args[value][0]
                 if number not in self.group_loops:
                     group = g.groups[number]
-                    # a loop that is moved to where it runs for what it was not meant for might never end
+                    # a loop that is moved out of its branch might never end for inputs that don't take the branch
                     bits = group.around if isinstance(group, Loop) and group.condition is not None else 0
                     for read in self._group_reads(number):
                         bits |= self.loops[read]
@@ -192,7 +192,7 @@ class Scheduler:
         return a
 
     def _hoist(self, region: int, loops: int) -> int:
-        """Out of the loops that are not depended on."""
+        """Return the region outside of the loops that a value does not depend on."""
         while True:
             loop = self.regions[region].loop
             if loop < 0 or loops >> loop & 1:
@@ -202,7 +202,7 @@ class Scheduler:
     # -- in what order
 
     def _measure(self) -> None:
-        """How many values must be alive at once to compute each, if nothing were shared."""
+        """Estimate how many values are alive at once while each is computed (Sethi-Ullman number)."""
         g = self.graph
         self.room: dict[Value, int] = {}
         for value in self.needed:
@@ -247,7 +247,7 @@ class Scheduler:
                 continue
             stack.append((item, True))
             reads = [read for read in self._item_reads(item) if self._here(read, region)]
-            reads.sort(key=lambda read: self.room[read])  # the roomiest is popped, and so computed, first
+            reads.sort(key=lambda read: self.room[read])  # the highest pressure is popped, and so computed, first
             stack.extend((self._item(read), False) for read in reads if self._item(read) not in done)
 
     def _here(self, value: Value, region: int) -> bool:

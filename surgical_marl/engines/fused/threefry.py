@@ -1,7 +1,7 @@
 """JAX's random numbers: Threefry-2x32 with 20 rounds, written once for numpy arrays and for the values of a graph.
 
-J. Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011. Without JAX, whose start alone takes longer
-than that of a warm engine.
+J. Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011. It does not import JAX, because that alone
+takes longer than the start of a warm engine.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""From a JAX function to a `Graph`: its jaxpr is run on arrays of values.
+"""Traces a JAX function into a `Graph`: its jaxpr is run on arrays of values.
 
-Functions within functions are opened up. A branch (`lax.cond`, `lax.switch`) stays a branch: what it computes it does
-not share with what is around it, so that nothing but its operands has to be kept for it. A loop (`lax.scan` without
-arrays that it reads or writes row by row, `lax.while_loop`) stays a loop, unless it is to be unrolled (`unroll=True` or
-one round). Other scans are unrolled.
+Nested functions are inlined. A branch (`lax.cond`, `lax.switch`) stays a branch. It shares no computed values with the
+code around it, so that only its operands have to be kept for it. A loop (`lax.scan` without arrays that it reads or
+writes row by row, `lax.while_loop`) stays a loop, unless it is to be unrolled (`unroll=True` or one round). Other scans
+are unrolled.
 """
 
 from __future__ import annotations
@@ -196,7 +196,7 @@ class Tracer:
         g = self.graph
         shapes, dtypes = [x.shape for x in carry], [_dtype(g, x) for x in carry]
         starts = [value for x in carry for value in lift(g, x).ravel().tolist()]
-        varying = [False] * len(starts)  # until a round is seen to change it
+        varying = [False] * len(starts)  # until a round changes it
         while True:
             # unknown while the loop is tried: how many rounds
             loop, number, around = Loop([], length=length, around=self._around), len(g.groups), self._around

@@ -1,4 +1,4 @@
-"""From an environment's functions to kernels in C: traced, placed in arrays and written down."""
+"""Translates an environment's functions to kernels in C: traces them, lays out their arrays and writes the code."""
 
 from __future__ import annotations
 

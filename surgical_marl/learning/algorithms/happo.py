@@ -1,4 +1,6 @@
-"""HAPPO: every agent has its own network, and agents learn one after the other, each from what the others became.
+"""HAPPO: every agent has its own network, and agents learn one after the other.
+
+Each agent learns in response to the new policies of the agents before it.
 
 From the rollout's advantage `A` of all agents together, an agent `i` maximises
 
@@ -28,8 +30,8 @@ class HAPPO(Algorithm):
     is the same work whenever its turn comes, so that it can be a CUDA graph. `M` stands in the storage in place of the
     advantages. The critic, whose values are not needed any more, learns in the same mini-batches as the first agent.
 
-    The paper's guarantee is for one reward of the whole team, `team_reward`; with own rewards each agent learns its own
-    best answer to what the agents before it became.
+    The paper's guarantee is for one reward of the whole team, `team_reward`; with own rewards each agent learns its
+    best response to the new policies of the agents before it.
     """
 
     grouping = "agent"
@@ -61,7 +63,7 @@ class HAPPO(Algorithm):
         return super().load(loaded_dict, load_cfg, strict)
 
     def _learn_agent(self, index: int) -> None:
-        """Learn the network of one agent, then weigh the advantages of those that follow by what it became."""
+        """Learn the network of one agent, then weigh the advantages of those that follow with its new policy."""
         actor = self._actors[index]
         for batch in self.batches():
             with self.precision():

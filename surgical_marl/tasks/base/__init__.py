@@ -1,1 +1,1 @@
-"""What tasks share."""
+"""Base classes, options and helpers of tasks."""

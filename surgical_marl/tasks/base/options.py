@@ -1,6 +1,6 @@
 """The options of an environment, declared once.
 
-`Env`, `BatchedEnv`, every face, training settings and the command line all take these options and pass them on.
+`Env`, `BatchedEnv`, every interface, training settings and the command line take these options and pass them on.
 
     Options(task="reach", scene="bimanual_psm", difficulty="hard")
 """
@@ -42,19 +42,20 @@ class Checked:
 
 @dataclass(frozen=True)
 class Options(Checked):
-    """What an environment is.
+    """The options of an environment.
 
     Attributes:
         task: a name of `list_tasks()`.
         scene: a name of `list_scenes()` or the path of a scene file.
         control: what an action commands: "position" moves position targets, "velocity" and "torque" command those.
-        difficulty: a level of the task; its page says what each is.
-        goals: "training", or "held_out" for those of evaluations, which training never draws.
-        start: "home", or "random" for a collision-free posture drawn anew in each episode, where the task has it.
+        difficulty: a level of the task; the docstring of the task says what each level is.
+        goals: "training", or "held_out" for goals of evaluations, which training never draws.
+        start: "home", or "random" for a collision-free posture that is drawn anew in each episode, if the task has such
+            starts.
         max_steps: control steps until an episode is truncated; the task's own number if None.
-        decimation: physics steps a control step.
+        decimation: physics steps per control step.
         reward: weights of reward terms that replace the task's own, as in {"collision": -5}.
-        observe: agent -> names of the observation terms that it sees, instead of the task's own choice, as in
+        observe: agent -> names of the observation terms that it observes, instead of the task's own choice, as in
             {"ecm_0": ["qpos", "image"]}.
 
     Raises:
@@ -103,7 +104,7 @@ def make_options(task: str, scene: str, options: Mapping[str, Any]) -> Options:
 
 
 def choices(name: str, of: type = Options) -> tuple[str, ...]:
-    """Return the good values of a field whose type lists them."""
+    """Return the valid values of a field whose type lists them."""
     return get_args(get_type_hints(of)[name])
 
 

@@ -1,4 +1,4 @@
-"""What tasks with moving targets share: a row of a table of paths, and a time on it."""
+"""The base class of tasks with moving targets: a row of a table of paths, and a time on the path."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ if TYPE_CHECKING:
 
 
 class PathGoal(NamedTuple):
-    """Where targets are, and where they go."""
+    """The current targets, and the path that they follow."""
 
     targets: Array
     """[arms, 3], m, each in its arm's base frame."""
     row: Array
-    """Of the table of paths."""
+    """Row of the table of paths."""
     time: Array
-    """Since the start of the episode, s."""
+    """Time since the start of the episode, s."""
 
 
 class PathTask(TipTask):
@@ -38,7 +38,7 @@ class PathTask(TipTask):
 
     @staticmethod
     def draw(rng: np.random.Generator, count: int, start: np.ndarray, level: Level) -> np.ndarray:
-        """One of the ways to draw paths in `surgical_marl/tasks/base/paths.py`."""
+        """Draw paths: one of the functions for this in `surgical_marl/tasks/base/paths.py`."""
         raise NotImplementedError
 
     def __init__(self, scene: Scene, options: Options) -> None:
@@ -66,7 +66,7 @@ class PathTask(TipTask):
         return (jnp.stack(spline.weights(f), axis=-1)[..., None, None] * near).sum(-3)
 
     def velocities(self, goal: PathGoal) -> Array:
-        """Of the targets, [arms, 3], m/s."""
+        """Return the velocities of the targets, [arms, 3], m/s."""
         near, f = self._near(goal.row, goal.time)
         slopes = jnp.stack(spline.slopes(f), axis=-1) / np.float32(KNOT)
         rests = ~self.tables["closed"][goal.row] & (goal.time >= np.float32(SEGMENTS * KNOT))

@@ -1,7 +1,7 @@
-"""Moving targets that a scene's arms can follow: drawn on the host once, looked up by the environments.
+"""Moving targets that a scene's arms can follow. The host draws them once, and environments look them up.
 
-A path is a uniform cubic B-spline (`tasks/base/spline.py`) of an episode's length for each arm, from where its tool
-tip is at home. A draw is kept only if all arms can follow it together: inverse kinematics leads along it within joint
+A path is a uniform cubic B-spline (`tasks/base/spline.py`) for each arm. It starts at the tool tip of the arm at home
+and lasts an episode. A draw is kept only if all arms can follow it together: inverse kinematics follows it within joint
 limits and joint speeds, and the arms stay apart. An environment picks a row of the table and a time.
 """
 
@@ -21,23 +21,23 @@ from surgical_marl.tasks.base.workspace import CLEARANCE, TOLERANCE, choose
 
 ROWS = 1024
 DURATION = 5.0
-"""Of a path, s."""
+"""Duration of a path, s."""
 SEGMENTS = 50
-"""Of a path's spline; each takes KNOT seconds."""
+"""Segments of a path's spline; each takes KNOT seconds."""
 KNOT = DURATION / SEGMENTS
 CHECKS = 25
-"""Moments, equally far apart, at which a path is checked."""
+"""Number of equally spaced times at which a path is checked."""
 HEADROOM = 0.8
-"""Share of a joint's `speed` that following a path may take: the rest is for catching up."""
+"""Share of a joint's `speed` that following a path may need; the rest is reserved for catching up."""
 CROSSING = 0.02
-"""Paths of two tips cross if they come this near to each other, m, at whatever times: about as near as two tools 8 mm
-thick may be at one time."""
+"""Paths of two tips cross if they come this near to each other, m, even at different times. It is about the least
+distance that two tools 8 mm thick may have at one time."""
 WAYPOINTS = 5
 WILD = 0.5
-"""How far waypoints stray from a circle or from straight on, as a share of a step."""
+"""Randomness of waypoints: deviation from a circle or from a straight line, as a share of a step."""
 TURNING = 4.0
-"""Paths through waypoints turn no faster, rad/s: their curvature is at most this over their speed. A circle in
-`DURATION` takes 1.3 rad/s."""
+"""Greatest turning rate of paths through waypoints, rad/s: their curvature is at most this divided by their speed. A
+circle in `DURATION` takes 1.3 rad/s."""
 SLOWEST = 0.5
 """Share of the greatest speed that the slowest of these paths has."""
 
@@ -45,16 +45,17 @@ Draw = Callable[[np.random.Generator, int, np.ndarray, Level], np.ndarray]
 
 
 def walks(rng: np.random.Generator, count: int, start: np.ndarray, level: Level) -> np.ndarray:
-    """Random walks of the velocity, as in the paper, within bounds.
+    """Draw random walks of the velocity, as in the paper, within bounds.
 
-    Each knot's velocity is the last one's plus a normal step, so large that after a second the walk is as fast as it
-    may be; a faster one is cut to the greatest speed. A target that would leave the ball of radius `extent` about its
-    start is reflected. As the spline stays in the hull of its control points, both bounds hold at all times.
+    The velocity at a knot is that at the last knot plus a normal step. Steps are so large that the walk reaches its
+    greatest speed after about a second; a higher speed is cut to the greatest one. A target that would leave the ball
+    of radius `extent` about its start is reflected. As the spline stays in the hull of its control points, both bounds
+    hold at all times.
 
     Args:
         rng: source of randomness.
         count: how many.
-        start: where the target rests at first, [3], m.
+        start: position of the target at the start, where it is at rest, [3], m.
         level: with the extent and the greatest speed.
 
     Returns:
@@ -74,13 +75,13 @@ def walks(rng: np.random.Generator, count: int, start: np.ndarray, level: Level)
 
 
 def loops_and_lines(rng: np.random.Generator, count: int, start: np.ndarray, level: Level) -> np.ndarray:
-    """Cubic splines through random waypoints, passed once at constant speed: even rows closed, odd ones open.
+    """Draw cubic splines through random waypoints, passed once at constant speed: even rows closed, odd ones open.
 
-    Waypoints of a closed path lie about a circle through `start` in a random plane, those of an open one follow each
-    other from there with random turns. The curve is scaled about its start, so that passing it takes `DURATION` at its
-    own speed, between `SLOWEST` and all of `level.speed`, and is sampled anew at equal arc length. Kept are paths that
-    stay in the ball of radius `extent` about the start and turn no faster than `TURNING`. Arguments and result are
-    those of `walks`.
+    Waypoints of a closed path lie near a circle through `start` in a random plane. Waypoints of an open path follow one
+    another from `start` with random turns. The curve is scaled about its start, so that passing it takes `DURATION` at
+    its own speed, between `SLOWEST` and all of `level.speed`, and is sampled anew at equal arc length. A path is kept
+    if it stays in the ball of radius `extent` about the start and turns no faster than `TURNING`. Arguments and result
+    are those of `walks`.
 
     Raises:
         ValueError: no more than one path in a hundred can be kept.
@@ -104,7 +105,7 @@ def loops_and_lines(rng: np.random.Generator, count: int, start: np.ndarray, lev
 
 
 def _around(rng: np.random.Generator, count: int) -> np.ndarray:
-    """Waypoints about a circle, the last the first, [count, WAYPOINTS + 1, 3]; the first is the origin."""
+    """Return waypoints near a circle, [count, WAYPOINTS + 1, 3]; the first and the last are the origin."""
     angle = 2 * np.pi * np.arange(WAYPOINTS) / WAYPOINTS
     ring = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=-1)
     ring = ring * rng.uniform(1 - WILD, 1 + WILD, (count, WAYPOINTS, 1))
@@ -115,7 +116,7 @@ def _around(rng: np.random.Generator, count: int) -> np.ndarray:
 
 
 def _onwards(rng: np.random.Generator, count: int) -> np.ndarray:
-    """Waypoints one after the other, [count, WAYPOINTS, 3]; the first is the origin."""
+    """Return waypoints of open paths, [count, WAYPOINTS, 3]; the first is the origin."""
     direction = rng.normal(size=(WAYPOINTS - 1, count, 3))
     direction[1:] *= WILD
     for last, following in pairwise(direction):
@@ -127,7 +128,7 @@ def _onwards(rng: np.random.Generator, count: int) -> np.ndarray:
 
 
 def path_table(scene: Scene, draw: Draw, level: Level, seed: int = 0) -> np.ndarray:
-    """Paths that all arms of a scene can follow at once.
+    """Return paths that all arms of a scene can follow at once.
 
     Args:
         draw: `walks` or `loops_and_lines`.
@@ -163,13 +164,13 @@ def _draw(scene: Scene, draw: Draw, level: Level, seed: int) -> np.ndarray:
 
 
 def _points(table: np.ndarray) -> np.ndarray:
-    """Where targets are at the moments of the checks, [N, CHECKS + 1, arms, 3]."""
+    """Return the targets at the times of the checks, [N, CHECKS + 1, arms, 3]."""
     curves = np.moveaxis(table, 2, 1)
     return np.moveaxis(spline.evaluate(curves, np.linspace(0, SEGMENTS, CHECKS + 1)), 1, 2)
 
 
 def _can_follow(scene: Scene, table: np.ndarray) -> np.ndarray:
-    """Which rows of a table all arms can follow, [N] bool."""
+    """Return which rows of a table all arms can follow, [N] bool."""
     points, fine = _points(table), np.ones(len(table), dtype=bool)
     q = {a: np.broadcast_to(m.arm.home, (len(table), len(m.arm.home))) for a, m in scene.mounts.items()}
     for moment in range(1, CHECKS + 1):
@@ -184,7 +185,7 @@ def _can_follow(scene: Scene, table: np.ndarray) -> np.ndarray:
 
 
 def _cross(scene: Scene, table: np.ndarray) -> np.ndarray:
-    """In which rows the paths of two arms come near each other, [N] bool."""
+    """Return in which rows the paths of two arms come near each other, [N] bool."""
     world = [
         p @ m.rotation.T + m.position
         for p, m in zip(np.moveaxis(_points(table), 2, 0), scene.mounts.values(), strict=True)
@@ -198,7 +199,7 @@ def _cross(scene: Scene, table: np.ndarray) -> np.ndarray:
 
 
 def _cut(vectors: np.ndarray, most: float) -> np.ndarray:
-    """Vectors [..., 3], none longer than `most`."""
+    """Return vectors [..., 3] shortened to a length of at most `most`."""
     return np.asarray(vectors * np.minimum(1, most / np.maximum(_length(vectors), 1e-9)))
 
 

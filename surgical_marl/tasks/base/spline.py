@@ -3,7 +3,7 @@
 A curve of n segments has n + 3 control points; its parameter u runs from 0 to n. Velocity and acceleration are those of
 the differences of the control points, so bounds on these bound the curve (C. de Boor, "A practical guide to splines",
 2001, ch. IX). The host makes and measures curves with SciPy, which is imported only then: tables of paths are cached.
-`weights` and `slopes` take JAX arrays: with them environments look a point up.
+`weights` and `slopes` take JAX arrays; environments evaluate points with them.
 """
 
 from __future__ import annotations
@@ -17,37 +17,37 @@ if TYPE_CHECKING:
 
 
 def weights(f: Any) -> tuple[Any, Any, Any, Any]:
-    """Of the four control points of a segment, at a share `f` [...] in 0 to 1 of it; [...] each."""
+    """Return the weights of a segment's four control points, [...] each, at a share `f` [...] of it, 0 to 1."""
     g = 1 - f
     return g * g * g / 6, (4 - 6 * f * f + 3 * f * f * f) / 6, (4 - 6 * g * g + 3 * g * g * g) / 6, f * f * f / 6
 
 
 def slopes(f: Any) -> tuple[Any, Any, Any]:
-    """Of the three differences of a segment's control points in its derivative by u, [...] each."""
+    """Return the weights of the three differences of a segment's control points in its derivative by u, [...] each."""
     g = 1 - f
     return g * g / 2, (1 + 2 * f * g) / 2, f * f / 2
 
 
 def evaluate(control: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """Points [..., m, 3] at parameters u [m] of curves with control points [..., n + 3, 3]."""
+    """Return points [..., m, 3] at parameters u [m] of curves with control points [..., n + 3, 3]."""
     return np.asarray(_curve(control)(u))
 
 
 def through(points: np.ndarray, closed: bool) -> np.ndarray:
-    """Control points [..., n + 3, 3] of curves that pass through points [..., n + 1, 3] at u = 0, 1, ..., n.
+    """Return control points [..., n + 3, 3] of curves that pass through points [..., n + 1, 3] at u = 0, 1, ..., n.
 
-    A closed curve goes on from the last point to the first, which are the same, as if it had no ends. An open one keeps
+    On a closed curve the last point equals the first, and the curve is smooth there. An open one keeps
     its third derivative over the first two and over the last two segments ("not a knot").
 
     Raises:
-        ValueError: fewer than four points, or three on a closed curve's round.
+        ValueError: fewer than four points, or fewer than three different points on a closed curve.
     """
     from scipy.interpolate import CubicSpline
 
     n = points.shape[-2] - 1
     if n < 3:
         raise ValueError(f"a spline needs at least 4 waypoints, not {n + 1}")
-    if closed:  # the ends are the same but for rounding, which SciPy does not let pass
+    if closed:  # the ends differ by rounding, which SciPy does not accept
         points = np.concatenate([points[..., :-1, :], points[..., :1, :]], axis=-2)
     curve = CubicSpline(np.arange(n + 1), points, axis=-2, bc_type="periodic" if closed else "not-a-knot")
     # At a knot the point is (c0 + 4 c1 + c2) / 6 and the second derivative c0 - 2 c1 + c2.
@@ -58,7 +58,7 @@ def through(points: np.ndarray, closed: bool) -> np.ndarray:
 
 
 def equal_steps(control: np.ndarray, steps: int, fine: int = 24) -> tuple[np.ndarray, np.ndarray]:
-    """Points [..., steps + 1, 3] at equal arc length along curves, from one end to the other, and lengths [...].
+    """Return points [..., steps + 1, 3] at equal arc length along curves, from end to end, and the lengths [...].
 
     Arc length is that of the polygon through `fine` points a segment.
     """

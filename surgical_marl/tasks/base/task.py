@@ -1,8 +1,8 @@
-"""What a task is: how an episode begins, what each agent observes, named reward terms, and what success is.
+"""The base classes of tasks: the start of an episode, observations, named reward terms, and success.
 
-A task is a class with pure functions, derived from `Task`, or from `TipTask` where every tool tip has a target. One
-that ships is the class `Task` of a module in `surgical_marl/tasks/`; one of another package is named by its entry point
-(docs/your_own_task.md). Its docstring, or its module's, is its page.
+A task is a class with pure functions, derived from `Task`, or from `TipTask` where every tool tip has a target. A
+shipped task is the class `Task` of a module in `surgical_marl/tasks/`. A task of another package is named by an entry
+point (docs/your_own_task.md). The docstring of the class, or of the module of a shipped task, describes the task.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ if TYPE_CHECKING:
     from surgical_marl.scenes.scene import Scene
 
 PRECISION = 0.005
-"""Distance in m over which the term for precision falls to a third."""
+"""Distance in m over which the reward term `precision` falls to a third."""
 APPROACH = 0.025
-"""Another arm nearer than this, m, counts in the term for clearance: two or three control steps before a touch, as arms
-come at each other at 8 mm a step, and some at twice that."""
+"""Distance of another arm, m, below which the reward term `clearance` grows. It is two or three control steps before a
+touch, because arms approach each other at 8 mm per step, and some at twice that."""
 
 
 SEEDS = {"training": 0, "held_out": 1}
@@ -38,34 +38,34 @@ SEEDS = {"training": 0, "held_out": 1}
 
 
 class Start(NamedTuple):
-    """How an episode begins."""
+    """The start of an episode."""
 
     goal: Any
-    """What the episode is after, as a named tuple of arrays: the task's own."""
+    """The goal of the episode, a named tuple of arrays that the task defines."""
     qpos: Array | None = None
-    """Joint positions of the whole scene, [nq]; None where every episode begins at home."""
+    """Joint positions of the whole scene, [nq]; None if every episode starts at home."""
 
 
 class Level(NamedTuple):
-    """How hard a task is."""
+    """A level of difficulty."""
 
     extent: float
-    """How far targets stray from the point in front of each arm, m."""
+    """Extent of the targets about the point in front of each arm, m."""
     crossing: float
-    """Share of episodes, 0 to 1, in which the ways of two arms' tool tips cross; nothing for one arm."""
+    """Share of episodes, 0 to 1, in which the paths of two arms' tool tips cross; unused with one arm."""
     speed: float = 0.0
-    """The fastest that a target moves, m/s."""
+    """Greatest speed of a target, m/s."""
 
 
 class Task:
     """The pure functions of a task. Results are keyed by agent, for one environment.
 
-    What a function reads from `self.tables` and `self.weights` is an input of the kernel: another table or weight of
-    the same shape compiles nothing. All else that it reads from `self` is a constant there.
+    Values that a function reads from `self.tables` and `self.weights` are inputs of the kernel: another table or weight
+    of the same shape compiles nothing. Everything else that it reads from `self` is a constant in the kernel.
 
     Args:
         scene: the arms.
-        options: `difficulty`, `start` and `reward` concern a task.
+        options: a task reads `difficulty`, `start`, `goals` and `reward`.
 
     Raises:
         ValueError: an unknown difficulty, start or reward term.
@@ -73,18 +73,18 @@ class Task:
 
     levels: ClassVar[Mapping[str, Any]] = {"default": None}
     starts: ClassVar[tuple[str, ...]] = ("home",)
-    """What episodes may begin with: see `Options.start`."""
+    """Allowed values of `Options.start`."""
     default_scene: ClassVar[str | None] = None
     """The scene of an environment that is made without one; None where any scene will do."""
     max_steps: int = 100
     weights: Mapping[str, float] = {}
-    """Of each term of `reward_terms`."""
+    """Weight of each term of `reward_terms`."""
     senses: tuple[str, ...] = ()
-    """Numbers that `sense` makes of an environment's pictures after each step, before reward is given."""
+    """Names of the numbers that `sense` computes from an environment's pictures after each step, before the reward."""
     stages: ClassVar[tuple[str, ...]] = ()
-    """What is reached one after the other on the way to success."""
+    """Stages on the way to success, in order."""
     follows: ClassVar[bool] = False
-    """Whether goals move, so that every step of an episode counts in its evaluation, and not the last ones alone."""
+    """Whether goals move. If so, every step of an episode counts in its evaluation, and not only the last ones."""
     has_targets: ClassVar[bool] = False
     """Whether `targets` says where tool tips should be."""
     wanted: ClassVar[Mapping[str, tuple[str, float]]] = {}
@@ -97,20 +97,20 @@ class Task:
             raise unknown(f"start of task {options.task!r}", options.start, self.starts)
         self.scene, self.level, self.starts_at = scene, self.levels[options.difficulty], options.start
         self.seed = SEEDS[options.goals]
-        """Of what the task draws on the host: held-out goals come from another seed than those of training."""
+        """Seed of the draws on the host: held-out goals come from another seed than those of training."""
         for name in options.reward:
             if name not in self.weights:
                 raise unknown("reward term", name, list(self.weights))
         self.weights = {**self.weights, **options.reward}
         self.tables: dict[str, np.ndarray] = {}
         self.postures: dict[str, np.ndarray] = {}
-        """Tables of `qpos` of the whole scene, [rows, nq] each, that pictures to be matched are taken from."""
+        """Tables of `qpos` of the whole scene, [rows, nq] each, for target pictures."""
         self.watched: dict[str, tuple[str, ...]] = {}
-        """Agent -> pictures that `sense` looks at, whether or not the agent observes them."""
+        """Agent -> pictures that `sense` reads, whether or not the agent observes them."""
 
     @classmethod
     def summary(cls) -> str:
-        """Return the first line of the task's page: that of its module, or of the class."""
+        """Return the first line of the task's description: the docstring of its module, or of the class."""
         page = sys.modules[cls.__module__].__doc__ if cls.__name__ == "Task" else cls.__doc__
         return (page or cls.__name__).splitlines()[0]
 
@@ -121,7 +121,7 @@ class Task:
         return task
 
     def start(self, key: Array) -> Start:
-        """Return how an episode begins, drawn by its key."""
+        """Return the start of an episode, drawn with its key."""
         raise NotImplementedError
 
     def advance(self, goal: Any, dt: float) -> Any:
@@ -133,22 +133,23 @@ class Task:
         return {**arm_terms(self.scene, agent), **picture_terms(self.scene, agent)}
 
     def observes(self, agent: str) -> tuple[str, ...]:
-        """Return the names of what it does observe unless a scene or a call chooses others."""
+        """Return the names of the terms that it observes unless a scene or a call chooses others."""
         return tuple(name for name, term in arm_terms(self.scene, agent).items() if name != "contact_force")
 
     def privileged(self, goal: Any) -> Array:
-        """Return what only critics see: what no agent is told of the goal, [p]."""
+        """Return what only critics see: numbers of the goal that no agent observes, [p]."""
         return jnp.zeros(0, jnp.float32)
 
     @property
     def privileged_bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Least and greatest of `privileged`, [p] each."""
+        """Bounds of `privileged`, [p] each."""
         return np.zeros(0), np.zeros(0)
 
     def reward_terms(self, world: World) -> dict[str, dict[str, Array]]:
         """Return agent -> reward term -> its value before weighting, for the step that led here.
 
-        Those of every task: `clearance`, up to 1 as another arm comes nearer than `APPROACH`, and `collision`, 0 or 1.
+        The terms of every task: `clearance`, up to 1 as another arm comes nearer than `APPROACH`, and `collision`, 0 or
+            1.
         """
         return {
             agent: {
@@ -166,7 +167,7 @@ class Task:
         }
 
     def success(self, world: World) -> dict[str, Array]:
-        """Return whether each agent has reached what it is after, [] bool."""
+        """Return whether each agent succeeds now, [] bool."""
         raise NotImplementedError
 
     def reached(self, world: World) -> dict[str, dict[str, Array]]:
@@ -174,11 +175,14 @@ class Task:
         return {agent: {} for agent in world.arms}
 
     def metrics(self, world: World) -> dict[str, dict[str, Array]]:
-        """Return agent -> what its `infos` hold besides what those of all tasks do."""
+        """Return agent -> entries of its `infos` in addition to those of all tasks."""
         return {agent: {} for agent in world.arms}
 
     def terminated(self, world: World) -> Array:
-        """Return whether the episode ends here, [] bool. Never: arms go on holding or following their targets."""
+        """Return whether the episode ends here, [] bool.
+
+        By default never: arms continue to hold or follow their targets.
+        """
         return jnp.bool_(False)
 
     def sense(self, pictures: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
@@ -210,7 +214,7 @@ class Task:
 
 
 class Goal(NamedTuple):
-    """What the goal of a `TipTask` holds. A task of its own may carry more fields."""
+    """The goal of a `TipTask`. A subclass may use a goal with more fields."""
 
     targets: Array
     """Where the tool tips should be now, [arms, 3], m, each in its arm's base frame."""
@@ -230,7 +234,7 @@ class TipTask(Task):
         return {agent: _length()(targets[i] - view.tool_tip) for i, (agent, view) in enumerate(world.arms.items())}
 
     def terms(self, agent: str) -> dict[str, Term | Picture]:
-        """Return those of every task, `target` [3], and `to_target` [3] from the tip."""
+        """Return the terms of every task, `target` [3], and `to_target` [3] from the tip."""
         i, space = self.scene.agents.index(agent), np.full(3, FAR)
         targets = {
             "target": Term(lambda world: world.goal.targets[i], -space, space),
@@ -239,12 +243,12 @@ class TipTask(Task):
         return {**super().terms(agent), **targets}
 
     def observes(self, agent: str) -> tuple[str, ...]:
-        """Return what the agent knows of itself, then its target, then what it knows of the others."""
+        """Return the terms of the agent itself, then its target, then the terms of the other arms."""
         own = super().observes(agent)
         return (*own[:4], "target", "to_target", *own[4:])
 
     def reward_terms(self, world: World) -> dict[str, dict[str, Array]]:
-        """Return those of every task, `distance` of tip and target in m, and `precision`, 1 at the target."""
+        """Return the terms of every task, `distance` of tip and target in m, and `precision`, 1 at the target."""
         errors, safety = self.tip_errors(world), super().reward_terms(world)
         return {
             agent: {"distance": error, "precision": jnp.exp(-error / PRECISION), **safety[agent]}

@@ -1,7 +1,7 @@
 """Observation terms: the named parts of what an agent observes.
 
 A term is declared once, with the function that reads it and its bounds. The vector of an observation, its space, and
-the names and slices within it all follow from that.
+the names and slices within it all follow from this declaration.
 """
 
 from __future__ import annotations
@@ -39,16 +39,16 @@ class Picture(NamedTuple):
     """A part of an observation that is a picture: of colours uint8 [64, 64, 3], of depth float32 [64, 64, 1] in m."""
 
     camera: str
-    """The agent whose endoscope sees it."""
+    """The agent of the endoscope."""
     eye: str = "left"
     channel: str = "rgb"
     table: str | None = None
-    """Of a picture that is to be matched: the task's table of postures `qpos` [rows, nq] that it is taken from. Row
-    `goal.row` is the episode's."""
+    """For a target picture: the name of the task's table of postures `qpos` [rows, nq]. An episode has the picture of
+    row `goal.row`."""
 
 
 def arm_terms(scene: Scene, agent: str) -> dict[str, Term]:
-    """Return what every arm knows of itself and of the others, in its base frame and SI units.
+    """Return the terms of every arm about itself and the others, in its base frame and SI units.
 
     `qpos` and `qvel` [n] of its joints, `tool_tip` [3], `command` [n], `contact_force` [1] on it; with other arms also
     `to_nearest_tip` [3] from its tip, and the least distance `min_distance` [1] to any of them.
@@ -102,7 +102,7 @@ def read_vector(terms: dict[str, Term], names: tuple[str, ...], world: World) ->
 
 
 def slices(terms: dict[str, Any], names: tuple[str, ...]) -> dict[str, slice]:
-    """Return where each term stands in the vector of these terms."""
+    """Return the slice of each term in the vector of these terms."""
     found, start = {}, 0
     for name in names:
         found[name] = slice(start, start + len(terms[name].low))

@@ -1,4 +1,4 @@
-"""Targets that a scene's arms can reach: drawn on the host once, looked up by the environments.
+"""Targets that a scene's arms can reach. The host draws them once, and environments look them up.
 
 Targets are drawn from a normal distribution about the point in front of each arm, and a draw is kept only if every arm
 reaches its target within its joint limits and in time, and if the arms stay apart both there and on the straight
@@ -19,26 +19,26 @@ from surgical_marl.scenes.scene import Scene
 
 TABLE_SIZE = 4096
 CLEARANCE = 0.01
-"""Arms stay this far apart on the way to their targets, m."""
+"""Least distance between arms on the way to their targets, m."""
 PATH_POINTS = 8
 CROSSING_POINTS = 6
 TIME = 1.5
-"""Arms get to their targets in this time at their joints' speeds, s: an episode of `reach` leaves them half a second to
-settle."""
+"""Time in which arms can get to their targets at their joints' speeds, s. In an episode of `reach` half a second is
+left to settle."""
 MOST_BATCHES = 8
-"""So many are drawn in search of targets that cross."""
+"""Greatest number of batches that are drawn in search of targets that cross."""
 TOLERANCE = 1e-4
 """A target is reached when inverse kinematics comes this close, m."""
 
 
 def target_table(scene: Scene, spread: float, crossing: float = 0.0, seed: int = 0) -> np.ndarray:
-    """Reachable, collision-free targets for all arms of a scene at once.
+    """Return reachable, collision-free targets for all arms of a scene at once.
 
     Args:
         spread: standard deviation of the draws in m, the same along each axis.
-        crossing: share of rows, 0 to 1, in which the straight joint-space paths of two arms from home collide, if the
-            one has come far and the other not yet, though all are apart at their targets. These are drawn about the
-            middle between the points in front of an arm and of the next.
+        crossing: share of rows, 0 to 1, in which the straight joint-space paths of two arms from home collide if the
+            arms are at different points of their paths, though all arms are apart at their targets. These targets are
+            drawn about the middle between the points in front of neighbouring arms.
         seed: of the draws; the same seed gives the same table.
 
     Returns:
@@ -56,11 +56,11 @@ def target_table(scene: Scene, spread: float, crossing: float = 0.0, seed: int =
 
 
 def start_table(scene: Scene, spread: float, seed: int = 0) -> dict[str, np.ndarray]:
-    """Return postures to begin with, and targets that all arms of a scene can reach from there.
+    """Return postures to start from, and targets that all arms of a scene can reach from there.
 
-    Targets are drawn as for `target_table`. From the posture there every joint but the jaw's is moved away evenly, as
-    far as its range and its speed in `TIME` let it. A draw is kept if the arms are apart, and no arm touches itself, on
-    the straight joint-space path between both.
+    Targets are drawn as for `target_table`. From the posture at the targets every joint except the jaw is moved away by
+    a uniform random distance, as far as its range and its speed in `TIME` allow. A draw is kept if the arms are apart,
+    and no arm touches itself, on the straight joint-space path between both.
 
     Args:
         spread: standard deviation of the targets in m, the same along each axis.
@@ -82,13 +82,13 @@ def start_table(scene: Scene, spread: float, seed: int = 0) -> dict[str, np.ndar
 def choose(
     scene: Scene, batch: Callable[[bool], tuple[np.ndarray, np.ndarray]], rows: int, crossing: float
 ) -> np.ndarray:
-    """So many rows from batches of draws, a share of them crossing.
+    """Return a number of rows from batches of draws, a share of which cross.
 
     Args:
-        scene: for the message.
-        batch: draws about `rows` of them and gives those that can be kept [n, ...] and which of these cross, [n] bool.
-            If it is called with True, only those that cross are needed. It is called until there are enough. If a
-            batch or `MOST_BATCHES` show that the arms never or hardly meet, others stand in for those that cross.
+        scene: its name is in the error message.
+        batch: draws about `rows` rows and returns those that can be kept [n, ...] and which of them cross, [n] bool. If
+            it is called with True, only rows that cross are needed. It is called until there are enough rows. If the
+            arms never or hardly meet in a batch or in `MOST_BATCHES`, other rows replace those that cross.
         rows: how many.
         crossing: share of rows that cross, 0 to 1.
 
@@ -135,7 +135,7 @@ def _draw(scene: Scene, spread: float, crossing: float, seed: int) -> np.ndarray
 
 
 def _draw_starts(scene: Scene, spread: float, seed: int) -> np.ndarray:
-    """Postures and targets of `start_table`, side by side, [TABLE_SIZE, nq + 3 arms]."""
+    """Return postures and targets of `start_table` side by side, [TABLE_SIZE, nq + 3 arms]."""
     rng = np.random.default_rng(seed)
 
     def batch(_: bool) -> tuple[np.ndarray, np.ndarray]:
@@ -153,7 +153,7 @@ def _draw_starts(scene: Scene, spread: float, seed: int) -> np.ndarray:
 
 
 def _away(rng: np.random.Generator, arm: Arm, q: np.ndarray) -> np.ndarray:
-    """Joint positions [N, n] from which an arm comes to `q` in `TIME`; the jaw stays."""
+    """Return joint positions [N, n] from which an arm can move to `q` in `TIME`; the jaw stays."""
     jaw = np.array([arm.jaw is not None and joint.name == arm.jaw.joint for joint in arm.actuated])
     furthest = TIME * arm.speed * ~jaw
     return rng.uniform(np.maximum(q - furthest, arm.lower), np.minimum(q + furthest, arm.upper))
@@ -165,7 +165,7 @@ def _reach(scene: Scene, targets: np.ndarray, time: float = TIME) -> tuple[dict[
     Args:
         scene: the scene of the agents.
         targets: [N, arms, 3], each in its arm's base frame, m.
-        time: how long the way from home may take, s.
+        time: greatest time of the way from home, s.
 
     Returns:
         Joint positions [N, n] of each agent at its targets, and [N] bool: whether all agents get to theirs in `time`.
@@ -181,7 +181,7 @@ def _reach(scene: Scene, targets: np.ndarray, time: float = TIME) -> tuple[dict[
 
 
 def _cross(scene: Scene, goals: dict[str, np.ndarray]) -> np.ndarray:
-    """Where two arms collide at any two points of their straight ways from home, the others being there, [N] bool."""
+    """Return where two arms collide at any two points of their straight paths, with the others at home, [N] bool."""
     least = np.full(len(next(iter(goals.values()))), np.inf)
     shares = np.linspace(0.0, 1.0, CROSSING_POINTS)[:, None]
     for one, other in combinations(scene.agents, 2):
@@ -194,7 +194,7 @@ def _cross(scene: Scene, goals: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def _between(scene: Scene) -> np.ndarray:
-    """For each arm, in its base frame, the middle between the points in front of it and of the next arm, [arms, 3]."""
+    """Return the middle between the workspace points of each arm and the next, in the arm's base frame, [arms, 3]."""
     mounts = list(scene.mounts.values())
     world = np.array([mount.rotation @ mount.workspace + mount.position for mount in mounts])
     middle = (world + np.roll(world, -1, axis=0)) / 2

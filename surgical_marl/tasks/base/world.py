@@ -1,4 +1,4 @@
-"""What the functions of a task are given."""
+"""The input of a task's functions."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ if TYPE_CHECKING:
 
 
 class World(NamedTuple):
-    """What the functions of a task are given: one environment after a step."""
+    """The input of a task's functions: one environment after a step."""
 
     arms: Mapping[str, ArmView]
-    """What is seen of each agent's arm."""
+    """The view of each agent's arm."""
     goal: Any
     sensed: Mapping[str, Array] = {}
-    """What `Task.sense` made of the pictures, by the names in `Task.senses`."""
+    """The numbers that `Task.sense` computed from the pictures, by the names in `Task.senses`."""
