@@ -24,7 +24,7 @@ from surgical_marl.interfaces.rsl_rl import RslRlVecEnv
 
 STEPS = 6
 CONTROLS = ("position", "velocity", "torque")
-QUICK = {("reach", "psm", "position"), ("track", "bimanual_star", "velocity"), ("match_image", "ecm", "position")}
+QUICK = {("reach", "psm", "position"), ("track", "star", "velocity"), ("match_image", "ecm", "position")}
 
 
 def combinations() -> list[Any]:

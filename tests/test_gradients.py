@@ -13,7 +13,7 @@ from jax.flatten_util import ravel_pytree
 import surgical_marl as sm
 
 STEPS, EPSILON = 20, 1e-3
-slow = pytest.mark.slow
+SCENES = ["ecm", *(pytest.param(scene, marks=pytest.mark.slow) for scene in ("psm", "star", "bimanual_psm"))]
 
 
 class Episode:
@@ -42,9 +42,7 @@ class Episode:
         return jnp.array([float(arm.jaw is not None and joint.name == arm.jaw.joint) for joint in arm.actuated])
 
 
-@pytest.mark.parametrize(
-    "scene", ["psm", "ecm", pytest.param("star", marks=slow), pytest.param("bimanual_psm", marks=slow)]
-)
+@pytest.mark.parametrize("scene", SCENES)
 def test_the_reverse_derivative_is_that_of_finite_differences(scene: str) -> None:
     """From rest without a motion, and in motion; over the first step alone, and over a whole episode of 20.
 
@@ -72,7 +70,7 @@ def test_the_reverse_derivative_is_that_of_finite_differences(scene: str) -> Non
             assert np.sum(gradients[k] * direction) == pytest.approx(expected, rel=0.02)
 
 
-@pytest.mark.parametrize("scene", ["psm"])
+@pytest.mark.parametrize("scene", SCENES)
 def test_forward_and_reverse_derivatives_are_finite_and_the_same(scene: str) -> None:
     """`jacfwd` and `jacrev` of the first step after a reset, without an action: `grad` and `jvp` are parts of them."""
     episode = Episode(scene)

@@ -27,10 +27,14 @@ def gymnasium_id(task: str) -> str:
     return f"surgical_marl/{''.join(part.title() for part in task.split('_'))}-v0"
 
 
-def playable() -> list[tuple[str, str]]:
-    """Every task on every scene that it can be played on."""
+QUICK = {("reach", "psm"), ("reach", "bimanual_psm"), ("track", "ecm"), ("match_image", "ecm")}
+
+
+def playable() -> list[Any]:
+    """Every task on every scene that it can be played on: a few at once, all of them with `-m slow`."""
     every = [(task, scene) for task in sm.list_tasks() for scene in sm.list_scenes()]
-    return [(task, scene) for task, scene in every if task != "match_image" or "ecm" in scene]
+    good = [pair for pair in every if pair[0] != "match_image" or "ecm" in pair[1]]
+    return [pytest.param(*pair, marks=[] if pair in QUICK else pytest.mark.slow) for pair in good]
 
 
 @pytest.mark.parametrize(("task", "scene"), playable())
