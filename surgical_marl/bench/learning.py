@@ -17,8 +17,8 @@ from typing import Any
 
 from surgical_marl import machine
 from surgical_marl.bench import clock, sim
-from surgical_marl.bench.report import aligned, describe_machine
 from surgical_marl.bench.stopwatch import STARTING, Stopwatch, rows
+from surgical_marl.bench.text import aligned, describe_machine
 from surgical_marl.bench.workload import Workload
 from surgical_marl.learning.room import in_memory
 from surgical_marl.learning.train import make_training

@@ -10,6 +10,7 @@ from typing import Any
 
 from surgical_marl.bench.course import Course, make_course
 from surgical_marl.bench.sim import Point, Speed, measure, sweep
+from surgical_marl.bench.text import aligned, describe_machine
 from surgical_marl.bench.workload import Workload
 from surgical_marl.files import write_atomic
 from surgical_marl.machine import machine
@@ -115,12 +116,6 @@ def table(found: Mapping[str, Any]) -> str:
     )
 
 
-def describe_machine(found: Mapping[str, Any] | None = None) -> str:
-    """Return one line about this machine, or about another one if `found` is what `machine` returned there."""
-    found = found or machine()
-    return f"{found['cpu']}, {found['threads']} threads" + (f"; {found['gpu']}" if found["gpu"] else "")
-
-
 def _ratio_lines(found: Mapping[str, Mapping[str, float]]) -> list[str]:
     names = {"physics": "physics steps", "env": "environment steps"}
     return [
@@ -138,19 +133,6 @@ def sweep_table(points: Iterable[Point]) -> str:
         physics = f"{speed.physics_steps_per_s:,.0f}"
         cells.append((speed.engine, speed.device, f"{speed.num_envs:,}", physics, env, f"{size}" if size else "-"))
     return "\n".join(aligned(cells))
-
-
-def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Rows in columns; what holds digits stands to the right."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    right = [all(cell[:1].isdigit() or cell == "-" for cell in column[1:]) for column in zip(*rows, strict=True)]
-    return [
-        "  ".join(
-            cell.rjust(width) if side else cell.ljust(width)
-            for cell, width, side in zip(row, widths, right, strict=True)
-        ).rstrip()
-        for row in rows
-    ]
 
 
 def draw(points: Sequence[Point], title: str, out: Path) -> None:
