@@ -7,7 +7,7 @@ import itertools
 import sys
 import threading
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from importlib import import_module
 from typing import Any
 
@@ -218,6 +218,15 @@ def test_rsl_rls_own_runner_trains_untouched(scene: str) -> None:
         env.step(torch.zeros(8, env.num_actions))
 
 
+@pytest.fixture
+def own_garbage() -> Iterator[None]:
+    """The garbage collector looks at the test's own objects alone: those of all tests before take it seconds."""
+    gc.freeze()
+    yield
+    gc.unfreeze()
+
+
+@pytest.mark.usefixtures("own_garbage")
 @pytest.mark.parametrize(
     ("task", "scene", "options"),
     [("reach", "psm", {}), ("reach", "psm", {"num_envs": 128}), ("match_image", "ecm", {})],

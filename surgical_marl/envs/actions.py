@@ -27,7 +27,7 @@ def check_actions(actions: Any, shapes: Mapping[str, tuple[int, ...]]) -> dict[s
         ValueError: it is no dict, an agent is missing or unknown, a shape is wrong, or a value is not a finite number.
     """
     if not isinstance(actions, Mapping):
-        raise ValueError(f"actions must be a dict of agents to arrays, not {_shown(actions)}")
+        raise ValueError(f"actions must be a dict of agents to arrays, not {shown(actions)}")
     for agent in actions:
         if agent not in shapes:
             raise ValueError(f"action for {agent!r}, which is not an agent of the scene ({', '.join(shapes)})")
@@ -95,10 +95,10 @@ def _not_finite(agent: str) -> ValueError:
 
 
 def _no_numbers(agent: str, found: Any) -> ValueError:
-    return ValueError(f"action of {agent!r} must hold real numbers, not {_shown(found)}")
+    return ValueError(f"action of {agent!r} must hold real numbers, not {shown(found)}")
 
 
-def _shown(value: Any) -> str:
+def shown(value: Any) -> str:
     """Return a value as a message shows it: short, in one line."""
     text = " ".join(repr(value).split())
     return text if len(text) <= 60 else f"{text[:57]}..."

@@ -24,7 +24,26 @@ from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.policies.teammates import Teammate, Teammates
 
 
-class SurgicalEnv(gymnasium.Env[Any, np.ndarray]):
+class LimitInSpec:
+    """The `spec` of an environment of Gymnasium, or of many: its `max_episode_steps` is the limit in force."""
+
+    batch: BatchedEnv
+    _spec: EnvSpec | None = None
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """How to make the same again."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        self._spec = found = copy.copy(spec)
+        if found is not None:
+            limit = self.batch.max_steps
+            found.max_episode_steps, found.kwargs = limit, {**found.kwargs, "max_steps": limit}
+
+
+class SurgicalEnv(LimitInSpec, gymnasium.Env[Any, np.ndarray]):
     """A single environment for Gymnasium, in which one action moves one arm, or several.
 
     `info` holds all that is known of the agent's arm, as in the parallel face. With several arms it is the team's:
@@ -62,18 +81,8 @@ class SurgicalEnv(gymnasium.Env[Any, np.ndarray]):
         self.metadata = {**self.metadata, "render_fps": round(1 / self.batch.control_dt)}
         self.render_mode = render_mode
         self._rendering = Rendering(self.batch, render_mode)
-        self._spec: EnvSpec | None = None
         self._seen: dict[str, Any] = {}
         self._over = True
-
-    @property
-    def spec(self) -> EnvSpec | None:
-        """How to make the same environment again. Its `max_episode_steps` is the limit in force."""
-        return self._spec
-
-    @spec.setter
-    def spec(self, spec: EnvSpec | None) -> None:
-        self._spec = with_limit(spec, self.batch.max_steps)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start an episode.
@@ -127,15 +136,6 @@ def make_batch(task: str, scene: str | None, num_envs: int, options: dict[str, A
     if options.get("arrays", "numpy") != "numpy":
         raise ValueError(f"arrays {options['arrays']!r}: Gymnasium's faces speak numpy; leave it out")
     return BatchedEnv(task, scene or TASKS.load(task).default_scene or "psm", num_envs=num_envs, **options)
-
-
-def with_limit(spec: EnvSpec | None, max_steps: int) -> EnvSpec | None:
-    """Return a spec that says what the time limit is, and makes an environment with the same one."""
-    if spec is None:
-        return None
-    found = copy.copy(spec)
-    found.max_episode_steps, found.kwargs = max_steps, {**spec.kwargs, "max_steps": max_steps}
-    return found
 
 
 def _limit_of_make() -> int | None:

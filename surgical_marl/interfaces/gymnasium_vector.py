@@ -11,16 +11,15 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from surgical_marl.interfaces.gymnasium import check_render_mode, make_batch, with_limit
+from surgical_marl.interfaces.gymnasium import LimitInSpec, check_render_mode, make_batch
 from surgical_marl.interfaces.joint import JointAgent
 from surgical_marl.policies.teammates import Teammate, Teammates
 
 
-class SurgicalVectorEnv(VectorEnv[Any, np.ndarray, Any]):
+class SurgicalVectorEnv(LimitInSpec, VectorEnv[Any, np.ndarray, Any]):
     """N environments at once.
 
     Args:
@@ -65,21 +64,11 @@ class SurgicalVectorEnv(VectorEnv[Any, np.ndarray, Any]):
         )
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self._spec: EnvSpec | None = None
         self._seen: dict[str, Any] = {}
         """What all arms observe, as it was last returned."""
         self._over = np.zeros(self.num_envs, bool)
         """Where an episode is over and the next one has not been shown yet."""
         self._pictures: Any = None
-
-    @property
-    def spec(self) -> EnvSpec | None:
-        """How to make the same environments again. Its `max_episode_steps` is the limit in force."""
-        return self._spec
-
-    @spec.setter
-    def spec(self, spec: EnvSpec | None) -> None:
-        self._spec = with_limit(spec, self.batch.max_steps)
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None

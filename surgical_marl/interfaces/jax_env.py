@@ -18,6 +18,7 @@ import numpy as np
 
 from surgical_marl.content import unknown
 from surgical_marl.engines.stepper import MOST_KEPT, Stepper, representative
+from surgical_marl.envs.actions import shown
 from surgical_marl.envs.env import Carry, Env
 from surgical_marl.runtime import jax, jnp
 
@@ -131,7 +132,7 @@ class JaxEnv:
                 number, or not finite, where it is known when the step is called.
         """
         if not isinstance(state, EnvState):
-            raise ValueError(f"state must be what reset() or step() returned, not {_shown(state)}")
+            raise ValueError(f"state must be what reset() or step() returned, not {shown(state)}")
         after = self._functions[1](state.carry, self._checked(actions), self.env.parameters)
         done = after.terminated | after.truncated
         infos = {
@@ -148,7 +149,7 @@ class JaxEnv:
 
     def _checked(self, actions: Any) -> dict[str, Array]:
         if not isinstance(actions, Mapping):
-            raise ValueError(f"actions must be a dict of agents to arrays, not {_shown(actions)}")
+            raise ValueError(f"actions must be a dict of agents to arrays, not {shown(actions)}")
         for agent in actions:
             if agent not in self.action_spaces:
                 raise ValueError(f"action for {agent!r}, which is not an agent of the scene ({', '.join(self.agents)})")
@@ -161,7 +162,7 @@ class JaxEnv:
         try:
             action = jnp.asarray(actions[agent])
         except (TypeError, ValueError):
-            raise ValueError(f"action of {agent!r} must hold real numbers, not {_shown(actions[agent])}") from None
+            raise ValueError(f"action of {agent!r} must hold real numbers, not {shown(actions[agent])}") from None
         if action.dtype == bool or not jnp.isrealobj(action):
             raise ValueError(f"action of {agent!r} must hold real numbers, not {action.dtype}")
         if action.shape != shape:
@@ -202,15 +203,9 @@ def _raw(key: Any) -> Array:
     if hasattr(key, "dtype") and jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
         raw = jax.random.key_data(key)
     if getattr(raw, "shape", None) != (2,) or raw.dtype != jnp.uint32:
-        raise ValueError(f"key must be one key such as jax.random.key(0), not {_shown(key)}")
+        raise ValueError(f"key must be one key such as jax.random.key(0), not {shown(key)}")
     return raw
 
 
 def _box(space: spaces.Box) -> Box:
     return Box(jnp.asarray(space.low), jnp.asarray(space.high))
-
-
-def _shown(value: Any) -> str:
-    """Return a value as a message shows it: short, in one line."""
-    text = " ".join(repr(value).split())
-    return text if len(text) <= 60 else f"{text[:57]}..."
