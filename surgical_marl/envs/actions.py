@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import numpy as np
@@ -26,15 +26,9 @@ def check_actions(actions: Any, shapes: Mapping[str, tuple[int, ...]]) -> dict[s
     Raises:
         ValueError: it is no dict, an agent is missing or unknown, a shape is wrong, or a value is not a finite number.
     """
-    if not isinstance(actions, Mapping):
-        raise ValueError(f"actions must be a dict of agents to arrays, not {shown(actions)}")
-    for agent in actions:
-        if agent not in shapes:
-            raise ValueError(f"action for {agent!r}, which is not an agent of the scene ({', '.join(shapes)})")
+    check_agents(actions, shapes)
     checked, away = {}, {}
     for agent, shape in shapes.items():
-        if agent not in actions:
-            raise ValueError(f"no action for agent {agent!r}")
         action = _array(agent, actions[agent])
         if tuple(action.shape) != shape:
             raise ValueError(f"action of {agent!r} has shape {tuple(action.shape)}, it must be {shape}")
@@ -46,6 +40,18 @@ def check_actions(actions: Any, shapes: Mapping[str, tuple[int, ...]]) -> dict[s
     if away:
         _check_finite(away)
     return checked
+
+
+def check_agents(actions: Any, agents: Collection[str]) -> None:
+    """Raise a ValueError unless actions are a dict with just these agents."""
+    if not isinstance(actions, Mapping):
+        raise ValueError(f"actions must be a dict of agents to arrays, not {shown(actions)}")
+    for agent in actions:
+        if agent not in agents:
+            raise ValueError(f"action for {agent!r}, which is not an agent of the scene ({', '.join(agents)})")
+    for agent in agents:
+        if agent not in actions:
+            raise ValueError(f"no action for agent {agent!r}")
 
 
 def _array(agent: str, given: Any) -> Any:

@@ -96,7 +96,8 @@ def card(folder: Path, name: str) -> str:
 def _what(settings: Settings, name: str, folder: Path) -> str:
     scene, task = load_scene(settings.scene), TASKS.load(settings.task).summary().partition(": ")[2]
     clip = f"\n[A video of two episodes]({CLIP}) on held-out goals. Balls mark the goals.\n"
-    clip = clip if (folder / CLIP).is_file() else ""
+    if not (folder / CLIP).is_file():
+        clip = ""
     return f"""# {name}
 
 This policy plays the task `{settings.task}` in the scene `{settings.scene}`. The task: {task}

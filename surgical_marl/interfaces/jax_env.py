@@ -18,7 +18,7 @@ import numpy as np
 
 from surgical_marl.content import unknown
 from surgical_marl.engines.stepper import MOST_KEPT, Stepper, representative
-from surgical_marl.envs.actions import shown
+from surgical_marl.envs.actions import check_agents, shown
 from surgical_marl.envs.env import Carry, Env
 from surgical_marl.runtime import jax, jnp
 
@@ -148,16 +148,10 @@ class JaxEnv:
         return spaces[agent]
 
     def _checked(self, actions: Any) -> dict[str, Array]:
-        if not isinstance(actions, Mapping):
-            raise ValueError(f"actions must be a dict of agents to arrays, not {shown(actions)}")
-        for agent in actions:
-            if agent not in self.action_spaces:
-                raise ValueError(f"action for {agent!r}, which is not an agent of the scene ({', '.join(self.agents)})")
+        check_agents(actions, self.agents)
         return {agent: self._checked_action(agent, actions) for agent in self.agents}
 
     def _checked_action(self, agent: str, actions: Mapping[str, Any]) -> Array:
-        if agent not in actions:
-            raise ValueError(f"no action for agent {agent!r}")
         shape = self.action_spaces[agent].shape
         try:
             action = jnp.asarray(actions[agent])
