@@ -12,7 +12,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from surgical_marl.content import list_arms, list_policies, list_scenes
+from surgical_marl.content import list_arms, list_objects, list_policies, list_scenes
 from surgical_marl.interfaces.registration import register_ids, register_task
 from surgical_marl.plugins.algorithms import list_algorithms, register_algorithm
 from surgical_marl.plugins.tasks import list_tasks
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from surgical_marl.interfaces.pettingzoo import parallel_env
     from surgical_marl.robots.arm import load_arm
     from surgical_marl.scenes.load import load_scene
+    from surgical_marl.scenes.objects import load_object
     from surgical_marl.tasks.base.task import Task, TipTask
 
 __version__ = "0.1.0"
@@ -31,6 +32,7 @@ _LAZY = {
     "BatchedEnv": "surgical_marl.envs.batch",
     "jax_env": "surgical_marl.interfaces.jax_env",
     "load_arm": "surgical_marl.robots.arm",
+    "load_object": "surgical_marl.scenes.objects",
     "load_scene": "surgical_marl.scenes.load",
     "Task": "surgical_marl.tasks.base.task",
     "TipTask": "surgical_marl.tasks.base.task",
@@ -44,10 +46,12 @@ __all__ = [
     "jax_env",
     "list_algorithms",
     "list_arms",
+    "list_objects",
     "list_policies",
     "list_scenes",
     "list_tasks",
     "load_arm",
+    "load_object",
     "load_scene",
     "parallel_env",
     "register_algorithm",

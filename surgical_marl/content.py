@@ -1,4 +1,4 @@
-"""Where the swappable content lives: arms, scenes, configs and policies, by name or by path.
+"""Where the swappable content lives: arms, scenes, objects, configs and policies, by name or by path.
 
 Shipped content is at the top of the repository. An installed package adds its own content in folders of the same names,
 and registers itself with an entry point: `my_package = "my_package"` in the group `surgical_marl.content`.
@@ -15,22 +15,24 @@ from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
 
-KINDS = ("arms", "scenes", "configs", "policies")
+KINDS = ("arms", "scenes", "objects", "configs", "policies")
 BASELINES = ("zero", "random", "oracle")
 """Policies that need no learning. They have no task and scene of their own."""
 
 _PACKAGE = Path(__file__).resolve().parent
-_NOUNS = {"arms": "arm", "scenes": "scene", "configs": "config", "policies": "run or policy"}
+_NOUNS = {"arms": "arm", "scenes": "scene", "objects": "object", "configs": "config", "policies": "run or policy"}
+_FOLDER = {"objects": "scenes/objects"}
 _MARKER = {"arms": "arm.yaml", "policies": "config.yaml"}
-_SUFFIX = {"scenes": ".yaml", "configs": ".yaml"}
+_SUFFIX = {"scenes": ".yaml", "objects": ".yaml", "configs": ".yaml"}
 
 
 def content_dir(kind: str) -> Path:
     """Return the folder of one kind of content: inside the package in a wheel, beside it in a checkout."""
     if kind not in KINDS:
         raise unknown("kind of content", kind, KINDS)
-    shipped = _PACKAGE / "content" / kind
-    return shipped if shipped.is_dir() else _PACKAGE.parent / kind
+    folder = _FOLDER.get(kind, kind)
+    shipped = _PACKAGE / "content" / folder
+    return shipped if shipped.is_dir() else _PACKAGE.parent / folder
 
 
 def list_arms() -> list[str]:
@@ -41,6 +43,11 @@ def list_arms() -> list[str]:
 def list_scenes() -> list[str]:
     """Return the names of the scenes that ship and of those of installed packages."""
     return _names("scenes")
+
+
+def list_objects() -> list[str]:
+    """Return the names of the objects that ship and of those of installed packages."""
+    return _names("objects")
 
 
 def list_configs() -> list[str]:
@@ -85,7 +92,7 @@ def _names(kind: str) -> list[str]:
 def _places(kind: str) -> dict[str, list[Path]]:
     """Return the files or folders of a kind of content by name, both shipped ones and those of installed packages."""
     found: dict[str, list[Path]] = {}
-    for folder in (content_dir(kind), *(root / kind for root in _plugin_roots())):
+    for folder in (content_dir(kind), *(root / _FOLDER.get(kind, kind) for root in _plugin_roots())):
         for path in folder.glob(f"[!._]*{_SUFFIX.get(kind, '')}"):
             if kind in _SUFFIX or (path / _MARKER[kind]).exists():
                 found.setdefault(path.stem if kind in _SUFFIX else path.name, []).append(path)

@@ -7,6 +7,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
 
@@ -67,3 +68,25 @@ def build(cls: type, mapping: Any, where: Path | str) -> Any:
     except TypeError:
         missing = [name for name in names if name not in values]
         raise ValueError(f"{where}: a {cls.__name__.lower()} lacks {', '.join(missing)}") from None
+
+
+def read_vector(value: Any, where: str, count: int = 3, words: str = "three finite numbers") -> np.ndarray:
+    """Return numbers [count] that a person wrote.
+
+    Raises:
+        ValueError: not as many, or not numbers, or not finite.
+    """
+    try:
+        vector = np.array(value, dtype=float)
+    except (TypeError, ValueError):
+        vector = np.empty(0)
+    if vector.shape != (count,) or not np.isfinite(vector).all():
+        raise ValueError(f"{where}: {value!r} must be {words}")
+    return vector
+
+
+def read_mapping(value: Any, where: str) -> dict[str, Any]:
+    """Return a mapping, empty for None; raise ValueError for anything else."""
+    if value is not None and not isinstance(value, dict):
+        raise ValueError(f"{where}: {value!r} must be a mapping")
+    return value or {}

@@ -267,7 +267,7 @@ def test_bad_urdf_is_one_sentence(tmp_path: Path, old: str, new: str, words: str
         ("armature: 4.976e-4", "inertia: 4.976e-4", "cable 0: unknown key 'inertia'"),
         ("  - {joints", "  a: {joints", "cables must be a list"),
         ("urdf: psm.urdf", "urdf: other.urdf", "no URDF file"),
-        ("jaw: {joint: jaw_left", "jaw: {joint: jaw_right", "jaw joint 'jaw_right'"),
+        ("  joint: jaw_left\n", "  joint: jaw_right\n", "jaw joint 'jaw_right'"),
         ("joints:", "joints: [", "not valid YAML"),
     ],
 )

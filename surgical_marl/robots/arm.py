@@ -19,6 +19,7 @@ import numpy as np
 from surgical_marl.content import find
 from surgical_marl.robots.description import MOVING, Robot, RobotJoint, Vector
 from surgical_marl.robots.drives import Cable, Drive, read_cables, read_drives
+from surgical_marl.robots.jaw import Jaw, read_jaw
 from surgical_marl.robots.mesh import MAX_MESH, mesh_files, resolve_meshes
 from surgical_marl.robots.safe_xml import read_bytes
 from surgical_marl.robots.urdf import Faults, read_urdf
@@ -27,15 +28,6 @@ from surgical_marl.yaml_file import build, check_keys, read_yaml
 
 CONTROL_MODES = ("position", "velocity", "torque")
 KEYS = ("description", "urdf", "tool_tip", "remote_center", "camera", "joints", "cables", "jaw")
-
-
-@dataclass(frozen=True)
-class Jaw:
-    """A jaw. One command, open or closed, moves `joint` and the joints that mimic it."""
-
-    joint: str
-    open: float
-    closed: float
 
 
 @dataclass(frozen=True)
@@ -235,14 +227,13 @@ def load_arm(name: str | Path) -> Arm:
     faults += robot_faults(robot, path) + lost
     leaders = [joint.name for joint in robot.joints if joint.type in MOVING and not joint.mimic]
     drives = read_drives(settings.get("joints") or {}, leaders, where, keep)
-    camera, jaw = (
-        None if settings.get(key) is None else keep(build, cls, settings[key], where)
-        for key, cls in (("camera", Camera), ("jaw", Jaw))
-    )
+    camera = None if settings.get("camera") is None else keep(build, Camera, settings["camera"], where)
+    jaw = None if settings.get("jaw") is None else keep(read_jaw, settings["jaw"], where)
     pulled = [name for name in drives if jaw is None or name != jaw.joint]
     cables = read_cables(settings.get("cables") or [], pulled, where, keep)
     links = [link.name for link in robot.links]
     named = {key: settings.get(key) for key in ("tool_tip", "remote_center")} | {"camera": camera and camera.link}
+    named |= {f"jaw pad {number}": pad.link for number, pad in enumerate(jaw.pads if jaw else ())}
     for key, link in named.items():
         if link not in links and (key == "tool_tip" or link is not None):
             faults.append(f"{where}: {key} {link!r} is not a link of the URDF ({', '.join(links)})")

@@ -21,14 +21,20 @@ from surgical_marl.robots.drives import Cable, Drive
 from surgical_marl.robots.mesh import read_mesh
 from surgical_marl.robots.rotation import quaternion
 
-VISUAL_GROUP, COLLISION_GROUP = 2, 3
+VISUAL_GROUP, COLLISION_GROUP, PAD_GROUP = 2, 3, 4
 SOLREF = (0.005, 1.0)
 """Time constant in s and damping ratio of joint limits and contacts: as stiff as a step of 2.5 ms allows."""
 DEFAULT_RGBA = (0.7, 0.7, 0.72, 1.0)
 
 
-def build_spec(arm: Arm, control: str = "position") -> mujoco.MjSpec:
+def build_spec(arm: Arm, control: str = "position", pads: bool = False) -> mujoco.MjSpec:
     """Return a new MjSpec of the arm.
+
+    Args:
+        arm: what to build.
+        control: the control mode of its actuators.
+        pads: whether to add the plates of its jaw, `<link>/pad`. Only objects touch them, so that the model of an arm
+            in a scene without objects doesn't have them.
 
     Raises ValueError for an unknown control mode or a mesh that can't be read.
     """
@@ -56,6 +62,11 @@ def build_spec(arm: Arm, control: str = "position") -> mujoco.MjSpec:
                 joint = joints[element.name]
                 _add_joint(body, joint, element.axis, _mode(arm, joint, control))
             _add_link(spec, body, links[element.child], arm.folder)
+    for pad in arm.jaw.pads if pads and arm.jaw else ():
+        shape = {"type": mujoco.mjtGeom.mjGEOM_BOX, "size": np.array(pad.size) / 2}
+        place = np.eye(4)
+        place[:3, :3], place[:3, 3] = pad.rotation, pad.position
+        _add_geom(bodies[pad.link], shape, place, name=f"{pad.link}/pad", rgba=[0.2, 0.5, 0.9, 0.3], group=PAD_GROUP)
     bodies[arm.tool_tip].add_site(name="tool_tip", size=[0.001] * 3, group=4)
     if arm.camera is not None:
         for name, side in (("left", -0.5), ("right", 0.5)):

@@ -27,7 +27,9 @@ def set_physics(spec: mujoco.MjSpec) -> None:
     option.gravity = [0.0, 0.0, 0.0]
 
 
-def build_scene(name: str, mounts: dict[str, Mount], control: str, randomisation: Randomisation) -> mujoco.MjSpec:
+def build_scene(
+    name: str, mounts: dict[str, Mount], control: str, randomisation: Randomisation, pads: bool = False
+) -> mujoco.MjSpec:
     spec = mujoco.MjSpec()
     spec.modelname = name
     spec.compiler.degree = False
@@ -35,7 +37,7 @@ def build_scene(name: str, mounts: dict[str, Mount], control: str, randomisation
     set_physics(spec)
     for agent, mount in mounts.items():
         frame = spec.worldbody.add_frame(pos=mount.position, quat=quaternion(mount.rotation))
-        spec.attach(build_spec(mount.arm, control), prefix=f"{agent}/", frame=frame)
+        spec.attach(build_spec(mount.arm, control, pads), prefix=f"{agent}/", frame=frame)
         if randomisation.payload:
             spec.body(f"{agent}/{mount.arm.tool_tip}").add_body(name=f"{agent}/{PAYLOAD}")
     return spec

@@ -1,4 +1,4 @@
-"""Scene files: which arms stand where.
+"""Scene files: which arms and objects stand where.
 
     scene = load_scene("bimanual_psm")
 
@@ -22,11 +22,11 @@ from surgical_marl.robots.rotation import turned
 from surgical_marl.robots.spec import SOLREF
 from surgical_marl.scenes.build import build_scene, cached_model, compile_scene, weigh_shapes
 from surgical_marl.scenes.contacts import contact_pairs
+from surgical_marl.scenes.placing import add_objects, read_placements
 from surgical_marl.scenes.randomisation import read_randomisation
 from surgical_marl.scenes.scene import Mount, Scene
 from surgical_marl.scenes.surroundings import add_surroundings, add_tissue
-from surgical_marl.scenes.vectors import read_mapping, read_vector
-from surgical_marl.yaml_file import check_keys, read_yaml
+from surgical_marl.yaml_file import check_keys, read_mapping, read_vector, read_yaml
 
 
 def load_scene(name: str | Path, control: str = "position") -> Scene:
@@ -37,22 +37,25 @@ def load_scene(name: str | Path, control: str = "position") -> Scene:
     """
     path = find("scenes", name)
     settings = read_yaml(path)
-    check_keys(settings, ("description", "arms", "view", "tissue", "randomisation", "observe"), path)
+    check_keys(settings, ("description", "arms", "view", "tissue", "objects", "randomisation", "observe"), path)
     arms = settings.get("arms")
     if not isinstance(arms, dict) or not arms:
         raise ValueError(f"{path}: arms must map agent names such as psm_0 to arms")
     load = cache(load_arm)  # two agents may be the same arm
     mounts = {agent: _read_mount(agent, mount, path, load) for agent, mount in arms.items()}
+    objects = read_placements(settings.get("objects"), mounts, path)
     randomisation = read_randomisation(settings.get("randomisation"), path)
     description = str(settings.get("description", ""))
     observe = read_mapping(settings.get("observe"), f"{path}, observe")
-    scene = partial(Scene, path.stem, description, control, mounts, randomisation=randomisation, observe=observe)
+    scene = partial(Scene, path.stem, description, control, mounts, randomisation=randomisation, observe=observe,
+                    objects=objects)  # fmt: skip
 
     def compute() -> mujoco.MjModel:
-        spec = build_scene(path.stem, mounts, control, randomisation)
+        spec = build_scene(path.stem, mounts, control, randomisation, pads=bool(objects))
         add_surroundings(spec, mounts, settings.get("view"), path)
         for piece, what in read_mapping(settings.get("tissue"), f"{path}, tissue").items():
             add_tissue(spec, f"tissue/{piece}", what, f"{path}, tissue {piece!r}")
+        add_objects(spec, objects)
         bare = scene(model=compile_scene(spec))
         for one, other in contact_pairs(bare):
             spec.add_pair(geomname1=one, geomname2=other, condim=1, solref=SOLREF)
@@ -60,7 +63,8 @@ def load_scene(name: str | Path, control: str = "position") -> Scene:
 
     about = repr((path.stem, control, settings))
     contents = (part for mount in mounts.values() for part in mount.arm.content)
-    return scene(model=cached_model(compute, about, *contents))
+    held = (place.object.content for place in objects.values())
+    return scene(model=cached_model(compute, about, *contents, *held))
 
 
 def _read_mount(agent: str, settings: Any, path: Path, load: Callable[[str | Path], Arm]) -> Mount:

@@ -18,6 +18,7 @@ from surgical_marl.content import unknown
 from surgical_marl.robots.arm import Arm
 from surgical_marl.robots.spec import COLLISION_GROUP, build_spec
 from surgical_marl.scenes.geometry import Capsule, capsule_distance, link_capsule
+from surgical_marl.scenes.objects import Placement
 from surgical_marl.scenes.randomisation import Randomisation
 
 PAYLOAD = "payload"
@@ -50,6 +51,8 @@ class Scene:
     """Ranges of domain randomisation; all zero unless the scene file sets them."""
     observe: dict[str, list[str]] = field(default_factory=dict)
     """Agent -> names of the observation terms that it observes, instead of the task's own choice."""
+    objects: dict[str, Placement] = field(default_factory=dict)
+    """Name -> object and where it is. In `model` free objects are mocap bodies of this name, which have no joints."""
 
     @property
     def agents(self) -> tuple[str, ...]:
@@ -176,7 +179,7 @@ def are_alike(one: Arm, other: Arm) -> bool:
 
 
 def _model_content(arm: Arm) -> bytes:
-    spec = build_spec(arm)
+    spec = build_spec(arm, pads=True)
     spec.modelname = ""
     model = spec.compile()
     content = np.empty(mujoco.mj_sizeModel(model), np.uint8)

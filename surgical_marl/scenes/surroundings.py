@@ -10,8 +10,7 @@ import numpy as np
 
 from surgical_marl.robots.rotation import quaternion, turned
 from surgical_marl.scenes.scene import Mount
-from surgical_marl.scenes.vectors import read_mapping, read_vector
-from surgical_marl.yaml_file import check_keys
+from surgical_marl.yaml_file import check_keys, read_mapping, read_vector
 
 STILL = {"contype": 0, "conaffinity": 0, "group": 1}
 """Attributes of geoms that are only visible: nothing collides with them."""

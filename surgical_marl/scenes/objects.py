@@ -1,0 +1,183 @@
+"""Objects: what arms hold, look at or bump into, one YAML file each.
+
+    needle = load_object("needle_sh")
+    needle.mass                                 # kg
+    position, rotation = needle.sites["tip"]
+
+`docs/your_own_object.md` makes one. A scene says where objects are: `Scene.objects`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from surgical_marl.content import find
+from surgical_marl.robots.rotation import matrix_of, quaternion, turned
+from surgical_marl.scenes.shapes import Shape as Shape
+from surgical_marl.scenes.shapes import read_colour, read_number, read_shapes
+from surgical_marl.yaml_file import check_keys, read_mapping, read_vector, read_yaml
+
+KEYS = ("description", "free", "mass", "density", "friction", "stiffness", "colour", "shapes", "sites")
+GREY = (0.7, 0.7, 0.72)
+"""The colour of an object that has none."""
+GEOMS = {
+    "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
+    "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
+    "box": mujoco.mjtGeom.mjGEOM_BOX,
+    "plane": mujoco.mjtGeom.mjGEOM_PLANE,
+}
+"""MuJoCo's geom of each kind of shape."""
+
+
+@dataclass(frozen=True)
+class Surface:
+    """How something feels to what touches it."""
+
+    sliding: float
+    """Coefficient of sliding friction."""
+    torsion: float
+    """Radius in m: the torque of friction about the normal is up to sliding * torsion * normal force."""
+    stiffness: float
+    """Of one contact point, N/m."""
+
+    def against(self, other: Surface) -> Surface:
+        """Return the contact of two surfaces: geometric means of both frictions, and two springs in series."""
+        stiffness = self.stiffness * other.stiffness / (self.stiffness + other.stiffness)
+        return Surface(math.sqrt(self.sliding * other.sliding), math.sqrt(self.torsion * other.torsion), stiffness)
+
+
+JAW = Surface(sliding=0.8, torsion=0.002, stiffness=2e5)
+"""The inserts of a needle driver's jaw. A steel wire between them has a coefficient of 0.8 too."""
+LINK = Surface(sliding=0.3, torsion=0.001, stiffness=2e5)
+"""All other parts of an arm: smooth steel."""
+
+
+@dataclass(frozen=True)
+class Object:
+    """A rigid object in a frame of its own. Lengths in m, angles in rad."""
+
+    name: str
+    description: str
+    free: bool
+    """Whether it moves; otherwise it is fixed in the world."""
+    mass: float
+    """kg; 0 if the object is fixed."""
+    center: np.ndarray
+    """Centre of mass, m, [3]."""
+    inertia: np.ndarray
+    """About the centre of mass, along the object's axes, kg m2, [3, 3]."""
+    friction: tuple[float, float]
+    """Coefficient of sliding friction, and torsion radius in m: the torque of friction about the normal of a contact is
+    up to sliding * torsion radius * normal force."""
+    stiffness: float
+    """Of one contact point, N/m."""
+    shapes: tuple[Shape, ...]
+    sites: dict[str, tuple[np.ndarray, np.ndarray]]
+    """Named places: position, m, [3], and axes, [3, 3]."""
+    content: bytes = field(repr=False)
+    """Everything that the object is made from. It is a key for caches."""
+
+    @property
+    def surface(self) -> Surface:
+        """How it feels to what touches it."""
+        return Surface(*self.friction, self.stiffness)
+
+
+@dataclass(frozen=True)
+class Placement:
+    """An object in a scene."""
+
+    object: Object
+    position: np.ndarray
+    """Origin of the object's frame in the world, m, [3]. A free object starts here unless a task says otherwise."""
+    rotation: np.ndarray
+    """Axes of the object's frame in the world, [3, 3]."""
+
+
+def load_object(name: str | Path, colour: Any = None) -> Object:
+    """Read an object by a shipped name (`list_objects()`) or the path of a YAML file.
+
+    Args:
+        name: what to read.
+        colour: red, green and blue from 0 to 1, for the file's own `colour`.
+
+    Raises:
+        ValueError: the name is unknown, or the file lacks something or has a bad value.
+    """
+    path = find("objects", name)
+    settings, where = read_yaml(path), str(path)
+    check_keys(settings, KEYS, path)
+    free = settings.get("free")
+    if not isinstance(free, bool):
+        raise ValueError(f"{path}: free must be true, for an object that moves, or false, not {free!r}")
+    painted = read_colour(colour, where, read_colour(settings.get("colour"), where, np.array(GREY)))
+    shapes = read_shapes(settings.get("shapes"), painted, where)
+    mass, center, inertia = _inertia(shapes, _density(settings, free, shapes, where), free)
+    friction = read_mapping(settings.get("friction"), f"{where}, friction")
+    check_keys(friction, ("sliding", "torsion"), f"{where}, friction")
+    sliding, torsion = (read_number(friction.get(key), f"{where}: {key} friction") for key in ("sliding", "torsion"))
+    return Object(
+        name=path.stem,
+        description=str(settings.get("description", "")),
+        free=free,
+        mass=mass,
+        center=center,
+        inertia=inertia,
+        friction=(sliding, torsion),
+        stiffness=read_number(settings.get("stiffness"), f"{where}: stiffness (N/m)", above=0.0),
+        shapes=shapes,
+        sites=_sites(settings.get("sites"), where),
+        content=repr((path.stem, settings, painted.tolist())).encode(),
+    )
+
+
+def _density(settings: dict[str, Any], free: bool, shapes: tuple[Shape, ...], where: str) -> float:
+    """Return the mean density, kg/m3; 0 for a fixed object."""
+    given = [key for key in ("mass", "density") if settings.get(key) is not None]
+    if not free:
+        if given:
+            raise ValueError(f"{where}: a fixed object has no {given[0]}; leave it out, or say free: true")
+        return 0.0
+    if len(given) != 1:
+        raise ValueError(f"{where}: a free object needs either its mass (kg) or its density (kg/m3)")
+    if any(shape.kind == "plane" for shape in shapes):
+        raise ValueError(f"{where}: a plane has no end, so it can't be part of a free object; take a box")
+    value = read_number(settings[given[0]], f"{where}: {given[0]}", above=0.0)
+    return value if given == ["density"] else value / sum(shape.volume for shape in shapes)
+
+
+def _inertia(shapes: tuple[Shape, ...], density: float, free: bool) -> tuple[float, np.ndarray, np.ndarray]:
+    """Return mass, centre of mass [3] and moments of inertia [3, 3] of the shapes, as MuJoCo computes them."""
+    if not free:
+        return 0.0, np.zeros(3), np.zeros((3, 3))
+    spec = mujoco.MjSpec()
+    body = spec.worldbody.add_body()
+    mass = density * sum(shape.volume for shape in shapes)
+    for shape in shapes:  # of 1 kg in all: MuJoCo takes a body of less than 1e-15 kg for one without mass
+        add_shape(body, shape, mass=shape.volume * density / mass)
+    model = spec.compile()
+    axes = matrix_of(model.body_iquat[1])
+    return mass, model.body_ipos[1].copy(), mass * axes @ np.diag(model.body_inertia[1]) @ axes.T
+
+
+def add_shape(body: Any, shape: Shape, **rest: Any) -> None:
+    """Add a shape to a body of an MjSpec as a geom with the rest of its attributes."""
+    size = [0.0, 0.0, 1.0] if shape.kind == "plane" else [*shape.size, 0.0, 0.0][:3]
+    body.add_geom(type=GEOMS[shape.kind], size=size, pos=shape.position, quat=quaternion(shape.rotation), **rest)
+
+
+def _sites(settings: Any, where: str) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    sites = {}
+    for name, place in read_mapping(settings, f"{where}, sites").items():
+        at = f"{where}, site {name!r}"
+        place = read_mapping(place, at)
+        check_keys(place, ("position", "tilt"), at)
+        position, tilt = (read_vector(place.get(key, [0, 0, 0]), f"{at}, {key}") for key in ("position", "tilt"))
+        sites[str(name)] = position, turned(tilt)
+    return sites

@@ -1,0 +1,58 @@
+"""Places objects in a scene: read from its file, and built into its model."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import mujoco
+
+from surgical_marl.robots.rotation import quaternion, turned
+from surgical_marl.scenes.objects import Placement, add_shape, load_object
+from surgical_marl.scenes.surroundings import STILL
+from surgical_marl.yaml_file import check_keys, read_mapping, read_vector
+
+
+def read_placements(settings: Any, agents: Iterable[str], path: Path) -> dict[str, Placement]:
+    """Return the objects of a scene file by their names in the scene.
+
+    Raises:
+        ValueError: a name that is also an agent's, an unknown object or key, or a bad number.
+    """
+    found = {}
+    for name, place in read_mapping(settings, f"{path}, objects").items():
+        where = f"{path}, object {name!r}"
+        if not re.fullmatch(r"[A-Za-z_]\w*", str(name)):
+            raise ValueError(f"{where}: a name in a scene is of letters, digits and underscores")
+        if name in agents or name == "world":
+            raise ValueError(f"{where}: {name} is taken; give the object another name")
+        found[name] = _read_placement(place, where, path.parent)
+    return found
+
+
+def _read_placement(settings: Any, where: str, folder: Path) -> Placement:
+    if not isinstance(settings, dict) or "object" not in settings:
+        raise ValueError(f"{where}: must be a mapping that names its object")
+    check_keys(settings, ("object", "position", "tilt", "colour"), where)
+    source = str(settings["object"])
+    local = folder / source  # a user's own object may be named relative to the scene file
+    item = load_object(local if local.is_file() else source, settings.get("colour"))
+    position, tilt = (read_vector(settings.get(key, [0, 0, 0]), f"{where}, {key}") for key in ("position", "tilt"))
+    return Placement(item, position, turned(tilt))
+
+
+def add_objects(spec: mujoco.MjSpec, objects: dict[str, Placement]) -> None:
+    """Add a body for each object, with geoms `<name>/<number>` and sites `<name>/<site>`.
+
+    A free object is a mocap body: it moves, but has no degrees of freedom in `qpos`, which stays that of the arms.
+    """
+    for name, place in objects.items():
+        body = spec.worldbody.add_body(
+            name=name, pos=place.position, quat=quaternion(place.rotation), mocap=place.object.free
+        )
+        for number, shape in enumerate(place.object.shapes):
+            add_shape(body, shape, name=f"{name}/{number}", mass=0, rgba=[*shape.colour, 1], **STILL)
+        for site, (position, rotation) in place.object.sites.items():
+            body.add_site(name=f"{name}/{site}", pos=position, quat=quaternion(rotation), size=[0.001] * 3, group=4)
