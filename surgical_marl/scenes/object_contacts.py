@@ -10,11 +10,15 @@ from collections.abc import Iterator
 from itertools import combinations, product
 from typing import NamedTuple
 
+import mujoco
 import numpy as np
 
 from surgical_marl.robots.spec import COLLISION_GROUP, PAD_GROUP
 from surgical_marl.scenes.objects import JAW, LINK, Surface
 from surgical_marl.scenes.scene import Scene
+
+RESTING = 1e-5
+"""What lies on something at the start may reach this deep into it, m: numbers in files are rounded."""
 
 
 class Touch(NamedTuple):
@@ -26,6 +30,24 @@ class Touch(NamedTuple):
     """Of the contact."""
     weight: float
     """Sum of the inverse weights of the two bodies, 1/kg."""
+
+
+def check_apart(scene: Scene) -> None:
+    """Raise ValueError if an object overlaps another one at the start, or an arm at its home.
+
+    Fixed objects may overlap each other.
+    """
+    model, data = scene.model, mujoco.MjData(scene.model)
+    data.qpos[:] = scene.home
+    mujoco.mj_kinematics(model, data)
+    for touch in touches(scene):
+        one, other = (model.geom(name).id for name in (touch.one, touch.other))
+        depth = -mujoco.mj_geomDistance(model, data, one, other, 1.0, None)
+        if depth > RESTING:
+            raise ValueError(
+                f"scene {scene.name!r}: {touch.one!r} and {touch.other!r} overlap at the start by "
+                f"{1000 * depth:.3g} mm; move the object"
+            )
 
 
 class _Side(NamedTuple):
