@@ -208,4 +208,4 @@ def test_an_unknown_name_is_bad_input(
     monkeypatch.chdir(tmp_path)
     assert main(["check", source]) == 2
     out, err = capsys.readouterr()
-    assert not out and "unknown arm or scene" in err and err.count("\n") == 1
+    assert not out and "unknown arm, scene or object" in err and err.count("\n") == 1

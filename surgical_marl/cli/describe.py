@@ -1,14 +1,15 @@
-"""Describes scenes, arms, tasks, algorithms and policies for `surgical-marl list -v`."""
+"""Describes scenes, arms, objects, tasks, algorithms and policies for `surgical-marl list -v`."""
 
 from __future__ import annotations
 
 import inspect
 
-from surgical_marl.content import list_arms, list_scenes
+from surgical_marl.content import list_arms, list_objects, list_scenes
 from surgical_marl.plugins.algorithms import ALGORITHMS, list_algorithms
 from surgical_marl.plugins.tasks import TASKS, list_tasks
 from surgical_marl.robots.arm import load_arm
 from surgical_marl.scenes.load import load_scene
+from surgical_marl.scenes.objects import load_object
 from surgical_marl.scenes.scene import Scene
 from surgical_marl.scenes.shared_workspace import shared_workspace
 
@@ -19,6 +20,7 @@ def describe(kind: str) -> str:
         "tasks": lambda: [_task(name) for name in list_tasks()],
         "scenes": lambda: [_scene(load_scene(name)) for name in list_scenes()],
         "arms": lambda: [_arm(name) for name in list_arms()],
+        "objects": lambda: [_object(name) for name in list_objects()],
         "algorithms": lambda: [_algorithm(name) for name in list_algorithms()],
         "policies": _policies,
     }[kind]()
@@ -33,6 +35,9 @@ def _scene(scene: Scene) -> str:
         way = f"shaft along ({shaft[0]:.2f}, {shaft[1]:.2f}, {shaft[2]:.2f}) at zero" if mount.arm.remote_center else ""
         point = "remote center" if mount.arm.remote_center else "base"
         lines.append(f"    {agent:14} {point} at ({x:.3f}, {y:.3f}, {z:.3f}) m {way}".rstrip())
+    for name, placement in scene.objects.items():
+        x, y, z = placement.position
+        lines.append(f"    {name:14} {placement.object.name} at ({x:.3f}, {y:.3f}, {z:.3f}) m")
     pairs = f"{len(scene.pairs)} pairs of shapes can touch"
     if len(scene.agents) > 1:
         home = {agent: mount.arm.home for agent, mount in scene.mounts.items()}
@@ -44,6 +49,13 @@ def _scene(scene: Scene) -> str:
 def _arm(name: str) -> str:
     arm = load_arm(name)
     return f"{name:14} {arm.description}\n    {', '.join(joint.name for joint in arm.actuated)}"
+
+
+def _object(name: str) -> str:
+    item = load_object(name)
+    mass = f"{1000 * item.mass:.3g} g" if item.free else "fixed"
+    sites = f", sites {', '.join(item.sites)}" if item.sites else ""
+    return f"{name:18} {item.description}\n    {mass}, shapes: {len(item.shapes)}{sites}"
 
 
 def _policies() -> list[str]:

@@ -14,7 +14,7 @@ from typing import Any, NoReturn
 
 from surgical_marl.bench.workload import BENCHED, Workload
 from surgical_marl.cli.flags import add_flags, flagged, given, one_of, whole
-from surgical_marl.content import BASELINES, find, list_arms, list_policies, list_scenes, unknown
+from surgical_marl.content import BASELINES, find, list_arms, list_objects, list_policies, list_scenes, unknown
 from surgical_marl.plugins.algorithms import list_algorithms
 from surgical_marl.plugins.tasks import list_tasks
 from surgical_marl.runs.settings import Settings
@@ -25,6 +25,7 @@ _LISTS = {
     "tasks": list_tasks,
     "scenes": list_scenes,
     "arms": list_arms,
+    "objects": list_objects,
     "algorithms": list_algorithms,
     "policies": list_policies,
 }
@@ -119,13 +120,13 @@ def _parser() -> argparse.ArgumentParser:
     evaluate.add_argument("--figure", type=Path, metavar="FILE.png", help="success against threshold, and the errors")
     evaluate.set_defaults(command=_eval, name="eval")
 
-    names = commands.add_parser("list", help="list tasks, scenes, arms, algorithms and policies")
+    names = commands.add_parser("list", help="list tasks, scenes, arms, objects, algorithms and policies")
     names.add_argument("kind", nargs="?", type=one_of(tuple(_LISTS)), metavar="|".join(_LISTS))
     names.add_argument("-v", "--verbose", action="store_true", help="what each one is")
     names.set_defaults(command=_list, name="list")
 
-    audit = commands.add_parser("check", help="say what is wrong with an arm or a scene")
-    audit.add_argument("source", metavar="ARM_OR_SCENE", help="a name, an arm's folder or a scene's .yaml file")
+    audit = commands.add_parser("check", help="say what is wrong with an arm, a scene or an object")
+    audit.add_argument("source", metavar="SOURCE", help="an arm, scene or object: its name, folder or .yaml file")
     audit.set_defaults(command=_check, name="check")
 
     export = commands.add_parser("export", help="write a scene for other programs, or a policy to pass on")

@@ -1,4 +1,4 @@
-"""Finds faults of an arm or a scene, one sentence each: faults of its files, then faults of its behaviour once loaded.
+"""Finds faults of an arm, a scene or an object, one sentence each: of its files, then of its behaviour once loaded.
 
     for finding in check("my_arm"):
         print(finding)
@@ -11,13 +11,13 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from itertools import combinations
+from itertools import chain, combinations
 from pathlib import Path
 
 import mujoco
 import numpy as np
 
-from surgical_marl.content import find, list_arms, list_scenes, unknown
+from surgical_marl.content import find, list_arms, list_objects, list_scenes, unknown
 from surgical_marl.robots.arm import Arm, load_arm
 from surgical_marl.robots.inverse_kinematics import inverse_kinematics
 from surgical_marl.robots.spec import COLLISION_GROUP, build_spec
@@ -25,8 +25,10 @@ from surgical_marl.robots.urdf import Faults
 from surgical_marl.scenes.build import set_physics
 from surgical_marl.scenes.contacts import collision_geoms, neighbours
 from surgical_marl.scenes.load import load_scene
+from surgical_marl.scenes.objects import load_object
 from surgical_marl.scenes.scene import Scene
 from surgical_marl.scenes.timing import TIMESTEP
+from surgical_marl.yaml_file import read_yaml
 
 REACH = 0.001
 """A scene's workspace point must be within reach to this, m."""
@@ -40,54 +42,69 @@ rounding."""
 
 
 def check(source: str | Path) -> list[str]:
-    """Return findings about an arm or a scene, an empty list if nothing is wrong.
+    """Return findings about an arm, a scene or an object, an empty list if nothing is wrong.
 
     Args:
-        source: the name of a shipped arm or scene (of both, if both have it), an arm's folder or a scene's YAML file.
+        source: the name of a shipped arm, scene or object (of all that have it), an arm's folder, or the YAML file of a
+            scene or an object.
 
     Raises:
-        ValueError: if there is no such arm or scene.
+        ValueError: if there is nothing of that name.
     """
-    folder, path = _find(source)
-    findings: list[str] = []
-    if folder is not None:
-        findings += _check_arm(folder)
-    if path is not None:
-        findings += _check_scene(path)
+    findings = [finding for kind, path in _find(source).items() for finding in _CHECKS[kind](path)]
     return list(dict.fromkeys(findings))
 
 
 def summary(source: str | Path) -> str:
     """Return what was checked, in a few words: "7 joints, 4 collision shapes; scene of 1 arm"."""
-    folder, path = _find(source)
-    words = []
-    if folder is not None:
-        arm = load_arm(folder)
-        shapes = sum(len(link.collisions) for link in arm.urdf.links)
-        words.append(f"{_count(len(arm.actuated), 'joint')}, {_count(shapes, 'collision shape')}")
-    if path is not None:
-        words.append(f"scene of {_count(len(load_scene(path).agents), 'arm')}")
-    return "; ".join(words)
+    return "; ".join(_SUMMARIES[kind](path) for kind, path in _find(source).items())
+
+
+def _sum_up_arm(folder: Path) -> str:
+    arm = load_arm(folder)
+    shapes = sum(len(link.collisions) for link in arm.urdf.links)
+    return f"{_count(len(arm.actuated), 'joint')}, {_count(shapes, 'collision shape')}"
+
+
+def _sum_up_scene(path: Path) -> str:
+    scene = load_scene(path)
+    objects = f", {_count(len(scene.objects), 'object')}" if scene.objects else ""
+    return f"scene of {_count(len(scene.agents), 'arm')}{objects}"
+
+
+def _sum_up_object(path: Path) -> str:
+    item = load_object(path)
+    mass = f"free object of {1000 * item.mass:.3g} g" if item.free else "fixed object"
+    return f"{mass}, {_count(len(item.shapes), 'shape')}"
 
 
 def _count(number: int, noun: str) -> str:
     return f"{number} {noun}{'s' * (number != 1)}"
 
 
-def _find(source: str | Path) -> tuple[Path | None, Path | None]:
-    """Return the folder of the arm and the file of the scene that have this name; one may be None."""
-    text = os.fspath(source)
-    arm, scene = text in list_arms(), text in list_scenes()
-    if arm or scene:
-        return find("arms", text) if arm else None, find("scenes", text) if scene else None
+def _find(source: str | Path) -> dict[str, Path]:
+    """Return the arm's folder, the scene's file and the object's file of this name, by their kind, as far as any."""
+    text, named = os.fspath(source), {"arms": list_arms(), "scenes": list_scenes(), "objects": list_objects()}
+    found = {kind: find(kind, text) for kind, names in named.items() if text in names}
+    if found:
+        return found
     path = Path(text).expanduser().resolve()  # so that `./psm` is not taken for the shipped psm further down
     if text and path.name == "arm.yaml" and path.is_file():
         path = path.parent
     if text and path.is_dir():
-        return path, None
+        return {"arms": path}
     if text and path.is_file():
-        return None, path
-    raise unknown("arm or scene", text, list(dict.fromkeys([*list_arms(), *list_scenes()])))
+        return {"objects" if _is_object(path) else "scenes": path}
+    raise unknown("arm, scene or object", text, list(dict.fromkeys(chain(*named.values()))))
+
+
+def _is_object(path: Path) -> bool:
+    """Return whether a file looks like an object's rather than a scene's."""
+    try:
+        settings = read_yaml(path)
+    except ValueError:
+        return False
+    return "arms" not in settings and not {"shapes", "free"}.isdisjoint(settings)
 
 
 def _check_arm(folder: Path) -> list[str]:
@@ -112,6 +129,18 @@ def _check_scene(path: Path) -> list[str]:
     arms = {mount.arm.folder: mount.arm for mount in scene.mounts.values()}
     findings = [finding for arm in arms.values() for finding in _arm_findings(arm)]
     return findings + list(_scene_findings(scene))
+
+
+def _check_object(path: Path) -> list[str]:
+    try:
+        load_object(path)
+    except ValueError as error:
+        return [str(error)]
+    return []
+
+
+_CHECKS = {"arms": _check_arm, "scenes": _check_scene, "objects": _check_object}
+_SUMMARIES = {"arms": _sum_up_arm, "scenes": _sum_up_scene, "objects": _sum_up_object}
 
 
 def _arm_findings(arm: Arm) -> Iterator[str]:

@@ -22,6 +22,7 @@ from surgical_marl.robots.rotation import turned
 from surgical_marl.robots.spec import SOLREF
 from surgical_marl.scenes.build import build_scene, cached_model, compile_scene, weigh_shapes
 from surgical_marl.scenes.contacts import contact_pairs
+from surgical_marl.scenes.object_contacts import check_apart
 from surgical_marl.scenes.placing import add_objects, read_placements
 from surgical_marl.scenes.randomisation import read_randomisation
 from surgical_marl.scenes.scene import Mount, Scene
@@ -33,7 +34,7 @@ def load_scene(name: str | Path, control: str = "position") -> Scene:
     """Read a scene by a shipped name (`list_scenes()`) or the path of a YAML file.
 
     Raises:
-        ValueError: unknown name or control mode, or a file that is not a valid scene.
+        ValueError: unknown name or control mode, a file that is not a valid scene, or objects that overlap.
     """
     path = find("scenes", name)
     settings = read_yaml(path)
@@ -59,7 +60,9 @@ def load_scene(name: str | Path, control: str = "position") -> Scene:
         bare = scene(model=compile_scene(spec))
         for one, other in contact_pairs(bare):
             spec.add_pair(geomname1=one, geomname2=other, condim=1, solref=SOLREF)
-        return weigh_shapes(compile_scene(spec), bare.home)
+        model = weigh_shapes(compile_scene(spec), bare.home)
+        check_apart(scene(model=model))
+        return model
 
     about = repr((path.stem, control, settings))
     contents = (part for mount in mounts.values() for part in mount.arm.content)

@@ -9,14 +9,21 @@ as numbers.
 
 from __future__ import annotations
 
+from dataclasses import astuple
 from typing import Any
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 import mujoco
 import numpy as np
 
-from surgical_marl.robots.spec import COLLISION_GROUP
+from surgical_marl.robots.rotation import quaternion
+from surgical_marl.robots.spec import COLLISION_GROUP, PAD_GROUP
+from surgical_marl.scenes.object_contacts import direct_solref, touches
+from surgical_marl.scenes.objects import Object
 from surgical_marl.scenes.scene import Scene
+
+GRAVITY = (0.0, 0.0, -9.81)
+"""In scenes with objects, m/s2. It acts on objects only: arms are balanced."""
 
 
 def mjcf(scene: Scene) -> str:
@@ -28,13 +35,17 @@ def mjcf(scene: Scene) -> str:
     collision shapes of a link are in a body of their own within it, `<link>/contact`, which has no mass. The centre of
     that body is the point where the link's weight is the one in `scene.model` (`weigh_shapes` in `scenes/build.py`), or
     comes nearest to it.
+
+    A free object has a free joint of its name, after all joints of the arms; in `scene.model` it has none. Gravity acts
+    on objects, and contacts of objects are pairs with friction and a stiffness in N/m (`object_contacts.py`).
     """
     model = scene.model
     root = Element("mujoco", model=scene.name)
     _add(root, "compiler", angle="radian")
-    _add(root, "option", timestep=model.opt.timestep, gravity=model.opt.gravity,
+    _add(root, "option", timestep=model.opt.timestep, gravity=GRAVITY if scene.objects else model.opt.gravity,
          integrator=_word(mujoco.mjtIntegrator(model.opt.integrator)),
-         jacobian=_word(mujoco.mjtJacobian(model.opt.jacobian)))  # fmt: skip
+         jacobian=_word(mujoco.mjtJacobian(model.opt.jacobian)),
+         cone="elliptic" if scene.objects else None, impratio=10 if scene.objects else None)  # fmt: skip
     _add(_add(root, "default"), "geom", contype=0, conaffinity=0, mass=0)
     assets = _add(root, "asset")
     for mesh in map(model.mesh, range(model.nmesh)):
@@ -44,16 +55,25 @@ def mjcf(scene: Scene) -> str:
     bodies = [_add(root, "worldbody")]
     for body in range(model.nbody):
         if body > 0:
-            bodies.append(_add_body(bodies[model.body_parentid[body]], model, body))
+            place = scene.objects.get(model.body(body).name)
+            parent = bodies[model.body_parentid[body]]
+            bodies.append(_add_body(parent, model, body, bool(scene.objects), place.object if place else None))
         _add_parts(bodies[body], model, body)
     pairs = _add(root, "contact")
     for (one, other), pair in zip(scene.pairs, range(model.npair), strict=True):
         _add(pairs, "pair", geom1=one, geom2=other, condim=model.pair_dim[pair], solref=model.pair_solref[pair])
+    _add_touches(pairs, scene)
     _add_actuators(root, model)
     holding = np.where(model.actuator_biasprm[:, 1] != 0, scene.moment @ scene.home, 0.0)
-    _add(_add(root, "keyframe"), "key", name="home", qpos=scene.home, ctrl=holding)
+    _add(_add(root, "keyframe"), "key", name="home", qpos=_home(scene), ctrl=holding)
     indent(root)
     return tostring(root, encoding="unicode") + "\n"
+
+
+def _home(scene: Scene) -> np.ndarray:
+    """Return `qpos` of arms at home and of free objects where the scene has them."""
+    free = [place for place in scene.objects.values() if place.object.free]
+    return np.concatenate([scene.home, *((*place.position, *quaternion(place.rotation)) for place in free)])
 
 
 def _add(parent: Element, tag: str, **attributes: Any) -> Element:
@@ -73,8 +93,15 @@ def _word(value: Any) -> str:
     return str(value.name.split("_")[1].lower())
 
 
-def _add_body(parent: Element, model: mujoco.MjModel, body: int) -> Element:
-    element = _add(parent, "body", name=model.body(body).name, pos=model.body_pos[body], quat=model.body_quat[body])
+def _add_body(parent: Element, model: mujoco.MjModel, body: int, balanced: bool, item: Object | None) -> Element:
+    """Add a body: a link, balanced against gravity if asked for, or an object."""
+    balance = 1 if balanced and model.body_mass[body] > 0 else None
+    element = _add(parent, "body", name=model.body(body).name, pos=model.body_pos[body], quat=model.body_quat[body],
+                   gravcomp=balance)  # fmt: skip
+    if item is not None and item.free:
+        tensor = item.inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+        _add(element, "inertial", pos=item.center, mass=item.mass, fullinertia=tensor)
+        _add(element, "freejoint", name=model.body(body).name)
     if model.body_mass[body] > 0:
         _add(element, "inertial", pos=model.body_ipos[body], quat=model.body_iquat[body], mass=model.body_mass[body],
              diaginertia=model.body_inertia[body])  # fmt: skip
@@ -98,9 +125,10 @@ def _add_parts(element: Element, model: mujoco.MjModel, body: int) -> None:
         # with the link's axes, MuJoCo keeps the orientation of its shapes
         _add(touching, "inertial", pos=_contact_center(model, body, shapes[collides]), quat=model.body_iquat[body],
              mass=0, diaginertia=np.zeros(3))  # fmt: skip
-    for geom, touches in zip(shapes, collides, strict=True):
+    solid = collides | (model.geom_group[shapes] == PAD_GROUP)
+    for geom, touches_others in zip(shapes, solid, strict=True):
         kind, mesh = mujoco.mjtGeom(model.geom_type[geom]), int(model.geom_dataid[geom])
-        _add(touching if touches else element, "geom", name=model.geom(geom).name or None, type=_word(kind),
+        _add(touching if touches_others else element, "geom", name=model.geom(geom).name or None, type=_word(kind),
              size=model.geom_size[geom] if mesh < 0 else None, mesh=model.mesh(mesh).name if mesh >= 0 else None,
              pos=model.geom_pos[geom], quat=model.geom_quat[geom], group=model.geom_group[geom],
              rgba=model.geom_rgba[geom].astype(float).round(6))  # fmt: skip
@@ -112,6 +140,16 @@ def _add_parts(element: Element, model: mujoco.MjModel, body: int) -> None:
              quat=model.cam_quat[camera], fovy=model.cam_fovy[camera])  # fmt: skip
     for light in np.flatnonzero(model.light_bodyid == body):
         _add(element, "light", pos=model.light_pos[light], dir=model.light_dir[light])
+
+
+def _add_touches(pairs: Element, scene: Scene) -> None:
+    """Add the contacts of objects."""
+    for touch in touches(scene):
+        sliding, torsion, _ = astuple(touch.surface)
+        solref, solimp = direct_solref(touch.surface, touch.weight, scene.model.opt.timestep)
+        friction = [sliding, sliding, sliding * torsion, 0.0, 0.0]  # MuJoCo's torsion is a length times the coefficient
+        _add(pairs, "pair", geom1=touch.one, geom2=touch.other, condim=4, friction=friction, solref=solref,
+             solimp=solimp)  # fmt: skip
 
 
 def _contact_center(model: mujoco.MjModel, body: int, geoms: np.ndarray) -> np.ndarray:

@@ -147,8 +147,8 @@ class Endoscope:
 
 def _labels(scene: Scene) -> tuple[np.ndarray, tuple[str, ...]]:
     """For `labels[segmentation]`: whose a geom is, int32 [ngeom + 1], the last for -1; and the names of the labels."""
-    names = ("nothing", "tissue", *scene.agents)
+    names = ("nothing", "tissue", *scene.agents, *scene.objects)
     model = scene.model
     owners = [model.body(body).name.split("/")[0] for body in model.geom_bodyid]
-    own = [names.index(owner) if owner in scene.agents else 1 for owner in owners]
+    own = [names.index(owner) if owner in names[2:] else 1 for owner in owners]
     return np.array([*own, 0], np.int32), names

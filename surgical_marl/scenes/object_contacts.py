@@ -1,0 +1,117 @@
+"""Which shapes of a scene touch an object, and how: found by what they are, not by their names.
+
+An object can touch every arm and every other object, except that fixed objects don't touch each other. The plates of a
+jaw stand for their fingers; elsewhere the shapes are those that touch other arms too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import combinations, product
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from surgical_marl.robots.spec import COLLISION_GROUP, PAD_GROUP
+from surgical_marl.scenes.objects import JAW, LINK, Surface
+from surgical_marl.scenes.scene import Scene
+
+RESTING = 1e-5
+"""What lies on something at the start may reach this deep into it, m: numbers in files are rounded."""
+
+
+class Touch(NamedTuple):
+    """Two geoms that can touch."""
+
+    one: str
+    other: str
+    surface: Surface
+    """Of the contact."""
+    weight: float
+    """Sum of the inverse weights of the two bodies, 1/kg."""
+
+
+def check_apart(scene: Scene) -> None:
+    """Raise ValueError if an object overlaps another one at the start, or an arm at its home.
+
+    Fixed objects may overlap each other.
+    """
+    model, data = scene.model, mujoco.MjData(scene.model)
+    data.qpos[:] = scene.home
+    mujoco.mj_kinematics(model, data)
+    for touch in touches(scene):
+        one, other = (model.geom(name).id for name in (touch.one, touch.other))
+        depth = -mujoco.mj_geomDistance(model, data, one, other, 1.0, None)
+        if depth > RESTING:
+            raise ValueError(
+                f"scene {scene.name!r}: {touch.one!r} and {touch.other!r} overlap at the start by "
+                f"{1000 * depth:.3g} mm; move the object"
+            )
+
+
+class _Side(NamedTuple):
+    """A geom that can touch."""
+
+    name: str
+    surface: Surface
+    weight: float
+
+
+def touches(scene: Scene) -> Iterator[Touch]:
+    """Yield the pairs of geoms of which at least one is an object's, in the order of the scene."""
+    arms = [(True, _arm_sides(scene, agent)) for agent in scene.agents]
+    objects = [(place.object.free, _object_sides(scene, name)) for name, place in scene.objects.items()]
+    groups = [(True, moves, sides) for moves, sides in arms] + [(False, moves, sides) for moves, sides in objects]
+    for (arm, moves, sides), (other_arm, other_moves, others) in combinations(groups, 2):
+        if (arm and other_arm) or not (moves or other_moves):
+            continue
+        for one, other in product(sides, others):
+            yield Touch(one.name, other.name, one.surface.against(other.surface), one.weight + other.weight)
+
+
+def _arm_sides(scene: Scene, agent: str) -> list[_Side]:
+    model = scene.model
+    own = [geom for geom in range(model.ngeom) if model.geom(geom).name.startswith(f"{agent}/")]
+    pads = [geom for geom in own if model.geom_group[geom] == PAD_GROUP]
+    fingers = set(model.geom_bodyid[pads].tolist())
+    links = [
+        geom
+        for geom in own
+        if model.geom_group[geom] == COLLISION_GROUP and int(model.geom_bodyid[geom]) not in fingers
+    ]
+    weights = model.body_invweight0[model.geom_bodyid, 0]
+    return [
+        _Side(model.geom(geom).name, surface, float(weights[geom]))
+        for geoms, surface in ((pads, JAW), (links, LINK))
+        for geom in geoms
+    ]
+
+
+def _object_sides(scene: Scene, name: str) -> list[_Side]:
+    item = scene.objects[name].object
+    weight = 1 / item.mass if item.free else 0.0
+    return [_Side(f"{name}/{number}", item.surface, weight) for number in range(len(item.shapes))]
+
+
+def direct_solref(surface: Surface, weight: float, timestep: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return MuJoCo's `solref` and `solimp` of a contact point with a stiffness in N/m, critically damped.
+
+    MuJoCo's own stiffness k is an acceleration per depth. In a contact at rest the force is k / ((1 - d) weight) times
+    the depth, where d is the impedance, the same at all depths here. So k follows from d, which is as low as keeps k
+    within what a time step allows. Where even the greatest impedance, 0.9999, is not enough, the contact is softer than
+    asked for: it is then as stiff as the step allows.
+
+    Args:
+        surface: of the contact.
+        weight: sum of the inverse weights of the two bodies, 1/kg.
+        timestep: s.
+
+    Returns:
+        `solref` [2] in MuJoCo's direct format, (-stiffness, -damping), and `solimp` [5].
+    """
+    most = 1 / (2 * timestep) ** 2
+    per_share = surface.stiffness * weight
+    share = float(np.clip(most / per_share, 1e-4, 0.1))
+    stiffness = min(share * per_share, most)
+    return np.array([-stiffness, -2 * np.sqrt(stiffness)]), np.array([1 - share, 1 - share, 0.001, 0.5, 2.0])
