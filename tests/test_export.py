@@ -18,7 +18,7 @@ from surgical_marl.scenes.scene import Scene
 
 STEPS = 500
 FREE = scenes_without_objects()
-"""`tests/test_objects.py` has the others."""
+"""`tests/test_object_export.py` has the others."""
 CROSSED = {"bimanual_psm": [0.03, 0.02, 0.16], "trimanual_psm_ecm": [0.03, 0.02, 0.16]}
 """First joints of psm_0, at which it touches psm_1 with its own turned the other way."""
 
