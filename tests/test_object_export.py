@@ -12,6 +12,7 @@ import yaml
 import surgical_marl as sm
 from surgical_marl.robots.rotation import matrix_of
 from surgical_marl.scenes.mjcf import mjcf
+from surgical_marl.scenes.objects import JAW
 from surgical_marl.scenes.placing import scenes_without_objects
 from surgical_marl.scenes.scene import Scene
 
@@ -103,6 +104,23 @@ def test_a_contact_is_as_stiff_as_asked(tmp_path: Path) -> None:
     for _ in range(800):
         mujoco.mj_step(model, data)
     assert 0.005 - data.joint("ball").qpos[2] == pytest.approx(1 / 3e4 + 1 / 2e4, rel=0.01)
+
+
+def test_a_light_needle_has_its_full_stiffness_at_a_short_step() -> None:
+    """At 2.5 ms a contact with the jaw is softer than asked for, at 1 ms and less it is not."""
+    found = {}
+    for timestep in (0.0025, 0.001, 0.00025):
+        model = mujoco.MjModel.from_xml_string(mjcf(scene := sm.load_scene("psm_needle"), timestep))
+        assert model.opt.timestep == timestep
+        contact = {model.geom("needle/0").id, model.geom("psm_0/jaw_left_link/pad").id}
+        ids = zip(model.pair_geom1, model.pair_geom2, strict=True)
+        (pair,) = (number for number, geoms in enumerate(ids) if set(map(int, geoms)) == contact)
+        bodies = (model.body_invweight0[model.geom_bodyid[geom], 0] for geom in contact)
+        share = 1 - model.pair_solimp[pair, 0]
+        found[timestep] = -model.pair_solref[pair, 0] / (share * sum(bodies))
+    asked = scene.objects["needle"].object.surface.against(JAW).stiffness
+    assert found[0.001] == pytest.approx(asked, rel=1e-6) and found[0.00025] == pytest.approx(asked, rel=1e-6)
+    assert found[0.0025] < 0.2 * asked
 
 
 def test_a_scene_without_objects_exports_none() -> None:
