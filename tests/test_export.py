@@ -8,14 +8,17 @@ import mujoco
 import numpy as np
 import pytest
 
-from surgical_marl import list_scenes, load_scene
+from surgical_marl import load_scene
 from surgical_marl.cli.main import main
 from surgical_marl.robots.arm import CONTROL_MODES
 from surgical_marl.robots.spec import COLLISION_GROUP
 from surgical_marl.scenes.mjcf import mjcf
+from surgical_marl.scenes.placing import scenes_without_objects
 from surgical_marl.scenes.scene import Scene
 
 STEPS = 500
+FREE = scenes_without_objects()
+"""`tests/test_object_export.py` has the others."""
 CROSSED = {"bimanual_psm": [0.03, 0.02, 0.16], "trimanual_psm_ecm": [0.03, 0.02, 0.16]}
 """First joints of psm_0, at which it touches psm_1 with its own turned the other way."""
 
@@ -34,7 +37,7 @@ def start(scene: Scene) -> np.ndarray:
 
 
 @pytest.mark.parametrize("control", CONTROL_MODES)
-@pytest.mark.parametrize("name", list_scenes())
+@pytest.mark.parametrize("name", FREE)
 def test_it_steps_as_the_scene_does(name: str, control: str) -> None:
     """500 steps of random commands, qpos to 1e-9; with crossed arms they begin in contact."""
     scene = load_scene(name, control)
@@ -58,7 +61,7 @@ def test_it_steps_as_the_scene_does(name: str, control: str) -> None:
         assert touched > 50
 
 
-@pytest.mark.parametrize("name", list_scenes())
+@pytest.mark.parametrize("name", FREE)
 def test_it_is_the_same_model(name: str) -> None:
     scene = load_scene(name)
     ours, theirs = scene.model, written(scene)

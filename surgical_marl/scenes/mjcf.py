@@ -26,7 +26,7 @@ GRAVITY = (0.0, 0.0, -9.81)
 """In scenes with objects, m/s2. It acts on objects only: arms are balanced."""
 
 
-def mjcf(scene: Scene) -> str:
+def mjcf(scene: Scene, timestep: float | None = None) -> str:
     """Return the text of an MJCF file of a scene.
 
     The file has the same `qpos`, options, pairs and actuators as `scene.model`, and a keyframe `home`.
@@ -38,11 +38,16 @@ def mjcf(scene: Scene) -> str:
 
     A free object has a free joint of its name, after all joints of the arms; in `scene.model` it has none. Gravity acts
     on objects, and contacts of objects are pairs with friction and a stiffness in N/m (`object_contacts.py`).
+
+    Args:
+        scene: the scene.
+        timestep: of the file's physics, s; that of `scene.model` by default. Contacts of objects are as stiff as it
+            allows: those of a needle need 1 ms or less to have their full stiffness.
     """
-    model = scene.model
+    model, timestep = scene.model, timestep or scene.model.opt.timestep
     root = Element("mujoco", model=scene.name)
     _add(root, "compiler", angle="radian")
-    _add(root, "option", timestep=model.opt.timestep, gravity=GRAVITY if scene.objects else model.opt.gravity,
+    _add(root, "option", timestep=timestep, gravity=GRAVITY if scene.objects else model.opt.gravity,
          integrator=_word(mujoco.mjtIntegrator(model.opt.integrator)),
          jacobian=_word(mujoco.mjtJacobian(model.opt.jacobian)),
          cone="elliptic" if scene.objects else None, impratio=10 if scene.objects else None)  # fmt: skip
@@ -62,7 +67,7 @@ def mjcf(scene: Scene) -> str:
     pairs = _add(root, "contact")
     for (one, other), pair in zip(scene.pairs, range(model.npair), strict=True):
         _add(pairs, "pair", geom1=one, geom2=other, condim=model.pair_dim[pair], solref=model.pair_solref[pair])
-    _add_touches(pairs, scene)
+    _add_touches(pairs, scene, timestep)
     _add_actuators(root, model)
     holding = np.where(model.actuator_biasprm[:, 1] != 0, scene.moment @ scene.home, 0.0)
     _add(_add(root, "keyframe"), "key", name="home", qpos=_home(scene), ctrl=holding)
@@ -142,11 +147,11 @@ def _add_parts(element: Element, model: mujoco.MjModel, body: int) -> None:
         _add(element, "light", pos=model.light_pos[light], dir=model.light_dir[light])
 
 
-def _add_touches(pairs: Element, scene: Scene) -> None:
+def _add_touches(pairs: Element, scene: Scene, timestep: float) -> None:
     """Add the contacts of objects."""
     for touch in touches(scene):
         sliding, torsion, _ = astuple(touch.surface)
-        solref, solimp = direct_solref(touch.surface, touch.weight, scene.model.opt.timestep)
+        solref, solimp = direct_solref(touch.surface, touch.weight, timestep)
         friction = [sliding, sliding, sliding * torsion, 0.0, 0.0]  # MuJoCo's torsion is a length times the coefficient
         _add(pairs, "pair", geom1=touch.one, geom2=touch.other, condim=4, friction=friction, solref=solref,
              solimp=solimp)  # fmt: skip

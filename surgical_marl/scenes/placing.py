@@ -9,10 +9,16 @@ from typing import Any
 
 import mujoco
 
+from surgical_marl.content import find, list_scenes
 from surgical_marl.robots.rotation import quaternion, turned
 from surgical_marl.scenes.objects import Placement, add_shape, load_object
 from surgical_marl.scenes.surroundings import STILL
-from surgical_marl.yaml_file import check_keys, read_mapping, read_vector
+from surgical_marl.yaml_file import check_keys, read_mapping, read_vector, read_yaml
+
+
+def scenes_without_objects() -> list[str]:
+    """Return the names of the scenes in which arms have nothing to touch but each other."""
+    return [name for name in list_scenes() if not read_yaml(find("scenes", name)).get("objects")]
 
 
 def read_placements(settings: Any, agents: Iterable[str], path: Path) -> dict[str, Placement]:

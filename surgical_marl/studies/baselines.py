@@ -15,10 +15,11 @@ from typing import Any
 import yaml
 
 import surgical_marl.evaluation.goal_set
-from surgical_marl.content import BASELINES, list_scenes
+from surgical_marl.content import BASELINES
 from surgical_marl.evaluation.command import play_all
 from surgical_marl.evaluation.evaluate import summarise
 from surgical_marl.plugins.tasks import TASKS, list_tasks
+from surgical_marl.scenes.placing import scenes_without_objects
 
 HASHES = Path(surgical_marl.evaluation.goal_set.__file__).with_name("goal_sets.yaml")
 ERRORS = {"median_error_mm": "median error (mm)", "p95_error_mm": "95th percentile (mm)"}
@@ -48,7 +49,7 @@ def main(tasks: list[str]) -> None:
 
 def scenes(task: str) -> list[str]:
     """Where a task has a meaning."""
-    return ["ecm", "trimanual_psm_ecm"] if task == "match_image" else list_scenes()
+    return ["ecm", "trimanual_psm_ecm"] if task == "match_image" else scenes_without_objects()
 
 
 def table(rows: list[list[Any]]) -> str:
