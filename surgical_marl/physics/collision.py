@@ -58,7 +58,7 @@ class Pairs:
         self._radii = [model.geom_size[g, 0].astype(single) for g in self._geoms]
         bodies = [model.geom_bodyid[geoms] for geoms in self._geoms]
         self._weight = sum(model.body_invweight0[body, 0] for body in bodies).astype(single)
-        moved = _moved_bodies(model)
+        moved = moved_bodies(model)
         self._sign = (moved[bodies[1]] - moved[bodies[0]]).astype(single)
         self._roots = model.body_rootid[model.dof_bodyid]
 
@@ -103,7 +103,7 @@ class Pairs:
         return Touching(pair, -distance, jacobian * touching[:, None], jnp.asarray(self._weight)[pair])
 
 
-def _moved_bodies(model: mujoco.MjModel) -> np.ndarray:
+def moved_bodies(model: mujoco.MjModel) -> np.ndarray:
     """Which bodies each joint moves, [nbody, nv]."""
     moved = np.zeros((model.nbody, model.nv))
     for body in range(1, model.nbody):

@@ -1,0 +1,121 @@
+"""Free rigid bodies: the state of objects, the forces on them without contacts, and how they move."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import Array
+
+
+class Bodies(NamedTuple):
+    """The state of k free objects, in the world."""
+
+    position: Array
+    """Centres of mass, m, [k, 3]."""
+    quaternion: Array
+    """Orientation of the objects' frames, w, x, y, z, [k, 4]."""
+    velocity: Array
+    """Of the centres of mass, m/s, then angular, rad/s, both by the world's axes, [k, 6]."""
+    acceleration: Array
+    """Found by the last step, where the solver begins, [k, 6]."""
+
+
+class Masses(NamedTuple):
+    """Mass and inertia of k objects."""
+
+    mass: Array
+    """kg, [k]."""
+    inertia: Array
+    """About the centre of mass, by the axes of the object's frame, kg m2, [k, 3, 3]."""
+
+
+def rotation(quaternion: Array) -> Array:
+    """Return the rotation matrices [..., 3, 3] of unit quaternions [..., 4]."""
+    w, x, y, z = (quaternion[..., i] for i in range(4))
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    return jnp.stack([jnp.stack(row, -1) for row in rows], -2)
+
+
+def product(one: Array, other: Array) -> Array:
+    """Return the product of quaternions [..., 4]: first `other`, then `one`."""
+    a, u, b, v = one[..., :1], one[..., 1:], other[..., :1], other[..., 1:]
+    real = a * b - jnp.sum(u * v, -1, keepdims=True)
+    return jnp.concatenate([real, a * v + b * u + jnp.cross(u, v)], -1)
+
+
+def conjugate(quaternion: Array) -> Array:
+    """Return the inverse of unit quaternions [..., 4]."""
+    return quaternion * jnp.array([1.0, -1.0, -1.0, -1.0], jnp.float32)
+
+
+def turn(angle: Array) -> Array:
+    """Return the quaternion [..., 4] of a rotation vector [..., 3], rad."""
+    square = jnp.sum(angle * angle, -1, keepdims=True) / 4
+    half = jnp.sqrt(square)
+    small = square < 1e-4
+    share = jnp.where(small, 0.5 - square / 12, 0.5 * jnp.sin(half) / jnp.where(small, 1.0, half))
+    return jnp.concatenate([jnp.cos(half), share * angle], -1)
+
+
+def turned(angle: Array, quaternion: Array) -> Array:
+    """Return orientations [..., 4] after rotation vectors [..., 3] by the world's axes, as unit quaternions."""
+    moved = product(turn(angle), quaternion)
+    return moved / jnp.sqrt(jnp.sum(moved * moved, -1, keepdims=True))
+
+
+def inertias(masses: Masses, frames: Array) -> Array:
+    """Return the mass matrices [k, 6, 6] by the world's axes, from frames [k, 3, 3]."""
+    turning = frames @ masses.inertia @ jnp.swapaxes(frames, -1, -2)
+    moving = masses.mass[:, None, None] * jnp.eye(3)
+    none = jnp.zeros_like(turning)
+    return jnp.concatenate(
+        [jnp.concatenate([moving, none], -1), jnp.concatenate([none, turning], -1)], -2
+    )
+
+
+def free_acceleration(bodies: Bodies, masses: Masses, frames: Array, gravity: Array, dt: float) -> Array:
+    """Return the acceleration of objects that touch nothing, [k, 6].
+
+    The gyroscopic torque is implicit: one Newton step of Euler's equation at the end of the step, in the object's frame
+    (E. Catto, "Numerical Methods", Game Developers Conference 2015). Explicit, it would gain energy in every step.
+    """
+    spin = jnp.swapaxes(frames, -1, -2) @ bodies.velocity[:, 3:, None]
+    momentum = masses.inertia @ spin
+    torque = dt * jnp.cross(spin[..., 0], momentum[..., 0])
+    slope = masses.inertia + dt * (_skew(spin[..., 0]) @ masses.inertia - _skew(momentum[..., 0]))
+    change = -_solve3(slope, torque)
+    angular = (frames @ change[..., None])[..., 0] / dt
+    return jnp.concatenate([jnp.broadcast_to(gravity, angular.shape), angular], -1)
+
+
+def moved(bodies: Bodies, acceleration: Array, dt: float) -> Bodies:
+    """Return the bodies after a step with accelerations [k, 6]."""
+    velocity = bodies.velocity + dt * acceleration
+    return Bodies(
+        bodies.position + dt * velocity[:, :3],
+        turned(dt * velocity[:, 3:], bodies.quaternion),
+        velocity,
+        acceleration,
+    )
+
+
+def _skew(vector: Array) -> Array:
+    """Return the matrices [..., 3, 3] of the cross products with vectors [..., 3]."""
+    x, y, z = (vector[..., i] for i in range(3))
+    o = jnp.zeros_like(x)
+    rows = ((o, -z, y), (z, o, -x), (-y, x, o))
+    return jnp.stack([jnp.stack(row, -1) for row in rows], -2)
+
+
+def _solve3(matrix: Array, right: Array) -> Array:
+    """Return x with matrix @ x = right, [k, 3], by Cramer's rule."""
+    a, b, c = (matrix[..., i] for i in range(3))
+    bc, ca, ab = jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)
+    determinant = jnp.sum(a * bc, -1, keepdims=True)
+    dot = lambda one: jnp.sum(one * right, -1, keepdims=True)  # noqa: E731
+    return jnp.concatenate([dot(bc), dot(ca), dot(ab)], -1) / determinant

@@ -1,0 +1,233 @@
+"""What can touch objects in a scene, and the rows that these contacts add to the solver."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jax import Array
+
+from surgical_marl.physics.bodies import Bodies, conjugate, product, rotation, turn
+from surgical_marl.physics.collision import moved_bodies
+from surgical_marl.physics.cone import Cones, Forces
+from surgical_marl.physics.patches import AWAY, SLOTS, Patch, find_patch
+from surgical_marl.physics.shapes import Plate, Points, Segments, between_segments, on_plate
+from surgical_marl.physics.tables import Tables
+
+DAMPING = 5e-3
+"""Damping of a contact in the normal direction, s: this times its stiffness, N s/m."""
+DEEPEST = 3e-4
+"""Overlap that counts, m. A deeper one, as after a fall within one step, is pushed out no faster."""
+SHEAR = 0.8
+"""Stiffness of a contact along the surface, relative to that of a point along the normal (R. D. Mindlin, 1949: 2 (1 -
+nu) / (2 - nu) for materials of Poisson's ratio nu, 0.8 for 0.33)."""
+CREEP = 0.025
+"""Friction of a contact that remembers no position is a damper until it slips: this time, s, times its stiffness."""
+
+
+class Grips(NamedTuple):
+    """What friction remembers: where the object was in a finger's frame when the spring of friction was relaxed."""
+
+    position: Array
+    """Of the centre of mass in the finger's frame, m, [k, f, 3]."""
+    quaternion: Array
+    """[k, f, 4]"""
+    holds: Array
+    """Whether the finger pressed on the object at the end of the last step, [k, f] bool."""
+
+
+class Way(NamedTuple):
+    """How a body moves in a step at the velocity of now: a point p of it by shift + turn x p. World."""
+
+    shift: Array
+    """m, [3]"""
+    turn: Array
+    """rad, [3]"""
+
+    def soon(self, points: Points, other: Way) -> Array:
+        """Return the depth of points [c] between this body and another one after the step, m, [c]."""
+        shift = self.shift - other.shift + jnp.cross(self.turn - other.turn, points.place)
+        return points.depth - jnp.sum(shift * points.normal, -1)
+
+
+STILL = Way(jnp.zeros(3), jnp.zeros(3))
+
+
+class Felt(NamedTuple):
+    """Patches, and how they resist."""
+
+    patches: Patch
+    cones: Cones
+    slip: Array
+    """How far friction's springs are stretched, m, [g, 3]."""
+
+
+class Handling:
+    """The free objects of a scene, and all that can touch them or stands fixed in the world."""
+
+    def __init__(self, scene: Any) -> None:
+        self.tables = Tables(scene)
+        model = scene.model
+        moved = moved_bodies(model)
+        t = self.tables
+        self._roots, self._root_of = model.body_rootid[model.dof_bodyid], model.body_rootid
+        sign = lambda body: np.where(body[:, None] >= 0, moved[np.maximum(body, 0)], 0.0)  # noqa: E731
+        self._links = (sign(t.first_body) - sign(t.second_body)).astype(np.float32)
+        one_hot = lambda which: (which[:, None] == np.arange(t.count)).astype(np.float32)  # noqa: E731
+        self._objects = one_hot(t.first_object) - one_hot(t.second_object)
+
+    def find(self, data: Any, bodies: Bodies, dt: Any) -> Patch:
+        """Return all patches [g], in the order of `Tables`, from MJX's data with poses and velocities."""
+        t, frames = self.tables, rotation(bodies.quaternion)
+        own, pads, links = t.segments(bodies.position, frames), t.pads(data), t.links(data)
+        turns = dt * bodies.velocity[:, 3:]
+        ways = [*map(Way, dt * bodies.velocity[:, :3] - jnp.cross(turns, bodies.position), turns)]
+        finger_ways = [self._way(data, finger.body, dt) for finger in t.fingers]
+        link_ways = [self._way(data, body, dt) for body in t.link_bodies]
+        pick = lambda things, i: jax.tree.map(lambda x: x[i : i + 1], things)  # noqa: E731
+        found: list[Patch] = []
+
+        def add(one: Segments, way: Way, other: Plate | Segments, its: Way) -> None:
+            found.append(_patch(one, way, other, its, t.torsion[len(found)]))
+
+        for o in range(t.count):
+            mine = jax.tree.map(lambda x, o=o: x[o], own)
+            for f, its in enumerate(finger_ways):
+                add(mine, ways[o], pick(pads, f), its)
+            for i in t.bare:
+                add(mine, ways[o], pick(links, i), link_ways[i])
+            for fixed in (*t.plates, *t.posts):
+                add(mine, ways[o], fixed, STILL)
+            for other in range(o + 1, t.count):
+                add(mine, ways[o], jax.tree.map(lambda x, o=other: x[o], own), ways[other])
+        for i, way in enumerate(link_ways):
+            for fixed in (*t.plates, *t.posts):
+                add(pick(links, i), way, fixed, STILL)
+        return jax.tree.map(lambda *x: jnp.stack(x), *found)
+
+    def _way(self, data: Any, body: int, dt: Any) -> Way:
+        """Return how a link moves in a step."""
+        turn = dt * data.cvel[body, :3]
+        return Way(dt * data.cvel[body, 3:] - jnp.cross(turn, data.subtree_com[self._root_of[body]]), turn)
+
+    def feel(self, patches: Patch, data: Any, bodies: Bodies, qvel: Array, grips: Grips, dt: float) -> Felt:
+        """Return the rows of patches [g] on the joints of all arms and then on all objects."""
+        t = self.tables
+        velocity = jnp.concatenate([qvel, bodies.velocity.ravel()])
+        linear, _ = self._jacobians(data, bodies, patches.points.place)
+        normal = jnp.einsum("gsi,gsin->gsn", patches.points.normal, linear)
+        there = patches.points.depth > AWAY
+        k = jnp.where(there, jnp.asarray(t.stiffness)[:, None], 0.0)
+        rate = k * (dt + DAMPING)
+        speed = normal @ velocity
+        push = jnp.where(there, k * jnp.minimum(patches.points.depth, DEEPEST) - rate * speed, AWAY)
+        linear, angular = self._jacobians(data, bodies, patches.centre[:, None])
+        along = jnp.einsum("gti,gin->gtn", patches.frame[:, 1:], linear[:, 0])
+        about = patches.radius[:, None] * jnp.einsum("gi,gin->gn", patches.frame[:, 0], angular)
+        along = jnp.concatenate([along, about[:, None]], 1)
+        slip = self._slips(patches, data, bodies, grips)
+        k = SHEAR * jnp.asarray(t.stiffness)
+        springs = jnp.where(t.remembers, k, 0.0)
+        drag = jnp.where(t.remembers, k * (dt + DAMPING), k * CREEP)
+        pull = -springs[:, None] * slip - drag[:, None] * (along @ velocity)
+        cones = Cones(normal, dt * rate, push, along, dt * drag, pull, jnp.asarray(t.sliding))
+        return Felt(patches, cones, slip)
+
+    def _slips(self, patches: Patch, data: Any, bodies: Bodies, grips: Grips) -> Array:
+        """Return how far objects have moved along fingers since friction was relaxed, m, [g, 3]; 0 elsewhere."""
+        t = self.tables
+        slips = jnp.zeros((len(t.remembers), 3))
+        for (o, f), g in t.grip.items():
+            centre, frame = patches.centre[g], patches.frame[g]
+            place, axes = self._finger(data, f)
+            was = place + axes @ grips.position[o, f]
+            turned = product(bodies.quaternion[o], conjugate(product(_quaternion(axes), grips.quaternion[o, f])))
+            angle = 2 * turned[1:] * jnp.where(turned[0] < 0, -1.0, 1.0)
+            arm = centre - bodies.position[o]
+            shift = bodies.position[o] - was + jnp.cross(angle, arm)
+            slip = jnp.concatenate([frame[1:] @ shift, (patches.radius[g] * (frame[0] @ angle))[None]])
+            slips = slips.at[g].set(jnp.where(grips.holds[o, f], slip, 0.0))
+        return slips
+
+    def remember(
+        self, felt: Felt, forces: Forces, data: Any, bodies: Bodies, shift: Array, grips: Grips
+    ) -> Grips:
+        """Return what friction remembers after a step with these forces, in which everything moves by `shift` [n].
+
+        Where friction slips, its spring is stretched no further than its force says.
+        """
+        t, patches = self.tables, felt.patches
+        pressed = forces.normal.sum(-1)
+        after = felt.slip + felt.cones.along @ shift
+        springs = (SHEAR * jnp.asarray(t.stiffness))[:, None]
+        stretched = jnp.where(forces.slips[:, None], -forces.friction / springs, after)
+        excess = after - stretched
+        position, quaternion, holds = grips
+        for (o, f), g in t.grip.items():
+            place, axes = self._finger(data, f)
+            frame, centre, faces = patches.frame[g], patches.centre[g], _quaternion(axes)
+            # Kept as it is while nothing slips: rounding errors of a pose made anew in each step would add up.
+            along, about = excess[g, :2] @ frame[1:], turn(excess[g, 2] / patches.radius[g] * frame[0])
+            was, faced = place + axes @ position[o, f], product(faces, quaternion[o, f])
+            was, faced = centre + rotation(about) @ (was - centre) + along, product(about, faced)
+            new = ~holds[o, f]
+            was, faced = jnp.where(new, bodies.position[o] + along, was), jnp.where(new, bodies.quaternion[o], faced)
+            facing = product(conjugate(faces), faced)
+            moves = new | forces.slips[g]
+            position = position.at[o, f].set(jnp.where(moves, axes.T @ (was - place), position[o, f]))
+            quaternion = quaternion.at[o, f].set(jnp.where(moves, facing / jnp.linalg.norm(facing), quaternion[o, f]))
+            holds = holds.at[o, f].set(pressed[g] > 0)
+        return Grips(position, quaternion, holds)
+
+    def _finger(self, data: Any, f: int) -> tuple[Array, Array]:
+        body = self.tables.fingers[f].body
+        return data.xpos[body], data.xmat[body]
+
+    def _jacobians(self, data: Any, bodies: Bodies, places: Array) -> tuple[Array, Array]:
+        """Return the Jacobians of the relative velocity at places [g, s, 3], [g, s, 3, n] and [g, 3, n]."""
+        offset = places[:, :, None] - data.subtree_com[self._roots]  # [g, s, nv, 3]
+        links = jnp.asarray(self._links)
+        turning = data.cdof[:, :3]
+        moving = (data.cdof[:, 3:] + jnp.cross(turning, offset)) * links[:, None, :, None]
+        lever = places[:, :, None] - bodies.position  # [g, s, k, 3]
+        signs = jnp.asarray(self._objects)  # [g, k]
+        eye = jnp.eye(3)
+        linear = jnp.concatenate([jnp.broadcast_to(eye, (*lever.shape, 3)), jnp.cross(eye, lever[..., None, :])], -2)
+        linear = linear * signs[:, None, :, None, None]  # [g, s, k, 6, 3]
+        linear = linear.reshape(*places.shape[:2], -1, 3)
+        half = jnp.concatenate([jnp.zeros((3, 3)), eye])
+        angular = (signs[:, :, None, None] * half).reshape(len(signs), -1, 3)
+        spin = turning * links[:, :, None]
+        whole = jnp.swapaxes(jnp.concatenate([moving, linear], -2), -1, -2)
+        return whole, jnp.swapaxes(jnp.concatenate([spin, angular], -2), -1, -2)
+
+
+def _patch(one: Segments, way: Way, other: Plate | Segments, its: Way, torsion: Array) -> Patch:
+    """Return the patch of a body's capsules [c] on another's plates or capsules [d], and on which way both are."""
+    first, second = jax.tree.map(lambda x: x[:, None], one), jax.tree.map(lambda x: x[None], other)
+    if isinstance(second, Plate):
+        points, axes = on_plate(first, second), second.frame[0, 0, :, :2].T
+    else:
+        points, axes = between_segments(first, second), jnp.eye(3)[:2]
+    points = Points(points.depth.reshape(-1), points.place.reshape(-1, 3), points.normal.reshape(-1, 3))
+    return find_patch(points, way.soon(points, its), axes, torsion)
+
+
+def _quaternion(axes: Array) -> Array:
+    """Return the quaternion of a rotation matrix [3, 3]."""
+    m = axes
+    trace = m[0, 0] + m[1, 1] + m[2, 2]
+    sizes = jnp.stack([trace, m[0, 0], m[1, 1], m[2, 2]])
+    a, b, c = m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]
+    d, e, f = m[0, 1] + m[1, 0], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1]
+    rows = jnp.stack([
+        jnp.stack([1 + trace, a, b, c]),
+        jnp.stack([a, 1 + 2 * m[0, 0] - trace, d, e]),
+        jnp.stack([b, d, 1 + 2 * m[1, 1] - trace, f]),
+        jnp.stack([c, e, f, 1 + 2 * m[2, 2] - trace]),
+    ])
+    row = rows[jnp.argmax(sizes)]
+    return row / jnp.sqrt(jnp.sum(row * row))

@@ -1,0 +1,196 @@
+"""The constants of contact with objects: which bodies of a scene can touch, their shapes and surfaces.
+
+Patches are in one order everywhere: for each free object its patches with every finger, with every other link near it,
+with every fixed object (first plates, then capsules) and with the objects after it; then those of links with fixed
+objects.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jax import Array
+
+from surgical_marl.physics.bodies import Masses
+from surgical_marl.physics.patches import AWAY
+from surgical_marl.physics.shapes import Plate, Segments, plate_of_box
+from surgical_marl.robots.spec import COLLISION_GROUP, PAD_GROUP
+from surgical_marl.scenes.objects import JAW, LINK, Placement, Surface
+
+ENDLESS = 10.0
+"""Half side of the plate that stands for a plane, m."""
+
+
+class Finger(NamedTuple):
+    """The pad of a finger."""
+
+    agent: str
+    geom: int
+    body: int
+
+
+class Tables:
+    """Constants of a scene with objects."""
+
+    def __init__(self, scene: Any) -> None:
+        model = scene.model
+        free = {name: place for name, place in scene.objects.items() if place.object.free}
+        self.names, self.count = tuple(free), len(free)
+        self.fingers = tuple(
+            Finger(agent, int(g), int(model.geom_bodyid[g]))
+            for agent in scene.agents
+            for g in np.flatnonzero(model.geom_group == PAD_GROUP)
+            if model.geom(int(g)).name.startswith(f"{agent}/") and model.geom(int(g)).name.endswith("/pad")
+        )
+        self.near, self.bare = _near(scene)
+        self._read_free(free)
+        self._read_links(model)
+        self._read_fixed({n: place for n, place in scene.objects.items() if not place.object.free})
+        self._number(free)
+
+    # -- shapes where they are now
+
+    def segments(self, position: Array, frames: Array) -> Segments:
+        """Return the capsules of the objects [k, c] in the world; those that pad an object with fewer are far away."""
+        start, end = (
+            position[:, None] + jnp.matmul(jnp.asarray(x), jnp.swapaxes(frames, -1, -2)) for x in (self._start, self._end)
+        )
+        return Segments(start, end, jnp.asarray(self._radius))
+
+    def pads(self, data: Any) -> Plate:
+        """Return the plates of all fingers, [f]."""
+        geoms = np.array([finger.geom for finger in self.fingers], int)
+        frame = jnp.matmul(data.geom_xmat[geoms], jnp.asarray(self._pad_axes))
+        return Plate(data.geom_xpos[geoms], frame, jnp.asarray(self._pad_half), jnp.asarray(self._pad_radius))
+
+    def links(self, data: Any) -> Segments:
+        """Return the capsules of the other links that come near objects, [l]."""
+        centre, axis = data.geom_xpos[self.near], data.geom_xmat[self.near][:, :, 2]
+        half = jnp.asarray(self._link_half)[:, None]
+        return Segments(centre - half * axis, centre + half * axis, jnp.asarray(self._link_radius))
+
+    # -- set up
+
+    def _read_free(self, free: dict[str, Placement]) -> None:
+        most = max(len(place.object.shapes) for place in free.values())
+        shape = (self.count, most)
+        self._start, self._end = np.zeros((*shape, 3), np.float32), np.zeros((*shape, 3), np.float32)
+        self._radius = np.full(shape, 2 * AWAY, np.float32)  # of capsules that are not there
+        for o, place in enumerate(free.values()):
+            for c, part in enumerate(place.object.shapes):
+                if part.kind not in ("capsule", "sphere"):
+                    raise ValueError(f"object {place.object.name!r}: a free object is made of capsules and spheres, not "
+                                     f"of a {part.kind}")  # fmt: skip
+                half = part.size[1] * part.rotation[:, 2] if part.kind == "capsule" else np.zeros(3)
+                middle = part.position - place.object.center
+                self._start[o, c], self._end[o, c], self._radius[o, c] = middle - half, middle + half, part.size[0]
+        objects = [place.object for place in free.values()]
+        self.masses = Masses(
+            jnp.array([thing.mass for thing in objects], jnp.float32),
+            jnp.array(np.array([thing.inertia for thing in objects]), jnp.float32),
+        )
+        self.centers = np.array([thing.center for thing in objects], np.float32)
+
+    def _read_links(self, model: mujoco.MjModel) -> None:
+        plates = [plate_of_box(model.geom_size[finger.geom]) for finger in self.fingers]
+        single = lambda values, shape: np.array(values, np.float32).reshape(shape)  # noqa: E731
+        self._pad_axes = single([axes for axes, _, _ in plates], (-1, 3, 3))
+        self._pad_half = single([half for _, half, _ in plates], (-1, 2))
+        self._pad_radius = single([radius for _, _, radius in plates], (-1,))
+        capsule = model.geom_type[self.near] == mujoco.mjtGeom.mjGEOM_CAPSULE
+        self._link_half = single(np.where(capsule, model.geom_size[self.near, 1], 0.0), (-1,))
+        self._link_radius = single(model.geom_size[self.near, 0], (-1,))
+        self.link_bodies = model.geom_bodyid[self.near]
+
+    def _read_fixed(self, fixed: dict[str, Placement]) -> None:
+        self.plates: list[Plate] = []
+        self.posts: list[Segments] = []
+        self._plate_surfaces: list[Surface] = []
+        self._post_surfaces: list[Surface] = []
+        for place in fixed.values():
+            parts = place.object.shapes
+            flat = [_plate(part, place) for part in parts if part.kind in ("box", "plane")]
+            thin = [_segment(part, place) for part in parts if part.kind in ("capsule", "sphere")]
+            if flat:
+                self.plates.append(Plate(*(jnp.array(np.array(x), jnp.float32) for x in zip(*flat, strict=True))))
+                self._plate_surfaces.append(place.object.surface)
+            if thin:
+                self.posts.append(Segments(*(jnp.array(np.array(x), jnp.float32) for x in zip(*thin, strict=True))))
+                self._post_surfaces.append(place.object.surface)
+
+    def _number(self, free: dict[str, Placement]) -> None:
+        """Number the patches, and say of each which bodies it is between and how their surfaces feel."""
+        first_object, second_object, first_body, second_body, surfaces = [], [], [], [], []
+        self.grip: dict[tuple[int, int], int] = {}
+        """(object, finger) -> its patch."""
+
+        def add(surface: Surface, one: int = -1, other: int = -1, link: int = -1, second_link: int = -1) -> None:
+            first_object.append(one)
+            second_object.append(other)
+            first_body.append(link)
+            second_body.append(second_link)
+            surfaces.append(surface)
+
+        own = [place.object.surface for place in free.values()]
+        around = [*self._plate_surfaces, *self._post_surfaces]
+        for o, surface in enumerate(own):
+            for f, finger in enumerate(self.fingers):
+                self.grip[o, f] = len(surfaces)
+                add(surface.against(JAW), one=o, second_link=finger.body)
+            for body in self.link_bodies[self.bare]:
+                add(surface.against(LINK), one=o, second_link=int(body))
+            for other in around:
+                add(surface.against(other), one=o)
+            for other_object in range(o + 1, self.count):
+                add(surface.against(own[other_object]), one=o, other=other_object)
+        for body in self.link_bodies:
+            for other in around:
+                add(LINK.against(other), link=int(body))
+        self.first_object, self.second_object = np.array(first_object), np.array(second_object)
+        self.first_body, self.second_body = np.array(first_body), np.array(second_body)
+        column = lambda of: np.array([getattr(surface, of) for surface in surfaces], np.float32)  # noqa: E731
+        self.sliding, self.torsion, self.stiffness = column("sliding"), column("torsion"), column("stiffness")
+        self.remembers = np.isin(np.arange(len(surfaces)), list(self.grip.values()))
+
+
+def _near(scene: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return the geoms of links that come near objects, and which of these have no pad, which an object meets instead.
+
+    They are the links that the first three joints all move.
+    """
+    model, found = scene.model, []
+    for agent, mount in scene.mounts.items():
+        held = {pad.link for pad in mount.arm.jaw.pads} if mount.arm.jaw else set()
+        for geom in np.flatnonzero(model.geom_group == COLLISION_GROUP):
+            name, body = model.geom(int(geom)).name, int(model.geom_bodyid[geom])
+            if name.startswith(f"{agent}/") and _depth(model, body) >= 3:
+                found.append((int(geom), model.body(body).name.split("/")[1] in held))
+    return np.array([geom for geom, _ in found], int), np.flatnonzero([not holds for _, holds in found])
+
+
+def _depth(model: mujoco.MjModel, body: int) -> int:
+    """Return how many joints move a body."""
+    count = 0
+    while body > 0:
+        count += int(model.body_jntnum[body])
+        body = int(model.body_parentid[body])
+    return count
+
+
+def _plate(part: Any, place: Placement) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """Return centre, frame, half sides of the core and radius of a box or plane in the world."""
+    axes, half, radius = np.eye(3), np.full(2, ENDLESS), 0.0
+    if part.kind == "box":
+        axes, half, radius = plate_of_box(part.size)
+    frame = place.rotation @ part.rotation @ axes
+    return place.position + place.rotation @ part.position, frame, half, radius
+
+
+def _segment(part: Any, place: Placement) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return the ends and the radius of a capsule or sphere in the world."""
+    centre, axes = place.position + place.rotation @ part.position, place.rotation @ part.rotation
+    half = part.size[1] * axes[:, 2] if part.kind == "capsule" else np.zeros(3)
+    return centre - half, centre + half, float(part.size[0])
