@@ -9,7 +9,7 @@ from jax import Array
 
 from surgical_marl.envs.env import Carry, Env, State
 from surgical_marl.physics.dynamics import Physics
-from surgical_marl.physics.views import Contacts, Touch
+from surgical_marl.physics.views import Contacts
 
 
 class PhysicsAlone(Env):
@@ -33,8 +33,7 @@ class PhysicsAlone(Env):
     def step(self, carry: Carry, actions: dict[str, Array], parameters: Any = None) -> State:
         """Do one physics step; there are no actions."""
         _, distance = self.simulator._look(carry.physics.qpos)
-        nothing = jnp.zeros_like(distance)
-        physics, _ = self.simulator._step(carry.physics, Touch(nothing, nothing))
+        physics, _ = self.simulator._step(carry.physics, self.simulator.untouched)
         return self._state(carry, physics, distance)
 
     @property

@@ -70,7 +70,8 @@ class State(NamedTuple):
     """That of this step's episode, even if the episode ended."""
     final_state: Array
     infos: dict[str, dict[str, Array]]
-    """success, collision, min_distance (m), contact_force (N); `stage_<name>` and the task's own metrics, such as
+    """success, collision, min_distance (m), contact_force (N); with free objects `holding` any of them, and of each
+    `<object>_force` (N), `<object>_holding` and `<object>_slip` (m); `stage_<name>` and the task's own metrics, such as
     tip_error (m); `reward_<term>`, the weighted terms that the reward is the sum of; `cost_<name>`, the limits broken
     (`surgical_marl/envs/costs.py`), and their number `cost`. Of this step's episode, even if it ended."""
     contacts: Contacts
@@ -229,7 +230,7 @@ class Env:
         task, _ = self._bound(parameters)
         carry, contacts, arms = self._start(task, key, jnp.int32(episode))
         observations, state = self._observe(task, carry, contacts, arms)
-        world = World(arms, carry.goal, self._unsensed())
+        world = World(arms, carry.goal, self._unsensed(), self.simulator.objects(carry.physics))
         nothing = jax.tree.map(jnp.zeros_like, task.reward_terms(world))
         return State(
             carry=carry,
@@ -266,7 +267,7 @@ class Env:
         task, max_steps = self._bound(parameters)
         carry, contacts = moved.carry, moved.contacts
         arms = {agent: moved.arms[agent] for agent in self.agents}  # JAX sorts them by name
-        world = World(arms, carry.goal, sensed)
+        world = World(arms, carry.goal, sensed, self.simulator.objects(carry.physics))
         terms = task.rewards(world)
         terminated = task.terminated(world)
         truncated = (carry.steps >= max_steps) & ~terminated
@@ -321,7 +322,8 @@ class Env:
     ) -> tuple[dict[str, Array], Array]:
         """Return what policies observe, and what critics observe, of arms that are as in `arms`."""
         noise = jax.random.fold_in(jax.random.fold_in(jax.random.fold_in(carry.key, carry.episode), NOISE), carry.steps)
-        world = World(self.plant.measure(carry.physics, carry.hidden, contacts, arms, noise), carry.goal)
+        measured = self.plant.measure(carry.physics, carry.hidden, contacts, arms, noise)
+        world = World(measured, carry.goal, objects=self.simulator.objects(carry.physics))
         observations, every = {}, []
         for agent, seen in self.observed.items():
             observations[agent] = seen.read(task, world)
@@ -342,11 +344,22 @@ class Env:
                 "contact_force": view.contact_force,
                 **{f"stage_{name}": reached for name, reached in stages[agent].items()},
                 **{f"reward_{name}": value for name, value in terms[agent].items()},
+                **_handling(view),
                 "cost": sum((cost.astype(jnp.float32) for cost in broken.values()), start=jnp.float32(0.0)),
                 **{f"cost_{name}": cost for name, cost in broken.items()},
                 **metrics[agent],
             }
         return infos
+
+
+def _handling(view: ArmView) -> dict[str, Array]:
+    """Return the infos about the objects that an arm handles; none in a scene without free objects."""
+    if not view.handles:
+        return {}
+    infos = {"holding": jnp.stack([handled.holding for handled in view.handles.values()]).any()}
+    for name, handled in view.handles.items():
+        infos |= {f"{name}_{field}": value for field, value in handled._asdict().items()}
+    return infos
 
 
 def _box(low: np.ndarray, high: np.ndarray) -> spaces.Box:

@@ -54,9 +54,10 @@ class Forces(NamedTuple):
 
 
 class Solution(NamedTuple):
-    """Acceleration [n], forces of patches, and Newton steps taken []."""
+    """Acceleration [n], forces of rows [r] and of patches, and Newton steps taken []."""
 
     acceleration: Array
+    rows: Array
     forces: Forces
     steps: Array
 
@@ -152,8 +153,8 @@ def solve_contacts(
         return x, settled, count + 1
 
     x, _, count = jax.lax.while_loop(going, iterate, (start, jnp.bool_(False), jnp.int32(0)))
-    _, push, pull = sticking(x)
-    return Solution(x, within_cone(cones, push, pull), count)
+    row, push, pull = sticking(x)
+    return Solution(x, jnp.clip(row, rows.low, rows.high), within_cone(cones, push, pull), count)
 
 
 TOLERANCE = 1e-2

@@ -33,6 +33,8 @@ class Physics(NamedTuple):
     qacc_warmstart: Array
     ctrl: Array
     """Command of every actuator: position target, velocity or torque."""
+    objects: Any = ()
+    """The free objects (`surgical_marl/physics/together.py`), in a scene that has any."""
 
 
 class Forces(NamedTuple):
@@ -74,7 +76,8 @@ class Dynamics:
 
     def forces(self, physics: Physics) -> Forces:
         """Compute all of `mjx.forward` except collision and solver."""
-        data = self._data.replace(**physics._asdict())
+        qpos, qvel, warmstart, ctrl, _ = physics
+        data = self._data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart, ctrl=ctrl)
         for stage in ("fwd_position", "fwd_velocity", "fwd_actuation"):
             data = getattr(self._mjx, stage)(self.model, data)
         smooth = data.qfrc_passive - data.qfrc_bias + data.qfrc_actuator
@@ -96,7 +99,7 @@ class Dynamics:
         """Return the state one step later. The integration is implicit in the forces that depend on velocity."""
         change = solve_positive(forces.mass + self.dt * forces.damping, forces.mass @ qacc)
         qvel = physics.qvel + self.dt * change
-        return Physics(physics.qpos + self.dt * qvel, qvel, qacc, physics.ctrl)
+        return physics._replace(qpos=physics.qpos + self.dt * qvel, qvel=qvel, qacc_warmstart=qacc)
 
     def _rows(self, data: Any) -> Rows:
         rows = _internal(data)

@@ -29,14 +29,18 @@ CREEP = 0.025
 
 
 class Grips(NamedTuple):
-    """What friction remembers: where the object was in a finger's frame when the spring of friction was relaxed."""
+    """How k objects are held by f fingers of a arms, and what friction remembers of it."""
 
     position: Array
-    """Of the centre of mass in the finger's frame, m, [k, f, 3]."""
+    """Centre of mass in the finger's frame when the spring of friction was relaxed, m, [k, f, 3]."""
     quaternion: Array
-    """[k, f, 4]"""
-    holds: Array
-    """Whether the finger pressed on the object at the end of the last step, [k, f] bool."""
+    """Orientation likewise, [k, f, 4]."""
+    force: Array
+    """Normal force of the finger at the end of the last step, N, [k, f]; 0 where it does not touch."""
+    slid: Array
+    """How far the object has slid along the finger since it was touched, m, [k, f]."""
+    held: Array
+    """For how long the arm has held the object, s, [k, a]: both fingers press, from opposite sides."""
 
 
 class Way(NamedTuple):
@@ -53,7 +57,7 @@ class Way(NamedTuple):
         return points.depth - jnp.sum(shift * points.normal, -1)
 
 
-STILL = Way(jnp.zeros(3), jnp.zeros(3))
+STILL = Way(np.zeros(3, np.float32), np.zeros(3, np.float32))  # type: ignore[arg-type]
 
 
 class Felt(NamedTuple):
@@ -65,11 +69,20 @@ class Felt(NamedTuple):
     """How far friction's springs are stretched, m, [g, 3]."""
 
 
+OPPOSITE = float(np.cos(np.radians(25.0)))
+"""Cosine of the angle by which the normals of two fingers that hold an object may miss being opposite. Like the force it
+is of Isaac Lab's test whether a needle is held (pull request 6570)."""
+SPARE = 0.5
+"""Acceleration that the friction of a held object can take besides gravity, m/s2."""
+DWELL = 1.0 / 30.0
+"""Time that fingers must press before an object counts as held, s."""
+
+
 class Handling:
     """The free objects of a scene, and all that can touch them or stands fixed in the world."""
 
-    def __init__(self, scene: Any) -> None:
-        self.tables = Tables(scene)
+    def __init__(self, scene: Any, arms: bool = True) -> None:
+        self.tables = Tables(scene, arms)
         model = scene.model
         moved = moved_bodies(model)
         t = self.tables
@@ -79,14 +92,23 @@ class Handling:
         one_hot = lambda which: (which[:, None] == np.arange(t.count)).astype(np.float32)  # noqa: E731
         self._objects = one_hot(t.first_object) - one_hot(t.second_object)
 
-    def find(self, data: Any, bodies: Bodies, dt: Any) -> Patch:
-        """Return all patches [g], in the order of `Tables`, from MJX's data with poses and velocities."""
+    def find(self, data: Any, bodies: Bodies, moving: Any = None, dt: Any = 0.0) -> Patch:
+        """Return all patches [g], in the order of `Tables`.
+
+        Args:
+            data: MJX's data with the poses of the arms.
+            bodies: the objects.
+            moving: the same with velocities; None if the arms count as standing.
+            dt: time over which motions are looked ahead, s.
+        """
         t, frames = self.tables, rotation(bodies.quaternion)
-        own, pads, links = t.segments(bodies.position, frames), t.pads(data), t.links(data)
+        own = t.segments(bodies.position, frames)
+        pads = t.pads(data) if t.fingers else None
+        links = t.links(data) if len(t.near) else None
         turns = dt * bodies.velocity[:, 3:]
         ways = [*map(Way, dt * bodies.velocity[:, :3] - jnp.cross(turns, bodies.position), turns)]
-        finger_ways = [self._way(data, finger.body, dt) for finger in t.fingers]
-        link_ways = [self._way(data, body, dt) for body in t.link_bodies]
+        finger_ways = [self._way(moving, finger.body, dt) for finger in t.fingers]
+        link_ways = [self._way(moving, body, dt) for body in t.link_bodies]
         pick = lambda things, i: jax.tree.map(lambda x: x[i : i + 1], things)  # noqa: E731
         found: list[Patch] = []
 
@@ -110,6 +132,8 @@ class Handling:
 
     def _way(self, data: Any, body: int, dt: Any) -> Way:
         """Return how a link moves in a step."""
+        if data is None:
+            return STILL
         turn = dt * data.cvel[body, :3]
         return Way(dt * data.cvel[body, 3:] - jnp.cross(turn, data.subtree_com[self._root_of[body]]), turn)
 
@@ -149,11 +173,11 @@ class Handling:
             arm = centre - bodies.position[o]
             shift = bodies.position[o] - was + jnp.cross(angle, arm)
             slip = jnp.concatenate([frame[1:] @ shift, (patches.radius[g] * (frame[0] @ angle))[None]])
-            slips = slips.at[g].set(jnp.where(grips.holds[o, f], slip, 0.0))
+            slips = slips.at[g].set(jnp.where(grips.force[o, f] > 0, slip, 0.0))
         return slips
 
     def remember(
-        self, felt: Felt, forces: Forces, data: Any, bodies: Bodies, shift: Array, grips: Grips
+        self, felt: Felt, forces: Forces, data: Any, bodies: Bodies, shift: Array, grips: Grips, dt: Any
     ) -> Grips:
         """Return what friction remembers after a step with these forces, in which everything moves by `shift` [n].
 
@@ -165,7 +189,7 @@ class Handling:
         springs = (SHEAR * jnp.asarray(t.stiffness))[:, None]
         stretched = jnp.where(forces.slips[:, None], -forces.friction / springs, after)
         excess = after - stretched
-        position, quaternion, holds = grips
+        position, quaternion, force, slid = grips[:4]
         for (o, f), g in t.grip.items():
             place, axes = self._finger(data, f)
             frame, centre, faces = patches.frame[g], patches.centre[g], _quaternion(axes)
@@ -173,14 +197,28 @@ class Handling:
             along, about = excess[g, :2] @ frame[1:], turn(excess[g, 2] / patches.radius[g] * frame[0])
             was, faced = place + axes @ position[o, f], product(faces, quaternion[o, f])
             was, faced = centre + rotation(about) @ (was - centre) + along, product(about, faced)
-            new = ~holds[o, f]
+            new = grips.force[o, f] <= 0
             was, faced = jnp.where(new, bodies.position[o] + along, was), jnp.where(new, bodies.quaternion[o], faced)
             facing = product(conjugate(faces), faced)
             moves = new | forces.slips[g]
             position = position.at[o, f].set(jnp.where(moves, axes.T @ (was - place), position[o, f]))
             quaternion = quaternion.at[o, f].set(jnp.where(moves, facing / jnp.linalg.norm(facing), quaternion[o, f]))
-            holds = holds.at[o, f].set(pressed[g] > 0)
-        return Grips(position, quaternion, holds)
+            force = force.at[o, f].set(pressed[g])
+            way = jnp.sqrt(jnp.sum(excess[g, :2] ** 2))
+            slid = slid.at[o, f].set(jnp.where(new, 0.0, slid[o, f] + jnp.where(forces.slips[g], way, 0.0)))
+        return Grips(position, quaternion, force, slid, self._held(patches, pressed, grips.held, dt))
+
+    def _held(self, patches: Patch, pressed: Array, held: Array, dt: Any) -> Array:
+        """Return for how long each arm has held each object, s, [k, a]."""
+        t = self.tables
+        for o in range(t.count):
+            for a, (one, other) in t.jaws.items():
+                g, h = t.grip[o, one], t.grip[o, other]
+                least = t.masses.mass[o] * (9.81 + SPARE) / t.sliding[g] * jnp.where(held[o, a] > 0, 0.5, 1.0)
+                presses = (pressed[g] >= least) & (pressed[h] >= least)
+                opposite = jnp.sum(patches.frame[g, 0] * patches.frame[h, 0]) <= -OPPOSITE
+                held = held.at[o, a].set(jnp.where(presses & opposite, held[o, a] + dt, 0.0))
+        return held
 
     def _finger(self, data: Any, f: int) -> tuple[Array, Array]:
         body = self.tables.fingers[f].body
@@ -188,18 +226,18 @@ class Handling:
 
     def _jacobians(self, data: Any, bodies: Bodies, places: Array) -> tuple[Array, Array]:
         """Return the Jacobians of the relative velocity at places [g, s, 3], [g, s, 3, n] and [g, 3, n]."""
+        lever = places[:, :, None] - bodies.position  # [g, s, k, 3]
+        signs, eye = jnp.asarray(self._objects), jnp.eye(3)  # [g, k]
+        linear = jnp.concatenate([jnp.broadcast_to(eye, (*lever.shape, 3)), jnp.cross(eye, lever[..., None, :])], -2)
+        linear = (linear * signs[:, None, :, None, None]).reshape(*places.shape[:2], -1, 3)  # [g, s, 6 k, 3]
+        half = jnp.concatenate([jnp.zeros((3, 3)), eye])
+        angular = (signs[:, :, None, None] * half).reshape(len(signs), -1, 3)
+        if data is None:
+            return jnp.swapaxes(linear, -1, -2), jnp.swapaxes(angular, -1, -2)
         offset = places[:, :, None] - data.subtree_com[self._roots]  # [g, s, nv, 3]
         links = jnp.asarray(self._links)
         turning = data.cdof[:, :3]
         moving = (data.cdof[:, 3:] + jnp.cross(turning, offset)) * links[:, None, :, None]
-        lever = places[:, :, None] - bodies.position  # [g, s, k, 3]
-        signs = jnp.asarray(self._objects)  # [g, k]
-        eye = jnp.eye(3)
-        linear = jnp.concatenate([jnp.broadcast_to(eye, (*lever.shape, 3)), jnp.cross(eye, lever[..., None, :])], -2)
-        linear = linear * signs[:, None, :, None, None]  # [g, s, k, 6, 3]
-        linear = linear.reshape(*places.shape[:2], -1, 3)
-        half = jnp.concatenate([jnp.zeros((3, 3)), eye])
-        angular = (signs[:, :, None, None] * half).reshape(len(signs), -1, 3)
         spin = turning * links[:, :, None]
         whole = jnp.swapaxes(jnp.concatenate([moving, linear], -2), -1, -2)
         return whole, jnp.swapaxes(jnp.concatenate([spin, angular], -2), -1, -2)

@@ -21,7 +21,8 @@ from jax import Array
 from surgical_marl.physics.collision import Pairs
 from surgical_marl.physics.dynamics import Dynamics, Physics
 from surgical_marl.physics.solver import Rows, solve
-from surgical_marl.physics.views import ArmView, Contacts, Touch
+from surgical_marl.physics.together import Together
+from surgical_marl.physics.views import ArmView, Contacts, ObjectView, Touch
 from surgical_marl.scenes.build import alone
 from surgical_marl.scenes.scene import PAYLOAD, Scene
 from surgical_marl.scenes.timing import DECIMATION
@@ -67,7 +68,7 @@ class Kind:
 
         (own, _), _ = jax.lax.scan(next_arm, (own, others), None, length=len(dofs))
         qpos, qvel, qacc = (part.at[dofs].set(found) for part, found in zip(physics[:3], own[:3], strict=True))
-        return Physics(qpos, qvel, qacc, physics.ctrl)
+        return physics._replace(qpos=qpos, qvel=qvel, qacc_warmstart=qacc)
 
 
 class Simulator:
@@ -82,6 +83,7 @@ class Simulator:
         self._fields: dict[str, Array] = {}
         self._pairs, self._together = Pairs(scene.model), Dynamics(scene.model)
         self._kinds = [Kind(scene, agents) for agents in scene.types.values()]
+        self._objects = Together(scene, self._together, self._pairs) if scene.objects else None
         self.decimation, self.control_dt = decimation, decimation * scene.model.opt.timestep
         self._index_joints()
         self._index_pairs()
@@ -95,7 +97,7 @@ class Simulator:
     def at(self, qpos: Array) -> Physics:
         """Return all arms at rest at joint positions [nq] of the scene, with the commands that keep them there."""
         still = jnp.zeros(self.scene.model.nv, jnp.float32)
-        return Physics(qpos, still, still, self._holding(qpos))
+        return Physics(qpos, still, still, self._holding(qpos), self._objects.start(self.scene) if self._objects else ())
 
     def _holding(self, qpos: Any) -> Any:
         """Return the commands [nu] that keep the arms where they are."""
@@ -140,11 +142,20 @@ class Simulator:
         def substep(state: tuple[Physics, Touch], _: None) -> tuple[tuple[Physics, Touch], None]:
             return step(*state), None
 
-        none = jnp.zeros(self._pairs.count, jnp.float32)
-        (physics, touch), _ = jax.lax.scan(substep, (physics, Touch(none, none)), None, length=self.decimation)
+        (physics, touch), _ = jax.lax.scan(substep, (physics, self.untouched), None, length=self.decimation)
         tips, distance = self._look(physics.qpos)
         contacts = Contacts(distance, jnp.maximum(touch.penetration, -distance), touch.force)
-        return physics, contacts, self._view(jnp, physics, tips, contacts)
+        return physics, contacts, self._view(jnp, physics, tips, contacts, touch.handled)
+
+    @property
+    def untouched(self) -> Touch:
+        """Return the touch of a control step so far, at its beginning."""
+        none = jnp.zeros(self._pairs.count, jnp.float32)
+        return Touch(none, none, jnp.zeros(len(self.scene.agents) if self._objects else 0, jnp.float32))
+
+    def objects(self, physics: Physics) -> dict[str, ObjectView]:
+        """Return the view of every free object of the scene, by name."""
+        return self._objects.views(physics.objects) if self._objects else {}
 
     def varied(self, stiffness: Array, damping: Array, friction: Array, payload: Array, offset: Array) -> Simulator:
         """Return a copy of this simulator whose arms differ from their models.
@@ -199,6 +210,8 @@ class Simulator:
 
         Arms that touch nothing do not affect each other, so each is stepped on its own.
         """
+        if self._objects:
+            return self._objects.step(physics, touch, self._fields, self._apart)
         if not self._pairs.count:
             return self._apart(physics, touch)
         data = self._together.pose(physics.qpos)
@@ -221,11 +234,22 @@ class Simulator:
         qacc, force = solve(forces.mass, forces.smooth, joined, start, *TOUCHING_ITERATIONS)
         its_own = touching.pair == np.arange(self._pairs.count)[:, None]
         each = jnp.where(its_own, force[len(forces.rows.low) :], 0.0).sum(-1)
-        hardest = Touch(jnp.maximum(touch.penetration, -closest.distance), jnp.maximum(touch.force, each))
+        deepest = jnp.maximum(touch.penetration, -closest.distance)
+        hardest = touch._replace(penetration=deepest, force=jnp.maximum(touch.force, each))
         return dynamics.moved(physics, forces, qacc), hardest
 
-    def _view(self, xp: Any, physics: Physics, tips: Any, contacts: Contacts) -> dict[str, ArmView]:
-        """Return the views, from tool tips [arms, 3] in the world, computed with the array library `xp`."""
+    def _view(
+        self, xp: Any, physics: Physics, tips: Any, contacts: Contacts, handled: Any = None
+    ) -> dict[str, ArmView]:
+        """Return the views, computed with the array library `xp`.
+
+        Args:
+            xp: numpy or JAX's.
+            physics: the state.
+            tips: tool tips in the world, [arms, 3].
+            contacts: of arms with each other.
+            handled: the largest force of objects and fixed things on each arm, N, [arms]; None without any.
+        """
         views = {}
         for i, agent in enumerate(self.scene.agents):
             mount, touching = self.scene.mounts[agent], self._touching[agent]
@@ -242,7 +266,8 @@ class Simulator:
                 nearest_tip=nearest @ mount.rotation.astype(tips.dtype),
                 min_distance=contacts.distance[near].min(initial=np.inf),
                 collision=contacts.penetration[touching].max(initial=0.0) > 0,
-                contact_force=contacts.force[touching].max(initial=0.0),
+                contact_force=contacts.force[touching].max(initial=0.0 if handled is None else handled[i]),
+                handles=self._objects.handles(physics.objects, i) if self._objects else {},
             )
         return views
 
@@ -296,7 +321,8 @@ class Simulator:
         distance = np.array([mujoco.mj_geomDistance(model, data, a, b, 100.0, None) for a, b in ids])
         still = np.zeros(model.nv)
         contacts: Any = Contacts(distance, np.maximum(-distance, 0.0), 0.0 * distance)  # type: ignore[arg-type]
-        physics: Any = Physics(self.scene.home, still, still, self._holding(self.scene.home))  # type: ignore[arg-type]
+        objects = self._objects.start(self.scene) if self._objects else ()
+        physics: Any = Physics(self.scene.home, still, still, self._holding(self.scene.home), objects)  # type: ignore[arg-type]
         views = self._view(np, physics, data.site_xpos[list(self._sites.values())], contacts)
         single = lambda x: jnp.asarray(x, jnp.bool_ if x.dtype == bool else jnp.float32)  # noqa: E731
         # one by one: JAX would sort the agents by name

@@ -33,9 +33,9 @@ class Finger(NamedTuple):
 
 
 class Tables:
-    """Constants of a scene with objects."""
+    """Constants of a scene with objects, or of its objects alone."""
 
-    def __init__(self, scene: Any) -> None:
+    def __init__(self, scene: Any, arms: bool = True) -> None:
         model = scene.model
         free = {name: place for name, place in scene.objects.items() if place.object.free}
         self.names, self.count = tuple(free), len(free)
@@ -43,13 +43,17 @@ class Tables:
             Finger(agent, int(g), int(model.geom_bodyid[g]))
             for agent in scene.agents
             for g in np.flatnonzero(model.geom_group == PAD_GROUP)
-            if model.geom(int(g)).name.startswith(f"{agent}/") and model.geom(int(g)).name.endswith("/pad")
+            if arms and model.geom(int(g)).name.startswith(f"{agent}/")
         )
-        self.near, self.bare = _near(scene)
+        owners = [finger.agent for finger in self.fingers]
+        self.jaws = {a: tuple(np.flatnonzero(np.array(owners) == agent)) for a, agent in enumerate(scene.agents)
+                     if owners.count(agent) == 2}  # fmt: skip
+        """Number of an arm -> its two fingers."""
+        self.near, self.bare = _near(scene) if arms else (np.zeros(0, int), np.zeros(0, int))
         self._read_free(free)
         self._read_links(model)
         self._read_fixed({n: place for n, place in scene.objects.items() if not place.object.free})
-        self._number(free)
+        self._number(free, model, scene.agents)
 
     # -- shapes where they are now
 
@@ -75,7 +79,7 @@ class Tables:
     # -- set up
 
     def _read_free(self, free: dict[str, Placement]) -> None:
-        most = max(len(place.object.shapes) for place in free.values())
+        most = max((len(place.object.shapes) for place in free.values()), default=1)
         shape = (self.count, most)
         self._start, self._end = np.zeros((*shape, 3), np.float32), np.zeros((*shape, 3), np.float32)
         self._radius = np.full(shape, 2 * AWAY, np.float32)  # of capsules that are not there
@@ -89,10 +93,10 @@ class Tables:
                 self._start[o, c], self._end[o, c], self._radius[o, c] = middle - half, middle + half, part.size[0]
         objects = [place.object for place in free.values()]
         self.masses = Masses(
-            jnp.array([thing.mass for thing in objects], jnp.float32),
-            jnp.array(np.array([thing.inertia for thing in objects]), jnp.float32),
+            np.array([thing.mass for thing in objects], np.float32),
+            np.array([thing.inertia for thing in objects], np.float32).reshape(-1, 3, 3),
         )
-        self.centers = np.array([thing.center for thing in objects], np.float32)
+        self.centers = np.array([thing.center for thing in objects], np.float32).reshape(-1, 3)
 
     def _read_links(self, model: mujoco.MjModel) -> None:
         plates = [plate_of_box(model.geom_size[finger.geom]) for finger in self.fingers]
@@ -115,13 +119,13 @@ class Tables:
             flat = [_plate(part, place) for part in parts if part.kind in ("box", "plane")]
             thin = [_segment(part, place) for part in parts if part.kind in ("capsule", "sphere")]
             if flat:
-                self.plates.append(Plate(*(jnp.array(np.array(x), jnp.float32) for x in zip(*flat, strict=True))))
+                self.plates.append(Plate(*(np.array(x, np.float32) for x in zip(*flat, strict=True))))
                 self._plate_surfaces.append(place.object.surface)
             if thin:
-                self.posts.append(Segments(*(jnp.array(np.array(x), jnp.float32) for x in zip(*thin, strict=True))))
+                self.posts.append(Segments(*(np.array(x, np.float32) for x in zip(*thin, strict=True))))
                 self._post_surfaces.append(place.object.surface)
 
-    def _number(self, free: dict[str, Placement]) -> None:
+    def _number(self, free: dict[str, Placement], model: mujoco.MjModel, agents: tuple[str, ...]) -> None:
         """Number the patches, and say of each which bodies it is between and how their surfaces feel."""
         first_object, second_object, first_body, second_body, surfaces = [], [], [], [], []
         self.grip: dict[tuple[int, int], int] = {}
@@ -149,10 +153,13 @@ class Tables:
         for body in self.link_bodies:
             for other in around:
                 add(LINK.against(other), link=int(body))
-        self.first_object, self.second_object = np.array(first_object), np.array(second_object)
-        self.first_body, self.second_body = np.array(first_body), np.array(second_body)
+        self.first_object, self.second_object = np.array(first_object, int), np.array(second_object, int)
+        self.first_body, self.second_body = np.array(first_body, int), np.array(second_body, int)
         column = lambda of: np.array([getattr(surface, of) for surface in surfaces], np.float32)  # noqa: E731
         self.sliding, self.torsion, self.stiffness = column("sliding"), column("torsion"), column("stiffness")
+        owner = lambda body: agents.index(model.body(body).name.split("/")[0]) if body >= 0 else -1  # noqa: E731
+        self.owner = np.array([owner(max(pair)) for pair in zip(first_body, second_body, strict=True)], int)
+        """The arm that a patch is on, by its number; -1 if it is on none."""
         self.remembers = np.isin(np.arange(len(surfaces)), list(self.grip.values()))
 
 

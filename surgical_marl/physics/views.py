@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
@@ -29,6 +30,30 @@ class Touch(NamedTuple):
     """m"""
     force: Array
     """N"""
+    handled: Array
+    """The largest force of an object or of a fixed thing on each arm, N, [a]; [0] in a scene without objects."""
+
+
+class Handled(NamedTuple):
+    """How an arm handles an object."""
+
+    force: Array
+    """Normal forces of its fingers on the object at the end of the step, together, N, []."""
+    holding: Array
+    """Whether it has held the object for a while: both fingers press from opposite sides, [] bool."""
+    slip: Array
+    """How far the object has slid along its fingers since they touched it, m, []."""
+
+
+class ObjectView(NamedTuple):
+    """The newest state of a free object, in the world; SI units."""
+
+    position: Array
+    """Origin of its frame, [3]."""
+    rotation: Array
+    """Axes of its frame, [3, 3]."""
+    velocity: Array
+    """Of the centre of mass, then angular, [6]."""
 
 
 class ArmView(NamedTuple):
@@ -49,3 +74,5 @@ class ArmView(NamedTuple):
     """Whether it touched another arm or itself during the step, []."""
     contact_force: Array
     """The largest normal force on it during the step, N, []."""
+    handles: Mapping[str, Handled] = {}
+    """How it handles each free object of the scene."""

@@ -18,7 +18,7 @@ import numpy as np
 from surgical_marl.content import unknown
 from surgical_marl.runtime import jax, jnp
 from surgical_marl.tasks.base.options import Options
-from surgical_marl.tasks.base.terms import FAR, Picture, Term, arm_terms, picture_terms
+from surgical_marl.tasks.base.terms import FAR, Picture, Term, arm_terms, object_terms, picture_terms
 from surgical_marl.tasks.base.world import World
 
 if TYPE_CHECKING:
@@ -130,7 +130,7 @@ class Task:
 
     def terms(self, agent: str) -> dict[str, Term | Picture]:
         """Return all that an agent may observe, by name."""
-        return {**arm_terms(self.scene, agent), **picture_terms(self.scene, agent)}
+        return {**arm_terms(self.scene, agent), **object_terms(self.scene, agent), **picture_terms(self.scene, agent)}
 
     def observes(self, agent: str) -> tuple[str, ...]:
         """Return the names of the terms that it observes unless a scene or a call chooses others."""

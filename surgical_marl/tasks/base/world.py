@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 if TYPE_CHECKING:
     from jax import Array
 
-    from surgical_marl.physics.views import ArmView
+    from surgical_marl.physics.views import ArmView, ObjectView
 
 
 class World(NamedTuple):
@@ -19,3 +19,5 @@ class World(NamedTuple):
     goal: Any
     sensed: Mapping[str, Array] = {}
     """The numbers that `Task.sense` computed from the pictures, by the names in `Task.senses`."""
+    objects: Mapping[str, ObjectView] = {}
+    """The view of each free object of the scene."""
