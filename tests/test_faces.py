@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from importlib import import_module
 from typing import Any
 
+import gymnasium
 import matplotlib
 import numpy as np
 import pettingzoo.test
@@ -107,6 +108,16 @@ def test_spaces_are_there_as_dicts_too(form: dict[str, Any]) -> None:
     for spaces, space in ((env.observation_spaces, env.observation_space), (env.action_spaces, env.action_space)):
         assert list(spaces) == env.possible_agents
         assert all(spaces[agent] is space(agent) for agent in spaces)
+
+
+@pytest.mark.parametrize("form", [{}, {"num_envs": 2}])
+def test_an_environment_is_a_direct_child_of_pettingzoos_class(form: dict[str, Any]) -> None:
+    """skrl tells environments apart by their direct bases."""
+    env = sm.parallel_env("reach", scene="psm", **form)
+    assert pettingzoo.ParallelEnv in type(env).__bases__ and pettingzoo.ParallelEnv in type(env.unwrapped).__bases__
+    assert gymnasium.Env in type(gymnasium.make("surgical_marl/Reach-v0", scene="psm").unwrapped).__bases__
+    many = gymnasium.make_vec("surgical_marl/Reach-v0", scene="psm", num_envs=2)
+    assert gymnasium.vector.VectorEnv in type(many.unwrapped).__bases__
 
 
 SCENE, AGENTS, WIDTH = "bimanual_psm", ("psm_0", "psm_1"), 7

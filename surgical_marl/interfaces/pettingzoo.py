@@ -26,8 +26,11 @@ if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv, BatchStep
 
 
-class _Face(ParallelEnv[str, Any, Any]):
-    """What both parallel environments are."""
+class _Face:
+    """What both parallel environments have in common.
+
+    Each is a `ParallelEnv` itself, not by way of this class: skrl looks at an environment's direct bases.
+    """
 
     def __init__(self, batch: BatchedEnv, render_mode: str | None, render_modes: list[str]) -> None:
         self.batch = batch
@@ -89,7 +92,7 @@ class _Face(ParallelEnv[str, Any, Any]):
         return found
 
 
-class SurgicalParallelEnv(_Face):
+class SurgicalParallelEnv(_Face, ParallelEnv[str, Any, Any]):
     """One environment, numpy in and out; `agents` is empty once the episode is over, until `reset`."""
 
     def __init__(self, batch: BatchedEnv, render_mode: str | None = None) -> None:
@@ -137,7 +140,7 @@ class SurgicalParallelEnv(_Face):
         return outcome
 
 
-class SurgicalBatchedParallelEnv(_Face):
+class SurgicalBatchedParallelEnv(_Face, ParallelEnv[str, Any, Any]):
     """N environments behind the same five dicts. What ended starts anew in the same step.
 
     `infos[agent]` also holds "final_observation" [N, d]: the last observation of this step's episode.
