@@ -120,6 +120,29 @@ def test_an_environment_is_a_direct_child_of_pettingzoos_class(form: dict[str, A
     assert gymnasium.vector.VectorEnv in type(many.unwrapped).__bases__
 
 
+def test_after_an_episode_no_agents_do_nothing() -> None:
+    """PettingZoo's convention, which SuperSuit's `black_death` counts on."""
+    env = sm.parallel_env("reach", scene="psm", max_steps=1)
+    with pytest.raises(ValueError, match="no episode is under way"):
+        env.step({})
+    env.reset(seed=0)
+    env.step({"psm_0": np.zeros(7)})
+    assert env.step({}) == ({}, {}, {}, {}, {})
+    with pytest.raises(ValueError, match="no episode is under way"):
+        env.step({"psm_0": np.zeros(7)})
+    assert env.reset()[0]["psm_0"].shape == env.observation_space("psm_0").shape
+
+
+def test_black_death_and_padding_make_arms_of_different_kinds_alike() -> None:
+    supersuit = pytest.importorskip("supersuit")
+    env = sm.parallel_env("reach", scene="trimanual_psm_ecm", max_steps=STEPS)
+    env = supersuit.black_death_v3(supersuit.pad_action_space_v0(supersuit.pad_observations_v0(env)))
+    many = supersuit.concat_vec_envs_v1(supersuit.pettingzoo_env_to_vec_env_v1(env), 2, num_cpus=0)
+    many.reset(seed=0)
+    dones = [many.step(np.zeros((6, 7), np.float32))[3].all() for _ in range(3 * STEPS)]
+    assert sum(map(bool, dones)) == 2  # black death adds a step to each episode
+
+
 SCENE, AGENTS, WIDTH = "bimanual_psm", ("psm_0", "psm_1"), 7
 
 

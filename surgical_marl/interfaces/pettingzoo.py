@@ -116,12 +116,17 @@ class SurgicalParallelEnv(_Face, ParallelEnv[str, Any, Any]):
     def step(self, actions: dict[str, Any]) -> tuple[dict[str, Any], ...]:
         """One control step: observations, rewards, terminations, truncations, infos.
 
+        Once the episode is over, no agents do nothing: without actions all five are empty, as PettingZoo asks and
+        SuperSuit's `black_death` needs.
+
         Raises:
             ValueError: an agent that does not exist or has no action, a wrong shape, a value that is not a finite
                 number, an episode that is over, or a closed environment. Nothing has changed then.
         """
         self.batch.check_open()
         if not self.agents:
+            if self._state is not None and actions == {}:
+                return {}, {}, {}, {}, {}
             raise ValueError("no episode is under way: call reset() before step()")
         checked = check_actions(actions, self._shapes)
         step = self.batch.step({agent: action[None] for agent, action in checked.items()})
