@@ -124,7 +124,7 @@ def test_scaled_observations_mean_the_same(engine: str, task: str, scene: str, o
             np.testing.assert_allclose(seen, expected, atol=1e-6)
             back = vectors(scaled.restated(ours.observations, "si"))[agent]
             np.testing.assert_allclose(back, vectors(theirs.observations)[agent], atol=1e-4)
-            np.testing.assert_array_equal(ours.rewards[agent], theirs.rewards[agent])
+            np.testing.assert_allclose(ours.rewards[agent], theirs.rewards[agent], rtol=1e-5)
         np.testing.assert_allclose(ours.state, Scale(*bounds(si.state_space)).apply(theirs.state), atol=1e-6)
     assert set(np.unique(scaled.state_space.high)) == {1.0} == set(np.unique(-scaled.state_space.low))
 
