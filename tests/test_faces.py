@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from importlib import import_module
 from typing import Any
 
+import gymnasium
 import matplotlib
 import numpy as np
 import pettingzoo.test
@@ -107,6 +108,39 @@ def test_spaces_are_there_as_dicts_too(form: dict[str, Any]) -> None:
     for spaces, space in ((env.observation_spaces, env.observation_space), (env.action_spaces, env.action_space)):
         assert list(spaces) == env.possible_agents
         assert all(spaces[agent] is space(agent) for agent in spaces)
+
+
+@pytest.mark.parametrize("form", [{}, {"num_envs": 2}])
+def test_an_environment_is_a_direct_child_of_pettingzoos_class(form: dict[str, Any]) -> None:
+    """skrl tells environments apart by their direct bases."""
+    env = sm.parallel_env("reach", scene="psm", **form)
+    assert pettingzoo.ParallelEnv in type(env).__bases__ and pettingzoo.ParallelEnv in type(env.unwrapped).__bases__
+    assert gymnasium.Env in type(gymnasium.make("surgical_marl/Reach-v0", scene="psm").unwrapped).__bases__
+    many = gymnasium.make_vec("surgical_marl/Reach-v0", scene="psm", num_envs=2)
+    assert gymnasium.vector.VectorEnv in type(many.unwrapped).__bases__
+
+
+def test_after_an_episode_no_agents_do_nothing() -> None:
+    """PettingZoo's convention, which SuperSuit's `black_death` counts on."""
+    env = sm.parallel_env("reach", scene="psm", max_steps=1)
+    with pytest.raises(ValueError, match="no episode is under way"):
+        env.step({})
+    env.reset(seed=0)
+    env.step({"psm_0": np.zeros(7)})
+    assert env.step({}) == ({}, {}, {}, {}, {})
+    with pytest.raises(ValueError, match="no episode is under way"):
+        env.step({"psm_0": np.zeros(7)})
+    assert env.reset()[0]["psm_0"].shape == env.observation_space("psm_0").shape
+
+
+def test_black_death_and_padding_make_arms_of_different_kinds_alike() -> None:
+    supersuit = pytest.importorskip("supersuit")
+    env = sm.parallel_env("reach", scene="trimanual_psm_ecm", max_steps=STEPS)
+    env = supersuit.black_death_v3(supersuit.pad_action_space_v0(supersuit.pad_observations_v0(env)))
+    many = supersuit.concat_vec_envs_v1(supersuit.pettingzoo_env_to_vec_env_v1(env), 2, num_cpus=0)
+    many.reset(seed=0)
+    dones = [many.step(np.zeros((6, 7), np.float32))[3].all() for _ in range(3 * STEPS)]
+    assert sum(map(bool, dones)) == 2  # black death adds a step to each episode
 
 
 SCENE, AGENTS, WIDTH = "bimanual_psm", ("psm_0", "psm_1"), 7

@@ -17,7 +17,6 @@ from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test
 import surgical_marl as sm
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.envs.env import Env
-from surgical_marl.tasks.base.task import FAR
 from surgical_marl.vision.endoscope import SIZE, Endoscope
 from tests.helpers.actions import random_actions
 
@@ -147,8 +146,9 @@ def test_observations_lose_the_targets_and_nothing_else() -> None:
         n = env.num_actions(agent)
         box = env.observation_space(agent)
         assert box.shape == (3 * n + 3 + 4,)
-        np.testing.assert_allclose(box.high[-4:], 2 * FAR)
-        np.testing.assert_allclose(box.high[2 * n : 2 * n + 3], FAR)
+        low, high = env.scene.mounts[agent].arm.reach
+        np.testing.assert_allclose(box.low[2 * n : 2 * n + 3], low, rtol=1e-6)
+        np.testing.assert_allclose(box.high[2 * n : 2 * n + 3], high, rtol=1e-6)
 
 
 @pytest.mark.parametrize("arrays", ["torch", "jax"])

@@ -5,7 +5,8 @@
 
 SuperSuit makes each arm of each environment one environment of a vector. Arms of different kinds, as in
 `trimanual_psm_ecm`, observe and act in vectors of different lengths: padding makes them alike. Two PSMs are at a median
-error of 29 mm after 200,000 steps, some two minutes of one CPU core, from 76 mm untrained.
+error of 5 mm after 200,000 steps, some two minutes of one CPU core, from 76 mm untrained. Without `TimeLimits` it is
+29 mm.
 """
 
 import sys
@@ -14,9 +15,25 @@ import numpy as np
 import supersuit
 import torch
 from stable_baselines3 import PPO
-from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
+from stable_baselines3.common.vec_env import VecEnvWrapper, VecMonitor, VecNormalize
 
 import surgical_marl as sm
+
+
+class TimeLimits(VecEnvWrapper):
+    """Says that episodes end by their time limit, so that PPO counts what would have come after it.
+
+    SuperSuit passes the last observation on, but not whether the episode was truncated or terminated. Those of `reach`
+    are only ever truncated.
+    """
+
+    def reset(self):
+        return self.venv.reset()
+
+    def step_wait(self):
+        observations, rewards, dones, infos = self.venv.step_wait()
+        infos = [{**info, "TimeLimit.truncated": bool(done)} for info, done in zip(infos, dones, strict=True)]
+        return observations, rewards, dones, infos
 
 
 def make_envs(scene: str, count: int, **options):
@@ -24,7 +41,8 @@ def make_envs(scene: str, count: int, **options):
     env = sm.parallel_env("reach", scene=scene, **options)
     env = supersuit.pad_action_space_v0(supersuit.pad_observations_v0(env))
     env = supersuit.pettingzoo_env_to_vec_env_v1(env)
-    return VecMonitor(supersuit.concat_vec_envs_v1(env, count, num_cpus=0, base_class="stable_baselines3"))
+    env = supersuit.concat_vec_envs_v1(env, count, num_cpus=0, base_class="stable_baselines3")
+    return TimeLimits(VecMonitor(env))
 
 
 def main(steps: int = 200_000, scene: str = "bimanual_psm") -> float:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numbers
 import secrets
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -23,7 +23,7 @@ from surgical_marl.engines.choose import ENGINES, make_engine
 from surgical_marl.engines.fused.threefry import episode_keys
 from surgical_marl.envs.actions import check_actions
 from surgical_marl.envs.env import Env
-from surgical_marl.envs.observations import each
+from surgical_marl.envs.observations import each, with_vector
 from surgical_marl.physics.views import Contacts
 
 if TYPE_CHECKING:
@@ -169,6 +169,19 @@ class BatchedEnv:
         Pictures stand beside the vector, under their own names.
         """
         return dict(self.env.observed[agent].slices)
+
+    def restated(self, observations: Mapping[str, Any], how: str) -> dict[str, Any]:
+        """Return observations of this environment as another one, with `observations=how`, would have them.
+
+        Args:
+            observations: agent -> [..., d], or a dict of it and pictures, of any array library.
+            how: "si" or "scaled".
+        """
+        if how == self.env.options.observations:
+            return dict(observations)
+        scales = {agent: self.env.observed[agent].scales[False] for agent in observations}
+        change = {agent: scale.undo if self.env.scaled else scale.apply for agent, scale in scales.items()}
+        return {agent: with_vector(own, change[agent]) for agent, own in observations.items()}
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
         """Of one environment: a Box, or a Dict for an agent that sees pictures; the same object each time."""

@@ -19,6 +19,7 @@ import numpy as np
 from gymnasium import spaces
 
 from surgical_marl.envs.costs import costs
+from surgical_marl.envs.observations import Scale
 from surgical_marl.envs.observed import Observed
 from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.runtime import jax, jnp, prepare_jax
@@ -118,7 +119,8 @@ class Env:
                 raise ValueError(
                     f"observe names {agent!r}, which is not an agent of the scene ({', '.join(self.agents)})"
                 )
-        self.observed = {agent: Observed(self.task, agent, chosen.get(agent)) for agent in self.agents}
+        self.scaled = self.options.observations == "scaled"
+        self.observed = {agent: Observed(self.task, agent, chosen.get(agent), self.scaled) for agent in self.agents}
 
     @property
     def title(self) -> str:
@@ -154,7 +156,7 @@ class Env:
         model = np.empty(mujoco.mj_sizeModel(self.scene.model), np.uint8)
         mujoco.mj_saveModel(self.scene.model, None, model)
         observed = {agent: (seen.names, seen.unseen) for agent, seen in self.observed.items()}
-        how = (self.scene.control, self.decimation, self.scene.randomisation, self.options.start, observed)
+        how = (self.scene.control, self.decimation, self.scene.randomisation, self.options.start, self.scaled, observed)
         return self.scene.fingerprint + f"{self.task_name} {how}".encode() + model.tobytes()
 
     @property
@@ -208,16 +210,18 @@ class Env:
 
     def observation_space(self, agent: str) -> spaces.Box:
         """Bounds of the vector that an agent observes."""
-        return _box(*self.observed[agent].bounds(self.task))
+        return _box(*self.observed[agent].bounds())
 
     @property
     def state_space(self) -> spaces.Box:
         """Bounds of `State.state`."""
-        every = [
-            *(self.observed[agent].bounds(self.task, unseen=True) for agent in self.agents),
-            self.task.privileged_bounds,
-        ]
+        every = [self.observed[agent].bounds(unseen) for agent in self.agents for unseen in (False, True)]
+        every.append(self._privileged_scale.bounds if self.scaled else self.task.privileged_bounds)
         return _box(*map(np.concatenate, zip(*every, strict=True)))
+
+    @cached_property
+    def _privileged_scale(self) -> Scale:
+        return Scale(*self.task.privileged_bounds)
 
     def reset(self, key: Array, episode: Array | int = 0, parameters: Any = None) -> State:
         """Return the state at the start of an episode.
@@ -328,7 +332,9 @@ class Env:
         for agent, seen in self.observed.items():
             observations[agent] = seen.read(task, world)
             every += [observations[agent], seen.read(task, world, unseen=True)]
-        return observations, jnp.concatenate([*every, task.privileged(carry.goal)])
+        privileged = task.privileged(carry.goal)
+        every.append(self._privileged_scale.apply(privileged) if self.scaled else privileged)
+        return observations, jnp.concatenate(every)
 
     def _infos(
         self, task: Task, world: World, before: Array, after: Carry, terms: dict[str, dict[str, Array]]

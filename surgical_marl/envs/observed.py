@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from surgical_marl.content import unknown
+from surgical_marl.envs.observations import Scale
 from surgical_marl.tasks.base.task import Task
 from surgical_marl.tasks.base.terms import Picture, Term, read_vector, slices
 from surgical_marl.tasks.base.world import World
@@ -23,17 +24,20 @@ class Observed:
         task: declares the terms.
         agent: whose they are.
         chosen: names of terms, in the order of the vector; the task's own choice if None.
+        scaled: whether vectors are scaled by their bounds.
 
     Attributes:
         names: terms of the vector that the agent observes.
         pictures: its pictures, by name.
+        scales: how the vector of the terms is scaled (False) and that of the `unseen` ones (True), if they are.
         unseen: terms of the task's own choice that are left out of the agent's observation; critics see them.
 
     Raises:
         ValueError: a name that is no term, or twice; or no term that is a vector.
     """
 
-    def __init__(self, task: Task, agent: str, chosen: Sequence[str] | None) -> None:
+    def __init__(self, task: Task, agent: str, chosen: Sequence[str] | None, scaled: bool = False) -> None:
+        self.scaled = scaled
         self.agent, terms, usual = agent, task.terms(agent), task.observes(agent)
         wanted = usual if chosen is None else tuple(chosen)
         for name in wanted:
@@ -48,15 +52,22 @@ class Observed:
             raise ValueError(f"observe: {agent!r} needs a term that is a vector, such as qpos, besides its pictures")
         self.slices: dict[str, slice] = slices(terms, self.names)
 
+        self._limits = {False: _limits(terms, self.names), True: _limits(terms, self.unseen)}
+        self.scales = {unseen: Scale(*limits) for unseen, limits in self._limits.items()}
+
     def read(self, task: Task, world: World, unseen: bool = False) -> Array:
         """Return the vector of the terms, or of the `unseen` ones, [d], clipped to their bounds."""
-        return read_vector(self._terms(task), self.unseen if unseen else self.names, world)
+        terms = {name: term for name, term in task.terms(self.agent).items() if isinstance(term, Term)}
+        vector = read_vector(terms, self.unseen if unseen else self.names, world)
+        return self.scales[unseen].apply(vector) if self.scaled else vector
 
-    def bounds(self, task: Task, unseen: bool = False) -> tuple[np.ndarray, np.ndarray]:
-        """Return the least and the greatest vector, with the `unseen` terms behind, [d] each."""
-        terms = self._terms(task)
-        chosen = [terms[name] for name in (*self.names, *(self.unseen if unseen else ()))]
-        return np.concatenate([term.low for term in chosen]), np.concatenate([term.high for term in chosen])
+    def bounds(self, unseen: bool = False) -> tuple[np.ndarray, np.ndarray]:
+        """Return the least and the greatest vector of the terms, or of the `unseen` ones, [d] each."""
+        return self.scales[unseen].bounds if self.scaled else self._limits[unseen]
 
-    def _terms(self, task: Task) -> dict[str, Term]:
-        return {name: term for name, term in task.terms(self.agent).items() if isinstance(term, Term)}
+
+def _limits(terms: Mapping[str, Any], names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the bounds of terms in SI units, one after the other, [d] each."""
+    none = np.zeros(0)
+    low, high = ([getattr(terms[name], end) for name in names] for end in ("low", "high"))
+    return np.concatenate([none, *low]), np.concatenate([none, *high])

@@ -200,6 +200,8 @@ def _files(folder: Path) -> str:
         lines.append(
             f"- `{name}{SUFFIX}`: `observation` [N, {observation}]{one_hot}{pictures} -> `action` [N, {action}]."
         )
+    if read_settings(folder).observations == "scaled":
+        lines.append("- Observations are scaled: each number from -1 to 1 between its bounds.")
     text = "\n".join(lines)
     return f"""## Files
 

@@ -26,8 +26,11 @@ if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv, BatchStep
 
 
-class _Face(ParallelEnv[str, Any, Any]):
-    """What both parallel environments are."""
+class _Face:
+    """What both parallel environments have in common.
+
+    Each is a `ParallelEnv` itself, not by way of this class: skrl looks at an environment's direct bases.
+    """
 
     def __init__(self, batch: BatchedEnv, render_mode: str | None, render_modes: list[str]) -> None:
         self.batch = batch
@@ -89,7 +92,7 @@ class _Face(ParallelEnv[str, Any, Any]):
         return found
 
 
-class SurgicalParallelEnv(_Face):
+class SurgicalParallelEnv(_Face, ParallelEnv[str, Any, Any]):
     """One environment, numpy in and out; `agents` is empty once the episode is over, until `reset`."""
 
     def __init__(self, batch: BatchedEnv, render_mode: str | None = None) -> None:
@@ -113,12 +116,17 @@ class SurgicalParallelEnv(_Face):
     def step(self, actions: dict[str, Any]) -> tuple[dict[str, Any], ...]:
         """One control step: observations, rewards, terminations, truncations, infos.
 
+        Once the episode is over, no agents do nothing: without actions all five are empty, as PettingZoo asks and
+        SuperSuit's `black_death` needs.
+
         Raises:
             ValueError: an agent that does not exist or has no action, a wrong shape, a value that is not a finite
                 number, an episode that is over, or a closed environment. Nothing has changed then.
         """
         self.batch.check_open()
         if not self.agents:
+            if self._state is not None and actions == {}:
+                return {}, {}, {}, {}, {}
             raise ValueError("no episode is under way: call reset() before step()")
         checked = check_actions(actions, self._shapes)
         step = self.batch.step({agent: action[None] for agent, action in checked.items()})
@@ -137,7 +145,7 @@ class SurgicalParallelEnv(_Face):
         return outcome
 
 
-class SurgicalBatchedParallelEnv(_Face):
+class SurgicalBatchedParallelEnv(_Face, ParallelEnv[str, Any, Any]):
     """N environments behind the same five dicts. What ended starts anew in the same step.
 
     `infos[agent]` also holds "final_observation" [N, d]: the last observation of this step's episode.

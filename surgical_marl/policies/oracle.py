@@ -58,7 +58,8 @@ class _Oracle:
     def __call__(self, observations: Mapping[str, Any]) -> dict[str, Any]:
         env, arms = self._env, self._arms
         targets, began = np.asarray(env.task.targets(env.goal), float), _numpy(env.steps) == 0
-        seen = {agent: proprioception(observations[agent]) for agent in arms}
+        own = env.restated({agent: observations[agent] for agent in arms}, "si")
+        seen = {agent: proprioception(observation) for agent, observation in own.items()}
         moves = {agent: arm.move(targets, began, _numpy(seen[agent])) for agent, arm in arms.items()}
         furthest = np.max([np.abs(move).max(-1) for move in moves.values()], axis=0)
         pace = 1 / np.maximum(furthest, 1)[:, None]

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from surgical_marl.content import find, list_policies
 from surgical_marl.envs.observations import each, proprioception
-from surgical_marl.policies.acting import Policy
+from surgical_marl.policies.acting import Policy, forget
 from surgical_marl.policies.layout import GROUPINGS, Grouping, Layout
 from surgical_marl.policies.networks import MultiAgentActor, actor_config
 from surgical_marl.policies.oracle import oracle
@@ -49,7 +49,9 @@ def load_policy(run: str | Path, env: BatchedEnv) -> Policy:
         return random_policy(env)
     if run == "oracle":
         return oracle(env)
-    return acting_policy(*load_actor(run, env), str(env.device))
+    policy = acting_policy(*load_actor(run, env), str(env.device))
+    trained = read_settings(find_run(run)).observations
+    return policy if trained == env.env.options.observations else _Restating(policy, env, trained)
 
 
 def load_actor(run: str | Path, env: BatchedEnv) -> tuple[MultiAgentActor, Layout]:
@@ -195,6 +197,20 @@ class _Acting:
         if self._memory is None or self._memory.shape != shape:  # a batch of another size belongs to other episodes
             self._memory = torch.zeros(shape, device=self._device)
         return self._memory
+
+
+class _Restating:
+    """A policy that observes as an environment with other `observations` than this one would show it."""
+
+    def __init__(self, policy: Policy, env: BatchedEnv, observations: str) -> None:
+        self._policy, self._env, self._observations = policy, env, observations
+
+    def __call__(self, observations: Mapping[str, Any]) -> dict[str, Any]:
+        return self._policy(self._env.restated(observations, self._observations))
+
+    def reset(self, ended: Any = None) -> None:
+        """Tell the policy that episodes begin."""
+        forget(self._policy, ended)
 
 
 class _Heedless:

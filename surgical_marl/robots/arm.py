@@ -21,6 +21,7 @@ from surgical_marl.robots.description import MOVING, Robot, RobotJoint, Vector
 from surgical_marl.robots.drives import Cable, Drive, read_cables, read_drives
 from surgical_marl.robots.jaw import Jaw, read_jaw
 from surgical_marl.robots.mesh import MAX_MESH, mesh_files, resolve_meshes
+from surgical_marl.robots.reach import Box, box_of
 from surgical_marl.robots.safe_xml import read_bytes
 from surgical_marl.robots.urdf import Faults, read_urdf
 from surgical_marl.robots.urdf_faults import robot_faults
@@ -109,6 +110,20 @@ class Arm:
     def upper(self) -> np.ndarray:
         """Upper joint limits, shape [n]."""
         return np.array([joint.upper for joint in self.actuated])
+
+    @property
+    def joint_box(self) -> Box:
+        """Bounds of joint positions, [n] each, a tenth of a joint's range beyond its limits.
+
+        Stops give way, and readings may be off.
+        """
+        return Box(self.lower, self.upper).widened(0.1)
+
+    @cached_property
+    def reach(self) -> Box:
+        """Bounds of where the tool tip can be, [3] each, in the base frame, m, with a tenth to spare at each end."""
+        limits = Box(self.lower, self.upper)
+        return box_of(lambda q: self.forward_kinematics(q)[..., :3, 3], limits).widened(0.1, 0.01)
 
     @property
     def speed(self) -> np.ndarray:

@@ -25,7 +25,7 @@ import numpy as np
 from surgical_marl.tasks.base.path_task import PathTask
 from surgical_marl.tasks.base.paths import loops_and_lines
 from surgical_marl.tasks.base.task import Level
-from surgical_marl.tasks.base.terms import FAR, Picture, Term
+from surgical_marl.tasks.base.terms import Picture, Term
 from surgical_marl.tasks.base.world import World
 
 if TYPE_CHECKING:
@@ -47,8 +47,9 @@ class Task(PathTask):
 
     def terms(self, agent: str) -> dict[str, Term | Picture]:
         """Return those of `reach`, and `to_path_ahead` [9], the ways from the tip to three points ahead, m."""
-        space = np.full(3 * len(AHEAD), 2 * FAR)
-        return {**super().terms(agent), "to_path_ahead": Term(lambda w: self._ahead(w, agent), -space, space)}
+        terms = super().terms(agent)
+        low, high = (np.tile(getattr(terms["to_target"], end), len(AHEAD)) for end in ("low", "high"))
+        return {**terms, "to_path_ahead": Term(lambda w: self._ahead(w, agent), low, high)}
 
     def observes(self, agent: str) -> tuple[str, ...]:
         """Return what is observed in `reach`, then the points ahead."""

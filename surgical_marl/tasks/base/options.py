@@ -55,6 +55,7 @@ class Options(Checked):
         max_steps: control steps until an episode is truncated; the task's own number if None.
         decimation: physics steps per control step.
         reward: weights of reward terms that replace the task's own, as in {"collision": -5}.
+        observations: "si" for metres, radians and newtons, or "scaled" for numbers from -1 to 1 between their bounds.
         observe: agent -> names of the observation terms that it observes, instead of the task's own choice, as in
             {"ecm_0": ["qpos", "image"]}.
 
@@ -70,6 +71,7 @@ class Options(Checked):
     start: Literal["home", "random"] = choice("home", "postures that episodes begin with")
     max_steps: int | None = number(None, 1, 1_000_000, "control steps of an episode")
     decimation: int = number(DECIMATION, 1, 1_000_000, "physics steps a control step")
+    observations: Literal["si", "scaled"] = choice("si", "units of observations, or numbers from -1 to 1")
     reward: Mapping[str, float] = field(default_factory=dict)
     observe: Mapping[str, Sequence[str]] = field(default_factory=dict)
 

@@ -18,7 +18,7 @@ import numpy as np
 from surgical_marl.content import unknown
 from surgical_marl.runtime import jax, jnp
 from surgical_marl.tasks.base.options import Options
-from surgical_marl.tasks.base.terms import FAR, Picture, Term, arm_terms, object_terms, picture_terms
+from surgical_marl.tasks.base.terms import Picture, Term, arm_terms, object_terms, picture_terms
 from surgical_marl.tasks.base.world import World
 
 if TYPE_CHECKING:
@@ -235,10 +235,10 @@ class TipTask(Task):
 
     def terms(self, agent: str) -> dict[str, Term | Picture]:
         """Return the terms of every task, `target` [3], and `to_target` [3] from the tip."""
-        i, space = self.scene.agents.index(agent), np.full(3, FAR)
+        i, tip = self.scene.agents.index(agent), self.scene.mounts[agent].arm.reach
         targets = {
-            "target": Term(lambda world: world.goal.targets[i], -space, space),
-            "to_target": Term(lambda world: world.goal.targets[i] - world.arms[agent].tool_tip, -2 * space, 2 * space),
+            "target": Term(lambda world: world.goal.targets[i], *tip),
+            "to_target": Term(lambda world: world.goal.targets[i] - world.arms[agent].tool_tip, *tip.minus(tip)),
         }
         return {**super().terms(agent), **targets}
 

@@ -13,15 +13,16 @@ import numpy as np
 
 from surgical_marl.runtime import jnp
 from surgical_marl.scenes.scene import Scene
+from surgical_marl.tasks.base.bounds import distances_between_arms, ways_between_tips
 from surgical_marl.tasks.base.world import World
 
 if TYPE_CHECKING:
     from jax import Array
 
-FAR = 2.0
-"""Bound in m of everything observed in space; no arm reaches that far."""
 STRONGEST = 100.0
 """Bound of an observed contact force, N."""
+WIDE = 1.0
+"""Bound of an object's observed place, m: one that has fallen off the field counts as there."""
 FASTEST = 5.0
 """Bound of an object's observed speed, m/s; of its angular speed it is this over 0.01 m."""
 EYES, CHANNELS = ("left", "right"), ("rgb", "depth")
@@ -55,23 +56,22 @@ def arm_terms(scene: Scene, agent: str) -> dict[str, Term]:
     `qpos` and `qvel` [n] of its joints, `tool_tip` [3], `command` [n], `contact_force` [1] on it; with other arms also
     `to_nearest_tip` [3] from its tip, and the least distance `min_distance` [1] to any of them.
     """
-    joints = scene.mounts[agent].arm.actuated
-    low, high = (np.array([getattr(joint, end) for joint in joints]) for end in ("lower", "upper"))
-    slack, speed = 0.1 * (high - low), 2 * np.array([joint.velocity for joint in joints])
-    low, high, space = low - slack, high + slack, np.full(3, FAR)
-    furthest = np.array([max(joint.velocity, joint.effort, joint.upper) for joint in joints])
-    commands = (low, high) if scene.control == "position" else (-furthest, furthest)
+    arm = scene.mounts[agent].arm
+    joints = arm.joint_box
+    speed = 2 * np.array([joint.velocity for joint in arm.actuated])
+    furthest = np.array([max(joint.velocity, joint.effort, joint.upper) for joint in arm.actuated])
+    commands = joints if scene.control == "position" else (-furthest, furthest)
     of: Callable[[str], Callable[[World], Array]] = lambda name: lambda world: getattr(world.arms[agent], name)  # noqa: E731
     single: Callable[[str], Callable[[World], Array]] = lambda name: lambda world: of(name)(world)[None]  # noqa: E731
     terms = {
-        "qpos": Term(of("qpos"), low, high),
+        "qpos": Term(of("qpos"), *joints),
         "qvel": Term(of("qvel"), -speed, speed),
-        "tool_tip": Term(of("tool_tip"), -space, space),
+        "tool_tip": Term(of("tool_tip"), *arm.reach),
         "command": Term(of("command"), *commands),
     }
     if len(scene.agents) > 1:
-        terms["to_nearest_tip"] = Term(of("nearest_tip"), -2 * space, 2 * space)
-        terms["min_distance"] = Term(single("min_distance"), -space[:1], 2 * space[:1])
+        terms["to_nearest_tip"] = Term(of("nearest_tip"), *ways_between_tips(scene))
+        terms["min_distance"] = Term(single("min_distance"), *distances_between_arms(scene))
     terms["contact_force"] = Term(single("contact_force"), np.zeros(1), np.full(1, STRONGEST))
     return terms
 
@@ -85,7 +85,7 @@ def object_terms(scene: Scene, agent: str) -> dict[str, Term]:
     """
     mount, terms = scene.mounts[agent], {}
     turn, origin = mount.rotation.astype(np.float32), mount.position.astype(np.float32)
-    space, fast = np.full(3, FAR), np.repeat([FASTEST, FASTEST / 0.01], 3)
+    space, fast = np.full(3, WIDE), np.repeat([FASTEST, FASTEST / 0.01], 3)
     for name, place in scene.objects.items():
         if not place.object.free:
             continue
