@@ -73,9 +73,7 @@ def inertias(masses: Masses, frames: Array) -> Array:
     turning = frames @ masses.inertia @ jnp.swapaxes(frames, -1, -2)
     moving = masses.mass[:, None, None] * jnp.eye(3)
     none = jnp.zeros_like(turning)
-    return jnp.concatenate(
-        [jnp.concatenate([moving, none], -1), jnp.concatenate([none, turning], -1)], -2
-    )
+    return jnp.concatenate([jnp.concatenate([moving, none], -1), jnp.concatenate([none, turning], -1)], -2)
 
 
 def free_acceleration(bodies: Bodies, masses: Masses, frames: Array, gravity: Array, dt: float) -> Array:

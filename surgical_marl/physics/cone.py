@@ -136,7 +136,11 @@ def solve_contacts(
 
         begin = (jnp.float32(1.0), jnp.float32(0.0), jnp.float32(jnp.inf))
         (step, _, _), _ = jax.lax.scan(look, begin, None, length=line_search, unroll=True)
-        there, pushed, pulled = row - step * falls, push - step * cones.stiff * moves[0], pull - step * cones.rub[:, None] * moves[1]
+        there, pushed, pulled = (
+            row - step * falls,
+            push - step * cones.stiff * moves[0],
+            pull - step * cones.rub[:, None] * moves[1],
+        )
         after = within_cone(cones, pushed, pulled)
         same = (((there > rows.low) == (row > rows.low)) & ((there < rows.high) == (row < rows.high))).all()
         same &= (after.presses == forces.presses).all() & (after.slips == forces.slips).all()

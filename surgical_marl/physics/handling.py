@@ -101,41 +101,43 @@ class Handling:
             moving: the same with velocities; None if the arms count as standing.
             dt: time over which motions are looked ahead, s.
         """
-        t, frames = self.tables, rotation(bodies.quaternion)
-        own = t.segments(bodies.position, frames)
-        pads = t.pads(data) if t.fingers else None
-        links = t.links(data) if len(t.near) else None
-        turns = dt * bodies.velocity[:, 3:]
-        ways = [*map(Way, dt * bodies.velocity[:, :3] - jnp.cross(turns, bodies.position), turns)]
-        finger_ways = [self._way(moving, finger.body, dt) for finger in t.fingers]
-        link_ways = [self._way(moving, body, dt) for body in t.link_bodies]
-        pick = lambda things, i: jax.tree.map(lambda x: x[i : i + 1], things)  # noqa: E731
-        found: list[Patch] = []
+        t, found, start = self.tables, [], 0
+        shapes = self._shapes(data, bodies)
+        ways = self._ways(bodies, moving, dt)
+        for meeting in t.meetings:
+            torsion = t.torsion[start : start + len(meeting.one)]
+            start += len(meeting.one)
+            one, way = (jax.tree.map(lambda x: x[meeting.one], of[meeting.first]) for of in (shapes, ways))
+            if meeting.second == "fixed":
+                fixed = t.fixed[meeting.other[0]]
+                alone = lambda row, fixed=fixed: _patch(row[0], row[1], fixed, STILL, row[2])  # noqa: E731
+                found.append(jax.lax.map(alone, (one, way, torsion)))
+            else:
+                other, its = (jax.tree.map(lambda x: x[meeting.other], of[meeting.second]) for of in (shapes, ways))
+                found.append(jax.lax.map(lambda row: _patch(*row), (one, way, other, its, torsion)))
+        return jax.tree.map(lambda *x: jnp.concatenate(x), *found)
 
-        def add(one: Segments, way: Way, other: Plate | Segments, its: Way) -> None:
-            found.append(_patch(one, way, other, its, t.torsion[len(found)]))
+    def _shapes(self, data: Any, bodies: Bodies) -> dict[str, Plate | Segments]:
+        """Return the shapes of all bodies in the world by kind of body, [bodies, shapes of one]."""
+        t, every = self.tables, lambda x: x[:, None]
+        found: dict[str, Plate | Segments] = {"objects": t.segments(bodies.position, rotation(bodies.quaternion))}
+        if t.fingers:
+            found["pads"] = jax.tree.map(every, t.pads(data))
+        if len(t.near):
+            found["links"] = jax.tree.map(every, t.links(data))
+        return found
 
-        for o in range(t.count):
-            mine = jax.tree.map(lambda x, o=o: x[o], own)
-            for f, its in enumerate(finger_ways):
-                add(mine, ways[o], pick(pads, f), its)
-            for i in t.bare:
-                add(mine, ways[o], pick(links, i), link_ways[i])
-            for fixed in (*t.plates, *t.posts):
-                add(mine, ways[o], fixed, STILL)
-            for other in range(o + 1, t.count):
-                add(mine, ways[o], jax.tree.map(lambda x, o=other: x[o], own), ways[other])
-        for i, way in enumerate(link_ways):
-            for fixed in (*t.plates, *t.posts):
-                add(pick(links, i), way, fixed, STILL)
-        return jax.tree.map(lambda *x: jnp.stack(x), *found)
-
-    def _way(self, data: Any, body: int, dt: Any) -> Way:
-        """Return how a link moves in a step."""
-        if data is None:
-            return STILL
-        turn = dt * data.cvel[body, :3]
-        return Way(dt * data.cvel[body, 3:] - jnp.cross(turn, data.subtree_com[self._root_of[body]]), turn)
+    def _ways(self, bodies: Bodies, data: Any, dt: Any) -> dict[str, Way]:
+        """Return how all bodies move in a step, by kind of body; arms stand if `data` is None."""
+        t, turns = self.tables, dt * bodies.velocity[:, 3:]
+        found = {"objects": Way(dt * bodies.velocity[:, :3] - jnp.cross(turns, bodies.position), turns)}
+        for kind, links in (("pads", np.array([finger.body for finger in t.fingers], int)), ("links", t.link_bodies)):
+            turn, shift = jnp.zeros((len(links), 3)), jnp.zeros((len(links), 3))
+            if data is not None and len(links):
+                turn = dt * data.cvel[links, :3]
+                shift = dt * data.cvel[links, 3:] - jnp.cross(turn, data.subtree_com[self._root_of[links]])
+            found[kind] = Way(shift, turn)
+        return found
 
     def feel(self, patches: Patch, data: Any, bodies: Bodies, qvel: Array, grips: Grips, dt: float) -> Felt:
         """Return the rows of patches [g] on the joints of all arms and then on all objects."""
@@ -261,11 +263,13 @@ def _quaternion(axes: Array) -> Array:
     sizes = jnp.stack([trace, m[0, 0], m[1, 1], m[2, 2]])
     a, b, c = m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]
     d, e, f = m[0, 1] + m[1, 0], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1]
-    rows = jnp.stack([
-        jnp.stack([1 + trace, a, b, c]),
-        jnp.stack([a, 1 + 2 * m[0, 0] - trace, d, e]),
-        jnp.stack([b, d, 1 + 2 * m[1, 1] - trace, f]),
-        jnp.stack([c, e, f, 1 + 2 * m[2, 2] - trace]),
-    ])
+    rows = jnp.stack(
+        [
+            jnp.stack([1 + trace, a, b, c]),
+            jnp.stack([a, 1 + 2 * m[0, 0] - trace, d, e]),
+            jnp.stack([b, d, 1 + 2 * m[1, 1] - trace, f]),
+            jnp.stack([c, e, f, 1 + 2 * m[2, 2] - trace]),
+        ]
+    )
     row = rows[jnp.argmax(sizes)]
     return row / jnp.sqrt(jnp.sum(row * row))

@@ -97,7 +97,9 @@ class Simulator:
     def at(self, qpos: Array) -> Physics:
         """Return all arms at rest at joint positions [nq] of the scene, with the commands that keep them there."""
         still = jnp.zeros(self.scene.model.nv, jnp.float32)
-        return Physics(qpos, still, still, self._holding(qpos), self._objects.start(self.scene) if self._objects else ())
+        return Physics(
+            qpos, still, still, self._holding(qpos), self._objects.start(self.scene) if self._objects else ()
+        )
 
     def _holding(self, qpos: Any) -> Any:
         """Return the commands [nu] that keep the arms where they are."""

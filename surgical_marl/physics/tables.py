@@ -1,12 +1,11 @@
 """The constants of contact with objects: which bodies of a scene can touch, their shapes and surfaces.
 
-Patches are in one order everywhere: for each free object its patches with every finger, with every other link near it,
-with every fixed object (first plates, then capsules) and with the objects after it; then those of links with fixed
-objects.
+Patches are in the order of `Tables.meetings`, and within one in that of its bodies.
 """
 
 from __future__ import annotations
 
+from itertools import combinations, product
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -30,6 +29,21 @@ class Finger(NamedTuple):
     agent: str
     geom: int
     body: int
+
+
+class Meeting(NamedTuple):
+    """Pairs of bodies of two kinds that can touch: m patches."""
+
+    first: str
+    """Kind of the first body: "objects" or "links"."""
+    one: np.ndarray
+    """Numbers of the first bodies, [m]."""
+    second: str
+    """Kind of the second body: "pads", "links", "objects" or "fixed"."""
+    other: np.ndarray
+    """Numbers of the second bodies, [m]; all the same for a fixed one."""
+    surfaces: tuple[Surface, ...]
+    """How each pair feels."""
 
 
 class Tables:
@@ -60,7 +74,8 @@ class Tables:
     def segments(self, position: Array, frames: Array) -> Segments:
         """Return the capsules of the objects [k, c] in the world; those that pad an object with fewer are far away."""
         start, end = (
-            position[:, None] + jnp.matmul(jnp.asarray(x), jnp.swapaxes(frames, -1, -2)) for x in (self._start, self._end)
+            position[:, None] + jnp.matmul(jnp.asarray(x), jnp.swapaxes(frames, -1, -2))
+            for x in (self._start, self._end)
         )
         return Segments(start, end, jnp.asarray(self._radius))
 
@@ -110,57 +125,58 @@ class Tables:
         self.link_bodies = model.geom_bodyid[self.near]
 
     def _read_fixed(self, fixed: dict[str, Placement]) -> None:
-        self.plates: list[Plate] = []
-        self.posts: list[Segments] = []
-        self._plate_surfaces: list[Surface] = []
-        self._post_surfaces: list[Surface] = []
+        self.fixed: list[Plate | Segments] = []
+        """The plates of every fixed object that has any, and its capsules."""
+        self._fixed_surfaces: list[Surface] = []
         for place in fixed.values():
             parts = place.object.shapes
             flat = [_plate(part, place) for part in parts if part.kind in ("box", "plane")]
             thin = [_segment(part, place) for part in parts if part.kind in ("capsule", "sphere")]
-            if flat:
-                self.plates.append(Plate(*(np.array(x, np.float32) for x in zip(*flat, strict=True))))
-                self._plate_surfaces.append(place.object.surface)
-            if thin:
-                self.posts.append(Segments(*(np.array(x, np.float32) for x in zip(*thin, strict=True))))
-                self._post_surfaces.append(place.object.surface)
+            for kind, found in ((Plate, flat), (Segments, thin)):
+                if found:
+                    self.fixed.append(kind(*(np.array(x, np.float32) for x in zip(*found, strict=True))))
+                    self._fixed_surfaces.append(place.object.surface)
 
     def _number(self, free: dict[str, Placement], model: mujoco.MjModel, agents: tuple[str, ...]) -> None:
         """Number the patches, and say of each which bodies it is between and how their surfaces feel."""
-        first_object, second_object, first_body, second_body, surfaces = [], [], [], [], []
-        self.grip: dict[tuple[int, int], int] = {}
-        """(object, finger) -> its patch."""
-
-        def add(surface: Surface, one: int = -1, other: int = -1, link: int = -1, second_link: int = -1) -> None:
-            first_object.append(one)
-            second_object.append(other)
-            first_body.append(link)
-            second_body.append(second_link)
-            surfaces.append(surface)
-
         own = [place.object.surface for place in free.values()]
-        around = [*self._plate_surfaces, *self._post_surfaces]
-        for o, surface in enumerate(own):
-            for f, finger in enumerate(self.fingers):
-                self.grip[o, f] = len(surfaces)
-                add(surface.against(JAW), one=o, second_link=finger.body)
-            for body in self.link_bodies[self.bare]:
-                add(surface.against(LINK), one=o, second_link=int(body))
-            for other in around:
-                add(surface.against(other), one=o)
-            for other_object in range(o + 1, self.count):
-                add(surface.against(own[other_object]), one=o, other=other_object)
-        for body in self.link_bodies:
-            for other in around:
-                add(LINK.against(other), link=int(body))
-        self.first_object, self.second_object = np.array(first_object, int), np.array(second_object, int)
-        self.first_body, self.second_body = np.array(first_body, int), np.array(second_body, int)
-        column = lambda of: np.array([getattr(surface, of) for surface in surfaces], np.float32)  # noqa: E731
-        self.sliding, self.torsion, self.stiffness = column("sliding"), column("torsion"), column("stiffness")
-        owner = lambda body: agents.index(model.body(body).name.split("/")[0]) if body >= 0 else -1  # noqa: E731
-        self.owner = np.array([owner(max(pair)) for pair in zip(first_body, second_body, strict=True)], int)
+        felt = {"pads": [JAW] * len(self.fingers), "links": [LINK] * len(self.near), "objects": own,
+                "fixed": self._fixed_surfaces}  # fmt: skip
+        objects, fingers, links = (range(count) for count in (self.count, len(self.fingers), len(self.near)))
+        pairs = [
+            ("objects", "pads", list(product(objects, fingers))),
+            ("objects", "links", list(product(objects, self.bare.tolist()))),
+            *(("objects", "fixed", [(o, i) for o in objects]) for i in range(len(self.fixed))),
+            ("objects", "objects", list(combinations(objects, 2))),
+            *(("links", "fixed", [(n, i) for n in links]) for i in range(len(self.fixed))),
+        ]
+        self.meetings = tuple(
+            Meeting(first, np.array([a for a, _ in which]), second, np.array([b for _, b in which]),
+                    tuple(felt[first][a].against(felt[second][b]) for a, b in which))
+            for first, second, which in pairs if which
+        )  # fmt: skip
+        ends = [(m.first, m.one) for m in self.meetings], [(m.second, m.other) for m in self.meetings]
+        (self.first_object, self.first_body), (self.second_object, self.second_body) = map(self._ends, ends)
+        surfaces = [surface for meeting in self.meetings for surface in meeting.surfaces]
+        each = lambda of: np.array([getattr(surface, of) for surface in surfaces], np.float32)  # noqa: E731
+        self.sliding, self.torsion, self.stiffness = each("sliding"), each("torsion"), each("stiffness")
+        owner = lambda body: agents.index(model.body(int(body)).name.split("/")[0]) if body >= 0 else -1  # noqa: E731
+        self.owner = np.array([owner(max(pair)) for pair in zip(self.first_body, self.second_body, strict=True)], int)
         """The arm that a patch is on, by its number; -1 if it is on none."""
-        self.remembers = np.isin(np.arange(len(surfaces)), list(self.grip.values()))
+        pads = [(o, f) for o, f in product(objects, fingers)]
+        self.grip = {pair: g for g, pair in enumerate(pads)}
+        """(object, finger) -> its patch."""
+        self.remembers = np.arange(len(surfaces)) < len(pads)
+
+    def _ends(self, ends: list[tuple[str, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+        """Return the objects and the model's bodies at one end of all patches, [g] each; -1 where it is neither."""
+        bodies = {"links": self.link_bodies, "pads": np.array([finger.body for finger in self.fingers], int)}
+        objects, links = [np.zeros(0, int)], [np.zeros(0, int)]
+        for kind, numbers in ends:
+            neither = np.full(len(numbers), -1)
+            objects.append(numbers if kind == "objects" else neither)
+            links.append(bodies[kind][numbers] if kind in bodies else neither)
+        return np.concatenate(objects), np.concatenate(links)
 
 
 def _near(scene: Any) -> tuple[np.ndarray, np.ndarray]:
