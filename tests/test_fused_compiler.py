@@ -82,7 +82,13 @@ def everything(pool: Any) -> Any:
     chosen = lax.cond(pool["b"][0][0], arithmetic, lambda: jax.tree.map(jnp.zeros_like, arithmetic()))
     step = ("block", "a: add", (0, 0, 0, 0))
     loops = several([[("search", 5, [[step]]), ("repeat", 0, [[step]])]], pool)
-    return chosen, loops, all_blocks("x: table", pool), jnp.where(pool["b"][0], pool["e"][0], jnp.nan)
+    return (
+        chosen,
+        loops,
+        all_blocks("x: table", pool),
+        all_blocks("r", pool),
+        jnp.where(pool["b"][0], pool["e"][0], jnp.nan),
+    )
 
 
 def test_code_for_cuda_compiles(tmp_path: Path) -> None:

@@ -14,7 +14,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from jax import lax
 
-from surgical_marl.engines.fused.graph import FOLD, Branch, Graph, Loop, Value
+from surgical_marl.engines.fused.graph import Branch, Graph, Loop, Value
+from surgical_marl.engines.fused.operations import DTYPES, FOLD
 from surgical_marl.engines.fused.schedule import Schedule, Scheduler
 from tests.helpers.fused_blocks import all_blocks, random_arrays
 from tests.helpers.fused_kernels import make_stores
@@ -147,7 +148,8 @@ class Direct:
     def _loop(self, loop: Loop) -> list[Any]:
         outside, values, count = self.known, [self(start) for start in loop.starts], 0
         while True:
-            self.known = {**outside, **dict(zip(loop.phis, values, strict=True))}
+            row = loop.length - 1 - count if loop.backwards else count
+            self.known = {**outside, **dict(zip(loop.phis, values, strict=True)), loop.counter: np.int32(row)}
             if not (count < loop.length if loop.condition is None else self(loop.condition)):
                 break
             values, count = [self(value) for value in loop.nexts], count + 1
@@ -163,6 +165,15 @@ def compute(g: Graph, node: Value, read: Callable[[Value], Any], loads: Mapping[
         return g.tables[args[0]][int(read(args[1]))]
     if op == "select":
         return read(args[2]) if read(args[0]) else read(args[1])
+    if op == "room":
+        return np.zeros(int(g.kinds[node][1:]), DTYPES[g.kinds[node][0]])
+    if op == "array":
+        return np.array([read(value) for value in args])
+    if op == "read":
+        return read(args[0])[int(read(args[1]))]
+    if op == "put":
+        start, values = int(read(args[1])), [read(value) for value in args[2:]]
+        return np.concatenate([read(args[0])[:start], values, read(args[0])[start + len(values) :]])
     with np.errstate(all="ignore"):
         return np.asarray(FOLD[op](*map(read, args)))[()]
 
@@ -214,6 +225,7 @@ class Scheduled:
                 return True
 
             inside = known.new_child(dict(zip((loop.phis[j] for j in wanted), values, strict=True)))
+            inside[loop.counter] = np.int32(loop.length - 1 - count if loop.backwards else count)
             if not self._region(self.plan.inside[number][0], inside, result):
                 break
             values, count = found, count + 1
@@ -237,7 +249,7 @@ def assert_schedule_is_right(function: Callable[..., Any], *columns: Any) -> Non
 
 
 def test_the_schedule_of_every_block() -> None:
-    for group in ("a", "f", "m", "x"):
+    for group in ("a", "f", "m", "r", "x"):
         assert_schedule_is_right(partial(all_blocks, group), random_arrays(0))
 
 

@@ -1,7 +1,7 @@
 """Gather, scatter and slices at traced places, as arithmetic on indices.
 
 Indices that are known while tracing cost nothing: elements are moved. Another index becomes a lookup if the array is a
-table of constants, or else a selection among the elements that it may point to.
+table of constants or in memory, or else a selection among the elements that it may point to.
 """
 
 from __future__ import annotations
@@ -13,7 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from surgical_marl.engines.fused.graph import KINDS, Graph, Value
+from surgical_marl.engines.fused.graph import Graph, Value
+from surgical_marl.engines.fused.memory import view
+from surgical_marl.engines.fused.operations import KINDS
 from surgical_marl.engines.fused.scalars import convert
 from surgical_marl.engines.fused.traced import Symbolic, Table, Traced, Unsupported, lift
 
@@ -138,7 +140,7 @@ def _choose(
     if isinstance(operand, Table) or (isinstance(operand, np.ndarray) and operand.size >= LEAST_TABLE):
         find = partial(look_up, g, operand)
     else:
-        find = partial(_choose_one, g, lift(g, operand), lasts)
+        find = partial(_read_or_choose, g, lift(g, operand), lasts)
     out = []
     for element in np.ndindex(shape):
         moving, valid = {}, g.true
@@ -163,6 +165,16 @@ def look_up(g: Graph, operand: np.ndarray | Table, fixed: list[int], moving: dic
     for axis, start in moving.items():
         flat = g.add(flat, g.mul(g.constant(np.int32(strides[axis])), convert(g, start, "i")))
     return convert(g, g.lookup(number, flat), kind)
+
+
+def _read_or_choose(
+    g: Graph, ids: np.ndarray, lasts: dict[int, int], fixed: list[int], moving: dict[int, Value]
+) -> Value:
+    """Return the element at `fixed + moving`: from memory if the elements that it may be are there."""
+    found = view(g, ids[tuple(slice(None) if axis in moving else place for axis, place in enumerate(fixed))])
+    if found is None or found.op != "read":
+        return _choose_one(g, ids, lasts, fixed, moving)
+    return found.at(g, [g.add(_like(g, moving[axis], fixed[axis]), moving[axis]) for axis in sorted(moving)])
 
 
 def _choose_one(g: Graph, ids: np.ndarray, lasts: dict[int, int], fixed: list[int], moving: dict[int, Value]) -> Value:

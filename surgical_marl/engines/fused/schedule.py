@@ -13,6 +13,9 @@ from dataclasses import dataclass, field
 
 from surgical_marl.engines.fused.graph import Branch, Graph, Loop, Value
 
+GIVEN = ("phi", "counter")
+"""Values that are there at the start of a round of their loop."""
+
 
 @dataclass
 class Region:
@@ -60,7 +63,7 @@ class Scheduler:
         self._outside: dict[int, list[Value]] = {}
         self._members: dict[int, list[Value]] = {}
         for value in self.needed:
-            if self.graph.ops[value] != "phi":
+            if self.graph.ops[value] not in GIVEN:
                 self._members.setdefault(self.place[value], []).append(value)
         for number in range(len(self.regions)):
             self._order(number)
@@ -112,7 +115,7 @@ class Scheduler:
         self.group_loops: dict[int, int] = {}
         for value in self.needed:
             op = g.ops[value]
-            if op == "phi":
+            if op in GIVEN:
                 self.loops[value] = 1 << g.args[value][0]
                 continue
             if op == "out":
@@ -139,14 +142,16 @@ class Scheduler:
             self._use(value, 0)
         for value in reversed(self.needed):
             op = g.ops[value]
-            if op == "phi":
+            if op in GIVEN:
                 continue
             if op == "out":
                 number = g.args[value][0]
                 if number not in self.group_place:
                     self._place_group(number)
                 continue
-            region = self._hoist(self.place[value], self.loops[value])
+            region = self.place[value]
+            if op != "read":  # to keep what is in memory in registers too would need many of them
+                region = self._hoist(region, self.loops[value])
             self.place[value] = region
             for read in g.reads(value):
                 self._use(read, region)
@@ -179,7 +184,7 @@ class Scheduler:
             self._use(group.condition, region if isinstance(group, Branch) else inner[0])
 
     def _use(self, value: Value, region: int) -> None:
-        if value >= 0 and self.graph.ops[value] != "phi":
+        if value >= 0 and self.graph.ops[value] not in GIVEN:
             self.place[value] = self._common(self.place[value], region) if value in self.place else region
 
     def _common(self, a: int, b: int) -> int:
@@ -251,7 +256,7 @@ class Scheduler:
             stack.extend((self._item(read), False) for read in reads if self._item(read) not in done)
 
     def _here(self, value: Value, region: int) -> bool:
-        return self.graph.ops[value] != "phi" and self.place[value] == region
+        return self.graph.ops[value] not in GIVEN and self.place[value] == region
 
     def _item(self, value: Value) -> tuple[str, int]:
         return ("group", self.graph.args[value][0]) if self.graph.ops[value] == "out" else ("node", value)
@@ -273,7 +278,7 @@ class Scheduler:
         outside = [
             value
             for value in found
-            if self.graph.ops[value] != "phi" and self.regions[self.place[value]].depth <= depth
+            if self.graph.ops[value] not in GIVEN and self.regions[self.place[value]].depth <= depth
         ]
         self._outside[number] = outside
         return outside

@@ -9,8 +9,9 @@ import jax
 import numpy as np
 
 from surgical_marl.engines.fused.emit import Emitter, table_offsets
-from surgical_marl.engines.fused.graph import KINDS, Graph, Value
+from surgical_marl.engines.fused.graph import Graph, Value
 from surgical_marl.engines.fused.indexing import LEAST_TABLE, look_up
+from surgical_marl.engines.fused.operations import KINDS
 from surgical_marl.engines.fused.program import Leaf, Source
 from surgical_marl.engines.fused.trace import Tracer
 from surgical_marl.engines.fused.traced import Symbolic, Table, Traced, lift, lower
