@@ -143,7 +143,8 @@ class Direct:
         group = self.graph.groups[args[0]]
         if isinstance(group, Branch):
             return self((group.chosen if self(group.condition) else group.others)[args[1]])
-        return self._loop(group)[args[1]]
+        self.known.update(zip(group.outs, self._loop(group), strict=True))  # all of them at once
+        return self.known[node]
 
     def _loop(self, loop: Loop) -> list[Any]:
         outside, values, count = self.known, [self(start) for start in loop.starts], 0
