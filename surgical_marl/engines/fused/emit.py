@@ -70,6 +70,7 @@ class Emitter(ArrayEmitter):
         for kind, index in self.schedule.regions[number].items:
             if kind == "node":
                 self._node(index)
+                self._store_element(index)
             elif kind == "result":
                 result(index)
             else:

@@ -7,7 +7,7 @@ writes them in place.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Set
 from itertools import groupby
 
 import numpy as np
@@ -35,6 +35,9 @@ class ArrayEmitter:
         """For which environments of a vector an array must not change."""
         self._uses: Counter[Value] = Counter()
         self._place: dict[Value, int] = {}
+        self._awaited: dict[Value, list[tuple[Value, int]]] = {}
+        """The elements of arrays that a value is stored in as soon as it is known, so that it needs no register."""
+        self._stored: dict[Value, set[int]] = {}
         for number, region in enumerate(schedule.regions):
             for kind, item in region.items:
                 if kind != "result":
@@ -46,6 +49,9 @@ class ArrayEmitter:
         if kind == "node":
             self._place[item] = region
             self._uses.update(g.reads(item))
+            for k, value in enumerate(g.args[item] if g.ops[item] == "array" else ()):
+                if self._place.get(value) == region and g.ops[value] not in ("read", "out"):
+                    self._awaited.setdefault(value, []).append((item, k))
             return
         group = g.groups[item]
         sides = (group.chosen, group.others) if isinstance(group, Branch) else (group.starts, group.nexts)
@@ -81,10 +87,20 @@ class ArrayEmitter:
     def _assign(self, target: str, value: str, kept: str) -> str:
         return f"{target}={f'SELECT({kept},{target},{value})' if kept else value};"
 
+    def _store_element(self, value: Value) -> None:
+        """Store a value that was just computed in the arrays that wait for it."""
+        for array, k in self._awaited.get(value, []):
+            if array not in self.names:
+                self.names[array] = f"v{array}"
+                self._declare(f"v{array}", self.graph.kinds[array])
+            self._stored.setdefault(array, set()).add(k)
+            self.lines.append(f"v{array}[{k}]={self._name(value)};")
+
     def _array(self, value: Value) -> None:
-        self.names[value] = name = f"v{value}"
-        self._declare(name, self.graph.kinds[value])
-        self._fill(name, "0", list(self.graph.args[value]))
+        if value not in self.names:
+            self.names[value] = f"v{value}"
+            self._declare(f"v{value}", self.graph.kinds[value])
+        self._fill(f"v{value}", "0", list(self.graph.args[value]), self._stored.get(value, set()))
 
     def _put(self, value: Value) -> None:
         array, index, *values = self.graph.args[value]
@@ -98,30 +114,31 @@ class ArrayEmitter:
         assert at is not None
         self._fill(name, at, values)
 
-    def _fill(self, name: str, start: str, values: list[Value]) -> None:
+    def _fill(self, name: str, start: str, values: list[Value], stored: Set[int] = frozenset()) -> None:
         """Store values from `start` on; elements of one other array, and equal constants, by a loop."""
         kept = self.kept.get(name, "")
-        for first, run in self._runs(values):
+        for first, run in self._runs(values, stored):
             many = self._run(run) if len(run) >= LEAST_RUN else None
             if many is not None:
-                store = self._assign(f"{name}[{start}+{first}+k]", many, kept)
+                store = self._assign(f"{name}[{_plus(start, first)}+k]", many, kept)
                 self.lines.append(f"for(int k=0;k<{len(run)};++k){store}")
                 continue
             for k, value in enumerate(run, first):
-                self.lines.append(self._assign(f"{name}[{start}+{k}]", self._name(value), kept))
+                self.lines.append(self._assign(f"{name}[{_plus(start, k)}]", self._name(value), kept))
 
-    def _runs(self, values: list[Value]) -> Iterator[tuple[int, list[Value]]]:
+    def _runs(self, values: list[Value], stored: Set[int]) -> Iterator[tuple[int, list[Value]]]:
         """Return runs of values that may be copied by one loop, and where they begin."""
 
-        def sort(k: int) -> tuple[int, ...]:
+        def sort(item: tuple[int, int]) -> tuple[int, ...]:
+            count, k = item
             value = values[k]
             if value >= 0 and self.graph.ops[value] == "read":
                 source, index = self.graph.args[value]
-                return source, split(self.graph, index)[0] or -1
-            return (value,) if value < 0 else (-1, k, 0)
+                return source, _moving(self.graph, index), k - count
+            return (value, k - count) if value < 0 else (-1, k, 0, 0)
 
-        for _, run in groupby(range(len(values)), sort):
-            places = list(run)
+        for _, run in groupby(enumerate(k for k in range(len(values)) if k not in stored), sort):
+            places = [k for _, k in run]
             yield places[0], [values[k] for k in places]
 
     def _run(self, run: list[Value]) -> str | None:
@@ -129,10 +146,10 @@ class ArrayEmitter:
         if run[0] < 0:
             return self._name(run[0])
         found = view(self.graph, np.array(run))
-        base = "0" if found is None or found.base is None else self._whole(found.base)
-        if found is None or base is None:
+        if found is None or (found.base is not None and found.base not in self.wholes):
             return None
-        return f"{self.names[found.source]}[{base}+{found.first}+{found.strides[0]}*k]"
+        start = _plus("0" if found.base is None else self.wholes[found.base], found.first)
+        return f"{self.names[found.source]}[{start}+({found.strides[0]})*k]"
 
     # -- reading them
 
@@ -143,3 +160,13 @@ class ArrayEmitter:
         if at is None:
             return f"AT({TYPES[self.graph.kinds[value]]},{self.names[array]},{self._name(index)})"
         return f"{self.names[array]}[{at}]"
+
+
+def _plus(start: str, more: int) -> str:
+    return str(more) if start == "0" else f"{start}+{more}" if more else start
+
+
+def _moving(graph: Graph, index: Value) -> Value:
+    """Return what an index is without the constant in it, -1 for a constant."""
+    moving, _ = split(graph, index)
+    return -1 if moving is None else moving
