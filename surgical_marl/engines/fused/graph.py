@@ -14,12 +14,11 @@ Simplifications assume finite numbers: 0 * x is 0 even if x might be infinite, z
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from itertools import product
 from typing import Any
 
 import numpy as np
 
-from surgical_marl.engines.fused.operations import COMMUTATIVE, DTYPES, FOLD, KINDS, RESULT
+from surgical_marl.engines.fused.operations import COMMUTATIVE, DTYPES, FOLD, KINDS, RESULT, combined_bounds
 
 Value = int
 
@@ -356,11 +355,5 @@ class Graph:
         op, args = self.ops[value], self.args[value]
         if op == "counter":
             return 0, args[1] - 1
-        if op not in ("add", "sub", "mul", "neg"):
-            return None
-        known = [bounds for a in args if (bounds := self.bounds(a))]
-        if len(known) < len(args):
-            return None
-        corners = [int(FOLD[op](*np.array(corner, np.int64))) for corner in product(*known)]
-        low, high = min(corners), max(corners)
-        return (low, high) if low >= -(2**31) and high < 2**31 else None
+        known = [bounds for a in args if (bounds := self.bounds(a))] if op in ("add", "sub", "mul", "neg") else []
+        return combined_bounds(op, known) if known and len(known) == len(args) else None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -34,3 +35,13 @@ FOLD: dict[str, Callable[..., Any]] = {
 RESULT = {name: "b" for name in ("lt", "le", "gt", "ge", "eq", "ne", "isfinite")} | {
     "f2i": "i", "u2i": "i", "i2f": "f", "u2f": "f", "float": "f", "f2u": "u", "i2u": "u", "bits": "u",
 }  # fmt: skip
+
+
+def combined_bounds(op: str, bounds: list[tuple[int, int]]) -> tuple[int, int] | None:
+    """Return the least and the greatest result of a sum, a difference or a product of int32 within bounds.
+
+    Return None if it may overflow.
+    """
+    corners = [int(FOLD[op](*np.array(corner, np.int64))) for corner in product(*bounds)]
+    low, high = min(corners), max(corners)
+    return (low, high) if -(2**31) <= low and high < 2**31 else None

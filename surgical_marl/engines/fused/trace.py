@@ -1,9 +1,8 @@
 """Traces a JAX function into a `Graph`: its jaxpr is run on arrays of values.
 
 Nested functions are inlined. A branch (`lax.cond`, `lax.switch`) stays a branch. It shares no computed values with the
-code around it, so that only its operands have to be kept for it. A loop (`lax.scan` without arrays that it reads or
-writes row by row, `lax.while_loop`) stays a loop, unless it is to be unrolled (`unroll=True` or one round). Other scans
-are unrolled.
+code around it, so that only its operands have to be kept for it. A loop (`lax.scan`, `lax.while_loop`) stays a loop,
+unless it is to be unrolled: a scan whose `unroll` is at least its length.
 """
 
 from __future__ import annotations
