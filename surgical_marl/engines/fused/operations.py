@@ -44,4 +44,4 @@ def combined_bounds(op: str, bounds: list[tuple[int, int]]) -> tuple[int, int] |
     """
     corners = [int(FOLD[op](*np.array(corner, np.int64))) for corner in product(*bounds)]
     low, high = min(corners), max(corners)
-    return (low, high) if -(2**31) <= low and high < 2**31 else None
+    return (low, high) if low >= -(2**31) and high < 2**31 else None
