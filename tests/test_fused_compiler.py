@@ -165,7 +165,6 @@ UNSUPPORTED: dict[str, tuple[str, Callable[[Any], Any]]] = {
     "within loops": ("the primitive cbrt", lambda x: lax.fori_loop(0, 3, lambda k, s: lax.cbrt(s), x)),
     "a dtype": ("arrays of int8", lambda x: x.astype(jnp.int8)),
     "bits of a dtype": ("arrays of uint8", lambda x: lax.bitcast_convert_type(x, jnp.uint8)),
-    "a scatter": ("a scatter to places", lambda x: x.at[x.astype(int)].set(1)),
     "many keys": ("random_bits of many keys at once", lambda x: jax.vmap(jax.random.bits)(
         jax.random.split(jax.random.wrap_key_data(x.astype(jnp.uint32)[:2]), 3))),
     "a loop": ("a loop that never ends", endless),

@@ -94,8 +94,21 @@ def search(number: int, parts: list[Any], pool: Pool) -> State:
     return lax.while_loop(goes_on, body, (jnp.int32(0), latest(pool)))[1]
 
 
+def memory(number: int, parts: list[Any], pool: Pool) -> State:
+    """A loop that reads and changes rows wherever an index says."""
+
+    def body(k: Any, carry: Any) -> Any:
+        rows, state = carry
+        at = (state["i"][number % 3] + k) % 6
+        state = rounded(latest(parts[0](pool, {**state, "e": rows[at] + state["e"] / 2})))
+        return rows.at[at].set(state["e"]), state
+
+    rows, state = lax.fori_loop(0, 4, body, (jnp.zeros((6, 3)), latest(pool)))
+    return {**state, "e": rows[(number + state["i"][0]) % 6]}
+
+
 STRUCTURES: dict[str, Callable[..., State]] = {
-    "cond": cond, "switch": switch, "repeat": repeat, "scan": scan, "search": search,
+    "cond": cond, "switch": switch, "repeat": repeat, "scan": scan, "search": search, "memory": memory,
 }  # fmt: skip
 
 

@@ -97,6 +97,35 @@ def mixed(x: Arrays, y: Arrays, i: Arrays) -> Arrays:
     )
 
 
+def changed(x: Arrays, y: Arrays, i: Arrays, rounds: Any) -> Any:
+    """Rows that are read and changed wherever an index says, in a loop that environments leave one after another."""
+
+    def body(s: Any) -> Any:
+        k, rows, numbers = s
+        at = (i[0] + k * i[1]) % 8
+        old = rows[at]
+        rows = rows.at[at].set((old + rows[(at + 1) % 8]) / 2 + x)
+        rows = lax.dynamic_update_slice(rows, y[None, :2] - rows[at, 1], ((at + k) % 9, 1))
+        swapped = numbers.at[at % 5, k % 4].add(rows[k % 8, 2]).at[k, at].set(1.5, mode="drop")
+        return k + 1, rows, jnp.where(old[0] > 0, swapped, numbers)
+
+    return lax.while_loop(lambda s: s[0] < rounds, body, (0, jnp.zeros((8, 3)), jnp.tile(x[0], (5, 4))))[1:]
+
+
+def before(x: Arrays, y: Arrays, i: Arrays) -> Arrays:
+    """What was in an array before it was changed: read later, by a scan, in a branch and in a loop."""
+    rows = written(x, y)[1]
+
+    def body(k: Any, rows: Arrays) -> Arrays:
+        new = rows.at[(i[0] + k) % 4].set(total(rows, x) / 4)
+        new = lax.cond(new[k, 0] > 0, lambda: new.at[i[1] % 4, 1].add(rows[i[1] % 4, 2]), lambda: rows)
+        return (new + new.at[(i[1] + k) % 4].set(rows[i[2] % 4])) / 2
+
+    first = rows.at[i[0] % 4].set(x)
+    second = first.at[i[1] % 4].add(y)
+    return second[i[2] % 4] + rows[i[0] % 4] + total(rows, y) / 2 + lax.fori_loop(0, 4, body, rows)[i[1] % 4] / 2
+
+
 ROWS: dict[str, Block] = {
     "of constants": ("s", "s", lambda x: lax.scan(
         lambda c, r: (c / 2 + r[0] * r[2] + r[3] * x, None), x, REALS)[0] / 4),
@@ -131,5 +160,12 @@ ROWS: dict[str, Block] = {
     "in a branch": ("bssi", "s", lambda b, x, y, i: (
         taken(b[0], x, y)[1][i % 4, 1] + taken(b[1], y, x)[2][i % 4, 0, i % 3] + total(taken(b[2], y, x)[0], x)) / 16),
     "in a search": ("ssi", "s", lambda x, y, i: search(i[0] & 7, x, y) / 8),
+    "changed": ("ssi", "s", lambda x, y, i: changed(x, y, i, i[2] & 7)[0][i[0] % 8] / 8),
+    "changed cells": ("ssi", "s", lambda x, y, i: changed(x, y, i, 7)[1][i % 5, (i + 2) % 4] / 8),
+    "changed truths": ("bi", "b", lambda b, i: lax.fori_loop(
+        0, 5, lambda k, s: s.at[i[k % 3] % 20].set(b[k % 3] ^ s[k]), jnp.zeros(20, bool))[i % 20]),
+    "changed words": ("ui", "u", lambda u, i: lax.scan(
+        lambda s, r: (s.at[i % 16].add(r), None), jnp.arange(16, dtype=jnp.uint32) * u[0], WORDS[:, 0])[0][i % 16]),
+    "before": ("ssi", "s", lambda x, y, i: before(x, y, i) / 16),
     "exchanged": ("ss", "s", lambda x, y: exchange(x, y) / 16),
 }  # fmt: skip

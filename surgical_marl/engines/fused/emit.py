@@ -211,7 +211,7 @@ class Emitter(ArrayEmitter):
             self._array(value)
         elif op == "put":
             self._put(value)
-        elif op == "read" and g.args[value][1] < 0:
+        elif op == "read" and self._is_in_place(value):
             self.names[value] = self._read(value)
         elif g.kinds[value] == "i" and g.bounds(value):  # made of counters: the same for all environments
             code = _CODE[op].format(*map(self._whole, g.args[value]))

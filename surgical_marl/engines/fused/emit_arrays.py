@@ -65,6 +65,11 @@ class ArrayEmitter:
         """Whether what is made of an array in a region may take over its memory."""
         return self._uses[array] == 1 and self._place[array] == region
 
+    def _is_in_place(self, value: Value) -> bool:
+        """Whether an element of an array is read wherever it is used: at a known place of what does not change."""
+        array, index = self.graph.args[value]
+        return bool(index < 0) and array not in self.schedule.replaced
+
     def _whole(self, value: Value) -> str | None:
         if value >= 0:
             return self.wholes.get(value)
@@ -105,14 +110,21 @@ class ArrayEmitter:
     def _put(self, value: Value) -> None:
         array, index, *values = self.graph.args[value]
         name = self.names[array]
-        if not self._is_free(array, self._place[value]):
+        if self.schedule.replaced.get(array) != value:
             self._declare(f"v{value}", self.graph.kinds[value])
             self._copy(f"v{value}", name, self.graph.kinds[value])
             name = f"v{value}"
         self.names[value] = name
         at = self._whole(index)
-        assert at is not None
-        self._fill(name, at, values)
+        if at is not None:
+            self._fill(name, at, values)
+            return
+        kind = TYPES[self.graph.kinds[value][0]]
+        (element,) = values
+        stored, kept = self._name(element), self.kept.get(name, "")
+        if kept:
+            stored = f"SELECT({kept},AT({kind},{name},{self._name(index)}),{stored})"
+        self.lines.append(f"PUT({kind},{name},{self._name(index)},{stored})")
 
     def _fill(self, name: str, start: str, values: list[Value], stored: Set[int] = frozenset()) -> None:
         """Store values from `start` on; elements of one other array, and equal constants, by a loop."""
@@ -146,7 +158,11 @@ class ArrayEmitter:
         if run[0] < 0:
             return self._name(run[0])
         found = view(self.graph, np.array(run))
-        if found is None or (found.base is not None and found.base not in self.wholes):
+        if (
+            found is None
+            or found.source in self.schedule.replaced
+            or (found.base is not None and found.base not in self.wholes)
+        ):
             return None
         start = _plus("0" if found.base is None else self.wholes[found.base], found.first)
         return f"{self.names[found.source]}[{start}+({found.strides[0]})*k]"

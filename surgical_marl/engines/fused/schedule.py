@@ -43,6 +43,8 @@ class Schedule:
     """Group -> which of its outs (or phis) are needed."""
     outside: dict[int, list[Value]]
     """Group -> the values from around it that it reads."""
+    replaced: dict[Value, Value]
+    """Array -> the `put` that may take over its memory, as all else that reads the array comes before."""
 
 
 class Scheduler:
@@ -52,6 +54,7 @@ class Scheduler:
         self.graph, self.results = graph, results
         self.regions = [Region(-1, 0, -1)]
         self.inside: dict[int, tuple[int, ...]] = {}
+        self._owner: dict[int, int] = {}  # region -> group
         self.place: dict[Value, int] = {}
         self.group_place: dict[int, int] = {}
         self.alive = self._find_alive()
@@ -59,6 +62,7 @@ class Scheduler:
 
     def run(self) -> Schedule:
         self._place_all()
+        self._replace()
         self._measure()
         self._outside: dict[int, list[Value]] = {}
         self._members: dict[int, list[Value]] = {}
@@ -67,7 +71,9 @@ class Scheduler:
                 self._members.setdefault(self.place[value], []).append(value)
         for number in range(len(self.regions)):
             self._order(number)
-        return Schedule(self.regions, self.inside, self.alive, {n: self._all_reads(n) for n in self.inside})
+        return Schedule(
+            self.regions, self.inside, self.alive, {n: self._all_reads(n) for n in self.inside}, self.replaced
+        )
 
     # -- what is needed
 
@@ -171,6 +177,7 @@ class Scheduler:
         depth = self.regions[region].depth + 1
         for _ in inner:
             loop = number if isinstance(group, Loop) else self.regions[region].loop
+            self._owner[len(self.regions)] = number
             self.regions.append(Region(region, depth, loop))
         for k in self.alive[number]:
             if isinstance(group, Branch):
@@ -203,6 +210,53 @@ class Scheduler:
             if loop < 0 or loops >> loop & 1:
                 return region
             region = self.group_place[loop]
+
+    # -- arrays in memory
+
+    def _replace(self) -> None:
+        """Find the arrays that a `put` may change in place, and what has to come before it (`_before`).
+
+        A node that was made earlier can't depend on one that was made later. So the other readers of the array can come
+        first if all of them were made earlier.
+        """
+        g = self.graph
+        self.replaced: dict[Value, Value] = {}
+        self._before: dict[Value, list[Value]] = {}
+        readers: dict[Value, list[Value]] = {}
+        for value in self.needed:
+            if g.ops[value] in ("read", "put"):
+                readers.setdefault(g.args[value][0], []).append(value)
+        held = {value for number in self.inside for value in self._results_of(number)}
+        starts: dict[Value, list[Value]] = {}
+        for number in self.inside:
+            group = g.groups[number]
+            if isinstance(group, Loop):
+                for k in self.alive[number]:
+                    starts.setdefault(group.starts[k], []).append(group.outs[k])
+        for array, known in readers.items():
+            others = [*known, *starts.get(array, [])]
+            last = max(others)
+            if g.ops[last] != "put" or array in held or self.place[last] != self.place[array]:
+                continue
+            items = [self._around_in(self.place[last], value) for value in others if value != last]
+            if all(value is not None and value < last for value in items):
+                self.replaced[array] = last
+                self._before[last] = [value for value in items if value is not None]
+
+    def _results_of(self, number: int) -> Iterable[Value]:
+        group = self.graph.groups[number]
+        for k in self.alive[number]:
+            yield from (group.chosen[k], group.others[k]) if isinstance(group, Branch) else (group.nexts[k],)
+
+    def _around_in(self, region: int, value: Value) -> Value | None:
+        """Return the value, or the last result of the group in a region that it is computed in."""
+        here = self.place[value]
+        while here != region:
+            if here <= 0:
+                return None
+            group = self._owner[here]
+            value, here = max(self.graph.groups[group].outs[k] for k in self.alive[group]), self.group_place[group]
+        return value
 
     # -- in what order
 
@@ -263,7 +317,9 @@ class Scheduler:
 
     def _item_reads(self, item: tuple[str, int]) -> list[Value]:
         kind, number = item
-        return self.graph.reads(number) if kind == "node" else self._all_reads(number)
+        if kind == "group":
+            return self._all_reads(number)
+        return self.graph.reads(number) + self._before.get(number, [])
 
     def _all_reads(self, number: int) -> list[Value]:
         """Return what a group and everything in it read from outside the group."""
