@@ -17,6 +17,8 @@ from jax import lax
 from surgical_marl.engines.fused.graph import Branch, Graph, Loop, Value
 from surgical_marl.engines.fused.operations import DTYPES, FOLD
 from surgical_marl.engines.fused.schedule import Schedule, Scheduler
+from surgical_marl.engines.fused.traced import Table
+from surgical_marl.engines.fused.translate import trace
 from tests.helpers.fused_blocks import all_blocks, random_arrays
 from tests.helpers.fused_kernels import make_stores
 from tests.helpers.fused_programs import programs, several
@@ -258,3 +260,29 @@ def test_the_schedule_of_every_block() -> None:
 @given(st.lists(programs(2), min_size=1, max_size=1))
 def test_the_schedule_of_programs(written: list[list[Any]]) -> None:
     assert_schedule_is_right(partial(several, written), random_arrays(0))
+
+
+def test_rows_of_parameters() -> None:
+    """What a loop reads of a parameter is looked up at its counter, also row by row in a loop within the loop."""
+    values = np.random.default_rng(0).uniform(-1, 1, (6, 4, 3)).astype(np.float32)
+    truths = np.arange(24).reshape(6, 4) % 3 == 0
+
+    def function(parameters: Any) -> Any:
+        def inner(c: Any, row: Any) -> Any:
+            return c / 2 + row[0][0] * row[0][1], jnp.where(row[1], c, row[0][2])
+
+        outer = lax.scan(lambda c, rows: lax.scan(inner, c, rows), 0.5, parameters, reverse=True)
+        return outer, lax.scan(inner, 1.5, (parameters[0][2], parameters[1][0]), unroll=True)
+
+    g, shapes = Graph(), (jax.ShapeDtypeStruct((6, 4, 3), np.float32), jax.ShapeDtypeStruct((6, 4), bool))
+    tables = [
+        Table(g.input_table(values.ravel()), (6, 4, 3), values.dtype),
+        Table(g.input_table(truths.ravel().astype(np.int32)), (6, 4), truths.dtype),
+    ]
+    leaves, _ = trace(g, function, (), tables, shapes)
+    results = [value for leaf in leaves for value in leaf]
+    plan = Scheduler(g, results).run()
+    assert sum(len(region.items) for region in plan.regions) < 250
+    found = Scheduled(g, plan, {}).results(results)
+    expected = [np.ravel(leaf) for leaf in jax.tree.leaves(function((jnp.asarray(values), jnp.asarray(truths))))]
+    np.testing.assert_allclose(found, np.concatenate(expected), rtol=1e-6)

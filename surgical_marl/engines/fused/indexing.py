@@ -179,6 +179,12 @@ def look_up(g: Graph, operand: np.ndarray | Table, fixed: list[int], moving: dic
     return convert(g, g.lookup(number, flat), kind)
 
 
+def elements_of(g: Graph, table: Table) -> Symbolic:
+    """Return the elements of a table; what is not used costs nothing."""
+    ids = [look_up(g, table, list(place), {}) for place in np.ndindex(table.shape)]
+    return Symbolic(np.array(ids, np.int32).reshape(table.shape))
+
+
 def _read_or_choose(
     g: Graph, ids: np.ndarray, lasts: dict[int, int], fixed: list[int], moving: dict[int, Value]
 ) -> Value:

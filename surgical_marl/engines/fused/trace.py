@@ -17,6 +17,7 @@ from jax.extend import core, random, source_info_util
 
 from surgical_marl.engines.fused.carry import State
 from surgical_marl.engines.fused.graph import Branch, Graph, Loop, Value
+from surgical_marl.engines.fused.indexing import elements_of
 from surgical_marl.engines.fused.memory import depth, pack, unpack
 from surgical_marl.engines.fused.primitives import apply
 from surgical_marl.engines.fused.rows import Writer, reader
@@ -87,6 +88,8 @@ class Tracer:
             return [np.asarray(x) for x in (found if equation.primitive.multiple_results else [found])]
         if any(map(_is_key, avals)):
             return self._keys(name, avals, params, xs, [_is_key(variable.aval) for variable in equation.invars])
+        if name not in ("gather", "dynamic_slice"):
+            xs = [elements_of(self.graph, x) if isinstance(x, Table) else x for x in xs]
         return apply(self.graph, name, avals, params, xs)
 
     def _keys(self, name: str, avals: list[Any], params: Any, xs: list[Traced], are_keys: list[bool]) -> list[Traced]:
