@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -82,7 +83,57 @@ def everything(pool: Any) -> Any:
     chosen = lax.cond(pool["b"][0][0], arithmetic, lambda: jax.tree.map(jnp.zeros_like, arithmetic()))
     step = ("block", "a: add", (0, 0, 0, 0))
     loops = several([[("search", 5, [[step]]), ("repeat", 0, [[step]])]], pool)
-    return chosen, loops, all_blocks("x: table", pool), jnp.where(pool["b"][0], pool["e"][0], jnp.nan)
+    return (
+        chosen,
+        loops,
+        all_blocks("x: table", pool),
+        all_blocks("r", pool),
+        jnp.where(pool["b"][0], pool["e"][0], jnp.nan),
+    )
+
+
+def grouped(count: int, x: Any, which: Any) -> Any:
+    """All that scans do with rows, of `count` rows: two in each other, written, read again, in a branch and a loop."""
+    numbers = (np.arange(count * 24) % 7).astype(np.float32).reshape(count, 4, 6)
+
+    def member(c: Any, row: Any) -> Any:
+        return c / 2 + row[0] * x, (c + row[1], row[2] * c, c > 0)
+
+    def group(c: Any, rows: Any) -> Any:
+        return lax.scan(member, c, rows)
+
+    def sweep(k: Any, forces: Any) -> Any:
+        row = lambda c, r: (c / 2 + r[0][0], (r[0] + c * r[1]) / 2)  # noqa: E731
+        return lax.scan(row, x, (forces, numbers[:, 0, 0]), reverse=True)[1]
+
+    written = lax.scan(group, x, numbers)[1]
+    chosen = lax.cond(which > 3, lambda: written[1], lambda: lax.scan(group, 2 * x, numbers)[1][1])
+    swept = lax.fori_loop(0, 3, sweep, chosen)
+    return written[0][which % count, 2], swept[which % count, 1], written[2][-1, which % 4]
+
+
+def test_code_does_not_grow_with_the_number_of_rows() -> None:
+    columns = RNG.uniform(-1, 1, 9).astype(np.float32), RNG.integers(0, 2**30, 9).astype(np.int32)
+    for vector in (False, True):
+        few, many = (body(partial(grouped, count), *columns, vector=vector).splitlines() for count in (5, 100))
+        assert len(few) == len(many) < 150
+    expected = jax.jit(jax.vmap(partial(grouped, 30)))(*columns)
+    for found, values in zip(run(partial(grouped, 30), *columns), expected, strict=True):
+        np.testing.assert_allclose(found, values, rtol=1e-5)
+
+
+def test_a_scan_that_is_to_be_unrolled_is() -> None:
+    """Then it needs no memory."""
+
+    def function(unroll: bool | int, x: Any) -> Any:
+        return lax.scan(lambda c, row: (c / 2 + row * x, c), x, np.arange(6, dtype=np.float32), unroll=unroll)
+
+    x = RNG.uniform(-1, 1, 9).astype(np.float32)
+    assert "for(" in body(partial(function, 1), x, vector=False)
+    for unroll in (True, 6, 8):
+        code = body(partial(function, unroll), x, vector=False)
+        assert "for(" not in code and "[" not in code
+        np.testing.assert_allclose(run(partial(function, unroll), x)[1], run(partial(function, 1), x)[1], rtol=1e-6)
 
 
 def test_code_for_cuda_compiles(tmp_path: Path) -> None:
@@ -114,7 +165,6 @@ UNSUPPORTED: dict[str, tuple[str, Callable[[Any], Any]]] = {
     "within loops": ("the primitive cbrt", lambda x: lax.fori_loop(0, 3, lambda k, s: lax.cbrt(s), x)),
     "a dtype": ("arrays of int8", lambda x: x.astype(jnp.int8)),
     "bits of a dtype": ("arrays of uint8", lambda x: lax.bitcast_convert_type(x, jnp.uint8)),
-    "a scatter": ("a scatter to places", lambda x: x.at[x.astype(int)].set(1)),
     "many keys": ("random_bits of many keys at once", lambda x: jax.vmap(jax.random.bits)(
         jax.random.split(jax.random.wrap_key_data(x.astype(jnp.uint32)[:2]), 3))),
     "a loop": ("a loop that never ends", endless),

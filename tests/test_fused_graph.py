@@ -7,7 +7,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from surgical_marl.engines.fused.graph import DTYPES, FOLD, KINDS, Graph, Value
+from surgical_marl.engines.fused.graph import Graph, Value
+from surgical_marl.engines.fused.operations import DTYPES, FOLD, KINDS
 
 
 def load(g: Graph, kind: str, field: int = 0) -> Value:

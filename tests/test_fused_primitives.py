@@ -42,7 +42,7 @@ def compare(function: Callable[..., Any], *columns: Any, rtol: float = 1e-5, ato
             np.testing.assert_array_equal(b, a, err_msg=name)
 
 
-@pytest.mark.parametrize("group", ["a", "f", "m", "x"])
+@pytest.mark.parametrize("group", ["a", "f", "m", "r", "x"])
 def test_blocks(group: str) -> None:
     compare(partial(all_blocks, group), random_arrays(0))
 

@@ -11,6 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from tests.helpers.fused_rows import ROWS
+
 COUNT = 21
 """Environments: not a whole number of vectors, so that some lanes hold nothing but zeros."""
 
@@ -307,7 +309,7 @@ def windows(x: Arrays, y: Arrays, mode: str) -> Arrays:
 
 BLOCKS = {
     f"{group}: {name}": block
-    for group, blocks in {"a": ARITHMETIC, "f": FUNCTIONS, "m": MOVES, "x": INDEXING}.items()
+    for group, blocks in {"a": ARITHMETIC, "f": FUNCTIONS, "m": MOVES, "r": ROWS, "x": INDEXING}.items()
     for name, block in blocks.items()
 }
 

@@ -62,17 +62,24 @@ def repeat(number: int, parts: list[Any], pool: Pool) -> State:
 
 
 def scan(number: int, parts: list[Any], pool: Pool) -> State:
-    """Over rows: the carry comes in as one, and rows go out."""
+    """Over rows: the carry comes in as one, and rows go out. Another scan reads these, and they are looked up."""
 
     def body(state: State, row: Any) -> tuple[State, Any]:
         state = latest(parts[0](pool, {**state, "e": state["e"] / 2 + row[0], "b": row[1] ^ state["b"]}))
-        state["e"] = lax.clamp(np.float32(-8), jnp.round(state["e"] * 8) / 8, np.float32(8))
-        return state, (state["e"][0], state["u"][1])
+        return rounded(state), (state["e"], state["u"][1])
 
-    state, (reals, words) = lax.scan(
-        body, latest(pool), (pool["e"][0], pool["b"][0]), reverse=bool(number % 2), unroll=1 + number % 3
-    )
-    return {**state, "e": reals, "u": words}
+    def again(state: State, row: Any) -> tuple[State, Any]:
+        state = latest(parts[-1](pool, {**state, "e": state["e"] / 2 + row[0], "u": state["u"] ^ row[1]}))
+        return rounded(state), state["b"]
+
+    options: Any = {"reverse": bool(number % 2), "unroll": 1 + number % 3}
+    state, (reals, words) = lax.scan(body, latest(pool), (pool["e"][0], pool["b"][0]), **options)
+    state, truths = lax.scan(again, state, (reals[:, ::-1], words), reverse=number > 5)
+    return {**state, "e": rounded({"e": reals[state["i"] % 3, 1]})["e"], "u": words, "b": truths[:, number % 3]}
+
+
+def rounded(state: State) -> State:
+    return {**state, "e": lax.clamp(np.float32(-8), jnp.round(state["e"] * 8) / 8, np.float32(8))}
 
 
 def search(number: int, parts: list[Any], pool: Pool) -> State:
@@ -87,8 +94,21 @@ def search(number: int, parts: list[Any], pool: Pool) -> State:
     return lax.while_loop(goes_on, body, (jnp.int32(0), latest(pool)))[1]
 
 
+def memory(number: int, parts: list[Any], pool: Pool) -> State:
+    """A loop that reads and changes rows wherever an index says."""
+
+    def body(k: Any, carry: Any) -> Any:
+        rows, state = carry
+        at = (state["i"][number % 3] + k) % 6
+        state = rounded(latest(parts[0](pool, {**state, "e": rows[at] + state["e"] / 2})))
+        return rows.at[at].set(state["e"]), state
+
+    rows, state = lax.fori_loop(0, 4, body, (jnp.zeros((6, 3)), latest(pool)))
+    return {**state, "e": rows[(number + state["i"][0]) % 6]}
+
+
 STRUCTURES: dict[str, Callable[..., State]] = {
-    "cond": cond, "switch": switch, "repeat": repeat, "scan": scan, "search": search,
+    "cond": cond, "switch": switch, "repeat": repeat, "scan": scan, "search": search, "memory": memory,
 }  # fmt: skip
 
 

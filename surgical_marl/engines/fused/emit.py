@@ -12,13 +12,12 @@ from typing import Any
 
 import numpy as np
 
+from surgical_marl.engines.fused.emit_arrays import TYPES, ArrayEmitter
 from surgical_marl.engines.fused.graph import Branch, Graph, Loop, Value
-from surgical_marl.engines.fused.schedule import Schedule, Scheduler
+from surgical_marl.engines.fused.schedule import Scheduler
 
 LARGE = 500
 """Least number of operations in a branch whose inputs are hidden from the compiler (`HIDEF`)."""
-
-TYPES = {"f": "F", "i": "I", "u": "U", "b": "B"}
 
 _CODE = {
     "add": "{}+{}", "sub": "{}-{}", "mul": "{}*{}", "neg": "-{}", "lt": "{}<{}", "le": "{}<={}", "gt": "{}>{}",
@@ -32,7 +31,7 @@ _CODE = {
 }  # fmt: skip
 
 
-class Emitter:
+class Emitter(ArrayEmitter):
     """Writes the body of a function.
 
     `stores` are (buffer, field, value) in the order in which they should happen. A load is a node "load" of (buffer,
@@ -40,11 +39,8 @@ class Emitter:
     """
 
     def __init__(self, graph: Graph, stores: list[tuple[str, int, Value]], vector: bool) -> None:
-        self.graph, self.stores, self.vector = graph, stores, vector
-        self.schedule: Schedule = Scheduler(graph, [value for _, _, value in stores]).run()
-        self.offsets = table_offsets(graph)
-        self.lines: list[str] = []
-        self.names: dict[Value, str] = {}
+        super().__init__(graph, Scheduler(graph, [value for _, _, value in stores]).run(), vector)
+        self.stores, self.offsets = stores, table_offsets(graph)
         self.active: list[str] = []
         """Conditions of the code's branch: it applies to the environments of a vector for which all of them hold."""
 
@@ -73,7 +69,8 @@ class Emitter:
     def _region(self, number: int, result: Any) -> None:
         for kind, index in self.schedule.regions[number].items:
             if kind == "node":
-                self.lines.append(self._node(index))
+                self._node(index)
+                self._store_element(index)
             elif kind == "result":
                 result(index)
             else:
@@ -89,15 +86,21 @@ class Emitter:
         outs = [branch.outs[k] for k in wanted]
         for out in outs:
             self.names[out] = f"v{out}"
+            if self._is_array(out):
+                self._declare(f"v{out}", self.graph.kinds[out])
+                continue
             kind = TYPES[self.graph.kind(out)]
             self.lines.append(f"{kind} v{out}={kind}{{}};" if self.vector else f"{kind} v{out};")
         chosen, other = self.schedule.inside[number]
 
         def take(values: list[Value], first: bool) -> Any:
             def result(k: int) -> None:
-                value = self._name(values[wanted[k]])
-                blend = f"SELECT({condition},v{outs[k]},{value})" if self.vector and not first else value
-                self.lines.append(f"v{outs[k]}={blend};")
+                name, value = f"v{outs[k]}", self._name(values[wanted[k]])
+                kept = condition if self.vector and not first else ""
+                if self._is_array(outs[k]):
+                    self._copy(name, value, self.graph.kinds[outs[k]], kept)
+                else:
+                    self.lines.append(self._assign(name, value, kept))
 
             return result
 
@@ -120,7 +123,7 @@ class Emitter:
         names, size = dict(self.names), sum(len(self.schedule.regions[r].items) for r in self.schedule.inside[number])
         if size > LARGE and not self.vector:
             for value in self.schedule.outside[number]:
-                if self.graph.kind(value) != "b":
+                if self.graph.kind(value) != "b" and self.names[value].isalnum() and not self._is_array(value):
                     kind = TYPES[self.graph.kind(value)]
                     self.lines.append(f"{kind} h{value}={self._name(value)};HIDE{kind}(h{value})")
                     self.names[value] = f"h{value}"
@@ -129,17 +132,12 @@ class Emitter:
         self.active.pop()
 
     def _loop(self, number: int, loop: Loop) -> None:
-        wanted = self.schedule.alive[number]
-        phis = [loop.phis[k] for k in wanted]
-        for k in wanted:
-            phi = loop.phis[k]
-            self.names[phi] = self.names[loop.outs[k]] = f"v{phi}"
-            self.lines.append(f"{TYPES[self.graph.kind(phi)]} v{phi}={self._name(loop.starts[k])};")
-        counter = f"r{number}"
         tested = loop.condition is not None
+        for k in self.schedule.alive[number]:
+            self._start(number, loop, k)
         if tested and self.vector:
             self.lines.append(f"B m{number}={'&'.join(self.active) or 'SPLATB(1)'};")
-        self.lines.append("for(;;){" if tested else f"for(int {counter}=0;{counter}<{loop.length};++{counter}){{")
+        self.lines.append(self._head(number, loop))
 
         def result(k: int) -> None:
             if tested and k == 0:
@@ -153,32 +151,98 @@ class Emitter:
         self.active = [f"m{number}"] if tested else active
         self._region(self.schedule.inside[number][0], result)
         self.active = active
-        for k, phi in zip(wanted, phis, strict=True):
-            self.lines.append(f"{TYPES[self.graph.kind(phi)]} n{phi}={self._name(loop.nexts[k])};")
-        for phi in phis:
-            next_value = f"SELECT(m{number},n{phi},v{phi})" if tested and self.vector else f"n{phi}"
-            self.lines.append(f"v{phi}={next_value};")
+        self._next(number, loop)
         self.lines.append("}")
+        for k in self.schedule.alive[number]:
+            self.kept.pop(self.names[loop.phis[k]], None)
 
-    def _node(self, value: Value) -> str:
+    def _start(self, number: int, loop: Loop, k: int) -> None:
+        """Declare what a loop carries, and set it to what it starts with."""
+        phi, start = loop.phis[k], loop.starts[k]
+        kind, name = self.graph.kinds[phi], f"v{phi}"
+        if not self._is_array(phi):
+            self.lines.append(f"{TYPES[kind]} {name}={self._name(start)};")
+        elif self.graph.ops[start] in ("array", "out") and self._is_free(start, self._place[loop.outs[k]]):
+            name = self.names[start]
+        else:
+            self._declare(name, kind)
+            if self.graph.ops[start] != "room":
+                self._copy(name, self.names[start], kind)
+        self.names[phi] = self.names[loop.outs[k]] = name
+        if self._is_array(phi) and loop.condition is not None and self.vector:
+            self.kept[name] = f"NOT(m{number})"
+
+    def _head(self, number: int, loop: Loop) -> str:
+        r, length = f"r{number}", loop.length
+        if loop.condition is not None:
+            return "for(;;){"
+        if loop.counter is not None:
+            self.names[loop.counter], self.wholes[loop.counter] = f"SPLATI({r})", r
+        return f"for(int {r}={length - 1};{r}>=0;--{r}){{" if loop.backwards else f"for(int {r}=0;{r}<{length};++{r}){{"
+
+    def _next(self, number: int, loop: Loop) -> None:
+        """Write the end of a round: first all new values get names, and then they replace the old ones."""
+        wanted = self.schedule.alive[number]
+        carried = {self.names[loop.phis[k]] for k in wanted}
+        arrays = [k for k in wanted if self._is_array(loop.phis[k])]
+        sources = {k: self._name(loop.nexts[k]) for k in wanted}
+        for k in wanted:
+            phi, kind = loop.phis[k], self.graph.kinds[loop.phis[k]]
+            if k not in arrays:
+                self.lines.append(f"{TYPES[kind]} n{phi}={sources[k]};")
+                sources[k] = f"n{phi}"
+            elif sources[k] in carried - {self.names[phi]}:  # it may be replaced before it is read
+                self._declare(f"n{phi}", kind)
+                self._copy(f"n{phi}", sources[k], kind)
+                sources[k] = f"n{phi}"
+        for k in wanted:
+            phi, tested = loop.phis[k], loop.condition is not None and self.vector
+            if k in arrays:
+                self._copy(self.names[phi], sources[k], self.graph.kinds[phi], f"NOT(m{number})" if tested else "")
+            else:
+                self.lines.append(f"v{phi}={f'SELECT(m{number},{sources[k]},v{phi})' if tested else sources[k]};")
+
+    def _is_array(self, value: Value) -> bool:
+        return len(self.graph.kinds[value]) > 1
+
+    def _node(self, value: Value) -> None:
+        g, op = self.graph, self.graph.ops[value]
+        if op == "array":
+            self._array(value)
+        elif op == "put":
+            self._put(value)
+        elif op == "read" and self._is_in_place(value):
+            self.names[value] = self._read(value)
+        elif g.kinds[value] == "i" and g.bounds(value):  # made of counters: the same for all environments
+            code = _CODE[op].format(*map(self._whole, g.args[value]))
+            self.lines.append(f"int v{value}={code};")
+            self.names[value], self.wholes[value] = f"SPLATI(v{value})", f"v{value}"
+        elif op != "room":
+            code = self._operation(value)
+            self.names[value] = f"v{value}"
+            self.lines.append(f"{TYPES[g.kinds[value]]} v{value}={code};")
+
+    def _operation(self, value: Value) -> str:
+        """Return what computes a value."""
         g, op, args = self.graph, self.graph.ops[value], self.graph.args[value]
         kind = g.kinds[value]
-        self.names[value] = f"v{value}"
         if op == "load":
-            code = f"LD{kind.upper()}({args[0]},{args[1]})"
-        elif op == "lookup":
-            code = f"TABLE{kind.upper()}({self.offsets[args[0]]},{self._name(args[1])})"
-        elif op == "not":
-            code = f"NOT({self._name(args[0])})" if kind == "b" else f"~{self._name(args[0])}"
-        elif op in ("div", "rem", "max", "min"):
-            code = _CODE[op].format(self._name(args[0]), kind.upper(), self._name(args[1]))
-        elif op == "abs":
-            code = _CODE[op].format(self._name(args[0]), kind.upper())
-        elif kind == "i" and op in ("add", "sub", "mul", "neg", "shl"):  # overflow of I is undefined in C
-            code = f"(I)({_CODE[op].format(*(f'(U){self._name(a)}' for a in args))})"
-        else:
-            code = _CODE[op].format(*(self._name(a) for a in args))
-        return f"{TYPES[kind]} v{value}={code};"
+            return f"LD{kind.upper()}({args[0]},{args[1]})"
+        if op == "read":
+            return self._read(value)
+        if op == "lookup":
+            if args[1] in self.wholes:
+                return f"ROW{kind.upper()}({self.offsets[args[0]]},{self.wholes[args[1]]})"
+            return f"TABLE{kind.upper()}({self.offsets[args[0]]},{self._name(args[1])})"
+        if op == "not":
+            return f"NOT({self._name(args[0])})" if kind == "b" else f"~{self._name(args[0])}"
+        if op in ("div", "rem", "max", "min"):
+            return _CODE[op].format(self._name(args[0]), kind.upper(), self._name(args[1]))
+        if op == "abs":
+            return _CODE[op].format(self._name(args[0]), kind.upper())
+        if kind == "i" and op in ("add", "sub", "mul", "neg", "shl"):  # overflow of I is undefined in C
+            return f"(I)({_CODE[op].format(*(f'(U){self._name(a)}' for a in args))})"
+        return _CODE[op].format(*(self._name(a) for a in args))
 
     def _name(self, value: Value) -> str:
         return self.names[value] if value >= 0 else literal(self.graph.constants[~value])

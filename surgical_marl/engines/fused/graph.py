@@ -4,20 +4,21 @@ A value is an int. A negative one is a constant, `constants[~value]`; others are
 reads and a kind, one of "f" (float32), "i" (int32), "u" (uint32), "b" (bool). Equal nodes are made once. Branches and
 loops are groups, whose results are nodes that name the group. `schedule.py` decides where a node is computed.
 
+An array in memory is a value too, of the kind "f64" if it holds 64 floats. Nothing changes an array: `put` makes
+another one. `emit.py` gives both the same place in memory if nothing else reads the first.
+
 Simplifications assume finite numbers: 0 * x is 0 even if x might be infinite, zero has no sign, and only `x != x` and
 `isfinite` detect NaN.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-KINDS = {"float32": "f", "int32": "i", "uint32": "u", "bool": "b"}
-DTYPES = {kind: np.dtype(name).type for name, kind in KINDS.items()}
+from surgical_marl.engines.fused.operations import COMMUTATIVE, DTYPES, FOLD, KINDS, RESULT, combined_bounds
 
 Value = int
 
@@ -47,32 +48,9 @@ class Loop:
     length: int = 0
     around: int = 0
     """The loops around it, as bits."""
-
-
-COMMUTATIVE = {"add", "mul", "min", "max", "and", "or", "xor", "eq", "ne"}
-
-
-def _divide(a: Any, b: Any) -> Any:
-    return np.divide(a, b) if a.dtype.kind == "f" else np.trunc(np.divide(a, b, dtype=np.float64)).astype(a.dtype)
-
-
-FOLD: dict[str, Callable[..., Any]] = {
-    "add": np.add, "sub": np.subtract, "mul": np.multiply, "div": _divide, "neg": np.negative, "abs": np.abs,
-    "sqrt": np.sqrt, "floor": np.floor, "ceil": np.ceil, "rint": np.rint, "rem": np.fmod, "pow": np.power,
-    "log": np.log, "tan": np.tan, "acos": np.arccos, "asin": np.arcsin, "atan2": np.arctan2, "tanh": np.tanh,
-    "max": np.maximum, "min": np.minimum, "lt": np.less, "le": np.less_equal, "gt": np.greater,
-    "ge": np.greater_equal, "eq": np.equal, "ne": np.not_equal, "and": np.bitwise_and, "or": np.bitwise_or,
-    "xor": np.bitwise_xor, "not": np.bitwise_not, "shl": np.left_shift, "shr": np.right_shift,
-    "sar": np.right_shift, "isfinite": np.isfinite, "f2i": lambda a: a.astype(np.int32),
-    "i2f": lambda a: a.astype(np.float32), "u2f": lambda a: a.astype(np.float32),
-    "f2u": lambda a: a.astype(np.uint32), "i2u": lambda a: a.astype(np.uint32), "u2i": lambda a: a.astype(np.int32),
-    "bits": lambda a: a.view(np.uint32), "float": lambda a: a.view(np.float32),
-}  # fmt: skip
-"""What each operation does to constants: numpy, in the operands' own type."""
-
-RESULT = {name: "b" for name in ("lt", "le", "gt", "ge", "eq", "ne", "isfinite")} | {
-    "f2i": "i", "u2i": "i", "i2f": "f", "u2f": "f", "float": "f", "f2u": "u", "i2u": "u", "bits": "u",
-}  # fmt: skip
+    counter: Value | None = None
+    """The number of the round, if something reads it: from 0 on, or back to 0 if it goes `backwards`."""
+    backwards: bool = False
 
 
 class Graph:
@@ -91,6 +69,7 @@ class Graph:
         self._table_numbers: dict[tuple[str, bytes], int] = {}
         self._known: dict[tuple[Any, ...], Value] = {}
         self._scopes: list[dict[tuple[Any, ...], Value]] = []
+        self._bounds: dict[Value, tuple[int, int] | None] = {}
         self.zero, self.one = self.constant(np.float32(0)), self.constant(np.float32(1))
         self.false, self.true = self.constant(np.bool_(False)), self.constant(np.bool_(True))
 
@@ -146,7 +125,7 @@ class Graph:
         What a group reads is not counted for the nodes that stand for its values, but for the group.
         """
         op, args = self.ops[value], self.args[value]
-        if op in ("load", "phi", "out"):
+        if op in ("load", "phi", "out", "counter"):
             return []
         return [a for a in (args[1:] if op == "lookup" else args) if a >= 0]
 
@@ -235,6 +214,10 @@ class Graph:
             return self._compare_truths(op, a, b)
         if a == b and a >= 0 and not (self.kinds[a] == "f" and op in ("eq", "ne")):  # these are tests for NaN
             return self.true if op in ("le", "ge", "eq") else self.false
+        if (low := self.bounds(a)) and (high := self.bounds(b)) and max(a, b) >= 0:
+            known = {bool(FOLD[op](x, y)) for x in low for y in high}
+            if len(known) == 1 and (op not in ("eq", "ne") or low[1] < high[0] or high[1] < low[0]):
+                return self.true if known.pop() else self.false
         for x, y, flipped in ((a, b, False), (b, a, True)):
             # a choice between constants, compared with a constant: the choice itself
             if y < 0 and x >= 0 and self.ops[x] == "select" and max(self.args[x][1:]) < 0:
@@ -283,6 +266,10 @@ class Graph:
                 return y if (self.constants[~x] < 0) == (op == "max") else x
             if x < 0 <= y and self._is_beyond(op, x, y):
                 return x
+        if max(a, b) >= 0 and (low := self.bounds(a)) and (high := self.bounds(b)):
+            for x, y, least, most in ((a, b, low[0], high[1]), (b, a, high[0], low[1])):
+                if least >= most:
+                    return x if op == "max" else y
         return self.binary(op, a, b)
 
     def _is_beyond(self, op: str, constant: Value, value: Value) -> bool:
@@ -337,3 +324,36 @@ class Graph:
     def dtype(self, value: Value) -> type:
         """Return the numpy type of a value."""
         return DTYPES[self.kind(value)]
+
+    # -- arrays in memory
+
+    def array(self, values: list[Value]) -> Value:
+        """Return an array that holds these values."""
+        return self.node("array", *values, kind=f"{self.kind(values[0])}{len(values)}")
+
+    def put(self, array: Value, index: Value, values: list[Value]) -> Value:
+        """Return an array that holds `values` from `index` on; the index must be in range."""
+        return self.node("put", array, index, *values, kind=self.kinds[array])
+
+    def read(self, array: Value, index: Value) -> Value:
+        """`array[index]`; the index must be in range."""
+        if index < 0 and self.ops[array] == "array":
+            return int(self.args[array][int(self.constants[~index])])
+        return self.node("read", array, index, kind=self.kinds[array][0])
+
+    def bounds(self, value: Value) -> tuple[int, int] | None:
+        """Return the least and the greatest that a whole number can be, if it is made of counters and constants."""
+        if value not in self._bounds:
+            self._bounds[value] = self._find_bounds(value)
+        return self._bounds[value]
+
+    def _find_bounds(self, value: Value) -> tuple[int, int] | None:
+        if self.kind(value) != "i":
+            return None
+        if value < 0:
+            return (int(self.constants[~value]),) * 2
+        op, args = self.ops[value], self.args[value]
+        if op == "counter":
+            return 0, args[1] - 1
+        known = [bounds for a in args if (bounds := self.bounds(a))] if op in ("add", "sub", "mul", "neg") else []
+        return combined_bounds(op, known) if known and len(known) == len(args) else None

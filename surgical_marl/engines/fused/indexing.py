@@ -1,7 +1,7 @@
 """Gather, scatter and slices at traced places, as arithmetic on indices.
 
 Indices that are known while tracing cost nothing: elements are moved. Another index becomes a lookup if the array is a
-table of constants, or else a selection among the elements that it may point to.
+table of constants or in memory, or else a selection among the elements that it may point to.
 """
 
 from __future__ import annotations
@@ -13,9 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from surgical_marl.engines.fused.graph import KINDS, Graph, Value
+from surgical_marl.engines.fused.graph import Graph, Value
+from surgical_marl.engines.fused.memory import depth, pack, unpack, view
+from surgical_marl.engines.fused.operations import KINDS
 from surgical_marl.engines.fused.scalars import convert
-from surgical_marl.engines.fused.traced import Symbolic, Table, Traced, Unsupported, lift
+from surgical_marl.engines.fused.traced import Symbolic, Table, Traced, lift
 
 LEAST_TABLE = 16
 """Least number of constants that are looked up in memory instead of being selected one by one."""
@@ -61,6 +63,15 @@ def dynamic_slice(g: Graph, shape: Any, params: Any, operand: Traced | Table, *s
 def dynamic_update_slice(g: Graph, shape: Any, params: Any, operand: Traced, update: Traced, *starts: Traced) -> Traced:
     """Do what `lax.dynamic_update_slice` does."""
     out, new = lift(g, operand).copy(), lift(g, update)
+    if any(isinstance(start, Symbolic) for start in starts) and (out.size >= LEAST_TABLE or depth(g, out)):
+        grid: Places = [np.array(axis) for axis in np.indices(new.shape)]
+        corners = {}
+        for axis, start in enumerate(starts):
+            if isinstance(start, Symbolic):
+                corners[axis] = np.broadcast_to(start.ids, new.shape)
+            else:
+                grid[axis] = grid[axis] + int(np.clip(int(start), 0, shape[axis] - new.shape[axis]))
+        return _write(g, out, grid, corners, new, clip=True)
     lasts = [size - length for size, length in zip(shape, new.shape, strict=True)]
     corner = [_bounded(g, int(lift(g, start)), last) for start, last in zip(starts, lasts, strict=True)]
     for at in _corners(g, corner, lasts):
@@ -80,9 +91,7 @@ def scatter(
     indices: Traced,
     updates: Traced,
 ) -> Traced:
-    """`lax.scatter` and its kin, at known places. A window that is not all inside is left out, or moved there."""
-    if isinstance(indices, Symbolic):
-        raise Unsupported("a scatter to places that are not known while tracing")
+    """`lax.scatter` and its kin. A window that is not all inside is left out, or moved there."""
     numbers, new = params["dimension_numbers"], lift(g, updates)
     grid = np.indices(new.shape)
     batch = [grid[axis] for axis in range(new.ndim) if axis not in numbers.update_window_dims]
@@ -90,10 +99,15 @@ def scatter(
     place = _windows(new.shape, operand, numbers.inserted_window_dims, numbers.operand_batching_dims, windows)
     for axis, start in zip(numbers.operand_batching_dims, numbers.scatter_indices_batching_dims, strict=True):
         place[axis] = place[axis] + batch[start]
+    clip = "clip" in str(params["mode"]).lower()
+    if isinstance(indices, Symbolic):
+        axes = numbers.scatter_dims_to_operand_dims
+        starts = {axis: np.broadcast_to(indices.ids[(*batch, k)], new.shape) for k, axis in enumerate(axes)}
+        return _write(g, lift(g, operand), place, starts, new, clip, combine)
     inside = np.ones(new.shape, bool)
     for k, axis in enumerate(numbers.scatter_dims_to_operand_dims):
         start, last = indices[(*batch, k)].astype(int), shape[axis] - 1 - place[axis].max(initial=0)
-        if "clip" in str(params["mode"]).lower():
+        if clip:
             start = np.clip(start, 0, last)
         inside &= (start >= 0) & (start <= last)
         place[axis] = place[axis] + start
@@ -138,7 +152,7 @@ def _choose(
     if isinstance(operand, Table) or (isinstance(operand, np.ndarray) and operand.size >= LEAST_TABLE):
         find = partial(look_up, g, operand)
     else:
-        find = partial(_choose_one, g, lift(g, operand), lasts)
+        find = partial(_read_or_choose, g, lift(g, operand), lasts)
     out = []
     for element in np.ndindex(shape):
         moving, valid = {}, g.true
@@ -163,6 +177,22 @@ def look_up(g: Graph, operand: np.ndarray | Table, fixed: list[int], moving: dic
     for axis, start in moving.items():
         flat = g.add(flat, g.mul(g.constant(np.int32(strides[axis])), convert(g, start, "i")))
     return convert(g, g.lookup(number, flat), kind)
+
+
+def elements_of(g: Graph, table: Table) -> Symbolic:
+    """Return the elements of a table; what is not used costs nothing."""
+    ids = [look_up(g, table, list(place), {}) for place in np.ndindex(table.shape)]
+    return Symbolic(np.array(ids, np.int32).reshape(table.shape))
+
+
+def _read_or_choose(
+    g: Graph, ids: np.ndarray, lasts: dict[int, int], fixed: list[int], moving: dict[int, Value]
+) -> Value:
+    """Return the element at `fixed + moving`: from memory if the elements that it may be are there."""
+    found = view(g, ids[tuple(slice(None) if axis in moving else place for axis, place in enumerate(fixed))])
+    if found is None or found.op != "read":
+        return _choose_one(g, ids, lasts, fixed, moving)
+    return found.at(g, [g.add(_like(g, moving[axis], fixed[axis]), moving[axis]) for axis in sorted(moving)])
 
 
 def _choose_one(g: Graph, ids: np.ndarray, lasts: dict[int, int], fixed: list[int], moving: dict[int, Value]) -> Value:
@@ -211,3 +241,41 @@ def _fill(g: Graph, params: Any, operand: Traced | Table) -> Value:
         limits = np.iinfo(dtype) if dtype.kind in "iu" else None
         given = {"f": np.nan, "b": True}.get(dtype.kind) if limits is None else limits.min or limits.max
     return g.constant(dtype.type(given))
+
+
+# -- writing at indices that are not known while tracing
+
+
+def _write(
+    g: Graph,
+    ids: np.ndarray,
+    place: Places,
+    starts: dict[int, np.ndarray],
+    new: np.ndarray,
+    clip: bool,
+    combine: Callable[[Graph, Value, Value], Value] = lambda g, old, new: new,
+) -> Symbolic:
+    """Return an array in memory with the values `new` put at `place + starts`.
+
+    A window that is not all inside is moved there if `clip`, and left out otherwise.
+    """
+    axes = max(depth(g, ids), *(axis + 1 for axis in starts))
+    strides = np.cumprod([1, *ids.shape[axes - 1 : 0 : -1]])[::-1]
+    arrays = pack(g, ids, axes)
+    for element in np.ndindex(new.shape):
+        index, valid = g.constant(np.int32(0)), g.true
+        for axis in range(axes):
+            start = int(starts[axis][element]) if axis in starts else g.constant(np.int32(0))
+            inside = _bounded(g, start, ids.shape[axis] - 1 - int(place[axis].max(initial=0)))
+            valid = valid if clip else g.logic("and", valid, g.compare("eq", start, inside))
+            at = g.add(g.constant(np.int32(place[axis][element])), convert(g, inside, "i"))
+            index = g.add(index, g.mul(g.constant(np.int32(strides[axis])), at))
+        column = (
+            int(np.ravel_multi_index([int(p[element]) for p in place[axes:]], ids.shape[axes:]))
+            if ids.ndim > axes
+            else 0
+        )
+        old = g.read(arrays[column], index)
+        value = g.select(valid, old, combine(g, old, int(new[element])))
+        arrays[column] = g.put(arrays[column], index, [value])
+    return Symbolic(unpack(g, arrays, ids.shape, axes))

@@ -31,6 +31,10 @@ typedef float F; typedef int I; typedef unsigned int U; typedef bool B;
 #define STB(p,i,x) p.data[(size_t)(i)*stride+t]=(x);
 #define TABLEF(k,i) reals.data[k+(i)]
 #define TABLEI(k,i) wholes.data[k+(i)]
+#define ROWF(k,i) reals.data[k+(i)]
+#define ROWI(k,i) wholes.data[k+(i)]
+#define AT(T,a,i) a[i]
+#define PUT(T,a,i,x) a[i]=(x);
 #define DIVF(a,b) \
 ([](float x,float y){float r;asm("div.approx.ftz.f32 %0, %1, %2;":"=f"(r):"f"(x),"f"(y));return r;}(a,b))
 #define DIVI(a,b) ((a)/(b))
@@ -102,6 +106,10 @@ typedef unsigned char C __attribute__((ext_vector_type(SM_W)));
 #define LANEWISE(T,e) ({T r_;for(int l=0;l<SM_W;++l)r_[l]=(e);r_;})
 #define TABLEF(k,i) ({I i_=(i);LANEWISE(F,reals.data[k+i_[l]]);})
 #define TABLEI(k,i) ({I i_=(i);LANEWISE(I,wholes.data[k+i_[l]]);})
+#define ROWF(k,i) SPLAT(reals.data[k+(i)])
+#define ROWI(k,i) SPLATI(wholes.data[k+(i)])
+#define AT(T,a,i) ({I i_=(i);LANEWISE(T,a[i_[l]][l]);})
+#define PUT(T,a,i,x) {I i_=(i);T r_=(x);for(int l=0;l<SM_W;++l)a[i_[l]][l]=r_[l];}
 #define DIVF(a,b) ((a)/(b))
 #define DIVI(a,b) ((a)/(b))
 #define DIVU(a,b) ((a)/(b))

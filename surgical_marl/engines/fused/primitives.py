@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 
 from surgical_marl.engines.fused import elementary, linear
-from surgical_marl.engines.fused.graph import FOLD, Graph, Value
+from surgical_marl.engines.fused.graph import Graph, Value
 from surgical_marl.engines.fused.indexing import dynamic_slice, dynamic_update_slice, gather, scatter
+from surgical_marl.engines.fused.operations import FOLD
 from surgical_marl.engines.fused.scalars import ELEMENTWISE, bitcast, convert, extreme, logic, round_
 from surgical_marl.engines.fused.threefry import threefry
 from surgical_marl.engines.fused.traced import Rule, Symbolic, Traced, Unsupported, each, kind_of, lift, lower

@@ -7,7 +7,8 @@ from collections.abc import Callable
 import numpy as np
 
 from surgical_marl.engines.fused import elementary
-from surgical_marl.engines.fused.graph import DTYPES, Graph, Value
+from surgical_marl.engines.fused.graph import Graph, Value
+from surgical_marl.engines.fused.operations import DTYPES
 
 
 def _op(name: str) -> Callable[..., Value]:

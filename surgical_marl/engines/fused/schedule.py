@@ -13,6 +13,9 @@ from dataclasses import dataclass, field
 
 from surgical_marl.engines.fused.graph import Branch, Graph, Loop, Value
 
+GIVEN = ("phi", "counter")
+"""Values that are there at the start of a round of their loop."""
+
 
 @dataclass
 class Region:
@@ -40,6 +43,8 @@ class Schedule:
     """Group -> which of its outs (or phis) are needed."""
     outside: dict[int, list[Value]]
     """Group -> the values from around it that it reads."""
+    replaced: dict[Value, Value]
+    """Array -> the `put` that may take over its memory, as all else that reads the array comes before."""
 
 
 class Scheduler:
@@ -49,6 +54,7 @@ class Scheduler:
         self.graph, self.results = graph, results
         self.regions = [Region(-1, 0, -1)]
         self.inside: dict[int, tuple[int, ...]] = {}
+        self._owner: dict[int, int] = {}  # region -> group
         self.place: dict[Value, int] = {}
         self.group_place: dict[int, int] = {}
         self.alive = self._find_alive()
@@ -56,15 +62,18 @@ class Scheduler:
 
     def run(self) -> Schedule:
         self._place_all()
+        self._replace()
         self._measure()
         self._outside: dict[int, list[Value]] = {}
         self._members: dict[int, list[Value]] = {}
         for value in self.needed:
-            if self.graph.ops[value] != "phi":
+            if self.graph.ops[value] not in GIVEN:
                 self._members.setdefault(self.place[value], []).append(value)
         for number in range(len(self.regions)):
             self._order(number)
-        return Schedule(self.regions, self.inside, self.alive, {n: self._all_reads(n) for n in self.inside})
+        return Schedule(
+            self.regions, self.inside, self.alive, {n: self._all_reads(n) for n in self.inside}, self.replaced
+        )
 
     # -- what is needed
 
@@ -112,7 +121,7 @@ class Scheduler:
         self.group_loops: dict[int, int] = {}
         for value in self.needed:
             op = g.ops[value]
-            if op == "phi":
+            if op in GIVEN:
                 self.loops[value] = 1 << g.args[value][0]
                 continue
             if op == "out":
@@ -139,14 +148,16 @@ class Scheduler:
             self._use(value, 0)
         for value in reversed(self.needed):
             op = g.ops[value]
-            if op == "phi":
+            if op in GIVEN:
                 continue
             if op == "out":
                 number = g.args[value][0]
                 if number not in self.group_place:
                     self._place_group(number)
                 continue
-            region = self._hoist(self.place[value], self.loops[value])
+            region = self.place[value]
+            if op != "read":  # to keep what is in memory in registers too would need many of them
+                region = self._hoist(region, self.loops[value])
             self.place[value] = region
             for read in g.reads(value):
                 self._use(read, region)
@@ -166,6 +177,7 @@ class Scheduler:
         depth = self.regions[region].depth + 1
         for _ in inner:
             loop = number if isinstance(group, Loop) else self.regions[region].loop
+            self._owner[len(self.regions)] = number
             self.regions.append(Region(region, depth, loop))
         for k in self.alive[number]:
             if isinstance(group, Branch):
@@ -179,7 +191,7 @@ class Scheduler:
             self._use(group.condition, region if isinstance(group, Branch) else inner[0])
 
     def _use(self, value: Value, region: int) -> None:
-        if value >= 0 and self.graph.ops[value] != "phi":
+        if value >= 0 and self.graph.ops[value] not in GIVEN:
             self.place[value] = self._common(self.place[value], region) if value in self.place else region
 
     def _common(self, a: int, b: int) -> int:
@@ -198,6 +210,53 @@ class Scheduler:
             if loop < 0 or loops >> loop & 1:
                 return region
             region = self.group_place[loop]
+
+    # -- arrays in memory
+
+    def _replace(self) -> None:
+        """Find the arrays that a `put` may change in place, and what has to come before it (`_before`).
+
+        A node that was made earlier can't depend on one that was made later. So the other readers of the array can come
+        first if all of them were made earlier.
+        """
+        g = self.graph
+        self.replaced: dict[Value, Value] = {}
+        self._before: dict[Value, list[Value]] = {}
+        readers: dict[Value, list[Value]] = {}
+        for value in self.needed:
+            if g.ops[value] in ("read", "put"):
+                readers.setdefault(g.args[value][0], []).append(value)
+        held = {value for number in self.inside for value in self._results_of(number)}
+        starts: dict[Value, list[Value]] = {}
+        for number in self.inside:
+            group = g.groups[number]
+            if isinstance(group, Loop):
+                for k in self.alive[number]:
+                    starts.setdefault(group.starts[k], []).append(group.outs[k])
+        for array, known in readers.items():
+            others = [*known, *starts.get(array, [])]
+            last = max(others)
+            if g.ops[last] != "put" or array in held or self.place[last] != self.place[array]:
+                continue
+            items = [self._around_in(self.place[last], value) for value in others if value != last]
+            if all(value is not None and value < last for value in items):
+                self.replaced[array] = last
+                self._before[last] = [value for value in items if value is not None]
+
+    def _results_of(self, number: int) -> Iterable[Value]:
+        group = self.graph.groups[number]
+        for k in self.alive[number]:
+            yield from (group.chosen[k], group.others[k]) if isinstance(group, Branch) else (group.nexts[k],)
+
+    def _around_in(self, region: int, value: Value) -> Value | None:
+        """Return the value, or the last result of the group in a region that it is computed in."""
+        here = self.place[value]
+        while here != region:
+            if here <= 0:
+                return None
+            group = self._owner[here]
+            value, here = max(self.graph.groups[group].outs[k] for k in self.alive[group]), self.group_place[group]
+        return value
 
     # -- in what order
 
@@ -251,14 +310,16 @@ class Scheduler:
             stack.extend((self._item(read), False) for read in reads if self._item(read) not in done)
 
     def _here(self, value: Value, region: int) -> bool:
-        return self.graph.ops[value] != "phi" and self.place[value] == region
+        return self.graph.ops[value] not in GIVEN and self.place[value] == region
 
     def _item(self, value: Value) -> tuple[str, int]:
         return ("group", self.graph.args[value][0]) if self.graph.ops[value] == "out" else ("node", value)
 
     def _item_reads(self, item: tuple[str, int]) -> list[Value]:
         kind, number = item
-        return self.graph.reads(number) if kind == "node" else self._all_reads(number)
+        if kind == "group":
+            return self._all_reads(number)
+        return self.graph.reads(number) + self._before.get(number, [])
 
     def _all_reads(self, number: int) -> list[Value]:
         """Return what a group and everything in it read from outside the group."""
@@ -273,7 +334,7 @@ class Scheduler:
         outside = [
             value
             for value in found
-            if self.graph.ops[value] != "phi" and self.regions[self.place[value]].depth <= depth
+            if self.graph.ops[value] not in GIVEN and self.regions[self.place[value]].depth <= depth
         ]
         self._outside[number] = outside
         return outside

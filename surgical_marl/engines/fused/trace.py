@@ -1,9 +1,8 @@
 """Traces a JAX function into a `Graph`: its jaxpr is run on arrays of values.
 
 Nested functions are inlined. A branch (`lax.cond`, `lax.switch`) stays a branch. It shares no computed values with the
-code around it, so that only its operands have to be kept for it. A loop (`lax.scan` without arrays that it reads or
-writes row by row, `lax.while_loop`) stays a loop, unless it is to be unrolled (`unroll=True` or one round). Other scans
-are unrolled.
+code around it, so that only its operands have to be kept for it. A loop (`lax.scan`, `lax.while_loop`) stays a loop,
+unless it is to be unrolled: a scan whose `unroll` is at least its length.
 """
 
 from __future__ import annotations
@@ -16,10 +15,14 @@ import jax
 import numpy as np
 from jax.extend import core, random, source_info_util
 
-from surgical_marl.engines.fused.graph import DTYPES, Branch, Graph, Loop, Value
+from surgical_marl.engines.fused.carry import State
+from surgical_marl.engines.fused.graph import Branch, Graph, Loop, Value
+from surgical_marl.engines.fused.indexing import elements_of
+from surgical_marl.engines.fused.memory import depth, pack, unpack
 from surgical_marl.engines.fused.primitives import apply
+from surgical_marl.engines.fused.rows import Writer, reader
 from surgical_marl.engines.fused.scalars import convert
-from surgical_marl.engines.fused.traced import Symbolic, Traced, Unsupported, lift, lower
+from surgical_marl.engines.fused.traced import Symbolic, Table, Traced, Unsupported, dtype_of, lift, lower
 
 _INSIDE = {
     "jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr", "remat": "jaxpr",
@@ -85,6 +88,8 @@ class Tracer:
             return [np.asarray(x) for x in (found if equation.primitive.multiple_results else [found])]
         if any(map(_is_key, avals)):
             return self._keys(name, avals, params, xs, [_is_key(variable.aval) for variable in equation.invars])
+        if name not in ("gather", "dynamic_slice"):
+            xs = [elements_of(self.graph, x) if isinstance(x, Table) else x for x in xs]
         return apply(self.graph, name, avals, params, xs)
 
     def _keys(self, name: str, avals: list[Any], params: Any, xs: list[Traced], are_keys: list[bool]) -> list[Traced]:
@@ -127,12 +132,12 @@ class Tracer:
             g.close_scope()
         branch = Branch(condition)
         g.groups.append(branch)
-        merged: list[Traced] = []
-        for a, b in zip(*results, strict=True):
-            pairs = zip(lift(g, a).ravel().tolist(), lift(g, b).ravel().tolist(), strict=True)
-            ids = np.array([self._merge(branch, *pair) for pair in pairs], np.int32)
-            merged.append(lower(g, ids.reshape(a.shape), _dtype(g, a)))
-        return merged
+        pairs = [(lift(g, a), lift(g, b)) for a, b in zip(*results, strict=True)]
+        axes = [max(depth(g, side) for side in pair) for pair in pairs]  # what one of them has in memory stays there
+        packed = [[pack(g, side, n) for side in pair] for pair, n in zip(pairs, axes, strict=True)]
+        merged = [[self._merge(branch, *both) for both in zip(*sides, strict=True)] for sides in packed]
+        unpacked = [unpack(g, outs, x.shape, n) for outs, x, n in zip(merged, results[0], axes, strict=True)]
+        return [lower(g, ids, dtype_of(g, x)) for ids, x in zip(unpacked, results[0], strict=True)]
 
     def _merge(self, branch: Branch, other: Value, chosen: Value) -> Value:
         if other == chosen:
@@ -154,11 +159,16 @@ class Tracer:
             constants, carry, rows = xs[:fixed], xs[fixed : fixed + number], xs[fixed + number :]
         carried, outvars = len(carry), getattr(body, "jaxpr", body).outvars
         written = len(outvars) - carried
-        if not rows and not written and length > params["unroll"]:
-            return self._loop(carry, lambda c: self.run(body, constants + c), None, length)
+        if length > params["unroll"]:
+            readers = [reader(self.graph, x) for x in rows]
+
+            def round_(carry: list[Traced], at: Value) -> list[Traced]:
+                return self.run(body, [*constants, *carry, *(row(at) for row in readers)])
+
+            return self._loop(carry, round_, length=length, rows=len(rows) + written, backwards=params["reverse"])
         collected: list[list[Traced]] = [[] for _ in range(written)]
         for i in range(length)[:: -1 if params["reverse"] else 1]:
-            out = self.run(body, [*constants, *carry, *(_row(x, i) for x in rows)])
+            out = self.run(body, [*constants, *carry, *(_row(self.graph, x, i) for x in rows)])
             carry = out[:carried]
             for column, value in zip(collected, out[carried:], strict=True):
                 column.append(value)
@@ -184,50 +194,45 @@ class Tracer:
         def condition(c: list[Traced]) -> Traced:
             return self.run(test, test_constants + c)[0]
 
-        return self._loop(carry, lambda c: self.run(body, constants + c), condition, 0)
+        return self._loop(carry, lambda c, _: self.run(body, constants + c), condition)
 
     def _loop(
         self,
         carry: list[Traced],
-        body: Callable[[list[Traced]], list[Traced]],
-        condition: Callable[[list[Traced]], Traced] | None,
-        length: int,
+        body: Callable[[list[Traced], Value], list[Traced]],
+        condition: Callable[[list[Traced]], Traced] | None = None,
+        length: int = 0,
+        rows: int = 0,
+        backwards: bool = False,
     ) -> list[Traced]:
-        g = self.graph
-        shapes, dtypes = [x.shape for x in carry], [_dtype(g, x) for x in carry]
-        starts = [value for x in carry for value in lift(g, x).ravel().tolist()]
-        varying = [False] * len(starts)  # until a round changes it
+        """Return the carry after the last round, and the rows that the body returns after its carry.
+
+        `rows` is how many arrays have rows that the body reads or writes.
+        """
+        g, state = self.graph, State(self.graph, carry)
         while True:
-            # unknown while the loop is tried: how many rounds
+            # unknown while the loop is tried: what a round changes
             loop, number, around = Loop([], length=length, around=self._around), len(g.groups), self._around
+            before = len(g.ops)
             g.groups.append(loop)
             self._around |= 1 << number
-            values = list(starts)
-            for k, start in enumerate(starts):
-                if varying[k]:
-                    values[k] = g.fresh("phi", number, len(loop.phis), kind=g.kind(start))
-                    loop.phis.append(values[k])
-                    loop.starts.append(start)
-            arrays = _unflatten(g, values, shapes, dtypes)
+            if rows:
+                loop.counter, loop.backwards = g.fresh("counter", number, length, kind="i"), backwards
+            arrays = state.enter(loop, number)
             going = condition(arrays) if condition else None
-            nexts = [value for x in body(arrays) for value in lift(g, x).ravel().tolist()]
+            found = body(arrays, g.true if loop.counter is None else loop.counter)
             self._around = around
-            changed = [k for k, value in enumerate(nexts) if not varying[k] and value != values[k]]
-            if not changed:
+            if not state.changed(found[: len(carry)]):
                 break
-            for k in changed:
-                varying[k] = True
-        loop.nexts = [value for k, value in enumerate(nexts) if varying[k]]
         if going is not None:
             loop.condition = int(lift(g, going))
             if loop.condition < 0 and g.constants[~loop.condition]:
                 raise Unsupported("a loop that never ends")
-        outs = list(values)
-        for k, start in enumerate(starts):
-            if varying[k]:
-                outs[k] = g.fresh("out", number, len(loop.outs), kind=g.kind(start))
-                loop.outs.append(outs[k])
-        return _unflatten(g, outs, shapes, dtypes)
+        state.close(loop, found[: len(carry)])
+        writer = Writer(g, number, before, found[len(carry) :])
+        for k, phi in enumerate(loop.phis):
+            loop.outs.append(g.fresh("out", number, k, kind=g.kinds[phi]))
+        return [*state.leave(loop), *writer.leave()]
 
     # -- random numbers
 
@@ -285,20 +290,7 @@ def _is_key(aval: Any) -> bool:
     return bool(jax.dtypes.issubdtype(aval.dtype, jax.dtypes.prng_key))
 
 
-def _row(x: Traced, i: int) -> Traced:
+def _row(g: Graph, x: Traced | Table, i: int) -> Traced:
+    if isinstance(x, Table):
+        return reader(g, x)(g.constant(np.int32(i)))
     return Symbolic(x.ids[i]) if isinstance(x, Symbolic) else x[i]
-
-
-def _dtype(g: Graph, x: Traced) -> Any:
-    if isinstance(x, np.ndarray):
-        return x.dtype
-    return DTYPES[g.kind(int(x.ids.flat[0]))] if x.ids.size else np.float32
-
-
-def _unflatten(g: Graph, values: list[Value], shapes: list[Any], dtypes: list[Any]) -> list[Traced]:
-    arrays, at = [], 0
-    for shape, dtype in zip(shapes, dtypes, strict=True):
-        size = int(np.prod(shape, dtype=int))
-        arrays.append(lower(g, np.array(values[at : at + size], np.int32).reshape(shape), dtype))
-        at += size
-    return arrays

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from surgical_marl.engines.fused.graph import KINDS, Graph, Value
+from surgical_marl.engines.fused.graph import Graph, Value
+from surgical_marl.engines.fused.operations import DTYPES, KINDS
 
 
 class Symbolic:
@@ -60,6 +61,13 @@ def kind_of(dtype: Any) -> str:
     if name not in KINDS:
         raise Unsupported(f"arrays of {name}")
     return KINDS[name]
+
+
+def dtype_of(graph: Graph, array: Traced | Table) -> Any:
+    """Return the dtype of a traced array; float32 if it is empty."""
+    if not isinstance(array, Symbolic):
+        return array.dtype
+    return DTYPES[graph.kind(int(array.ids.flat[0]))] if array.ids.size else np.float32
 
 
 def lift(graph: Graph, array: Traced | Table) -> np.ndarray:

@@ -9,11 +9,12 @@ import jax
 import numpy as np
 
 from surgical_marl.engines.fused.emit import Emitter, table_offsets
-from surgical_marl.engines.fused.graph import KINDS, Graph, Value
-from surgical_marl.engines.fused.indexing import LEAST_TABLE, look_up
+from surgical_marl.engines.fused.graph import Graph, Value
+from surgical_marl.engines.fused.indexing import LEAST_TABLE, elements_of
+from surgical_marl.engines.fused.operations import KINDS
 from surgical_marl.engines.fused.program import Leaf, Source
 from surgical_marl.engines.fused.trace import Tracer
-from surgical_marl.engines.fused.traced import Symbolic, Table, Traced, lift, lower
+from surgical_marl.engines.fused.traced import Table, Traced, lift, lower
 from surgical_marl.engines.stepper import Stepper
 
 BUFFERS = {"f": "outs", "i": "counts", "u": "counts", "b": "flags"}
@@ -92,11 +93,7 @@ def _parameters(graph: Graph, parameters: Any) -> tuple[list[Traced | Table], di
         number = graph.input_table(np.zeros(value.size, buffer))
         places[jax.tree_util.keystr(path)] = Leaf(buffer, table_offsets(graph)[number], value.shape, value.dtype.name)
         table = Table(number, value.shape, value.dtype)
-        if value.size < LEAST_TABLE:
-            ids = [look_up(graph, table, list(place), {}) for place in np.ndindex(value.shape)]
-            given.append(Symbolic(np.array(ids, np.int32).reshape(value.shape)))
-        else:
-            given.append(table)
+        given.append(elements_of(graph, table) if value.size < LEAST_TABLE else table)
     return given, places
 
 

@@ -1,0 +1,69 @@
+"""What a loop carries from round to round: values, and arrays in memory."""
+
+from __future__ import annotations
+
+from surgical_marl.engines.fused.graph import Graph, Loop, Value
+from surgical_marl.engines.fused.memory import depth, pack, unpack
+from surgical_marl.engines.fused.traced import Traced, dtype_of, lift, lower
+
+
+class State:
+    """The carry of a loop that is traced again and again, until it is known what a round changes.
+
+    What no round changes is not carried. An array of which a round makes one in memory is carried there.
+    """
+
+    def __init__(self, g: Graph, carry: list[Traced]) -> None:
+        self._g, self._carry = g, carry
+        self._dtypes = [dtype_of(g, x) for x in carry]
+        self._axes = [0] * len(carry)
+        """Of each array, how many axes are in memory."""
+        self._starts = [self._packed(k, x) for k, x in enumerate(carry)]
+        self._varying = [[False] * len(starts) for starts in self._starts]
+        self._values: list[list[Value]] = []
+
+    def _packed(self, k: int, x: Traced) -> list[Value]:
+        return pack(self._g, lift(self._g, x), self._axes[k])
+
+    def _arrays(self, values: list[list[Value]]) -> list[Traced]:
+        g, shapes = self._g, [x.shape for x in self._carry]
+        unpacked = [unpack(g, *one) for one in zip(values, shapes, self._axes, strict=True)]
+        return [lower(g, ids, dtype) for ids, dtype in zip(unpacked, self._dtypes, strict=True)]
+
+    def enter(self, loop: Loop, number: int) -> list[Traced]:
+        """Return the carry at the start of a round."""
+        g = self._g
+        self._values = [list(starts) for starts in self._starts]
+        for values, starts, varying in zip(self._values, self._starts, self._varying, strict=True):
+            for k, start in enumerate(starts):
+                if varying[k]:
+                    values[k] = g.fresh("phi", number, len(loop.phis), kind=g.kind(start))
+                    loop.phis.append(values[k])
+                    loop.starts.append(start)
+        return self._arrays(self._values)
+
+    def changed(self, nexts: list[Traced]) -> bool:
+        """Whether a round changes more than was known; now it is known."""
+        found = False
+        for k, x in enumerate(nexts):
+            new, varying = self._packed(k, x), self._varying[k]
+            changes = [j for j, value in enumerate(new) if not varying[j] and value != self._values[k][j]]
+            found = found or bool(changes)
+            for j in changes:
+                varying[j] = True
+            if not self._axes[k] and any(varying) and (axes := depth(self._g, lift(self._g, x))):
+                self._axes[k], found = axes, True
+                self._starts[k] = self._packed(k, self._carry[k])
+                self._varying[k] = [False] * len(self._starts[k])
+        return found
+
+    def close(self, loop: Loop, nexts: list[Traced]) -> None:
+        """Say what each round makes of the carry."""
+        for k, x in enumerate(nexts):
+            new, varying = self._packed(k, x), self._varying[k]
+            loop.nexts.extend(value for value, varies in zip(new, varying, strict=True) if varies)
+
+    def leave(self, loop: Loop) -> list[Traced]:
+        """Return the carry after the last round."""
+        after = dict(zip(loop.phis, loop.outs, strict=True))
+        return self._arrays([[after.get(value, value) for value in values] for values in self._values])
