@@ -21,10 +21,6 @@ if TYPE_CHECKING:
 
 STRONGEST = 100.0
 """Bound of an observed contact force, N."""
-WIDE = 1.0
-"""Bound of an object's observed place, m: one that has fallen off the field counts as there."""
-FASTEST = 5.0
-"""Bound of an object's observed speed, m/s; of its angular speed it is this over 0.01 m."""
 EYES, CHANNELS = ("left", "right"), ("rgb", "depth")
 
 
@@ -73,32 +69,6 @@ def arm_terms(scene: Scene, agent: str) -> dict[str, Term]:
         terms["to_nearest_tip"] = Term(of("nearest_tip"), *ways_between_tips(scene))
         terms["min_distance"] = Term(single("min_distance"), *distances_between_arms(scene))
     terms["contact_force"] = Term(single("contact_force"), np.zeros(1), np.full(1, STRONGEST))
-    return terms
-
-
-def object_terms(scene: Scene, agent: str) -> dict[str, Term]:
-    """Return what an arm can know of every free object of a scene, in its base frame and SI units.
-
-    Of an object `needle` they are `needle_position` [3] of its origin, `needle_rotation` [6], the first two columns of its
-    rotation matrix, `needle_velocity` [6] of its centre of mass and angular, and `needle_grip` [3]: force of the arm's
-    fingers on it, whether the arm holds it, and how far it has slid along the fingers.
-    """
-    mount, terms = scene.mounts[agent], {}
-    turn, origin = mount.rotation.astype(np.float32), mount.position.astype(np.float32)
-    space, fast = np.full(3, WIDE), np.repeat([FASTEST, FASTEST / 0.01], 3)
-    for name, place in scene.objects.items():
-        if not place.object.free:
-            continue
-        of: Callable[[World], Any] = lambda world, name=name: world.objects[name]  # type: ignore[misc]
-        grip: Callable[[World], Any] = lambda world, name=name: world.arms[agent].handles[name]  # type: ignore[misc]
-        terms |= {
-            f"{name}_position": Term(lambda world, of=of: (of(world).position - origin) @ turn, -space, space),  # type: ignore[misc]
-            f"{name}_rotation": Term(lambda world, of=of: (turn.T @ of(world).rotation)[:, :2].T.ravel(),  # type: ignore[misc]
-                                     -np.ones(6), np.ones(6)),
-            f"{name}_velocity": Term(lambda world, of=of: (of(world).velocity.reshape(2, 3) @ turn).ravel(), -fast, fast),  # type: ignore[misc]
-            f"{name}_grip": Term(lambda world, grip=grip: jnp.stack([x.astype(jnp.float32) for x in grip(world)]),  # type: ignore[misc]
-                                 np.zeros(3), np.array([STRONGEST, 1.0, 0.1])),
-        }  # fmt: skip
     return terms
 
 
