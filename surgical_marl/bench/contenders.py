@@ -13,7 +13,7 @@ import numpy as np
 from mujoco import rollout
 
 from surgical_marl.bench.clock import Clock, cpu_clock, cuda_clock
-from surgical_marl.bench.course import HOLD, LAPS, Course, full_state, tile
+from surgical_marl.bench.course import HOLD, LAPS, Course, full_state, tile, with_objects
 from surgical_marl.bench.physics import PhysicsAlone
 from surgical_marl.bench.workload import Workload
 from surgical_marl.content import unknown
@@ -21,6 +21,7 @@ from surgical_marl.engines.choose import Engine, make_engine
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.machine import cores
 from surgical_marl.scenes.load import load_scene
+from surgical_marl.scenes.mjcf import mjcf
 
 ENGINES = ("fused", "mjx", "mujoco")
 MOST_ROLLED = 4096
@@ -88,6 +89,8 @@ def _batched(name: str, workload: Workload, course: Course) -> Contender:
     physics.reset(0)
     physics.write(".physics.qpos", give(tile(course.qpos, count)))
     physics.write(".physics.qvel", give(tile(course.qvel, count)))
+    for part, values in course.parts.items():
+        physics.write(f".physics.objects{part}", give(tile(values, count)))
     step_physics = _along(physics, [give(tile(rows, count)) for rows in course.commands])
     step_physics()  # compiles
     _wait(physics)
@@ -114,10 +117,12 @@ def _along(physics: Engine, commands: list[Any]) -> Callable[[], None]:
 def _mujoco(workload: Workload, course: Course) -> Contender:
     """C MuJoCo's own way to step many: `mujoco.rollout`, with a thread on every core."""
     count, threads = min(workload.count, MOST_ROLLED), cores()
-    state = full_state(tile(course.qpos, count), tile(course.qvel, count))
-    control = tile(course.commands.astype(float).repeat(HOLD, 0).swapaxes(0, 1), count)
     start = time.perf_counter()
-    model = load_scene(workload.scene, workload.control).model
+    scene = load_scene(workload.scene, workload.control)
+    model = mujoco.MjModel.from_xml_string(mjcf(scene)) if scene.objects else scene.model
+    qpos, qvel = with_objects(scene, course) if scene.objects else (course.qpos, course.qvel)
+    state = full_state(tile(qpos, count), tile(qvel, count))
+    control = tile(course.commands.astype(float).repeat(HOLD, 0).swapaxes(0, 1), count)
     data, pool = [mujoco.MjData(model) for _ in range(threads)], rollout.Rollout(nthread=threads)
     pool.rollout(model, data, state[:1], control[:1, :1])
     compile_s = time.perf_counter() - start

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import os
+from functools import partial
 from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 from mujoco import rollout
 
+from surgical_marl.bench.grasping import graspers, grasps
 from surgical_marl.physics.simulator import Simulator
+from surgical_marl.robots.rotation import matrix_of
 from surgical_marl.scenes.scene import Scene
 from surgical_marl.scenes.timing import DECIMATION
 
@@ -19,9 +22,10 @@ LAPS = 4
 """Actions after which a course begins again. The second half reverses the first, so that no joint drifts away."""
 DISTINCT = 256
 """Number of different environments. A larger batch repeats them, a smaller one is the first of them."""
-_AWAY = {"random": 50, "rough": 25}
+_AWAY = {"random": 50, "rough": 25, "grasp": 25}
 """Control steps before the start, 1 and 0.5 s. random: a new action every control step, as when training begins. rough:
-one action all the time, so that arms cross their ranges, and each other's way."""
+one action all the time, so that arms cross their ranges, and each other's way. grasp: jaws close on objects and carry
+them."""
 
 
 class Course(NamedTuple):
@@ -36,12 +40,25 @@ class Course(NamedTuple):
     """Agent -> [n, its actions], LAPS of them."""
     touching: float
     """Share of the environments in which something touches at the start, from 0 to 1."""
+    objects: Any = ()
+    """The state of the objects, a tree like `Physics.objects`; [n, ...]."""
+
+    @property
+    def parts(self) -> dict[str, np.ndarray]:
+        """The arrays of `objects` by their path in it, as in ".bodies.position"."""
+        import jax
+
+        return {jax.tree_util.keystr(k): v for k, v in jax.tree_util.tree_flatten_with_path(self.objects)[0]}
 
 
 def make_course(scene: Scene, motion: str = "random", seed: int = 0) -> Course:
     """Draw a course: every environment moves from home by random actions of its own, then to and fro.
 
-    C MuJoCo moves the arms. The states therefore come from none of this package's own engines.
+    C MuJoCo moves the arms. The states therefore come from none of this package's own engines. Only where there are
+    objects the reference physics moves all.
+
+    Raises:
+        ValueError: motion `grasp` in a scene without anything to grasp.
     """
     # otherwise JAX would reserve most of a GPU's memory, and leave too little for the fused engine
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
@@ -50,29 +67,66 @@ def make_course(scene: Scene, motion: str = "random", seed: int = 0) -> Course:
     rng, n = np.random.default_rng(seed), DISTINCT
     simulator, model = Simulator(scene, HOLD), scene.model
     command = jax.jit(jax.vmap(simulator.command))
+    advance = jax.jit(jax.vmap(lambda physics: simulator.advance(physics)[0]))
+    roll = (lambda now: jax.tree.map(np.asarray, advance(now))) if scene.objects else partial(_roll, model)
+    closes = motion == "grasp"
 
     def draw() -> dict[str, np.ndarray]:
-        return {a: rng.uniform(-1, 1, (n, len(m.arm.actuated))).astype(np.float32) for a, m in scene.mounts.items()}
+        drawn = {a: rng.uniform(-1, 1, (n, len(m.arm.actuated))).astype(np.float32) for a, m in scene.mounts.items()}
+        for agent in graspers(scene) if closes else ():
+            drawn[agent][:, -1] = -1.0
+        return drawn
 
     half = [draw() for _ in range(LAPS // 2)]
-    actions = [*half, *({agent: -action for agent, action in drawn.items()} for drawn in half[::-1])]
+    actions = [*half, *(_back(drawn, graspers(scene) if closes else []) for drawn in half[::-1])]
     now = jax.tree.map(lambda x: np.repeat(np.asarray(x)[None], n, 0), simulator.home)
+    if closes:
+        now = _grasping(scene, now, jax.vmap(simulator.at), rng)
     away = draw()
     for _ in range(_AWAY[motion]):
-        now = _roll(model, command(now, away))
-        away = draw() if motion == "random" else away
+        now = roll(command(now, away))
+        away = draw() if motion != "rough" else away
     start, commands = now, []
     for action in actions:
         now = command(now, action)
         commands.append(np.asarray(now.ctrl))
-        now = _roll(model, now)
+        now = roll(now)
     qpos, qvel = np.asarray(start.qpos), np.asarray(start.qvel)
-    return Course(qpos, qvel, np.array(commands), actions, _touching(model, qpos))
+    objects = jax.tree.map(np.asarray, start.objects)
+    touching = float((objects.grips.force > 0).any((1, 2)).mean()) if scene.objects else _touching(model, qpos)
+    return Course(qpos, qvel, np.array(commands), actions, touching, objects)
+
+
+def _back(drawn: dict[str, np.ndarray], closed: list[str]) -> dict[str, np.ndarray]:
+    """Return the actions that reverse a motion, with some jaws kept closed."""
+    back = {agent: -action for agent, action in drawn.items()}
+    for agent in closed:
+        back[agent][:, -1] = -1.0
+    return back
+
+
+def _grasping(scene: Scene, now: Any, at: Any, rng: np.random.Generator) -> Any:
+    """Return the state [n, ...] in which jaws are about to close on objects."""
+    qpos, position, turned = (x.astype(np.float32) for x in grasps(scene, len(now.qpos), rng))
+    objects = now.objects._replace(bodies=now.objects.bodies._replace(position=position, quaternion=turned))
+    return at(qpos)._replace(objects=objects)
 
 
 def tile(values: np.ndarray, num_envs: int) -> np.ndarray:
     """Rows over and over: [n, ...] -> [num_envs, ...]."""
     return np.ascontiguousarray(values[np.arange(num_envs) % len(values)])
+
+
+def with_objects(scene: Scene, course: Course) -> tuple[np.ndarray, np.ndarray]:
+    """Return `qpos` and `qvel` of the exported scene, in which free objects have joints behind those of the arms."""
+    qpos, qvel, (bodies, _) = [course.qpos], [course.qvel], course.objects
+    free = [place.object for place in scene.objects.values() if place.object.free]
+    for o, item in enumerate(free):
+        axes = np.stack([matrix_of(quaternion) for quaternion in bodies.quaternion[:, o]])
+        lever, spin = axes @ item.center, bodies.velocity[:, o, 3:]
+        qpos += [bodies.position[:, o] - lever, bodies.quaternion[:, o]]
+        qvel += [bodies.velocity[:, o, :3] - np.cross(spin, lever), (spin[:, None] @ axes)[:, 0]]
+    return np.concatenate(qpos, 1), np.concatenate(qvel, 1)
 
 
 def full_state(qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:

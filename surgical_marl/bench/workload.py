@@ -29,8 +29,9 @@ class Workload(Options):
     decimation: int = number(1, 1, 1_000_000, "physics steps an environment step")
     num_envs: int | None = number(None, 1, 2**24, "environments that run side by side (default: by the device)")
     device: DeviceName = choice("auto", "where it runs")
-    motion: Literal["random", "rough"] = choice(
-        "random", "random: a new action every control step; rough: arms cross each other's way"
+    motion: Literal["random", "rough", "grasp"] = choice(
+        "random",
+        "random: a new action every control step; rough: arms cross each other's way; grasp: jaws hold objects",
     )
 
     def __post_init__(self) -> None:

@@ -6,14 +6,13 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 from jax import Array
 
 from surgical_marl.physics.bodies import Bodies, conjugate, product, rotation, turn
 from surgical_marl.physics.collision import moved_bodies
 from surgical_marl.physics.cone import Cones, Forces
-from surgical_marl.physics.patches import AWAY, SLOTS, Patch, find_patch
+from surgical_marl.physics.patches import AWAY, Patch, find_patch
 from surgical_marl.physics.shapes import Plate, Points, Segments, between_segments, on_plate
 from surgical_marl.physics.tables import Tables
 

@@ -17,8 +17,8 @@ import numpy as np
 
 from surgical_marl.content import unknown
 from surgical_marl.runtime import jax, jnp
-from surgical_marl.tasks.base.options import Options
 from surgical_marl.tasks.base.object_terms import object_terms
+from surgical_marl.tasks.base.options import Options
 from surgical_marl.tasks.base.terms import Picture, Term, arm_terms, picture_terms
 from surgical_marl.tasks.base.world import World
 
