@@ -128,20 +128,24 @@ class Tracer:
         branch = Branch(condition)
         g.groups.append(branch)
         merged: list[Traced] = []
+        known: dict[tuple[Value, Value], Value] = {}
         for a, b in zip(*results, strict=True):
             pairs = zip(lift(g, a).ravel().tolist(), lift(g, b).ravel().tolist(), strict=True)
-            ids = np.array([self._merge(branch, *pair) for pair in pairs], np.int32)
+            ids = np.array([self._merge(branch, known, *pair) for pair in pairs], np.int32)
             merged.append(lower(g, ids.reshape(a.shape), _dtype(g, a)))
         return merged
 
-    def _merge(self, branch: Branch, other: Value, chosen: Value) -> Value:
+    def _merge(self, branch: Branch, known: dict[tuple[Value, Value], Value], other: Value, chosen: Value) -> Value:
+        """Return the value that is `chosen` or `other`. A pair that is `known` has one already."""
         if other == chosen:
             return other
-        branch.others.append(other)
-        branch.chosen.append(chosen)
-        g = self.graph
-        branch.outs.append(g.fresh("out", len(g.groups) - 1, len(branch.outs), kind=g.kind(other)))
-        return branch.outs[-1]
+        if (other, chosen) not in known:
+            branch.others.append(other)
+            branch.chosen.append(chosen)
+            g = self.graph
+            branch.outs.append(g.fresh("out", len(g.groups) - 1, len(branch.outs), kind=g.kind(other)))
+            known[other, chosen] = branch.outs[-1]
+        return known[other, chosen]
 
     # -- loops
 
