@@ -158,18 +158,6 @@ def defer_compiler() -> None:
 
 
 @functools.cache
-def let_torch_fork() -> None:
-    """Let processes that are forked from this one use torch on a CPU, with one thread.
-
-    A forked process has none of the threads that torch shares its work among. It would wait for them for ever.
-    """
-    import torch
-
-    if hasattr(os, "register_at_fork"):
-        os.register_at_fork(after_in_child=lambda: torch.set_num_threads(1))
-
-
-@functools.cache
 def prepare_warp() -> Any:
     """Import Warp, and start it without its banner and without a warning that there is no GPU."""
     import warp

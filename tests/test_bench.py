@@ -17,6 +17,7 @@ from surgical_marl.bench import contenders, render, report, sim
 from surgical_marl.bench.clock import race
 from surgical_marl.bench.contenders import Contender
 from surgical_marl.bench.course import HOLD, LAPS, full_state, make_course
+from surgical_marl.bench.face import measure_face
 from surgical_marl.bench.physics import PhysicsAlone
 from surgical_marl.bench.render import measure_rendering
 from surgical_marl.bench.report import QUOTED, draw, ratios, sweep_table
@@ -213,6 +214,17 @@ def test_rendering_as_json_and_as_a_sentence(
     assert "pictures/s of 64 x 64 pixels of rgb, 2 envs, cpu" in capsys.readouterr().out
     one, two = (measure_rendering("ecm", 1, "cpu", size=8, stereo=stereo) for stereo in (False, True))
     assert (one.stereo, two.stereo, two.width) == (False, True, 8)
+
+
+def test_what_the_face_adds_as_json_and_as_a_sentence(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(measure_face, "__defaults__", (None, 2, 0.0))
+    assert main(["bench", "face", "--num-envs", "2", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert list(found) == ["engine_s", "added_s", "share", "num_envs"] and found["num_envs"] == 2
+    assert main(["bench", "face", "--scene", "bimanual_psm"]) == 0
+    assert "reach on bimanual_psm: the face adds " in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -275,3 +276,39 @@ def test_caches_may_be_shared_and_damaged(tmp_path: Path, monkeypatch: pytest.Mo
         file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
     assert {out for out, _ in (*first, again, finish(start()))} == {again[0]}
     assert unfinished.is_dir()
+
+
+@pytest.mark.parametrize("library", ["numpy", "torch", "jax"])
+def test_later_steps_leave_results_as_they_are(library: str) -> None:
+    """Also where only a part of what a step returned is held, such as one agent's reward."""
+    env = BatchedEnv("reach", "psm", num_envs=8, engine="fused", device="cpu", arrays=library)
+    env.reset(0)
+    rng, held = np.random.default_rng(0), []
+    for _ in range(8):
+        step = env.step({"psm_0": rng.uniform(-1, 1, (8, 7))})
+        held += [(part, np.asarray(part).copy()) for part in (step.rewards["psm_0"], step.state[2:5], step.terminated)]
+        if len(held) > 12:
+            del held[3:9]  # so that some memory becomes free, and some does not
+        del step
+        for part, value in held:
+            np.testing.assert_array_equal(np.asarray(part), value)
+
+
+def test_results_that_are_equal_are_written_once() -> None:
+    """Also those of the next episode: one arm's observation is the whole state."""
+    results = FusedEngine(Env("reach", "psm"), 1, "cpu").source.results
+    assert results["state"] == results["observations"]["psm_0"]
+    assert results["final_state"] == results["final_observations"]["psm_0"]
+
+
+def test_a_step_on_a_cpu_takes_no_new_memory() -> None:
+    env = BatchedEnv("reach", "bimanual_psm", num_envs=1024, engine="fused", device="cpu")
+    env.reset(0)
+    actions = {agent: np.zeros((1024, 7), np.float32) for agent in env.agents}
+    step = [env.step(actions) for _ in range(2)][-1]
+    tracemalloc.start()
+    for _ in range(3):
+        step = env.step(actions)
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert most < step.state.nbytes  # of 1.3 MB of results

@@ -173,3 +173,20 @@ def test_a_function_that_answers_wrongly_is_named() -> None:
     env.reset(seed=0)
     with pytest.raises(ValueError, match=r"action of 'psm_0' has shape \(1, 6\), it must be \(1, 7\)"):
         env.step(np.zeros(7))
+
+
+def test_a_seed_of_reset_is_a_random_teammates_too() -> None:
+    """Without one its actions go on, as episodes do."""
+    env, played = make({"psm_0": "random"}), []
+    for seed in (3, 3, None, 4):
+        env.reset(seed=seed)
+        played.append([env.step(np.zeros(7))[-1]["agents"]["psm_0"]["tip_error"] for _ in range(3)])
+    assert played[0] == played[1]
+    assert len({tuple(found) for found in played}) == 3
+    for seeds in (3, [3, None], [3, 4]):
+        envs, seen = make_vec({"psm_0": "random"}), []
+        for _ in range(2):
+            envs.reset(seed=[5, 6])
+            envs.reset(seed=seeds)
+            seen.append(envs.step(np.zeros((2, 7)))[-1]["agents"]["psm_0"]["tip_error"])
+        np.testing.assert_array_equal(*seen)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -16,6 +17,7 @@ from surgical_marl.learning.train import Trainer, train
 from surgical_marl.policies.layout import Layout
 from surgical_marl.policies.policy import load_policy, random_policy, zero_policy
 from surgical_marl.runs.settings import Settings, load_config
+from surgical_marl.scenes.load import load_scene
 
 SMALL = [
     "num_envs=8",
@@ -91,3 +93,32 @@ def test_scripted_policies_act_on_dicts() -> None:
     assert found[0] < 0.5 < 5 < found[1]
     observations, *_ = RslRlVecEnv(made("ecm")).env.reset(0)
     assert zero_policy(made("ecm"))(observations)["ecm_0"].shape == (8, 4)
+
+
+@pytest.mark.parametrize("scene", ["ecm", "trimanual_psm_ecm"])
+def test_poses_are_those_of_c_mujoco(scene: str) -> None:
+    from surgical_marl.vision.kinematics import Kinematics, wp
+
+    model, count = load_scene(scene).model, 4
+    low, high = model.jnt_range.T
+    qpos = np.random.default_rng(0).uniform(low, high, (count, model.nq))
+    with wp.ScopedDevice("cpu"):
+        found = Kinematics(model, count)
+        found.qpos.assign(qpos.astype(np.float32))
+        found.update()
+    data = mujoco.MjData(model)
+    for i in range(count):
+        data.qpos[:] = qpos[i]
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_camlight(model, data)
+        for name in ("geom_xpos", "geom_xmat", "cam_xpos", "cam_xmat"):
+            wanted = getattr(data, name)
+            np.testing.assert_allclose(getattr(found, name).numpy()[i].reshape(wanted.shape), wanted, atol=2e-6)
+
+
+def test_pictures_need_hinges_and_slides() -> None:
+    from surgical_marl.vision.kinematics import Kinematics
+
+    free = '<mujoco><worldbody><body><freejoint/><geom size="1"/></body></worldbody></mujoco>'
+    with pytest.raises(ValueError, match="joints are hinges and slides"):
+        Kinematics(mujoco.MjModel.from_xml_string(free), 1)

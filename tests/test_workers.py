@@ -5,6 +5,8 @@ from __future__ import annotations
 import copy
 import multiprocessing
 import pickle
+import subprocess
+import sys
 from typing import Any
 
 import cloudpickle
@@ -105,3 +107,21 @@ def test_a_copy_of_a_closed_environment_is_closed() -> None:
     env.close()
     with pytest.raises(ValueError, match="the environment is closed"):
         copy.deepcopy(env).reset()
+
+
+@pytest.mark.parametrize(("task", "scene"), [("reach", "psm"), ("match_image", "ecm")])
+def test_a_worker_with_warm_caches_imports_nothing_that_takes_long(task: str, scene: str) -> None:
+    """Also where an episode ends and the next one begins."""
+    code = f"""
+import sys
+import numpy as np
+import surgical_marl as sm
+env = sm.parallel_env({task!r}, scene={scene!r}, engine="fused", device="cpu", num_envs=2, max_cycles=2)
+env.reset(seed=0)
+for _ in range(3):
+    env.step({{agent: np.zeros((2, *env.action_space(agent).shape)) for agent in env.agents}})
+print([name for name in ("torch", "jax", "mujoco.mjx", "scipy") if name in sys.modules])
+"""
+    for _ in range(2):  # the first one may have to fill the caches
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout == "[]\n", done.stderr

@@ -30,7 +30,7 @@ def run(arguments: Namespace) -> int:
     if arguments.task not in list_tasks():
         raise unknown("task", arguments.task, list_tasks())
     with _no_caches() if arguments.cold else contextlib.nullcontext():
-        return {"sim": _sim, "train": _train, "solve": _solve}[arguments.kind](arguments)
+        return {"sim": _sim, "train": _train, "solve": _solve, "face": _face}[arguments.kind](arguments)
 
 
 def _sim(arguments: Namespace) -> int:
@@ -72,6 +72,13 @@ def _solve(arguments: Namespace) -> int:
     text, solved = run(_settings(arguments), goal, arguments.limit, arguments.json)
     print(text)
     return 0 if solved else 1
+
+
+def _face(arguments: Namespace) -> int:
+    from surgical_marl.bench.face import run
+
+    print(run(arguments.task, arguments.scene, arguments.num_envs, arguments.json))
+    return 0
 
 
 def _settings(arguments: Namespace, num_envs: Mapping[str, int] | None = None) -> Settings:

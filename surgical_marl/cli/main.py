@@ -147,7 +147,7 @@ def _parser() -> argparse.ArgumentParser:
     policy.set_defaults(command=_export_policy, name="export policy")
 
     bench = commands.add_parser("bench", help="measure how fast this machine simulates, learns and draws")
-    kinds = bench.add_subparsers(required=True, metavar="{sim,train,solve,render}")
+    kinds = bench.add_subparsers(required=True, metavar="{sim,train,solve,render,face}")
     sim = _bench_parser(kinds, "sim", "steps/s of the engines and of C MuJoCo", Workload)
     sim.add_argument("--engine", type=one_of(BENCHED), default=BENCHED[0], metavar="|".join(BENCHED))
     sim.add_argument("--sweep", action="store_true", help="from 1 to 4 million environments, as far as memory goes")
@@ -165,6 +165,13 @@ def _parser() -> argparse.ArgumentParser:
     add_flags(draws, Settings, ("device",))
     draws.add_argument("--json", action="store_true", help="one JSON object instead of a table")
     draws.set_defaults(command=_bench, name="bench render", kind="render", of=Settings)
+
+    face = kinds.add_parser("face", help="what the PettingZoo face adds to a step of the engine, on a CPU")
+    face.add_argument("--task", default="reach", help=f"one of: {', '.join(list_tasks())}")
+    face.add_argument("--scene", default="psm", help="a name (see `list scenes`) or a .yaml file")
+    face.add_argument("--num-envs", type=whole(1), metavar="N", help="default: one environment, not batched")
+    face.add_argument("--json", action="store_true", help="one JSON object instead of a sentence")
+    face.set_defaults(command=_bench, name="bench face", kind="face", of=Settings, cold=False)
 
     doctor = commands.add_parser("doctor", help="check this machine and this installation")
     doctor.set_defaults(command=_doctor, name="doctor")

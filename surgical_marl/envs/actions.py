@@ -26,7 +26,7 @@ def check_actions(actions: Any, shapes: Mapping[str, tuple[int, ...]]) -> dict[s
     Raises:
         ValueError: it is no dict, an agent is missing or unknown, a shape is wrong, or a value is not a finite number.
     """
-    check_agents(actions, shapes)
+    check_agents(actions, shapes.keys())
     checked, away = {}, {}
     for agent, shape in shapes.items():
         action = _array(agent, actions[agent])
@@ -44,6 +44,8 @@ def check_actions(actions: Any, shapes: Mapping[str, tuple[int, ...]]) -> dict[s
 
 def check_agents(actions: Any, agents: Collection[str]) -> None:
     """Raise a ValueError unless actions are a dict with just these agents."""
+    if isinstance(actions, dict) and actions.keys() == agents:
+        return  # as nearly always, and quick
     if not isinstance(actions, Mapping):
         raise ValueError(f"actions must be a dict of agents to arrays, not {shown(actions)}")
     for agent in actions:
@@ -56,27 +58,30 @@ def check_agents(actions: Any, agents: Collection[str]) -> None:
 
 def _array(agent: str, given: Any) -> Any:
     """Return an action as an array of numbers: of numpy, or of its own library if it is on a GPU."""
+    array = given if isinstance(given, np.ndarray) else _converted(agent, given)
+    if getattr(array.dtype, "kind", "f") not in _NUMBERS:  # torch's types have no kind, and are checked already
+        raise _no_numbers(agent, given if array.dtype.kind == "O" else array.dtype)
+    return array
+
+
+def _converted(agent: str, given: Any) -> Any:
+    """Return what is no array of numpy as one, or as an array of its own library if it is on a GPU."""
     torch, jax = sys.modules.get("torch"), sys.modules.get("jax")
-    array = given
     if torch is not None and isinstance(given, torch.Tensor):
         if given.dtype == torch.bool or given.is_complex():
             raise _no_numbers(agent, given.dtype)
-        array = given.detach()
+        tensor = given.detach()
         if given.device.type != "cpu":
-            return array
-        return array.float().numpy() if given.dtype == torch.bfloat16 else array.numpy()
+            return tensor
+        return tensor.float().numpy() if given.dtype == torch.bfloat16 else tensor.numpy()
     if jax is not None and isinstance(given, jax.Array):
         if given.dtype == jax.numpy.bfloat16:
             given = given.astype(np.float32)
-        array = np.asarray(given) if given.devices() <= set(jax.devices("cpu")) else given
-    elif not isinstance(given, np.ndarray):
-        try:
-            array = np.asarray(given)
-        except (ValueError, TypeError, RuntimeError):  # lists of different lengths, or what has a fault of its own
-            raise _no_numbers(agent, given) from None
-    if array.dtype.kind not in _NUMBERS:
-        raise _no_numbers(agent, given if array.dtype.kind == "O" else array.dtype)
-    return array
+        return np.asarray(given) if given.devices() <= set(jax.devices("cpu")) else given
+    try:
+        return np.asarray(given)
+    except (ValueError, TypeError, RuntimeError):  # lists of different lengths, or what has a fault of its own
+        raise _no_numbers(agent, given) from None
 
 
 def _single(action: np.ndarray) -> np.ndarray:

@@ -115,7 +115,7 @@ class BatchedEnv:
         self.state_space = self.env.state_space
         self._sight: Sight | None = None
         if self.env.pauses:
-            from surgical_marl.envs.sight import Sight  # imports torch
+            from surgical_marl.envs.sight import Sight
 
             self._sight = Sight(self.env, self.engine, num_envs, arrays)
             self.observation_spaces |= self._sight.spaces(self.observation_spaces)

@@ -18,6 +18,8 @@ import mujoco
 import numpy as np
 from gymnasium import spaces
 
+from surgical_marl.cache import cached
+from surgical_marl.engines.stepper import describe
 from surgical_marl.envs.costs import costs
 from surgical_marl.envs.observations import Scale
 from surgical_marl.envs.observed import Observed
@@ -137,10 +139,14 @@ class Env:
 
     @cached_property
     def begins_at_home(self) -> bool:
-        """Whether all episodes begin with all arms at home."""
-        parameters = self.parameters
-        start = lambda key, p: self.task.bound(p["weights"], p["tables"]).start(key)  # noqa: E731
-        return jax.eval_shape(start, jax.ShapeDtypeStruct((2,), np.uint32), parameters).qpos is None
+        """Whether all episodes begin with all arms at home. It is kept on disk: JAX finds it out by tracing."""
+
+        def trace() -> np.ndarray:
+            start = lambda key, p: self.task.bound(p["weights"], p["tables"]).start(key)  # noqa: E731
+            found = jax.eval_shape(start, jax.ShapeDtypeStruct((2,), np.uint32), self.parameters)
+            return np.array(found.qpos is None)
+
+        return bool(cached("starts", trace, self.content, describe(self.parameters), roots=self.roots))
 
     @property
     def senses(self) -> tuple[str, ...]:

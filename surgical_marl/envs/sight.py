@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from gymnasium import spaces
 
 from surgical_marl.envs.env import Env
@@ -14,8 +13,8 @@ from surgical_marl.vision.pictures import Pictures, picture_space
 if TYPE_CHECKING:
     from surgical_marl.engines.choose import Engine
 
-Seen = dict[str, dict[str, torch.Tensor]]
-"""agent -> term -> picture [N, H, W, C]"""
+Seen = dict[str, dict[str, Any]]
+"""agent -> term -> picture [N, H, W, C], of numpy on a CPU and of torch on a GPU."""
 
 
 class Sight:
@@ -34,17 +33,16 @@ class Sight:
         terms = {agent: env.task.terms(agent) for agent in env.agents}
         names = {agent: (*self._observed.get(agent, ()), *env.task.watched.get(agent, ())) for agent in env.agents}
         wanted = {agent: {name: terms[agent][name] for name in own} for agent, own in names.items() if own}
+        self._cuda = engine.device == "cuda"
         self._pictures = Pictures(env.scene, wanted, env.task.postures, num_envs, engine.device)
         self._matched = ".goal.row" in engine.carry_shapes
         self._seen: Seen = {}
         self._home: Seen = {}
         if env.begins_at_home:  # home looks the same in all episodes
-            home = torch.from_numpy(np.repeat(env.scene.home[None], num_envs, 0)).to(engine.device)
-            rows = torch.zeros(num_envs, dtype=torch.long, device=engine.device) if self._matched else None
-            drawn = self._pictures.draw(home, rows)
-            self._home = {
-                agent: {name: picture[:1].clone() for name, picture in own.items()} for agent, own in drawn.items()
-            }
+            rows = self._own(np.zeros(num_envs, np.int64)) if self._matched else None
+            drawn = self._pictures.draw(self._own(np.repeat(env.scene.home[None], num_envs, 0)), rows)
+            # a list as the index makes a copy
+            self._home = {agent: {name: picture[[0]] for name, picture in own.items()} for agent, own in drawn.items()}
 
     def spaces(self, vectors: dict[str, spaces.Space[Any]]) -> dict[str, spaces.Space[Any]]:
         """Return the spaces of agents that see pictures, from those of their vectors."""
@@ -72,30 +70,42 @@ class Sight:
 
     def show(self, found: dict[str, Any]) -> None:
         """Put pictures into the outcome of a step: where an episode ended, `observations` are of the next one."""
-        ended = self._tensor(found["terminated"]) | self._tensor(found["truncated"])
+        ended = self._own(found["terminated"]) | self._own(found["truncated"])
         found["final_observations"] = self._with(found["final_observations"], self._seen)
         found["observations"] = self._with(found["observations"], self._next(ended))
 
-    def _next(self, ended: torch.Tensor) -> Seen:
+    def _next(self, ended: Any) -> Seen:
         if not self._home:
             return self._draw("")
-        rows, where = self._rows(""), ended[:, None, None, None]
+        rows, where, here = self._rows(""), self._where(), ended[:, None, None, None]
         return {
             agent: {
                 name: self._pictures.wanted(agent, name, rows)
                 if self._pictures.is_matched(agent, name)
-                else torch.where(where, self._home[agent][name], picture)
+                else where(here, self._home[agent][name], picture)
                 for name, picture in own.items()
             }
             for agent, own in self._seen.items()
         }
 
     def _draw(self, place: str) -> Seen:
-        return self._pictures.draw(self._engine.read(f"{place}.physics.qpos", "torch"), self._rows(place))
+        return self._pictures.draw(self._read(f"{place}.physics.qpos"), self._rows(place))
 
-    def _rows(self, place: str) -> torch.Tensor | None:
-        # as int64, a copy: a step gives its carry away
-        return self._engine.read(f"{place}.goal.row", "torch").long() if self._matched else None
+    def _rows(self, place: str) -> Any:
+        if not self._matched:
+            return None
+        rows = self._read(f"{place}.goal.row")
+        return rows.long() if self._cuda else rows.astype(np.int64)  # a copy: a step gives its carry away
+
+    def _read(self, name: str) -> Any:
+        return self._engine.read(name, "torch" if self._cuda else "numpy")
+
+    def _where(self) -> Any:
+        if not self._cuda:
+            return np.where
+        import torch
+
+        return torch.where
 
     def _with(self, observations: dict[str, Any], seen: Seen) -> dict[str, Any]:
         found = dict(observations)
@@ -104,15 +114,22 @@ class Sight:
             found[agent] = {"proprioception": observations[agent], **pictures}
         return found
 
-    def _tensor(self, values: Any) -> torch.Tensor:
-        values = values if torch.is_tensor(values) else torch.from_numpy(np.array(values))
-        return values.to(self._engine.device)
+    def _own(self, values: Any) -> Any:
+        """Return values of any library as pictures are: of numpy, or of torch on the GPU."""
+        if not self._cuda:
+            return np.asarray(values)
+        import torch
 
-    def _present(self, values: torch.Tensor) -> Any:
-        if self._arrays == "torch":
-            return values
+        return (values if torch.is_tensor(values) else torch.from_numpy(np.array(values))).to("cuda")
+
+    def _present(self, values: Any) -> Any:
+        """Return a picture, or what the task senses, in the library of the observations."""
         if self._arrays == "numpy":
-            return values.cpu().numpy()
-        import jax
+            return values.cpu().numpy() if self._cuda else values
+        if self._arrays == "jax":
+            import jax
 
-        return jax.dlpack.from_dlpack(values.contiguous())
+            return jax.dlpack.from_dlpack(values.contiguous()) if self._cuda else jax.numpy.asarray(values)
+        import torch
+
+        return values if self._cuda else torch.from_numpy(values)

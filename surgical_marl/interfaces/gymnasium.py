@@ -19,9 +19,11 @@ from gymnasium.envs.registration import EnvSpec
 
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.interfaces.joint import JointAgent
-from surgical_marl.interfaces.rendering import Rendering
+from surgical_marl.interfaces.rendering import Rendering, check_mode
 from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.policies.teammates import Teammate, Teammates
+
+RENDER_MODES = ("rgb_array",)
 
 
 class LimitInSpec:
@@ -64,7 +66,7 @@ class SurgicalEnv(LimitInSpec, gymnasium.Env[Any, np.ndarray]):
         ValueError: naming the unknown value and the good ones.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012 (Gymnasium's own convention)
+    metadata = {"render_modes": [*RENDER_MODES], "render_fps": 50}  # noqa: RUF012 (Gymnasium's own convention)
 
     def __init__(
         self, task: str = "reach", scene: str | None = None, *, agent: str | None = None,
@@ -72,7 +74,7 @@ class SurgicalEnv(LimitInSpec, gymnasium.Env[Any, np.ndarray]):
     ) -> None:  # fmt: skip
         if "num_envs" in options:
             raise ValueError(f"num_envs {options['num_envs']!r} is for many environments: use gymnasium.make_vec")
-        check_render_mode(render_mode)
+        check_mode(render_mode, RENDER_MODES)
         options["max_steps"] = _limit_of_make() or options.get("max_steps")
         self.batch = make_batch(task, scene, 1, options)
         self.joint = JointAgent(self.batch, agent, list(teammates or ()), alone=True)
@@ -91,6 +93,7 @@ class SurgicalEnv(LimitInSpec, gymnasium.Env[Any, np.ndarray]):
         """
         self._seen, _, infos = self.batch.reset(seed)
         super().reset(seed=None if seed is None else int(seed))  # for wrappers: episodes do not use `np_random`
+        self.teammates.seed(seed)
         self.teammates.forget()
         self._over = False
         return self.joint.observation(self._seen, 0), self.joint.info(infos, _first)
@@ -120,12 +123,6 @@ class SurgicalEnv(LimitInSpec, gymnasium.Env[Any, np.ndarray]):
         """Free the memory and the threads. A later step, reset or picture is a ValueError."""
         self._rendering.close()
         self.batch.close()
-
-
-def check_render_mode(mode: str | None) -> None:
-    """Raise a ValueError if a render mode is unknown."""
-    if mode not in (None, "rgb_array"):
-        raise ValueError(f"unknown render_mode {mode!r}; the modes are None and 'rgb_array'")
 
 
 def make_batch(task: str, scene: str | None, num_envs: int, options: dict[str, Any]) -> BatchedEnv:

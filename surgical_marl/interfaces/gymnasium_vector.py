@@ -14,8 +14,9 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from surgical_marl.interfaces.gymnasium import LimitInSpec, check_render_mode, make_batch
+from surgical_marl.interfaces.gymnasium import RENDER_MODES, LimitInSpec, make_batch
 from surgical_marl.interfaces.joint import JointAgent
+from surgical_marl.interfaces.rendering import check_mode
 from surgical_marl.policies.teammates import Teammate, Teammates
 
 
@@ -38,14 +39,14 @@ class SurgicalVectorEnv(LimitInSpec, VectorEnv[Any, np.ndarray, Any]):
         ValueError: naming the unknown value and the good ones.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 50, "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
+    metadata = {"render_modes": [*RENDER_MODES], "render_fps": 50, "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
 
     def __init__(
         self, num_envs: int = 1, task: str = "reach", scene: str | None = None, *, agent: str | None = None,
         teammates: Mapping[str, Teammate] | None = None, max_episode_steps: int | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP, render_mode: str | None = None, **options: Any,
     ) -> None:  # fmt: skip
-        check_render_mode(render_mode)
+        check_mode(render_mode, RENDER_MODES)
         self.autoreset_mode = _mode(autoreset_mode)
         if max_episode_steps is not None:
             options["max_steps"] = max_episode_steps
@@ -173,6 +174,7 @@ class SurgicalVectorEnv(LimitInSpec, VectorEnv[Any, np.ndarray, Any]):
     def _begin(self, chosen: np.ndarray, seed: Any, mask: np.ndarray | None, info: Any = None) -> dict[str, Any]:
         """Start episodes where they are chosen; return the infos, of the others those given or zeros."""
         seen, _, infos = self.batch.reset(seed, mask=mask)
+        self.teammates.seed(seed)
         self.teammates.forget(chosen)
         first = self.joint.info(infos)
         if chosen.all():

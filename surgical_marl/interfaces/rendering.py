@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,10 +14,11 @@ if TYPE_CHECKING:
 MODES = ("human", "rgb_array")
 
 
-def check_mode(mode: str | None) -> None:
-    """Raise a ValueError if a render mode is unknown, or is "human" where no window can be opened."""
-    if mode is not None and mode not in MODES:
-        raise ValueError(f"unknown render_mode {mode!r}; the modes are None, 'human' and 'rgb_array'")
+def check_mode(mode: str | None, modes: Sequence[str] = MODES) -> None:
+    """Raise a ValueError if a render mode is none of the `modes`, or is "human" where no window can be opened."""
+    if mode is not None and mode not in modes:
+        *first, last = ("None", *map(repr, modes))
+        raise ValueError(f"unknown render_mode {mode!r}; the modes are {', '.join(first)} and {last}")
     if mode == "human":
         from matplotlib import get_backend
 

@@ -6,7 +6,8 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 Policy = Callable[[Mapping[str, Any]], dict[str, Any]]
-"""Maps the observations of all agents to their actions. A recurrent policy has a method `reset` (see `forget`)."""
+"""Maps the observations of all agents to their actions. A recurrent policy has a method `reset` (see `forget`), and one
+that draws random numbers a method `seed`, which takes whole numbers and begins them anew."""
 
 
 def forget(policy: Callable[..., Any], ended: Any = None) -> None:

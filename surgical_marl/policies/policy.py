@@ -7,8 +7,7 @@ returns NumPy arrays for NumPy arrays and tensors for tensors. A recurrent polic
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from functools import partial
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -93,12 +92,12 @@ def untrained_policy(env: BatchedEnv, settings: Settings | None = None, grouping
 
 def zero_policy(env: BatchedEnv) -> Policy:
     """Make the policy whose actions are always zero."""
-    return _Heedless(env, partial(np.zeros, dtype=np.float32))
+    return _Zero(env)
 
 
 def random_policy(env: BatchedEnv, seed: int = 0) -> Policy:
     """Make the policy of uniform random actions in [-1, 1]."""
-    return _Heedless(env, partial(_uniform, np.random.default_rng(seed)))
+    return _Random(env, seed)
 
 
 def find_run(run: str | Path) -> Path:
@@ -213,11 +212,11 @@ class _Restating:
         forget(self._policy, ended)
 
 
-class _Heedless:
-    """A policy that observes nothing but the shapes of what it is shown."""
+class _Zero:
+    """Zeros. It observes nothing but the shapes of what it is shown."""
 
-    def __init__(self, env: BatchedEnv, act: Callable[[tuple[int, ...]], np.ndarray]) -> None:
-        self._widths, self._act = {agent: env.action_space(agent).shape for agent in env.agents}, act
+    def __init__(self, env: BatchedEnv) -> None:
+        self._widths = {agent: env.action_space(agent).shape for agent in env.agents}
 
     def __call__(self, observations: Mapping[str, Any]) -> dict[str, Any]:
         actions = {}
@@ -226,9 +225,22 @@ class _Heedless:
             actions[agent] = _like(observations[agent], torch.from_numpy(self._act(shape)))
         return actions
 
+    def _act(self, shape: tuple[int, ...]) -> np.ndarray:
+        return np.zeros(shape, np.float32)
 
-def _uniform(generator: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
-    return generator.uniform(-1, 1, shape).astype(np.float32)
+
+class _Random(_Zero):
+    """Uniform random actions, of a generator that `seed` begins anew."""
+
+    def __init__(self, env: BatchedEnv, seed: int) -> None:
+        super().__init__(env)
+        self._generator = np.random.default_rng(seed)
+
+    def seed(self, seed: Sequence[int]) -> None:
+        self._generator = np.random.default_rng(seed)
+
+    def _act(self, shape: tuple[int, ...]) -> np.ndarray:
+        return self._generator.uniform(-1, 1, shape).astype(np.float32)
 
 
 def _like(example: Any, action: Tensor) -> Any:

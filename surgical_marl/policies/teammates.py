@@ -1,6 +1,7 @@
 """Who moves the arms that a learner does not move.
 
 mates = Teammates(env, {"psm_0": "reach-bimanual_psm", "ecm_0": "frozen"})
+mates.seed(0)                              # random ones play the same again
 mates.forget()                             # where episodes begin
 actions = mates.actions(observations)      # of psm_0 and ecm_0
 """
@@ -8,7 +9,7 @@ actions = mates.actions(observations)      # of psm_0 and ecm_0
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,6 +23,9 @@ if TYPE_CHECKING:
 
 FROZEN = "frozen"
 """An arm that keeps still: the policy "zero" leaves it where it was sent."""
+
+_TEAMMATES = 1
+"""Put before a seed, so that teammates draw other numbers than an agent whose generator has the same seed."""
 
 Teammate = str | os.PathLike[str] | Callable[[Any], Any]
 """A policy by its name or folder, as `surgical-marl eval` takes it, or "frozen", or a function from what an arm
@@ -70,6 +74,17 @@ class Teammates:
             else:
                 actions[agent] = function(observations[agent])
         return actions
+
+    def seed(self, seed: int | Sequence[int | None] | None) -> None:
+        """Let policies that draw random numbers begin them anew, by a seed or all seeds of a list that are not None.
+
+        Without a seed they go on, and functions always do.
+        """
+        seeds = seed if isinstance(seed, Sequence | np.ndarray) else [seed]
+        whole = [int(own) for own in seeds if own is not None]
+        for policy, _ in self._policies:
+            if whole and hasattr(policy, "seed"):
+                policy.seed((_TEAMMATES, *whole))
 
     def forget(self, ended: np.ndarray | None = None) -> None:
         """Tell all that episodes begin: in all environments, or where the last one `ended`, [N] bool."""

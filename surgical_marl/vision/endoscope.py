@@ -4,29 +4,29 @@
     view = endoscope.render(env.qpos)           # joint positions [N, nq], numpy or torch
     view.rgb                                    # [N, eyes, 64, 64, 3] uint8
 
-Pictures depend on joint positions alone, which any engine has, so no second physics is needed. MuJoCo Warp computes the
-poses of the bodies, and `vision/raycaster.py` draws them, on a GPU or a CPU with the same code; docs/rendering.md
+Pictures depend on joint positions alone, which any engine has, so no second physics is needed. Poses come from
+`vision/kinematics.py`, and `vision/raycaster.py` draws them, on a GPU or a CPU with the same code; docs/rendering.md
 compares the pictures with C MuJoCo's ray caster.
 """
 
 from __future__ import annotations
 
 import numbers
+import sys
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
 
 from surgical_marl.content import unknown
-from surgical_marl.runtime import let_torch_fork, prepare_mjx, prepare_warp
+from surgical_marl.runtime import has_cuda, prepare_warp
 from surgical_marl.scenes.scene import Scene
 
 SIZE = 64
 """Pixels along each side of a picture."""
 EYES = ("left", "right")
 CHANNELS = ("rgb", "depth", "segmentation")
-_TYPES = {"rgb": torch.uint8, "depth": torch.float32, "segmentation": torch.int32}
+_TYPES = {"rgb": "uint8", "depth": "float32", "segmentation": "int32"}
 BACKGROUND = (0.05, 0.02, 0.02)
 """Background colour: the dark of a body cavity."""
 
@@ -86,27 +86,23 @@ class Endoscope:
         for channel in channels:
             if channel not in CHANNELS:
                 raise unknown("channel", channel, CHANNELS)
-        if device not in ("cpu", "cuda") or (device == "cuda" and not torch.cuda.is_available()):
+        if device not in ("cpu", "cuda") or (device == "cuda" and not has_cuda()):
             raise ValueError(f"device {device!r} is not there: the devices are cpu, and cuda where torch finds it")
         self.scene, self.num_envs, self.device, self.channels = scene, num_envs, device, tuple(channels)
         self.agent = scene.find_camera(agent)
         self.eyes = EYES if stereo else EYES[:1]
         self.labels, self.label_names = _labels(scene)
         self._shape = num_envs, len(self.eyes), height, width
-        let_torch_fork()
-        prepare_mjx()
         self._warp = prepare_warp()
-        from mujoco.mjx.third_party import mujoco_warp
-
+        from surgical_marl.vision.kinematics import Kinematics
         from surgical_marl.vision.raycaster import RayCaster
 
-        self._mujoco = mujoco_warp
         cameras = [scene.model.camera(f"{self.agent}/{eye}").id for eye in self.eyes]
         with self._warp.ScopedDevice(device):
-            self._model = mujoco_warp.put_model(scene.model)
-            self._data = mujoco_warp.make_data(scene.model, num_envs, nconmax=0, njmax=0)
+            self._kinematics = Kinematics(scene.model, num_envs)
             self._caster = RayCaster(scene.model, cameras, num_envs, width, height, BACKGROUND)
-        self._qpos = self._warp.to_torch(self._data.qpos)
+        qpos = self._kinematics.qpos
+        self._qpos = qpos.numpy() if device == "cpu" else self._warp.to_torch(qpos)  # the same memory
         self._warp.synchronize_device(device)  # the arrays were made on Warp's own stream
 
     def render(self, qpos: Any) -> View:
@@ -120,29 +116,52 @@ class Endoscope:
         """
         if tuple(qpos.shape) != tuple(self._qpos.shape):
             raise ValueError(f"qpos of shape {tuple(qpos.shape)} must be {tuple(self._qpos.shape)}")
-        given = torch.is_tensor(qpos)
-        self._qpos.copy_(qpos if given else torch.from_numpy(np.array(qpos, np.float32)))
+        tensor = _is_tensor(qpos)
+        self._fill(qpos, tensor)
         drawn = {name: self._empty(name) for name in CHANNELS}
         with self._stream():
-            self._mujoco.kinematics(self._model, self._data)
-            self._mujoco.camlight(self._model, self._data)
-            self._caster.draw(self._data, **drawn)
-        found = {name: drawn[name].unflatten(0, self._shape[:2]) for name in self.channels}
-        return View(**(found if given else {name: picture.cpu().numpy() for name, picture in found.items()}))
+            self._kinematics.update()
+            self._caster.draw(self._kinematics, **drawn)
+        found = {name: drawn[name].reshape(*self._shape[:2], *drawn[name].shape[1:]) for name in self.channels}
+        if tensor and self.device == "cpu":
+            found = {name: sys.modules["torch"].from_numpy(picture) for name, picture in found.items()}
+        elif not tensor and self.device == "cuda":
+            found = {name: picture.cpu().numpy() for name, picture in found.items()}
+        return View(**found)
 
-    def _empty(self, channel: str) -> torch.Tensor:
+    def _fill(self, qpos: Any, tensor: bool) -> None:
+        if self.device == "cpu":
+            self._qpos[:] = qpos.detach().cpu().numpy() if tensor else qpos
+        else:
+            import torch
+
+            self._qpos.copy_(qpos if tensor else torch.from_numpy(np.array(qpos, np.float32)))
+
+    def _empty(self, channel: str) -> Any:
         """Pictures to draw on, [N * E, H, W] or with [3] colours; none of a channel that nobody asked for."""
         envs, eyes, height, width = self._shape
         pictures = envs * eyes if channel in self.channels else 0
-        colours = (3,) if channel == "rgb" else ()
-        return torch.empty((pictures, height, width, *colours), dtype=_TYPES[channel], device=self.device)
+        shape = (pictures, height, width, *((3,) if channel == "rgb" else ()))
+        if self.device == "cpu":
+            return np.empty(shape, _TYPES[channel])
+        import torch
+
+        return torch.empty(shape, dtype=getattr(torch, _TYPES[channel]), device=self.device)
 
     def _stream(self) -> Any:
         if self.device == "cpu":
             return self._warp.ScopedDevice("cpu")
+        import torch
+
         # No work is left on Warp's own stream, and waiting for it would break a capture.
         stream = self._warp.stream_from_torch(torch.cuda.current_stream())
         return self._warp.ScopedStream(stream, sync_enter=False)
+
+
+def _is_tensor(values: Any) -> bool:
+    """Whether values are a tensor of torch, which is not imported to find out."""
+    torch = sys.modules.get("torch")
+    return torch is not None and bool(torch.is_tensor(values))
 
 
 def _labels(scene: Scene) -> tuple[np.ndarray, tuple[str, ...]]:

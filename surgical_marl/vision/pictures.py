@@ -1,7 +1,9 @@
 """Pictures as observation terms: the current pictures and the target pictures of N environments.
 
 The picture of an endoscope is drawn once, for all agents that observe it. Target pictures are drawn once for all
-episodes, one for each row of the table of postures; an episode looks its picture up.
+episodes, one for each row of the table of postures, and kept on disk; an episode looks its picture up.
+
+On a GPU the arrays are tensors of torch. On a CPU they are numpy's, so that drawing does not wait for torch's import.
 """
 
 from __future__ import annotations
@@ -9,11 +11,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import mujoco
 import numpy as np
-import torch
 from gymnasium import spaces
-from torch import Tensor
 
+from surgical_marl.cache import cached
 from surgical_marl.scenes.scene import Scene
 from surgical_marl.vision.endoscope import EYES, SIZE, Endoscope, View
 
@@ -54,7 +56,7 @@ class Pictures:
             for picture in dict.fromkeys(picture for picture in every if picture.table is not None)
         }
 
-    def draw(self, qpos: Tensor, rows: Tensor | None) -> dict[str, dict[str, Tensor]]:
+    def draw(self, qpos: Any, rows: Any) -> dict[str, dict[str, Any]]:
         """Return agent -> term -> picture [N, H, W, C]. On a GPU nothing waits for the host.
 
         Args:
@@ -74,7 +76,7 @@ class Pictures:
         """Return whether a term is a picture to be matched, and not what an endoscope sees now."""
         return self.terms[agent][name].table is not None
 
-    def wanted(self, agent: str, name: str, rows: Tensor | None) -> Tensor:
+    def wanted(self, agent: str, name: str, rows: Any) -> Any:
         """Return the pictures to be matched [N, H, W, C] in these rows of their table."""
         return self._wanted[self.terms[agent][name]][rows]
 
@@ -92,17 +94,28 @@ def _endoscope(scene: Scene, camera: str, terms: list[Any], num_envs: int, devic
     return Endoscope(scene, num_envs, device, stereo=stereo, channels=channels, agent=camera)
 
 
-def _draw_table(scene: Scene, term: Any, postures: np.ndarray, device: str) -> Tensor:
-    """Draw the picture of each posture, and return the pictures, [rows, H, W, C]."""
-    endoscope = _endoscope(scene, term.camera, [term], AT_ONCE, device)
-    drawn = []
-    for first in range(0, len(postures), AT_ONCE):
-        part = postures[first : first + AT_ONCE]
-        filled = np.concatenate([part, np.repeat(part[-1:], AT_ONCE - len(part), 0)])
-        drawn.append(_cut(endoscope.render(torch.from_numpy(filled)), term).clone())
-    return torch.cat(drawn)[: len(postures)]
+def _draw_table(scene: Scene, term: Any, postures: np.ndarray, device: str) -> Any:
+    """Return the picture of each posture, [rows, H, W, C], from the cache if they were drawn before."""
+
+    def draw() -> np.ndarray:
+        endoscope = _endoscope(scene, term.camera, [term], AT_ONCE, device)
+        drawn = []
+        for first in range(0, len(postures), AT_ONCE):
+            part = postures[first : first + AT_ONCE]
+            filled = np.concatenate([part, np.repeat(part[-1:], AT_ONCE - len(part), 0)])
+            drawn.append(_cut(endoscope.render(filled), term))
+        return np.concatenate(drawn)[: len(postures)]
+
+    model = np.empty(mujoco.mj_sizeModel(scene.model), np.uint8)
+    mujoco.mj_saveModel(scene.model, None, model)
+    pictures = cached("targets", draw, repr(term), device, model.tobytes(), postures.tobytes())
+    if device == "cpu":
+        return pictures
+    import torch
+
+    return torch.from_numpy(pictures).to(device)
 
 
-def _cut(view: View, term: Any) -> Tensor:
+def _cut(view: View, term: Any) -> Any:
     picture = getattr(view, term.channel)[:, EYES.index(term.eye)]
-    return picture.unsqueeze(-1) if term.channel == "depth" else picture
+    return picture[..., None] if term.channel == "depth" else picture

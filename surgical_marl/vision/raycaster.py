@@ -7,7 +7,6 @@ from typing import Any
 
 import mujoco
 import numpy as np
-import torch
 
 from surgical_marl.runtime import prepare_warp
 from surgical_marl.vision.rays import BOX, CAPSULE, CYLINDER, ELLIPSOID, MESH, TILE, Light, cull, make_draw, place
@@ -70,13 +69,14 @@ class RayCaster:
         self._light, self._background = _light(model), wp.vec3(*background)
         self._draw = make_draw(bool(self._meshes))
 
-    def draw(self, data: Any, rgb: torch.Tensor, depth: torch.Tensor, segmentation: torch.Tensor) -> None:
+    def draw(self, data: Any, rgb: Any, depth: Any, segmentation: Any) -> None:
         """Write pictures into arrays [N * C, height, width], or [N * C, height, width, 3] for colour.
 
-        C is the number of cameras. A channel whose array is empty is not drawn.
+        C is the number of cameras. The arrays are torch's, or numpy's on a CPU. A channel whose array is empty is not
+        drawn.
 
         Args:
-            data: MuJoCo Warp's, with `kinematics` and `camlight` done.
+            data: poses of geoms and cameras, of `vision/kinematics.py` or MuJoCo Warp.
             rgb: colour; may be empty.
             depth: distance along the optical axis, m; may be empty.
             segmentation: ids of geoms; may be empty.
@@ -89,8 +89,15 @@ class RayCaster:
         wp.launch(cull, self._counts.shape, inputs, block_dim=BLOCK)
         inputs = [self._kinds, self._sizes, self._colours, self._geoms, self._handles, self._first_faces, self._normals]
         inputs += [*placed, *listed, *cameras, *self._screen, self._light, self._background]
-        inputs += [wp.from_torch(rgb, dtype=wp.vec3ub), wp.from_torch(depth), wp.from_torch(segmentation)]
+        inputs += [_warp(rgb, wp.vec3ub), _warp(depth, wp.float32), _warp(segmentation, wp.int32)]
         wp.launch(self._draw, (*self._counts.shape, TILE**2), inputs, block_dim=BLOCK)
+
+
+def _warp(array: Any, dtype: Any) -> Any:
+    """Return an array of Warp's in the same memory."""
+    if isinstance(array, np.ndarray):
+        return wp.array(array, dtype=dtype, copy=False, device="cpu")
+    return wp.from_torch(array, dtype=dtype)
 
 
 def _sizes(model: mujoco.MjModel, geoms: np.ndarray) -> np.ndarray:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import weakref
 from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -17,7 +20,9 @@ _TYPES = {"state": np.float32, "counts": np.int32, "actions": np.float32, "outs"
 _VIEWS = {"bool": np.bool_, "uint32": np.uint32}
 """Types of leaves that are not the type of their buffer: the same bits, seen as another type."""
 _READ = ("outs", "flags", "counts")
-"""Buffers that a step's results are in."""
+"""Buffers that a step's results are in. Nothing else is in the first one, which is by far the largest."""
+_ROOMS = 3
+"""Rooms for results that are kept to be used again: a loop holds the last step's results, and some hold two."""
 
 
 def make_arrays(device: str, source: Source, tables: dict[str, np.ndarray], stride: int, num_envs: int) -> Arrays:
@@ -56,21 +61,11 @@ class Arrays(ABC):
 
     @abstractmethod
     def read_tree(self, tree: dict[str, Any], library: str) -> dict[str, Any]:
-        """Leaves of a dict of dicts, of one copy of the whole."""
-
-    def _cut(self, node: Any, copies: dict[str, Any], library: str) -> Any:
-        """Return a tree's leaves, taken out of copies of the buffers.
-
-        This is a method, not a function within a function. Such a function that calls itself keeps what it sees until
-        Python's garbage collector finds it. Here that would be the arrays of a whole step.
-        """
-        if isinstance(node, dict):
-            return {name: self._cut(child, copies, library) for name, child in node.items()}
-        rows = copies[node.buffer][node.first : node.first + node.size, : self.num_envs]
-        return self._present(node, rows, library)
+        """Return the leaves of a dict of dicts, of results. Later steps leave them as they are."""
 
     @abstractmethod
-    def _present(self, leaf: Leaf, rows: Any, library: str) -> Any: ...
+    def renew(self) -> None:
+        """Make room for results, before a kernel is launched."""
 
     @abstractmethod
     def _zeros(self, fields: int, stride: int, dtype: Any) -> Any: ...
@@ -90,9 +85,16 @@ class Arrays(ABC):
 
 
 class CpuArrays(Arrays):
-    """numpy arrays."""
+    """numpy arrays.
+
+    Results are not copied. A kernel writes them into a room that nobody holds an array of.
+    """
 
     device = "cpu"
+
+    def __init__(self, source: Source, tables: dict[str, np.ndarray], stride: int, num_envs: int) -> None:
+        super().__init__(source, tables, stride, num_envs)
+        self._rooms: deque[_Room] = deque(maxlen=_ROOMS)
 
     def _zeros(self, fields: int, stride: int, dtype: Any) -> Any:
         return np.zeros((fields, stride), dtype)
@@ -110,17 +112,37 @@ class CpuArrays(Arrays):
         self.rows(leaf)[:] = values.T.view(np.int32) if leaf.dtype == "uint32" else values.T
 
     def read(self, leaf: Leaf, library: str) -> Any:
-        return self._present(leaf, self.rows(leaf).copy(), library)
+        fields = self.rows(leaf).copy().view(_VIEWS.get(leaf.dtype, leaf.dtype)).T
+        return self._present(leaf, fields if leaf.shape else fields[:, 0], library)
 
     def read_tree(self, tree: dict[str, Any], library: str) -> dict[str, Any]:
-        return self._cut(tree, {name: self._buffers[name].copy() for name in _READ}, library)
+        flags, counts = (self._buffers[name].copy() for name in ("flags", "counts"))
+        typed = {"float32": self._buffers["outs"], "bool": flags.view(np.bool_), "int32": counts}
+        typed["uint32"] = counts.view(np.uint32)
+        return self._cut(tree, {dtype: own[:, : self.num_envs].T for dtype, own in typed.items()}, library)
 
-    def _present(self, leaf: Leaf, rows: np.ndarray, library: str) -> Any:
-        if leaf.dtype in _VIEWS:
-            rows = rows.view(_VIEWS[leaf.dtype])
-        dimensions = len(leaf.shape)
-        array = rows[0] if dimensions == 0 else rows.T
-        if dimensions > 1:
+    def _cut(self, tree: dict[str, Any], columns: dict[str, np.ndarray], library: str) -> dict[str, Any]:
+        """Return the leaves, taken out of arrays [N, fields] by dtype. Most of what Python does in a step is this."""
+        return {
+            name: self._cut(node, columns, library)
+            if isinstance(node, dict)
+            else columns[node.dtype][:, node.fields]
+            if library == "numpy" and len(node.shape) < 2
+            else self._present(node, columns[node.dtype][:, node.fields], library)
+            for name, node in tree.items()
+        }
+
+    def renew(self) -> None:
+        fields, stride = self._buffers.pop("outs").shape
+        room = next((room for room in self._rooms if room.is_free()), None)
+        if room is None:
+            room = _Room(self._zeros(fields, stride, _TYPES["outs"]))
+            self._rooms.append(room)
+        self._buffers["outs"] = room.lend()
+        self.all[list(_TYPES).index("outs")] = room.warp
+
+    def _present(self, leaf: Leaf, array: np.ndarray, library: str) -> Any:
+        if len(leaf.shape) > 1:
             array = array.reshape(self.num_envs, *leaf.shape)
         if library == "torch":
             import torch
@@ -130,6 +152,23 @@ class CpuArrays(Arrays):
             import jax
 
             return jax.numpy.asarray(array)
+        return array
+
+
+class _Room:
+    """Memory that is lent as an array, again and again, but never while somebody holds that array or a part of it."""
+
+    def __init__(self, memory: np.ndarray) -> None:
+        self.warp = wp.array(memory.reshape(-1), copy=False, device="cpu")
+        self._memory = memory.data
+        self._lent: Callable[[], np.ndarray | None] = lambda: None
+
+    def is_free(self) -> bool:
+        return self._lent() is None
+
+    def lend(self) -> np.ndarray:
+        array = np.asarray(self._memory)  # what numpy, torch and JAX make of it keeps it alive
+        self._lent = weakref.ref(array)
         return array
 
 
@@ -165,6 +204,20 @@ class CudaArrays(Arrays):
 
     def read_tree(self, tree: dict[str, Any], library: str) -> dict[str, Any]:
         return self._cut(tree, {name: self._buffers[name].clone() for name in _READ}, library)
+
+    def renew(self) -> None:
+        pass  # a CUDA graph writes to the same place at every replay, so what is read is copied
+
+    def _cut(self, node: Any, copies: dict[str, Any], library: str) -> Any:
+        """Return a tree's leaves, taken out of copies of the buffers.
+
+        This is a method, not a function within a function. Such a function that calls itself keeps what it sees until
+        Python's garbage collector finds it. Here that would be the arrays of a whole step.
+        """
+        if isinstance(node, dict):
+            return {name: self._cut(child, copies, library) for name, child in node.items()}
+        rows = copies[node.buffer][node.first : node.first + node.size, : self.num_envs]
+        return self._present(node, rows, library)
 
     def _present(self, leaf: Leaf, rows: Any, library: str) -> Any:
         import torch

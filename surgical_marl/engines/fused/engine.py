@@ -100,8 +100,8 @@ class FusedEngine:
     def outcome(self, library: str) -> dict[str, Any]:
         """Return what the last step or reset led to: fields of the environment's `State` as dicts of dicts.
 
-        The arrays are [N, ...] of "numpy", "torch" or "jax". They are copies, but on a GPU the next step overwrites
-        those for "torch".
+        The arrays are [N, ...] of "numpy", "torch" or "jax", and the next step leaves them as they are. In a CUDA graph
+        a replay overwrites those that were made while it was captured.
         """
         return self._arrays.read_tree(self.source.results, library)
 
@@ -133,6 +133,7 @@ class FusedEngine:
         return filled
 
     def _launch(self, name: str) -> None:
+        self._arrays.renew()
         launch = lambda share: self._kernels[name].launch(self._arrays.all, self._stride, *share)  # noqa: E731
         if len(self._shares) == 1:
             launch(self._shares[0])

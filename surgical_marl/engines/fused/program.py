@@ -29,6 +29,11 @@ class Leaf:
     def size(self) -> int:
         return math.prod(self.shape)
 
+    @cached_property
+    def fields(self) -> int | slice:
+        """The index of the fields in their array; of a single number without an axis."""
+        return slice(self.first, self.first + self.size) if self.shape else self.first
+
 
 @dataclass(frozen=True)
 class Source:

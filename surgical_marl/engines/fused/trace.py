@@ -135,18 +135,22 @@ class Tracer:
         pairs = [(lift(g, a), lift(g, b)) for a, b in zip(*results, strict=True)]
         axes = [max(depth(g, side) for side in pair) for pair in pairs]  # what one of them has in memory stays there
         packed = [[pack(g, side, n) for side in pair] for pair, n in zip(pairs, axes, strict=True)]
-        merged = [[self._merge(branch, *both) for both in zip(*sides, strict=True)] for sides in packed]
+        known: dict[tuple[Value, Value], Value] = {}
+        merged = [[self._merge(branch, known, *both) for both in zip(*sides, strict=True)] for sides in packed]
         unpacked = [unpack(g, outs, x.shape, n) for outs, x, n in zip(merged, results[0], axes, strict=True)]
         return [lower(g, ids, dtype_of(g, x)) for ids, x in zip(unpacked, results[0], strict=True)]
 
-    def _merge(self, branch: Branch, other: Value, chosen: Value) -> Value:
+    def _merge(self, branch: Branch, known: dict[tuple[Value, Value], Value], other: Value, chosen: Value) -> Value:
+        """Return the value that is `chosen` or `other`. A pair that is `known` has one already."""
         if other == chosen:
             return other
-        branch.others.append(other)
-        branch.chosen.append(chosen)
-        g = self.graph
-        branch.outs.append(g.fresh("out", len(g.groups) - 1, len(branch.outs), kind=g.kind(other)))
-        return branch.outs[-1]
+        if (other, chosen) not in known:
+            branch.others.append(other)
+            branch.chosen.append(chosen)
+            g = self.graph
+            branch.outs.append(g.fresh("out", len(g.groups) - 1, len(branch.outs), kind=g.kind(other)))
+            known[other, chosen] = branch.outs[-1]
+        return known[other, chosen]
 
     # -- loops
 

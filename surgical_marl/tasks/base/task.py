@@ -192,7 +192,7 @@ class Task:
         A metric of the same name must be the number itself: a reset puts it into the infos as it is.
 
         Args:
-            pictures: agent -> term -> torch tensor [N, H, W, C].
+            pictures: agent -> term -> picture [N, H, W, C]: an array of numpy, or a tensor of torch on a GPU.
         """
         return {}
 
