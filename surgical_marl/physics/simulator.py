@@ -147,7 +147,8 @@ class Simulator:
         (physics, touch), _ = jax.lax.scan(substep, (physics, self.untouched), None, length=self.decimation)
         tips, distance = self._look(physics.qpos)
         contacts = Contacts(distance, jnp.maximum(touch.penetration, -distance), touch.force)
-        return physics, contacts, self._view(jnp, physics, tips, contacts, touch.handled)
+        handled = touch.handled if self._objects else None
+        return physics, contacts, self._view(jnp, physics, tips, contacts, handled)
 
     @property
     def untouched(self) -> Touch:
