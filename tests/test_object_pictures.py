@@ -13,7 +13,8 @@ import surgical_marl as sm
 from surgical_marl import BatchedEnv
 from surgical_marl.policies.policy import zero_policy
 from surgical_marl.robots.rotation import matrix_of
-from surgical_marl.scenes.poses import Poses
+from surgical_marl.scenes.poses import Poses, frames
+from surgical_marl.scenes.scene import Scene
 from surgical_marl.view import record
 from surgical_marl.vision.endoscope import CHANNELS, Endoscope
 from tests.test_endoscope import cast
@@ -65,6 +66,11 @@ def test_poses_are_of_the_frames_of_falling_objects(env: BatchedEnv) -> None:
         turn = matrix_of(found.quaternion[0, i].astype(float))
         center = bodies[".physics.objects.bodies.position"][0, i]
         np.testing.assert_allclose(found.origin[0, i] + turn @ place.object.center, center, atol=1e-7)
+    parts = [bodies[f".physics.objects.bodies.{part}"] for part in ("position", "quaternion")]
+    centers = np.array([place.object.center for place in places], np.float32)
+    tensors = frames(*map(torch.from_numpy, [*parts, centers]))
+    np.testing.assert_allclose(tensors.origin.numpy(), found.origin, atol=1e-8)
+    np.testing.assert_array_equal(tensors.quaternion.numpy(), found.quaternion)
     fallen = 9.81 * 0.0025**2 * 16 * 17 / 2  # 16 physics steps, each with the velocity at its end
     np.testing.assert_allclose(found.origin[1, :, 2], 0.12 - fallen, atol=1e-6)
     assert (
@@ -80,17 +86,32 @@ def test_a_scene_without_free_objects_has_no_poses() -> None:
     assert env.object_poses.origin.shape == (3, 0, 3) and env.object_poses.quaternion.shape == (3, 0, 4)
 
 
+def anywhere(scene: Scene, seed: int = 0) -> Poses:
+    """Free objects at random about the middle of where the scene places them."""
+    rng, places = np.random.default_rng(seed), scene.free_objects.values()
+    middle = np.mean([place.position for place in places], axis=0)
+    origin = middle + rng.uniform(-0.04, 0.04, (POSES, len(places), 3))
+    turns = rng.normal(size=(POSES, len(places), 4))
+    quaternion = turns / np.linalg.norm(turns, axis=-1, keepdims=True)
+    return Poses(origin.astype(np.float32), quaternion.astype(np.float32))
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_a_gpu_draws_what_a_cpu_draws() -> None:
+    scene = sm.load_scene("trimanual_psm_ecm_pegs")
+    poses, qpos = anywhere(scene), np.repeat(scene.home[None], POSES, 0)
+    on_cpu = Endoscope(scene, POSES, channels=CHANNELS).render(qpos, poses).segmentation
+    given = Poses(*(torch.from_numpy(part).cuda() for part in vars(poses).values()))
+    drawn = Endoscope(scene, POSES, "cuda", channels=CHANNELS).render(torch.from_numpy(qpos).float().cuda(), given)
+    assert (drawn.segmentation.cpu().numpy() == on_cpu).mean() > 0.99
+
+
 def test_the_endoscope_agrees_with_the_rays_of_c_mujoco_at_any_poses() -> None:
     scene = sm.load_scene("trimanual_psm_ecm_pegs")
-    rng, k = np.random.default_rng(0), len(scene.free_objects)
-    middle = np.mean([place.position for place in scene.free_objects.values()], axis=0)
-    origin = (middle + rng.uniform(-0.04, 0.04, (POSES, k, 3))).astype(np.float32)
-    turns = rng.normal(size=(POSES, k, 4))
-    quaternion = (turns / np.linalg.norm(turns, axis=-1, keepdims=True)).astype(np.float32)
-    qpos = np.repeat(scene.home[None], POSES, 0)
+    poses, qpos = anywhere(scene), np.repeat(scene.home[None], POSES, 0)
     endoscope = Endoscope(scene, POSES, channels=CHANNELS)
-    drawn = endoscope.render(qpos, Poses(origin, quaternion))
-    rays = [cast(scene, scene.home, "left", *pose) for pose in zip(origin, quaternion, strict=True)]
+    drawn = endoscope.render(qpos, poses)
+    rays = [cast(scene, scene.home, "left", *pose) for pose in zip(poses.origin, poses.quaternion, strict=True)]
     geoms, depths = map(np.array, zip(*rays, strict=True))
     same = drawn.segmentation[:, 0] == geoms
     assert same.mean() > 0.99 and np.abs(drawn.depth[:, 0] - depths)[same].max() < 1e-4
@@ -100,7 +121,8 @@ def test_the_endoscope_agrees_with_the_rays_of_c_mujoco_at_any_poses() -> None:
         colour = np.array(place.object.shapes[0].colour)
         assert len(seen) > 100 and seen.mean(0).argmax() == colour.argmax()
 
-    tensors = endoscope.render(torch.from_numpy(qpos), Poses(torch.from_numpy(origin), torch.from_numpy(quaternion)))
+    given = Poses(*map(torch.from_numpy, vars(poses).values()))
+    tensors = endoscope.render(torch.from_numpy(qpos), given)
     np.testing.assert_array_equal(tensors.rgb.numpy(), drawn.rgb)
     # without poses, objects are where the scene places them, whatever was drawn before
     placed = mujoco.MjData(scene.model)
@@ -111,7 +133,7 @@ def test_the_endoscope_agrees_with_the_rays_of_c_mujoco_at_any_poses() -> None:
 
 
 def test_observed_pictures_follow_objects_over_the_end_of_an_episode(env: BatchedEnv) -> None:
-    eye = Endoscope(env.scene, ENVS, channels=CHANNELS)
+    eye = Endoscope(env.scene, ENVS, env.device, channels=CHANNELS)
     found, *_ = env.reset(seed=0)
     first = found["ecm_0"]
     before = first["image"]

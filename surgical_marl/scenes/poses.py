@@ -32,6 +32,6 @@ def frames(position: Any, quaternion: Any, centers: Any) -> Poses:
         import torch
 
         cross = torch.linalg.cross
-    real, axis = quaternion[..., :1], quaternion[..., 1:]
+    centers, real, axis = centers[None], quaternion[..., :1], quaternion[..., 1:]
     sideways = 2 * cross(axis, centers)
     return Poses(position - (centers + real * sideways + cross(axis, sideways)), quaternion)

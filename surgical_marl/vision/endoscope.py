@@ -103,10 +103,16 @@ class Endoscope:
         with self._warp.ScopedDevice(device):
             self._kinematics = Kinematics(scene.model, num_envs)
             self._caster = RayCaster(scene.model, cameras, num_envs, width, height, BACKGROUND)
-        poses = self._kinematics
-        given = {"qpos": poses.qpos, "origin": poses.origins, "quaternion": poses.turns}
-        to_own = (lambda values: values.numpy()) if device == "cpu" else self._warp.to_torch  # the same memory
-        self._given = {name: to_own(values) for name, values in given.items()}
+        own, count = self._kinematics, scene.model.nmocap
+        self._shapes = {
+            "qpos": (num_envs, scene.model.nq),
+            "origin": (num_envs, count, 3),
+            "quaternion": (num_envs, count, 4),
+        }
+        given = {"qpos": own.qpos, "origin": own.origins, "quaternion": own.turns} if count else {"qpos": own.qpos}
+        same = (lambda values: values.numpy()) if device == "cpu" else self._warp.to_torch
+        self._given = {name: same(values) for name, values in given.items()}
+        """Arrays of numpy or torch in the memory of Warp's, to be filled."""
         self._warp.synchronize_device(device)  # the arrays were made on Warp's own stream
 
     def render(self, qpos: Any, objects: Poses | None = None) -> View:
@@ -123,15 +129,16 @@ class Endoscope:
         """
         given = {"qpos": qpos} if objects is None else {"qpos": qpos, **vars(objects)}
         for name, values in given.items():
-            if tuple(values.shape) != tuple(self._given[name].shape):
+            if tuple(values.shape) != self._shapes[name]:
                 what = name if name == "qpos" else f"objects.{name}"
-                raise ValueError(f"{what} of shape {tuple(values.shape)} must be {tuple(self._given[name].shape)}")
+                raise ValueError(f"{what} of shape {tuple(values.shape)} must be {self._shapes[name]}")
         tensor = _is_tensor(qpos)
-        for name, values in given.items():
-            self._fill(self._given[name], values)
+        for name, own in self._given.items():
+            if name in given:
+                self._fill(own, given[name])
         drawn = {name: self._empty(name) for name in CHANNELS}
         with self._stream():
-            self._kinematics.update(moved=objects is not None and self.scene.model.nmocap > 0)
+            self._kinematics.update(moved=objects is not None and "origin" in self._given)
             self._caster.draw(self._kinematics, **drawn)
         found = {name: drawn[name].reshape(*self._shape[:2], *drawn[name].shape[1:]) for name in self.channels}
         if tensor and self.device == "cpu":
