@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -40,10 +41,17 @@ def seen(name: str, stereo: bool = True) -> tuple[Scene, Numbers, View]:
     return scene, qpos, Endoscope(scene, POSES, stereo=stereo, channels=CHANNELS).render(qpos)
 
 
-def cast(scene: Scene, qpos: Numbers, eye: str) -> tuple[NDArray[np.int32], Numbers]:
-    """Geom and depth of every pixel, [SIZE, SIZE] each, by C MuJoCo: a ray through the middle of each."""
+def cast(
+    scene: Scene, qpos: Numbers, eye: str, origin: Any = None, quaternion: Any = None
+) -> tuple[NDArray[np.int32], Numbers]:
+    """Geom and depth of every pixel, [SIZE, SIZE] each, by C MuJoCo: a ray through the middle of each.
+
+    Free objects are at an origin [k, 3] and a quaternion [k, 4], if any are given.
+    """
     data = mujoco.MjData(scene.model)
     data.qpos[:] = qpos
+    if origin is not None:
+        data.mocap_pos[:], data.mocap_quat[:] = origin, quaternion
     mujoco.mj_kinematics(scene.model, data)
     mujoco.mj_camlight(scene.model, data)
     camera = data.cam(f"ecm_0/{eye}")

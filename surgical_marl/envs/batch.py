@@ -23,8 +23,10 @@ from surgical_marl.engines.choose import ENGINES, make_engine
 from surgical_marl.engines.fused.threefry import episode_keys
 from surgical_marl.envs.actions import check_actions
 from surgical_marl.envs.env import Env
+from surgical_marl.envs.free_objects import FreeObjects
 from surgical_marl.envs.observations import each, with_vector
 from surgical_marl.physics.views import Contacts
+from surgical_marl.scenes.poses import Poses
 
 if TYPE_CHECKING:
     from surgical_marl.engines.choose import Engine
@@ -113,6 +115,7 @@ class BatchedEnv:
         self.observation_spaces: dict[str, spaces.Space[Any]] = {a: self.env.observation_space(a) for a in self.agents}
         self._action_shapes = {agent: (num_envs, *space.shape) for agent, space in self.action_spaces.items()}
         self.state_space = self.env.state_space
+        self._free_objects = FreeObjects(self.scene)
         self._sight: Sight | None = None
         if self.env.pauses:
             from surgical_marl.envs.sight import Sight
@@ -289,6 +292,15 @@ class BatchedEnv:
     def qpos(self) -> np.ndarray:
         """Joint positions of the whole scene, [N, nq], numpy."""
         return np.asarray(self._part(".physics.qpos", "numpy"))
+
+    @property
+    def object_poses(self) -> Poses:
+        """Where the free objects are: `origin` [N, k, 3] in m and `quaternion` [N, k, 4], numpy.
+
+        Object i is the i-th of `scene.free_objects`; k is 0 in a scene without any.
+        """
+        self._part(".steps", "numpy")
+        return self._free_objects.read(self.engine, self.num_envs)
 
     @property
     def goal(self) -> SimpleNamespace:

@@ -8,6 +8,7 @@ import numpy as np
 from gymnasium import spaces
 
 from surgical_marl.envs.env import Env
+from surgical_marl.envs.free_objects import FreeObjects
 from surgical_marl.vision.pictures import Pictures, picture_space
 
 if TYPE_CHECKING:
@@ -34,11 +35,14 @@ class Sight:
         names = {agent: (*self._observed.get(agent, ()), *env.task.watched.get(agent, ())) for agent in env.agents}
         wanted = {agent: {name: terms[agent][name] for name in own} for agent, own in names.items() if own}
         self._cuda = engine.device == "cuda"
+        self._library = "torch" if self._cuda else "numpy"
         self._pictures = Pictures(env.scene, wanted, env.task.postures, num_envs, engine.device)
         self._matched = ".goal.row" in engine.carry_shapes
+        self._free_objects = FreeObjects(env.scene)
+        self._num_envs = num_envs
         self._seen: Seen = {}
         self._home: Seen = {}
-        if env.begins_at_home:  # home looks the same in all episodes
+        if env.begins_at_home and not self._free_objects.count:  # home looks the same in all episodes
             rows = self._own(np.zeros(num_envs, np.int64)) if self._matched else None
             drawn = self._pictures.draw(self._own(np.repeat(env.scene.home[None], num_envs, 0)), rows)
             # a list as the index makes a copy
@@ -76,7 +80,8 @@ class Sight:
 
     def _next(self, ended: Any) -> Seen:
         if not self._home:
-            return self._draw("")
+            # on a GPU the host doesn't know whether an episode ended
+            return self._seen if not self._cuda and not ended.any() else self._draw("")
         rows, where, here = self._rows(""), self._where(), ended[:, None, None, None]
         return {
             agent: {
@@ -89,7 +94,10 @@ class Sight:
         }
 
     def _draw(self, place: str) -> Seen:
-        return self._pictures.draw(self._read(f"{place}.physics.qpos"), self._rows(place))
+        objects = None
+        if self._free_objects.count:
+            objects = self._free_objects.read(self._engine, self._num_envs, self._library, place)
+        return self._pictures.draw(self._read(f"{place}.physics.qpos"), self._rows(place), objects)
 
     def _rows(self, place: str) -> Any:
         if not self._matched:
@@ -98,7 +106,7 @@ class Sight:
         return rows.long() if self._cuda else rows.astype(np.int64)  # a copy: a step gives its carry away
 
     def _read(self, name: str) -> Any:
-        return self._engine.read(name, "torch" if self._cuda else "numpy")
+        return self._engine.read(name, self._library)
 
     def _where(self) -> Any:
         if not self._cuda:

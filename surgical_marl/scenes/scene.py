@@ -60,6 +60,11 @@ class Scene:
         return tuple(self.mounts)
 
     @cached_property
+    def free_objects(self) -> dict[str, Placement]:
+        """The objects that move, by name, in the order of the mocap bodies of `model` and of physical states."""
+        return {name: place for name, place in self.objects.items() if place.object.free}
+
+    @cached_property
     def types(self) -> dict[str, tuple[str, ...]]:
         """Agents by type, which is the content of their arm's model: {"psm": ("psm_0", "psm_1")}.
 

@@ -13,12 +13,15 @@ import mujoco
 import numpy as np
 
 from surgical_marl import list_arms, list_scenes, load_arm, load_scene
+from surgical_marl.scenes.placing import scenes_without_objects
 from surgical_marl.scenes.scene import Scene
 from surgical_marl.studies.command import results_folder
 from surgical_marl.view.render import Renderer
 
 DIRECTION = np.array([0.75, 0.60, 0.30])
 """From an arm to the camera."""
+COLUMNS, SIZE = 4, (320, 240)
+"""Pictures in a row of the gallery, and width and height of each, pixels."""
 
 
 def picture(scene: Scene, width: int, height: int) -> np.ndarray:
@@ -46,6 +49,14 @@ def portrait(name: str, folder: Path) -> np.ndarray:
     return picture(load_scene(path), 480, 480)
 
 
+def gallery(names: list[str]) -> np.ndarray:
+    """All scenes side by side in rows; what is left of the last row is white."""
+    pictures = [picture(load_scene(name), *SIZE) for name in names]
+    pictures += [np.full_like(pictures[0], 255)] * (-len(pictures) % COLUMNS)
+    rows = [np.concatenate(pictures[i : i + COLUMNS], axis=1) for i in range(0, len(pictures), COLUMNS)]
+    return np.concatenate(rows)
+
+
 def main(argv: list[str] | None = None) -> None:
     results = results_folder(__doc__, argv)
     with tempfile.TemporaryDirectory() as folder:
@@ -53,10 +64,8 @@ def main(argv: list[str] | None = None) -> None:
             path = load_arm(name).folder / "preview.png"
             imageio.imwrite(path, portrait(name, Path(folder)))
             print(path)
-    pictures = [picture(load_scene(name), 480, 360) for name in list_scenes()]
-    rows = [np.concatenate(pictures[i : i + 3], axis=1) for i in range(0, len(pictures), 3)]
     path = results / "scenes.png"
-    imageio.imwrite(path, np.concatenate(rows))
+    imageio.imwrite(path, gallery([*(names := scenes_without_objects()), *sorted({*list_scenes()} - {*names})]))
     print(path)
 
 

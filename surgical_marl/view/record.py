@@ -1,4 +1,4 @@
-"""Videos of a policy: the arms of one environment, and its goals as coloured balls."""
+"""Videos of a policy: arms and objects of one environment, and its goals as coloured balls."""
 
 from __future__ import annotations
 
@@ -78,6 +78,10 @@ class Pose(NamedTuple):
     """The content of a picture."""
 
     qpos: NDArray[np.float64]
+    origins: NDArray[np.float64]
+    """Of free objects, m, [k, 3]."""
+    quaternions: NDArray[np.float64]
+    """Of free objects, w, x, y, z, [k, 4]."""
     balls: list[Sphere]
     """A ball at each arm's goal."""
 
@@ -97,12 +101,12 @@ class ScenePicture:
 
         It shows the environment as it was at `pose`, or as it is now if there is no `pose`.
         """
-        qpos, balls = pose or self.pose()
+        pose = pose or self.pose()
         data = mujoco.MjData(model := self._env.scene.model)
-        data.qpos[:] = qpos
+        data.qpos[:], data.mocap_pos[:], data.mocap_quat[:] = pose.qpos, pose.origins, pose.quaternions
         mujoco.mj_kinematics(model, data)
         mujoco.mj_camlight(model, data)
-        return self._renderer.render(data, spheres=balls)
+        return self._renderer.render(data, spheres=pose.balls)
 
     def pose(self, index: int = 0) -> Pose:
         """Return the current pose of an environment, by its number in the batch."""
@@ -112,4 +116,5 @@ class ScenePicture:
         for number, (mount, target) in enumerate(zip(env.scene.mounts.values(), targets, strict=False)):
             place = mount.rotation @ target + mount.position  # the task has it in its arm's base frame
             balls.append((tuple(place), GOAL_RADIUS, COLOURS[number % len(COLOURS)]))
-        return Pose(np.array(self._env.qpos[index], float), balls)
+        objects, own = env.object_poses, lambda values: np.array(values[index], float)
+        return Pose(own(env.qpos), own(objects.origin), own(objects.quaternion), balls)

@@ -1,12 +1,13 @@
 """Pictures from a scene's endoscope for many environments at once: colour, depth and what each pixel shows.
 
     endoscope = Endoscope(load_scene("trimanual_psm_ecm"), num_envs=1024)
-    view = endoscope.render(env.qpos)           # joint positions [N, nq], numpy or torch
+    view = endoscope.render(env.qpos, env.object_poses)
     view.rgb                                    # [N, eyes, 64, 64, 3] uint8
 
-Pictures depend on joint positions alone, which any engine has, so no second physics is needed. Poses come from
-`vision/kinematics.py`, and `vision/raycaster.py` draws them, on a GPU or a CPU with the same code; docs/rendering.md
-compares the pictures with C MuJoCo's ray caster.
+Pictures depend on joint positions [N, nq] and on the poses of free objects alone, in numpy or torch. Any engine has
+them, so no second physics is needed. `vision/kinematics.py` computes the poses of all that is seen, and
+`vision/raycaster.py` draws it, on a GPU or a CPU with the same code; docs/rendering.md compares the pictures with
+C MuJoCo's ray caster.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import numpy as np
 
 from surgical_marl.content import unknown
 from surgical_marl.runtime import has_cuda, prepare_warp
+from surgical_marl.scenes.poses import Poses
 from surgical_marl.scenes.scene import Scene
 
 SIZE = 64
@@ -101,12 +103,23 @@ class Endoscope:
         with self._warp.ScopedDevice(device):
             self._kinematics = Kinematics(scene.model, num_envs)
             self._caster = RayCaster(scene.model, cameras, num_envs, width, height, BACKGROUND)
-        qpos = self._kinematics.qpos
-        self._qpos = qpos.numpy() if device == "cpu" else self._warp.to_torch(qpos)  # the same memory
+        own, count = self._kinematics, scene.model.nmocap
+        self._shapes = {
+            "qpos": (num_envs, scene.model.nq),
+            "origin": (num_envs, count, 3),
+            "quaternion": (num_envs, count, 4),
+        }
+        given = {"qpos": own.qpos, "origin": own.origins, "quaternion": own.turns} if count else {"qpos": own.qpos}
+        same = (lambda values: values.numpy()) if device == "cpu" else self._warp.to_torch
+        self._given = {name: same(values) for name, values in given.items()}
+        """Arrays of numpy or torch in the memory of Warp's, to be filled."""
         self._warp.synchronize_device(device)  # the arrays were made on Warp's own stream
 
-    def render(self, qpos: Any) -> View:
+    def render(self, qpos: Any, objects: Poses | None = None) -> View:
         """Return what the endoscopes see at joint positions [N, nq] of the whole scene.
+
+        Free objects are where `objects` says, as `BatchedEnv.object_poses` does, in arrays of the same library as
+        `qpos`; without it they are where the scene places them.
 
         The pictures are numpy arrays for a numpy array, and torch tensors for a torch tensor.
 
@@ -114,13 +127,18 @@ class Endoscope:
         waits for the GPU and nothing passes through the host, so that after a first call `render` can be captured in a
         CUDA graph.
         """
-        if tuple(qpos.shape) != tuple(self._qpos.shape):
-            raise ValueError(f"qpos of shape {tuple(qpos.shape)} must be {tuple(self._qpos.shape)}")
+        given = {"qpos": qpos} if objects is None else {"qpos": qpos, **vars(objects)}
+        for name, values in given.items():
+            if tuple(values.shape) != self._shapes[name]:
+                what = name if name == "qpos" else f"objects.{name}"
+                raise ValueError(f"{what} of shape {tuple(values.shape)} must be {self._shapes[name]}")
         tensor = _is_tensor(qpos)
-        self._fill(qpos, tensor)
+        for name, own in self._given.items():
+            if name in given:
+                self._fill(own, given[name])
         drawn = {name: self._empty(name) for name in CHANNELS}
         with self._stream():
-            self._kinematics.update()
+            self._kinematics.update(moved=objects is not None and "origin" in self._given)
             self._caster.draw(self._kinematics, **drawn)
         found = {name: drawn[name].reshape(*self._shape[:2], *drawn[name].shape[1:]) for name in self.channels}
         if tensor and self.device == "cpu":
@@ -129,13 +147,15 @@ class Endoscope:
             found = {name: picture.cpu().numpy() for name, picture in found.items()}
         return View(**found)
 
-    def _fill(self, qpos: Any, tensor: bool) -> None:
+    def _fill(self, own: Any, values: Any) -> None:
+        """Copy values of numpy or torch into an array of the device."""
+        tensor = _is_tensor(values)
         if self.device == "cpu":
-            self._qpos[:] = qpos.detach().cpu().numpy() if tensor else qpos
+            own[:] = values.detach().cpu().numpy() if tensor else values
         else:
             import torch
 
-            self._qpos.copy_(qpos if tensor else torch.from_numpy(np.array(qpos, np.float32)))
+            own.copy_(values if tensor else torch.from_numpy(np.array(values, np.float32)))
 
     def _empty(self, channel: str) -> Any:
         """Pictures to draw on, [N * E, H, W] or with [3] colours; none of a channel that nobody asked for."""

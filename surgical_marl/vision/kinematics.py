@@ -1,4 +1,7 @@
-"""Poses of a scene's bodies, geoms and cameras in many environments, from joint positions, in two Warp kernels."""
+"""Poses of a scene's bodies, geoms and cameras in many environments, in Warp kernels.
+
+They follow from joint positions and from the poses of free objects, which are mocap bodies in a scene's model.
+"""
 
 # Kernels are Warp's language, which only looks like Python: annotations are read as they are, without a
 # `from __future__`.
@@ -53,6 +56,21 @@ def move(
 
 
 @wp.kernel
+def put(
+    bodies: wp.array[int],
+    pos: wp.array2d[wp.vec3],
+    quat: wp.array2d[wp.vec4],
+    xpos: wp.array2d[wp.vec3],
+    xquat: wp.array2d[wp.quat],
+):
+    """Pose of each free object in the world; quaternions are given as MuJoCo has them, w first."""
+    env, thing = wp.tid()
+    body, turn = bodies[thing], quat[env, thing]
+    xpos[env, body] = pos[env, thing]
+    xquat[env, body] = wp.normalize(wp.quat(turn[1], turn[2], turn[3], turn[0]))
+
+
+@wp.kernel
 def attach(
     bodies: wp.array[int],
     pos: wp.array[wp.vec3],
@@ -87,6 +105,9 @@ class Kinematics:
         if not np.isin(model.jnt_type, _TYPES).all() or (model.cam_mode != mujoco.mjtCamLight.mjCAMLIGHT_FIXED).any():
             raise ValueError("pictures need a scene whose joints are hinges and slides, and whose cameras are fixed")
         self.qpos = wp.zeros((num_envs, model.nq), dtype=float)
+        self.origins, self.turns = (wp.zeros((num_envs, model.nmocap), dtype=dtype) for dtype in (wp.vec3, wp.vec4))
+        """Where free objects are, in the order of mocap bodies; quaternions w, x, y, z."""
+        self._objects = wp.array(np.flatnonzero(model.body_mocapid >= 0), dtype=int)
         tables = (model.qpos0, model.body_parentid, model.body_pos, model.body_quat, model.body_jntadr,
                   model.body_jntnum, model.jnt_type, model.jnt_pos, model.jnt_axis)  # fmt: skip
         self._bodies = [_given(table) for table in tables]
@@ -96,9 +117,14 @@ class Kinematics:
         self.geom_xpos, self.geom_xmat = _places(num_envs, model.ngeom)
         self.cam_xpos, self.cam_xmat = _places(num_envs, model.ncam)
 
-    def update(self) -> None:
-        """Compute the poses at `qpos`, [N, nq]."""
+    def update(self, moved: bool = False) -> None:
+        """Compute the poses at `qpos`, [N, nq].
+
+        Free objects are at `origins` and `turns` if they have `moved`, and where the model has them otherwise.
+        """
         wp.launch(move, len(self.qpos), [self.qpos, *self._bodies, *self._poses], block_dim=BLOCK)
+        if moved:
+            wp.launch(put, self.origins.shape, [self._objects, self.origins, self.turns, *self._poses], block_dim=BLOCK)
         for things, places in (
             (self._geoms, (self.geom_xpos, self.geom_xmat)),
             (self._cameras, (self.cam_xpos, self.cam_xmat)),

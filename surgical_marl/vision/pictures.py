@@ -16,6 +16,7 @@ import numpy as np
 from gymnasium import spaces
 
 from surgical_marl.cache import cached
+from surgical_marl.scenes.poses import Poses
 from surgical_marl.scenes.scene import Scene
 from surgical_marl.vision.endoscope import EYES, SIZE, Endoscope, View
 
@@ -56,14 +57,15 @@ class Pictures:
             for picture in dict.fromkeys(picture for picture in every if picture.table is not None)
         }
 
-    def draw(self, qpos: Any, rows: Any) -> dict[str, dict[str, Any]]:
+    def draw(self, qpos: Any, rows: Any, objects: Poses | None = None) -> dict[str, dict[str, Any]]:
         """Return agent -> term -> picture [N, H, W, C]. On a GPU nothing waits for the host.
 
         Args:
             qpos: joint positions [N, nq] of the whole scene.
             rows: of the tables, [N] int64; None without pictures to be matched.
+            objects: where free objects are; None for where the scene places them, as in all pictures to be matched.
         """
-        views = {camera: endoscope.render(qpos) for camera, endoscope in self._endoscopes.items()}
+        views = {camera: endoscope.render(qpos, objects) for camera, endoscope in self._endoscopes.items()}
         return {
             agent: {
                 name: self.wanted(agent, name, rows) if self.is_matched(agent, name) else _cut(views[term.camera], term)

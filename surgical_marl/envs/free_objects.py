@@ -1,0 +1,41 @@
+"""The free objects of the environments that an engine runs."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from surgical_marl.scenes.poses import Poses, frames
+
+if TYPE_CHECKING:
+    from surgical_marl.engines.choose import Engine
+    from surgical_marl.scenes.scene import Scene
+
+STATE = ".physics.objects.bodies"
+"""Where an engine has the centres of mass and the orientations of objects."""
+
+
+class FreeObjects:
+    """Reads where the free objects of a scene are."""
+
+    def __init__(self, scene: Scene) -> None:
+        centers = [place.object.center for place in scene.free_objects.values()]
+        self.count = len(centers)
+        self._centers: Any = np.array(centers, np.float32).reshape(-1, 3)
+
+    def read(self, engine: Engine, num_envs: int, library: str = "numpy", place: str = "") -> Poses:
+        """Return poses in arrays of "numpy" or "torch".
+
+        Args:
+            engine: runs the environments.
+            num_envs: their number.
+            library: of the arrays.
+            place: "" for where objects are now, ".moved.carry" for where they are after the first half of a step.
+        """
+        if not self.count:
+            return Poses(np.zeros((num_envs, 0, 3), np.float32), np.zeros((num_envs, 0, 4), np.float32))
+        position, quaternion = (engine.read(f"{place}{STATE}.{part}", library) for part in ("position", "quaternion"))
+        if library == "torch" and isinstance(self._centers, np.ndarray):
+            self._centers = position.new_tensor(self._centers)  # once: it waits for the device
+        return frames(position, quaternion, self._centers)

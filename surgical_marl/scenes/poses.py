@@ -1,0 +1,37 @@
+"""Where the free objects of many environments are, in arrays of numpy or torch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Poses:
+    """The frames of k objects in N environments, in the world. Objects are in the order of `Scene.free_objects`."""
+
+    origin: Any
+    """m, [N, k, 3]; for most shapes not the centre of mass."""
+    quaternion: Any
+    """w, x, y, z, [N, k, 4]."""
+
+
+def frames(position: Any, quaternion: Any, centers: Any) -> Poses:
+    """Return the poses of objects from their centres of mass.
+
+    Args:
+        position: of the centres of mass in the world, m, [N, k, 3].
+        quaternion: w, x, y, z, of length 1, [N, k, 4].
+        centers: of mass in the objects' own frames, m, [k, 3], in the same library and on the same device.
+    """
+    if isinstance(position, np.ndarray):
+        cross = np.cross
+    else:
+        import torch
+
+        cross = torch.linalg.cross
+    centers, real, axis = centers[None], quaternion[..., :1], quaternion[..., 1:]
+    sideways = 2 * cross(axis, centers)
+    return Poses(position - (centers + real * sideways + cross(axis, sideways)), quaternion)
