@@ -24,10 +24,13 @@ def graspers(scene: Scene) -> list[str]:
 
 
 def grasps(scene: Scene, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Draw starts of grasps: joints [count, nq], and centres of mass [count, k, 3] and quaternions [count, k, 4] of objects.
+    """Draw starts of grasps.
 
-    In a share of them one arm's open jaw is around the first free object at its site `grasp`, or at the first site whose
-    name begins so. The wire or bar there lies across the pads.
+    In a share of them one arm's open jaw is around the first free object, at a site whose name begins with `grasp`. The
+    wire or bar there lies across the pads.
+
+    Returns:
+        Joints [count, nq], and centres of mass [count, k, 3] and quaternions [count, k, 4] of the objects.
 
     Raises:
         ValueError: the scene has no free object with such a site, or no jaw with two pads.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
@@ -76,7 +76,7 @@ def inertias(masses: Masses, frames: Array) -> Array:
     return jnp.concatenate([jnp.concatenate([moving, none], -1), jnp.concatenate([none, turning], -1)], -2)
 
 
-def free_acceleration(bodies: Bodies, masses: Masses, frames: Array, gravity: Array, dt: float) -> Array:
+def free_acceleration(bodies: Bodies, masses: Masses, frames: Array, gravity: Array, dt: Any) -> Array:
     """Return the acceleration of objects that touch nothing, [k, 6].
 
     The gyroscopic torque is implicit: one Newton step of Euler's equation at the end of the step, in the object's frame
@@ -91,7 +91,7 @@ def free_acceleration(bodies: Bodies, masses: Masses, frames: Array, gravity: Ar
     return jnp.concatenate([jnp.broadcast_to(gravity, angular.shape), angular], -1)
 
 
-def moved(bodies: Bodies, acceleration: Array, dt: float) -> Bodies:
+def moved(bodies: Bodies, acceleration: Array, dt: Any) -> Bodies:
     """Return the bodies after a step with accelerations [k, 6]."""
     velocity = bodies.velocity + dt * acceleration
     return Bodies(

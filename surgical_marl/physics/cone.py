@@ -1,9 +1,9 @@
 """Contact with Coulomb friction: the acceleration at which all forces balance, by Newton's method.
 
-A contact is a stiff spring along its normal, and friction a stiff spring or damper that slips when its force reaches the
-friction coefficient times the normal force. All forces are those at the end of the step: an implicit step can not
-overshoot, however light an object is. Together they minimise a convex function of the acceleration, as in `solver.py`: the
-forces of a patch are the nearest ones in its friction cone to those that would stick. docs/physics.md says more.
+A contact is a stiff spring along its normal, and friction a stiff spring or damper that slips when its force reaches
+the friction coefficient times the normal force. All forces are those at the end of the step: an implicit step can not
+overshoot, however light an object is. Together they minimise a convex function of the acceleration, as in `solver.py`:
+the forces of a patch are the nearest ones in its friction cone to those that would stick. docs/physics.md says more.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ class Cones(NamedTuple):
     push: Array
     """Normal force without acceleration, N, [p, s]."""
     along: Array
-    """Speed in two directions along the surface, and about the normal times the patch's radius, by velocity, [p, 3, n]."""
+    """Speed in two directions along the surface, and about the normal times the patch's radius, by velocity,
+    [p, 3, n]."""
     rub: Array
     """Friction per acceleration, [p]."""
     pull: Array

@@ -69,8 +69,8 @@ class Felt(NamedTuple):
 
 
 OPPOSITE = float(np.cos(np.radians(25.0)))
-"""Cosine of the angle by which the normals of two fingers that hold an object may miss being opposite. Like the force it
-is of Isaac Lab's test whether a needle is held (pull request 6570)."""
+"""Cosine of the angle by which the normals of two fingers that hold an object may miss being opposite. Like the least
+force it is of Isaac Lab's test whether a needle is held (pull request 6570)."""
 SPARE = 0.5
 """Acceleration that the friction of a held object can take besides gravity, m/s2."""
 DWELL = 1.0 / 30.0
@@ -106,13 +106,13 @@ class Handling:
         for meeting in t.meetings:
             torsion = t.torsion[start : start + len(meeting.one)]
             start += len(meeting.one)
-            one, way = (jax.tree.map(lambda x: x[meeting.one], of[meeting.first]) for of in (shapes, ways))
+            one, way = (_rows(of[meeting.first], meeting.one) for of in (shapes, ways))
             if meeting.second == "fixed":
                 fixed = t.fixed[meeting.other[0]]
                 alone = lambda row, fixed=fixed: _patch(row[0], row[1], fixed, STILL, row[2])  # noqa: E731
                 found.append(jax.lax.map(alone, (one, way, torsion)))
             else:
-                other, its = (jax.tree.map(lambda x: x[meeting.other], of[meeting.second]) for of in (shapes, ways))
+                other, its = (_rows(of[meeting.second], meeting.other) for of in (shapes, ways))
                 found.append(jax.lax.map(lambda row: _patch(*row), (one, way, other, its, torsion)))
         return jax.tree.map(lambda *x: jnp.concatenate(x), *found)
 
@@ -138,7 +138,7 @@ class Handling:
             found[kind] = Way(shift, turn)
         return found
 
-    def feel(self, patches: Patch, data: Any, bodies: Bodies, qvel: Array, grips: Grips, dt: float) -> Felt:
+    def feel(self, patches: Patch, data: Any, bodies: Bodies, qvel: Array, grips: Grips, dt: Any) -> Felt:
         """Return the rows of patches [g] on the joints of all arms and then on all objects."""
         t = self.tables
         velocity = jnp.concatenate([qvel, bodies.velocity.ravel()])
@@ -242,6 +242,11 @@ class Handling:
         spin = turning * links[:, :, None]
         whole = jnp.swapaxes(jnp.concatenate([moving, linear], -2), -1, -2)
         return whole, jnp.swapaxes(jnp.concatenate([spin, angular], -2), -1, -2)
+
+
+def _rows(tree: Any, which: np.ndarray) -> Any:
+    """Return some rows of the arrays of a tree."""
+    return jax.tree.map(lambda x: x[which], tree)
 
 
 def _patch(one: Segments, way: Way, other: Plate | Segments, its: Way, torsion: Array) -> Patch:

@@ -1,9 +1,9 @@
 """Where objects are touched: patches, each between two bodies, of a few points and one friction.
 
 The points of a patch are the support of the contact: of all points at which the shapes of two bodies touch, the deepest
-one and the outermost ones in three directions. A patch has one friction, with a bound by the sum of its normal forces: a force along the
-surface and a torque about the normal, bounded together by an ellipsoid (R. D. Howe and M. R. Cutkosky, "Practical
-force-motion models for sliding manipulation", 1996).
+one and the outermost ones in three directions. A patch has one friction, with a bound by the sum of its normal forces:
+a force along the surface and a torque about the normal, bounded together by an ellipsoid (R. D. Howe and M. R.
+Cutkosky, "Practical force-motion models for sliding manipulation", 1996).
 """
 
 from __future__ import annotations

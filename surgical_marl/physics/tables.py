@@ -60,8 +60,8 @@ class Tables:
             if arms and model.geom(int(g)).name.startswith(f"{agent}/")
         )
         owners = [finger.agent for finger in self.fingers]
-        self.jaws = {a: tuple(np.flatnonzero(np.array(owners) == agent)) for a, agent in enumerate(scene.agents)
-                     if owners.count(agent) == 2}  # fmt: skip
+        numbers = {a: [f for f, owner in enumerate(owners) if owner == name] for a, name in enumerate(scene.agents)}
+        self.jaws = {arm: (own[0], own[1]) for arm, own in numbers.items() if len(own) == 2}
         """Number of an arm -> its two fingers."""
         self.near, self.bare = _near(scene) if arms else (np.zeros(0, int), np.zeros(0, int))
         self._read_free(free)
@@ -101,15 +101,17 @@ class Tables:
         for o, place in enumerate(free.values()):
             for c, part in enumerate(place.object.shapes):
                 if part.kind not in ("capsule", "sphere"):
-                    raise ValueError(f"object {place.object.name!r}: a free object is made of capsules and spheres, not "
-                                     f"of a {part.kind}")  # fmt: skip
+                    name = place.object.name
+                    raise ValueError(
+                        f"object {name!r}: a free object is made of capsules and spheres, not a {part.kind}"
+                    )
                 half = part.size[1] * part.rotation[:, 2] if part.kind == "capsule" else np.zeros(3)
                 middle = part.position - place.object.center
                 self._start[o, c], self._end[o, c], self._radius[o, c] = middle - half, middle + half, part.size[0]
         objects = [place.object for place in free.values()]
         self.masses = Masses(
-            np.array([thing.mass for thing in objects], np.float32),
-            np.array([thing.inertia for thing in objects], np.float32).reshape(-1, 3, 3),
+            np.array([thing.mass for thing in objects], np.float32),  # type: ignore[arg-type]
+            np.array([thing.inertia for thing in objects], np.float32).reshape(-1, 3, 3),  # type: ignore[arg-type]
         )
         self.centers = np.array([thing.center for thing in objects], np.float32).reshape(-1, 3)
 
@@ -134,11 +136,11 @@ class Tables:
             thin = [_segment(part, place) for part in parts if part.kind in ("capsule", "sphere")]
             for kind, found in ((Plate, flat), (Segments, thin)):
                 if found:
-                    self.fixed.append(kind(*(np.array(x, np.float32) for x in zip(*found, strict=True))))
+                    self.fixed.append(kind(*(np.array(x, np.float32) for x in zip(*found, strict=True))))  # type: ignore[arg-type]
                     self._fixed_surfaces.append(place.object.surface)
 
     def _number(self, free: dict[str, Placement], model: mujoco.MjModel, agents: tuple[str, ...]) -> None:
-        """Number the patches, and say of each which bodies it is between and how their surfaces feel."""
+        """Set the number of each patch, the bodies that it is between, and how their surfaces feel."""
         own = [place.object.surface for place in free.values()]
         felt = {"pads": [JAW] * len(self.fingers), "links": [LINK] * len(self.near), "objects": own,
                 "fixed": self._fixed_surfaces}  # fmt: skip

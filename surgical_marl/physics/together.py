@@ -1,7 +1,7 @@
 """The physics step of a scene with objects.
 
-As long as no arm is near an object, or touches another arm, arms and objects move on their own. Otherwise all of them are
-solved together.
+As long as no arm is near an object, or touches another arm, arms and objects move on their own. Otherwise all of them
+are solved together.
 """
 
 from __future__ import annotations

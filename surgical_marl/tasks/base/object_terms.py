@@ -27,9 +27,9 @@ FURTHEST = 0.1
 def object_terms(scene: Scene, agent: str) -> dict[str, Term]:
     """Return what an arm can know of every free object of a scene, in its base frame and SI units.
 
-    Of an object `needle` they are `needle_position` [3] of its origin, `needle_rotation` [6], the first two columns of its
-    rotation matrix, `needle_velocity` [6], of its centre of mass and angular, and `needle_grip` [3]: the force of the
-    arm's fingers on it, whether the arm holds it, and how far it has slid along the fingers.
+    Of an object `needle` they are `needle_position` [3] of its origin, `needle_rotation` [6], the first two columns of
+    its rotation matrix, `needle_velocity` [6], of its centre of mass and angular, and `needle_grip` [3]: the force of
+    the arm's fingers on it, whether the arm holds it, and how far it has slid along the fingers.
     """
     free = [name for name, place in scene.objects.items() if place.object.free]
     return {term: value for name in free for term, value in _terms(scene, agent, name).items()}
