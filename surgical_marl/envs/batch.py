@@ -300,7 +300,8 @@ class BatchedEnv:
         Object i is the i-th of `scene.free_objects`; k is 0 in a scene without any.
         """
         self._part(".steps", "numpy")
-        return self._free_objects.read(self.engine, self.num_envs)
+        found = self._free_objects.read(self.engine, self.num_envs)
+        return Poses(found.origin, np.array(found.quaternion))  # a copy: a step gives its state away
 
     @property
     def goal(self) -> SimpleNamespace:
