@@ -13,15 +13,16 @@ import mujoco
 import numpy as np
 import pytest
 
-from surgical_marl import list_scenes, load_arm, load_scene
+from surgical_marl import load_arm, load_scene
 from surgical_marl.physics.simulator import Simulator
 from surgical_marl.robots.arm import CONTROL_MODES
+from surgical_marl.scenes.placing import scenes_without_objects
 from surgical_marl.scenes.scene import Scene
 from surgical_marl.scenes.timing import DECIMATION, TIMESTEP
 from surgical_marl.studies.energy import energy_drift
 from tests.helpers.rollouts import read_state, roll_out
 
-SCENES = list_scenes()
+SCENES = scenes_without_objects()
 STEPS, EPISODES = 10_000, 20
 
 
