@@ -54,6 +54,10 @@ class Seen(NamedTuple):
     """The deepest overlap with the arm in all physics steps of the control step, m, [...]."""
     holding: Any
     """Whether the arm holds it, [...]."""
+    place: Any
+    """Centre of mass in the world, m, [..., 3]."""
+    command: Any
+    """Commands of all actuators, [..., nu]."""
 
 
 class Grasps:
@@ -126,7 +130,8 @@ class Grasps:
         turned_by = frame.T @ rotation(bodies.quaternion[held])
         holding = jnp.stack([handles[name].holding for name in self.names])[held]
         overlap = self.handling.find(data, bodies).points.depth.max()
-        return Seen(position, turned_by, physics.objects.grips.force[held], overlap, holding)
+        force, place = physics.objects.grips.force[held], bodies.position[held]
+        return Seen(position, turned_by, force, overlap, holding, place, physics.ctrl)
 
     def _draw(self, rng: np.random.Generator, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return qpos, and the object's centre of mass and quaternion: between the pads, and not in the wrist's way."""
