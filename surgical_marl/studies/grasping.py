@@ -1,0 +1,240 @@
+"""Random grasps of objects, shaken at full speed: how many are dropped, how far objects slip and how deep jaws go in.
+
+Run: python -m surgical_marl.studies.grasping --grasps 1000 --seconds 10
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from surgical_marl import load_scene
+from surgical_marl.cli.main import whole
+from surgical_marl.physics.bodies import rotation
+from surgical_marl.physics.dynamics import Dynamics, Physics
+from surgical_marl.physics.handling import Handling
+from surgical_marl.physics.simulator import Simulator
+from surgical_marl.physics.views import Handled
+from surgical_marl.robots.rotation import quaternion, turned
+from surgical_marl.scenes.scene import Scene
+from surgical_marl.scenes.timing import DECIMATION
+from surgical_marl.studies.command import make_parser, run
+
+OBJECTS = {"needle_sh": "grasp", "needle_40": "grasp", "block": "grasp_0"}
+"""Objects, and the site at which each is grasped: its x axis is along the wire or bar."""
+CONTROL = 0.02
+CHUNK = 12
+"""Control steps between two changes of direction, 0.24 s."""
+CLOSING, RESTING = 3, 2
+"""Chunks in which the jaw closes at the start, and in which the arm stands at the end."""
+GAP = 3e-5
+"""Between each pad and the object at the start, m."""
+LOST = 2e-3
+"""An object that has moved this far in the jaw counts as dropped, m."""
+
+
+class Seen(NamedTuple):
+    """What is seen of the object at the end of control steps [...]."""
+
+    position: Any
+    """Centre of mass in the frame of the finger pair, m, [..., 3]."""
+    rotation: Any
+    """Axes likewise, [..., 3, 3]."""
+    force: Any
+    """Normal forces of the two fingers, N, [..., 2]."""
+    overlap: Any
+    """The deepest overlap with the arm in all physics steps of the control step, m, [...]."""
+    holding: Any
+    """Whether the arm holds it, [...]."""
+    place: Any
+    """Centre of mass in the world, m, [..., 3]."""
+    command: Any
+    """Commands of all actuators, [..., nu]."""
+
+
+class Grasps:
+    """One PSM that grasps one of some objects in the air, in environments side by side. All others fall.
+
+    Args:
+        names: the objects.
+    """
+
+    def __init__(self, names: Sequence[str]) -> None:
+        self.names, self.scene = tuple(names), scene_of(names)
+        (self.agent,) = self.scene.agents
+        self.simulator = Simulator(self.scene, decimation=1)
+        self._dynamics, self.handling = Dynamics(self.scene.model), Handling(self.scene)
+        self._play = jax.jit(jax.vmap(self._advance))
+
+    def begin(self, held: np.ndarray, seed: int = 0) -> Physics:
+        """Return states [E]: the arm anywhere, its jaw around the object without touching it.
+
+        Args:
+            held: number of the object that is between the pads, [E].
+            seed: of the random numbers.
+        """
+        rng = np.random.default_rng(seed)
+        drawn = zip(*(self._draw(rng, self.names[o]) for o in held), strict=True)
+        qpos, position, turn = (jnp.asarray(np.array(part), jnp.float32) for part in drawn)
+        physics, each = jax.vmap(self.simulator.at)(qpos), np.arange(len(held))
+        bodies = physics.objects.bodies
+        placed = bodies._replace(
+            position=bodies.position.at[each, held].set(position),
+            quaternion=bodies.quaternion.at[each, held].set(turn),
+        )
+        return physics._replace(objects=physics.objects._replace(bodies=placed))
+
+    def play(self, physics: Physics, actions: np.ndarray, held: np.ndarray) -> tuple[Physics, Seen]:
+        """Return states [E] after actions [E, steps, n], and what was seen of the held objects, [E, steps]."""
+        physics, seen = self._play(physics, jnp.asarray(actions, jnp.float32), jnp.asarray(held))
+        return physics, jax.tree.map(np.asarray, seen)
+
+    def shake(self, held: np.ndarray, seconds: float, seed: int = 0) -> Seen:
+        """Return what is seen [E, steps] of grasps that close, are shaken at full speed and stand still again."""
+        rng, physics, seen = np.random.default_rng(seed + 1), self.begin(held, seed), []
+        count, shaken = len(held), max(1, round(seconds / CONTROL / CHUNK))
+        for chunk in range(CLOSING + shaken + RESTING):
+            actions = np.zeros((count, CHUNK, len(self.scene.mounts[self.agent].arm.actuated)), np.float32)
+            if CLOSING <= chunk < CLOSING + shaken:
+                actions += rng.choice([-1.0, 1.0], (count, 1, actions.shape[-1]))
+            actions[..., -1] = -1.0
+            physics, found = self.play(physics, actions, held)
+            seen.append(found)
+        return Seen(*(np.concatenate(parts, 1) for parts in zip(*seen, strict=True)))
+
+    def _advance(self, physics: Physics, actions: Any, held: Any) -> tuple[Physics, Seen]:
+        # eight commands of an eighth of the way each are one of the whole
+        def substep(physics: Physics, action: Any) -> tuple[Physics, Seen]:
+            physics, _, views = self.simulator.advance(self.simulator.command(physics, {self.agent: action}))
+            return physics, self._look(physics, views[self.agent].handles, held)
+
+        physics, seen = jax.lax.scan(substep, physics, jnp.repeat(actions, DECIMATION, 0))
+        deepest = seen.overlap.reshape(-1, DECIMATION).max(1)
+        return physics, Seen(*(part[DECIMATION - 1 :: DECIMATION] for part in seen))._replace(overlap=deepest)
+
+    def _look(self, physics: Physics, handles: Mapping[str, Handled], held: Any) -> Seen:
+        data, bodies = self._dynamics.pose(physics.qpos), physics.objects.bodies
+        fingers = np.array([finger.body for finger in self.handling.tables.fingers])
+        along, down = (data.xmat[fingers][:, :, axis].sum(0) for axis in (1, 2))
+        along, down = along / jnp.linalg.norm(along), down / jnp.linalg.norm(down)
+        frame = jnp.stack([jnp.cross(along, down), along, down], 1)
+        position = frame.T @ (bodies.position[held] - data.xpos[fingers].mean(0))
+        turned_by = frame.T @ rotation(bodies.quaternion[held])
+        holding = jnp.stack([handles[name].holding for name in self.names])[held]
+        overlap = self.handling.find(data, bodies).points.depth.max()
+        force, place = physics.objects.grips.force[held], bodies.position[held]
+        return Seen(position, turned_by, force, overlap, holding, place, physics.ctrl)
+
+    def _draw(self, rng: np.random.Generator, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return qpos, and the object's centre of mass and quaternion: between the pads, and not in the wrist's way."""
+        arm, item = self.scene.mounts[self.agent].arm, self.scene.objects[name].object
+        (site, axes), radius = item.sites[OBJECTS[name]], min(shape.size[0] for shape in item.shapes)
+        away, data = item.center - site, mujoco.MjData(self.scene.model)
+        while True:
+            q, depth = arm.home.copy(), rng.uniform(0.006, 0.009)
+            q[:2] += rng.uniform(-0.3, 0.3, 2)
+            q[2:6] = [rng.uniform(0.06, 0.12), rng.uniform(-1, 1), *rng.uniform(-0.5, 0.5, 2)]
+            q[6] = arm.lower[-1] + (radius + GAP) / depth
+            data.qpos[:] = self.scene.full_qpos({self.agent: q})
+            mujoco.mj_kinematics(self.scene.model, data)
+            link = data.body(f"{self.agent}/wrist_yaw_link")
+            wrist = link.xmat.reshape(3, 3)
+            tilt, spin = rng.uniform(-0.5, 0.5), rng.uniform(-np.pi, np.pi)
+            # the site's x axis is along y of the wrist, across the jaw; tilted, and turned about itself
+            across = np.stack([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]], 1)
+            turn = wrist @ turned(np.degrees([tilt, 0, 0])) @ across @ turned(np.degrees([spin, 0, 0])) @ axes.T
+            at = link.xpos + wrist @ [0, rng.uniform(-5e-4, 5e-4), -depth]
+            if (turn @ away) @ wrist[:, 2] < -0.2 * np.linalg.norm(away):
+                break
+        for _ in range(5):  # as wide open as the object's bends need, and in the middle
+            left, right = self._gaps(data, name, at - turn @ site, quaternion(turn))
+            at = at + (right - left) / 2 * wrist[:, 0]
+            q[6] += (GAP - (left + right) / 2) / depth
+            data.qpos[:] = self.scene.full_qpos({self.agent: q})
+        return data.qpos.copy(), at + turn @ away, quaternion(turn)
+
+    def _gaps(self, data: mujoco.MjData, name: str, position: np.ndarray, turn: np.ndarray) -> tuple[float, float]:
+        """Return the distances of an object from the pad on the side of the wrist's -x and from that on its +x, m."""
+        model, body = self.scene.model, self.scene.model.body(name)
+        data.mocap_pos[body.mocapid[0]], data.mocap_quat[body.mocapid[0]] = position, turn
+        mujoco.mj_kinematics(model, data)
+        link, shapes = (
+            data.body(f"{self.agent}/wrist_yaw_link"),
+            range(body.geomadr[0], body.geomadr[0] + body.geomnum[0]),
+        )
+        pads = sorted(self.handling.tables.fingers, key=lambda f: (data.geom_xpos[f.geom] - link.xpos) @ link.xmat[::3])
+        first, second = (
+            min(mujoco.mj_geomDistance(model, data, s, pad.geom, 1.0, None) for s in shapes) for pad in pads
+        )
+        return first, second
+
+
+def scene_of(names: Sequence[str]) -> Scene:
+    """Return a scene of one PSM and some objects in the air."""
+    places = [f"  {name}: {{object: {name}, position: [{0.1 * i}, 0.3, 0.0]}}" for i, name in enumerate(names)]
+    arm = ["arms:", "  psm_0: {arm: psm, position: [0.0, 0.0, 0.15]}"]
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "psm_in_the_air.yaml"
+        path.write_text("\n".join([*arm, "objects:", *places]))
+        return load_scene(path)
+
+
+class Held(NamedTuple):
+    """How grasps held, [grasps] each."""
+
+    slip: np.ndarray
+    """How far the object moved in the jaw, from rest to rest, m."""
+    turn: np.ndarray
+    """How far it turned, rad."""
+    overlap: np.ndarray
+    """The deepest overlap once the jaw has closed, m."""
+    dropped: np.ndarray
+    """bool"""
+
+
+def judge(seen: Seen) -> Held:
+    """Return how grasps [E] held in motions [E, steps] as `Grasps.shake` makes them."""
+    start = CLOSING * CHUNK - 1
+    moved = np.linalg.norm(seen.position[:, start:] - seen.position[:, start, None], axis=-1)
+    turned_by = np.einsum("eij,eij->e", seen.rotation[:, start].astype(float), seen.rotation[:, -1]) - 1
+    dropped = ~(moved.max(1) < LOST) | ~(seen.force[:, -1] > 0).all(-1)
+    return Held(moved[:, -1], np.arccos(np.clip(turned_by / 2, -1, 1)), seen.overlap[:, start:].max(1), dropped)
+
+
+def rows(names: list[str], grasps: int, seconds: float, batch: int = 250) -> Iterator[str]:
+    """Yield the rows of the table, one for each object."""
+    for name in names:
+        held, jaw = [], Grasps([name])
+        size = min(batch, grasps)
+        for seed in range(-(-grasps // size)):
+            held.append(judge(jaw.shake(np.zeros(size, int), seconds, seed)))
+        slip, turn, overlap, dropped = (np.concatenate(parts)[:grasps] for parts in zip(*held, strict=True))
+        kept = slip[~dropped] if not dropped.all() else np.full(1, np.nan)
+        angle = np.degrees(turn[~dropped]) if not dropped.all() else np.full(1, np.nan)
+        yield (f"| {name} | {grasps} | {dropped.sum()} | {1000 * np.median(kept):.3f}, {1000 * kept.max():.3f} "
+               f"| {np.median(angle):.2f}, {angle.max():.2f} | {1000 * overlap.max():.3f} |")  # fmt: skip
+
+
+def main(argv: list[str] | None = None) -> int:
+    parser = make_parser(__doc__)
+    parser.add_argument("--objects", nargs="+", choices=list(OBJECTS), default=list(OBJECTS))
+    parser.add_argument("--grasps", type=whole(1), default=100, metavar="N", help="of each object (%(default)s)")
+    parser.add_argument("--seconds", type=float, default=10.0, metavar="T", help="of shaking (%(default)s)")
+    arguments = parser.parse_args(argv)
+    print("| object | grasps | drops | slip: median, worst (mm) | median, worst (degrees) | deepest overlap (mm) |")
+    print("|---|---|---|---|---|---|")
+    for row in rows(arguments.objects, arguments.grasps, arguments.seconds):
+        print(row, flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(run("grasping", main))

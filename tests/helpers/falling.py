@@ -1,0 +1,96 @@
+"""Objects that fall, slide and spin far from any arm, in environments side by side."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NamedTuple
+from unittest.mock import patch
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import yaml
+
+import surgical_marl as sm
+from surgical_marl.physics import together
+from surgical_marl.physics.bodies import Bodies, rotation
+from surgical_marl.physics.collision import Pairs
+from surgical_marl.physics.dynamics import Dynamics
+from surgical_marl.physics.handling import Handling
+from surgical_marl.physics.together import Objects, Together
+
+DT = 0.0025
+DOWN = np.array([0.0, 0.0, -9.81], np.float32)
+
+
+class Trace(NamedTuple):
+    """What objects [k] did in environments [E] at the end of every step [T]."""
+
+    position: np.ndarray
+    """Of the centres of mass, m, [E, T, k, 3]."""
+    quaternion: np.ndarray
+    velocity: np.ndarray
+    depth: np.ndarray
+    """The deepest overlap with anything, m, [E, T]."""
+
+
+class Falling:
+    """The free objects of a scene and what is fixed in it, under any gravity."""
+
+    def __init__(self, folder: Path, objects: dict[str, dict[str, Any]]) -> None:
+        path = folder / "falling.yaml"
+        arms = {"psm_0": {"arm": "psm", "position": [0.0, 0.0, 5.0]}}
+        path.write_text(yaml.safe_dump({"arms": arms, "objects": objects}, sort_keys=False))
+        self.scene = sm.load_scene(path)
+        self.together = Together(self.scene, Dynamics(self.scene.model), Pairs(self.scene.model))
+        self.handling = Handling(self.scene, arms=False)
+        self.masses, self.names = self.handling.tables.masses, self.together.names
+        self._play = jax.jit(jax.vmap(self._advance, in_axes=(0, 0, None)), static_argnums=2)
+
+    def begin(self, count: int) -> Objects:
+        """Return the objects where the scene has them, [count]."""
+        start = self.together.start(self.scene)
+        return jax.tree.map(lambda x: jnp.repeat(x[None], count, 0), start)
+
+    def play(self, objects: Objects, seconds: float, gravity: np.ndarray = DOWN) -> tuple[Objects, Trace]:
+        each = jnp.broadcast_to(jnp.asarray(gravity, jnp.float32), (len(objects.bodies.position), 3))
+        objects, path = self._play(objects, each, round(seconds / DT))
+        return objects, Trace(*(np.asarray(part, float) for part in path))
+
+    def _advance(self, objects: Objects, gravity: Any, steps: int) -> tuple[Objects, Trace]:
+        def step(objects: Objects, _: None) -> tuple[Objects, Trace]:
+            objects = self.together._step_objects(objects)
+            bodies, depth = objects.bodies, jnp.float32(-1.0)
+            if self.handling.tables.meetings:
+                depth = self.handling.find(None, bodies).points.depth.max()
+            return objects, Trace(bodies.position, bodies.quaternion, bodies.velocity, depth)
+
+        with patch.object(together, "GRAVITY", gravity):
+            return jax.lax.scan(step, objects, None, length=steps)
+
+    def energy(self, path: Trace) -> np.ndarray:
+        """Return kinetic and potential energy, J, [E, T, k]."""
+        mass, spin = self.masses.mass, path.velocity[..., 3:]
+        turning = np.einsum("...ki,...kij,...kj->...k", spin, self.tensors(path), spin)
+        return mass * ((path.velocity[..., :3] ** 2).sum(-1) / 2 + 9.81 * path.position[..., 2]) + turning / 2
+
+    def momentum(self, path: Trace) -> np.ndarray:
+        """Return angular momentum about the centres of mass, [E, T, k, 3]."""
+        return np.einsum("...ij,...j->...i", self.tensors(path), path.velocity[..., 3:])
+
+    def tensors(self, path: Trace) -> np.ndarray:
+        frames = np.asarray(rotation(jnp.asarray(path.quaternion)), float)
+        return np.einsum("...ij,...jk,...lk->...il", frames, self.masses.inertia.astype(float), frames)
+
+
+def thrown(objects: Objects, **changes: Any) -> Objects:
+    """Return objects with other fields of their bodies."""
+    values = {name: jnp.asarray(value, jnp.float32) for name, value in changes.items()}
+    bodies: Bodies = objects.bodies._replace(**values)
+    return objects._replace(bodies=bodies)
+
+
+def random_turns(rng: np.random.Generator, *shape: int) -> np.ndarray:
+    """Return unit quaternions [*shape, 4]."""
+    drawn = rng.standard_normal((*shape, 4))
+    return drawn / np.linalg.norm(drawn, axis=-1, keepdims=True)
