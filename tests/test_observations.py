@@ -22,9 +22,10 @@ from surgical_marl.policies.teammates import Teammates
 from surgical_marl.robots.reach import Box, box_of
 from surgical_marl.runs.folder import read_settings
 from surgical_marl.runs.settings import NetworkSettings, PPOSettings, Settings
+from surgical_marl.scenes.placing import scenes_without_objects
 
 SHIPPED = "reach-psm"
-TASKS = [("reach", scene) for scene in sm.list_scenes()] + [
+TASKS = [("reach", scene) for scene in scenes_without_objects()] + [
     ("track", "bimanual_psm"), ("follow_path", "trimanual_psm_ecm"), ("match_image", "ecm"),
 ]  # fmt: skip
 
