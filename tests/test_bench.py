@@ -8,6 +8,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 from mujoco import rollout
@@ -18,6 +19,7 @@ from surgical_marl.bench.clock import race
 from surgical_marl.bench.contenders import Contender
 from surgical_marl.bench.course import HOLD, LAPS, full_state, make_course
 from surgical_marl.bench.face import measure_face
+from surgical_marl.bench.grasping import grasps
 from surgical_marl.bench.physics import PhysicsAlone
 from surgical_marl.bench.render import measure_rendering
 from surgical_marl.bench.report import QUOTED, draw, ratios, sweep_table
@@ -26,6 +28,7 @@ from surgical_marl.bench.workload import MOTIONS, Workload
 from surgical_marl.cli.main import main
 from surgical_marl.engines.choose import make_engine
 from surgical_marl.envs.env import Env
+from surgical_marl.robots.rotation import matrix_of
 from surgical_marl.scenes.load import load_scene
 from surgical_marl.scenes.timing import TIMESTEP
 
@@ -192,12 +195,41 @@ def test_what_is_timed_is_what_c_mujoco_steps() -> None:
     assert np.abs(found[:, -1, 1 : 1 + scene.model.nq] - course.qpos[:rows]).max() > 1e-2, "nothing moved"
 
 
-@pytest.mark.parametrize("motion", MOTIONS)
+@pytest.mark.parametrize("motion", [motion for motion in MOTIONS if motion != "grasp"])
 def test_a_course_takes_back_what_it_did(motion: str) -> None:
     course = make_course(load_scene("ecm"), motion)
     total = sum(actions["ecm_0"] for actions in course.actions)
     np.testing.assert_allclose(total, 0, atol=1e-6)
     assert len(course.commands) == len(course.actions) == LAPS
+
+
+def test_a_grasp_begins_with_a_wire_between_the_pads_of_a_jaw() -> None:
+    """Its site lies in the middle between the pads, a wire's radius and a gap away from both."""
+    scene = load_scene("psm_needle")
+    item, model = scene.objects["needle"].object, scene.model
+    radius, (site, _) = item.shapes[0].size[0], item.sites["grasp"]
+    data, held = mujoco.MjData(model), 0
+    for qpos, position, quaternion in zip(*grasps(scene, 40, np.random.default_rng(0)), strict=True):
+        axes = matrix_of(quaternion[0])
+        data.qpos[:], data.mocap_quat[0] = qpos, quaternion[0]
+        data.mocap_pos[0] = position[0] - axes @ item.center
+        mujoco.mj_kinematics(model, data)
+        hinge = data.body("psm_0/wrist_yaw_link")
+        place = hinge.xmat.reshape(3, 3).T @ (data.mocap_pos[0] + axes @ site - hinge.xpos)
+        if np.linalg.norm(place) > 0.02:  # it lies on the pad
+            continue
+        held += 1
+        assert abs(place[0]) < 1e-6 and abs(place[1]) <= 5e-4 and -0.009 <= place[2] <= -0.006
+        for side in ("left", "right"):
+            pad, point = data.geom(f"psm_0/jaw_{side}_link/pad"), data.mocap_pos[0] + axes @ site
+            depth = abs((pad.xmat.reshape(3, 3).T @ (point - pad.xpos))[0]) - model.geom(pad.id).size[0]
+            assert 0 < depth - radius < 1e-4
+    assert 20 <= held < 40
+
+
+def test_a_scene_without_objects_has_nothing_to_grasp(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["bench", "sim", "--scene", "ecm", "--motion", "grasp", "--num-envs", "1", "--device", "cpu"]) == 2
+    assert "scene 'ecm' has nothing to grasp" in capsys.readouterr().err
 
 
 def test_rendering_as_json_and_as_a_sentence(

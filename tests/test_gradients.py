@@ -74,6 +74,7 @@ def test_the_reverse_derivative_is_that_of_finite_differences(scene: str) -> Non
             assert np.sum(gradients[k] * direction) == pytest.approx(expected, rel=0.02, abs=1e-3)  # of float32
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scene", SCENES)
 def test_forward_and_reverse_derivatives_are_finite_and_the_same(scene: str) -> None:
     """`jacfwd` and `jacrev` of the first step after a reset, without an action: `grad` and `jvp` are parts of them."""

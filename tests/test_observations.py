@@ -22,12 +22,15 @@ from surgical_marl.policies.teammates import Teammates
 from surgical_marl.robots.reach import Box, box_of
 from surgical_marl.runs.folder import read_settings
 from surgical_marl.runs.settings import NetworkSettings, PPOSettings, Settings
-from surgical_marl.scenes.placing import scenes_without_objects
 
 SHIPPED = "reach-psm"
-TASKS = [("reach", scene) for scene in scenes_without_objects()] + [
-    ("track", "bimanual_psm"), ("follow_path", "trimanual_psm_ecm"), ("match_image", "ecm"),
-]  # fmt: skip
+QUICK = [("reach", "psm"), ("reach", "bimanual_psm")]
+TASKS = QUICK + [
+    pytest.param(*case, marks=pytest.mark.slow)
+    for case in [("track", "bimanual_psm"), ("follow_path", "trimanual_psm_ecm"), ("match_image", "ecm")]
+    + [("reach", scene) for scene in sm.list_scenes()]
+    if case not in QUICK
+]
 
 
 def wild(env: Any, steps: int, seed: int = 0) -> Any:
@@ -106,7 +109,7 @@ def test_a_scale_is_undone(seed: int) -> None:
     np.testing.assert_allclose(ends, [[-1] * 3, [1] * 3], atol=1e-4)
 
 
-@pytest.mark.parametrize("engine", ["fused", "mjx"])
+@pytest.mark.parametrize("engine", ["fused", pytest.param("mjx", marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     ("task", "scene", "options"),
     [
