@@ -120,8 +120,7 @@ def tile(values: np.ndarray, num_envs: int) -> np.ndarray:
 def with_objects(scene: Scene, course: Course) -> tuple[np.ndarray, np.ndarray]:
     """Return `qpos` and `qvel` of the exported scene, in which free objects have joints behind those of the arms."""
     qpos, qvel, (bodies, _) = [course.qpos], [course.qvel], course.objects
-    free = [place.object for place in scene.objects.values() if place.object.free]
-    for o, item in enumerate(free):
+    for o, item in enumerate(place.object for place in scene.free_objects.values()):
         axes = np.stack([matrix_of(quaternion) for quaternion in bodies.quaternion[:, o]])
         lever, spin = axes @ item.center, bodies.velocity[:, o, 3:]
         qpos += [bodies.position[:, o] - lever, bodies.quaternion[:, o]]

@@ -35,7 +35,7 @@ def grasps(scene: Scene, count: int, rng: np.random.Generator) -> tuple[np.ndarr
     Raises:
         ValueError: the scene has no free object with such a site, or no jaw with two pads.
     """
-    free = {name: place for name, place in scene.objects.items() if place.object.free}
+    free = scene.free_objects
     agents, first = graspers(scene), next(iter(free.values()), None)
     sites = [site for site in first.object.sites if site.startswith("grasp")] if first else []
     if not agents or not first or not sites:

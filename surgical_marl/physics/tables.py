@@ -51,7 +51,7 @@ class Tables:
 
     def __init__(self, scene: Any, arms: bool = True) -> None:
         model = scene.model
-        free = {name: place for name, place in scene.objects.items() if place.object.free}
+        free = scene.free_objects
         self.names, self.count = tuple(free), len(free)
         self.fingers = tuple(
             Finger(agent, int(g), int(model.geom_bodyid[g]))
@@ -124,7 +124,9 @@ class Tables:
         capsule = model.geom_type[self.near] == mujoco.mjtGeom.mjGEOM_CAPSULE
         self._link_half = single(np.where(capsule, model.geom_size[self.near, 1], 0.0), (-1,))
         self._link_radius = single(model.geom_size[self.near, 0], (-1,))
-        self.link_bodies = model.geom_bodyid[self.near]
+        pads = np.array([finger.body for finger in self.fingers], int)
+        self.bodies = {"pads": pads, "links": model.geom_bodyid[self.near]}
+        """The model's bodies of each kind of thing that an arm has."""
 
     def _read_fixed(self, fixed: dict[str, Placement]) -> None:
         self.fixed: list[Plate | Segments] = []
@@ -172,12 +174,11 @@ class Tables:
 
     def _ends(self, ends: list[tuple[str, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
         """Return the objects and the model's bodies at one end of all patches, [g] each; -1 where it is neither."""
-        bodies = {"links": self.link_bodies, "pads": np.array([finger.body for finger in self.fingers], int)}
         objects, links = [np.zeros(0, int)], [np.zeros(0, int)]
         for kind, numbers in ends:
             neither = np.full(len(numbers), -1)
             objects.append(numbers if kind == "objects" else neither)
-            links.append(bodies[kind][numbers] if kind in bodies else neither)
+            links.append(self.bodies[kind][numbers] if kind in self.bodies else neither)
         return np.concatenate(objects), np.concatenate(links)
 
 

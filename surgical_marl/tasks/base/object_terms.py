@@ -31,8 +31,7 @@ def object_terms(scene: Scene, agent: str) -> dict[str, Term]:
     its rotation matrix, `needle_velocity` [6], of its centre of mass and angular, and `needle_grip` [3]: the force of
     the arm's fingers on it, whether the arm holds it, and how far it has slid along the fingers.
     """
-    free = [name for name, place in scene.objects.items() if place.object.free]
-    return {term: value for name in free for term, value in _terms(scene, agent, name).items()}
+    return {term: value for name in scene.free_objects for term, value in _terms(scene, agent, name).items()}
 
 
 def _terms(scene: Scene, agent: str, name: str) -> dict[str, Term]:
