@@ -167,9 +167,9 @@ class Handling:
         slips = jnp.zeros((len(t.remembers), 3))
         for (o, f), g in t.grip.items():
             centre, frame = patches.centre[g], patches.frame[g]
-            place, axes, faces = self._finger(data, f)
+            place, axes = self._finger(data, f)
             was = place + axes @ grips.position[o, f]
-            turned = product(bodies.quaternion[o], conjugate(product(faces, grips.quaternion[o, f])))
+            turned = product(bodies.quaternion[o], conjugate(product(_quaternion(axes), grips.quaternion[o, f])))
             angle = 2 * turned[1:] * jnp.where(turned[0] < 0, -1.0, 1.0)
             arm = centre - bodies.position[o]
             shift = bodies.position[o] - was + jnp.cross(angle, arm)
@@ -192,8 +192,8 @@ class Handling:
         excess = after - stretched
         position, quaternion, force, slid = grips[:4]
         for (o, f), g in t.grip.items():
-            place, axes, faces = self._finger(data, f)
-            frame, centre = patches.frame[g], patches.centre[g]
+            place, axes = self._finger(data, f)
+            frame, centre, faces = patches.frame[g], patches.centre[g], _quaternion(axes)
             # Kept as it is while nothing slips: rounding errors of a pose made anew in each step would add up.
             along, about = excess[g, :2] @ frame[1:], turn(excess[g, 2] / patches.radius[g] * frame[0])
             was, faced = place + axes @ position[o, f], product(faces, quaternion[o, f])
@@ -221,10 +221,9 @@ class Handling:
                 held = held.at[o, a].set(jnp.where(presses & opposite, held[o, a] + dt, 0.0))
         return held
 
-    def _finger(self, data: Any, f: int) -> tuple[Array, Array, Array]:
-        """Return origin [3], axes [3, 3] and quaternion [4] of a finger."""
+    def _finger(self, data: Any, f: int) -> tuple[Array, Array]:
         body = self.tables.fingers[f].body
-        return data.xpos[body], data.xmat[body], data.xquat[body]
+        return data.xpos[body], data.xmat[body]
 
     def _jacobians(self, data: Any, bodies: Bodies, places: Array) -> tuple[Array, Array]:
         """Return the Jacobians of the relative velocity at places [g, s, 3], [g, s, 3, n] and [g, 3, n]."""
@@ -259,3 +258,22 @@ def _patch(one: Segments, way: Way, other: Plate | Segments, its: Way, torsion: 
         points, axes = between_segments(first, second), jnp.eye(3)[:2]
     points = Points(points.depth.reshape(-1), points.place.reshape(-1, 3), points.normal.reshape(-1, 3))
     return find_patch(points, way.soon(points, its), axes, torsion)
+
+
+def _quaternion(axes: Array) -> Array:
+    """Return the quaternion of a rotation matrix [3, 3]."""
+    m = axes
+    trace = m[0, 0] + m[1, 1] + m[2, 2]
+    sizes = jnp.stack([trace, m[0, 0], m[1, 1], m[2, 2]])
+    a, b, c = m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]
+    d, e, f = m[0, 1] + m[1, 0], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1]
+    rows = jnp.stack(
+        [
+            jnp.stack([1 + trace, a, b, c]),
+            jnp.stack([a, 1 + 2 * m[0, 0] - trace, d, e]),
+            jnp.stack([b, d, 1 + 2 * m[1, 1] - trace, f]),
+            jnp.stack([c, e, f, 1 + 2 * m[2, 2] - trace]),
+        ]
+    )
+    row = rows[jnp.argmax(sizes)]
+    return row / jnp.sqrt(jnp.sum(row * row))
