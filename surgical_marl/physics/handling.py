@@ -1,4 +1,4 @@
-"""What can touch objects in a scene, and the rows that these contacts add to the solver."""
+"""How patches resist: springs and dampers along the normal, friction that remembers how fingers hold objects."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import numpy as np
 from jax import Array
 
 from surgical_marl.physics.bodies import Bodies, conjugate, product, rotation, turn
-from surgical_marl.physics.collision import moved_bodies
-from surgical_marl.physics.cone import Cones, Forces
-from surgical_marl.physics.patches import AWAY, Patch, find_patch
-from surgical_marl.physics.shapes import Plate, Points, Segments, between_segments, on_plate
+from surgical_marl.physics.cone import Cone
+from surgical_marl.physics.newton import SLIPS, Contact, Newton, Pressed
+from surgical_marl.physics.patches import AWAY, Patch
 from surgical_marl.physics.tables import Tables
+from surgical_marl.physics.touching import Joints, Slots, stored
 
 DAMPING = 5e-3
 """Damping of a contact in the normal direction, s: this times its stiffness, N s/m."""
@@ -25,6 +25,13 @@ SHEAR = 0.8
 nu) / (2 - nu) for materials of Poisson's ratio nu, 0.8 for 0.33)."""
 CREEP = 0.025
 """Friction of a contact that remembers no position is a damper until it slips: this time, s, times its stiffness."""
+OPPOSITE = float(np.cos(np.radians(25.0)))
+"""Cosine of the angle by which the normals of two fingers that hold an object may miss being opposite. Like the least
+force it is of Isaac Lab's test whether a needle is held (pull request 6570)."""
+SPARE = 0.5
+"""Acceleration that the friction of a held object can take besides gravity, m/s2."""
+DWELL = 1.0 / 30.0
+"""Time that fingers must press before an object counts as held, s."""
 
 
 class Grips(NamedTuple):
@@ -42,222 +49,198 @@ class Grips(NamedTuple):
     """For how long the arm has held the object, s, [k, a]: both fingers press, from opposite sides."""
 
 
-class Way(NamedTuple):
-    """How a body moves in a step at the velocity of now: a point p of it by shift + turn x p. World."""
+class Fingers(NamedTuple):
+    """The frames of all fingers in the world, [f]."""
 
-    shift: Array
-    """m, [3]"""
-    turn: Array
-    """rad, [3]"""
-
-    def soon(self, points: Points, other: Way) -> Array:
-        """Return the depth of points [c] between this body and another one after the step, m, [c]."""
-        shift = self.shift - other.shift + jnp.cross(self.turn - other.turn, points.place)
-        return points.depth - jnp.sum(shift * points.normal, -1)
-
-
-STILL = Way(np.zeros(3, np.float32), np.zeros(3, np.float32))  # type: ignore[arg-type]
+    position: Array
+    axes: Array
+    """[f, 3, 3]"""
+    quaternion: Array
 
 
 class Felt(NamedTuple):
-    """Patches, and how they resist."""
+    """Contacts, and how far friction's springs are stretched, m, [s, 3]."""
 
-    patches: Patch
-    cones: Cones
+    contacts: Contact
     slip: Array
-    """How far friction's springs are stretched, m, [g, 3]."""
-
-
-OPPOSITE = float(np.cos(np.radians(25.0)))
-"""Cosine of the angle by which the normals of two fingers that hold an object may miss being opposite. Like the least
-force it is of Isaac Lab's test whether a needle is held (pull request 6570)."""
-SPARE = 0.5
-"""Acceleration that the friction of a held object can take besides gravity, m/s2."""
-DWELL = 1.0 / 30.0
-"""Time that fingers must press before an object counts as held, s."""
 
 
 class Handling:
-    """The free objects of a scene, and all that can touch them or stands fixed in the world."""
+    """What friction and contact do in a scene."""
 
-    def __init__(self, scene: Any, arms: bool = True) -> None:
-        self.tables = Tables(scene, arms)
-        model = scene.model
-        moved = moved_bodies(model)
+    def __init__(self, tables: Tables, newton: Newton) -> None:
+        self.tables, self._newton = tables, newton
+
+    def fingers(self, data: Any) -> Fingers:
+        """Return the frames of all fingers, in memory, from MJX's data with poses."""
+        bodies = self.tables.bodies["pads"]
+        axes = data.xmat[bodies]
+        return stored(Fingers(data.xpos[bodies], axes, jax.vmap(_quaternion)(axes)))
+
+    def feel(
+        self, slots: Slots, joints: Joints | None, fingers: Fingers | None, qvel: Array, bodies: Bodies, grips: Grips,
+        dt: Any,
+    ) -> Felt:  # fmt: skip
+        """Return how the patches in all slots resist. There are neither joints nor fingers without arms."""
+        speeds = self._newton.by_arm(qvel), stored(bodies.velocity)
+        at = stored(bodies.position), stored(bodies.quaternion)
+        grips = stored(grips)
+
+        def one(row: tuple[Patch, Array]) -> Felt:
+            patch, number = row
+            contact = self._contact(patch, number, joints, at[0])
+            slip = jnp.zeros(3) if fingers is None else self._slip(patch, number, fingers, at, grips)
+            twist = self._newton.twist(contact, *speeds)
+            return Felt(self._resisting(contact, patch, number, slip, twist, dt), slip)
+
+        return jax.lax.map(one, (slots.patch, slots.number))
+
+    def _contact(self, patch: Patch, number: Array, joints: Joints | None, position: Array) -> Contact:
+        """Return what a patch is between, and its directions; nothing of it resists yet."""
         t = self.tables
-        self._roots, self._root_of = model.body_rootid[model.dof_bodyid], model.body_rootid
-        sign = lambda body: np.where(body[:, None] >= 0, moved[np.maximum(body, 0)], 0.0)  # noqa: E731
-        self._links = (sign(t.first_body) - sign(t.second_body)).astype(np.float32)
-        one_hot = lambda which: (which[:, None] == np.arange(t.count)).astype(np.float32)  # noqa: E731
-        self._objects = one_hot(t.first_object) - one_hot(t.second_object)
+        first, second, arm = (
+            jnp.asarray(x.astype(np.int32))[number] for x in (t.first_object, t.second_object, t.owner)
+        )
+        origin = jnp.where(first < t.count, position.at[first].get(mode="clip"), patch.centre)
+        offset, jacobian = jnp.zeros(3), jnp.zeros((6, t.most))
+        if t.count > 1:
+            offset = jnp.where(second < t.count, position.at[second].get(mode="clip") - origin, 0.0)
+        if joints is not None:
+            own = jax.tree.map(lambda x: x.at[arm].get(mode="clip"), joints)
+            slides = jnp.asarray(t.slides).at[arm].get(mode="clip")
+            moving, turning = own.columns(slides, origin)
+            jacobian = (jnp.asarray(t.pulls)[number][:, None] * jnp.concatenate([moving, turning], -1)).T
+        points, (ahead, *across) = patch.points, patch.frame
+        normal = jnp.concatenate([points.normal, jnp.cross(points.place - origin, points.normal)], -1)
+        lever = patch.centre - origin
+        along = [jnp.concatenate([way, jnp.cross(lever, way)]) for way in across]
+        about = jnp.concatenate([jnp.zeros(3), patch.radius * ahead])
+        none, each = jnp.float32(0.0), jnp.zeros(len(normal))
+        cone = Cone(normal, each, each, jnp.stack([*along, about]), none, jnp.zeros(3), none)
+        return Contact(cone, first, second, offset, arm, jacobian)
 
-    def find(self, data: Any, bodies: Bodies, moving: Any = None, dt: Any = 0.0) -> Patch:
-        """Return all patches [g], in the order of `Tables`.
-
-        Args:
-            data: MJX's data with the poses of the arms.
-            bodies: the objects.
-            moving: the same with velocities; None if the arms count as standing.
-            dt: time over which motions are looked ahead, s.
-        """
-        t, found, start = self.tables, [], 0
-        shapes = self._shapes(data, bodies)
-        ways = self._ways(bodies, moving, dt)
-        for meeting in t.meetings:
-            torsion = t.torsion[start : start + len(meeting.one)]
-            start += len(meeting.one)
-            one, way = (_rows(of[meeting.first], meeting.one) for of in (shapes, ways))
-            if meeting.second == "fixed":
-                fixed = t.fixed[meeting.other[0]]
-                alone = lambda row, fixed=fixed: _patch(row[0], row[1], fixed, STILL, row[2])  # noqa: E731
-                found.append(jax.lax.map(alone, (one, way, torsion)))
-            else:
-                other, its = (_rows(of[meeting.second], meeting.other) for of in (shapes, ways))
-                found.append(jax.lax.map(lambda row: _patch(*row), (one, way, other, its, torsion)))
-        return jax.tree.map(lambda *x: jnp.concatenate(x), *found)
-
-    def _shapes(self, data: Any, bodies: Bodies) -> dict[str, Plate | Segments]:
-        """Return the shapes of all bodies in the world by kind of body, [bodies, shapes of one]."""
-        t, every = self.tables, lambda x: x[:, None]
-        found: dict[str, Plate | Segments] = {"objects": t.segments(bodies.position, rotation(bodies.quaternion))}
-        if t.fingers:
-            found["pads"] = jax.tree.map(every, t.pads(data))
-        if len(t.near):
-            found["links"] = jax.tree.map(every, t.links(data))
-        return found
-
-    def _ways(self, bodies: Bodies, data: Any, dt: Any) -> dict[str, Way]:
-        """Return how all bodies move in a step, by kind of body; arms stand if `data` is None."""
-        t, turns = self.tables, dt * bodies.velocity[:, 3:]
-        found = {"objects": Way(dt * bodies.velocity[:, :3] - jnp.cross(turns, bodies.position), turns)}
-        for kind, links in t.bodies.items():
-            turn, shift = jnp.zeros((len(links), 3)), jnp.zeros((len(links), 3))
-            if data is not None and len(links):
-                turn = dt * data.cvel[links, :3]
-                shift = dt * data.cvel[links, 3:] - jnp.cross(turn, data.subtree_com[self._root_of[links]])
-            found[kind] = Way(shift, turn)
-        return found
-
-    def feel(self, patches: Patch, data: Any, bodies: Bodies, qvel: Array, grips: Grips, dt: Any) -> Felt:
-        """Return the rows of patches [g] on the joints of all arms and then on all objects."""
-        t = self.tables
-        velocity = jnp.concatenate([qvel, bodies.velocity.ravel()])
-        linear, _ = self._jacobians(data, bodies, patches.points.place)
-        normal = jnp.einsum("gsi,gsin->gsn", patches.points.normal, linear)
-        there = patches.points.depth > AWAY
-        k = jnp.where(there, jnp.asarray(t.stiffness)[:, None], 0.0)
+    def _resisting(self, contact: Contact, patch: Patch, number: Array, slip: Array, twist: Array, dt: Any) -> Contact:
+        """Return the contact with the forces of its springs and dampers at a twist of now."""
+        t, cone = self.tables, contact.cone
+        there = patch.points.depth > AWAY
+        stiffness = jnp.asarray(t.stiffness)[number]
+        k = jnp.where(there, stiffness, 0.0)
         rate = k * (dt + DAMPING)
-        speed = normal @ velocity
-        push = jnp.where(there, k * jnp.minimum(patches.points.depth, DEEPEST) - rate * speed, AWAY)
-        linear, angular = self._jacobians(data, bodies, patches.centre[:, None])
-        along = jnp.einsum("gti,gin->gtn", patches.frame[:, 1:], linear[:, 0])
-        about = patches.radius[:, None] * jnp.einsum("gi,gin->gn", patches.frame[:, 0], angular)
-        along = jnp.concatenate([along, about[:, None]], 1)
-        slip = self._slips(patches, data, bodies, grips)
-        k = SHEAR * jnp.asarray(t.stiffness)
-        springs = jnp.where(t.remembers, k, 0.0)
-        drag = jnp.where(t.remembers, k * (dt + DAMPING), k * CREEP)
-        pull = -springs[:, None] * slip - drag[:, None] * (along @ velocity)
-        cones = Cones(normal, dt * rate, push, along, dt * drag, pull, jnp.asarray(t.sliding))
-        return Felt(patches, cones, slip)
+        push = jnp.where(there, k * jnp.minimum(patch.points.depth, DEEPEST) - rate * (cone.normal @ twist), AWAY)
+        k, remembers = SHEAR * stiffness, self._finger(number) < len(t.fingers)
+        springs = jnp.where(remembers, k, 0.0)
+        drag = jnp.where(remembers, k * (dt + DAMPING), k * CREEP)
+        pull = -springs * slip - drag * (cone.along @ twist)
+        resisting = Cone(cone.normal, dt * rate, push, cone.along, dt * drag, pull, jnp.asarray(t.sliding)[number])
+        return contact._replace(cone=resisting)
 
-    def _slips(self, patches: Patch, data: Any, bodies: Bodies, grips: Grips) -> Array:
-        """Return how far objects have moved along fingers since friction was relaxed, m, [g, 3]; 0 elsewhere."""
-        t = self.tables
-        slips = jnp.zeros((len(t.remembers), 3))
-        for (o, f), g in t.grip.items():
-            centre, frame = patches.centre[g], patches.frame[g]
-            place, axes = self._finger(data, f)
-            was = place + axes @ grips.position[o, f]
-            turned = product(bodies.quaternion[o], conjugate(product(_quaternion(axes), grips.quaternion[o, f])))
+    def _finger(self, number: Array) -> Array:
+        """Return the finger that a patch is on, []."""
+        return jnp.asarray(self.tables.finger.astype(np.int32))[number]
+
+    def _slip(self, patch: Patch, number: Array, fingers: Fingers, at: tuple[Array, Array], grips: Grips) -> Array:
+        """Return how far the object has moved along the finger since friction was relaxed, m, [3]; 0 elsewhere."""
+        f = self._finger(number)
+
+        def moved(_: None) -> Array:
+            o = jnp.asarray(self.tables.first_object.astype(np.int32))[number]
+            frame = _row(fingers, f)
+            position, quaternion, force = (x[o, f] for x in grips[:3])
+            was = frame.position + frame.axes @ position
+            turned = product(at[1][o], conjugate(product(frame.quaternion, quaternion)))
             angle = 2 * turned[1:] * jnp.where(turned[0] < 0, -1.0, 1.0)
-            arm = centre - bodies.position[o]
-            shift = bodies.position[o] - was + jnp.cross(angle, arm)
-            slip = jnp.concatenate([frame[1:] @ shift, (patches.radius[g] * (frame[0] @ angle))[None]])
-            slips = slips.at[g].set(jnp.where(grips.force[o, f] > 0, slip, 0.0))
-        return slips
+            shift = at[0][o] - was + jnp.cross(angle, patch.centre - at[0][o])
+            slip = jnp.concatenate([patch.frame[1:] @ shift, (patch.radius * (patch.frame[0] @ angle))[None]])
+            return jnp.where(force > 0, slip, 0.0)
+
+        return jax.lax.cond(f < len(self.tables.fingers), moved, lambda _: jnp.zeros(3), None)
+
+    # -- what is remembered
 
     def remember(
-        self, felt: Felt, forces: Forces, data: Any, bodies: Bodies, shift: Array, grips: Grips, dt: Any
-    ) -> Grips:
-        """Return what friction remembers after a step with these forces, in which everything moves by `shift` [n].
+        self, felt: Felt, slots: Slots, pressed: Pressed, fingers: Fingers, bodies: Bodies,
+        shift: tuple[Array, Array], grips: Grips, dt: Any,
+    ) -> Grips:  # fmt: skip
+        """Return what friction remembers after a step with these forces.
 
-        Where friction slips, its spring is stretched no further than its force says.
+        Where friction slips, its spring is stretched no further than its force says. `shift` is by how much all arms'
+        joints [n] and objects [k, 6] move in the step.
         """
-        t, patches = self.tables, felt.patches
-        pressed = forces.normal.sum(-1)
-        after = felt.slip + felt.cones.along @ shift
-        springs = (SHEAR * jnp.asarray(t.stiffness))[:, None]
-        stretched = jnp.where(forces.slips[:, None], -forces.friction / springs, after)
-        excess = after - stretched
-        position, quaternion, force, slid = grips[:4]
-        for (o, f), g in t.grip.items():
-            place, axes = self._finger(data, f)
-            frame, centre, faces = patches.frame[g], patches.centre[g], _quaternion(axes)
-            # Kept as it is while nothing slips: rounding errors of a pose made anew in each step would add up.
-            along, about = excess[g, :2] @ frame[1:], turn(excess[g, 2] / patches.radius[g] * frame[0])
-            was, faced = place + axes @ position[o, f], product(faces, quaternion[o, f])
-            was, faced = centre + rotation(about) @ (was - centre) + along, product(about, faced)
-            new = grips.force[o, f] <= 0
-            was, faced = jnp.where(new, bodies.position[o] + along, was), jnp.where(new, bodies.quaternion[o], faced)
-            facing = product(conjugate(faces), faced)
-            moves = new | forces.slips[g]
-            position = position.at[o, f].set(jnp.where(moves, axes.T @ (was - place), position[o, f]))
-            quaternion = quaternion.at[o, f].set(jnp.where(moves, facing / jnp.linalg.norm(facing), quaternion[o, f]))
-            force = force.at[o, f].set(pressed[g])
-            way = jnp.sqrt(jnp.sum(excess[g, :2] ** 2))
-            slid = slid.at[o, f].set(jnp.where(new, 0.0, slid[o, f] + jnp.where(forces.slips[g], way, 0.0)))
-        return Grips(position, quaternion, force, slid, self._held(patches, pressed, grips.held, dt))
+        t, k, old = self.tables, len(bodies.position), stored(grips)
+        moves = self._newton.by_arm(shift[0]), stored(shift[1])
+        at = stored(bodies.position), stored(bodies.quaternion)
+        normal = jnp.zeros((k, len(t.fingers), 3))
+        fresh = grips._replace(force=jnp.zeros_like(grips.force), slid=jnp.zeros_like(grips.slid))
 
-    def _held(self, patches: Patch, pressed: Array, held: Array, dt: Any) -> Array:
+        def one(kept: tuple[Grips, Array], row: Any) -> tuple[tuple[Grips, Array], None]:
+            patch, number, index, contact, slip, forces = row
+            f = self._finger(number)
+
+            def note(kept: tuple[Grips, Array]) -> tuple[Grips, Array]:
+                after = slip + contact.cone.along @ self._newton.twist(contact, *moves)
+                place = contact.first, f
+                own = Grips(*(x[place] for x in old[:4]), old.held)
+                new = self._kept(
+                    patch, number, forces, after, _row(fingers, f), tuple(x[contact.first] for x in at), own
+                )
+                found = Grips(*(x.at[place].set(y) for x, y in zip(kept[0][:4], new, strict=True)), kept[0].held)
+                return found, kept[1].at[place].set(patch.frame[0])
+
+            is_grip = (f < len(t.fingers)) & (index < slots.count)
+            return jax.lax.cond(is_grip, note, lambda kept: kept, kept), None
+
+        rows = (
+            slots.patch,
+            slots.number,
+            np.arange(len(slots.number), dtype=np.int32),
+            felt.contacts,
+            felt.slip,
+            pressed,
+        )
+        (grips, normal), _ = jax.lax.scan(one, (fresh, normal), rows)
+        return grips._replace(held=self._held(normal, grips.force, grips.held, dt))
+
+    def _kept(
+        self, patch: Patch, number: Array, forces: Pressed, after: Array, finger: Fingers, at: tuple[Array, Array],
+        grip: Grips,
+    ) -> tuple[Array, Array, Array, Array]:  # fmt: skip
+        """Return the first four columns of `Grips` for one finger and one object."""
+        place, axes, faces = finger
+        slips = forces.sides >= SLIPS
+        stretched = jnp.where(slips, -forces.friction / (SHEAR * jnp.asarray(self.tables.stiffness)[number]), after)
+        excess = after - stretched
+        # Kept as it is while nothing slips: rounding errors of a pose made anew in each step would add up.
+        along, about = excess[:2] @ patch.frame[1:], turn(excess[2] / patch.radius * patch.frame[0])
+        was, faced = place + axes @ grip.position, product(faces, grip.quaternion)
+        was, faced = patch.centre + rotation(about) @ (was - patch.centre) + along, product(about, faced)
+        new = grip.force <= 0
+        was, faced = jnp.where(new, at[0] + along, was), jnp.where(new, at[1], faced)
+        facing = product(conjugate(faces), faced)
+        moves, way = new | slips, jnp.sqrt(jnp.sum(excess[:2] ** 2))
+        return (
+            jnp.where(moves, axes.T @ (was - place), grip.position),
+            jnp.where(moves, facing / jnp.linalg.norm(facing), grip.quaternion),
+            forces.normal,
+            jnp.where(new, 0.0, grip.slid + jnp.where(slips, way, 0.0)),
+        )
+
+    def _held(self, normal: Array, force: Array, held: Array, dt: Any) -> Array:
         """Return for how long each arm has held each object, s, [k, a]."""
         t = self.tables
         for o in range(t.count):
             for a, (one, other) in t.jaws.items():
-                g, h = t.grip[o, one], t.grip[o, other]
-                least = t.masses.mass[o] * (9.81 + SPARE) / t.sliding[g] * jnp.where(held[o, a] > 0, 0.5, 1.0)
-                presses = (pressed[g] >= least) & (pressed[h] >= least)
-                opposite = jnp.sum(patches.frame[g, 0] * patches.frame[h, 0]) <= -OPPOSITE
+                sliding = t.sliding[
+                    [g for g in range(len(t.finger)) if (t.first_object[g], t.finger[g]) == (o, one)][0]
+                ]
+                least = t.masses.mass[o] * (9.81 + SPARE) / sliding * jnp.where(held[o, a] > 0, 0.5, 1.0)
+                presses = (force[o, one] >= least) & (force[o, other] >= least)
+                opposite = jnp.sum(normal[o, one] * normal[o, other]) <= -OPPOSITE
                 held = held.at[o, a].set(jnp.where(presses & opposite, held[o, a] + dt, 0.0))
         return held
 
-    def _finger(self, data: Any, f: int) -> tuple[Array, Array]:
-        body = self.tables.fingers[f].body
-        return data.xpos[body], data.xmat[body]
 
-    def _jacobians(self, data: Any, bodies: Bodies, places: Array) -> tuple[Array, Array]:
-        """Return the Jacobians of the relative velocity at places [g, s, 3], [g, s, 3, n] and [g, 3, n]."""
-        lever = places[:, :, None] - bodies.position  # [g, s, k, 3]
-        signs, eye = jnp.asarray(self._objects), jnp.eye(3)  # [g, k]
-        linear = jnp.concatenate([jnp.broadcast_to(eye, (*lever.shape, 3)), jnp.cross(eye, lever[..., None, :])], -2)
-        linear = (linear * signs[:, None, :, None, None]).reshape(*places.shape[:2], -1, 3)  # [g, s, 6 k, 3]
-        half = jnp.concatenate([jnp.zeros((3, 3)), eye])
-        angular = (signs[:, :, None, None] * half).reshape(len(signs), -1, 3)
-        if data is None:
-            return jnp.swapaxes(linear, -1, -2), jnp.swapaxes(angular, -1, -2)
-        offset = places[:, :, None] - data.subtree_com[self._roots]  # [g, s, nv, 3]
-        links = jnp.asarray(self._links)
-        turning = data.cdof[:, :3]
-        moving = (data.cdof[:, 3:] + jnp.cross(turning, offset)) * links[:, None, :, None]
-        spin = turning * links[:, :, None]
-        whole = jnp.swapaxes(jnp.concatenate([moving, linear], -2), -1, -2)
-        return whole, jnp.swapaxes(jnp.concatenate([spin, angular], -2), -1, -2)
-
-
-def _rows(tree: Any, which: np.ndarray) -> Any:
-    """Return some rows of the arrays of a tree."""
-    return jax.tree.map(lambda x: x[which], tree)
-
-
-def _patch(one: Segments, way: Way, other: Plate | Segments, its: Way, torsion: Array) -> Patch:
-    """Return the patch of a body's capsules [c] on another's plates or capsules [d], and on which way both are."""
-    first, second = jax.tree.map(lambda x: x[:, None], one), jax.tree.map(lambda x: x[None], other)
-    if isinstance(second, Plate):
-        points, axes = on_plate(first, second), second.frame[0, 0, :, :2].T
-    else:
-        points, axes = between_segments(first, second), jnp.eye(3)[:2]
-    points = Points(points.depth.reshape(-1), points.place.reshape(-1, 3), points.normal.reshape(-1, 3))
-    return find_patch(points, way.soon(points, its), axes, torsion)
+def _row(tree: Any, i: Array) -> Any:
+    return jax.tree.map(lambda x: x[i], tree)
 
 
 def _quaternion(axes: Array) -> Array:

@@ -77,3 +77,10 @@ def tangents(normal: Array) -> Array:
     one = jnp.stack([1 + sign * x * x * a, sign * b, -sign * x], -1)
     other = jnp.stack([b, sign + y * y * a, -y], -1)
     return jnp.stack([normal, one, other], -2)
+
+
+def no_patch() -> Patch:
+    """Return a patch that is not there."""
+    none = jnp.zeros(3)
+    points = Points(jnp.full(SLOTS, AWAY), jnp.zeros((SLOTS, 3)), jnp.zeros((SLOTS, 3)))
+    return Patch(points, none, jnp.zeros((3, 3)), jnp.float32(1.0))

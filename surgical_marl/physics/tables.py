@@ -5,15 +5,15 @@ Patches are in the order of `Tables.meetings`, and within one in that of its bod
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from itertools import combinations, product
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jax import Array
 
 from surgical_marl.physics.bodies import Masses
+from surgical_marl.physics.collision import moved_bodies
 from surgical_marl.physics.patches import AWAY
 from surgical_marl.physics.shapes import Plate, Segments, plate_of_box
 from surgical_marl.robots.spec import COLLISION_GROUP, PAD_GROUP
@@ -39,20 +39,24 @@ class Meeting(NamedTuple):
     one: np.ndarray
     """Numbers of the first bodies, [m]."""
     second: str
-    """Kind of the second body: "pads", "links", "objects" or "fixed"."""
+    """Kind of the second body: "pads", "links", "objects", or one of what is fixed: "plates" or "rods"."""
     other: np.ndarray
-    """Numbers of the second bodies, [m]; all the same for a fixed one."""
+    """Numbers of the second bodies, [m]."""
     surfaces: tuple[Surface, ...]
     """How each pair feels."""
 
 
 class Tables:
-    """Constants of a scene with objects, or of its objects alone."""
+    """Constants of a scene with objects, or of its objects alone.
+
+    A number that stands for no body is the number of bodies of that kind, so that what is written there is dropped.
+    """
 
     def __init__(self, scene: Any, arms: bool = True) -> None:
         model = scene.model
         free = scene.free_objects
         self.names, self.count = tuple(free), len(free)
+        self.arms = len(scene.agents) if arms else 0
         self.fingers = tuple(
             Finger(agent, int(g), int(model.geom_bodyid[g]))
             for agent in scene.agents
@@ -67,37 +71,15 @@ class Tables:
         self._read_free(free)
         self._read_links(model)
         self._read_fixed({n: place for n, place in scene.objects.items() if not place.object.free})
-        self._number(free, model, scene.agents)
-
-    # -- shapes where they are now
-
-    def segments(self, position: Array, frames: Array) -> Segments:
-        """Return the capsules of the objects [k, c] in the world; those that pad an object with fewer are far away."""
-        start, end = (
-            position[:, None] + jnp.matmul(jnp.asarray(x), jnp.swapaxes(frames, -1, -2))
-            for x in (self._start, self._end)
-        )
-        return Segments(start, end, jnp.asarray(self._radius))
-
-    def pads(self, data: Any) -> Plate:
-        """Return the plates of all fingers, [f]."""
-        geoms = np.array([finger.geom for finger in self.fingers], int)
-        frame = jnp.matmul(data.geom_xmat[geoms], jnp.asarray(self._pad_axes))
-        return Plate(data.geom_xpos[geoms], frame, jnp.asarray(self._pad_half), jnp.asarray(self._pad_radius))
-
-    def links(self, data: Any) -> Segments:
-        """Return the capsules of the other links that come near objects, [l]."""
-        centre, axis = data.geom_xpos[self.near], data.geom_xmat[self.near][:, :, 2]
-        half = jnp.asarray(self._link_half)[:, None]
-        return Segments(centre - half * axis, centre + half * axis, jnp.asarray(self._link_radius))
-
-    # -- set up
+        self._read_joints(model, scene.agents if arms else ())
+        self._number(free)
 
     def _read_free(self, free: dict[str, Placement]) -> None:
         most = max((len(place.object.shapes) for place in free.values()), default=1)
         shape = (self.count, most)
-        self._start, self._end = np.zeros((*shape, 3), np.float32), np.zeros((*shape, 3), np.float32)
-        self._radius = np.full(shape, 2 * AWAY, np.float32)  # of capsules that are not there
+        self.start, self.end = np.zeros((*shape, 3), np.float32), np.zeros((*shape, 3), np.float32)
+        """Ends of the capsules of the objects, from the centre of mass, by the axes of the object's frame, [k, c, 3]."""
+        self.radius = np.full(shape, 2 * AWAY, np.float32)  # of capsules that are not there
         for o, place in enumerate(free.values()):
             for c, part in enumerate(place.object.shapes):
                 if part.kind not in ("capsule", "sphere"):
@@ -107,7 +89,10 @@ class Tables:
                     )
                 half = part.size[1] * part.rotation[:, 2] if part.kind == "capsule" else np.zeros(3)
                 middle = part.position - place.object.center
-                self._start[o, c], self._end[o, c], self._radius[o, c] = middle - half, middle + half, part.size[0]
+                self.start[o, c], self.end[o, c], self.radius[o, c] = middle - half, middle + half, part.size[0]
+        ends = np.maximum(*(np.linalg.norm(x, axis=-1) for x in (self.start, self.end)))
+        self.bound = (ends + self.radius).max(1, initial=0.0)
+        """Radius of a ball about the centre of mass that holds the object, m, [k]."""
         objects = [place.object for place in free.values()]
         self.masses = Masses(
             np.array([thing.mass for thing in objects], np.float32),  # type: ignore[arg-type]
@@ -118,68 +103,81 @@ class Tables:
     def _read_links(self, model: mujoco.MjModel) -> None:
         plates = [plate_of_box(model.geom_size[finger.geom]) for finger in self.fingers]
         single = lambda values, shape: np.array(values, np.float32).reshape(shape)  # noqa: E731
-        self._pad_axes = single([axes for axes, _, _ in plates], (-1, 3, 3))
-        self._pad_half = single([half for _, half, _ in plates], (-1, 2))
-        self._pad_radius = single([radius for _, _, radius in plates], (-1,))
+        self.pad_geoms = np.array([finger.geom for finger in self.fingers], int)
+        self.pad_axes = single([axes for axes, _, _ in plates], (-1, 3, 3))
+        self.pad_half = single([half for _, half, _ in plates], (-1, 2))
+        self.pad_radius = single([radius for _, _, radius in plates], (-1,))
         capsule = model.geom_type[self.near] == mujoco.mjtGeom.mjGEOM_CAPSULE
-        self._link_half = single(np.where(capsule, model.geom_size[self.near, 1], 0.0), (-1,))
-        self._link_radius = single(model.geom_size[self.near, 0], (-1,))
+        self.link_half = single(np.where(capsule, model.geom_size[self.near, 1], 0.0), (-1,))
+        self.link_radius = single(model.geom_size[self.near, 0], (-1,))
         pads = np.array([finger.body for finger in self.fingers], int)
         self.bodies = {"pads": pads, "links": model.geom_bodyid[self.near]}
         """The model's bodies of each kind of thing that an arm has."""
 
     def _read_fixed(self, fixed: dict[str, Placement]) -> None:
-        self.fixed: list[Plate | Segments] = []
-        """The plates of every fixed object that has any, and its capsules."""
-        self._fixed_surfaces: list[Surface] = []
-        for place in fixed.values():
-            parts = place.object.shapes
-            flat = [_plate(part, place) for part in parts if part.kind in ("box", "plane")]
-            thin = [_segment(part, place) for part in parts if part.kind in ("capsule", "sphere")]
-            for kind, found in ((Plate, flat), (Segments, thin)):
-                if found:
-                    self.fixed.append(kind(*(np.array(x, np.float32) for x in zip(*found, strict=True))))  # type: ignore[arg-type]
-                    self._fixed_surfaces.append(place.object.surface)
+        """Set the plates and the rods, which are capsules, of all fixed objects: each is a body of its own."""
+        parts = [(part, place) for place in fixed.values() for part in place.object.shapes]
+        flat = [(part, place) for part, place in parts if part.kind in ("box", "plane")]
+        thin = [(part, place) for part, place in parts if part.kind in ("capsule", "sphere")]
+        self.plates = Plate(*_stacked([_plate(*each) for each in flat], (3,), (3, 3), (2,), ()))
+        self.rods = Segments(*_stacked([_segment(*each) for each in thin], (3,), (3,), ()))
+        self._fixed_surfaces = {
+            kind: [place.object.surface for _, place in of] for kind, of in (("plates", flat), ("rods", thin))
+        }
 
-    def _number(self, free: dict[str, Placement], model: mujoco.MjModel, agents: tuple[str, ...]) -> None:
+    def _read_joints(self, model: mujoco.MjModel, agents: tuple[str, ...]) -> None:
+        """Set which joints each arm has, and which of them move the bodies of each kind."""
+        owner = np.array([agents.index(name) if name in agents else -1 for name in _owners(model, model.dof_bodyid)])
+        joints = [np.flatnonzero(owner == arm) for arm in range(len(agents))]
+        self.most = max(map(len, joints), default=0)
+        self.dofs = np.full((len(agents), self.most), model.nv)
+        """Degrees of freedom of each arm, [a, m]; `model.nv` where it has fewer than others."""
+        for arm, own in enumerate(joints):
+            self.dofs[arm, : len(own)] = own
+        self.slides = np.append(model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE, False)[self.dofs]
+        moved = np.pad(moved_bodies(model), ((0, 0), (0, 1)))
+        self.arm_of, self.moves = {}, {}
+        """Of each kind of body: the arm that it is on, and which of that arm's joints move it, [m]."""
+        for kind, bodies in self.bodies.items():
+            self.arm_of[kind] = np.array([agents.index(name) for name in _owners(model, bodies)], int)
+            own = self.dofs[self.arm_of[kind]] if len(bodies) else np.zeros((0, self.most), int)
+            self.moves[kind] = np.take_along_axis(moved[bodies], own, 1).astype(np.float32)
+
+    def _number(self, free: dict[str, Placement]) -> None:
         """Set the number of each patch, the bodies that it is between, and how their surfaces feel."""
         own = [place.object.surface for place in free.values()]
         felt = {"pads": [JAW] * len(self.fingers), "links": [LINK] * len(self.near), "objects": own,
-                "fixed": self._fixed_surfaces}  # fmt: skip
-        objects, fingers, links = (range(count) for count in (self.count, len(self.fingers), len(self.near)))
+                **self._fixed_surfaces}  # fmt: skip
+        objects, fingers, links = range(self.count), range(len(self.fingers)), range(len(self.near))
+        fixed = {kind: range(len(surfaces)) for kind, surfaces in self._fixed_surfaces.items()}
         pairs = [
             ("objects", "pads", list(product(objects, fingers))),
             ("objects", "links", list(product(objects, self.bare.tolist()))),
-            *(("objects", "fixed", [(o, i) for o in objects]) for i in range(len(self.fixed))),
+            *(("objects", kind, list(product(objects, all_))) for kind, all_ in fixed.items()),
             ("objects", "objects", list(combinations(objects, 2))),
-            *(("links", "fixed", [(n, i) for n in links]) for i in range(len(self.fixed))),
+            *(("links", kind, list(product(links, all_))) for kind, all_ in fixed.items()),
         ]
         self.meetings = tuple(
             Meeting(first, np.array([a for a, _ in which]), second, np.array([b for _, b in which]),
                     tuple(felt[first][a].against(felt[second][b]) for a, b in which))
             for first, second, which in pairs if which
         )  # fmt: skip
-        ends = [(m.first, m.one) for m in self.meetings], [(m.second, m.other) for m in self.meetings]
-        (self.first_object, self.first_body), (self.second_object, self.second_body) = map(self._ends, ends)
         surfaces = [surface for meeting in self.meetings for surface in meeting.surfaces]
         each = lambda of: np.array([getattr(surface, of) for surface in surfaces], np.float32)  # noqa: E731
         self.sliding, self.torsion, self.stiffness = each("sliding"), each("torsion"), each("stiffness")
-        owner = lambda body: agents.index(model.body(int(body)).name.split("/")[0]) if body >= 0 else -1  # noqa: E731
-        self.owner = np.array([owner(max(pair)) for pair in zip(self.first_body, self.second_body, strict=True)], int)
-        """The arm that a patch is on, by its number; -1 if it is on none."""
-        pads = [(o, f) for o, f in product(objects, fingers)]
-        self.grip = {pair: g for g, pair in enumerate(pads)}
-        """(object, finger) -> its patch."""
-        self.remembers = np.arange(len(surfaces)) < len(pads)
-
-    def _ends(self, ends: list[tuple[str, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
-        """Return the objects and the model's bodies at one end of all patches, [g] each; -1 where it is neither."""
-        objects, links = [np.zeros(0, int)], [np.zeros(0, int)]
-        for kind, numbers in ends:
-            neither = np.full(len(numbers), -1)
-            objects.append(numbers if kind == "objects" else neither)
-            links.append(self.bodies[kind][numbers] if kind in self.bodies else neither)
-        return np.concatenate(objects), np.concatenate(links)
+        ends = [[(m.first, m.one) for m in self.meetings], [(m.second, m.other) for m in self.meetings]]
+        numbers = lambda end, kind, none: np.concatenate(  # noqa: E731
+            [np.zeros(0, int), *(n if of == kind else np.full(len(n), none) for of, n in end)]
+        )
+        self.first_object, self.second_object = (numbers(end, "objects", self.count) for end in ends)
+        self.finger = numbers(ends[1], "pads", len(self.fingers))
+        self.owner, self.pulls = np.full(len(surfaces), self.arms), np.zeros((len(surfaces), self.most), np.float32)
+        """The arm that each patch is on, and the sign with which it moves with that arm's joints, [m]."""
+        for end, sign in zip(ends, (1.0, -1.0), strict=True):
+            for kind in self.bodies:
+                of = numbers(end, kind, -1)
+                on = of >= 0
+                self.owner[on], self.pulls[on] = self.arm_of[kind][of[on]], sign * self.moves[kind][of[on]]
 
 
 def _near(scene: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -195,6 +193,17 @@ def _near(scene: Any) -> tuple[np.ndarray, np.ndarray]:
             if name.startswith(f"{agent}/") and _depth(model, body) >= 3:
                 found.append((int(geom), model.body(body).name.split("/")[1] in held))
     return np.array([geom for geom, _ in found], int), np.flatnonzero([not holds for _, holds in found])
+
+
+def _owners(model: mujoco.MjModel, bodies: np.ndarray) -> list[str]:
+    """Return the agents whose bodies these are."""
+    return [model.body(int(body)).name.split("/")[0] for body in bodies]
+
+
+def _stacked(rows: list[tuple[Any, ...]], *shapes: tuple[int, ...]) -> Iterator[np.ndarray]:
+    """Return an array for each column of some rows; `shapes` are those of one row."""
+    for k, shape in enumerate(shapes):
+        yield np.array([row[k] for row in rows], np.float32).reshape(-1, *shape)
 
 
 def _depth(model: mujoco.MjModel, body: int) -> int:

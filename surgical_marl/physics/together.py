@@ -16,23 +16,20 @@ from jax import Array
 
 from surgical_marl.physics.bodies import Bodies, free_acceleration, inertias, moved, rotation
 from surgical_marl.physics.collision import Pairs
-from surgical_marl.physics.cone import Forces, solve_contacts
 from surgical_marl.physics.dynamics import Dynamics, Physics
-from surgical_marl.physics.handling import DWELL, Felt, Grips, Handling
+from surgical_marl.physics.handling import DWELL, Grips, Handling
+from surgical_marl.physics.newton import Newton, Pressed, Problem
 from surgical_marl.physics.solver import Rows
+from surgical_marl.physics.tables import Tables
+from surgical_marl.physics.touching import Finder, Joints, Slots
 from surgical_marl.physics.views import Handled, ObjectView, Touch
 from surgical_marl.robots.rotation import quaternion
 
 if TYPE_CHECKING:
     from surgical_marl.scenes.scene import Scene
 
-ITERATIONS = (8, 4)
-"""Most Newton steps, and line search steps in each: see docs/physics.md."""
 GRAVITY = np.array([0.0, 0.0, -9.81], np.float32)
 """m/s2, on objects alone: arms are balanced."""
-NEAR = 1e-3
-"""Distance of an arm from an object or a fixed thing below which all is solved together, m. An arm moves less in a
-step."""
 
 
 class Objects(NamedTuple):
@@ -46,15 +43,19 @@ class Together:
     """The physics of a scene with objects."""
 
     def __init__(self, scene: Scene, dynamics: Dynamics, pairs: Pairs) -> None:
-        self._handling, self._alone, self._pairs = Handling(scene), Handling(scene, arms=False), pairs
-        tables = self._handling.tables
-        self.names = tables.names
-        self._dynamics, self._arms = dynamics, len(scene.agents)
-        self._mine = tables.owner[:, None] == np.arange(self._arms)  # [g, a]
+        self._pairs, self._dynamics, self._arms = pairs, dynamics, len(scene.agents)
+        self.tables = Tables(scene)
+        self.names = self.tables.names
+        joints, none = scene.model.nv, np.zeros((0, 0), int)
+        self._newton, self._objects_alone = (
+            Newton(self.tables.dofs, joints, len(self.names)),
+            Newton(none, 0, len(self.names)),
+        )
+        self._finder = Finder(self.tables)
 
     def start(self, scene: Scene) -> Objects:
         """Return the objects at rest where the scene places them."""
-        tables, places = self._handling.tables, [scene.objects[name] for name in self.names]
+        tables, places = self.tables, [scene.objects[name] for name in self.names]
         k, f = tables.count, len(tables.fingers)
         position = np.array([place.position + place.rotation @ place.object.center for place in places])
         turned = np.array([quaternion(place.rotation) for place in places])
@@ -67,13 +68,13 @@ class Together:
 
     def views(self, objects: Objects) -> dict[str, ObjectView]:
         """Return the view of every free object, by name."""
-        frames, centers = rotation(objects.bodies.quaternion), jnp.asarray(self._handling.tables.centers)
+        frames, centers = rotation(objects.bodies.quaternion), jnp.asarray(self.tables.centers)
         origins = objects.bodies.position - (frames @ centers[..., None])[..., 0]
         return {n: ObjectView(origins[o], frames[o], objects.bodies.velocity[o]) for o, n in enumerate(self.names)}
 
     def handles(self, objects: Objects, arm: int) -> dict[str, Handled]:
         """Return how an arm handles every free object, by name."""
-        fingers, found = list(self._handling.tables.jaws.get(arm, ())), {}
+        fingers, found = list(self.tables.jaws.get(arm, ())), {}
         for o, name in enumerate(self.names):
             force, slid = (of[o, np.array(fingers, int)] for of in (objects.grips.force, objects.grips.slid))
             held = objects.grips.held[o, arm] >= DWELL
@@ -89,90 +90,90 @@ class Together:
             fields: other values of some fields of the model.
             apart: steps arms that touch nothing.
         """
-        data = self._dynamics.pose(physics.qpos)
+        data, dt, bodies = self._dynamics.pose(physics.qpos), self._dynamics.dt, physics.objects.bodies
+        joints = self._finder.joints(data)
+        slots = self._finder.find(data, joints, physics.qvel, bodies, dt)
         near = self._pairs.overlap(data.geom_xpos, data.geom_xmat) if self._pairs.count else jnp.bool_(False)
-        depth = self._handling.find(data, physics.objects.bodies).points.depth.max(-1)
-        near |= jnp.max(jnp.where(self._mine.any(1), depth, -1.0), initial=-1.0) > -NEAR
+        near |= (self._on_arm(slots) < self._arms).any()
 
         def alone(physics: Physics, touch: Touch) -> tuple[Physics, Touch]:
-            objects = self._step_objects(physics.objects)
+            objects = self._step_objects(physics.objects, slots)
             physics, touch = apart(physics, touch)
             return physics._replace(objects=objects), touch
 
         def together(physics: Physics, touch: Touch) -> tuple[Physics, Touch]:
-            return self._step(self._dynamics.varied(fields), physics, touch)
+            return self._step(self._dynamics.varied(fields), physics, touch, slots, joints)
 
         return jax.lax.cond(near, together, alone, physics, touch)
 
-    def _step_objects(self, objects: Objects) -> Objects:
+    def _step_objects(self, objects: Objects, slots: Slots) -> Objects:
         """Return the objects after a step in which no arm is near."""
-        handling, bodies, dt = self._alone, objects.bodies, self._dynamics.dt
+        bodies, dt, none = objects.bodies, self._dynamics.dt, jnp.zeros(0)
         masses, free = self._free(bodies)
-        k = bodies.position.shape[0]
-        if k and len(handling.tables.stiffness):
-            felt = handling.feel(handling.find(None, bodies, None, dt), None, bodies, jnp.zeros(0), objects.grips, dt)
-            none = jnp.zeros(0)
-            rows = Rows(jnp.zeros((0, 6 * k)), none, none, none, none)
-            mass, smooth = _blocks(jnp.zeros((0, 0)), masses), (masses @ free[..., None]).ravel()
-            found = solve_contacts(mass, smooth, rows, felt.cones, bodies.acceleration.ravel(), *ITERATIONS)
-            free = found.acceleration.reshape(k, 6)
+        handling = Handling(self.tables, self._objects_alone)
+        felt = handling.feel(slots, None, None, none, bodies, objects.grips, dt)
+        rows = Rows(jnp.zeros((0, 0)), none, none, none, none)
+        problem = Problem(jnp.zeros((0, 0)), none, rows, rows, masses, free, felt.contacts, slots.count)
+        found = self._objects_alone.solve(problem, none, bodies.acceleration).objects
         grips = objects.grips
         loose = grips._replace(force=0 * grips.force, slid=0 * grips.slid, held=0 * grips.held)
-        return Objects(moved(bodies, free, dt), loose)
+        return Objects(moved(bodies, found, dt), loose)
 
-    def _step(self, dynamics: Dynamics, physics: Physics, touch: Touch) -> tuple[Physics, Touch]:
+    def _step(
+        self, dynamics: Dynamics, physics: Physics, touch: Touch, slots: Slots, joints: Joints
+    ) -> tuple[Physics, Touch]:
         """Return the state after a step of all arms and objects together.
 
         The arms' damping is part of their mass matrix here, so the solver sees the velocities at the end of the step.
         """
-        dt, (bodies, grips), handling = dynamics.dt, physics.objects, self._handling
-        forces, n, k = dynamics.forces(physics), len(physics.qvel), len(self.names)
+        dt, (bodies, grips) = dynamics.dt, physics.objects
+        handling, forces = Handling(self.tables, self._newton), dynamics.forces(physics)
         data = forces.data
-        felt = handling.feel(handling.find(data, bodies, data, dt), data, bodies, physics.qvel, grips, dt)
+        fingers = handling.fingers(data)
+        felt = handling.feel(slots, joints, fingers, physics.qvel, bodies, grips, dt)
         masses, free = self._free(bodies)
-        mass = _blocks(forces.mass + dt * forces.damping, masses)
-        smooth = jnp.concatenate([forces.smooth, (masses @ free[..., None]).ravel()])
-        joints = len(forces.rows.low)
-        rows, touching, closest = forces.rows, None, None
-        if self._pairs.count:
-            closest = self._pairs.closest(data.geom_xpos, data.geom_xmat)
-            touching = self._pairs.deepest(data, closest)
-            between = dynamics.contact_rows(touching.jacobian, touching.distance, touching.weight, physics.qvel)
-            rows = Rows(*(jnp.concatenate(parts) for parts in zip(rows, between, strict=True)))
-        wide = jnp.concatenate([rows.jacobian, jnp.zeros((len(rows.low), 6 * k))], 1)
-        start = jnp.concatenate([dynamics.relaxed(forces, physics.qacc_warmstart), bodies.acceleration.ravel()])
-        found = solve_contacts(mass, smooth, rows._replace(jacobian=wide), felt.cones, start, *ITERATIONS)
-        velocity = jnp.concatenate([physics.qvel, bodies.velocity.ravel()])
-        shift = dt * (velocity + dt * found.acceleration)
-        grips = handling.remember(felt, found.forces, data, bodies, shift, grips, dt)
-        qacc, qvel = found.acceleration[:n], shift[:n] / dt
-        objects = Objects(moved(bodies, found.acceleration[n:].reshape(k, 6), dt), grips)
-        after = Physics(physics.qpos + shift[:n], qvel, qacc, physics.ctrl, objects)
-        handled = jnp.maximum(touch.handled, self._hardest(felt, found.forces))
-        if touching is None or closest is None:
-            return after, touch._replace(handled=handled)
+        closest, touching, between = self._between(dynamics, data, physics.qvel)
+        problem = Problem(
+            forces.mass + dt * forces.damping, forces.smooth, forces.rows, between, masses, free, felt.contacts,
+            slots.count,
+        )  # fmt: skip
+        start = dynamics.relaxed(forces, physics.qacc_warmstart)
+        found = self._newton.solve(problem, start, bodies.acceleration)
+        qvel = physics.qvel + dt * found.arms
+        objects = moved(bodies, found.objects, dt)
+        shift = dt * qvel, dt * objects.velocity
+        grips = handling.remember(felt, slots, found.pressed, fingers, bodies, shift, grips, dt)
+        after = Physics(physics.qpos + shift[0], qvel, found.arms, physics.ctrl, Objects(objects, grips))
+        touch = touch._replace(handled=jnp.maximum(touch.handled, self._hardest(slots, found.pressed)))
+        if closest is None:
+            return after, touch
         its_own = touching.pair == np.arange(self._pairs.count)[:, None]
-        each = jnp.where(its_own, found.rows[joints:], 0.0).sum(-1)
+        each = jnp.where(its_own, found.between, 0.0).sum(-1)
         penetration = jnp.maximum(touch.penetration, -closest.distance)
-        return after, Touch(penetration, jnp.maximum(touch.force, each), handled)
+        return after, touch._replace(penetration=penetration, force=jnp.maximum(touch.force, each))
 
-    def _hardest(self, felt: Felt, forces: Forces) -> Array:
+    def _between(self, dynamics: Dynamics, data: Any, qvel: Array) -> tuple[Any, Any, Rows]:
+        """Return where arms are closest to each other, the deepest contacts and their rows; None, None without pairs."""
+        if not self._pairs.count:
+            none = jnp.zeros(0)
+            return None, None, Rows(jnp.zeros((0, len(qvel))), none, none, none, none)
+        closest = self._pairs.closest(data.geom_xpos, data.geom_xmat)
+        touching = self._pairs.deepest(data, closest)
+        rows = dynamics.contact_rows(touching.jacobian, touching.distance, touching.weight, qvel)
+        return closest, touching, rows
+
+    def _on_arm(self, slots: Slots) -> Array:
+        """Return the arm that the patch in each slot is on, [s]; the number of arms for none."""
+        arm = jnp.asarray(self.tables.owner.astype(np.int32))[slots.number]
+        return jnp.where(np.arange(len(slots.number)) < slots.count, arm, self._arms)
+
+    def _hardest(self, slots: Slots, pressed: Pressed) -> Array:
         """Return the largest normal force of a patch on each arm, N, [a]."""
-        pressed = forces.normal.sum(-1)
-        return jnp.max(jnp.where(self._mine, pressed[:, None], 0.0), 0, initial=0.0)
+        mine = self._on_arm(slots)[:, None] == np.arange(self._arms)
+        return jnp.max(jnp.where(mine, pressed.normal[:, None], 0.0), 0, initial=0.0)
 
     def _free(self, bodies: Bodies) -> tuple[Array, Array]:
         """Return the mass matrices [k, 6, 6] of the objects, and their accelerations [k, 6] without contacts."""
-        frames, masses = rotation(bodies.quaternion), self._handling.tables.masses
+        frames, masses = rotation(bodies.quaternion), self.tables.masses
         free = free_acceleration(bodies, masses, frames, jnp.asarray(GRAVITY), self._dynamics.dt)
         return inertias(masses, frames), free
-
-
-def _blocks(arms: Array, objects: Array) -> Array:
-    """Return the matrix with the arms' [n, n] and the objects' [k, 6, 6] along its diagonal."""
-    n, k = len(arms), len(objects)
-    mass = jnp.zeros((n + 6 * k, n + 6 * k)).at[:n, :n].set(arms)
-    for o in range(k):
-        own = slice(n + 6 * o, n + 6 * o + 6)
-        mass = mass.at[own, own].set(objects[o])
-    return mass

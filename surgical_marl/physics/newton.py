@@ -1,0 +1,374 @@
+"""The acceleration of arms and objects at which all forces balance, by Newton's method on what touches.
+
+All forces are gradients of convex functions of the acceleration (`solver.py`, `cone.py`), and so is their sum. A Newton
+step is a linear system in which each object is six numbers that only meet arms, so objects are eliminated first: what
+is left is as large as the arms, whatever the number of objects. Where two objects touch, the curvature of their contact
+is replaced by one that is larger and concerns each of them alone. The step then falls short, but still goes down.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.lax.linalg import triangular_solve
+
+from surgical_marl.physics.cone import Cone, curvature, forces, wrench
+from surgical_marl.physics.solver import Rows, solve_positive
+from surgical_marl.physics.touching import stored
+
+PASSES = 16
+"""Evaluations of all forces in a step at most."""
+ENOUGH = 0.3
+"""A step is long enough if the slope at its end is at most this share of that at its beginning."""
+LOOKS = 4
+"""Lengths of a step that are tried at most."""
+TOLERANCE = 1e-2
+"""Change of friction in a Newton step, as a share of the normal force, at which sliding contacts have converged."""
+
+
+class Contact(NamedTuple):
+    """A patch between bodies: what resists their relative acceleration. Batches [s]."""
+
+    cone: Cone
+    first: Array
+    """Number of its object, [], at whose centre of mass the twist is taken; that of no object if there is none."""
+    second: Array
+    """Number of the other object, []."""
+    offset: Array
+    """From the origin of the twist to the centre of mass of the other object, m, [3]."""
+    arm: Array
+    """Number of the arm that it is on, []."""
+    jacobian: Array
+    """Twist by velocity of that arm's joints, [6, m]."""
+
+
+class Problem(NamedTuple):
+    """What is to be solved: n joints of a arms, k objects, s contacts."""
+
+    mass: Array
+    """Mass matrix of the arms with the implicit parts of other forces, [n, n]."""
+    smooth: Array
+    """Sum of all other forces on the arms, [n]."""
+    rows: Rows
+    """Friction and limits of joints."""
+    between: Rows
+    """Contacts of arms with arms."""
+    masses: Array
+    """Mass matrices of the objects, [k, 6, 6]."""
+    free: Array
+    """Accelerations of the objects without contacts, [k, 6]."""
+    contacts: Contact
+    count: Array
+    """How many contacts there are, []."""
+
+
+class Pressed(NamedTuple):
+    """The forces of contacts, [s]."""
+
+    normal: Array
+    """Of all points together, N, [s]."""
+    friction: Array
+    """N, [s, 3]."""
+    sides: Array
+    """Which points press, and whether friction slips: bits, [s]."""
+
+
+SLIPS = 1 << 8
+"""The bit of `Pressed.sides` for friction that slips."""
+
+
+class Solution(NamedTuple):
+    """Accelerations of arms [n] and objects [k, 6], forces of contacts and of arms on arms, and passes taken []."""
+
+    arms: Array
+    objects: Array
+    pressed: Pressed
+    between: Array
+    passes: Array
+
+
+class _Point(NamedTuple):
+    arms: Array
+    objects: Array
+
+
+class _Local(NamedTuple):
+    """Sums over contacts: forces, and by how much they fall with the acceleration."""
+
+    arm_excess: Array
+    """[a, m]"""
+    arm: Array
+    """[a, m, m]"""
+    excess: Array
+    """[k, 6]"""
+    object: Array
+    """[k, 6, 6]"""
+    coupling: Array
+    """[k, a, 6, m]"""
+
+
+class Newton:
+    """Solves problems of one scene with k objects.
+
+    `dofs` [a, m] are the numbers of each arm's joints; where it has fewer than others, that of no joint.
+    """
+
+    def __init__(self, dofs: np.ndarray, joints: int, objects: int) -> None:
+        self._dofs, self._objects = dofs, objects
+        self._own = [np.flatnonzero(row < joints) for row in dofs]
+
+    def twist(self, contact: Contact, arms: Array, objects: Array) -> Array:
+        """Return the twist [6] of a contact by motions of arms [a, m] and objects [k, 6], both in memory."""
+        twist = objects.at[contact.first].get(mode="fill", fill_value=0.0)
+        if self._objects > 1:
+            other = objects.at[contact.second].get(mode="fill", fill_value=0.0)
+            twist -= _moved_to(other, contact.offset)
+        if len(self._dofs):
+            still = lambda twist: twist  # noqa: E731
+            with_arm = lambda twist: twist + contact.jacobian @ arms[contact.arm]  # noqa: E731
+            twist = jax.lax.cond(contact.arm < len(self._dofs), with_arm, still, twist)
+        return twist
+
+    def by_arm(self, joints: Array) -> Array:
+        """Return what belongs to the joints [n] of all arms by arm, in memory, [a, m]; 0 for joints that are not."""
+        return stored(jnp.append(joints, 0.0)[np.minimum(self._dofs, len(joints))])
+
+    def solve(self, problem: Problem, arms: Array, objects: Array) -> Solution:
+        """Return the accelerations and forces, beginning with accelerations of arms [n] and objects [k, 6]."""
+        begin, slots = _Point(arms, objects), len(problem.contacts.arm)
+        still = jax.tree.map(jnp.zeros_like, begin)
+        pressed = Pressed(jnp.zeros(slots), jnp.zeros((slots, 3)), jnp.full(slots, -1, jnp.int32))
+        zero = jnp.float32(0.0)
+        search = _Search(begin, still, zero, zero, jnp.float32(jnp.inf), zero, zero, zero, jnp.int32(0))
+        state = search, pressed, self._sides(problem, arms), jnp.bool_(False), jnp.int32(0)
+
+        def going(state: Any) -> Array:
+            _, _, _, settled, count = state
+            return ~settled & (count < PASSES)
+
+        def iterate(state: Any) -> Any:
+            search, before, sides, _, count = state
+            here = search.here()
+            local, pressed = self._contacts(problem, here)
+            excess, felt = self._excess(problem, here, local)
+            slope = -_dot(excess, search.way)
+            new_sides = self._sides(problem, here.arms)
+            same = (pressed.sides == before.sides).all() & (new_sides == sides).all() & (search.length == 1)
+            turned = jnp.sum((pressed.friction - before.friction) ** 2, -1) > TOLERANCE**2 * pressed.normal**2
+            settled = same & ~(turned & (pressed.sides >= SLIPS)).any()
+            if self._objects > 1:
+                settled &= jnp.abs(slope) <= TOLERANCE * jnp.abs(search.slope)
+            enough = settled | (jnp.abs(slope) <= ENOUGH * jnp.abs(search.slope)) | (search.looks >= LOOKS)
+
+            def on(search: _Search) -> _Search:
+                way = self._direction(problem, excess, local, felt)
+                return search.begin(here, way, -_dot(excess, way))
+
+            stay = lambda search: search.at(here)  # noqa: E731
+            accept = lambda search: jax.lax.cond(settled, stay, on, search)  # noqa: E731
+            search = jax.lax.cond(enough, accept, lambda search: search.look(slope), search)
+            pressed, sides = jax.tree.map(
+                lambda new, old: jnp.where(enough, new, old), (pressed, new_sides), (before, sides)
+            )
+            return search, pressed, sides, settled, count + 1
+
+        search, pressed, _, _, count = jax.lax.while_loop(going, iterate, state)
+        point = search.start
+        force = _clipped(problem.between, point.arms)
+        return Solution(point.arms, point.objects, pressed, force, count)
+
+    # -- forces at a point
+
+    def _contacts(self, problem: Problem, point: _Point) -> tuple[_Local, Pressed]:
+        """Return sums over all contacts, and their forces."""
+        k, (a, m) = self._objects, self._dofs.shape
+        arms, objects = self.by_arm(point.arms), stored(point.objects)
+        inertia = (problem.masses @ (problem.free - point.objects)[..., None])[..., 0]
+        none = _Local(jnp.zeros((a, m)), jnp.zeros((a, m, m)), inertia, problem.masses, jnp.zeros((k, a, 6, m)))
+
+        def one(local: _Local, row: tuple[Contact, Array]) -> tuple[_Local, Pressed]:
+            contact, number = row
+
+            def felt(local: _Local) -> tuple[_Local, Pressed]:
+                found = forces(contact.cone, self.twist(contact, arms, objects))
+                bits = jnp.where(found.normal > 0, 1 << np.arange(len(found.normal), dtype=np.int32), 0)
+                pressed = Pressed(
+                    jnp.sum(found.normal), found.friction, jnp.sum(bits) + jnp.where(found.slips, SLIPS, 0)
+                )
+                pull, stiff = wrench(contact.cone, found), curvature(contact.cone, found)
+                return self._add(local, contact, pull, stiff), pressed
+
+            nothing = Pressed(jnp.float32(0.0), jnp.zeros(3), jnp.int32(0))
+            return jax.lax.cond(number < problem.count, felt, lambda local: (local, nothing), local)
+
+        rows = problem.contacts, np.arange(len(problem.contacts.arm), dtype=np.int32)
+        return jax.lax.scan(one, none, rows)
+
+    def _add(self, local: _Local, contact: Contact, pull: Array, stiff: Array) -> _Local:
+        """Return sums with one more contact: the force and torque [6] on its first body, and how they fall [6, 6]."""
+        first, second = contact.first, contact.second
+        whole = stiff
+        if self._objects > 1:  # twice the curvature on each alone is more than the curvature on both
+            both = second < self._objects
+            whole = jnp.where(both, 2.0, 1.0) * stiff
+
+            def on_other(parts: tuple[Array, Array]) -> tuple[Array, Array]:
+                shift = _shift(contact.offset)
+                excess = parts[0].at[second].add(-(shift.T @ pull), mode="drop")
+                return excess, parts[1].at[second].add(shift.T @ whole @ shift, mode="drop")
+
+            parts = jax.lax.cond(both, on_other, lambda parts: parts, (local.excess, local.object))
+            local = local._replace(excess=parts[0], object=parts[1])
+        local = local._replace(
+            excess=local.excess.at[first].add(pull, mode="drop"),
+            object=local.object.at[first].add(whole, mode="drop"),
+        )
+        if not len(self._dofs):
+            return local
+
+        def on_arm(local: _Local) -> _Local:
+            arm, jacobian = contact.arm, contact.jacobian
+            half = stiff @ jacobian
+            return local._replace(
+                arm_excess=local.arm_excess.at[arm].add(jacobian.T @ pull),
+                arm=local.arm.at[arm].add(jacobian.T @ half),
+                coupling=local.coupling.at[first, arm].add(half, mode="drop"),
+            )
+
+        return jax.lax.cond(contact.arm < len(self._dofs), on_arm, lambda local: local, local)
+
+    def _excess(self, problem: Problem, point: _Point, local: _Local) -> tuple[_Point, Array]:
+        """Return the forces that are left over, and by how much those on arms [n, n] fall without the objects."""
+        rows, n = problem.rows, len(point.arms)
+        if not n:
+            return _Point(point.arms, local.excess), problem.mass
+        unbounded = rows.impedance * (rows.reference - rows.jacobian @ point.arms)
+        gives = jnp.where((unbounded > rows.low) & (unbounded < rows.high), rows.impedance, 0.0)
+        excess = problem.smooth - problem.mass @ point.arms + rows.jacobian.T @ jnp.clip(unbounded, rows.low, rows.high)
+        stiff = problem.mass + rows.jacobian.T @ (gives[:, None] * rows.jacobian)
+        for arm, own in enumerate(self._own):
+            dofs = self._dofs[arm, own]
+            excess = excess.at[dofs].add(local.arm_excess[arm, own])
+            stiff = stiff.at[np.ix_(dofs, dofs)].add(local.arm[arm][np.ix_(own, own)])
+
+        def press(total: tuple[Array, Array], row: Rows) -> tuple[tuple[Array, Array], None]:
+            force = row.impedance * (row.reference - row.jacobian @ point.arms)
+
+            def add(total: tuple[Array, Array]) -> tuple[Array, Array]:
+                whole = row.impedance * row.jacobian
+                return total[0] + force * row.jacobian, total[1] + whole[:, None] * row.jacobian
+
+            touches = (force > 0) & (jnp.abs(row.jacobian).max() > 0)
+            return jax.lax.cond(touches, add, lambda total: total, total), None
+
+        if len(problem.between.low):
+            (excess, stiff), _ = jax.lax.scan(press, (excess, stiff), problem.between)
+        return _Point(excess, local.excess), stiff
+
+    def _sides(self, problem: Problem, arms: Array) -> Array:
+        """Return which rows are between their bounds (0), which at the lower (-1) and which at the upper one, [r]."""
+        found = []
+        for rows in (problem.rows, problem.between):
+            unbounded = rows.impedance * (rows.reference - rows.jacobian @ arms)
+            found.append((unbounded > rows.low).astype(jnp.int32) - (unbounded < rows.high))
+        return jnp.concatenate(found)
+
+    # -- the way from there
+
+    def _direction(self, problem: Problem, excess: _Point, local: _Local, stiff: Array) -> _Point:
+        """Return the Newton step: objects are eliminated, arms solved, and objects found from them."""
+        n = len(excess.arms)
+
+        def eliminate(arms: tuple[Array, Array], row: Any) -> tuple[tuple[Array, Array], Any]:
+            own, force, coupling, coupled = row
+            factor = jax.lax.linalg.cholesky(own, symmetrize_input=False)
+            half = triangular_solve(factor, force[:, None], left_side=True, lower=True)[:, 0]
+
+            def on_arms(arms: tuple[Array, Array]) -> tuple[tuple[Array, Array], Array]:
+                wide = jnp.zeros((6, n))
+                for arm, joints in enumerate(self._own):
+                    wide = wide.at[:, self._dofs[arm, joints]].set(coupling[arm][:, joints])
+                wide = triangular_solve(factor, wide, left_side=True, lower=True)
+                return (arms[0] - wide.T @ wide, arms[1] - wide.T @ half), wide
+
+            alone = lambda arms: (arms, jnp.zeros((6, n)))  # noqa: E731
+            arms, wide = jax.lax.cond(coupled, on_arms, alone, arms) if n else alone(arms)
+            return arms, (factor, half, wide, coupled)
+
+        def back(row: Any) -> Array:
+            factor, half, wide, coupled = row
+            left = jax.lax.cond(coupled, lambda half: half - wide @ found, lambda half: half, half) if n else half
+            return triangular_solve(factor, left[:, None], left_side=True, lower=True, transpose_a=True)[:, 0]
+
+        rows = local.object, local.excess, local.coupling, self._coupled(problem)
+        (stiff, force), kept = jax.lax.scan(eliminate, (stiff, excess.arms), rows)
+        found = solve_positive(stiff, force) if n else force
+        return _Point(found, jax.lax.map(back, kept))
+
+    def _coupled(self, problem: Problem) -> Array:
+        """Return which objects touch an arm, [k]."""
+        contacts = problem.contacts
+        on_arm = (contacts.arm < len(self._dofs)) & (np.arange(len(contacts.arm)) < problem.count)
+        return jnp.stack([(on_arm & (contacts.first == o)).any() for o in range(self._objects)])
+
+
+class _Search(NamedTuple):
+    """A step from a start along a way, and which lengths of it were tried."""
+
+    start: _Point
+    way: _Point
+    length: Array
+    low: Array
+    """The longest length that was too short."""
+    high: Array
+    """The shortest one that was too long."""
+    slope: Array
+    """Of the cost along the way, at the start."""
+    slope_low: Array
+    slope_high: Array
+    looks: Array
+    """How many were tried."""
+
+    def here(self) -> _Point:
+        return jax.tree.map(lambda x, way: x + self.length * way, self.start, self.way)
+
+    def at(self, here: _Point) -> _Search:
+        return self._replace(start=here)
+
+    def begin(self, here: _Point, way: _Point, slope: Array) -> _Search:
+        """Return the search along a new way."""
+        zero = jnp.float32(0.0)
+        return _Search(here, way, jnp.float32(1.0), zero, jnp.float32(jnp.inf), slope, slope, zero, jnp.int32(0))
+
+    def look(self, slope: Array) -> _Search:
+        """Return the search with the length that comes next, where the line through both slopes is zero."""
+        short = slope < 0
+        low, slope_low = jnp.where(short, self.length, self.low), jnp.where(short, slope, self.slope_low)
+        high, slope_high = jnp.where(short, self.high, self.length), jnp.where(short, self.slope_high, slope)
+        share = jnp.clip(slope_low / jnp.minimum(slope_low - slope_high, -1e-30), 0.1, 0.9)
+        length = jnp.where(high < jnp.inf, low + share * (jnp.minimum(high, 1e9) - low), 2 * low)
+        return self._replace(
+            length=length, low=low, high=high, slope_low=slope_low, slope_high=slope_high, looks=self.looks + 1
+        )
+
+
+def _clipped(rows: Rows, arms: Array) -> Array:
+    return jnp.clip(rows.impedance * (rows.reference - rows.jacobian @ arms), rows.low, rows.high)
+
+
+def _dot(one: _Point, other: _Point) -> Array:
+    return jnp.sum(one.arms * other.arms) + jnp.sum(one.objects * other.objects)
+
+
+def _moved_to(twist: Array, offset: Array) -> Array:
+    """Return the twist [6] at a place from that of a body whose centre of mass is `offset` [3] away."""
+    return jnp.concatenate([twist[:3] - jnp.cross(twist[3:], offset), twist[3:]])
+
+
+def _shift(offset: Array) -> Array:
+    """Return the matrix [6, 6] of `_moved_to`."""
+    return jax.vmap(lambda unit: _moved_to(unit, offset), out_axes=1)(jnp.eye(6))

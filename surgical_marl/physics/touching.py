@@ -1,0 +1,228 @@
+"""Finds what touches objects and what is fixed in the world: at most `SLOTS` patches at a time.
+
+Pairs of bodies that are far from each other cost a distance of a ball. What is found is kept in slots, so that all that
+follows is in proportion to what touches, not to what could.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from surgical_marl.physics.bodies import Bodies, rotation
+from surgical_marl.physics.patches import Patch, find_patch, no_patch
+from surgical_marl.physics.shapes import Plate, Points, Segments, between_segments, on_plate
+from surgical_marl.physics.tables import Meeting, Tables
+
+SLOTS = 16
+"""Patches at one time; more are counted, and not felt."""
+NEAR = 1e-3
+"""Distance below which bodies count as touching, m."""
+
+
+class Slots(NamedTuple):
+    """The patches that were found, [s]."""
+
+    patch: Patch
+    number: Array
+    """Of each patch in `Tables`, [s]."""
+    count: Array
+    """How many were found, []; more than there are slots if some found no room."""
+
+
+class Way(NamedTuple):
+    """How bodies move in a step with the velocities of now: a point p of one by shift + turn x p. World, [n]."""
+
+    shift: Array
+    """m, [n, 3]"""
+    turn: Array
+    """rad, [n, 3]"""
+
+    def of(self, points: Points) -> Array:
+        """Return by how much points [c] come nearer along their normals in the step, if one body [] moves, m, [c]."""
+        return -jnp.sum((self.shift + jnp.cross(self.turn, points.place)) * points.normal, -1)
+
+
+class Joints(NamedTuple):
+    """The axes of the joints of arms, [a, m]. World."""
+
+    axis: Array
+    """[a, m, 3]"""
+    anchor: Array
+    """A point on the axis, [a, m, 3]."""
+
+    def columns(self, slides: Any, place: Array) -> tuple[Array, Array]:
+        """Return the velocity of places [..., 3] and the angular velocity by joint velocity, [..., 3] both."""
+        moving = jnp.where(slides[..., None], self.axis, jnp.cross(self.axis, place - self.anchor))
+        return moving, jnp.where(slides[..., None], 0.0, self.axis)
+
+
+class Placed(NamedTuple):
+    """Where all bodies are and how they move."""
+
+    position: Array
+    """Centres of mass of the objects, [k, 3]."""
+    frames: Array
+    """Axes of their frames, [k, 3, 3]."""
+    pads: Plate
+    """[f]"""
+    links: Segments
+    """[l]"""
+    ways: dict[str, Way]
+    """Of what moves, by kind of body."""
+
+
+class Finder:
+    """Finds the patches of a scene."""
+
+    def __init__(self, tables: Tables) -> None:
+        self._tables = tables
+        self.slots = min(SLOTS, len(tables.stiffness))
+
+    def joints(self, data: Any) -> Joints:
+        """Return the axes of the arms' joints, in memory, from MJX's data with poses."""
+        pad = lambda x: jnp.concatenate([x, jnp.zeros((1, 3))])[self._tables.dofs]  # noqa: E731
+        return stored(Joints(pad(data.xaxis), pad(data.xanchor)))
+
+    def find(self, data: Any, joints: Joints | None, qvel: Array, bodies: Bodies, dt: Any) -> Slots:
+        """Return the patches between bodies that are near each other, or will be after a step.
+
+        Args:
+            data: MJX's data with the poses of the arms.
+            joints: axes of the arms' joints; None without arms.
+            qvel: velocities of the arms' joints.
+            bodies: the objects.
+            dt: time over which motions are looked ahead, s.
+        """
+        placed = self._place(data, joints, qvel, bodies, dt)
+        none, number = jnp.int32(0), 0
+        slots = Slots(
+            jax.tree.map(lambda x: jnp.broadcast_to(x, (self.slots, *x.shape)), no_patch()),
+            jnp.zeros(self.slots, jnp.int32),
+            none,
+        )
+        for meeting in self._tables.meetings:
+            numbers = np.arange(number, number + len(meeting.one), dtype=np.int32)
+            number += len(meeting.one)
+            rows = meeting.one.astype(np.int32), meeting.other.astype(np.int32), numbers
+            slots, _ = jax.lax.scan(
+                lambda slots, row, m=meeting: (self._look(placed, m, slots, *row), None), slots, rows
+            )
+        return slots
+
+    def _look(self, placed: Placed, meeting: Meeting, slots: Slots, i: Array, j: Array, number: Array) -> Slots:
+        """Return the slots with the patch of two bodies, if they are near each other."""
+        t = self._tables
+        if meeting.first == "objects":
+            centre, bound = placed.position[i], _constant(t.bound)[i]
+        else:
+            links = placed.links
+            centre = (links.start[i] + links.end[i]) / 2
+            bound = _constant(t.link_half + t.link_radius)[i]
+        its = placed.ways.get(meeting.second)
+        ways = _row(placed.ways[meeting.first], i), None if its is None else _row(its, j)
+        speed = sum(_size(way.shift + jnp.cross(way.turn, centre)) + _size(way.turn) * bound for way in ways if way)
+        near = self._distance(placed, meeting.second, j, centre) - bound < NEAR + speed
+        return jax.lax.cond(near, lambda s: self._meet(placed, meeting, s, i, j, number, ways), lambda s: s, slots)
+
+    def _meet(
+        self,
+        placed: Placed,
+        meeting: Meeting,
+        slots: Slots,
+        i: Array,
+        j: Array,
+        number: Array,
+        ways: tuple[Way, Way | None],
+    ) -> Slots:
+        one = self._capsules(placed, meeting.first, i)
+        first = jax.tree.map(lambda x: x[:, None], one)
+        if meeting.second in ("pads", "plates"):
+            plate = self._plate(placed, meeting.second, j)
+            points, axes = on_plate(first, jax.tree.map(lambda x: x[None, None], plate)), plate.frame[:, :2].T
+        else:
+            other = self._capsules(placed, meeting.second, j)
+            points, axes = between_segments(first, jax.tree.map(lambda x: x[None], other)), jnp.eye(3)[:2]
+        points = Points(points.depth.reshape(-1), points.place.reshape(-1, 3), points.normal.reshape(-1, 3))
+        soon = points.depth + ways[0].of(points) - (0.0 if ways[1] is None else ways[1].of(points))
+        patch = find_patch(points, soon, axes, _constant(self._tables.torsion)[number])
+        touches = jnp.maximum(jnp.max(points.depth), jnp.max(soon)) > -NEAR
+        place = jnp.where(touches, slots.count, self.slots)
+        put = lambda all_, one: all_.at[place].set(one, mode="drop")  # noqa: E731
+        return Slots(
+            jax.tree.map(put, slots.patch, patch), put(slots.number, number), slots.count + touches.astype(jnp.int32)
+        )
+
+    # -- bodies
+
+    def _place(self, data: Any, joints: Joints | None, qvel: Array, bodies: Bodies, dt: Any) -> Placed:
+        t, turn = self._tables, dt * bodies.velocity[:, 3:]
+        ways = {"objects": Way(dt * bodies.velocity[:, :3] - jnp.cross(turn, bodies.position), turn)}
+        frames, none = rotation(bodies.quaternion), jnp.zeros((0, 3))
+        pads, links = Plate(none, jnp.zeros((0, 3, 3)), none, none), Segments(none, none, none)
+        if joints is not None:
+            frame = jnp.matmul(data.geom_xmat[t.pad_geoms], jnp.asarray(t.pad_axes))
+            pads = Plate(data.geom_xpos[t.pad_geoms], frame, _constant(t.pad_half), _constant(t.pad_radius))
+            half = jnp.asarray(t.link_half)[:, None] * data.geom_xmat[t.near][:, :, 2]
+            centre = data.geom_xpos[t.near]
+            links = Segments(centre - half, centre + half, _constant(t.link_radius))
+            pads = pads._replace(centre=stored(pads.centre), frame=stored(pads.frame))
+            links = links._replace(start=stored(links.start), end=stored(links.end))
+            shift, spin = joints.columns(jnp.asarray(t.slides), jnp.zeros(3))
+            moves = dt * jnp.append(qvel, 0.0)[t.dofs]
+            moves = stored((shift * moves[..., None], spin * moves[..., None]))
+            for kind in t.bodies:
+                ways[kind] = Way(*jax.lax.map(lambda row: _moved(*row, moves), (t.arm_of[kind], t.moves[kind])))
+        return Placed(stored(bodies.position), stored(frames), pads, links, ways | {"objects": stored(ways["objects"])})
+
+    def _capsules(self, placed: Placed, kind: str, i: Array) -> Segments:
+        """Return the capsules of one body, [c]."""
+        t = self._tables
+        if kind == "objects":
+            frame, at = placed.frames[i], placed.position[i]
+            start, end = (at + _constant(x)[i] @ frame.T for x in (t.start, t.end))
+            return Segments(start, end, _constant(t.radius)[i])
+        of = placed.links if kind == "links" else jax.tree.map(_constant, t.rods)
+        return jax.tree.map(lambda x: x[i][None], of)
+
+    def _plate(self, placed: Placed, kind: str, j: Array) -> Plate:
+        return _row(placed.pads if kind == "pads" else jax.tree.map(_constant, self._tables.plates), j)
+
+    def _distance(self, placed: Placed, kind: str, j: Array, point: Array) -> Array:
+        """Return a lower bound of the distance of a point from a body, m; exact for plates and capsules."""
+        if kind == "objects":
+            return _size(point - placed.position[j]) - _constant(self._tables.bound)[j]
+        if kind in ("pads", "plates"):
+            plate = self._plate(placed, kind, j)
+            local = (point - plate.centre) @ plate.frame
+            beside = local[:2] - jnp.clip(local[:2], -plate.half, plate.half)
+            return jnp.sqrt(jnp.sum(beside * beside) + local[2] * local[2]) - plate.radius
+        rod = _row(self._capsules(placed, kind, j), 0)
+        way = rod.end - rod.start
+        share = jnp.clip((point - rod.start) @ way / jnp.maximum(way @ way, 1e-12), 0.0, 1.0)
+        return _size(point - rod.start - share * way) - rod.radius
+
+
+def stored(tree: Any) -> Any:
+    """Return the same arrays: the fused engine keeps what a loop has written in memory, where it can be looked up."""
+    return jax.lax.map(lambda row: row, tree)
+
+
+def _moved(arm: Array, moves: Array, joints: tuple[Array, Array]) -> tuple[Array, Array]:
+    return tuple(moves @ of[arm] for of in joints)  # type: ignore[return-value]
+
+
+def _constant(x: Any) -> Array:
+    return jnp.asarray(x)
+
+
+def _row(tree: Any, i: Array | int) -> Any:
+    return jax.tree.map(lambda x: x[i], tree)
+
+
+def _size(vector: Array) -> Array:
+    return jnp.sqrt(jnp.sum(vector * vector, -1))
