@@ -36,7 +36,7 @@ def gather(g: Graph, shape: Any, params: Any, operand: Traced | Table, indices: 
     for axis, start in zip(numbers.operand_batching_dims, numbers.start_indices_batching_dims, strict=True):
         place[axis] = place[axis] + batch[start]
     raw = indices.ids if isinstance(indices, Symbolic) else indices
-    starts = {axis: raw[(*batch, k)] for k, axis in enumerate(numbers.start_index_map)}
+    starts = {axis: np.broadcast_to(raw[(*batch, k)], shape) for k, axis in enumerate(numbers.start_index_map)}
     fill = _fill(g, params, operand) if "fill" in str(params["mode"]).lower() else None
     if isinstance(indices, Symbolic):
         return _choose(g, operand, sizes, place, starts, fill)
