@@ -93,7 +93,17 @@ class Handling:
             twist = self._newton.twist(contact, *speeds)
             return Felt(self._resisting(contact, patch, number, slip, twist, dt), slip)
 
-        return jax.lax.map(one, (slots.patch, slots.number))
+        def nothing(_: None) -> Felt:
+            t, shapes = self.tables, jax.eval_shape(lambda: one((_row(slots.patch, 0), slots.number[0])))
+            none = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+            nobody = (jnp.int32(t.count), jnp.int32(t.count), jnp.int32(t.arms))
+            first, second, arm = nobody
+            return none._replace(contacts=none.contacts._replace(first=first, second=second, arm=arm))
+
+        def each(row: tuple[Patch, Array, Array]) -> Felt:
+            return jax.lax.cond(row[2] < slots.count, lambda row: one(row[:2]), lambda _: nothing(None), row)
+
+        return jax.lax.map(each, (slots.patch, slots.number, np.arange(len(slots.number), dtype=np.int32)))
 
     def _contact(self, patch: Patch, number: Array, joints: Joints | None, position: Array) -> Contact:
         """Return what a patch is between, and its directions; nothing of it resists yet."""

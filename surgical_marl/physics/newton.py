@@ -193,25 +193,26 @@ class Newton:
         def one(local: _Local, row: tuple[Contact, Array]) -> tuple[_Local, Pressed]:
             contact, number = row
 
-            def felt(local: _Local) -> tuple[_Local, Pressed]:
+            def felt(_: None) -> tuple[Pressed, Array, Array]:
                 found = forces(contact.cone, self.twist(contact, arms, objects))
                 bits = jnp.where(found.normal > 0, 1 << np.arange(len(found.normal), dtype=np.int32), 0)
                 pressed = Pressed(
                     jnp.sum(found.normal), found.friction, jnp.sum(bits) + jnp.where(found.slips, SLIPS, 0)
                 )
-                pull, stiff = wrench(contact.cone, found), curvature(contact.cone, found)
-                return self._add(local, contact, pull, stiff), pressed
+                return pressed, wrench(contact.cone, found), curvature(contact.cone, found)
 
-            nothing = Pressed(jnp.float32(0.0), jnp.zeros(3), jnp.int32(0))
-            return jax.lax.cond(number < problem.count, felt, lambda local: (local, nothing), local)
+            def nothing(_: None) -> tuple[Pressed, Array, Array]:
+                return Pressed(jnp.float32(0.0), jnp.zeros(3), jnp.int32(0)), jnp.zeros(6), jnp.zeros((6, 6))
+
+            pressed, pull, stiff = jax.lax.cond(number < problem.count, felt, nothing, None)
+            return self._add(local, contact, pull, stiff), pressed
 
         rows = problem.contacts, np.arange(len(problem.contacts.arm), dtype=np.int32)
         return jax.lax.scan(one, none, rows)
 
     def _add(self, local: _Local, contact: Contact, pull: Array, stiff: Array) -> _Local:
         """Return sums with one more contact: the force and torque [6] on its first body, and how they fall [6, 6]."""
-        first, second = contact.first, contact.second
-        whole = stiff
+        first, second, whole = contact.first, contact.second, stiff
         if self._objects > 1:  # twice the curvature on each alone is more than the curvature on both
             both = second < self._objects
             whole = jnp.where(both, 2.0, 1.0) * stiff
@@ -234,8 +235,8 @@ class Newton:
             arm, jacobian = contact.arm, contact.jacobian
             half = stiff @ jacobian
             return local._replace(
-                arm_excess=local.arm_excess.at[arm].add(jacobian.T @ pull),
-                arm=local.arm.at[arm].add(jacobian.T @ half),
+                arm_excess=local.arm_excess.at[arm].add(jacobian.T @ pull, mode="clip"),
+                arm=local.arm.at[arm].add(jacobian.T @ half, mode="clip"),
                 coupling=local.coupling.at[first, arm].add(half, mode="drop"),
             )
 

@@ -6,7 +6,7 @@ if any of them takes it, and its results are blended. The differences are in two
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -84,7 +84,12 @@ class Emitter(ArrayEmitter):
     def _branch(self, number: int, branch: Branch) -> None:
         wanted, condition = self.schedule.alive[number], self._name(branch.condition)
         outs = [branch.outs[k] for k in wanted]
+        kept = {self.names[self.schedule.kept[out]]: out for out in outs if out in self.schedule.kept}
+        for name, out in kept.items():
+            self.names[out] = name
         for out in outs:
+            if out in self.schedule.kept:
+                continue
             self.names[out] = f"v{out}"
             if self._is_array(out):
                 self._declare(f"v{out}", self.graph.kinds[out])
@@ -95,7 +100,7 @@ class Emitter(ArrayEmitter):
 
         def take(values: list[Value], first: bool) -> Any:
             def result(k: int) -> None:
-                name, value = f"v{outs[k]}", self._name(values[wanted[k]])
+                name, value = self.names[outs[k]], self._name(values[wanted[k]])
                 kept = condition if self.vector and not first else ""
                 if self._is_array(outs[k]):
                     self._copy(name, value, self.graph.kinds[outs[k]], kept)
@@ -105,12 +110,21 @@ class Emitter(ArrayEmitter):
             return result
 
         self.lines.append(f"if(ANY({condition})){{")
-        with self._side(number, condition):
+        with self._side(number, condition), self._kept(kept, f"NOT({condition})"):
             self._region(chosen, take(branch.chosen, True))
         self.lines.append(f"}}\nif(ANY(NOT({condition}))){{" if self.vector else "}else{")
-        with self._side(number, f"NOT({condition})"):
+        with self._side(number, f"NOT({condition})"), self._kept(kept, condition):
             self._region(other, take(branch.others, False))
         self.lines.append("}")
+
+    @contextmanager
+    def _kept(self, arrays: Iterable[str], condition: str) -> Iterator[None]:
+        """Let a side of a branch change arrays for those environments of a vector alone that take it."""
+        before = dict(self.kept)
+        if self.vector:
+            self.kept.update({name: f"({condition}|{before[name]})" if name in before else condition for name in arrays})
+        yield
+        self.kept = before
 
     @contextmanager
     def _side(self, number: int, condition: str) -> Iterator[None]:

@@ -110,7 +110,7 @@ class ArrayEmitter:
     def _put(self, value: Value) -> None:
         array, index, *values = self.graph.args[value]
         name = self.names[array]
-        if self.schedule.replaced.get(array) != value:
+        if value not in self.schedule.takers:
             self._declare(f"v{value}", self.graph.kinds[value])
             self._copy(f"v{value}", name, self.graph.kinds[value])
             name = f"v{value}"

@@ -8,6 +8,7 @@ Within a region values are computed depth first from the results, the operand wi
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
@@ -43,8 +44,12 @@ class Schedule:
     """Group -> which of its outs (or phis) are needed."""
     outside: dict[int, list[Value]]
     """Group -> the values from around it that it reads."""
-    replaced: dict[Value, Value]
-    """Array -> the `put` that may take over its memory, as all else that reads the array comes before."""
+    replaced: set[Value]
+    """Arrays whose memory something else takes over."""
+    takers: set[Value]
+    """The `put`s that take over the memory of the array they change, as all else that reads it comes before."""
+    kept: dict[Value, Value]
+    """Out of a branch -> the array whose memory it takes over: both sides leave it there, changed or not."""
 
 
 class Scheduler:
@@ -72,7 +77,13 @@ class Scheduler:
         for number in range(len(self.regions)):
             self._order(number)
         return Schedule(
-            self.regions, self.inside, self.alive, {n: self._all_reads(n) for n in self.inside}, self.replaced
+            self.regions,
+            self.inside,
+            self.alive,
+            {n: self._all_reads(n) for n in self.inside},
+            self.replaced,
+            self.takers,
+            self.kept,
         )
 
     # -- what is needed
@@ -214,34 +225,88 @@ class Scheduler:
     # -- arrays in memory
 
     def _replace(self) -> None:
-        """Find the arrays that a `put` may change in place, and what has to come before it (`_before`).
+        """Find the arrays that a `put`, or a branch, may change in place, and what has to come before it (`_before`).
 
         A node that was made earlier can't depend on one that was made later. So the other readers of the array can come
         first if all of them were made earlier.
         """
         g = self.graph
-        self.replaced: dict[Value, Value] = {}
+        self.replaced: set[Value] = set()
+        self.takers: set[Value] = set()
+        self.kept: dict[Value, Value] = {}
         self._before: dict[Value, list[Value]] = {}
-        readers: dict[Value, list[Value]] = {}
+        self._readers: dict[Value, list[Value]] = {}
         for value in self.needed:
             if g.ops[value] in ("read", "put"):
-                readers.setdefault(g.args[value][0], []).append(value)
-        held = {value for number in self.inside for value in self._results_of(number)}
-        starts: dict[Value, list[Value]] = {}
+                self._readers.setdefault(g.args[value][0], []).append(value)
         for number in self.inside:
             group = g.groups[number]
             if isinstance(group, Loop):
                 for k in self.alive[number]:
-                    starts.setdefault(group.starts[k], []).append(group.outs[k])
-        for array, known in readers.items():
-            others = [*known, *starts.get(array, [])]
-            last = max(others)
-            if g.ops[last] != "put" or array in held or self.place[last] != self.place[array]:
+                    self._readers.setdefault(group.starts[k], []).append(group.outs[k])
+        held = Counter(value for number in self.inside for value in self._results_of(number))
+        for array, known in self._readers.items():
+            last = max(known)
+            if g.ops[last] == "put" and array not in held and self.place[last] == self.place[array]:
+                before = self._come_first(self.place[last], last, [value for value in known if value != last])
+                if before is not None:
+                    self._take(array, [last], {last: before})
+        for number in self.inside:
+            branch = g.groups[number]
+            if isinstance(branch, Branch):
+                for k in self.alive[number]:
+                    if len(g.kinds[branch.outs[k]]) > 1:
+                        self._keep(number, branch, k, held)
+
+    def _keep(self, number: int, branch: Branch, k: int, held: Counter[Value]) -> None:
+        """Let a branch leave an array where it is, if one side changes it by `put`s and the other one too, or not."""
+        inner, region = self.inside[number], self.group_place[number]
+        ends = branch.chosen[k], branch.others[k]
+        chains = [self._chain(end, side) for end, side in zip(ends, inner, strict=True)]
+        array = chains[0][-1]
+        if chains[1][-1] != array or array < 0 or self.place.get(array) != region:
+            return
+        if held[array] != ends.count(array) or array in self.replaced or any(held[end] > 1 for end in ends):
+            return
+        puts = [chain[-2] for chain in chains if len(chain) > 1]
+        within = {put: self.place[put] for put in puts}
+        order: dict[Value, list[Value]] = {put: [] for put in puts}
+        outside = []
+        for value in self._readers.get(array, []):
+            if value in puts:
                 continue
-            items = [self._around_in(self.place[last], value) for value in others if value != last]
-            if all(value is not None and value < last for value in items):
-                self.replaced[array] = last
-                self._before[last] = [value for value in items if value is not None]
+            home = next((put for put, side in within.items() if self._around_in(side, value) is not None), None)
+            if home is not None:
+                order[home].append(value)
+            elif all(self._around_in(side, value) is None for side in inner):
+                outside.append(value)
+        first = min(branch.outs[j] for j in self.alive[number])
+        before = self._come_first(region, first, outside)
+        inside = {put: self._come_first(within[put], put, values) for put, values in order.items()}
+        if before is None or any(values is None for values in inside.values()):
+            return
+        self._take(array, puts, {**inside, branch.outs[self.alive[number][0]]: before})  # type: ignore[dict-item]
+        self.kept[branch.outs[k]] = array
+
+    def _take(self, array: Value, puts: list[Value], before: dict[Value, list[Value]]) -> None:
+        self.replaced.add(array)
+        self.takers.update(puts)
+        for value, readers in before.items():
+            self._before.setdefault(value, []).extend(readers)
+
+    def _chain(self, value: Value, region: int) -> list[Value]:
+        """Return an array, the one that it is a changed copy of, and so on, until one was made outside of a region."""
+        chain = [value]
+        while value >= 0 and self.graph.ops[value] == "put" and self.place[value] == region:
+            value = self.graph.args[value][0]
+            chain.append(value)
+        return chain
+
+    def _come_first(self, region: int, last: Value, values: list[Value]) -> list[Value] | None:
+        """Return what has to come first in a region, so that all of these values come before another; None if some
+        can't."""
+        items = [self._around_in(region, value) for value in values]
+        return None if any(item is None or item >= last for item in items) else items  # type: ignore[return-value]
 
     def _results_of(self, number: int) -> Iterable[Value]:
         group = self.graph.groups[number]
@@ -318,7 +383,8 @@ class Scheduler:
     def _item_reads(self, item: tuple[str, int]) -> list[Value]:
         kind, number = item
         if kind == "group":
-            return self._all_reads(number)
+            first = self.graph.groups[number].outs[self.alive[number][0]]
+            return [*self._all_reads(number), *self._before.get(first, [])]
         return self.graph.reads(number) + self._before.get(number, [])
 
     def _all_reads(self, number: int) -> list[Value]:
