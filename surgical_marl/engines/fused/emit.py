@@ -137,7 +137,9 @@ class Emitter(ArrayEmitter):
         names, size = dict(self.names), sum(len(self.schedule.regions[r].items) for r in self.schedule.inside[number])
         if size > LARGE and not self.vector:
             for value in self.schedule.outside[number]:
-                if self.graph.kind(value) != "b" and self.names[value].isalnum() and not self._is_array(value):
+                if self._is_array(value) or self.graph.kind(value) == "b":
+                    continue
+                if self.names[value].isalnum():
                     kind = TYPES[self.graph.kind(value)]
                     self.lines.append(f"{kind} h{value}={self._name(value)};HIDE{kind}(h{value})")
                     self.names[value] = f"h{value}"
