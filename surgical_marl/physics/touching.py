@@ -20,6 +20,8 @@ from surgical_marl.physics.tables import Meeting, Tables
 
 SLOTS = 16
 """Patches at one time; more are counted, and not felt."""
+NEAREST = 16
+"""Pairs of two kinds of body that are near at one time; more are counted as patches that found no room."""
 NEAR = 1e-3
 """Distance below which bodies count as touching, m."""
 
@@ -106,39 +108,58 @@ class Finder:
             none,
         )
         for meeting in self._tables.meetings:
-            numbers = np.arange(number, number + len(meeting.one), dtype=np.int32)
+            slots = self._meet(placed, meeting, number, slots)
             number += len(meeting.one)
-            rows = meeting.one.astype(np.int32), meeting.other.astype(np.int32), numbers
-            slots, _ = jax.lax.scan(
-                lambda slots, row, m=meeting: (self._look(placed, m, slots, *row), None), slots, rows
-            )
         return slots
 
-    def _look(self, placed: Placed, meeting: Meeting, slots: Slots, i: Array, j: Array, number: Array) -> Slots:
-        """Return the slots with the patch of two bodies, if they are near each other."""
-        t = self._tables
-        if meeting.first == "objects":
-            centre, bound = placed.position[i], _constant(t.bound)[i]
-        else:
-            links = placed.links
-            centre = (links.start[i] + links.end[i]) / 2
-            bound = _constant(t.link_half + t.link_radius)[i]
-        its = placed.ways.get(meeting.second)
-        ways = _row(placed.ways[meeting.first], i), None if its is None else _row(its, j)
-        speed = sum(_size(way.shift + jnp.cross(way.turn, centre)) + _size(way.turn) * bound for way in ways if way)
-        near = self._distance(placed, meeting.second, j, centre) - bound < NEAR + speed
-        return jax.lax.cond(near, lambda s: self._meet(placed, meeting, s, i, j, number, ways), lambda s: s, slots)
+    def _meet(self, placed: Placed, meeting: Meeting, start: int, slots: Slots) -> Slots:
+        """Return the slots with the patches of a meeting, whose numbers begin at `start`.
 
-    def _meet(
-        self,
-        placed: Placed,
-        meeting: Meeting,
-        slots: Slots,
-        i: Array,
-        j: Array,
-        number: Array,
-        ways: tuple[Way, Way | None],
-    ) -> Slots:
+        Pairs that are near are listed first. Environments that run side by side then look closely at as many pairs as
+        the one of them with most, and not at all that are near in any of them.
+        """
+        most = min(NEAREST, len(meeting.one))
+
+        def look(found: tuple[Array, Array], pair: Array) -> tuple[tuple[Array, Array], None]:
+            pairs, count = found
+            near = self._is_near(placed, meeting, pair)
+            pairs = pairs.at[jnp.where(near, count, most)].set(pair, mode="drop")
+            return (pairs, count + near.astype(jnp.int32)), None
+
+        none = jnp.zeros(most, jnp.int32), jnp.int32(0)
+        (pairs, count), _ = jax.lax.scan(look, none, np.arange(len(meeting.one), dtype=np.int32))
+
+        def meet(n: Array, slots: Slots) -> Slots:
+            patch, touches = self._patch(placed, meeting, start, pairs[n])
+            place = jnp.where(touches, slots.count, self.slots)
+            put = lambda all_, one: all_.at[place].set(one, mode="drop")  # noqa: E731
+            number = start + pairs[n]
+            return Slots(jax.tree.map(put, slots.patch, patch), put(slots.number, number), slots.count + touches)
+
+        slots = jax.lax.fori_loop(0, jnp.minimum(count, most), meet, slots)
+        return slots._replace(count=slots.count + jnp.maximum(count - most, 0))
+
+    def _is_near(self, placed: Placed, meeting: Meeting, pair: Array) -> Array:
+        """Return whether two bodies may touch in the next step, []."""
+        i, j = _numbers(meeting, pair)
+        ways = self._ways(placed, meeting, i, j)
+        if meeting.first == "objects":
+            centre, bound = placed.position[i], _constant(self._tables.bound)[i]
+            distance = self._distance(placed, meeting.second, j, centre) - bound
+        else:
+            link = _row(self._capsules(placed, "links", i), 0)
+            centre, bound = (link.start + link.end) / 2, _constant(self._tables.link_half + self._tables.link_radius)[i]
+            distance = self._link_distance(placed, meeting.second, j, link)
+        speed = sum(_size(way.shift + jnp.cross(way.turn, centre)) + _size(way.turn) * bound for way in ways if way)
+        return distance < NEAR + speed
+
+    def _ways(self, placed: Placed, meeting: Meeting, i: Array, j: Array) -> tuple[Way, Way | None]:
+        its = placed.ways.get(meeting.second)
+        return _row(placed.ways[meeting.first], i), None if its is None else _row(its, j)
+
+    def _patch(self, placed: Placed, meeting: Meeting, start: int, pair: Array) -> tuple[Patch, Array]:
+        """Return the patch of two bodies, and whether they touch, 1 or 0."""
+        i, j = _numbers(meeting, pair)
         one = self._capsules(placed, meeting.first, i)
         first = jax.tree.map(lambda x: x[:, None], one)
         if meeting.second in ("pads", "plates"):
@@ -148,14 +169,11 @@ class Finder:
             other = self._capsules(placed, meeting.second, j)
             points, axes = between_segments(first, jax.tree.map(lambda x: x[None], other)), jnp.eye(3)[:2]
         points = Points(points.depth.reshape(-1), points.place.reshape(-1, 3), points.normal.reshape(-1, 3))
+        ways = self._ways(placed, meeting, i, j)
         soon = points.depth + ways[0].of(points) - (0.0 if ways[1] is None else ways[1].of(points))
-        patch = find_patch(points, soon, axes, _constant(self._tables.torsion)[number])
+        patch = find_patch(points, soon, axes, _constant(self._tables.torsion)[start + pair])
         touches = jnp.maximum(jnp.max(points.depth), jnp.max(soon)) > -NEAR
-        place = jnp.where(touches, slots.count, self.slots)
-        put = lambda all_, one: all_.at[place].set(one, mode="drop")  # noqa: E731
-        return Slots(
-            jax.tree.map(put, slots.patch, patch), put(slots.number, number), slots.count + touches.astype(jnp.int32)
-        )
+        return patch, touches.astype(jnp.int32)
 
     # -- bodies
 
@@ -205,6 +223,20 @@ class Finder:
         way = rod.end - rod.start
         share = jnp.clip((point - rod.start) @ way / jnp.maximum(way @ way, 1e-12), 0.0, 1.0)
         return _size(point - rod.start - share * way) - rod.radius
+
+    def _link_distance(self, placed: Placed, kind: str, j: Array, link: Segments) -> Array:
+        """Return a lower bound of the distance of a link from what is fixed, m; exact for rods."""
+        if kind == "rods":
+            return -between_segments(link, _row(self._capsules(placed, kind, j), 0)).depth
+        plate = self._plate(placed, kind, j)
+        heights = jnp.stack([(end - plate.centre) @ plate.frame[:, 2] for end in (link.start, link.end)])
+        beyond = jnp.maximum(jnp.min(heights), -jnp.max(heights))  # on one side of the middle plane, if above 0
+        return jnp.maximum(beyond, 0.0) - plate.radius - link.radius
+
+
+def _numbers(meeting: Meeting, pair: Array) -> tuple[Array, Array]:
+    """Return the numbers of the two bodies of a pair."""
+    return tuple(jnp.asarray(of.astype(np.int32))[pair] for of in (meeting.one, meeting.other))  # type: ignore[return-value]
 
 
 def stored(tree: Any) -> Any:

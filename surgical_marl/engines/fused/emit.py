@@ -122,7 +122,9 @@ class Emitter(ArrayEmitter):
         """Let a side of a branch change arrays for those environments of a vector alone that take it."""
         before = dict(self.kept)
         if self.vector:
-            self.kept.update({name: f"({condition}|{before[name]})" if name in before else condition for name in arrays})
+            self.kept.update(
+                {name: f"({condition}|{before[name]})" if name in before else condition for name in arrays}
+            )
         yield
         self.kept = before
 
