@@ -18,6 +18,11 @@ from surgical_marl.physics.tables import Tables
 
 DAMPING = 5e-3
 """Damping of a contact in the normal direction, s: this times its stiffness, N s/m."""
+FIRM = 1e-5
+"""Overlap from which on that damping is whole, m. It begins with none (K. H. Hunt and F. R. E. Crossley, 1975), so that
+the force of a contact is continuous where it begins, and nothing is slowed before it touches."""
+MARGIN = 5e-5
+"""Distance within which a point that might touch during the step is watched, m: its stiffness grows from none there."""
 DEEPEST = 3e-4
 """Overlap that counts, m. A deeper one, as after a fall within one step, is pushed out no faster."""
 SHEAR = 0.8
@@ -88,6 +93,8 @@ class Handling:
         self._roots, self._root_of = model.body_rootid[model.dof_bodyid], model.body_rootid
         sign = lambda body: np.where(body[:, None] >= 0, moved[np.maximum(body, 0)], 0.0)  # noqa: E731
         self._links = (sign(t.first_body) - sign(t.second_body)).astype(np.float32)
+        self._body = np.maximum(np.maximum(t.first_body, t.second_body), 0)
+        self._sign = ((t.first_body >= 0).astype(np.float32) - (t.second_body >= 0)).astype(np.float32)
         one_hot = lambda which: (which[:, None] == np.arange(t.count)).astype(np.float32)  # noqa: E731
         self._objects = one_hot(t.first_object) - one_hot(t.second_object)
 
@@ -144,11 +151,13 @@ class Handling:
         velocity = jnp.concatenate([qvel, bodies.velocity.ravel()])
         linear, _ = self._jacobians(data, bodies, patches.points.place)
         normal = jnp.einsum("gsi,gsin->gsn", patches.points.normal, linear)
-        there = patches.points.depth > AWAY
-        k = jnp.where(there, jnp.asarray(t.stiffness)[:, None], 0.0)
-        rate = k * (dt + DAMPING)
-        speed = normal @ velocity
-        push = jnp.where(there, k * jnp.minimum(patches.points.depth, DEEPEST) - rate * speed, AWAY)
+        depth, speed = patches.points.depth, normal @ velocity
+        bends = self._bends(data, bodies, qvel, jnp.concatenate([patches.points.place, patches.centre[:, None]], 1))
+        speed += dt / 2 * jnp.sum(patches.points.normal * bends[:, :-1], -1)
+        near = jnp.clip(1 + jnp.maximum(depth, depth - dt * speed) / MARGIN, 0.0, 1.0)
+        k = near * jnp.asarray(t.stiffness)[:, None]
+        rate = k * (dt + DAMPING * jnp.clip(depth / FIRM, 0.0, 1.0))
+        push = jnp.where(near > 0, k * jnp.minimum(depth, DEEPEST) - rate * speed, AWAY)
         linear, angular = self._jacobians(data, bodies, patches.centre[:, None])
         along = jnp.einsum("gti,gin->gtn", patches.frame[:, 1:], linear[:, 0])
         about = patches.radius[:, None] * jnp.einsum("gi,gin->gn", patches.frame[:, 0], angular)
@@ -157,7 +166,8 @@ class Handling:
         k = SHEAR * jnp.asarray(t.stiffness)
         springs = jnp.where(t.remembers, k, 0.0)
         drag = jnp.where(t.remembers, k * (dt + DAMPING), k * CREEP)
-        pull = -springs[:, None] * slip - drag[:, None] * (along @ velocity)
+        rubbed = along @ velocity + dt / 2 * jnp.concatenate([jnp.einsum("gti,gi->gt", patches.frame[:, 1:], bends[:, -1]), 0 * about[:, :1]], -1)
+        pull = -springs[:, None] * slip - drag[:, None] * rubbed
         cones = Cones(normal, dt * rate, push, along, dt * drag, pull, jnp.asarray(t.sliding))
         return Felt(patches, cones, slip)
 
@@ -224,6 +234,24 @@ class Handling:
     def _finger(self, data: Any, f: int) -> tuple[Array, Array]:
         body = self.tables.fingers[f].body
         return data.xpos[body], data.xmat[body]
+
+    def _bends(self, data: Any, bodies: Bodies, qvel: Array, places: Array) -> Array:
+        """Return the relative acceleration at places [g, s, 3] with which all go on at the velocities of now, [g, s, 3].
+
+        In a step joints move bodies on arcs, and an object turns about its centre of mass, which goes straight on. Half of
+        this acceleration times the step's duration makes velocities at its start those of its chords.
+        """
+        spin, signs = bodies.velocity[:, 3:], jnp.asarray(self._objects)[:, None, :, None]
+        lever = places[:, :, None] - bodies.position
+        found = jnp.sum(signs * jnp.cross(spin, jnp.cross(spin, lever)), 2)
+        if data is None:
+            return found
+        body, sign = self._body, jnp.asarray(self._sign)[:, None]
+        arm = places - data.subtree_com[self._root_of[body]][:, None]
+        turning, moving = (data.cvel[body][:, None, half] for half in (slice(3), slice(3, 6)))
+        own = jnp.einsum("gn,nk,n->gk", jnp.asarray(self._links), data.cdof_dot, qvel)[:, None]
+        round_ = jnp.cross(turning, moving + jnp.cross(turning, arm))
+        return found + own[..., 3:] + jnp.cross(own[..., :3], arm) + sign[..., None] * round_
 
     def _jacobians(self, data: Any, bodies: Bodies, places: Array) -> tuple[Array, Array]:
         """Return the Jacobians of the relative velocity at places [g, s, 3], [g, s, 3, n] and [g, 3, n]."""

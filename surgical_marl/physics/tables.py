@@ -21,6 +21,8 @@ from surgical_marl.scenes.objects import JAW, LINK, Placement, Surface
 
 ENDLESS = 10.0
 """Half side of the plate that stands for a plane, m."""
+THICK = 0.01
+"""Radius of that plate, m: the plane is its upper face."""
 
 
 class Finger(NamedTuple):
@@ -208,11 +210,12 @@ def _depth(model: mujoco.MjModel, body: int) -> int:
 
 def _plate(part: Any, place: Placement) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """Return centre, frame, half sides of the core and radius of a box or plane in the world."""
-    axes, half, radius = np.eye(3), np.full(2, ENDLESS), 0.0
+    axes, half, radius, centre = np.eye(3), np.full(2, ENDLESS), THICK, np.array([0.0, 0.0, -THICK])
     if part.kind == "box":
         axes, half, radius = plate_of_box(part.size)
+        centre = np.zeros(3)
     frame = place.rotation @ part.rotation @ axes
-    return place.position + place.rotation @ part.position, frame, half, radius
+    return place.position + place.rotation @ (part.position + part.rotation @ centre), frame, half, radius
 
 
 def _segment(part: Any, place: Placement) -> tuple[np.ndarray, np.ndarray, float]:

@@ -35,7 +35,7 @@ CHUNK = 12
 """Control steps between two changes of direction, 0.24 s."""
 CLOSING, RESTING = 3, 2
 """Chunks in which the jaw closes at the start, and in which the arm stands at the end."""
-GAP = 3e-5
+GAP = 1e-5
 """Between each pad and the object at the start, m."""
 LOST = 2e-3
 """An object that has moved this far in the jaw counts as dropped, m."""
@@ -72,7 +72,7 @@ class Grasps:
         (self.agent,) = self.scene.agents
         self.simulator = Simulator(self.scene, decimation=1)
         self._dynamics, self.handling = Dynamics(self.scene.model), Handling(self.scene)
-        self._play = jax.jit(jax.vmap(self._advance))
+        self._play, self._depth = jax.jit(jax.vmap(self._advance)), jax.jit(self._overlap)
 
     def begin(self, held: np.ndarray, seed: int = 0) -> Physics:
         """Return states [E]: the arm anywhere, its jaw around the object without touching it.
@@ -155,7 +155,7 @@ class Grasps:
             if (turn @ away) @ wrist[:, 2] < -0.2 * np.linalg.norm(away):
                 break
         for _ in range(5):  # as wide open as the object's bends need, and in the middle
-            left, right = self._gaps(data, name, at - turn @ site, quaternion(turn))
+            left, right = self._gaps(data, name, at + turn @ away, quaternion(turn))
             at = at + (right - left) / 2 * wrist[:, 0]
             q[6] += (GAP - (left + right) / 2) / depth
             data.qpos[:] = self.scene.full_qpos({self.agent: q})
@@ -163,18 +163,22 @@ class Grasps:
 
     def _gaps(self, data: mujoco.MjData, name: str, position: np.ndarray, turn: np.ndarray) -> tuple[float, float]:
         """Return the distances of an object from the pad on the side of the wrist's -x and from that on its +x, m."""
-        model, body = self.scene.model, self.scene.model.body(name)
-        data.mocap_pos[body.mocapid[0]], data.mocap_quat[body.mocapid[0]] = position, turn
-        mujoco.mj_kinematics(model, data)
-        link, shapes = (
-            data.body(f"{self.agent}/wrist_yaw_link"),
-            range(body.geomadr[0], body.geomadr[0] + body.geomnum[0]),
+        o, link = self.names.index(name), data.body(f"{self.agent}/wrist_yaw_link")
+        depth = self._depth(jnp.float32(data.qpos), o, jnp.float32(position), jnp.float32(turn))
+        aside = [(data.geom_xpos[finger.geom] - link.xpos) @ link.xmat[::3] for finger in self.handling.tables.fingers]
+        first, second = np.argsort(aside)
+        return -float(depth[first]), -float(depth[second])
+
+    def _overlap(self, qpos: Any, o: Any, position: Any, turn: Any) -> Any:
+        """Return how deep object number `o` overlaps each finger, m."""
+        bodies = self.simulator.home.objects.bodies
+        placed = bodies._replace(
+            position=bodies.position.at[o].set(position), quaternion=bodies.quaternion.at[o].set(turn)
         )
-        pads = sorted(self.handling.tables.fingers, key=lambda f: (data.geom_xpos[f.geom] - link.xpos) @ link.xmat[::3])
-        first, second = (
-            min(mujoco.mj_geomDistance(model, data, s, pad.geom, 1.0, None) for s in shapes) for pad in pads
-        )
-        return first, second
+        depth = self.handling.find(self._dynamics.pose(qpos), placed).points.depth.max(-1)
+        table = self.handling.tables
+        patches = np.array([[table.grip[k, f] for f in range(len(table.fingers))] for k in range(table.count)])
+        return depth[jnp.asarray(patches)[o]]
 
 
 def scene_of(names: Sequence[str]) -> Scene:
