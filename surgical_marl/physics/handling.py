@@ -21,7 +21,7 @@ DAMPING = 5e-3
 FIRM = 1e-5
 """Overlap from which on that damping is whole, m. It begins with none (K. H. Hunt and F. R. E. Crossley, 1975), so that
 the force of a contact is continuous where it begins, and nothing is slowed before it touches."""
-MARGIN = 5e-5
+MARGIN = 2e-4
 """Distance within which a point that might touch during the step is watched, m: its stiffness grows from none there."""
 DEEPEST = 3e-4
 """Overlap that counts, m. A deeper one, as after a fall within one step, is pushed out no faster."""
@@ -154,9 +154,10 @@ class Handling:
         depth, speed = patches.points.depth, normal @ velocity
         bends = self._bends(data, bodies, qvel, jnp.concatenate([patches.points.place, patches.centre[:, None]], 1))
         speed += dt / 2 * jnp.sum(patches.points.normal * bends[:, :-1], -1)
-        near = jnp.clip(1 + jnp.maximum(depth, depth - dt * speed) / MARGIN, 0.0, 1.0)
+        reach = jnp.maximum(depth, depth - dt * speed)
+        near = jnp.clip(1 + reach / MARGIN, 0.0, 1.0)
         k = near * jnp.asarray(t.stiffness)[:, None]
-        rate = k * (dt + DAMPING * jnp.clip(depth / FIRM, 0.0, 1.0))
+        rate = k * (dt + DAMPING * jnp.clip(reach / FIRM, 0.0, 1.0))
         push = jnp.where(near > 0, k * jnp.minimum(depth, DEEPEST) - rate * speed, AWAY)
         linear, angular = self._jacobians(data, bodies, patches.centre[:, None])
         along = jnp.einsum("gti,gin->gtn", patches.frame[:, 1:], linear[:, 0])

@@ -23,7 +23,7 @@ SLOTS = 4
 """Points of a patch."""
 AWAY = -100.0
 """Depth, m, of a point that is not there: no scene is so large."""
-TILT = 0.1
+TILT = 0.03
 """By which a body is tilted to find the rim of a contact, rad: about the angle by which an object in a firm grip can rock."""
 BLEND = 1e-5
 """Difference in depth over which the place of a point goes from one of two candidates to the other, m: a quarter of the
