@@ -21,6 +21,9 @@ DAMPING = 5e-3
 FIRM = 1e-5
 """Overlap from which on that damping is whole, m. It begins with none (K. H. Hunt and F. R. E. Crossley, 1975), so that
 the force of a contact is continuous where it begins, and nothing is slowed before it touches."""
+SHARE = 0.5
+"""Stiffness of each of the four points of a contact, relative to that of a point in an object's file: a contact is as stiff
+as a capsule that lies flat, on its two ends."""
 MARGIN = 2e-4
 """Distance within which a point that might touch during the step is watched, m: its stiffness grows from none there."""
 DEEPEST = 3e-4
@@ -156,7 +159,7 @@ class Handling:
         speed += dt / 2 * jnp.sum(patches.points.normal * bends[:, :-1], -1)
         reach = jnp.maximum(depth, depth - dt * speed)
         near = jnp.clip(1 + reach / MARGIN, 0.0, 1.0)
-        k = near * jnp.asarray(t.stiffness)[:, None]
+        k = near * SHARE * jnp.asarray(t.stiffness)[:, None]
         rate = k * (dt + DAMPING * jnp.clip(reach / FIRM, 0.0, 1.0))
         push = jnp.where(near > 0, k * jnp.minimum(depth, DEEPEST) - rate * speed, AWAY)
         linear, angular = self._jacobians(data, bodies, patches.centre[:, None])
