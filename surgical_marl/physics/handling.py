@@ -26,6 +26,9 @@ SHARE = 0.5
 as a capsule that lies flat, on its two ends."""
 MARGIN = 2e-4
 """Distance within which a point that might touch during the step is watched, m: its stiffness grows from none there."""
+AHEAD = 0.02
+"""Distance up to which a point is watched, m, however fast it comes: 8 m/s in a step of 2.5 ms. What spins fast would seem to
+come nearer from anywhere: by the angle times its distance."""
 DEEPEST = 3e-4
 """Overlap that counts, m. A deeper one, as after a fall within one step, is pushed out no faster."""
 SHEAR = 0.8
@@ -61,7 +64,7 @@ class Way(NamedTuple):
     def soon(self, points: Points, other: Way) -> Array:
         """Return the depth of points [c] between this body and another one after the step, m, [c]."""
         shift = self.shift - other.shift + jnp.cross(self.turn - other.turn, points.place)
-        return points.depth - jnp.sum(shift * points.normal, -1)
+        return points.depth - jnp.maximum(jnp.sum(shift * points.normal, -1), -AHEAD)
 
 
 STILL = Way(np.zeros(3, np.float32), np.zeros(3, np.float32))  # type: ignore[arg-type]
@@ -157,7 +160,7 @@ class Handling:
         depth, speed = patches.points.depth, normal @ velocity
         bends = self._bends(data, bodies, qvel, jnp.concatenate([patches.points.place, patches.centre[:, None]], 1))
         speed += dt / 2 * jnp.sum(patches.points.normal * bends[:, :-1], -1)
-        reach = jnp.maximum(depth, depth - dt * speed)
+        reach = depth + jnp.clip(-dt * speed, 0.0, AHEAD)
         near = jnp.clip(1 + reach / MARGIN, 0.0, 1.0)
         k = near * SHARE * jnp.asarray(t.stiffness)[:, None]
         rate = k * (dt + DAMPING * jnp.clip(reach / FIRM, 0.0, 1.0))
