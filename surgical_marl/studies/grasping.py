@@ -61,7 +61,7 @@ class Seen(NamedTuple):
     place: Any
     """Centre of mass in the world, m, [..., 3]."""
     command: Any
-    """Commands of all actuators, [..., nu]."""
+    """Commands of all actuators in each physics step, [..., DECIMATION, nu]."""
 
 
 class Grasps:
@@ -124,7 +124,8 @@ class Grasps:
         deepest = seen.overlap.reshape(-1, DECIMATION).max(1)
         struck = seen.struck.reshape(-1, DECIMATION).any(1)
         last = Seen(*(part[DECIMATION - 1 :: DECIMATION] for part in seen))
-        return physics, last._replace(overlap=deepest, struck=struck)
+        command = seen.command.reshape(-1, DECIMATION, seen.command.shape[-1])
+        return physics, last._replace(overlap=deepest, struck=struck, command=command)
 
     def _look(self, physics: Physics, handles: Mapping[str, Handled], held: Any) -> Seen:
         data, bodies = self._dynamics.pose(physics.qpos), physics.objects.bodies
