@@ -29,8 +29,9 @@ MARGIN = 2e-4
 AHEAD = 0.02
 """Distance up to which a point is watched, m, however fast it comes: 8 m/s in a step of 2.5 ms. What spins fast would seem to
 come nearer from anywhere: by the angle times its distance."""
-DEEPEST = 3e-4
-"""Overlap that counts, m. A deeper one, as after a fall within one step, is pushed out no faster."""
+FASTEST = 0.04
+"""Speed at which an overlap is pushed out at most, m/s: a deep one, as after a fall within one step, meets more damping. The
+force of something that is pressed in grows with its overlap nevertheless."""
 SHEAR = 0.8
 """Stiffness of a contact along the surface, relative to that of a point along the normal (R. D. Mindlin, 1949: 2 (1 -
 nu) / (2 - nu) for materials of Poisson's ratio nu, 0.8 for 0.33)."""
@@ -163,8 +164,8 @@ class Handling:
         reach = depth + jnp.clip(-dt * speed, 0.0, AHEAD)
         near = jnp.clip(1 + reach / MARGIN, 0.0, 1.0)
         k = near * SHARE * jnp.asarray(t.stiffness)[:, None]
-        rate = k * (dt + DAMPING * jnp.clip(reach / FIRM, 0.0, 1.0))
-        push = jnp.where(near > 0, k * jnp.minimum(depth, DEEPEST) - rate * speed, AWAY)
+        rate = k * jnp.maximum(dt + DAMPING * jnp.clip(reach / FIRM, 0.0, 1.0), depth / FASTEST)
+        push = jnp.where(near > 0, k * depth - rate * speed, AWAY)
         linear, angular = self._jacobians(data, bodies, patches.centre[:, None])
         along = jnp.einsum("gti,gin->gtn", patches.frame[:, 1:], linear[:, 0])
         about = patches.radius[:, None] * jnp.einsum("gi,gin->gn", patches.frame[:, 0], angular)
