@@ -12,6 +12,11 @@ REPETITIONS = 3
 0.1 % for a second, one of 150 rad/s to 3 %."""
 
 
+MOST_TURN = 1.0
+"""Most that a body turns in a step, rad. A faster one is slowed: contacts are those of the start of the step, and mean
+nothing after half a turn."""
+
+
 class Bodies(NamedTuple):
     """The state of k free objects, in the world."""
 
@@ -104,6 +109,9 @@ def free_acceleration(bodies: Bodies, masses: Masses, frames: Array, gravity: Ar
 def moved(bodies: Bodies, acceleration: Array, dt: Any) -> Bodies:
     """Return the bodies after a step with accelerations [k, 6]."""
     velocity = bodies.velocity + dt * acceleration
+    spin = jnp.sqrt(jnp.sum(velocity[:, 3:] ** 2, -1, keepdims=True))
+    slowed = velocity[:, 3:] * jnp.minimum(1.0, MOST_TURN / (dt * jnp.maximum(spin, 1e-9)))
+    velocity = jnp.concatenate([velocity[:, :3], slowed], -1)
     return Bodies(
         bodies.position + dt * velocity[:, :3],
         turned(dt * velocity[:, 3:], bodies.quaternion),

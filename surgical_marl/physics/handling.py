@@ -14,12 +14,19 @@ from surgical_marl.physics.cone import Cone
 from surgical_marl.physics.newton import SLIPS, Contact, Newton, Pressed
 from surgical_marl.physics.patches import AWAY, Patch
 from surgical_marl.physics.tables import Tables
-from surgical_marl.physics.touching import Joints, Slots, stored
+from surgical_marl.physics.touching import AHEAD, MARGIN, Joints, Slots, stored
 
 DAMPING = 5e-3
 """Damping of a contact in the normal direction, s: this times its stiffness, N s/m."""
-DEEPEST = 3e-4
-"""Overlap that counts, m. A deeper one, as after a fall within one step, is pushed out no faster."""
+FIRM = 1e-5
+"""Overlap from which on that damping is whole, m. It begins with none (K. H. Hunt and F. R. E. Crossley, 1975), so that
+the force of a contact is continuous where it begins, and nothing is slowed before it touches."""
+SHARE = 0.5
+"""Stiffness of each of the four points of a contact, relative to that of a point in an object's file: a contact is as stiff
+as a capsule that lies flat, on its two ends."""
+FASTEST = 0.04
+"""Speed at which an overlap is pushed out at most, m/s: a deep one, as after a fall within one step, meets more damping. The
+force of something that is pressed in grows with its overlap nevertheless."""
 SHEAR = 0.8
 """Stiffness of a contact along the surface, relative to that of a point along the normal (R. D. Mindlin, 1949: 2 (1 -
 nu) / (2 - nu) for materials of Poisson's ratio nu, 0.8 for 0.33)."""
@@ -65,6 +72,30 @@ class Felt(NamedTuple):
     slip: Array
 
 
+class _Speeds(NamedTuple):
+    """Velocities, in memory."""
+
+    joints: Array
+    """Of arms, [a, m]."""
+    objects: Array
+    """[k, 6]"""
+    bends: Array | None
+    """What `Joints.bends` returns; None without arms."""
+
+
+class _Motion(NamedTuple):
+    """How two bodies move relative to each other."""
+
+    twist: Array
+    """[6]"""
+    bends: Array
+    """Relative acceleration at all points and at the centre, [s + 1, 3], with which both go on at the velocities of now.
+
+    In a step joints move bodies on arcs, and an object turns about its centre of mass, which goes straight on. Half of
+    this acceleration times the step's duration makes velocities at its start those of its chords.
+    """
+
+
 class Handling:
     """What friction and contact do in a scene."""
 
@@ -82,16 +113,18 @@ class Handling:
         dt: Any,
     ) -> Felt:  # fmt: skip
         """Return how the patches in all slots resist. There are neither joints nor fingers without arms."""
-        speeds = self._newton.by_arm(qvel), stored(bodies.velocity)
+        joint_speeds = self._newton.by_arm(qvel)
+        bends = None if joints is None else joints.bends(self.tables, joint_speeds)
+        speeds = _Speeds(joint_speeds, stored(bodies.velocity), bends)
         at = stored(bodies.position), stored(bodies.quaternion)
         grips = stored(grips)
 
         def one(row: tuple[Patch, Array]) -> Felt:
             patch, number = row
-            contact = self._contact(patch, number, joints, at[0])
+            contact, origin = self._contact(patch, number, joints, at[0])
             slip = jnp.zeros(3) if fingers is None else self._slip(patch, number, fingers, at, grips)
-            twist = self._newton.twist(contact, *speeds)
-            return Felt(self._resisting(contact, patch, number, slip, twist, dt), slip)
+            motion = self._motion(contact, patch, number, speeds, origin)
+            return Felt(self._resisting(contact, patch, number, slip, motion, dt), slip)
 
         def nothing(_: None) -> Felt:
             t, shapes = self.tables, jax.eval_shape(lambda: one((_row(slots.patch, 0), slots.number[0])))
@@ -105,8 +138,8 @@ class Handling:
 
         return jax.lax.map(each, (slots.patch, slots.number, np.arange(len(slots.number), dtype=np.int32)))
 
-    def _contact(self, patch: Patch, number: Array, joints: Joints | None, position: Array) -> Contact:
-        """Return what a patch is between, and its directions; nothing of it resists yet."""
+    def _contact(self, patch: Patch, number: Array, joints: Joints | None, position: Array) -> tuple[Contact, Array]:
+        """Return what a patch is between, its directions, of which nothing resists yet, and the origin of its twists."""
         t = self.tables
         first, second, arm = (
             jnp.asarray(x.astype(np.int32))[number] for x in (t.first_object, t.second_object, t.owner)
@@ -127,22 +160,44 @@ class Handling:
         about = jnp.concatenate([jnp.zeros(3), patch.radius * ahead])
         none, each = jnp.float32(0.0), jnp.zeros(len(normal))
         cone = Cone(normal, each, each, jnp.stack([*along, about]), none, jnp.zeros(3), none)
-        return Contact(cone, first, second, offset, arm, jacobian)
+        return Contact(cone, first, second, offset, arm, jacobian), origin
 
-    def _resisting(self, contact: Contact, patch: Patch, number: Array, slip: Array, twist: Array, dt: Any) -> Contact:
-        """Return the contact with the forces of its springs and dampers at a twist of now."""
-        t, cone = self.tables, contact.cone
-        there = patch.points.depth > AWAY
+    def _resisting(
+        self, contact: Contact, patch: Patch, number: Array, slip: Array, motion: _Motion, dt: Any
+    ) -> Contact:
+        """Return the contact with the forces of its springs and dampers at a motion of now."""
+        t, cone, points = self.tables, contact.cone, patch.points
+        speed = cone.normal @ motion.twist + dt / 2 * jnp.sum(points.normal * motion.bends[:-1], -1)
+        reach = points.depth + jnp.clip(-dt * speed, 0.0, AHEAD)
+        near = jnp.clip(1 + reach / MARGIN, 0.0, 1.0)
         stiffness = jnp.asarray(t.stiffness)[number]
-        k = jnp.where(there, stiffness, 0.0)
-        rate = k * (dt + DAMPING)
-        push = jnp.where(there, k * jnp.minimum(patch.points.depth, DEEPEST) - rate * (cone.normal @ twist), AWAY)
+        k = near * SHARE * stiffness
+        rate = k * jnp.maximum(dt + DAMPING * jnp.clip(reach / FIRM, 0.0, 1.0), points.depth / FASTEST)
+        push = jnp.where(near > 0, k * points.depth - rate * speed, AWAY)
         k, remembers = SHEAR * stiffness, self._finger(number) < len(t.fingers)
         springs = jnp.where(remembers, k, 0.0)
         drag = jnp.where(remembers, k * (dt + DAMPING), k * CREEP)
-        pull = -springs * slip - drag * (cone.along @ twist)
+        rubbed = cone.along @ motion.twist + dt / 2 * jnp.append(patch.frame[1:] @ motion.bends[-1], 0.0)
+        pull = -springs * slip - drag * rubbed
         resisting = Cone(cone.normal, dt * rate, push, cone.along, dt * drag, pull, jnp.asarray(t.sliding)[number])
         return contact._replace(cone=resisting)
+
+    def _motion(self, contact: Contact, patch: Patch, number: Array, speeds: _Speeds, origin: Array) -> _Motion:
+        """Return how the two bodies of a contact move relative to each other now."""
+        t, places = self.tables, jnp.concatenate([patch.points.place, patch.centre[None]]) - origin
+        twist = self._newton.twist(contact, speeds.joints, speeds.objects)
+        spin = speeds.objects.at[contact.first].get(mode="fill", fill_value=0.0)[3:]
+        bends = jnp.cross(spin, jnp.cross(spin, places))
+        if t.count > 1:
+            spin = speeds.objects.at[contact.second].get(mode="fill", fill_value=0.0)[3:]
+            bends -= jnp.cross(spin, jnp.cross(spin, places - contact.offset))
+        if t.arms and speeds.bends is not None:
+            sign = jnp.asarray(t.sign)[number]
+            moving, turning = jnp.split(contact.jacobian @ speeds.joints.at[contact.arm].get(mode="clip"), 2)
+            own = jnp.asarray(t.pulls)[number] @ speeds.bends.at[contact.arm].get(mode="clip")
+            straight = own[:3] + jnp.cross(own[3:], origin + places)
+            bends += straight + sign * jnp.cross(turning, moving + jnp.cross(turning, places))
+        return _Motion(twist, bends)
 
     def _finger(self, number: Array) -> Array:
         """Return the finger that a patch is on, []."""

@@ -15,6 +15,15 @@ import numpy as np
 from jax import Array
 
 
+EVEN = 0.02
+"""Angle between a capsule and what it touches, rad, up to which it rests on more than its nearer end: how far a capsule of
+some mm turns as its one end goes in by the overlap of a firm grip."""
+
+
+HUGE = 1e9
+"""More than any slope, m2."""
+
+
 class Segments(NamedTuple):
     """Capsules and spheres; a sphere's two ends are one point. Batches [...]."""
 
@@ -52,14 +61,15 @@ class Points(NamedTuple):
 def between_segments(one: Segments, other: Segments) -> Points:
     """Return the nearest points of capsules, [...].
 
-    C. Ericson, "Real-Time Collision Detection", 2005, section 5.1.9.
+    C. Ericson, "Real-Time Collision Detection", 2005, section 5.1.9. Along parallel capsules any points are nearest; here
+    they are those in the middle, towards which axes pull that are `EVEN` or less from parallel.
     """
     d1, d2, r = one.end - one.start, other.end - other.start, one.start - other.start
     a, e, b = _dot(d1, d1), _dot(d2, d2), _dot(d1, d2)
     c, f = _dot(d1, r), _dot(d2, r)
     tiny = 1e-12  # of a sphere; lengths below 1 um
-    crossing = jnp.maximum(a * e - b * b, 1e-6 * a * e + tiny**2)  # parallel: any point will do
-    s = jnp.clip((b * f - c * e) / crossing, 0.0, 1.0)
+    even = EVEN**2 * a * e + tiny**2
+    s = jnp.clip((b * f - c * e + even / 2) / (jnp.maximum(a * e - b * b, 0.0) + even), 0.0, 1.0)
     t = jnp.clip((b * s + f) / jnp.maximum(e, tiny), 0.0, 1.0)
     s = jnp.clip((b * t - c) / jnp.maximum(a, tiny), 0.0, 1.0)
     gap = r + s[..., None] * d1 - t[..., None] * d2
@@ -71,59 +81,61 @@ def between_segments(one: Segments, other: Segments) -> Points:
 
 
 def on_plate(one: Segments, plate: Plate) -> Points:
-    """Return two points [..., 2] where each capsule touches a plate.
+    """Return two points [..., 2] where each capsule is nearest to a plate, one for each of its ends.
 
-    They are the ends of the part of the capsule that lies above the rectangle. Where no part does, they are the nearest
-    point, twice, and the second one counts as far away. So it is with a sphere.
+    A point is where the distance to the plate is least, plus a small price for being away from its end of the capsule:
+    `EVEN` / 2 times the square of the way from there, as a share of the length, times the length. So a capsule that lies
+    flat has its points at both ends, or at the edges of the plate if it juts out; where it stands, both are at its lower
+    end. In between they move along the capsule, no faster than 1 / `EVEN` times as it turns (a proximal point: J. J. Moreau,
+    "Proximité et dualité dans un espace hilbertien", 1965). Depth and normal are those of the point itself, so all that a
+    contact needs is a continuous function of where the shapes are. The ends of what lies above the rectangle, say, are
+    not: they jump when the capsule leaves over an edge.
     """
     start, end = (_in_frame(point, plate) for point in (one.start, one.end))
     way = end - start
     half, radius = jnp.asarray(plate.half), one.radius + plate.radius
-    slope = jnp.where(jnp.abs(way[..., :2]) < 1e-9, 1e-9, way[..., :2])
-    at_low, at_high = (-half - start[..., :2]) / slope, (half - start[..., :2]) / slope
-    first, last = jnp.minimum(at_low, at_high), jnp.maximum(at_low, at_high)
-    enters = jnp.clip(jnp.max(first, -1), 0.0, 1.0)
-    leaves = jnp.clip(jnp.min(last, -1), 0.0, 1.0)
-    above = (jnp.max(first, -1) <= jnp.min(last, -1)) & (jnp.max(first, -1) <= 1) & (jnp.min(last, -1) >= 0)
-    breaks = jnp.clip(jnp.concatenate([first, last], -1), 0.0, 1.0)
-    nearest = _nearest(start, way, half, breaks)
-    share = jnp.stack([jnp.where(above, enters, nearest), leaves], -1)
+    share = _nearest(start, way, half, EVEN * radius * jnp.sqrt(jnp.maximum(_dot(way, way), 1e-18)))
     point = start[..., None, :] + share[..., None] * way[..., None, :]
-    side = jnp.where(start[..., 2] + end[..., 2] < 0, -1.0, 1.0)[..., None]  # that of the capsule's middle
-    held = jnp.clip(point[..., :2], -half[..., None, :], half[..., None, :])
-    off = jnp.concatenate([point[..., :2] - held, point[..., 2:]], -1)
+    off = _off(point, half)
     length = jnp.sqrt(jnp.maximum(_dot(off, off), 1e-18))
-    face = jnp.stack([0 * side, 0 * side, side], -1)
-    normal = jnp.where(above[..., None, None], face, off / length[..., None])
-    depth = radius[..., None] - jnp.where(above[..., None], side * point[..., 2], length)
-    single = ~above | (_dot(way, way) < 1e-12)
-    depth = depth.at[..., 1].set(jnp.where(single, depth[..., 0] - 100.0, depth[..., 1]))
+    depth, normal = radius[..., None] - length, off / length[..., None]
     normal = jnp.matmul(normal, jnp.swapaxes(plate.frame, -1, -2))
     world = plate.centre[..., None, :] + jnp.matmul(point, jnp.swapaxes(plate.frame, -1, -2))
     radius = jnp.broadcast_to(jnp.asarray(one.radius), depth.shape[:-1])[..., None]
     return Points(depth, world - (radius - depth / 2)[..., None] * normal, normal)
 
 
-def _nearest(start: Array, way: Array, half: Array, breaks: Array) -> Array:
-    """Return where on segments, 0 to 1, the point nearest to a rectangle is, [...].
+def _nearest(start: Array, way: Array, half: Array, price: Array) -> Array:
+    """Return where on segments, 0 to 1, the points nearest to a rectangle are, one for each end, [..., 2].
 
-    The slope of the squared distance along the segment is piecewise linear and grows. So its root lies between the two
-    of its corners at which it changes sign.
+    Half the squared distance has a slope along the segment that grows piecewise linearly, with corners where the segment
+    passes a side of the rectangle. So has the price times the way from an end. The root of their sum lies between those two
+    corners between which it changes sign.
     """
+    slope = jnp.where(jnp.abs(way[..., :2]) < 1e-9, 1e-9, way[..., :2])
+    breaks = jnp.clip(
+        jnp.concatenate([-half - start[..., :2], half - start[..., :2]], -1) / jnp.tile(slope, 2), 0.0, 1.0
+    )
     ends = jnp.zeros((*breaks.shape[:-1], 1))
     corners = jnp.concatenate([breaks, ends, ends + 1.0], -1)
-
     point = start[..., None, :] + corners[..., None] * way[..., None, :]
+    rise = jnp.sum(_off(point, half) * way[..., None, :], -1)
+    found = []
+    for end in (0.0, 1.0):
+        slope = rise + price[..., None] * (corners - end)
+        low = jnp.max(jnp.where(slope <= 0, corners, 0.0), -1)
+        high = jnp.min(jnp.where(slope >= 0, corners, 1.0), -1)
+        at_low = jnp.max(jnp.where((slope <= 0) & (corners >= low[..., None]), slope, -HUGE), -1)
+        at_high = jnp.min(jnp.where((slope >= 0) & (corners <= high[..., None]), slope, HUGE), -1)
+        inside = low - at_low / jnp.maximum(at_high - at_low, 1e-20) * (high - low)
+        found.append(jnp.where(at_low == -HUGE, 0.0, jnp.where(at_high == HUGE, 1.0, inside)))
+    return jnp.stack(found, -1)
+
+
+def _off(point: Array, half: Array) -> Array:
+    """Return the way to points [..., q, 3] from the nearest points of rectangles with half sides [..., 2]."""
     held = jnp.clip(point[..., :2], -half[..., None, :], half[..., None, :])
-    off = jnp.concatenate([point[..., :2] - held, point[..., 2:]], -1)
-    slope = jnp.sum(off * way[..., None, :], -1)
-    low = jnp.max(jnp.where(slope <= 0, corners, 0.0), -1)
-    high = jnp.min(jnp.where(slope >= 0, corners, 1.0), -1)
-    at_low = jnp.max(jnp.where((slope <= 0) & (corners >= low[..., None]), slope, -jnp.inf), -1)
-    at_high = jnp.min(jnp.where((slope >= 0) & (corners <= high[..., None]), slope, jnp.inf), -1)
-    fall, rise = jnp.where(jnp.isfinite(at_low), -at_low, 0.0), jnp.where(jnp.isfinite(at_high), at_high, 0.0)
-    share = fall / jnp.maximum(fall + rise, 1e-20)
-    return jnp.where(jnp.isfinite(at_low), jnp.where(jnp.isfinite(at_high), low + share * (high - low), 1.0), 0.0)
+    return jnp.concatenate([point[..., :2] - held, point[..., 2:]], -1)
 
 
 def _in_frame(point: Array, plate: Plate) -> Array:

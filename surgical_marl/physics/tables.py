@@ -21,6 +21,8 @@ from surgical_marl.scenes.objects import JAW, LINK, Placement, Surface
 
 ENDLESS = 10.0
 """Half side of the plate that stands for a plane, m."""
+THICK = 0.01
+"""Radius of that plate, m: the plane is its upper face."""
 
 
 class Finger(NamedTuple):
@@ -134,6 +136,10 @@ class Tables:
         """Degrees of freedom of each arm, [a, m]; `model.nv` where it has fewer than others."""
         for arm, own in enumerate(joints):
             self.dofs[arm, : len(own)] = own
+        ancestors = np.array([[_moves(model, i, j) for i in range(model.nv)] for j in range(model.nv)])
+        ancestors = np.pad(ancestors, ((0, 1), (0, 1)))
+        self.before = ancestors[self.dofs[:, :, None], self.dofs[:, None, :]].astype(np.float32)
+        """Which joints of an arm move each of its joints, [a, m, m]."""
         self.slides = np.append(model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE, False)[self.dofs]
         moved = np.pad(moved_bodies(model), ((0, 0), (0, 1)))
         self.arm_of, self.moves = {}, {}
@@ -173,10 +179,13 @@ class Tables:
         self.finger = numbers(ends[1], "pads", len(self.fingers))
         self.owner, self.pulls = np.full(len(surfaces), self.arms), np.zeros((len(surfaces), self.most), np.float32)
         """The arm that each patch is on, and the sign with which it moves with that arm's joints, [m]."""
+        self.sign = np.zeros(len(surfaces), np.float32)
+        """1 if the first body of a patch is on an arm, -1 if the second one is."""
         for end, sign in zip(ends, (1.0, -1.0), strict=True):
             for kind in self.bodies:
                 of = numbers(end, kind, -1)
                 on = of >= 0
+                self.sign[on] = sign
                 self.owner[on], self.pulls[on] = self.arm_of[kind][of[on]], sign * self.moves[kind][of[on]]
 
 
@@ -206,6 +215,16 @@ def _stacked(rows: list[tuple[Any, ...]], *shapes: tuple[int, ...]) -> Iterator[
         yield np.array([row[k] for row in rows], np.float32).reshape(-1, *shape)
 
 
+def _moves(model: mujoco.MjModel, i: int, j: int) -> bool:
+    """Return whether joint i moves joint j, and is not it; each joint has a degree of freedom."""
+    body, own = int(model.dof_bodyid[j]), int(model.dof_bodyid[i])
+    if body == own:
+        return i < j
+    while body > 0 and body != own:
+        body = int(model.body_parentid[body])
+    return body == own
+
+
 def _depth(model: mujoco.MjModel, body: int) -> int:
     """Return how many joints move a body."""
     count = 0
@@ -217,11 +236,12 @@ def _depth(model: mujoco.MjModel, body: int) -> int:
 
 def _plate(part: Any, place: Placement) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """Return centre, frame, half sides of the core and radius of a box or plane in the world."""
-    axes, half, radius = np.eye(3), np.full(2, ENDLESS), 0.0
+    axes, half, radius, centre = np.eye(3), np.full(2, ENDLESS), THICK, np.array([0.0, 0.0, -THICK])
     if part.kind == "box":
         axes, half, radius = plate_of_box(part.size)
+        centre = np.zeros(3)
     frame = place.rotation @ part.rotation @ axes
-    return place.position + place.rotation @ part.position, frame, half, radius
+    return place.position + place.rotation @ (part.position + part.rotation @ centre), frame, half, radius
 
 
 def _segment(part: Any, place: Placement) -> tuple[np.ndarray, np.ndarray, float]:

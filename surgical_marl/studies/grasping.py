@@ -35,8 +35,10 @@ CHUNK = 12
 """Control steps between two changes of direction, 0.24 s."""
 CLOSING, RESTING = 3, 2
 """Chunks in which the jaw closes at the start, and in which the arm stands at the end."""
-GAP = 3e-5
+GAP = 1e-5
 """Between each pad and the object at the start, m."""
+CLOSE = 2e-4
+"""An object this near to another part of the arm counts as struck by it, m."""
 LOST = 2e-3
 """An object that has moved this far in the jaw counts as dropped, m."""
 
@@ -51,13 +53,15 @@ class Seen(NamedTuple):
     force: Any
     """Normal forces of the two fingers, N, [..., 2]."""
     overlap: Any
-    """The deepest overlap with the arm in all physics steps of the control step, m, [...]."""
+    """The deepest overlap with the fingers in all physics steps of the control step, m, [...]."""
+    struck: Any
+    """Whether another part of the arm was at the object in one of these steps, [...] bool."""
     holding: Any
     """Whether the arm holds it, [...]."""
     place: Any
     """Centre of mass in the world, m, [..., 3]."""
     command: Any
-    """Commands of all actuators, [..., nu]."""
+    """Commands of all actuators in each physics step, [..., DECIMATION, nu]."""
 
 
 class Grasps:
@@ -72,7 +76,7 @@ class Grasps:
         (self.agent,) = self.scene.agents
         self.simulator = Simulator(self.scene, decimation=1)
         self._dynamics, self.handling = Dynamics(self.scene.model), Handling(self.scene)
-        self._play = jax.jit(jax.vmap(self._advance))
+        self._play, self._depth = jax.jit(jax.vmap(self._advance)), jax.jit(self._overlap)
 
     def begin(self, held: np.ndarray, seed: int = 0) -> Physics:
         """Return states [E]: the arm anywhere, its jaw around the object without touching it.
@@ -118,7 +122,10 @@ class Grasps:
 
         physics, seen = jax.lax.scan(substep, physics, jnp.repeat(actions, DECIMATION, 0))
         deepest = seen.overlap.reshape(-1, DECIMATION).max(1)
-        return physics, Seen(*(part[DECIMATION - 1 :: DECIMATION] for part in seen))._replace(overlap=deepest)
+        struck = seen.struck.reshape(-1, DECIMATION).any(1)
+        last = Seen(*(part[DECIMATION - 1 :: DECIMATION] for part in seen))
+        command = seen.command.reshape(-1, DECIMATION, seen.command.shape[-1])
+        return physics, last._replace(overlap=deepest, struck=struck, command=command)
 
     def _look(self, physics: Physics, handles: Mapping[str, Handled], held: Any) -> Seen:
         data, bodies = self._dynamics.pose(physics.qpos), physics.objects.bodies
@@ -129,9 +136,11 @@ class Grasps:
         position = frame.T @ (bodies.position[held] - data.xpos[fingers].mean(0))
         turned_by = frame.T @ rotation(bodies.quaternion[held])
         holding = jnp.stack([handles[name].holding for name in self.names])[held]
-        overlap = self.handling.find(data, bodies).points.depth.max()
+        depth, table = self.handling.find(data, bodies).points.depth.max(-1), self.handling.tables
+        overlap = jnp.max(jnp.where(table.remembers, depth, -1.0))
+        struck = jnp.max(jnp.where(table.remembers | (table.owner < 0), -1.0, depth)) > -CLOSE
         force, place = physics.objects.grips.force[held], bodies.position[held]
-        return Seen(position, turned_by, force, overlap, holding, place, physics.ctrl)
+        return Seen(position, turned_by, force, overlap, struck, holding, place, physics.ctrl)
 
     def _draw(self, rng: np.random.Generator, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return qpos, and the object's centre of mass and quaternion: between the pads, and not in the wrist's way."""
@@ -155,7 +164,7 @@ class Grasps:
             if (turn @ away) @ wrist[:, 2] < -0.2 * np.linalg.norm(away):
                 break
         for _ in range(5):  # as wide open as the object's bends need, and in the middle
-            left, right = self._gaps(data, name, at - turn @ site, quaternion(turn))
+            left, right = self._gaps(data, name, at + turn @ away, quaternion(turn))
             at = at + (right - left) / 2 * wrist[:, 0]
             q[6] += (GAP - (left + right) / 2) / depth
             data.qpos[:] = self.scene.full_qpos({self.agent: q})
@@ -163,18 +172,22 @@ class Grasps:
 
     def _gaps(self, data: mujoco.MjData, name: str, position: np.ndarray, turn: np.ndarray) -> tuple[float, float]:
         """Return the distances of an object from the pad on the side of the wrist's -x and from that on its +x, m."""
-        model, body = self.scene.model, self.scene.model.body(name)
-        data.mocap_pos[body.mocapid[0]], data.mocap_quat[body.mocapid[0]] = position, turn
-        mujoco.mj_kinematics(model, data)
-        link, shapes = (
-            data.body(f"{self.agent}/wrist_yaw_link"),
-            range(body.geomadr[0], body.geomadr[0] + body.geomnum[0]),
+        o, link = self.names.index(name), data.body(f"{self.agent}/wrist_yaw_link")
+        depth = self._depth(jnp.float32(data.qpos), o, jnp.float32(position), jnp.float32(turn))
+        aside = [(data.geom_xpos[finger.geom] - link.xpos) @ link.xmat[::3] for finger in self.handling.tables.fingers]
+        first, second = np.argsort(aside)
+        return -float(depth[first]), -float(depth[second])
+
+    def _overlap(self, qpos: Any, o: Any, position: Any, turn: Any) -> Any:
+        """Return how deep object number `o` overlaps each finger, m."""
+        bodies = self.simulator.home.objects.bodies
+        placed = bodies._replace(
+            position=bodies.position.at[o].set(position), quaternion=bodies.quaternion.at[o].set(turn)
         )
-        pads = sorted(self.handling.tables.fingers, key=lambda f: (data.geom_xpos[f.geom] - link.xpos) @ link.xmat[::3])
-        first, second = (
-            min(mujoco.mj_geomDistance(model, data, s, pad.geom, 1.0, None) for s in shapes) for pad in pads
-        )
-        return first, second
+        depth = self.handling.find(self._dynamics.pose(qpos), placed).points.depth.max(-1)
+        table = self.handling.tables
+        patches = np.array([[table.grip[k, f] for f in range(len(table.fingers))] for k in range(table.count)])
+        return depth[jnp.asarray(patches)[o]]
 
 
 def scene_of(names: Sequence[str]) -> Scene:
@@ -198,6 +211,8 @@ class Held(NamedTuple):
     """The deepest overlap once the jaw has closed, m."""
     dropped: np.ndarray
     """bool"""
+    struck: np.ndarray
+    """Whether the arm's wrist struck the object, bool: then it may well slip."""
 
 
 def judge(seen: Seen) -> Held:
@@ -206,7 +221,8 @@ def judge(seen: Seen) -> Held:
     moved = np.linalg.norm(seen.position[:, start:] - seen.position[:, start, None], axis=-1)
     turned_by = np.einsum("eij,eij->e", seen.rotation[:, start].astype(float), seen.rotation[:, -1]) - 1
     dropped = ~(moved.max(1) < LOST) | ~(seen.force[:, -1] > 0).all(-1)
-    return Held(moved[:, -1], np.arccos(np.clip(turned_by / 2, -1, 1)), seen.overlap[:, start:].max(1), dropped)
+    angle = np.arccos(np.clip(turned_by / 2, -1, 1))
+    return Held(moved[:, -1], angle, seen.overlap[:, start:].max(1), dropped, seen.struck[:, start:].any(1))
 
 
 def rows(names: list[str], grasps: int, seconds: float, batch: int = 250) -> Iterator[str]:
@@ -216,11 +232,14 @@ def rows(names: list[str], grasps: int, seconds: float, batch: int = 250) -> Ite
         size = min(batch, grasps)
         for seed in range(-(-grasps // size)):
             held.append(judge(jaw.shake(np.zeros(size, int), seconds, seed)))
-        slip, turn, overlap, dropped = (np.concatenate(parts)[:grasps] for parts in zip(*held, strict=True))
-        kept = slip[~dropped] if not dropped.all() else np.full(1, np.nan)
-        angle = np.degrees(turn[~dropped]) if not dropped.all() else np.full(1, np.nan)
-        yield (f"| {name} | {grasps} | {dropped.sum()} | {1000 * np.median(kept):.3f}, {1000 * kept.max():.3f} "
-               f"| {np.median(angle):.2f}, {angle.max():.2f} | {1000 * overlap.max():.3f} |")  # fmt: skip
+        slip, turn, overlap, dropped, struck = (np.concatenate(parts)[:grasps] for parts in zip(*held, strict=True))
+        free, kept = ~struck, ~struck & ~dropped
+        if not kept.any():
+            raise ValueError(f"no grasp of {name} holds it: all {grasps} drop it, or strike it with the wrist")
+        slips, turns = 1000 * slip[kept], np.degrees(turn[kept])
+        yield (f"| {name} | {grasps} | {free.sum()} | {(dropped & free).sum()} | {(dropped & struck).sum()} "
+               f"| {np.median(slips):.3f}, {slips.max():.3f} | {np.median(turns):.2f}, {turns.max():.2f} "
+               f"| {1000 * overlap[free].max():.3f} |")  # fmt: skip
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -229,8 +248,9 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--grasps", type=whole(1), default=100, metavar="N", help="of each object (%(default)s)")
     parser.add_argument("--seconds", type=float, default=10.0, metavar="T", help="of shaking (%(default)s)")
     arguments = parser.parse_args(argv)
-    print("| object | grasps | drops | slip: median, worst (mm) | median, worst (degrees) | deepest overlap (mm) |")
-    print("|---|---|---|---|---|---|")
+    print("| object | grasps | not struck | of these dropped | of others | slip: median, worst (mm) "
+          "| turn: median, worst (degrees) | deepest overlap (mm) |")  # fmt: skip
+    print("|---|---|---|---|---|---|---|---|")
     for row in rows(arguments.objects, arguments.grasps, arguments.seconds):
         print(row, flush=True)
     return 0
