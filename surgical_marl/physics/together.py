@@ -81,6 +81,14 @@ class Together:
             found[name] = Handled(jnp.sum(force), held, jnp.max(slid, initial=0.0))
         return found
 
+    def find(self, physics: Physics) -> Slots:
+        """Return the patches at which objects, arms and fixed things touch, or nearly do."""
+        return self._find(self._dynamics.pose(physics.qpos), physics)[0]
+
+    def _find(self, data: Any, physics: Physics) -> tuple[Slots, Joints]:
+        joints = self._finder.joints(data)
+        return self._finder.find(data, joints, physics.qvel, physics.objects.bodies, self._dynamics.dt), joints
+
     def step(self, physics: Physics, touch: Touch, fields: dict[str, Array], apart: Callable[..., Any]) -> Any:
         """Return the state after one physics step, and the hardest touch up to the start of that step.
 
@@ -90,9 +98,8 @@ class Together:
             fields: other values of some fields of the model.
             apart: steps arms that touch nothing.
         """
-        data, dt, bodies = self._dynamics.pose(physics.qpos), self._dynamics.dt, physics.objects.bodies
-        joints = self._finder.joints(data)
-        slots = self._finder.find(data, joints, physics.qvel, bodies, dt)
+        data = self._dynamics.pose(physics.qpos)
+        slots, joints = self._find(data, physics)
         near = self._pairs.overlap(data.geom_xpos, data.geom_xmat) if self._pairs.count else jnp.bool_(False)
         near |= (self._on_arm(slots) < self._arms).any()
 
