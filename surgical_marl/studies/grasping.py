@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 from surgical_marl import load_scene
@@ -23,7 +22,8 @@ from surgical_marl.physics.dynamics import Dynamics, Physics
 from surgical_marl.physics.handling import Handling
 from surgical_marl.physics.simulator import Simulator
 from surgical_marl.physics.views import Handled
-from surgical_marl.robots.rotation import quaternion, turned
+from surgical_marl.robots.rotation import quaternion
+from surgical_marl.scenes.grasps import Jaw
 from surgical_marl.scenes.scene import Scene
 from surgical_marl.scenes.timing import DECIMATION
 from surgical_marl.studies.command import make_parser, run
@@ -35,8 +35,6 @@ CHUNK = 12
 """Control steps between two changes of direction, 0.24 s."""
 CLOSING, RESTING = 3, 2
 """Chunks in which the jaw closes at the start, and in which the arm stands at the end."""
-GAP = 3e-5
-"""Between each pad and the object at the start, m."""
 LOST = 2e-3
 """An object that has moved this far in the jaw counts as dropped, m."""
 
@@ -72,6 +70,7 @@ class Grasps:
         (self.agent,) = self.scene.agents
         self.simulator = Simulator(self.scene, decimation=1)
         self._dynamics, self.handling = Dynamics(self.scene.model), Handling(self.scene)
+        self._jaw = Jaw(self.scene, self.agent)
         self._play = jax.jit(jax.vmap(self._advance))
 
     def begin(self, held: np.ndarray, seed: int = 0) -> Physics:
@@ -135,46 +134,10 @@ class Grasps:
 
     def _draw(self, rng: np.random.Generator, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return qpos, and the object's centre of mass and quaternion: between the pads, and not in the wrist's way."""
-        arm, item = self.scene.mounts[self.agent].arm, self.scene.objects[name].object
-        (site, axes), radius = item.sites[OBJECTS[name]], min(shape.size[0] for shape in item.shapes)
-        away, data = item.center - site, mujoco.MjData(self.scene.model)
-        while True:
-            q, depth = arm.home.copy(), rng.uniform(0.006, 0.009)
-            q[:2] += rng.uniform(-0.3, 0.3, 2)
-            q[2:6] = [rng.uniform(0.06, 0.12), rng.uniform(-1, 1), *rng.uniform(-0.5, 0.5, 2)]
-            q[6] = arm.lower[-1] + (radius + GAP) / depth
-            data.qpos[:] = self.scene.full_qpos({self.agent: q})
-            mujoco.mj_kinematics(self.scene.model, data)
-            link = data.body(f"{self.agent}/wrist_yaw_link")
-            wrist = link.xmat.reshape(3, 3)
-            tilt, spin = rng.uniform(-0.5, 0.5), rng.uniform(-np.pi, np.pi)
-            # the site's x axis is along y of the wrist, across the jaw; tilted, and turned about itself
-            across = np.stack([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]], 1)
-            turn = wrist @ turned(np.degrees([tilt, 0, 0])) @ across @ turned(np.degrees([spin, 0, 0])) @ axes.T
-            at = link.xpos + wrist @ [0, rng.uniform(-5e-4, 5e-4), -depth]
-            if (turn @ away) @ wrist[:, 2] < -0.2 * np.linalg.norm(away):
-                break
-        for _ in range(5):  # as wide open as the object's bends need, and in the middle
-            left, right = self._gaps(data, name, at - turn @ site, quaternion(turn))
-            at = at + (right - left) / 2 * wrist[:, 0]
-            q[6] += (GAP - (left + right) / 2) / depth
-            data.qpos[:] = self.scene.full_qpos({self.agent: q})
-        return data.qpos.copy(), at + turn @ away, quaternion(turn)
-
-    def _gaps(self, data: mujoco.MjData, name: str, position: np.ndarray, turn: np.ndarray) -> tuple[float, float]:
-        """Return the distances of an object from the pad on the side of the wrist's -x and from that on its +x, m."""
-        model, body = self.scene.model, self.scene.model.body(name)
-        data.mocap_pos[body.mocapid[0]], data.mocap_quat[body.mocapid[0]] = position, turn
-        mujoco.mj_kinematics(model, data)
-        link, shapes = (
-            data.body(f"{self.agent}/wrist_yaw_link"),
-            range(body.geomadr[0], body.geomadr[0] + body.geomnum[0]),
-        )
-        pads = sorted(self.handling.tables.fingers, key=lambda f: (data.geom_xpos[f.geom] - link.xpos) @ link.xmat[::3])
-        first, second = (
-            min(mujoco.mj_geomDistance(model, data, s, pad.geom, 1.0, None) for s in shapes) for pad in pads
-        )
-        return first, second
+        item = self.scene.objects[name].object
+        grasp = self._jaw.draw(name, item.sites[OBJECTS[name]], rng)
+        place = grasp.position + grasp.rotation @ item.center
+        return self.scene.full_qpos({self.agent: grasp.q}), place, quaternion(grasp.rotation)
 
 
 def scene_of(names: Sequence[str]) -> Scene:
