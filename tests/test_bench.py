@@ -16,13 +16,13 @@ from mujoco import rollout
 from surgical_marl import machine
 from surgical_marl.bench import contenders, render, report, sim
 from surgical_marl.bench.clock import race
-from surgical_marl.bench.contenders import Contender
 from surgical_marl.bench.course import HOLD, LAPS, full_state, make_course
 from surgical_marl.bench.face import measure_face
 from surgical_marl.bench.grasping import grasps
 from surgical_marl.bench.physics import PhysicsAlone
 from surgical_marl.bench.render import measure_rendering
 from surgical_marl.bench.report import QUOTED, draw, ratios, sweep_table
+from surgical_marl.bench.rivals import Contender
 from surgical_marl.bench.sim import Point, Speed, measure, sweep
 from surgical_marl.bench.workload import MOTIONS, Workload
 from surgical_marl.cli.main import main
@@ -203,28 +203,30 @@ def test_a_course_takes_back_what_it_did(motion: str) -> None:
     assert len(course.commands) == len(course.actions) == LAPS
 
 
-def test_a_grasp_begins_with_a_wire_between_the_pads_of_a_jaw() -> None:
-    """Its site lies in the middle between the pads, a wire's radius and a gap away from both."""
-    scene = load_scene("psm_needle")
-    item, model = scene.objects["needle"].object, scene.model
-    radius, (site, _) = item.shapes[0].size[0], item.sites["grasp"]
-    data, held = mujoco.MjData(model), 0
-    for qpos, position, quaternion in zip(*grasps(scene, 40, np.random.default_rng(0)), strict=True):
-        axes = matrix_of(quaternion[0])
-        data.qpos[:], data.mocap_quat[0] = qpos, quaternion[0]
-        data.mocap_pos[0] = position[0] - axes @ item.center
+@pytest.mark.parametrize("name", ["psm_needle", "bimanual_psm_pegs"])
+def test_a_grasp_begins_with_an_object_between_the_pads_of_a_jaw_or_of_two(name: str) -> None:
+    """A gap away from both pads of as many arms as are said to grasp it, and the arms apart."""
+    scene, count = load_scene(name), 24
+    (held, place), model = next(iter(scene.free_objects.items())), scene.model
+    data, body = mujoco.MjData(model), model.body(held)
+    shapes = range(body.geomadr[0], body.geomadr[0] + body.geomnum[0])
+    starts = grasps(scene, count, np.random.default_rng(0))
+    for qpos, position, quaternion, arms in zip(*starts, strict=True):
+        axes, mocap = matrix_of(quaternion[0]), body.mocapid[0]
+        data.qpos[:], data.mocap_quat[mocap] = qpos, quaternion[0]
+        data.mocap_pos[mocap] = position[0] - axes @ place.object.center
         mujoco.mj_kinematics(model, data)
-        hinge = data.body("psm_0/wrist_yaw_link")
-        place = hinge.xmat.reshape(3, 3).T @ (data.mocap_pos[0] + axes @ site - hinge.xpos)
-        if np.linalg.norm(place) > 0.02:  # it lies on the pad
-            continue
-        held += 1
-        assert abs(place[0]) < 1e-6 and abs(place[1]) <= 5e-4 and -0.009 <= place[2] <= -0.006
-        for side in ("left", "right"):
-            pad, point = data.geom(f"psm_0/jaw_{side}_link/pad"), data.mocap_pos[0] + axes @ site
-            depth = abs((pad.xmat.reshape(3, 3).T @ (point - pad.xpos))[0]) - model.geom(pad.id).size[0]
-            assert 0 < depth - radius < 1e-4
-    assert 20 <= held < 40
+        around = 0
+        for agent in scene.agents:
+            pads = [model.geom(f"{agent}/jaw_{side}_link/pad").id for side in ("left", "right")]
+            gaps = [min(mujoco.mj_geomDistance(model, data, s, pad, 1.0, None) for s in shapes) for pad in pads]
+            around += max(gaps) < 0.01
+            assert min(gaps) > (1e-5 if max(gaps) < 0.01 else 0) and (max(gaps) < 1e-4 or min(gaps) > 1e-3)
+        assert around == arms
+        q = {agent: qpos[scene.qpos_index(agent)] for agent in scene.agents}
+        assert scene.clearance(q) > 5e-4
+    found = set(starts.arms.tolist())
+    assert found == set(range(len(scene.agents) + 1))
 
 
 def test_a_scene_without_objects_has_nothing_to_grasp(capsys: pytest.CaptureFixture[str]) -> None:
