@@ -154,7 +154,8 @@ class Together:
         its_own = touching.pair == np.arange(self._pairs.count)[:, None]
         each = jnp.where(its_own, found.rows[joints:], 0.0).sum(-1)
         penetration = jnp.maximum(touch.penetration, -closest.distance)
-        return after, Touch(penetration, jnp.maximum(touch.force, each), handled)
+        overflow = jnp.maximum(touch.overflow, self._pairs.overflow(closest))
+        return after, Touch(penetration, jnp.maximum(touch.force, each), handled, overflow)
 
     def _hardest(self, felt: Felt, forces: Forces) -> Array:
         """Return the largest normal force of a patch on each arm, N, [a]."""
