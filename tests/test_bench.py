@@ -14,7 +14,7 @@ import pytest
 from mujoco import rollout
 
 from surgical_marl import machine
-from surgical_marl.bench import contenders, render, report, sim
+from surgical_marl.bench import contenders, render, report, rivals, sim
 from surgical_marl.bench.clock import race
 from surgical_marl.bench.course import HOLD, LAPS, full_state, make_course
 from surgical_marl.bench.face import measure_face
@@ -29,6 +29,7 @@ from surgical_marl.cli.main import main
 from surgical_marl.engines.choose import make_engine
 from surgical_marl.envs.env import Env
 from surgical_marl.robots.rotation import matrix_of
+from surgical_marl.runtime import prepare_mjx, prepare_warp
 from surgical_marl.scenes.load import load_scene
 from surgical_marl.scenes.timing import TIMESTEP
 
@@ -59,7 +60,9 @@ def made_up(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         if workload.count > 64:
             raise MemoryError(f"{engine} has no room for {workload.count} environments")
         tick = lambda count: 1e-6 * (64 + workload.count) * count  # noqa: E731
-        return Contender(workload.count, "cpu", 1.0, tick, None if engine == "mujoco" else tick, bytes_per_env=100)
+        return Contender(
+            workload.count, "cpu", 1.0, tick, None if engine.startswith("mujoco") else tick, bytes_per_env=100
+        )
 
     monkeypatch.setattr(sim, "prepare", prepare)
     monkeypatch.setattr(machine, "restart_peak", lambda: machine.peak())  # without a search for garbage
@@ -97,6 +100,35 @@ def test_all_engines_stand_beside_what_is_quoted(made_up: None, capsys: pytest.C
     measured = [line for line in lines if line.startswith(("fused engine", "MJX engine", "C MuJoCo"))]
     assert len(measured) == 5 and not any("quoted" in line for line in measured)
     assert "500,000" in measured[0]
+
+
+def test_on_a_gpu_mujoco_warp_stands_beside_c_mujoco(
+    made_up: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("surgical_marl.bench.workload.has_cuda", lambda: True)
+    assert main(["bench", "sim", "--num-envs", "64", "--device", "cuda"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    for rival in ("C MuJoCo", "MuJoCo Warp"):
+        assert sum(line.startswith(rival) for line in lines) == 1
+        assert any(line.startswith(f"physics steps, fused engine over {rival}: ") for line in lines)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("scene", "motion", "near"), [("ecm", "random", 1e-5), ("psm_needle", "grasp", 0.01)])
+def test_mujoco_warp_steps_as_c_mujoco_does(scene: str, motion: Any, near: float) -> None:
+    """A lap of a course, on a CPU: joints, and where objects are."""
+    workload = Workload(scene=scene, motion=motion, num_envs=3, device="cpu")
+    course = make_course(load_scene(scene), motion)
+    prepare_mjx()
+    model, states = rivals._exported(workload, course)
+    controls = rivals._controls(course)[:3]
+    contacts, rows = rivals._most(model, states[:3], controls)
+    _, data, short = rivals._warp_lap(prepare_warp(), workload, course, model, states, contacts, rows)
+    found, _ = rollout.rollout(model, mujoco.MjData(model), states[:3], controls)
+    assert not short
+    np.testing.assert_allclose(data.qpos.numpy(), found[:, -1, 1 : 1 + model.nq], atol=near)
+    _, _, short = rivals._warp_lap(prepare_warp(), workload, course, model, states, 0, -6)
+    assert short, "one row is not enough, and it did not say so"
 
 
 @pytest.mark.usefixtures("made_up")
@@ -271,7 +303,7 @@ def test_what_the_face_adds_as_json_and_as_a_sentence(
         (["sim", "--scene", "psmm"], ["'psmm'", "did you mean 'psm'", "bimanual_psm"]),
         (["sim", "--task", "reech"], ["'reech'", "did you mean 'reach'"]),
         (["sim", "--num-envs", "0"], ["--num-envs", "'0'"]),
-        (["sim", "--motion", "wild"], ["'wild'", "random, rough"]),
+        (["sim", "--motion", "wild"], ["'wild'", "random, rough, grasp"]),
         (["sim", "--decimation", "0"], ["--decimation", "'0'"]),
         (["sim", "--device", "gpu"], ["'gpu'", "auto, cpu, cuda"]),
         (["sim", "--engine", "mujoco", "--device", "cuda"], ["'mujoco'", "'cuda'", "CPU"]),

@@ -28,9 +28,8 @@ def load_source(env: Stepper, vector: bool, announce: Callable[[], None] = lambd
         from surgical_marl.engines.fused.translate import make_source  # imports JAX
 
         announce()
-        with (
-            no_collection()
-        ):  # tracing makes objects that stay: to look for garbage among them takes a fifth of the time
+        # what tracing makes stays: to look for garbage among it takes a fifth of the time
+        with no_collection():
             source = make_source(env, vector)
         return np.frombuffer(json.dumps(asdict(source), default=np.ndarray.tolist).encode(), np.uint8)
 
