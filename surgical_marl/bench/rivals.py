@@ -130,7 +130,6 @@ def _warp_lap(
 ) -> tuple[Callable[[], None], Any, bool]:
     """Return what makes a lap, its data after one, and whether that needed more room for contacts or rows."""
     from mujoco.mjx.third_party import mujoco_warp as library
-    from mujoco.mjx.third_party.mujoco_warp._src.types import OverflowType  # the public names leave it out
 
     count, nq = workload.count, model.nq
     warped = library.put_model(model)
@@ -147,5 +146,6 @@ def _warp_lap(
                 library.step(warped, data)
 
     lap()
-    full = OverflowType.NEFC | OverflowType.NJMAX_NNZ | OverflowType.BROADPHASE | OverflowType.NARROWPHASE
+    kinds = library.OverflowType
+    full = kinds.NEFC | kinds.NJMAX_NNZ | kinds.BROADPHASE | kinds.NARROWPHASE
     return lap, data, bool((data.overflow.numpy() & int(full)).any())
