@@ -1,5 +1,6 @@
 """JAX starts the way the package starts it, whichever test comes first; workers beside each other share the cores."""
 
+import gc
 import os
 
 from surgical_marl.runtime import prepare_jax
@@ -14,3 +15,7 @@ if workers := os.environ.get("PYTEST_XDIST_WORKER_COUNT"):
     os.environ["OMP_NUM_THREADS"] = str(max(1, (os.cpu_count() or 1) // int(workers)))
 
 prepare_jax()
+
+# To trace a step makes a million objects that stay, and a worker keeps what all its tests have made: Python's usual
+# thresholds look through all of that again and again.
+gc.set_threshold(50_000, 20, 20)

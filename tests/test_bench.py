@@ -14,21 +14,22 @@ import pytest
 from mujoco import rollout
 
 from surgical_marl import machine
-from surgical_marl.bench import contenders, render, report, sim
+from surgical_marl.bench import contenders, render, report, rivals, sim
 from surgical_marl.bench.clock import race
-from surgical_marl.bench.contenders import Contender
 from surgical_marl.bench.course import HOLD, LAPS, full_state, make_course
 from surgical_marl.bench.face import measure_face
 from surgical_marl.bench.grasping import grasps
 from surgical_marl.bench.physics import PhysicsAlone
 from surgical_marl.bench.render import measure_rendering
 from surgical_marl.bench.report import QUOTED, draw, ratios, sweep_table
+from surgical_marl.bench.rivals import Contender
 from surgical_marl.bench.sim import Point, Speed, measure, sweep
 from surgical_marl.bench.workload import MOTIONS, Workload
 from surgical_marl.cli.main import main
 from surgical_marl.engines.choose import make_engine
 from surgical_marl.envs.env import Env
 from surgical_marl.robots.rotation import matrix_of
+from surgical_marl.runtime import prepare_mjx, prepare_warp
 from surgical_marl.scenes.load import load_scene
 from surgical_marl.scenes.timing import TIMESTEP
 
@@ -59,9 +60,12 @@ def made_up(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         if workload.count > 64:
             raise MemoryError(f"{engine} has no room for {workload.count} environments")
         tick = lambda count: 1e-6 * (64 + workload.count) * count  # noqa: E731
-        return Contender(workload.count, "cpu", 1.0, tick, None if engine == "mujoco" else tick, bytes_per_env=100)
+        return Contender(
+            workload.count, "cpu", 1.0, tick, None if engine.startswith("mujoco") else tick, bytes_per_env=100
+        )
 
     monkeypatch.setattr(sim, "prepare", prepare)
+    monkeypatch.setattr(machine, "restart_peak", lambda: machine.peak())  # without a search for garbage
     monkeypatch.setattr(sim, "make_course", lambda scene, motion: None)
     yield
 
@@ -96,6 +100,35 @@ def test_all_engines_stand_beside_what_is_quoted(made_up: None, capsys: pytest.C
     measured = [line for line in lines if line.startswith(("fused engine", "MJX engine", "C MuJoCo"))]
     assert len(measured) == 5 and not any("quoted" in line for line in measured)
     assert "500,000" in measured[0]
+
+
+def test_on_a_gpu_mujoco_warp_stands_beside_c_mujoco(
+    made_up: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("surgical_marl.bench.workload.has_cuda", lambda: True)
+    assert main(["bench", "sim", "--num-envs", "64", "--device", "cuda"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    for rival in ("C MuJoCo", "MuJoCo Warp"):
+        assert sum(line.startswith(rival) for line in lines) == 1
+        assert any(line.startswith(f"physics steps, fused engine over {rival}: ") for line in lines)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("scene", "motion", "near"), [("ecm", "random", 1e-5), ("psm_needle", "grasp", 0.01)])
+def test_mujoco_warp_steps_as_c_mujoco_does(scene: str, motion: Any, near: float) -> None:
+    """A lap of a course, on a CPU: joints, and where objects are."""
+    workload = Workload(scene=scene, motion=motion, num_envs=3, device="cpu")
+    course = make_course(load_scene(scene), motion)
+    prepare_mjx()
+    model, states = rivals._exported(workload, course)
+    controls = rivals._controls(course)[:3]
+    contacts, rows = rivals._most(model, states[:3], controls)
+    _, data, short = rivals._warp_lap(prepare_warp(), workload, course, model, states, contacts, rows)
+    found, _ = rollout.rollout(model, mujoco.MjData(model), states[:3], controls)
+    assert not short
+    np.testing.assert_allclose(data.qpos.numpy(), found[:, -1, 1 : 1 + model.nq], atol=near)
+    _, _, short = rivals._warp_lap(prepare_warp(), workload, course, model, states, 0, -6)
+    assert short, "one row is not enough, and it did not say so"
 
 
 @pytest.mark.usefixtures("made_up")
@@ -203,28 +236,30 @@ def test_a_course_takes_back_what_it_did(motion: str) -> None:
     assert len(course.commands) == len(course.actions) == LAPS
 
 
-def test_a_grasp_begins_with_a_wire_between_the_pads_of_a_jaw() -> None:
-    """Its site lies in the middle between the pads, a wire's radius and a gap away from both."""
-    scene = load_scene("psm_needle")
-    item, model = scene.objects["needle"].object, scene.model
-    radius, (site, _) = item.shapes[0].size[0], item.sites["grasp"]
-    data, held = mujoco.MjData(model), 0
-    for qpos, position, quaternion in zip(*grasps(scene, 40, np.random.default_rng(0)), strict=True):
-        axes = matrix_of(quaternion[0])
-        data.qpos[:], data.mocap_quat[0] = qpos, quaternion[0]
-        data.mocap_pos[0] = position[0] - axes @ item.center
+@pytest.mark.parametrize("name", ["psm_needle", "bimanual_psm_pegs"])
+def test_a_grasp_begins_with_an_object_between_the_pads_of_a_jaw_or_of_two(name: str) -> None:
+    """A gap away from both pads of as many arms as are said to grasp it, and the arms apart."""
+    scene, count = load_scene(name), 24
+    (held, place), model = next(iter(scene.free_objects.items())), scene.model
+    data, body = mujoco.MjData(model), model.body(held)
+    shapes = range(body.geomadr[0], body.geomadr[0] + body.geomnum[0])
+    starts = grasps(scene, count, np.random.default_rng(0))
+    for qpos, position, quaternion, arms in zip(*starts, strict=True):
+        axes, mocap = matrix_of(quaternion[0]), body.mocapid[0]
+        data.qpos[:], data.mocap_quat[mocap] = qpos, quaternion[0]
+        data.mocap_pos[mocap] = position[0] - axes @ place.object.center
         mujoco.mj_kinematics(model, data)
-        hinge = data.body("psm_0/wrist_yaw_link")
-        place = hinge.xmat.reshape(3, 3).T @ (data.mocap_pos[0] + axes @ site - hinge.xpos)
-        if np.linalg.norm(place) > 0.02:  # it lies on the pad
-            continue
-        held += 1
-        assert abs(place[0]) < 1e-6 and abs(place[1]) <= 5e-4 and -0.009 <= place[2] <= -0.006
-        for side in ("left", "right"):
-            pad, point = data.geom(f"psm_0/jaw_{side}_link/pad"), data.mocap_pos[0] + axes @ site
-            depth = abs((pad.xmat.reshape(3, 3).T @ (point - pad.xpos))[0]) - model.geom(pad.id).size[0]
-            assert 0 < depth - radius < 1e-4
-    assert 20 <= held < 40
+        around = 0
+        for agent in scene.agents:
+            pads = [model.geom(f"{agent}/jaw_{side}_link/pad").id for side in ("left", "right")]
+            gaps = [min(mujoco.mj_geomDistance(model, data, s, pad, 1.0, None) for s in shapes) for pad in pads]
+            around += max(gaps) < 0.01
+            assert min(gaps) > (1e-5 if max(gaps) < 0.01 else 0) and (max(gaps) < 1e-4 or min(gaps) > 1e-3)
+        assert around == arms
+        q = {agent: qpos[scene.qpos_index(agent)] for agent in scene.agents}
+        assert scene.clearance(q) > 5e-4
+    found = set(starts.arms.tolist())
+    assert found == set(range(len(scene.agents) + 1))
 
 
 def test_a_scene_without_objects_has_nothing_to_grasp(capsys: pytest.CaptureFixture[str]) -> None:
@@ -268,7 +303,7 @@ def test_what_the_face_adds_as_json_and_as_a_sentence(
         (["sim", "--scene", "psmm"], ["'psmm'", "did you mean 'psm'", "bimanual_psm"]),
         (["sim", "--task", "reech"], ["'reech'", "did you mean 'reach'"]),
         (["sim", "--num-envs", "0"], ["--num-envs", "'0'"]),
-        (["sim", "--motion", "wild"], ["'wild'", "random, rough"]),
+        (["sim", "--motion", "wild"], ["'wild'", "random, rough, grasp"]),
         (["sim", "--decimation", "0"], ["--decimation", "'0'"]),
         (["sim", "--device", "gpu"], ["'gpu'", "auto, cpu, cuda"]),
         (["sim", "--engine", "mujoco", "--device", "cuda"], ["'mujoco'", "'cuda'", "CPU"]),

@@ -12,6 +12,7 @@ import pytest
 
 from surgical_marl import list_scenes
 from surgical_marl.envs.batch import BatchedEnv
+from surgical_marl.physics.collision import SLOTS
 from surgical_marl.physics.simulator import Physics
 from surgical_marl.scenes.timing import DECIMATION, TIMESTEP
 from tests.helpers.actions import random_actions
@@ -270,6 +271,28 @@ def test_every_pair_shows_its_distance_penetration_and_force() -> None:
     for agent, view in views.items():
         own = [agent in "".join(pair) for pair in env.scene.pairs]
         assert view.collision and view.contact_force == pytest.approx(force[own].max(), rel=0.02)
+
+
+def test_contacts_that_are_left_out_are_counted() -> None:
+    """Two wrists inside each other, in so many pairs that not all become rows; then apart."""
+    env, q = batched(), {
+        "psm_0": np.array([-0.006, 0.102, 0.131, 3.189, -1.363, -0.372, 0.403]),
+        "psm_1": np.array([-0.287, -0.021, 0.165, -0.227, 1.396, -0.422, 0.611]),
+    }  # fmt: skip
+    env.reset(0)
+    model, data = env.scene.model, host_data(env)
+    qpos = env.qpos.copy()
+    qpos[1] = data.qpos[:] = env.scene.full_qpos(q)
+    mujoco.mj_kinematics(model, data)
+    ids = zip(model.pair_geom1, model.pair_geom2, strict=True)
+    overlapping = sum(mujoco.mj_geomDistance(model, data, a, b, 1.0, None) < 0 for a, b in ids)
+    assert overlapping > SLOTS
+    env.engine.write(".physics.qpos", qpos.astype(np.float32))
+    infos = env.step(random_actions(env, np.random.default_rng(0))).infos
+    for agent in env.agents:
+        left_out = infos[agent]["contact_overflow"]
+        assert left_out.dtype == np.int32 and left_out[1] >= overlapping - SLOTS
+        assert not left_out[[0, 2, 3]].any()
 
 
 @pytest.mark.parametrize("scene", SCENES)

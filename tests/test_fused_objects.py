@@ -34,7 +34,7 @@ def test_a_step_with_objects_is_that_of_the_reference(name: str) -> None:
     env = Env("reach", name)
     simulator, rng = env.simulator, np.random.default_rng(0)
     step = jax.jit(jax.vmap(lambda physics: simulator._step(physics, simulator.untouched)[0]))
-    qpos, position, quaternion = (x.astype(np.float32) for x in grasps(env.scene, COUNT, rng))
+    qpos, position, quaternion = (x.astype(np.float32) for x in grasps(env.scene, COUNT, rng)[:3])
     now = jax.vmap(simulator.at)(qpos)
     bodies = now.objects.bodies._replace(position=position, quaternion=quaternion)
     closed = np.array(simulator.home.ctrl)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -17,6 +18,8 @@ from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test
 import surgical_marl as sm
 
 SCENES = ("psm", "bimanual_psm")
+UNSORTED = str(Path(__file__).parent / "example_plugin" / "example_plugin" / "scenes" / "psm_watched.yaml")
+"""A scene whose agents stand in no order of their names."""
 STEPS = 12
 
 
@@ -134,7 +137,7 @@ def test_gymnasium_accepts_it_without_a_warning(scene: str) -> None:
         check_env(env.unwrapped)
 
 
-@pytest.mark.parametrize("scene", [*SCENES, "trimanual_psm_ecm"])  # whose agents stand in no order of their names
+@pytest.mark.parametrize("scene", [*SCENES, UNSORTED])
 def test_both_faces_show_the_same_numbers(scene: str) -> None:
     joint = gymnasium.make("surgical_marl/Reach-v0", scene=scene, max_steps=STEPS)
     team, rng = make(scene), np.random.default_rng(0)

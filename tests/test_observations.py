@@ -87,7 +87,10 @@ def test_bounds_clip_no_place_that_an_episode_brings(task: str, scene: str) -> N
                     assert (low[part] < vector[:, part]).all() and (vector[:, part] < high[part]).all(), name
 
 
-@pytest.mark.parametrize("scene", ["bimanual_psm", "trimanual_psm_ecm", "bimanual_star"])
+@pytest.mark.parametrize(
+    "scene",
+    ["bimanual_psm", *(pytest.param(s, marks=pytest.mark.slow) for s in ("trimanual_psm_ecm", "bimanual_star"))],
+)
 def test_arms_of_a_kind_have_the_same_bounds(scene: str) -> None:
     env = Env("track", scene)
     for first, *others in env.scene.types.values():
@@ -114,7 +117,7 @@ def test_a_scale_is_undone(seed: int) -> None:
     ("task", "scene", "options"),
     [
         ("reach", "psm", {}),
-        ("reach", "psm", {"observe": {"psm_0": ["qpos", "target"]}}),
+        pytest.param("reach", "psm", {"observe": {"psm_0": ["qpos", "target"]}}, marks=pytest.mark.slow),
         ("match_image", "ecm", {}),
     ],
 )

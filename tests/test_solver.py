@@ -368,9 +368,10 @@ CLUSTER_PAIRS = Pairs(CLUSTER)
 
 
 @jax.jit
-def compiled_deepest(xpos: Any, xmat: Any, cdof: Any, com: Any) -> tuple[collision.Closest, collision.Touching]:
+def compiled_deepest(xpos: Any, xmat: Any, cdof: Any, com: Any) -> tuple[collision.Closest, collision.Touching, Any]:
     closest = CLUSTER_PAIRS.closest(xpos, xmat)
-    return closest, CLUSTER_PAIRS.deepest(SimpleNamespace(cdof=cdof, subtree_com=com), closest)
+    touching = CLUSTER_PAIRS.deepest(SimpleNamespace(cdof=cdof, subtree_com=com), closest)
+    return closest, touching, CLUSTER_PAIRS.overflow(closest)
 
 
 @settings(max_examples=100, deadline=None)
@@ -381,8 +382,9 @@ def test_the_deepest_contacts_become_rows(seed: int) -> None:
     data.qpos[:] = rng.uniform(-1, 1, CLUSTER.nq) * np.where(CLUSTER.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE, 0.03, 2.0)
     mujoco.mj_fwdPosition(CLUSTER, data)
     arrays = data.geom_xpos, data.geom_xmat.reshape(-1, 3, 3), data.cdof, data.subtree_com
-    closest, touching = jax.tree.map(np.asarray, compiled_deepest(*(np.float32(array) for array in arrays)))
+    closest, touching, overflow = jax.tree.map(np.asarray, compiled_deepest(*(np.float32(array) for array in arrays)))
     assert len(set(touching.pair)) == SLOTS
+    assert overflow == max(0, (closest.distance < 0).sum() - SLOTS)
     np.testing.assert_array_equal(touching.distance, np.sort(closest.distance)[:SLOTS])
     np.testing.assert_array_equal(touching.distance, closest.distance[touching.pair])
     for slot, pair in enumerate(touching.pair):

@@ -39,7 +39,7 @@ def copy_arm(folder: Path, factor: float = 1.0) -> None:
     urdf.write_text(re.sub(r'(<mass value)="([^"]+)"', heavier, text))
 
 
-@pytest.mark.parametrize("control", ["torque", "position"])
+@pytest.mark.parametrize("control", [pytest.param("torque", marks=pytest.mark.slow), "position"])
 def test_arms_of_one_name_move_by_their_own_models(control: str, tmp_path: Path) -> None:
     copy_arm(tmp_path / "a/ecm")
     copy_arm(tmp_path / "b/ecm", HEAVIER)

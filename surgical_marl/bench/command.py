@@ -46,8 +46,10 @@ def _sim(arguments: Namespace) -> int:
     from surgical_marl.bench.contenders import ENGINES
     from surgical_marl.bench.report import run
 
-    engines = ENGINES if arguments.engine == "all" else (arguments.engine,)
     workload = Workload(task=arguments.task, scene=arguments.scene, **arguments.given)
+    engines: tuple[str, ...] = (arguments.engine,)
+    if arguments.engine == "all":  # MuJoCo Warp is made for GPUs; on a CPU it has to be named
+        engines = tuple(name for name in ENGINES if name != "mujoco_warp" or workload.where == "cuda")
     print(run(workload, engines, arguments.sweep, arguments.json, arguments.out))
     return 0
 

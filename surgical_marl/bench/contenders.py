@@ -5,45 +5,20 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
-import mujoco
 import numpy as np
-from mujoco import rollout
 
-from surgical_marl.bench.clock import Clock, cpu_clock, cuda_clock
-from surgical_marl.bench.course import HOLD, LAPS, Course, full_state, tile, with_objects
+from surgical_marl.bench.clock import cpu_clock, cuda_clock
+from surgical_marl.bench.course import HOLD, LAPS, Course, tile
 from surgical_marl.bench.physics import PhysicsAlone
+from surgical_marl.bench.rivals import RIVALS, Contender
 from surgical_marl.bench.workload import Workload
 from surgical_marl.content import unknown
 from surgical_marl.engines.choose import Engine, make_engine
 from surgical_marl.envs.batch import BatchedEnv
-from surgical_marl.machine import cores
-from surgical_marl.scenes.load import load_scene
-from surgical_marl.scenes.mjcf import mjcf
 
-ENGINES = ("fused", "mjx", "mujoco")
-MOST_ROLLED = 4096
-"""Environments for which C MuJoCo gets memory. It steps environments one after the other on each core, so more don't
-make it faster."""
-
-
-@dataclass(frozen=True)
-class Contender:
-    """Clocks of an engine."""
-
-    num_envs: int
-    device: str
-    compile_s: float
-    """Time from imported packages to the end of the first step, s."""
-    physics: Clock
-    env: Clock | None
-    """Clock of environment steps; C MuJoCo has none."""
-    stride: int = 1
-    """Physics steps that the clock of physics counts as one."""
-    bytes_per_env: int | None = None
-    """Bytes of the arrays of the fused engine's kernel."""
+ENGINES = ("fused", "mjx", *RIVALS)
 
 
 def prepare(engine: str, workload: Workload, course: Course) -> Contender:
@@ -56,7 +31,7 @@ def prepare(engine: str, workload: Workload, course: Course) -> Contender:
     if engine not in ENGINES:
         raise unknown("engine", engine, ENGINES)
     try:
-        return _mujoco(workload, course) if engine == "mujoco" else _batched(engine, workload, course)
+        return RIVALS[engine](workload, course) if engine in RIVALS else _batched(engine, workload, course)
     except (ValueError, RuntimeError) as error:
         text = str(error)
         if any(sign in text.lower() for sign in ("no room", "out of memory", "resource_exhausted")):
@@ -112,26 +87,6 @@ def _along(physics: Engine, commands: list[Any]) -> Callable[[], None]:
         physics.step({})
 
     return step
-
-
-def _mujoco(workload: Workload, course: Course) -> Contender:
-    """C MuJoCo's own way to step many: `mujoco.rollout`, with a thread on every core."""
-    count, threads = min(workload.count, MOST_ROLLED), cores()
-    start = time.perf_counter()
-    scene = load_scene(workload.scene, workload.control)
-    model = mujoco.MjModel.from_xml_string(mjcf(scene)) if scene.objects else scene.model
-    qpos, qvel = with_objects(scene, course) if scene.objects else (course.qpos, course.qvel)
-    state = full_state(tile(qpos, count), tile(qvel, count))
-    control = tile(course.commands.astype(float).repeat(HOLD, 0).swapaxes(0, 1), count)
-    data, pool = [mujoco.MjData(model) for _ in range(threads)], rollout.Rollout(nthread=threads)
-    pool.rollout(model, data, state[:1], control[:1, :1])
-    compile_s = time.perf_counter() - start
-    out = np.empty((count, HOLD * LAPS, state.shape[1]))
-
-    def lap() -> None:
-        pool.rollout(model, data, state, control, state=out)
-
-    return Contender(count, "cpu", compile_s, cpu_clock(lap), None, stride=HOLD * LAPS)
 
 
 def _wait(engine: Engine) -> None:

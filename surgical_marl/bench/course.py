@@ -10,9 +10,10 @@ import mujoco
 import numpy as np
 from mujoco import rollout
 
-from surgical_marl.bench.grasping import graspers, grasps
+from surgical_marl.bench.grasping import Starts, grasps
 from surgical_marl.physics.simulator import Simulator
 from surgical_marl.robots.rotation import matrix_of
+from surgical_marl.scenes.grasps import graspers
 from surgical_marl.scenes.scene import Scene
 from surgical_marl.scenes.timing import DECIMATION
 
@@ -26,6 +27,8 @@ _AWAY = {"random": 50, "rough": 25, "grasp": 25}
 """Control steps before the start, 1 and 0.5 s. random: a new action every control step, as when training begins. rough:
 one action all the time, so that arms cross their ranges, and each other's way. grasp: jaws close on objects and carry
 them."""
+GENTLE = 0.05
+"""Share of their speed at which two arms move that hold one object: faster, one would tear it from the other."""
 
 
 class Course(NamedTuple):
@@ -69,19 +72,21 @@ def make_course(scene: Scene, motion: str = "random", seed: int = 0) -> Course:
     command = jax.jit(jax.vmap(simulator.command))
     advance = jax.jit(jax.vmap(lambda physics: simulator.advance(physics)[0]))
     roll = (lambda now: jax.tree.map(np.asarray, advance(now))) if scene.objects else partial(_roll, model)
-    closes = motion == "grasp"
+    now = jax.tree.map(lambda x: np.repeat(np.asarray(x)[None], n, 0), simulator.home)
+    closed, share = [], np.ones((n, 1), np.float32)
+    if motion == "grasp":
+        closed, starts = graspers(scene), grasps(scene, n, rng)
+        now = _grasping(now, starts, jax.vmap(simulator.at))
+        share = np.where(starts.arms[:, None] > 1, GENTLE, share)
 
     def draw() -> dict[str, np.ndarray]:
-        drawn = {a: rng.uniform(-1, 1, (n, len(m.arm.actuated))).astype(np.float32) for a, m in scene.mounts.items()}
-        for agent in graspers(scene) if closes else ():
+        drawn = {a: share * rng.uniform(-1, 1, (n, len(m.arm.actuated))) for a, m in scene.mounts.items()}
+        for agent in closed:
             drawn[agent][:, -1] = -1.0
-        return drawn
+        return {agent: values.astype(np.float32) for agent, values in drawn.items()}
 
     half = [draw() for _ in range(LAPS // 2)]
-    actions = [*half, *(_back(drawn, graspers(scene) if closes else []) for drawn in half[::-1])]
-    now = jax.tree.map(lambda x: np.repeat(np.asarray(x)[None], n, 0), simulator.home)
-    if closes:
-        now = _grasping(scene, now, jax.vmap(simulator.at), rng)
+    actions = [*half, *(_back(drawn, closed) for drawn in half[::-1])]
     away = draw()
     for _ in range(_AWAY[motion]):
         now = roll(command(now, away))
@@ -105,9 +110,9 @@ def _back(drawn: dict[str, np.ndarray], closed: list[str]) -> dict[str, np.ndarr
     return back
 
 
-def _grasping(scene: Scene, now: Any, at: Any, rng: np.random.Generator) -> Any:
+def _grasping(now: Any, starts: Starts, at: Any) -> Any:
     """Return the state [n, ...] in which jaws are about to close on objects."""
-    qpos, position, turned = (x.astype(np.float32) for x in grasps(scene, len(now.qpos), rng))
+    qpos, position, turned = (x.astype(np.float32) for x in starts[:3])
     objects = now.objects._replace(bodies=now.objects.bodies._replace(position=position, quaternion=turned))
     return at(qpos)._replace(objects=objects)
 

@@ -53,5 +53,5 @@ class PhysicsAlone(Env):
             final_observations=nothing,
             final_state=nothing,
             infos=nothing,
-            contacts=Contacts(distance, nothing, nothing),
+            contacts=Contacts(distance, nothing, nothing, nothing),
         )

@@ -27,8 +27,8 @@ QUOTED = {
 """Steps/s from Table I of Schmidgall et al., "Surgical Gym", 2023, arXiv:2310.04676. Surgical Gym: 20,000 environments
 on an 8 GB Quadro RTX 4000."""
 
-NAMES = {"fused": "fused engine", "mjx": "MJX engine", "mujoco": "C MuJoCo"}
-_COLORS = {"fused": "#1f6f8b", "mjx": "#b23a48", "mujoco": "#7a7a7a"}
+NAMES = {"fused": "fused engine", "mjx": "MJX engine", "mujoco": "C MuJoCo", "mujoco_warp": "MuJoCo Warp"}
+_COLORS = {"fused": "#1f6f8b", "mjx": "#b23a48", "mujoco": "#7a7a7a", "mujoco_warp": "#6a994e"}
 
 
 def run(

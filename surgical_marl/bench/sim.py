@@ -1,4 +1,4 @@
-"""Throughput of the engines and of C MuJoCo, in physics steps and in environment steps.
+"""Throughput of the engines, of C MuJoCo and of MuJoCo Warp, in physics steps and in environment steps.
 
     speeds, left_out = measure(Workload("reach", "psm", num_envs=4096), ("fused", "mjx", "mujoco"))
     speeds["fused"].physics_steps_per_s / speeds["mujoco"].physics_steps_per_s
@@ -15,8 +15,9 @@ from typing import NamedTuple
 
 from surgical_marl import machine
 from surgical_marl.bench import clock
-from surgical_marl.bench.contenders import ENGINES, MOST_ROLLED, Contender, prepare
+from surgical_marl.bench.contenders import ENGINES, prepare
 from surgical_marl.bench.course import Course, make_course
+from surgical_marl.bench.rivals import MOST_ROLLED, Contender
 from surgical_marl.bench.workload import Workload
 from surgical_marl.engines.choose import DeviceName
 from surgical_marl.scenes.load import load_scene
@@ -24,6 +25,8 @@ from surgical_marl.scenes.timing import TIMESTEP
 
 SWEEP = tuple(4**k for k in range(12))
 """Environments of a sweep: 1 to 4 million."""
+LEFT_OUT = (("mujoco", "cuda"), ("mujoco_warp", "cpu"))
+"""Not in a sweep: C MuJoCo runs on a CPU alone, and MuJoCo Warp is made for GPUs."""
 LONGEST = 10.0
 """Seconds that a step may take in a sweep."""
 
@@ -34,7 +37,7 @@ class Speed:
 
     physics_steps_per_s: float
     env_steps_per_s: float | None
-    """Steps of the task: observation, reward and reset included. None for C MuJoCo, which has no tasks."""
+    """Steps of the task: observation, reward and reset included. None for other simulators, which have no tasks."""
     simulated_s_per_s: float
     """Of all environments together, by environment steps where there are any."""
     num_envs: int
@@ -130,7 +133,7 @@ def sweep(
         devices.append("cpu")
     for device in devices:
         for name in engines:
-            if name != "mujoco" or device == "cpu":  # it has no GPU to run on
+            if (name, device) not in LEFT_OUT:
                 yield from _sweep_one(name, replace(workload, device=device), course, counts, seconds, repeats)
 
 

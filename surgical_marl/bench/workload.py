@@ -13,8 +13,8 @@ from surgical_marl.tasks.base.options import Options, choice, choices, number
 
 NUM_ENVS = {"cpu": 4096, "cuda": 131072}
 """Default number of environments on each device."""
-BENCHED = ("all", "fused", "mjx", "mujoco")
-"""What `bench sim` can time: this package's engines, and C MuJoCo."""
+BENCHED = ("all", "fused", "mjx", "mujoco", "mujoco_warp")
+"""What `bench sim` can time: this package's engines, C MuJoCo and MuJoCo Warp."""
 
 
 @dataclass(frozen=True)

@@ -148,7 +148,7 @@ def _parser() -> argparse.ArgumentParser:
 
     bench = commands.add_parser("bench", help="measure how fast this machine simulates, learns and draws")
     kinds = bench.add_subparsers(required=True, metavar="{sim,train,solve,render,face}")
-    sim = _bench_parser(kinds, "sim", "steps/s of the engines and of C MuJoCo", Workload)
+    sim = _bench_parser(kinds, "sim", "steps/s of the engines, C MuJoCo and MuJoCo Warp", Workload)
     sim.add_argument("--engine", type=one_of(BENCHED), default=BENCHED[0], metavar="|".join(BENCHED))
     sim.add_argument("--sweep", action="store_true", help="from 1 to 4 million environments, as far as memory goes")
     sim.add_argument("--out", type=Path, metavar="FILE.png", help="picture of a sweep")

@@ -53,9 +53,9 @@ class BatchStep(NamedTuple):
     """[N, d], of this step's episode even where it ended."""
     final_state: Any
     infos: dict[str, dict[str, Any]]
-    """agent -> success, collision (bool), min_distance (m), contact_force (N), stage_<name> (bool), reward_<term>
-    (weighted), cost, cost_<name> (bool), [N] each, and a task's own metrics such as tip_error (m); of this step's
-    episode."""
+    """agent -> success, collision (bool), min_distance (m), contact_force (N), contact_overflow (a count), stage_<name>
+    (bool), reward_<term> (weighted), cost, cost_<name> (bool), [N] each, and a task's own metrics such as tip_error
+    (m); of this step's episode."""
     contacts: Contacts
     """Distance and penetration (m) and force (N) of every pair in `scene.pairs`, [N, P] each; likewise."""
 

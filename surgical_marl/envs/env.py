@@ -73,10 +73,11 @@ class State(NamedTuple):
     """That of this step's episode, even if the episode ended."""
     final_state: Array
     infos: dict[str, dict[str, Array]]
-    """success, collision, min_distance (m), contact_force (N); with free objects `holding` any of them, and of each
-    `<object>_force` (N), `<object>_holding` and `<object>_slip` (m); `stage_<name>` and the task's own metrics, such as
-    tip_error (m); `reward_<term>`, the weighted terms that the reward is the sum of; `cost_<name>`, the limits broken
-    (`surgical_marl/envs/costs.py`), and their number `cost`. Of this step's episode, even if it ended."""
+    """success, collision, min_distance (m), contact_force (N), contact_overflow (how many
+    contacts of arms in the scene were left out; 0 unless very many touch); with free objects `holding` any of them, and
+    of each `<object>_force` (N), `<object>_holding` and `<object>_slip` (m); `stage_<name>` and the task's own metrics,
+    such as tip_error (m); `reward_<term>`, the weighted terms that the reward is the sum of; `cost_<name>`, the limits
+    broken (`surgical_marl/envs/costs.py`), and their number `cost`. Of this step's episode, even if it ended."""
     contacts: Contacts
     """Every pair of geoms that can touch, likewise."""
 
@@ -354,6 +355,7 @@ class Env:
                 "collision": view.collision,
                 "min_distance": view.min_distance,
                 "contact_force": view.contact_force,
+                "contact_overflow": view.contact_overflow,
                 **{f"stage_{name}": reached for name, reached in stages[agent].items()},
                 **{f"reward_{name}": value for name, value in terms[agent].items()},
                 **_handling(view),

@@ -25,6 +25,7 @@ _TEAM: dict[str, Callable[[Any, Any], Any]] = {
     "collision": np.logical_or,
     "min_distance": np.minimum,
     "contact_force": np.maximum,
+    "contact_overflow": np.maximum,
 }
 """How values of two arms make one of both; see also `_combine`."""
 

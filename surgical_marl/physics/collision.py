@@ -89,6 +89,13 @@ class Pairs:
         one, other = (Capsule(geom_xpos[g], geom_xmat[g][:, :, 2], half, radius) for g, half, radius in parts)
         return one, other
 
+    def overflow(self, closest: Closest) -> Array:
+        """Return how many overlapping pairs `deepest` leaves out, []."""
+        if self.count <= SLOTS:
+            return jnp.int32(0)
+        count = jnp.sum(closest.distance < 0, dtype=jnp.float32)  # the fused engine looks for bounds of whole numbers
+        return jnp.maximum(count - SLOTS, 0.0).astype(jnp.int32)
+
     def deepest(self, data: Any, closest: Closest) -> Touching:
         """Return the contacts of the deepest pairs, at most `SLOTS` of them.
 

@@ -21,8 +21,9 @@ _PACKED[_FIRST, _SECOND] = _PACKED[_SECOND, _FIRST] = np.arange(len(_FIRST))
 
 
 class Cone(NamedTuple):
-    """The contact of two bodies at s points. A twist is the velocity [3] at an origin, and the angular velocity [3], of
-    one body relative to the other, or their derivatives.
+    """The contact of two bodies at s points.
+
+    A twist is the velocity [3] of one body relative to the other at an origin, and the relative angular velocity [3].
     """
 
     normal: Array

@@ -22,11 +22,11 @@ FIRM = 1e-5
 """Overlap from which on that damping is whole, m. It begins with none (K. H. Hunt and F. R. E. Crossley, 1975), so that
 the force of a contact is continuous where it begins, and nothing is slowed before it touches."""
 SHARE = 0.5
-"""Stiffness of each of the four points of a contact, relative to that of a point in an object's file: a contact is as stiff
-as a capsule that lies flat, on its two ends."""
+"""Stiffness of each of the four points of a contact, relative to that of a point in an object's file: a contact is as
+stiff as a capsule that lies flat, on its two ends."""
 FASTEST = 0.04
-"""Speed at which an overlap is pushed out at most, m/s: a deep one, as after a fall within one step, meets more damping. The
-force of something that is pressed in grows with its overlap nevertheless."""
+"""Speed at which an overlap is pushed out at most, m/s: a deep one, as after a fall within one step, meets more
+damping. The force of something that is pressed in grows with its overlap nevertheless."""
 SHEAR = 0.8
 """Stiffness of a contact along the surface, relative to that of a point along the normal (R. D. Mindlin, 1949: 2 (1 -
 nu) / (2 - nu) for materials of Poisson's ratio nu, 0.8 for 0.33)."""
@@ -89,7 +89,8 @@ class _Motion(NamedTuple):
     twist: Array
     """[6]"""
     bends: Array
-    """Relative acceleration at all points and at the centre, [s + 1, 3], with which both go on at the velocities of now.
+    """Relative acceleration at all points and at the centre, [s + 1, 3], with which both go on at the velocities of
+    now.
 
     In a step joints move bodies on arcs, and an object turns about its centre of mass, which goes straight on. Half of
     this acceleration times the step's duration makes velocities at its start those of its chords.
@@ -139,7 +140,7 @@ class Handling:
         return jax.lax.map(each, (slots.patch, slots.number, np.arange(len(slots.number), dtype=np.int32)))
 
     def _contact(self, patch: Patch, number: Array, joints: Joints | None, position: Array) -> tuple[Contact, Array]:
-        """Return what a patch is between, its directions, of which nothing resists yet, and the origin of its twists."""
+        """Return a contact that does not resist yet: what it is between, and its directions; and its twists' origin."""
         t = self.tables
         first, second, arm = (
             jnp.asarray(x.astype(np.int32))[number] for x in (t.first_object, t.second_object, t.owner)
@@ -294,9 +295,7 @@ class Handling:
         t = self.tables
         for o in range(t.count):
             for a, (one, other) in t.jaws.items():
-                sliding = t.sliding[
-                    [g for g in range(len(t.finger)) if (t.first_object[g], t.finger[g]) == (o, one)][0]
-                ]
+                sliding = t.sliding[t.grip[o, one]]
                 least = t.masses.mass[o] * (9.81 + SPARE) / sliding * jnp.where(held[o, a] > 0, 0.5, 1.0)
                 presses = (force[o, one] >= least) & (force[o, other] >= least)
                 opposite = jnp.sum(normal[o, one] * normal[o, other]) <= -OPPOSITE

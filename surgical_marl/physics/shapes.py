@@ -14,10 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-
 EVEN = 0.02
-"""Angle between a capsule and what it touches, rad, up to which it rests on more than its nearer end: how far a capsule of
-some mm turns as its one end goes in by the overlap of a firm grip."""
+"""Angle between a capsule and what it touches, rad, up to which it rests on more than its nearer end: how far a capsule
+of some mm turns as its one end goes in by the overlap of a firm grip."""
 
 
 HUGE = 1e9
@@ -61,8 +60,8 @@ class Points(NamedTuple):
 def between_segments(one: Segments, other: Segments) -> Points:
     """Return the nearest points of capsules, [...].
 
-    C. Ericson, "Real-Time Collision Detection", 2005, section 5.1.9. Along parallel capsules any points are nearest; here
-    they are those in the middle, towards which axes pull that are `EVEN` or less from parallel.
+    C. Ericson, "Real-Time Collision Detection", 2005, section 5.1.9. Along parallel capsules any points are nearest;
+    here they are those in the middle, towards which axes pull that are `EVEN` or less from parallel.
     """
     d1, d2, r = one.end - one.start, other.end - other.start, one.start - other.start
     a, e, b = _dot(d1, d1), _dot(d2, d2), _dot(d1, d2)
@@ -84,12 +83,12 @@ def on_plate(one: Segments, plate: Plate) -> Points:
     """Return two points [..., 2] where each capsule is nearest to a plate, one for each of its ends.
 
     A point is where the distance to the plate is least, plus a small price for being away from its end of the capsule:
-    `EVEN` / 2 times the square of the way from there, as a share of the length, times the length. So a capsule that lies
-    flat has its points at both ends, or at the edges of the plate if it juts out; where it stands, both are at its lower
-    end. In between they move along the capsule, no faster than 1 / `EVEN` times as it turns (a proximal point: J. J. Moreau,
-    "Proximité et dualité dans un espace hilbertien", 1965). Depth and normal are those of the point itself, so all that a
-    contact needs is a continuous function of where the shapes are. The ends of what lies above the rectangle, say, are
-    not: they jump when the capsule leaves over an edge.
+    `EVEN` / 2 times the square of the way from there, as a share of the length, times the length. So a capsule that
+    lies flat has its points at both ends, or at the edges of the plate if it juts out; where it stands, both are at its
+    lower end. In between they move along the capsule, no faster than 1 / `EVEN` times as it turns (a proximal point: J.
+    J. Moreau, "Proximité et dualité dans un espace hilbertien", 1965). Depth and normal are those of the point itself,
+    so all that a contact needs is a continuous function of where the shapes are. The ends of what lies above the
+    rectangle, say, are not: they jump when the capsule leaves over an edge.
     """
     start, end = (_in_frame(point, plate) for point in (one.start, one.end))
     way = end - start
@@ -108,9 +107,9 @@ def on_plate(one: Segments, plate: Plate) -> Points:
 def _nearest(start: Array, way: Array, half: Array, price: Array) -> Array:
     """Return where on segments, 0 to 1, the points nearest to a rectangle are, one for each end, [..., 2].
 
-    Half the squared distance has a slope along the segment that grows piecewise linearly, with corners where the segment
-    passes a side of the rectangle. So has the price times the way from an end. The root of their sum lies between those two
-    corners between which it changes sign.
+    Half the squared distance has a slope along the segment that grows piecewise linearly, with corners where the
+    segment passes a side of the rectangle. So has the price times the way from an end. The root of their sum lies
+    between those two corners between which it changes sign.
     """
     slope = jnp.where(jnp.abs(way[..., :2]) < 1e-9, 1e-9, way[..., :2])
     breaks = jnp.clip(

@@ -146,7 +146,7 @@ class Simulator:
 
         (physics, touch), _ = jax.lax.scan(substep, (physics, self.untouched), None, length=self.decimation)
         tips, distance = self._look(physics.qpos)
-        contacts = Contacts(distance, jnp.maximum(touch.penetration, -distance), touch.force)
+        contacts = Contacts(distance, jnp.maximum(touch.penetration, -distance), touch.force, touch.overflow)
         handled = touch.handled if self._objects else None
         return physics, contacts, self._view(jnp, physics, tips, contacts, handled)
 
@@ -154,7 +154,7 @@ class Simulator:
     def untouched(self) -> Touch:
         """Return the touch of a control step so far, at its beginning."""
         none = jnp.zeros(self._pairs.count, jnp.float32)
-        return Touch(none, none, jnp.zeros(len(self.scene.agents) if self._objects else 0, jnp.float32))
+        return Touch(none, none, jnp.zeros(len(self.scene.agents) if self._objects else 0, jnp.float32), jnp.int32(0))
 
     def objects(self, physics: Physics) -> dict[str, ObjectView]:
         """Return the view of every free object of the scene, by name."""
@@ -191,7 +191,7 @@ class Simulator:
     def look(self, physics: Physics) -> tuple[Contacts, dict[str, ArmView]]:
         """Return contacts and views of arms at rest, without penetrations and forces."""
         tips, distance = self._look(physics.qpos)
-        contacts = Contacts(distance, jnp.maximum(-distance, 0.0), jnp.zeros_like(distance))
+        contacts = Contacts(distance, jnp.maximum(-distance, 0.0), jnp.zeros_like(distance), jnp.int32(0))
         return contacts, self._view(jnp, physics, tips, contacts)
 
     def view(self, physics: Physics, contacts: Contacts) -> dict[str, ArmView]:
@@ -238,7 +238,8 @@ class Simulator:
         its_own = touching.pair == np.arange(self._pairs.count)[:, None]
         each = jnp.where(its_own, force[len(forces.rows.low) :], 0.0).sum(-1)
         deepest = jnp.maximum(touch.penetration, -closest.distance)
-        hardest = touch._replace(penetration=deepest, force=jnp.maximum(touch.force, each))
+        overflow = jnp.maximum(touch.overflow, self._pairs.overflow(closest))
+        hardest = touch._replace(penetration=deepest, force=jnp.maximum(touch.force, each), overflow=overflow)
         return dynamics.moved(physics, forces, qacc), hardest
 
     def _view(
@@ -270,6 +271,7 @@ class Simulator:
                 min_distance=contacts.distance[near].min(initial=np.inf),
                 collision=contacts.penetration[touching].max(initial=0.0) > 0,
                 contact_force=contacts.force[touching].max(initial=0.0 if handled is None else handled[i]),
+                contact_overflow=contacts.overflow,
                 handles=self._objects.handles(physics.objects, i) if self._objects else {},
             )
         return views
@@ -323,10 +325,11 @@ class Simulator:
         ids = zip(model.pair_geom1, model.pair_geom2, strict=True)
         distance = np.array([mujoco.mj_geomDistance(model, data, a, b, 100.0, None) for a, b in ids])
         still = np.zeros(model.nv)
-        contacts: Any = Contacts(distance, np.maximum(-distance, 0.0), 0.0 * distance)  # type: ignore[arg-type]
+        contacts: Any = Contacts(distance, np.maximum(-distance, 0.0), 0.0 * distance, np.int32(0))  # type: ignore[arg-type]
         objects = self._objects.start(self.scene) if self._objects else ()
         physics: Any = Physics(self.scene.home, still, still, self._holding(self.scene.home), objects)  # type: ignore[arg-type]
         views = self._view(np, physics, data.site_xpos[list(self._sites.values())], contacts)
-        single = lambda x: jnp.asarray(x, jnp.bool_ if x.dtype == bool else jnp.float32)  # noqa: E731
+        kinds = {"b": jnp.bool_, "i": jnp.int32}
+        single = lambda x: jnp.asarray(x, kinds.get(x.dtype.kind, jnp.float32))  # noqa: E731
         # one by one: JAX would sort the agents by name
         return jax.tree.map(single, contacts), {agent: jax.tree.map(single, view) for agent, view in views.items()}

@@ -80,7 +80,8 @@ class Tables:
         most = max((len(place.object.shapes) for place in free.values()), default=1)
         shape = (self.count, most)
         self.start, self.end = np.zeros((*shape, 3), np.float32), np.zeros((*shape, 3), np.float32)
-        """Ends of the capsules of the objects, from the centre of mass, by the axes of the object's frame, [k, c, 3]."""
+        """Ends of the capsules of the objects, from the centre of mass, by the axes of the object's frame, [k, c,
+        3]."""
         self.radius = np.full(shape, 2 * AWAY, np.float32)  # of capsules that are not there
         for o, place in enumerate(free.values()):
             for c, part in enumerate(place.object.shapes):
@@ -177,6 +178,12 @@ class Tables:
         )
         self.first_object, self.second_object = (numbers(end, "objects", self.count) for end in ends)
         self.finger = numbers(ends[1], "pads", len(self.fingers))
+        self.grip = {
+            (int(o), int(f)): g
+            for g, (o, f) in enumerate(zip(self.first_object, self.finger, strict=True))
+            if f < len(self.fingers)
+        }
+        """(object, finger) -> its patch."""
         self.owner, self.pulls = np.full(len(surfaces), self.arms), np.zeros((len(surfaces), self.most), np.float32)
         """The arm that each patch is on, and the sign with which it moves with that arm's joints, [m]."""
         self.sign = np.zeros(len(surfaces), np.float32)

@@ -85,6 +85,11 @@ class Together:
         """Return the patches at which objects, arms and fixed things touch, or nearly do."""
         return self._find(self._dynamics.pose(physics.qpos), physics)[0]
 
+    def depths(self, physics: Physics) -> Array:
+        """Return how deep each pair of bodies overlaps, m, [g], in the order of `tables`; negative for a distance."""
+        data = self._dynamics.pose(physics.qpos)
+        return self._finder.depths(data, self._finder.joints(data), physics.objects.bodies)
+
     def _find(self, data: Any, physics: Physics) -> tuple[Slots, Joints]:
         joints = self._finder.joints(data)
         return self._finder.find(data, joints, physics.qvel, physics.objects.bodies, self._dynamics.dt), joints
@@ -106,7 +111,8 @@ class Together:
         def alone(physics: Physics, touch: Touch) -> tuple[Physics, Touch]:
             objects = self._step_objects(physics.objects, slots)
             physics, touch = apart(physics, touch)
-            return physics._replace(objects=objects), touch
+            left_out = jnp.maximum(touch.overflow, slots.count - len(slots.number))
+            return physics._replace(objects=objects), touch._replace(overflow=left_out)
 
         def together(physics: Physics, touch: Touch) -> tuple[Physics, Touch]:
             return self._step(self._dynamics.varied(fields), physics, touch, slots, joints)
@@ -151,16 +157,20 @@ class Together:
         shift = dt * qvel, dt * objects.velocity
         grips = handling.remember(felt, slots, found.pressed, fingers, bodies, shift, grips, dt)
         after = Physics(physics.qpos + shift[0], qvel, found.arms, physics.ctrl, Objects(objects, grips))
-        touch = touch._replace(handled=jnp.maximum(touch.handled, self._hardest(slots, found.pressed)))
+        touch = touch._replace(
+            handled=jnp.maximum(touch.handled, self._hardest(slots, found.pressed)),
+            overflow=jnp.maximum(touch.overflow, slots.count - len(slots.number)),
+        )
         if closest is None:
             return after, touch
         its_own = touching.pair == np.arange(self._pairs.count)[:, None]
         each = jnp.where(its_own, found.between, 0.0).sum(-1)
         penetration = jnp.maximum(touch.penetration, -closest.distance)
-        return after, touch._replace(penetration=penetration, force=jnp.maximum(touch.force, each))
+        overflow = jnp.maximum(touch.overflow, self._pairs.overflow(closest))
+        return after, touch._replace(penetration=penetration, force=jnp.maximum(touch.force, each), overflow=overflow)
 
     def _between(self, dynamics: Dynamics, data: Any, qvel: Array) -> tuple[Any, Any, Rows]:
-        """Return where arms are closest to each other, the deepest contacts and their rows; None, None without pairs."""
+        """Return where arms are closest to each other (None without pairs), the deepest contacts, and their rows."""
         if not self._pairs.count:
             none = jnp.zeros(0)
             return None, None, Rows(jnp.zeros((0, len(qvel))), none, none, none, none)

@@ -25,8 +25,8 @@ NEAREST = 16
 MARGIN = 2e-4
 """Distance within which a point that might touch during the step is watched, m: its stiffness grows from none there."""
 AHEAD = 0.02
-"""Distance up to which a point is watched, m, however fast it comes: 8 m/s in a step of 2.5 ms. What spins fast would seem to
-come nearer from anywhere: by the angle times its distance."""
+"""Distance up to which a point is watched, m, however fast it comes: 8 m/s in a step of 2.5 ms. What spins fast would
+seem to come nearer from anywhere: by the angle times its distance."""
 NEAR = MARGIN + 1e-4
 """Distance below which bodies count as touching, m."""
 
@@ -182,22 +182,33 @@ class Finder:
 
     def _patch(self, placed: Placed, meeting: Meeting, start: int, pair: Array) -> tuple[Patch, Array]:
         """Return the patch of two bodies, and whether they touch, 1 or 0."""
+        points, axes = self._points(placed, meeting, pair)
+        ways = self._ways(placed, meeting, *_numbers(meeting, pair))
+        nearer = ways[0].of(points) - (0.0 if ways[1] is None else ways[1].of(points))
+        soon = points.depth + jnp.minimum(nearer, AHEAD)
+        patch = find_patch(points, soon, axes, _constant(self._tables.torsion)[start + pair])
+        touches = jnp.maximum(jnp.max(points.depth), jnp.max(soon)) > -NEAR
+        return patch, touches.astype(jnp.int32)
+
+    def _points(self, placed: Placed, meeting: Meeting, pair: Array) -> tuple[Points, Array]:
+        """Return all points [c] at which two bodies may touch, and two directions [2, 3] in whose plane they spread."""
         i, j = _numbers(meeting, pair)
-        one = self._capsules(placed, meeting.first, i)
-        first = jax.tree.map(lambda x: x[:, None], one)
+        first = jax.tree.map(lambda x: x[:, None], self._capsules(placed, meeting.first, i))
         if meeting.second in ("pads", "plates"):
             plate = self._plate(placed, meeting.second, j)
             points, axes = on_plate(first, jax.tree.map(lambda x: x[None, None], plate)), plate.frame[:, :2].T
         else:
             other = self._capsules(placed, meeting.second, j)
             points, axes = between_segments(first, jax.tree.map(lambda x: x[None], other)), jnp.eye(3)[:2]
-        points = Points(points.depth.reshape(-1), points.place.reshape(-1, 3), points.normal.reshape(-1, 3))
-        ways = self._ways(placed, meeting, i, j)
-        nearer = ways[0].of(points) - (0.0 if ways[1] is None else ways[1].of(points))
-        soon = points.depth + jnp.minimum(nearer, AHEAD)
-        patch = find_patch(points, soon, axes, _constant(self._tables.torsion)[start + pair])
-        touches = jnp.maximum(jnp.max(points.depth), jnp.max(soon)) > -NEAR
-        return patch, touches.astype(jnp.int32)
+        return Points(points.depth.reshape(-1), points.place.reshape(-1, 3), points.normal.reshape(-1, 3)), axes
+
+    def depths(self, data: Any, joints: Joints, bodies: Bodies) -> Array:
+        """Return how deep each pair of bodies overlaps, m, [g]; negative for a distance."""
+        placed, found = self._place(data, joints, jnp.zeros(len(data.qpos)), bodies, 0.0), [jnp.zeros(0)]
+        for meeting in self._tables.meetings:
+            deepest = lambda pair, m=meeting: self._points(placed, m, pair)[0].depth.max()  # noqa: E731
+            found.append(jax.lax.map(deepest, np.arange(len(meeting.one), dtype=np.int32)))
+        return jnp.concatenate(found)
 
     # -- bodies
 

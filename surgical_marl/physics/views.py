@@ -18,6 +18,8 @@ class Contacts(NamedTuple):
     """The deepest overlap during the control step, m; 0 without any."""
     force: Array
     """The largest normal force during the control step, N."""
+    overflow: Array
+    """By how many pairs at most more overlapped in one physics step than contacts are computed for, []."""
 
 
 class Touch(NamedTuple):
@@ -32,6 +34,8 @@ class Touch(NamedTuple):
     """N"""
     handled: Array
     """The largest force of an object or of a fixed thing on each arm, N, [a]; [0] in a scene without objects."""
+    overflow: Array
+    """As in `Contacts`, []."""
 
 
 class Handled(NamedTuple):
@@ -74,5 +78,7 @@ class ArmView(NamedTuple):
     """Whether it touched another arm or itself during the step, []."""
     contact_force: Array
     """The largest normal force on it during the step, N, []."""
+    contact_overflow: Array
+    """`Contacts.overflow` of the whole scene."""
     handles: Mapping[str, Handled] = {}
     """How it handles each free object of the scene."""

@@ -105,14 +105,18 @@ class Scene:
         return np.array([self.model.joint(f"{agent}/{name}").qposadr[0] for name in names])
 
     def full_qpos(self, q: dict[str, np.ndarray]) -> np.ndarray:
-        """Return `qpos` [..., nq] from each agent's actuated joints [..., n]; joints that mimic another follow it."""
+        """Return `qpos` [..., nq] from agents' actuated joints [..., n]; joints that mimic another follow it.
+
+        Agents that are not in `q` are at home.
+        """
         batch = np.broadcast_shapes(*(np.shape(value)[:-1] for value in q.values()))
         qpos = np.zeros((*batch, self.model.nq))
         for agent, mount in self.mounts.items():
             names = [joint.name for joint in mount.arm.actuated]
             for joint in mount.arm.joints:
                 address = self.model.joint(f"{agent}/{joint.name}").qposadr[0]
-                qpos[..., address] = joint.multiplier * q[agent][..., names.index(joint.leader)] + joint.offset
+                own = q.get(agent, mount.arm.home)
+                qpos[..., address] = joint.multiplier * own[..., names.index(joint.leader)] + joint.offset
         return qpos
 
     @cached_property

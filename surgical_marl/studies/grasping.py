@@ -13,17 +13,18 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 from surgical_marl import load_scene
 from surgical_marl.cli.main import whole
 from surgical_marl.physics.bodies import rotation
+from surgical_marl.physics.collision import Pairs
 from surgical_marl.physics.dynamics import Dynamics, Physics
-from surgical_marl.physics.handling import Handling
 from surgical_marl.physics.simulator import Simulator
+from surgical_marl.physics.together import Together
 from surgical_marl.physics.views import Handled
-from surgical_marl.robots.rotation import quaternion, turned
+from surgical_marl.robots.rotation import quaternion
+from surgical_marl.scenes.grasps import Jaw
 from surgical_marl.scenes.scene import Scene
 from surgical_marl.scenes.timing import DECIMATION
 from surgical_marl.studies.command import make_parser, run
@@ -35,8 +36,6 @@ CHUNK = 12
 """Control steps between two changes of direction, 0.24 s."""
 CLOSING, RESTING = 3, 2
 """Chunks in which the jaw closes at the start, and in which the arm stands at the end."""
-GAP = 1e-5
-"""Between each pad and the object at the start, m."""
 CLOSE = 2e-4
 """An object this near to another part of the arm counts as struck by it, m."""
 LOST = 2e-3
@@ -75,8 +74,10 @@ class Grasps:
         self.names, self.scene = tuple(names), scene_of(names)
         (self.agent,) = self.scene.agents
         self.simulator = Simulator(self.scene, decimation=1)
-        self._dynamics, self.handling = Dynamics(self.scene.model), Handling(self.scene)
-        self._play, self._depth = jax.jit(jax.vmap(self._advance)), jax.jit(self._overlap)
+        self._dynamics = Dynamics(self.scene.model)
+        self.together = Together(self.scene, self._dynamics, Pairs(self.scene.model))
+        self._jaw = Jaw(self.scene, self.agent)
+        self._play = jax.jit(jax.vmap(self._advance))
 
     def begin(self, held: np.ndarray, seed: int = 0) -> Physics:
         """Return states [E]: the arm anywhere, its jaw around the object without touching it.
@@ -129,65 +130,26 @@ class Grasps:
 
     def _look(self, physics: Physics, handles: Mapping[str, Handled], held: Any) -> Seen:
         data, bodies = self._dynamics.pose(physics.qpos), physics.objects.bodies
-        fingers = np.array([finger.body for finger in self.handling.tables.fingers])
+        tables = self.together.tables
+        fingers = tables.bodies["pads"]
         along, down = (data.xmat[fingers][:, :, axis].sum(0) for axis in (1, 2))
         along, down = along / jnp.linalg.norm(along), down / jnp.linalg.norm(down)
         frame = jnp.stack([jnp.cross(along, down), along, down], 1)
         position = frame.T @ (bodies.position[held] - data.xpos[fingers].mean(0))
         turned_by = frame.T @ rotation(bodies.quaternion[held])
         holding = jnp.stack([handles[name].holding for name in self.names])[held]
-        depth, table = self.handling.find(data, bodies).points.depth.max(-1), self.handling.tables
-        overlap = jnp.max(jnp.where(table.remembers, depth, -1.0))
-        struck = jnp.max(jnp.where(table.remembers | (table.owner < 0), -1.0, depth)) > -CLOSE
+        depth, grips = self.together.depths(physics), tables.finger < len(tables.fingers)
+        overlap = jnp.max(jnp.where(grips, depth, -1.0))
+        struck = jnp.max(jnp.where(grips | (tables.owner == tables.arms), -1.0, depth)) > -CLOSE
         force, place = physics.objects.grips.force[held], bodies.position[held]
         return Seen(position, turned_by, force, overlap, struck, holding, place, physics.ctrl)
 
     def _draw(self, rng: np.random.Generator, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return qpos, and the object's centre of mass and quaternion: between the pads, and not in the wrist's way."""
-        arm, item = self.scene.mounts[self.agent].arm, self.scene.objects[name].object
-        (site, axes), radius = item.sites[OBJECTS[name]], min(shape.size[0] for shape in item.shapes)
-        away, data = item.center - site, mujoco.MjData(self.scene.model)
-        while True:
-            q, depth = arm.home.copy(), rng.uniform(0.006, 0.009)
-            q[:2] += rng.uniform(-0.3, 0.3, 2)
-            q[2:6] = [rng.uniform(0.06, 0.12), rng.uniform(-1, 1), *rng.uniform(-0.5, 0.5, 2)]
-            q[6] = arm.lower[-1] + (radius + GAP) / depth
-            data.qpos[:] = self.scene.full_qpos({self.agent: q})
-            mujoco.mj_kinematics(self.scene.model, data)
-            link = data.body(f"{self.agent}/wrist_yaw_link")
-            wrist = link.xmat.reshape(3, 3)
-            tilt, spin = rng.uniform(-0.5, 0.5), rng.uniform(-np.pi, np.pi)
-            # the site's x axis is along y of the wrist, across the jaw; tilted, and turned about itself
-            across = np.stack([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]], 1)
-            turn = wrist @ turned(np.degrees([tilt, 0, 0])) @ across @ turned(np.degrees([spin, 0, 0])) @ axes.T
-            at = link.xpos + wrist @ [0, rng.uniform(-5e-4, 5e-4), -depth]
-            if (turn @ away) @ wrist[:, 2] < -0.2 * np.linalg.norm(away):
-                break
-        for _ in range(5):  # as wide open as the object's bends need, and in the middle
-            left, right = self._gaps(data, name, at + turn @ away, quaternion(turn))
-            at = at + (right - left) / 2 * wrist[:, 0]
-            q[6] += (GAP - (left + right) / 2) / depth
-            data.qpos[:] = self.scene.full_qpos({self.agent: q})
-        return data.qpos.copy(), at + turn @ away, quaternion(turn)
-
-    def _gaps(self, data: mujoco.MjData, name: str, position: np.ndarray, turn: np.ndarray) -> tuple[float, float]:
-        """Return the distances of an object from the pad on the side of the wrist's -x and from that on its +x, m."""
-        o, link = self.names.index(name), data.body(f"{self.agent}/wrist_yaw_link")
-        depth = self._depth(jnp.float32(data.qpos), o, jnp.float32(position), jnp.float32(turn))
-        aside = [(data.geom_xpos[finger.geom] - link.xpos) @ link.xmat[::3] for finger in self.handling.tables.fingers]
-        first, second = np.argsort(aside)
-        return -float(depth[first]), -float(depth[second])
-
-    def _overlap(self, qpos: Any, o: Any, position: Any, turn: Any) -> Any:
-        """Return how deep object number `o` overlaps each finger, m."""
-        bodies = self.simulator.home.objects.bodies
-        placed = bodies._replace(
-            position=bodies.position.at[o].set(position), quaternion=bodies.quaternion.at[o].set(turn)
-        )
-        depth = self.handling.find(self._dynamics.pose(qpos), placed).points.depth.max(-1)
-        table = self.handling.tables
-        patches = np.array([[table.grip[k, f] for f in range(len(table.fingers))] for k in range(table.count)])
-        return depth[jnp.asarray(patches)[o]]
+        item = self.scene.objects[name].object
+        grasp = self._jaw.draw(name, item.sites[OBJECTS[name]], rng)
+        place = grasp.position + grasp.rotation @ item.center
+        return self.scene.full_qpos({self.agent: grasp.q}), place, quaternion(grasp.rotation)
 
 
 def scene_of(names: Sequence[str]) -> Scene:

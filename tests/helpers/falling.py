@@ -16,7 +16,7 @@ from surgical_marl.physics import together
 from surgical_marl.physics.bodies import Bodies, rotation
 from surgical_marl.physics.collision import Pairs
 from surgical_marl.physics.dynamics import Dynamics
-from surgical_marl.physics.handling import Handling
+from surgical_marl.physics.simulator import Simulator
 from surgical_marl.physics.together import Objects, Together
 
 DT = 0.0025
@@ -43,8 +43,8 @@ class Falling:
         path.write_text(yaml.safe_dump({"arms": arms, "objects": objects}, sort_keys=False))
         self.scene = sm.load_scene(path)
         self.together = Together(self.scene, Dynamics(self.scene.model), Pairs(self.scene.model))
-        self.handling = Handling(self.scene, arms=False)
-        self.masses, self.names = self.handling.tables.masses, self.together.names
+        self.masses, self.names = self.together.tables.masses, self.together.names
+        self._arms = Simulator(self.scene).home
         self._play = jax.jit(jax.vmap(self._advance, in_axes=(0, 0, None)), static_argnums=2)
 
     def begin(self, count: int) -> Objects:
@@ -59,10 +59,9 @@ class Falling:
 
     def _advance(self, objects: Objects, gravity: Any, steps: int) -> tuple[Objects, Trace]:
         def step(objects: Objects, _: None) -> tuple[Objects, Trace]:
-            objects = self.together._step_objects(objects)
-            bodies, depth = objects.bodies, jnp.float32(-1.0)
-            if self.handling.tables.meetings:
-                depth = self.handling.find(None, bodies).points.depth.max()
+            slots = self.together.find(self._arms._replace(objects=objects))
+            objects = self.together._step_objects(objects, slots)
+            bodies, depth = objects.bodies, self.together.depths(self._arms._replace(objects=objects)).max(initial=-1.0)
             return objects, Trace(bodies.position, bodies.quaternion, bodies.velocity, depth)
 
         with patch.object(together, "GRAVITY", gravity):

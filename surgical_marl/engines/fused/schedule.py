@@ -303,8 +303,7 @@ class Scheduler:
         return chain
 
     def _come_first(self, region: int, last: Value, values: list[Value]) -> list[Value] | None:
-        """Return what has to come first in a region, so that all of these values come before another; None if some
-        can't."""
+        """Return what must come first in a region, so that values come before the value `last`; None if some can't."""
         items = [self._around_in(region, value) for value in values]
         return None if any(item is None or item >= last for item in items) else items  # type: ignore[return-value]
 
