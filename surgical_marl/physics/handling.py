@@ -56,6 +56,10 @@ class Grips(NamedTuple):
     """For how long the arm has held the object, s, [k, a]: both fingers press, from opposite sides."""
 
 
+OF_FINGERS = Grips._fields[:4]
+"""What is kept for each finger."""
+
+
 class Fingers(NamedTuple):
     """The frames of all fingers in the world, [f]."""
 
@@ -135,7 +139,7 @@ class Handling:
             return none._replace(contacts=none.contacts._replace(first=first, second=second, arm=arm))
 
         def each(row: tuple[Patch, Array, Array]) -> Felt:
-            return jax.lax.cond(row[2] < slots.count, lambda row: one(row[:2]), lambda _: nothing(None), row)
+            return jax.lax.cond(row[2] < slots.total, lambda row: one(row[:2]), lambda _: nothing(None), row)
 
         return jax.lax.map(each, (slots.patch, slots.number, np.arange(len(slots.number), dtype=np.int32)))
 
@@ -245,14 +249,14 @@ class Handling:
             def note(kept: tuple[Grips, Array]) -> tuple[Grips, Array]:
                 after = slip + contact.cone.along @ self._newton.twist(contact, *moves)
                 place = contact.first, f
-                own = Grips(*(x[place] for x in old[:4]), old.held)
+                own = old._replace(**{name: getattr(old, name)[place] for name in OF_FINGERS})
                 new = self._kept(
                     patch, number, forces, after, _row(fingers, f), tuple(x[contact.first] for x in at), own
                 )
-                found = Grips(*(x.at[place].set(y) for x, y in zip(kept[0][:4], new, strict=True)), kept[0].held)
-                return found, kept[1].at[place].set(patch.frame[0])
+                found = {name: getattr(kept[0], name).at[place].set(y) for name, y in zip(OF_FINGERS, new, strict=True)}
+                return kept[0]._replace(**found), kept[1].at[place].set(patch.frame[0])
 
-            is_grip = (f < len(t.fingers)) & (index < slots.count)
+            is_grip = (f < len(t.fingers)) & (index < slots.total)
             return jax.lax.cond(is_grip, note, lambda kept: kept, kept), None
 
         rows = (
@@ -270,7 +274,7 @@ class Handling:
         self, patch: Patch, number: Array, forces: Pressed, after: Array, finger: Fingers, at: tuple[Array, Array],
         grip: Grips,
     ) -> tuple[Array, Array, Array, Array]:  # fmt: skip
-        """Return the first four columns of `Grips` for one finger and one object."""
+        """Return what is kept for one finger and one object."""
         place, axes, faces = finger
         slips = forces.sides >= SLIPS
         stretched = jnp.where(slips, -forces.friction / (SHEAR * jnp.asarray(self.tables.stiffness)[number]), after)
@@ -303,7 +307,7 @@ class Handling:
         return held
 
 
-def _row(tree: Any, i: Array) -> Any:
+def _row(tree: Any, i: Array | int) -> Any:
     return jax.tree.map(lambda x: x[i], tree)
 
 

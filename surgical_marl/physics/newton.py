@@ -62,7 +62,7 @@ class Problem(NamedTuple):
     free: Array
     """Accelerations of the objects without contacts, [k, 6]."""
     contacts: Contact
-    count: Array
+    total: Array
     """How many contacts there are, []."""
 
 
@@ -204,10 +204,10 @@ class Newton:
             def nothing(_: None) -> tuple[Pressed, Array, Array]:
                 return Pressed(jnp.float32(0.0), jnp.zeros(3), jnp.int32(0)), jnp.zeros(6), jnp.zeros((6, 6))
 
-            pressed, pull, stiff = jax.lax.cond(number < problem.count, felt, nothing, None)
+            pressed, pull, stiff = jax.lax.cond(number < problem.total, felt, nothing, None)
             return self._add(local, contact, pull, stiff), pressed
 
-        rows = problem.contacts, np.arange(len(problem.contacts.arm), dtype=np.int32)
+        rows = problem.contacts, jnp.arange(len(problem.contacts.arm), dtype=jnp.int32)
         return jax.lax.scan(one, none, rows)
 
     def _add(self, local: _Local, contact: Contact, pull: Array, stiff: Array) -> _Local:
@@ -313,7 +313,7 @@ class Newton:
     def _coupled(self, problem: Problem) -> Array:
         """Return which objects touch an arm, [k]."""
         contacts = problem.contacts
-        on_arm = (contacts.arm < len(self._dofs)) & (np.arange(len(contacts.arm)) < problem.count)
+        on_arm = (contacts.arm < len(self._dofs)) & (np.arange(len(contacts.arm)) < problem.total)
         return jnp.stack([(on_arm & (contacts.first == o)).any() for o in range(self._objects)])
 
 

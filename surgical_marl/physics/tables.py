@@ -122,8 +122,8 @@ class Tables:
         parts = [(part, place) for place in fixed.values() for part in place.object.shapes]
         flat = [(part, place) for part, place in parts if part.kind in ("box", "plane")]
         thin = [(part, place) for part, place in parts if part.kind in ("capsule", "sphere")]
-        self.plates = Plate(*_stacked([_plate(*each) for each in flat], (3,), (3, 3), (2,), ()))
-        self.rods = Segments(*_stacked([_segment(*each) for each in thin], (3,), (3,), ()))
+        self.plates = Plate(*_stacked([_plate(*each) for each in flat], (3,), (3, 3), (2,), ()))  # type: ignore[arg-type]
+        self.rods = Segments(*_stacked([_segment(*each) for each in thin], (3,), (3,), ()))  # type: ignore[arg-type]
         self._fixed_surfaces = {
             kind: [place.object.surface for _, place in of] for kind, of in (("plates", flat), ("rods", thin))
         }

@@ -111,7 +111,7 @@ class Together:
         def alone(physics: Physics, touch: Touch) -> tuple[Physics, Touch]:
             objects = self._step_objects(physics.objects, slots)
             physics, touch = apart(physics, touch)
-            left_out = jnp.maximum(touch.overflow, slots.count - len(slots.number))
+            left_out = jnp.maximum(touch.overflow, slots.total - len(slots.number))
             return physics._replace(objects=objects), touch._replace(overflow=left_out)
 
         def together(physics: Physics, touch: Touch) -> tuple[Physics, Touch]:
@@ -126,7 +126,7 @@ class Together:
         handling = Handling(self.tables, self._objects_alone)
         felt = handling.feel(slots, None, None, none, bodies, objects.grips, dt)
         rows = Rows(jnp.zeros((0, 0)), none, none, none, none)
-        problem = Problem(jnp.zeros((0, 0)), none, rows, rows, masses, free, felt.contacts, slots.count)
+        problem = Problem(jnp.zeros((0, 0)), none, rows, rows, masses, free, felt.contacts, slots.total)
         found = self._objects_alone.solve(problem, none, bodies.acceleration).objects
         grips = objects.grips
         loose = grips._replace(force=0 * grips.force, slid=0 * grips.slid, held=0 * grips.held)
@@ -148,7 +148,7 @@ class Together:
         closest, touching, between = self._between(dynamics, data, physics.qvel)
         problem = Problem(
             forces.mass + dt * forces.damping, forces.smooth, forces.rows, between, masses, free, felt.contacts,
-            slots.count,
+            slots.total,
         )  # fmt: skip
         start = dynamics.relaxed(forces, physics.qacc_warmstart)
         found = self._newton.solve(problem, start, bodies.acceleration)
@@ -159,7 +159,7 @@ class Together:
         after = Physics(physics.qpos + shift[0], qvel, found.arms, physics.ctrl, Objects(objects, grips))
         touch = touch._replace(
             handled=jnp.maximum(touch.handled, self._hardest(slots, found.pressed)),
-            overflow=jnp.maximum(touch.overflow, slots.count - len(slots.number)),
+            overflow=jnp.maximum(touch.overflow, slots.total - len(slots.number)),
         )
         if closest is None:
             return after, touch
@@ -182,7 +182,7 @@ class Together:
     def _on_arm(self, slots: Slots) -> Array:
         """Return the arm that the patch in each slot is on, [s]; the number of arms for none."""
         arm = jnp.asarray(self.tables.owner.astype(np.int32))[slots.number]
-        return jnp.where(np.arange(len(slots.number)) < slots.count, arm, self._arms)
+        return jnp.where(np.arange(len(slots.number)) < slots.total, arm, self._arms)
 
     def _hardest(self, slots: Slots, pressed: Pressed) -> Array:
         """Return the largest normal force of a patch on each arm, N, [a]."""

@@ -37,7 +37,7 @@ class Slots(NamedTuple):
     patch: Patch
     number: Array
     """Of each patch in `Tables`, [s]."""
-    count: Array
+    total: Array
     """How many were found, []; more than there are slots if some found no room."""
 
 
@@ -148,19 +148,19 @@ class Finder:
             return (pairs, count + near.astype(jnp.int32)), None
 
         none = jnp.zeros(most, jnp.int32), jnp.int32(0)
-        (pairs, count), _ = jax.lax.scan(look, none, np.arange(len(meeting.one), dtype=np.int32))
+        (pairs, count), _ = jax.lax.scan(look, none, jnp.arange(len(meeting.one), dtype=jnp.int32))
 
         def meet(n: Array, slots: Slots) -> Slots:
             patch, touches = self._patch(placed, meeting, start, pairs[n])
-            place = jnp.where(touches, slots.count, self.slots)
+            place = jnp.where(touches, slots.total, self.slots)
             put = lambda all_, one: all_.at[place].set(one, mode="drop")  # noqa: E731
             number = start + pairs[n]
-            return Slots(jax.tree.map(put, slots.patch, patch), put(slots.number, number), slots.count + touches)
+            return Slots(jax.tree.map(put, slots.patch, patch), put(slots.number, number), slots.total + touches)
 
         if most == 1:
             return jax.lax.cond(count > 0, lambda slots: meet(jnp.int32(0), slots), lambda slots: slots, slots)
         slots = jax.lax.fori_loop(0, jnp.minimum(count, most), meet, slots)
-        return slots._replace(count=slots.count + jnp.maximum(count - most, 0))
+        return slots._replace(total=slots.total + jnp.maximum(count - most, 0))
 
     def _is_near(self, placed: Placed, meeting: Meeting, pair: Array) -> Array:
         """Return whether two bodies may touch in the next step, []."""
@@ -229,7 +229,9 @@ class Finder:
             moves = dt * jnp.append(qvel, 0.0)[t.dofs]
             moves = stored((shift * moves[..., None], spin * moves[..., None]))
             for kind in t.bodies:
-                ways[kind] = Way(*jax.lax.map(lambda row: _moved(*row, moves), (t.arm_of[kind], t.moves[kind])))
+                ways[kind] = Way(
+                    *jax.lax.map(lambda row: _moved(row[0], row[1], moves), (t.arm_of[kind], t.moves[kind]))
+                )
         return Placed(stored(bodies.position), stored(frames), pads, links, ways | {"objects": stored(ways["objects"])})
 
     def _capsules(self, placed: Placed, kind: str, i: Array) -> Segments:
