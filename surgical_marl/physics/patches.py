@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -52,18 +53,35 @@ def find_patch(points: Points, soon: Array, axes: Array, torsion: Array) -> Patc
     """Return the patch of a pair of bodies.
 
     Args:
-        points: all points [c] at which their shapes may touch. soon: their depths after a step with the velocities of
-        now, [c]. A point counts by the larger one of both depths, so that no part of a fast object comes in unseen.
-        axes: two directions, [2, 3]: bodies are tilted about those across them. torsion: radius of the contact at a
-        point, m, [].
+        points: all points at which their shapes may touch, [c, d]: d for each of c shapes.
+        soon: their depths after a step with the velocities of now, [c, d]. A point counts by the larger one of both
+            depths, so that no part of a fast object comes in unseen.
+        axes: two directions, [2, 3]: bodies are tilted about those across them.
+        torsion: radius of the contact at a point, m, [].
     """
-    reach = jnp.maximum(points.depth, soon)
-    middle = jnp.mean(points.place, 0)
-    rim = jnp.minimum(reach, ALIKE)[:, None] + TILT * ((points.place - middle) @ axes.T @ jnp.asarray(_TILTS).T)
-    tilted = jnp.concatenate([reach[:, None], rim], 1)  # [c, SLOTS]
-    weight = jnp.maximum(tilted - jnp.max(tilted, 0) + BLEND, 0.0)
-    weight = (weight / jnp.sum(weight, 0)).T
-    chosen = Points(weight @ points.depth, middle + weight @ (points.place - middle), _unit(weight @ points.normal))
+    middle = points.place[0, 0]
+
+    def tilted(depth: Array, place: Array, soon: Array) -> Array:
+        """Return the depths of points [d] as the bodies are, and tilted, [d, SLOTS]."""
+        reach = jnp.maximum(depth, soon)
+        rim = jnp.minimum(reach, ALIKE)[:, None] + TILT * ((place - middle) @ axes.T @ jnp.asarray(_TILTS).T)
+        return jnp.concatenate([reach[:, None], rim], 1)
+
+    def deepest(most: Array, row: tuple[Points, Array]) -> tuple[Array, None]:
+        one, soon = row
+        return jnp.maximum(most, jnp.max(tilted(one.depth, one.place, soon), 0)), None
+
+    most, _ = jax.lax.scan(deepest, jnp.full(SLOTS, 2 * AWAY), (points, soon))
+
+    def add(total: tuple[Array, Points], row: tuple[Points, Array]) -> tuple[tuple[Array, Points], None]:
+        one, soon = row
+        weight = jnp.maximum(tilted(one.depth, one.place, soon) - most + BLEND, 0.0).T  # [SLOTS, d]
+        own = Points(weight @ one.depth, weight @ (one.place - middle), weight @ one.normal)
+        return (total[0] + jnp.sum(weight, 1), jax.tree.map(jnp.add, total[1], own)), None
+
+    none = Points(jnp.zeros(SLOTS), jnp.zeros((SLOTS, 3)), jnp.zeros((SLOTS, 3)))
+    (weight, found), _ = jax.lax.scan(add, (jnp.zeros(SLOTS), none), (points, soon))
+    chosen = Points(found.depth / weight, middle + found.place / weight[:, None], _unit(found.normal / weight[:, None]))
     return _with_frame(chosen, torsion)
 
 

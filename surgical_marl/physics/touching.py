@@ -50,7 +50,7 @@ class Way(NamedTuple):
     """rad, [n, 3]"""
 
     def of(self, points: Points) -> Array:
-        """Return by how much points [c] come nearer along their normals in the step, if one body [] moves, m, [c]."""
+        """Return by how much points come nearer along their normals in the step, if one body [] moves, m, [...]."""
         return -jnp.sum((self.shift + jnp.cross(self.turn, points.place)) * points.normal, -1)
 
 
@@ -191,16 +191,15 @@ class Finder:
         return patch, touches.astype(jnp.int32)
 
     def _points(self, placed: Placed, meeting: Meeting, pair: Array) -> tuple[Points, Array]:
-        """Return all points [c] at which two bodies may touch, and two directions [2, 3] in whose plane they spread."""
+        """Return all points [c, d] at which two bodies may touch, and two directions [2, 3] in whose plane they spread."""
         i, j = _numbers(meeting, pair)
-        first = jax.tree.map(lambda x: x[:, None], self._capsules(placed, meeting.first, i))
         if meeting.second in ("pads", "plates"):
             plate = self._plate(placed, meeting.second, j)
-            points, axes = on_plate(first, jax.tree.map(lambda x: x[None, None], plate)), plate.frame[:, :2].T
+            touch, axes = lambda capsule: on_plate(capsule, plate), plate.frame[:, :2].T  # noqa: E731
         else:
             other = self._capsules(placed, meeting.second, j)
-            points, axes = between_segments(first, jax.tree.map(lambda x: x[None], other)), jnp.eye(3)[:2]
-        return Points(points.depth.reshape(-1), points.place.reshape(-1, 3), points.normal.reshape(-1, 3)), axes
+            touch, axes = lambda capsule: between_segments(capsule, other), jnp.eye(3)[:2]  # noqa: E731
+        return jax.lax.map(touch, self._capsules(placed, meeting.first, i)), axes
 
     def depths(self, data: Any, joints: Joints, bodies: Bodies) -> Array:
         """Return how deep each pair of bodies overlaps, m, [g]; negative for a distance."""
