@@ -17,11 +17,13 @@ from jax import Array
 from jax.lax.linalg import triangular_solve
 
 from surgical_marl.physics.cone import Cone, curvature, forces, wrench
-from surgical_marl.physics.solver import Rows, solve_positive
+from surgical_marl.physics.solver import Rows, solve
 from surgical_marl.physics.touching import stored
 
 PASSES = 16
 """Evaluations of all forces in a step at most."""
+ITERATIONS = (6, 4)
+"""Newton steps for arms alone at most, and line search steps in each, while contacts are linear functions."""
 ENOUGH = 0.3
 """A step is long enough if the slope at its end is at most this share of that at its beginning."""
 LOOKS = 4
@@ -155,7 +157,7 @@ class Newton:
             here = search.here()
             local, pressed = self._contacts(problem, here)
             excess, felt = self._excess(problem, here, local)
-            slope = -_dot(excess, search.way)
+            slope = -_dot(self._whole(problem, here, excess), search.way)
             new_sides = self._sides(problem, here.arms)
             same = (pressed.sides == before.sides).all() & (new_sides == sides).all() & (search.length == 1)
             turned = jnp.sum((pressed.friction - before.friction) ** 2, -1) > TOLERANCE**2 * pressed.normal**2
@@ -165,8 +167,8 @@ class Newton:
             enough = settled | (jnp.abs(slope) <= ENOUGH * jnp.abs(search.slope)) | (search.looks >= LOOKS)
 
             def on(search: _Search) -> _Search:
-                way = self._direction(problem, excess, local, felt)
-                return search.begin(here, way, -_dot(excess, way))
+                way = self._direction(problem, here, excess, local, felt)
+                return search.begin(here, way, -_dot(self._whole(problem, here, excess), way))
 
             stay = lambda search: search.at(here)  # noqa: E731
             accept = lambda search: jax.lax.cond(settled, stay, on, search)  # noqa: E731
@@ -243,14 +245,10 @@ class Newton:
         return jax.lax.cond(contact.arm < len(self._dofs), on_arm, lambda local: local, local)
 
     def _excess(self, problem: Problem, point: _Point, local: _Local) -> tuple[_Point, Array]:
-        """Return the forces that are left over, and by how much those on arms [n, n] fall without the objects."""
-        rows, n = problem.rows, len(point.arms)
-        if not n:
+        """Return the forces that are left over, but for joints' rows, and how those on arms fall, [n, n]."""
+        if not len(point.arms):
             return _Point(point.arms, local.excess), problem.mass
-        unbounded = rows.impedance * (rows.reference - rows.jacobian @ point.arms)
-        gives = jnp.where((unbounded > rows.low) & (unbounded < rows.high), rows.impedance, 0.0)
-        excess = problem.smooth - problem.mass @ point.arms + rows.jacobian.T @ jnp.clip(unbounded, rows.low, rows.high)
-        stiff = problem.mass + rows.jacobian.T @ (gives[:, None] * rows.jacobian)
+        excess, stiff = problem.smooth - problem.mass @ point.arms, problem.mass
         for arm, own in enumerate(self._own):
             dofs = self._dofs[arm, own]
             excess = excess.at[dofs].add(local.arm_excess[arm, own])
@@ -270,18 +268,23 @@ class Newton:
             (excess, stiff), _ = jax.lax.scan(press, (excess, stiff), problem.between)
         return _Point(excess, local.excess), stiff
 
+    def _whole(self, problem: Problem, point: _Point, excess: _Point) -> _Point:
+        """Return the forces that are left over, with those of joints' rows."""
+        rows = problem.rows
+        return excess._replace(arms=excess.arms + rows.jacobian.T @ _clipped(rows, point.arms))
+
     def _sides(self, problem: Problem, arms: Array) -> Array:
-        """Return which rows are between their bounds (0), which at the lower (-1) and which at the upper one, [r]."""
-        found = []
-        for rows in (problem.rows, problem.between):
-            unbounded = rows.impedance * (rows.reference - rows.jacobian @ arms)
-            found.append((unbounded > rows.low).astype(jnp.int32) - (unbounded < rows.high))
-        return jnp.concatenate(found)
+        """Return which contacts of arms with arms press, [r] bool."""
+        rows = problem.between
+        return rows.reference - rows.jacobian @ arms > 0
 
     # -- the way from there
 
-    def _direction(self, problem: Problem, excess: _Point, local: _Local, stiff: Array) -> _Point:
-        """Return the Newton step: objects are eliminated, arms solved, and objects found from them."""
+    def _direction(self, problem: Problem, here: _Point, excess: _Point, local: _Local, stiff: Array) -> _Point:
+        """Return the way to the least cost if contacts are linear functions; friction and limits of joints are not.
+
+        Objects are eliminated, arms solved (`solver.py`), and objects found from them.
+        """
         n = len(excess.arms)
 
         def eliminate(arms: tuple[Array, Array], row: Any) -> tuple[tuple[Array, Array], Any]:
@@ -307,7 +310,10 @@ class Newton:
 
         rows = local.object, local.excess, local.coupling, self._coupled(problem)
         (stiff, force), kept = jax.lax.scan(eliminate, (stiff, excess.arms), rows)
-        found = solve_positive(stiff, force) if n else force
+        found = force
+        if n:
+            smooth = stiff @ here.arms + force
+            found = solve(stiff, smooth, problem.rows, here.arms, *ITERATIONS)[0] - here.arms
         return _Point(found, jax.lax.map(back, kept))
 
     def _coupled(self, problem: Problem) -> Array:

@@ -150,8 +150,7 @@ class Together:
             forces.mass + dt * forces.damping, forces.smooth, forces.rows, between, masses, free, felt.contacts,
             slots.total,
         )  # fmt: skip
-        start = dynamics.relaxed(forces, physics.qacc_warmstart)
-        found = self._newton.solve(problem, start, bodies.acceleration)
+        found = self._newton.solve(problem, physics.qacc_warmstart, bodies.acceleration)
         qvel = physics.qvel + dt * found.arms
         objects = moved(bodies, found.objects, dt)
         shift = dt * qvel, dt * objects.velocity

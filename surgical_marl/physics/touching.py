@@ -191,14 +191,14 @@ class Finder:
         return patch, touches.astype(jnp.int32)
 
     def _points(self, placed: Placed, meeting: Meeting, pair: Array) -> tuple[Points, Array]:
-        """Return all points [c, d] at which two bodies may touch, and two directions [2, 3] in whose plane they spread."""
+        """Return all points [c, d] at which two bodies may touch, and two directions [2, 3] along which they spread."""
         i, j = _numbers(meeting, pair)
         if meeting.second in ("pads", "plates"):
             plate = self._plate(placed, meeting.second, j)
-            touch, axes = lambda capsule: on_plate(capsule, plate), plate.frame[:, :2].T  # noqa: E731
+            touch, axes = lambda capsule: on_plate(capsule, plate), plate.frame[:, :2].T
         else:
             other = self._capsules(placed, meeting.second, j)
-            touch, axes = lambda capsule: between_segments(capsule, other), jnp.eye(3)[:2]  # noqa: E731
+            touch, axes = lambda capsule: between_segments(capsule, other), jnp.eye(3)[:2]
         return jax.lax.map(touch, self._capsules(placed, meeting.first, i)), axes
 
     def depths(self, data: Any, joints: Joints, bodies: Bodies) -> Array:
