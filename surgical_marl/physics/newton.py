@@ -26,7 +26,7 @@ ITERATIONS = (6, 4)
 """Newton steps for arms alone at most, and line search steps in each, while contacts are linear functions."""
 ENOUGH = 0.3
 """A step is long enough if the slope at its end is at most this share of that at its beginning."""
-LOOKS = 4
+LOOKS = 6
 """Lengths of a step that are tried at most."""
 TOLERANCE = 1e-2
 """Change of friction in a Newton step, as a share of the normal force, at which sliding contacts have converged."""
@@ -145,7 +145,7 @@ class Newton:
         still = jax.tree.map(jnp.zeros_like, begin)
         pressed = Pressed(jnp.zeros(slots), jnp.zeros((slots, 3)), jnp.full(slots, -1, jnp.int32))
         zero = jnp.float32(0.0)
-        search = _Search(begin, still, zero, zero, jnp.float32(jnp.inf), zero, zero, zero, jnp.int32(0))
+        search = _Search(begin, still, zero, zero, jnp.float32(jnp.inf), zero, jnp.int32(0))
         state = search, pressed, self._sides(problem, arms), jnp.bool_(False), jnp.int32(0)
 
         def going(state: Any) -> Array:
@@ -170,9 +170,12 @@ class Newton:
                 way = self._direction(problem, here, excess, local, felt)
                 return search.begin(here, way, -_dot(self._whole(problem, here, excess), way))
 
+            def look(search: _Search) -> _Search:
+                return search.look(slope, self._growth(problem, here, search.way, local, felt))
+
             stay = lambda search: search.at(here)  # noqa: E731
             accept = lambda search: jax.lax.cond(settled, stay, on, search)  # noqa: E731
-            search = jax.lax.cond(enough, accept, lambda search: search.look(slope), search)
+            search = jax.lax.cond(enough, accept, look, search)
             pressed, sides = jax.tree.map(
                 lambda new, old: jnp.where(enough, new, old), (pressed, new_sides), (before, sides)
             )
@@ -316,6 +319,18 @@ class Newton:
             found = solve(stiff, smooth, problem.rows, here.arms, *ITERATIONS)[0] - here.arms
         return _Point(found, jax.lax.map(back, kept))
 
+    def _growth(self, problem: Problem, here: _Point, way: _Point, local: _Local, stiff: Array) -> Array:
+        """Return by how much the slope of the cost along a way grows per length of it, []."""
+        rows, own = problem.rows, (local.object @ way.objects[..., None])[..., 0]
+        total = jnp.sum(way.objects * own)
+        if not len(way.arms):
+            return total
+        free = _clipped(rows, here.arms) == rows.impedance * (rows.reference - rows.jacobian @ here.arms)
+        along = rows.jacobian @ way.arms
+        total += way.arms @ (stiff @ way.arms) + jnp.sum(jnp.where(free, rows.impedance * along**2, 0.0))
+        joined = jnp.einsum("kacm,am->kc", local.coupling, self.by_arm(way.arms))
+        return total + 2 * jnp.sum(way.objects * joined)
+
     def _coupled(self, problem: Problem) -> Array:
         """Return which objects touch an arm, [k]."""
         contacts = problem.contacts
@@ -335,8 +350,6 @@ class _Search(NamedTuple):
     """The shortest one that was too long."""
     slope: Array
     """Of the cost along the way, at the start."""
-    slope_low: Array
-    slope_high: Array
     looks: Array
     """How many were tried."""
 
@@ -349,18 +362,16 @@ class _Search(NamedTuple):
     def begin(self, here: _Point, way: _Point, slope: Array) -> _Search:
         """Return the search along a new way."""
         zero = jnp.float32(0.0)
-        return _Search(here, way, jnp.float32(1.0), zero, jnp.float32(jnp.inf), slope, slope, zero, jnp.int32(0))
+        return _Search(here, way, jnp.float32(1.0), zero, jnp.float32(jnp.inf), slope, jnp.int32(0))
 
-    def look(self, slope: Array) -> _Search:
-        """Return the search with the length that comes next, where the line through both slopes is zero."""
+    def look(self, slope: Array, growth: Array) -> _Search:
+        """Return the search with the length that comes next: Newton's method on the slope, within a bracket."""
         short = slope < 0
-        low, slope_low = jnp.where(short, self.length, self.low), jnp.where(short, slope, self.slope_low)
-        high, slope_high = jnp.where(short, self.high, self.length), jnp.where(short, self.slope_high, slope)
-        share = jnp.clip(slope_low / jnp.minimum(slope_low - slope_high, -1e-30), 0.1, 0.9)
-        length = jnp.where(high < jnp.inf, low + share * (jnp.minimum(high, 1e9) - low), 2 * low)
-        return self._replace(
-            length=length, low=low, high=high, slope_low=slope_low, slope_high=slope_high, looks=self.looks + 1
-        )
+        low, high = jnp.where(short, self.length, self.low), jnp.where(short, self.high, self.length)
+        length = self.length - slope / jnp.maximum(growth, 1e-20)
+        inside = jnp.where(short, length < high, length > low)
+        length = jnp.where(inside, length, jnp.where(high < jnp.inf, (low + high) / 2, 2 * low))
+        return self._replace(length=length, low=low, high=high, looks=self.looks + 1)
 
 
 def _clipped(rows: Rows, arms: Array) -> Array:
