@@ -151,8 +151,7 @@ class Together:
         handled = jnp.maximum(touch.handled, self._hardest(felt, found.forces))
         if touching is None or closest is None:
             return after, touch._replace(handled=handled)
-        its_own = touching.pair == np.arange(self._pairs.count)[:, None]
-        each = jnp.where(its_own, found.rows[joints:], 0.0).sum(-1)
+        each = self._pairs.spread(touching, found.rows[joints:])
         penetration = jnp.maximum(touch.penetration, -closest.distance)
         overflow = jnp.maximum(touch.overflow, self._pairs.overflow(closest))
         return after, Touch(penetration, jnp.maximum(touch.force, each), handled, overflow)
