@@ -7,6 +7,7 @@ at a time: only the `SLOTS` deepest become constraint rows.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -15,10 +16,18 @@ import mujoco
 import numpy as np
 from jax import Array
 
+from surgical_marl.physics.tiles import Tiles
 from surgical_marl.scenes.geometry import Capsule, axis_gap
 
 SLOTS = 6
 """Contacts at one time. Arms driven at random with full effort in all six scenes had 4 at most, in 144,000 steps."""
+
+
+AT_ONCE = 128
+"""Pairs up to which all are looked at side by side. If there are more, a loop over pairs of arms keeps the fused
+engine's code as short for six arms as for two."""
+BLOCK = 36
+"""Pairs among which the deepest are found at a time, if there are more than `AT_ONCE`."""
 
 
 class Closest(NamedTuple):
@@ -52,21 +61,24 @@ class Pairs:
         self.count = model.npair
         self._geoms = model.pair_geom1.copy(), model.pair_geom2.copy()
         capsule = mujoco.mjtGeom.mjGEOM_CAPSULE
-        self._halves = [
-            np.where(model.geom_type[g] == capsule, model.geom_size[g, 1], 0).astype(single) for g in self._geoms
-        ]
-        self._radii = [model.geom_size[g, 0].astype(single) for g in self._geoms]
+        self._half = np.where(model.geom_type == capsule, model.geom_size[:, 1], 0).astype(single)
+        self._radius = model.geom_size[:, 0].astype(single)
+        self.tiles = Tiles(model, *self._geoms) if self.count > AT_ONCE else None
         bodies = [model.geom_bodyid[geoms] for geoms in self._geoms]
         self._weight = sum(model.body_invweight0[body, 0] for body in bodies).astype(single)
         moved = moved_bodies(model)
+        self._blocks = np.minimum(np.arange(-(-self.count // BLOCK) * BLOCK), self.count - 1).reshape(-1, BLOCK)
         self._sign = (moved[bodies[1]] - moved[bodies[0]]).astype(single)
         self._roots = model.body_rootid[model.dof_bodyid]
 
     def overlap(self, geom_xpos: Array, geom_xmat: Array) -> Array:
         """Return whether any pair overlaps, []: for less than what `distance` costs."""
-        gap = axis_gap(*self._capsules(geom_xpos, geom_xmat))[1]
-        reach = self._radii[0] + self._radii[1]
-        return jnp.min(jnp.sum(gap * gap, -1) - reach * reach, initial=np.inf) < 0
+
+        def least(one: Capsule, other: Capsule, is_pair: Any) -> Array:
+            gap, reach = axis_gap(one, other)[1], one.radius + other.radius
+            return jnp.min(jnp.where(is_pair, jnp.sum(gap * gap, -1) - reach * reach, np.inf), initial=np.inf)
+
+        return jnp.min(self._each(least, geom_xpos, geom_xmat)) < 0
 
     def distance(self, geom_xpos: Array, geom_xmat: Array) -> Array:
         """Return the signed distance of every pair, m, [P]; negative where they overlap."""
@@ -74,20 +86,25 @@ class Pairs:
 
     def closest(self, geom_xpos: Array, geom_xmat: Array) -> Closest:
         """Return where the pairs are closest, from positions [ngeom, 3] and frames [ngeom, 3, 3] of all geoms."""
-        one, other = self._capsules(geom_xpos, geom_xmat)
-        where, gap = axis_gap(one, other)
-        length = jnp.sqrt(jnp.maximum(jnp.sum(gap * gap, -1), 1e-18))
-        normal = gap / length[:, None]
-        distance = length - (one.radius + other.radius)
-        segment = one.segment()
-        point = segment.start + where[:, None] * segment.extent + (one.radius + distance / 2)[:, None] * normal
-        return Closest(distance, point, normal)
+        found: Closest = self._each(_closest, geom_xpos, geom_xmat)
+        if self.tiles is None:
+            return found
+        place = self.tiles.place
+        return jax.tree.map(lambda x: x.reshape(-1, *x.shape[3:])[place], found)
 
-    def _capsules(self, geom_xpos: Array, geom_xmat: Array) -> tuple[Capsule, Capsule]:
-        """Return the capsules of the first and of the second geoms of all pairs, [P] each."""
-        parts = zip(self._geoms, self._halves, self._radii, strict=True)
-        one, other = (Capsule(geom_xpos[g], geom_xmat[g][:, :, 2], half, radius) for g, half, radius in parts)
-        return one, other
+    def _each(self, of: Callable[[Capsule, Capsule, Any], Any], geom_xpos: Array, geom_xmat: Array) -> Any:
+        """Return what a function makes of the capsules of all pairs.
+
+        It is called with both capsules of all pairs, [P], and True; or, if there are many, as `Tiles.each` does.
+        """
+        if self.tiles is None:
+            one, other = (self._capsules(geoms, geom_xpos, geom_xmat) for geoms in self._geoms)
+            return of(one, other, np.bool_(True))
+        return self.tiles.each(of, self._capsules(self.tiles.geoms, geom_xpos, geom_xmat))
+
+    def _capsules(self, geoms: np.ndarray, geom_xpos: Array, geom_xmat: Array) -> Capsule:
+        """Return the capsules of some geoms."""
+        return Capsule(geom_xpos[geoms], geom_xmat[geoms][:, :, 2], self._half[geoms], self._radius[geoms])
 
     def overflow(self, closest: Closest) -> Array:
         """Return how many overlapping pairs `deepest` leaves out, []."""
@@ -99,15 +116,47 @@ class Pairs:
     def deepest(self, data: Any, closest: Closest) -> Touching:
         """Return the contacts of the deepest pairs, at most `SLOTS` of them.
 
-        `data` is MJX's data, with `cdof` and `subtree_com`. The Jacobian of a pair that does not overlap is zero.
+        `data` is MJX's data, with the poses of geoms, `cdof` and `subtree_com`. The Jacobian of a pair that does not
+        overlap is zero.
         """
-        distance, pair = jax.lax.top_k(-closest.distance, min(SLOTS, self.count))
-        point, normal = closest.point[pair], closest.normal[pair]
+        distance, pair = self._top(-closest.distance)
+        if self.tiles is None:
+            point, normal = closest.point[pair], closest.normal[pair]
+        else:  # computed again: the fused engine would look for each number among those of all pairs
+            known = self._capsules(self.tiles.geoms, data.geom_xpos, data.geom_xmat)
+            _, point, normal = _closest(*self.tiles.ends_of(pair, known), np.bool_(True))
         offset = point[:, None] - data.subtree_com[self._roots]
         velocity = data.cdof[:, 3:] + jnp.cross(data.cdof[:, :3], offset)
         jacobian = jnp.asarray(self._sign)[pair] * jnp.sum(velocity * normal[:, None], -1)
         touching = distance > 0
         return Touching(pair, -distance, jacobian * touching[:, None], jnp.asarray(self._weight)[pair])
+
+    def _top(self, depth: Array) -> tuple[Array, Array]:
+        """Return the `SLOTS` largest of all pairs' depths [P], and which pairs these are."""
+        if self.tiles is None:
+            return jax.lax.top_k(depth, min(SLOTS, self.count))
+        padded = jnp.where(np.arange(self._blocks.size) < self.count, depth[self._blocks.ravel()], -np.inf)
+        found, place = jax.lax.map(lambda rows: jax.lax.top_k(rows, SLOTS), padded.reshape(-1, BLOCK))
+        pairs = place + BLOCK * np.arange(len(found))[:, None]
+        best, which = jax.lax.top_k(found.ravel(), SLOTS)
+        return best, pairs.ravel()[which]
+
+    def spread(self, touching: Touching, values: Array) -> Array:
+        """Return values of the deepest contacts [K] by pair, [P]; 0 for all others."""
+        if self.tiles is None:
+            return jnp.where(touching.pair == np.arange(self.count)[:, None], values, 0.0).sum(-1)
+        return jnp.zeros(self.count, values.dtype).at[touching.pair].set(values)
+
+
+def _closest(one: Capsule, other: Capsule, is_pair: Any) -> Closest:
+    """Return where pairs of capsules are closest."""
+    where, gap = axis_gap(one, other)
+    length = jnp.sqrt(jnp.maximum(jnp.sum(gap * gap, -1), 1e-18))
+    normal = gap / length[..., None]
+    distance = length - (one.radius + other.radius)
+    segment = one.segment()
+    point = segment.start + where[..., None] * segment.extent + (one.radius + distance / 2)[..., None] * normal
+    return Closest(distance, point, normal)
 
 
 def moved_bodies(model: mujoco.MjModel) -> np.ndarray:

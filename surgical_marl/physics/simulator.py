@@ -30,6 +30,9 @@ from surgical_marl.scenes.timing import DECIMATION
 TOUCHING_ITERATIONS = (6, 6)
 """Most Newton steps, and line search steps in each, for arms that touch: see docs/physics.md."""
 
+MOST_JOINED = 32
+"""Joints up to which arms that touch are one dense problem: the code of a dense one grows with the cube of them."""
+
 
 class Kind:
     """The arms of one type in a scene.
@@ -234,9 +237,9 @@ class Simulator:
         contacts = dynamics.contact_rows(touching.jacobian, touching.distance, touching.weight, physics.qvel)
         joined = Rows(*(jnp.concatenate(parts) for parts in zip(forces.rows, contacts, strict=True)))
         start = dynamics.relaxed(forces, physics.qacc_warmstart)
-        qacc, force = solve(forces.mass, forces.smooth, joined, start, *TOUCHING_ITERATIONS)
-        its_own = touching.pair == np.arange(self._pairs.count)[:, None]
-        each = jnp.where(its_own, force[len(forces.rows.low) :], 0.0).sum(-1)
+        between = len(touching.pair) if len(physics.qvel) > MOST_JOINED else 0
+        qacc, force = solve(forces.mass, forces.smooth, joined, start, *TOUCHING_ITERATIONS, between)
+        each = self._pairs.spread(touching, force[len(forces.rows.low) :])
         deepest = jnp.maximum(touch.penetration, -closest.distance)
         overflow = jnp.maximum(touch.overflow, self._pairs.overflow(closest))
         hardest = touch._replace(penetration=deepest, force=jnp.maximum(touch.force, each), overflow=overflow)

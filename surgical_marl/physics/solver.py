@@ -104,14 +104,15 @@ def relax(mass: Array, smooth: Array, joints: JointRows, qacc: Array) -> Array:
     return jnp.stack(found)
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(4, 5))
+@partial(jax.custom_jvp, nondiff_argnums=(4, 5, 6))
 def solve(
-    mass: Array, smooth: Array, rows: Rows, start: Array, iterations: int, line_search: int
+    mass: Array, smooth: Array, rows: Rows, start: Array, iterations: int, line_search: int, between: int = 0
 ) -> tuple[Array, Array]:
     """Return the acceleration [n] and the force of each row [r].
 
     They are found for a mass matrix [n, n] and the sum `smooth` [n] of all other forces, by Newton steps from `start`.
-    Each Newton step has `line_search` steps of line search.
+    Each Newton step has `line_search` steps of line search. If `between` is not 0, only that many rows, the last ones,
+    concern joints of several arms: then no matrix larger than that of an arm is factorised (`_newton_step`).
 
     There are at most `iterations` Newton steps. A step over which no row changes sides ends at the solution, and a
     second such step removes its rounding error. After that the search stops.
@@ -124,9 +125,8 @@ def solve(
         force = jnp.clip(unbounded, rows.low, rows.high)
         above, below = unbounded > rows.low, unbounded < rows.high
         rest = mass @ qacc - smooth
-        weighted = jnp.where(above & below, rows.impedance, 0.0)[:, None] * rows.jacobian
-        hessian = mass + rows.jacobian.T @ weighted
-        search = solve_positive(hessian, rows.jacobian.T @ force - rest)
+        gives = jnp.where(above & below, rows.impedance, 0.0)
+        search = _newton_step(mass, rows.jacobian, gives, rows.jacobian.T @ force - rest, between)
         step, end = _line_search(mass, rows, unbounded, rest, search, line_search)
         return qacc + step * search, (((end > rows.low) == above) & ((end < rows.high) == below)).all()
 
@@ -146,9 +146,25 @@ def solve(
     return qacc, _force(rows, qacc)
 
 
+def _newton_step(mass: Array, jacobian: Array, gives: Array, excess: Array, between: int) -> Array:
+    """Return x [n] with (mass + jacobian.T @ diag(gives) @ jacobian) @ x = excess.
+
+    Without the last `between` rows the matrix has a block for each arm and zeros elsewhere, and so has its Cholesky
+    factor: the fused engine has no code for zeros. These rows are added by Woodbury's identity (W. Hager, "Updating the
+    inverse of a matrix", SIAM Review 31, 1989), which takes one small matrix more.
+    """
+    if not between:
+        return solve_positive(mass + jacobian.T @ (gives[:, None] * jacobian), excess)
+    own, root = jacobian[:-between], jnp.sqrt(gives[-between:])[:, None] * jacobian[-between:]
+    blocks = mass + own.T @ (gives[:-between, None] * own)
+    eased = solve_positive(blocks, jnp.concatenate([excess[:, None], root.T], 1))
+    share = solve_positive(jnp.eye(between) + root @ eased[:, 1:], root @ eased[:, 0])
+    return eased[:, 0] - eased[:, 1:] @ share
+
+
 @solve.defjvp
 def _differentiate(
-    iterations: int, line_search: int, primals: tuple[Any, ...], tangents: tuple[Any, ...]
+    iterations: int, line_search: int, between: int, primals: tuple[Any, ...], tangents: tuple[Any, ...]
 ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
     """Return the solution and its derivative, by the implicit function theorem.
 
@@ -156,7 +172,7 @@ def _differentiate(
     system, which is never degenerate. The way to the solution is no use: at rest it divides zero by zero.
     """
     mass, smooth, rows, _ = primals
-    qacc, force = solve(*primals, iterations, line_search)
+    qacc, force = solve(*primals, iterations, line_search, between)
 
     def excess(mass: Array, smooth: Array, rows: Rows) -> Array:
         return smooth + rows.jacobian.T @ _force(rows, qacc) - mass @ qacc
@@ -203,5 +219,5 @@ def _line_search(
 
 
 def solve_positive(matrix: Array, right: Array) -> Array:
-    """Return x with matrix @ x = right, for a symmetric positive definite matrix [n, n]."""
+    """Return x with matrix @ x = right [n] or [n, k], for a symmetric positive definite matrix [n, n]."""
     return cho_solve((jax.lax.linalg.cholesky(matrix, symmetrize_input=False), True), right)

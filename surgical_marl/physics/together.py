@@ -162,8 +162,7 @@ class Together:
         )
         if closest is None:
             return after, touch
-        its_own = touching.pair == np.arange(self._pairs.count)[:, None]
-        each = jnp.where(its_own, found.between, 0.0).sum(-1)
+        each = self._pairs.spread(touching, found.between)
         penetration = jnp.maximum(touch.penetration, -closest.distance)
         overflow = jnp.maximum(touch.overflow, self._pairs.overflow(closest))
         return after, touch._replace(penetration=penetration, force=jnp.maximum(touch.force, each), overflow=overflow)

@@ -1,0 +1,59 @@
+"""The fused engine's physics step with objects beside the reference, from any states."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import numpy as np
+
+from surgical_marl.bench.physics import PhysicsAlone
+from surgical_marl.engines.choose import make_engine
+from surgical_marl.envs.env import Env
+
+PARTS = (".qpos", ".qvel", ".objects.bodies.position", ".objects.bodies.quaternion", ".objects.bodies.velocity",
+         ".objects.grips.force", ".objects.grips.position")  # fmt: skip
+
+
+class Beside:
+    """Both engines on a scene."""
+
+    def __init__(self, scene: str, count: int) -> None:
+        self.env = Env("reach", scene)
+        self.simulator = simulator = self.env.simulator
+        self._step = jax.jit(jax.vmap(lambda physics: simulator._step(physics, simulator.untouched)[0]))
+        self._engine = make_engine(PhysicsAlone(self.env), count, "fused", "cpu")
+        self._engine.reset(0)
+
+    def step(self, now: Any, compared: bool = True) -> Any:
+        """Return the reference's states [n] after a step, once the fused engine's are found to be the same.
+
+        Equal to 1e-5 of their scale, or as near as the reference is to itself when the last digit of the state changes.
+        """
+        now = jax.tree.map(np.asarray, now)
+        after = jax.tree.map(np.asarray, self._step(now))
+        if compared:
+            for path, values in _leaves(now).items():
+                self._engine.write(f".physics{path}", values)
+            self._engine.step({})
+            others, expected = [_leaves(self._step(_nudged(now, way))) for way in (-99, 99)], _leaves(after)
+            for part in PARTS:
+                found = self._engine.read(f".physics{part}", "numpy")
+                scale = np.abs(expected[part]).max() + 1e-3
+                response = max(np.abs(other[part] - expected[part]).max() for other in others)
+                off = np.abs(found - expected[part]).max()
+                assert off <= 1e-5 * scale + 10 * response, f"{part} is off by {off}, the response is {response}"
+        return after
+
+
+def _nudged(physics: Any, way: float) -> Any:
+    """Return the same states with the last digit changed of all joints, and of how objects are and move."""
+    change = lambda values: np.nextafter(values, np.float32(way))  # noqa: E731
+    bodies = physics.objects.bodies
+    moved = bodies._replace(**{part: change(getattr(bodies, part)) for part in ("position", "quaternion", "velocity")})
+    return physics._replace(qpos=change(physics.qpos), objects=physics.objects._replace(bodies=moved))
+
+
+def _leaves(tree: Any) -> dict[str, np.ndarray]:
+    found = jax.tree_util.tree_flatten_with_path(tree)[0]
+    return {jax.tree_util.keystr(path): np.asarray(leaf) for path, leaf in found}
