@@ -68,11 +68,12 @@ class Grasps:
     """One PSM that grasps one of some objects in the air, in environments side by side. All others fall.
 
     Args:
-        names: the objects.
+        objects: their names or files. One that isn't in `OBJECTS` has a site `grasp`.
     """
 
-    def __init__(self, names: Sequence[str]) -> None:
-        self.names, self.scene = tuple(names), scene_of(names)
+    def __init__(self, objects: Sequence[str]) -> None:
+        self.scene = scene_of(objects)
+        self.names = tuple(self.scene.objects)
         (self.agent,) = self.scene.agents
         self.simulator = Simulator(self.scene, decimation=1)
         self._dynamics, self.handling = Dynamics(self.scene.model), Handling(self.scene)
@@ -145,7 +146,7 @@ class Grasps:
     def _draw(self, rng: np.random.Generator, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return qpos, and the object's centre of mass and quaternion: between the pads, and not in the wrist's way."""
         arm, item = self.scene.mounts[self.agent].arm, self.scene.objects[name].object
-        (site, axes), radius = item.sites[OBJECTS[name]], min(shape.size[0] for shape in item.shapes)
+        (site, axes), radius = item.sites[OBJECTS.get(name, "grasp")], min(shape.size[0] for shape in item.shapes)
         away, data = item.center - site, mujoco.MjData(self.scene.model)
         while True:
             q, depth = arm.home.copy(), rng.uniform(0.006, 0.009)
@@ -161,7 +162,7 @@ class Grasps:
             across = np.stack([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]], 1)
             turn = wrist @ turned(np.degrees([tilt, 0, 0])) @ across @ turned(np.degrees([spin, 0, 0])) @ axes.T
             at = link.xpos + wrist @ [0, rng.uniform(-5e-4, 5e-4), -depth]
-            if (turn @ away) @ wrist[:, 2] < -0.2 * np.linalg.norm(away):
+            if (turn @ away) @ wrist[:, 2] <= 1e-9 - 0.2 * np.linalg.norm(away):
                 break
         for _ in range(5):  # as wide open as the object's bends need, and in the middle
             left, right = self._gaps(data, name, at + turn @ away, quaternion(turn))
@@ -190,9 +191,9 @@ class Grasps:
         return depth[jnp.asarray(patches)[o]]
 
 
-def scene_of(names: Sequence[str]) -> Scene:
-    """Return a scene of one PSM and some objects in the air."""
-    places = [f"  {name}: {{object: {name}, position: [{0.1 * i}, 0.3, 0.0]}}" for i, name in enumerate(names)]
+def scene_of(objects: Sequence[str]) -> Scene:
+    """Return a scene of one PSM and some objects in the air, by their names or files."""
+    places = [f"  {Path(o).stem}: {{object: {o}, position: [{0.1 * i}, 0.3, 0.0]}}" for i, o in enumerate(objects)]
     arm = ["arms:", "  psm_0: {arm: psm, position: [0.0, 0.0, 0.15]}"]
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "psm_in_the_air.yaml"

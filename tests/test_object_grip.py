@@ -1,0 +1,78 @@
+"""What forces a grip bears, and what stops a finger."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import surgical_marl as sm
+from surgical_marl.physics import together
+from surgical_marl.physics.handling import Handling
+from surgical_marl.physics.simulator import Simulator
+from surgical_marl.robots.inverse_kinematics import inverse_kinematics
+from surgical_marl.studies.grasping import CHUNK, CLOSING, Grasps
+
+STEPS = 240
+FRICTIONS = (0.12, 0.18, 0.25)
+"""With more friction the arm, which bears 9.9 N along its shaft, would give way before the grip does."""
+
+
+BAR = """
+description: a bar, gripped in its middle
+free: true
+mass: 0.001
+friction: {sliding: 0.8, torsion: 0.002}
+stiffness: 1.0e+6
+colour: [0.5, 0.5, 0.5]
+shapes:
+  - capsule: {radius: 0.0004, from: [-0.005, 0.0, 0.0], to: [0.005, 0.0, 0.0]}
+sites:
+  grasp: {position: [0.0, 0.0, 0.0]}
+"""
+
+
+@pytest.mark.slow
+def test_a_held_object_breaks_away_at_the_force_that_coulomb_says(tmp_path: Path) -> None:
+    """Bars in grips of three frictions are pulled out of the jaw, harder and harder, by their weight."""
+    (tmp_path / "bar.yaml").write_text(BAR)
+    jaw, each = Grasps([str(tmp_path / "bar.yaml")]), 3
+    held, mu = np.zeros(3 * each, int), np.repeat(FRICTIONS, each)
+    tables, mass = jaw.simulator._objects._handling.tables, float(jaw.handling.tables.masses.mass[0])  # type: ignore[union-attr]
+    fingers, pads = (np.array([getattr(f, of) for f in jaw.handling.tables.fingers]) for of in ("body", "geom"))
+    closing = np.zeros((len(held), CLOSING * CHUNK, 7), np.float32)
+    closing[..., -1] = -1
+    physics, _ = jaw.play(jaw.begin(held, seed=3), closing, held)
+
+    def frame(physics: Any) -> tuple[Any, Any, Any]:
+        """Return the way out of the jaw, how far out the object is, and how far the pads' normals point that way."""
+        data = jaw._dynamics.pose(physics.qpos)
+        out = -data.xmat[fingers][:, :, 2].sum(0)
+        out /= jnp.linalg.norm(out)
+        lean = jnp.abs(data.geom_xmat[pads][:, :, 0] @ out)  # they are thinnest in x
+        return out, out @ (physics.objects.bodies.position[0] - data.xpos[fingers].mean(0)), lean
+
+    def pull(physics: Any, mu: Any) -> Any:
+        out, _, _ = frame(physics)
+
+        def step(physics: Any, force: Any) -> Any:
+            sliding = jnp.full(len(tables.sliding), mu)
+            with patch.object(together, "GRAVITY", out * force / mass), patch.object(tables, "sliding", sliding):
+                physics, _ = jaw.simulator._step(physics, jaw.simulator.untouched)
+            return physics, (*frame(physics)[1:], physics.objects.grips.force[0])
+
+        return jax.lax.scan(step, physics, 60 * mu * jnp.arange(STEPS) / STEPS)[1]
+
+    way, lean, normal = (np.asarray(x, float) for x in jax.jit(jax.vmap(pull))(physics, jnp.float32(mu)))
+    for e, friction in enumerate(mu):
+        loose = int(np.argmax(way[e] > way[e, 0] + 1e-4))
+        assert 0 < loose, "it is held for ever"
+        found = 60 * friction * loose / STEPS
+        coulomb = normal[e, loose - 1] @ (friction * np.sqrt(1 - lean[e, loose - 1] ** 2) - lean[e, loose - 1])
+        print(friction, found, coulomb)
+        assert abs(found / coulomb - 1) < 0.15, (friction, found, coulomb)
