@@ -15,7 +15,6 @@ import surgical_marl as sm
 from surgical_marl.physics import together
 from surgical_marl.physics.handling import Handling
 from surgical_marl.physics.simulator import Simulator
-from surgical_marl.robots.inverse_kinematics import inverse_kinematics
 from surgical_marl.studies.grasping import CHUNK, CLOSING, Grasps
 
 STEPS = 240
@@ -39,11 +38,12 @@ sites:
 
 @pytest.mark.slow
 def test_a_held_object_breaks_away_at_the_force_that_coulomb_says(tmp_path: Path) -> None:
-    """Balls in grips of three frictions are pulled out of the jaw, harder and harder, by their weight. The pads lean outwards."""
+    """Balls in grips of three frictions are pulled out of the jaw, harder and harder. The pads lean outwards."""
     (tmp_path / "ball.yaml").write_text(BALL)
     jaw, each = Grasps([str(tmp_path / "ball.yaml")]), 3
     held, mu = np.zeros(3 * each, int), np.repeat(FRICTIONS, each)
-    tables, mass = jaw.simulator._objects._handling.tables, float(jaw.handling.tables.masses.mass[0])  # type: ignore[union-attr]
+    assert jaw.simulator._objects
+    tables, mass = jaw.simulator._objects._handling.tables, float(jaw.handling.tables.masses.mass[0])
     fingers, pads = (np.array([getattr(f, of) for f in jaw.handling.tables.fingers]) for of in ("body", "geom"))
     closing = np.zeros((len(held), CLOSING * CHUNK, 7), np.float32)
     closing[..., -1] = -1
@@ -71,15 +71,19 @@ def test_a_held_object_breaks_away_at_the_force_that_coulomb_says(tmp_path: Path
     way, lean, normal = (np.asarray(x, float) for x in jax.jit(jax.vmap(pull))(physics, jnp.float32(mu)))
     for e, friction in enumerate(mu):
         loose = int(np.argmax(way[e] > way[e, 0] + 1e-4))
-        assert 0 < loose, "it is held for ever"
+        assert loose > 0, "it is held for ever"
         found = 60 * friction * loose / STEPS
         coulomb = normal[e, 0] @ (friction * np.sqrt(1 - lean[e, 0] ** 2) - lean[e, 0])
         assert abs(found / coulomb - 1) < 0.15, (friction, found, coulomb)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "place", "most"), [("pad", (0.0, 0.0), 5e-4), ("peg_board_icra2026", (-0.02, 0.0), 1e-4)])
-def test_a_finger_pressed_on_something_stops_there(tmp_path: Path, name: str, place: tuple[float, float], most: float) -> None:
+@pytest.mark.parametrize(
+    ("name", "place", "most"), [("pad", (0.0, 0.0), 5e-4), ("peg_board_icra2026", (-0.02, 0.0), 1e-4)]
+)
+def test_a_finger_pressed_on_something_stops_there(
+    tmp_path: Path, name: str, place: tuple[float, float], most: float
+) -> None:
     """The arm moves down at its full speed and goes on pressing with full effort."""
     thing = f"{{object: {name}, position: [{place[0]}, {place[1]}, 0.02]}}"
     needle = "{object: needle_sh, position: [0.0, 1.0, 0.0]}"

@@ -149,7 +149,7 @@ def test_an_object_slides_where_coulomb_says(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_what_falls_on_a_board_and_on_pegs_comes_to_rest_there(tmp_path: Path) -> None:
-    """Blocks around pegs, upright or aslant, and needles on the pegs' tops; then they drift by less than 0.1 mm in 10 s."""
+    """Blocks around pegs, upright or aslant, and needles on top; then they drift by less than 0.1 mm in 10 s."""
     places = {
         "block": {"object": "block", "position": [-0.06, 0.0, 0.0076]},
         "aslant": {"object": "block", "position": [0.0615, 0.001, 0.012], "tilt": [12.0, 8.0, 0.0]},

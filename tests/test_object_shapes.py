@@ -110,7 +110,7 @@ def test_contact_of_capsules_is_a_continuous_function_of_the_pose(
 @given(poses)
 @settings(max_examples=50, deadline=None)
 def test_the_overlap_with_a_plate_is_that_of_geometry(pose: tuple[float, ...]) -> None:
-    """Of 20,001 places along each capsule none is deeper than its nearest point by more than the price of the way there."""
+    """Of 20,001 places along each capsule none is deeper than its nearest point by more than the price."""
     wire, (points, _) = wire_at(jnp.array(pose)), touch(jnp.array(pose))
     start, end, share = np.array(wire.start, float), np.array(wire.end, float), np.linspace(0, 1, 20001)[:, None]
     for c in range(3):

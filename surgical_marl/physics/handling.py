@@ -19,19 +19,19 @@ from surgical_marl.physics.tables import Tables
 DAMPING = 5e-3
 """Damping of a contact in the normal direction, s: this times its stiffness, N s/m."""
 FIRM = 1e-5
-"""Overlap from which on that damping is whole, m. It begins with none (K. H. Hunt and F. R. E. Crossley, 1975), so that
-the force of a contact is continuous where it begins, and nothing is slowed before it touches."""
+"""Overlap now or at the end of the step from which on this damping is whole, m. It begins with none (K. H. Hunt and F.
+F. R. E. Crossley, 1975), so that a force is continuous where it begins, and what will not touch is not slowed."""
 SHARE = 0.5
-"""Stiffness of each of the four points of a contact, relative to that of a point in an object's file: a contact is as stiff
-as a capsule that lies flat, on its two ends."""
+"""Stiffness of each of the four points of a contact, relative to that of a point in an object's file: a contact is as
+stiff as a capsule that lies flat, on its two ends."""
 MARGIN = 2e-4
 """Distance within which a point that might touch during the step is watched, m: its stiffness grows from none there."""
 AHEAD = 0.02
-"""Distance up to which a point is watched, m, however fast it comes: 8 m/s in a step of 2.5 ms. What spins fast would seem to
-come nearer from anywhere: by the angle times its distance."""
+"""Distance up to which a point is watched, m, however fast it comes: 8 m/s in a step of 2.5 ms. What spins fast would
+seem to come nearer from anywhere: by the angle times its distance."""
 FASTEST = 0.04
-"""Speed at which an overlap is pushed out at most, m/s: a deep one, as after a fall within one step, meets more damping. The
-force of something that is pressed in grows with its overlap nevertheless."""
+"""Speed at which an overlap is pushed out at most, m/s: a deep one, as after a fall within one step, meets more
+damping. The force of something that is pressed in grows with its overlap nevertheless."""
 SHEAR = 0.8
 """Stiffness of a contact along the surface, relative to that of a point along the normal (R. D. Mindlin, 1949: 2 (1 -
 nu) / (2 - nu) for materials of Poisson's ratio nu, 0.8 for 0.33)."""
@@ -174,7 +174,8 @@ class Handling:
         k = SHEAR * jnp.asarray(t.stiffness)
         springs = jnp.where(t.remembers, k, 0.0)
         drag = jnp.where(t.remembers, k * (dt + DAMPING), k * CREEP)
-        rubbed = along @ velocity + dt / 2 * jnp.concatenate([jnp.einsum("gti,gi->gt", patches.frame[:, 1:], bends[:, -1]), 0 * about[:, :1]], -1)
+        bent = jnp.einsum("gti,gi->gt", patches.frame[:, 1:], bends[:, -1])
+        rubbed = along @ velocity + dt / 2 * jnp.pad(bent, ((0, 0), (0, 1)))  # turning about the normal: too little
         pull = -springs[:, None] * slip - drag[:, None] * rubbed
         cones = Cones(normal, dt * rate, push, along, dt * drag, pull, jnp.asarray(t.sliding))
         return Felt(patches, cones, slip)
@@ -244,10 +245,10 @@ class Handling:
         return data.xpos[body], data.xmat[body]
 
     def _bends(self, data: Any, bodies: Bodies, qvel: Array, places: Array) -> Array:
-        """Return the relative acceleration at places [g, s, 3] with which all go on at the velocities of now, [g, s, 3].
+        """Return the relative acceleration, [g, s, 3], at places [g, s, 3] if all goes on at the velocities of now.
 
-        In a step joints move bodies on arcs, and an object turns about its centre of mass, which goes straight on. Half of
-        this acceleration times the step's duration makes velocities at its start those of its chords.
+        In a step joints move bodies on arcs, and an object turns about its centre of mass, which goes straight on.
+        Half of this acceleration times the step's duration makes velocities at its start those of its chords.
         """
         spin, signs = bodies.velocity[:, 3:], jnp.asarray(self._objects)[:, None, :, None]
         lever = places[:, :, None] - bodies.position

@@ -1,8 +1,8 @@
 """Where objects are touched: patches, each between two bodies, of a few points and one friction.
 
-The points of a patch are the support of the contact: of all points at which the shapes of two bodies may touch, those that
-are deepest as the bodies are, and if one of them were tilted a little in each of three directions. Points that are equally
-deep are averaged. So points move as the bodies move; none appears or vanishes from one step to the next.
+The points of a patch are the support of the contact: of all points at which the shapes of two bodies may touch, those
+that are deepest as the bodies are, and if one of them were tilted a little in each of three directions. Points that are
+equally deep are averaged. So points move as the bodies move; none appears or vanishes from one step to the next.
 
 A patch has one friction, with a bound by the sum of its normal forces: a force along the surface and a torque about the
 normal, bounded together by an ellipsoid (R. D. Howe and M. R. Cutkosky, "Practical force-motion models for sliding
@@ -24,13 +24,14 @@ SLOTS = 4
 AWAY = -100.0
 """Depth, m, of a point that is not there: no scene is so large."""
 TILT = 0.03
-"""By which a body is tilted to find the rim of a contact, rad: about the angle by which an object in a firm grip can rock."""
+"""By which a body is tilted to find the rim of a contact, rad: about the angle by which an object in a firm grip can
+rock."""
 BLEND = 1e-5
 """Difference in depth over which the place of a point goes from one of two candidates to the other, m: a quarter of the
 overlap of a firm grip."""
 ALIKE = 1e-4
-"""Depth beyond which points of the rim are not told apart, m: of all points that a fast object brings in within a step it
-takes the outermost."""
+"""Depth beyond which points of the rim are not told apart, m: of all points that a fast object brings in within a step
+it takes the outermost."""
 _TILTS = np.array([[1.0, 0.0], [-0.5, 0.866], [-0.5, -0.866]], np.float32)
 
 
@@ -52,8 +53,8 @@ def find_patch(points: Points, soon: Array, axes: Array, torsion: Array) -> Patc
 
     Args:
         points: all points [c] at which their shapes may touch.
-        soon: their depths after a step with the velocities of now, [c]. A point counts by the larger one of both depths,
-            so that no part of a fast object comes in unseen.
+        soon: their depths after a step with the velocities of now, [c]. A point counts by the larger one of both
+            depths, so that no part of a fast object comes in unseen.
         axes: two directions, [2, 3]: bodies are tilted about those across them.
         torsion: radius of the contact at a point, m, [].
     """

@@ -14,13 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-
 NEAR = 0.02
 """Angle between a capsule and what it touches, rad, up to which its nearest point is not at its nearer end: how far a
 capsule of some mm turns as its one end goes in by the overlap of a firm grip."""
 EVEN = 0.2
-"""Angle likewise up to which a capsule has a point near its farther end: more than it turns within a step, so that a step
-knows on what it will rest."""
+"""Angle likewise up to which a capsule has a point near its farther end: more than it turns within a step, so that a
+step knows on what it will rest."""
 HUGE = 1e9
 """More than any slope, m2."""
 
@@ -62,8 +61,8 @@ class Points(NamedTuple):
 def between_segments(one: Segments, other: Segments) -> Points:
     """Return the nearest points of capsules, [...].
 
-    C. Ericson, "Real-Time Collision Detection", 2005, section 5.1.9. Along parallel capsules any points are nearest; here
-    they are those in the middle, and become those as the angle goes below `NEAR`.
+    C. Ericson, "Real-Time Collision Detection", 2005, section 5.1.9. Along parallel capsules any points are nearest;
+    here they are those in the middle, and become those as the angle goes below `NEAR`.
     """
     d1, d2, r = one.end - one.start, other.end - other.start, one.start - other.start
     a, e, b = _dot(d1, d1), _dot(d2, d2), _dot(d1, d2)
@@ -84,12 +83,13 @@ def between_segments(one: Segments, other: Segments) -> Points:
 def on_plate(one: Segments, plate: Plate) -> Points:
     """Return three points [..., 3] where each capsule is near a plate: its nearest point, and one for each end.
 
-    All three are where the distance to the plate is least, plus a small price for the way from a place on the capsule: from
-    its middle, or from one of its ends. The price is half of an angle, times the capsule's length, times the square of the
-    way as a share of that length. So a capsule that lies flat has its points in the middle and at both ends, or at the edges
-    of the plate where it juts out. As it turns by that angle they move to its lower end. These are proximal points (J. J.
-    Moreau, "Proximité et dualité dans un espace hilbertien", 1965): they move no faster than the capsule's length over the
-    angle, however the shapes lie. Depth and normal are those of the points themselves, and change no faster than these move.
+    All three are where the distance to the plate is least, plus a small price for the way from a place on the capsule:
+    from its middle, or from one of its ends. The price is half of an angle, times the capsule's length, times the
+    square of the way as a share of that length. So a capsule that lies flat has its points in the middle and at both
+    ends, or at the edges of the plate where it juts out. As it turns by that angle they move to its lower end. These
+    are proximal points (J. J. Moreau, "Proximité et dualité dans un espace hilbertien", 1965): they move no faster than
+    the capsule's length over the angle, however the shapes lie. Depth and normal are those of the points themselves,
+    and change no faster than these move.
 
     The ends of the part above the plate, for example, would not do: they jump when the capsule leaves over an edge.
     """
@@ -110,12 +110,14 @@ def on_plate(one: Segments, plate: Plate) -> Points:
 def _nearest(start: Array, way: Array, half: Array, price: Array) -> Array:
     """Return where on segments, 0 to 1, their three points near a rectangle are, [..., 3].
 
-    Half the squared distance has a slope along the segment that grows piecewise linearly, with corners where the segment
-    passes a side of the rectangle. So has the price, a length times the angle. The root of their sum lies between those two
-    corners between which it changes sign.
+    Half the squared distance has a slope along the segment that grows piecewise linearly, with corners where the
+    segment passes a side of the rectangle. So has the price, a length times the angle. The root of their sum lies
+    between those two corners between which it changes sign.
     """
     slope = jnp.where(jnp.abs(way[..., :2]) < 1e-9, 1e-9, way[..., :2])
-    breaks = jnp.clip(jnp.concatenate([-half - start[..., :2], half - start[..., :2]], -1) / jnp.tile(slope, 2), 0.0, 1.0)
+    breaks = jnp.clip(
+        jnp.concatenate([-half - start[..., :2], half - start[..., :2]], -1) / jnp.tile(slope, 2), 0.0, 1.0
+    )
     ends = jnp.zeros((*breaks.shape[:-1], 1))
     corners = jnp.concatenate([breaks, ends, ends + 1.0], -1)
     point = start[..., None, :] + corners[..., None] * way[..., None, :]

@@ -226,12 +226,12 @@ def judge(seen: Seen) -> Held:
     return Held(moved[:, -1], angle, seen.overlap[:, start:].max(1), dropped, seen.struck[:, start:].any(1))
 
 
-def rows(names: list[str], grasps: int, seconds: float, batch: int = 250) -> Iterator[str]:
+def rows(names: list[str], grasps: int, seconds: float, first: int = 0, batch: int = 250) -> Iterator[str]:
     """Yield the rows of the table, one for each object."""
     for name in names:
         held, jaw = [], Grasps([name])
         size = min(batch, grasps)
-        for seed in range(-(-grasps // size)):
+        for seed in range(first, first - (-grasps // size)):
             held.append(judge(jaw.shake(np.zeros(size, int), seconds, seed)))
         slip, turn, overlap, dropped, struck = (np.concatenate(parts)[:grasps] for parts in zip(*held, strict=True))
         free, kept = ~struck, ~struck & ~dropped
@@ -248,11 +248,12 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--objects", nargs="+", choices=list(OBJECTS), default=list(OBJECTS))
     parser.add_argument("--grasps", type=whole(1), default=100, metavar="N", help="of each object (%(default)s)")
     parser.add_argument("--seconds", type=float, default=10.0, metavar="T", help="of shaking (%(default)s)")
+    parser.add_argument("--seed", type=whole(0), default=0, metavar="S", help="of the first 250 (%(default)s)")
     arguments = parser.parse_args(argv)
     print("| object | grasps | not struck | of these dropped | of others | slip: median, worst (mm) "
           "| turn: median, worst (degrees) | deepest overlap (mm) |")  # fmt: skip
     print("|---|---|---|---|---|---|---|---|")
-    for row in rows(arguments.objects, arguments.grasps, arguments.seconds):
+    for row in rows(arguments.objects, arguments.grasps, arguments.seconds, arguments.seed):
         print(row, flush=True)
     return 0
 
