@@ -96,7 +96,7 @@ def falling(tmp_path_factory: pytest.TempPathFactory) -> Falling:
     return Falling(tmp_path_factory.mktemp("falling"), {"pad": {"object": "pad"}, **places})
 
 
-@pytest.mark.parametrize("speed", [0.0, 1.0])
+@pytest.mark.parametrize("speed", [0.0, 1.0, 3.0])
 def test_what_falls_on_a_pad_comes_to_rest_there(falling: Falling, speed: float) -> None:
     """Within 2 s, whatever way it is turned; then it drifts by less than 0.1 mm in 10 s."""
     rng = np.random.default_rng(0)
@@ -145,3 +145,21 @@ def test_an_object_slides_where_coulomb_says(tmp_path: Path) -> None:
     slides = pulled > 0
     np.testing.assert_allclose(way[slides], pulled[slides], atol=0.01)  # less than 1 % of gravity
     assert np.abs(way[~slides]).max() < 1e-3
+
+
+@pytest.mark.slow
+def test_what_falls_on_a_board_and_on_pegs_comes_to_rest_there(tmp_path: Path) -> None:
+    """Blocks around pegs, upright or aslant, and needles on top; then they drift by less than 0.1 mm in 10 s."""
+    places = {
+        "block": {"object": "block", "position": [-0.06, 0.0, 0.0076]},
+        "aslant": {"object": "block", "position": [0.0615, 0.001, 0.012], "tilt": [12.0, 8.0, 0.0]},
+        "needle": {"object": "needle_40", "position": [0.06, -0.035, 0.03], "tilt": [5.0, 0.0, 30.0]},
+    }
+    falling = Falling(tmp_path, {"board": {"object": "peg_board_icra2026"}, **places})
+    rng, start = np.random.default_rng(0), falling.begin(8)
+    position = np.array(start.bodies.position) + rng.uniform(-5e-4, 5e-4, (8, 3, 3)) * [1, 1, 0]
+    objects, path = falling.play(thrown(start, position=position), 2.0)
+    assert path.position[..., 2].min() > 0 and path.depth[:, -1].max() < 1e-5
+    assert (falling.energy(path) <= falling.energy(path)[:, :1] * (1 + 1e-3)).all()
+    _, later = falling.play(objects, 2.0)
+    assert 5 * np.linalg.norm(later.position[:, -1] - path.position[:, -1], axis=-1).max() < 1e-4

@@ -9,7 +9,7 @@ from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
 from surgical_marl.physics.patches import BLEND, Patch, find_patch
-from surgical_marl.physics.shapes import EVEN, Plate, Points, Segments, between_segments, on_plate
+from surgical_marl.physics.shapes import NEAR, Plate, Points, Segments, between_segments, on_plate
 
 HALF, THICK, WIRE = np.array([0.0042, 0.0018]), 0.0006, 0.0005
 """A jaw's plate and a wire, m."""
@@ -87,10 +87,10 @@ def test_contact_with_a_plate_is_a_continuous_function_of_the_pose(
     assume(float(here.depth.max()) < THICK + WIRE - APART)
     way = 6 * STEP + NOISE  # three directions and three angles
     depth, place, normal = moved(here, there)
-    assert depth <= way and place <= 2 / EVEN * way and normal <= 2 / EVEN * way / APART
+    assert depth <= way and place <= 2 / NEAR * way and normal <= 2 / NEAR * way / APART
     depth, place, normal = moved(patch.points, other.points)
     most = 4 * 0.012 / BLEND  # as it goes from one end of the wire to the other
-    assert depth <= 5 * way and place <= most * way and normal <= (most * EVEN + 2 / EVEN) * way / APART
+    assert depth <= 5 * way and place <= most * way and normal <= (most * NEAR + 2 / NEAR) * way / APART
     assert abs(float(patch.radius - other.radius)) <= most * way
 
 
@@ -104,13 +104,13 @@ def test_contact_of_capsules_is_a_continuous_function_of_the_pose(
     assume(float(here.depth.max()) < THICK + WIRE - APART)
     depth, place, normal = moved(here, there)
     way = 6 * STEP + NOISE
-    assert depth <= 2 * way and place <= 4 / EVEN * way and normal <= 4 / EVEN * way / APART
+    assert depth <= 2 * way and place <= 4 / NEAR * way and normal <= 4 / NEAR * way / APART
 
 
 @given(poses)
 @settings(max_examples=50, deadline=None)
 def test_the_overlap_with_a_plate_is_that_of_geometry(pose: tuple[float, ...]) -> None:
-    """Of 20,001 places along each capsule none is deeper than its two points by more than the price of their ends."""
+    """Of 20,001 places along each capsule none is deeper than its nearest point by more than the price."""
     wire, (points, _) = wire_at(jnp.array(pose)), touch(jnp.array(pose))
     start, end, share = np.array(wire.start, float), np.array(wire.end, float), np.linspace(0, 1, 20001)[:, None]
     for c in range(3):
@@ -118,6 +118,6 @@ def test_the_overlap_with_a_plate_is_that_of_geometry(pose: tuple[float, ...]) -
         away = np.concatenate([along[:, :2] - np.clip(along[:, :2], -HALF, HALF), along[:, 2:]], 1)
         deepest = THICK + WIRE - np.linalg.norm(away, axis=1).min()
         assume(deepest < THICK + WIRE - APART)
-        found = float(points.depth[2 * c : 2 * c + 2].max())
-        price = EVEN / 2 * np.linalg.norm(end[c] - start[c]) * (THICK + WIRE) / APART
+        found = float(points.depth[3 * c : 3 * c + 3].max())
+        price = NEAR / 2 * np.linalg.norm(end[c] - start[c]) * (THICK + WIRE) / APART
         assert -1e-7 <= deepest - found <= price

@@ -19,8 +19,8 @@ from surgical_marl.physics.touching import AHEAD, MARGIN, Joints, Slots, stored
 DAMPING = 5e-3
 """Damping of a contact in the normal direction, s: this times its stiffness, N s/m."""
 FIRM = 1e-5
-"""Overlap from which on that damping is whole, m. It begins with none (K. H. Hunt and F. R. E. Crossley, 1975), so that
-the force of a contact is continuous where it begins, and nothing is slowed before it touches."""
+"""Overlap now or at the end of the step from which on this damping is whole, m. It begins with none, so that a force is
+continuous where it begins (K. H. Hunt and F. R. E. Crossley, 1975), and what will not touch is not slowed."""
 SHARE = 0.5
 """Stiffness of each of the four points of a contact, relative to that of a point in an object's file: a contact is as
 stiff as a capsule that lies flat, on its two ends."""

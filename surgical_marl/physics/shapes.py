@@ -14,11 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-EVEN = 0.02
-"""Angle between a capsule and what it touches, rad, up to which it rests on more than its nearer end: how far a capsule
-of some mm turns as its one end goes in by the overlap of a firm grip."""
-
-
+NEAR = 0.02
+"""Angle between a capsule and what it touches, rad, up to which its nearest point is not at its nearer end: how far a
+capsule of some mm turns as its one end goes in by the overlap of a firm grip."""
+EVEN = 0.2
+"""Angle likewise up to which a capsule has a point near its farther end: more than it turns within a step, so that a
+step knows on what it will rest."""
 HUGE = 1e9
 """More than any slope, m2."""
 
@@ -61,13 +62,13 @@ def between_segments(one: Segments, other: Segments) -> Points:
     """Return the nearest points of capsules, [...].
 
     C. Ericson, "Real-Time Collision Detection", 2005, section 5.1.9. Along parallel capsules any points are nearest;
-    here they are those in the middle, towards which axes pull that are `EVEN` or less from parallel.
+    here they are those in the middle, and become those as the angle goes below `NEAR`.
     """
     d1, d2, r = one.end - one.start, other.end - other.start, one.start - other.start
     a, e, b = _dot(d1, d1), _dot(d2, d2), _dot(d1, d2)
     c, f = _dot(d1, r), _dot(d2, r)
     tiny = 1e-12  # of a sphere; lengths below 1 um
-    even = EVEN**2 * a * e + tiny**2
+    even = NEAR**2 * a * e + tiny**2
     s = jnp.clip((b * f - c * e + even / 2) / (jnp.maximum(a * e - b * b, 0.0) + even), 0.0, 1.0)
     t = jnp.clip((b * s + f) / jnp.maximum(e, tiny), 0.0, 1.0)
     s = jnp.clip((b * t - c) / jnp.maximum(a, tiny), 0.0, 1.0)
@@ -80,20 +81,22 @@ def between_segments(one: Segments, other: Segments) -> Points:
 
 
 def on_plate(one: Segments, plate: Plate) -> Points:
-    """Return two points [..., 2] where each capsule is nearest to a plate, one for each of its ends.
+    """Return three points [..., 3] where each capsule is near a plate: its nearest point, and one for each end.
 
-    A point is where the distance to the plate is least, plus a small price for being away from its end of the capsule:
-    `EVEN` / 2 times the square of the way from there, as a share of the length, times the length. So a capsule that
-    lies flat has its points at both ends, or at the edges of the plate if it juts out; where it stands, both are at its
-    lower end. In between they move along the capsule, no faster than 1 / `EVEN` times as it turns (a proximal point: J.
-    J. Moreau, "Proximité et dualité dans un espace hilbertien", 1965). Depth and normal are those of the point itself,
-    so all that a contact needs is a continuous function of where the shapes are. The ends of what lies above the
-    rectangle, say, are not: they jump when the capsule leaves over an edge.
+    All three are where the distance to the plate is least, plus a small price for the way from a place on the capsule:
+    from its middle, or from one of its ends. The price is half of an angle, times the capsule's length, times the
+    square of the way as a share of that length. So a capsule that lies flat has its points in the middle and at both
+    ends, or at the edges of the plate where it juts out. As it turns by that angle they move to its lower end. These
+    are proximal points (J. J. Moreau, "Proximité et dualité dans un espace hilbertien", 1965): they move no faster than
+    the capsule's length over the angle, however the shapes lie. Depth and normal are those of the points themselves,
+    and change no faster than these move.
+
+    The ends of the part above the plate, for example, would not do: they jump when the capsule leaves over an edge.
     """
     start, end = (_in_frame(point, plate) for point in (one.start, one.end))
     way = end - start
     half, radius = jnp.asarray(plate.half), one.radius + plate.radius
-    share = _nearest(start, way, half, EVEN * radius * jnp.sqrt(jnp.maximum(_dot(way, way), 1e-18)))
+    share = _nearest(start, way, half, radius * jnp.sqrt(jnp.maximum(_dot(way, way), 1e-18)))
     point = start[..., None, :] + share[..., None] * way[..., None, :]
     off = _off(point, half)
     length = jnp.sqrt(jnp.maximum(_dot(off, off), 1e-18))
@@ -105,10 +108,10 @@ def on_plate(one: Segments, plate: Plate) -> Points:
 
 
 def _nearest(start: Array, way: Array, half: Array, price: Array) -> Array:
-    """Return where on segments, 0 to 1, the points nearest to a rectangle are, one for each end, [..., 2].
+    """Return where on segments, 0 to 1, their three points near a rectangle are, [..., 3].
 
     Half the squared distance has a slope along the segment that grows piecewise linearly, with corners where the
-    segment passes a side of the rectangle. So has the price times the way from an end. The root of their sum lies
+    segment passes a side of the rectangle. So has the price, a length times the angle. The root of their sum lies
     between those two corners between which it changes sign.
     """
     slope = jnp.where(jnp.abs(way[..., :2]) < 1e-9, 1e-9, way[..., :2])
@@ -120,8 +123,8 @@ def _nearest(start: Array, way: Array, half: Array, price: Array) -> Array:
     point = start[..., None, :] + corners[..., None] * way[..., None, :]
     rise = jnp.sum(_off(point, half) * way[..., None, :], -1)
     found = []
-    for end in (0.0, 1.0):
-        slope = rise + price[..., None] * (corners - end)
+    for anchor, even in ((0.5, NEAR), (0.0, EVEN), (1.0, EVEN)):
+        slope = rise + even * price[..., None] * (corners - anchor)
         low = jnp.max(jnp.where(slope <= 0, corners, 0.0), -1)
         high = jnp.min(jnp.where(slope >= 0, corners, 1.0), -1)
         at_low = jnp.max(jnp.where((slope <= 0) & (corners >= low[..., None]), slope, -HUGE), -1)

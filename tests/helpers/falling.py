@@ -61,11 +61,15 @@ class Falling:
         def step(objects: Objects, _: None) -> tuple[Objects, Trace]:
             slots = self.together.find(self._arms._replace(objects=objects))
             objects = self.together._step_objects(objects, slots)
-            bodies, depth = objects.bodies, self.together.depths(self._arms._replace(objects=objects)).max(initial=-1.0)
+            bodies, depth = objects.bodies, self.depth(objects)
             return objects, Trace(bodies.position, bodies.quaternion, bodies.velocity, depth)
 
         with patch.object(together, "GRAVITY", gravity):
             return jax.lax.scan(step, objects, None, length=steps)
+
+    def depth(self, objects: Objects) -> Any:
+        """Return the deepest overlap of anything, m."""
+        return self.together.depths(self._arms._replace(objects=objects)).max(initial=-1.0)
 
     def energy(self, path: Trace) -> np.ndarray:
         """Return kinetic and potential energy, J, [E, T, k]."""

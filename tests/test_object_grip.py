@@ -1,0 +1,107 @@
+"""What forces a grip bears, and what stops a finger."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import surgical_marl as sm
+from surgical_marl.physics import together
+from surgical_marl.physics.simulator import Simulator
+from surgical_marl.studies.grasping import CHUNK, CLOSING, Grasps
+
+STEPS = 240
+FRICTIONS = (0.12, 0.18, 0.25)
+"""With more friction the arm, which bears 9.9 N along its shaft, would give way before the grip does."""
+
+
+BALL = """
+description: a ball
+free: true
+mass: 0.001
+friction: {sliding: 0.8, torsion: 0.002}
+stiffness: 1.0e+6
+colour: [0.5, 0.5, 0.5]
+shapes:
+  - sphere: {radius: 0.0005, position: [0.0, 0.0, 0.0]}
+sites:
+  grasp: {position: [0.0, 0.0, 0.0]}
+"""
+
+
+@pytest.mark.slow
+def test_a_held_object_breaks_away_at_the_force_that_coulomb_says(tmp_path: Path) -> None:
+    """Balls in grips of three frictions are pulled out of the jaw, harder and harder. The pads lean outwards."""
+    (tmp_path / "ball.yaml").write_text(BALL)
+    jaw, each = Grasps([str(tmp_path / "ball.yaml")]), 3
+    held, mu = np.zeros(3 * each, int), np.repeat(FRICTIONS, each)
+    assert jaw.simulator._objects
+    tables = jaw.simulator._objects.tables
+    mass, fingers, pads = float(tables.masses.mass[0]), tables.bodies["pads"], tables.pad_geoms
+    closing = np.zeros((len(held), CLOSING * CHUNK, 7), np.float32)
+    closing[..., -1] = -1
+    physics, _ = jaw.play(jaw.begin(held, seed=3), closing, held)
+
+    def frame(physics: Any) -> tuple[Any, Any, Any]:
+        """Return the way out of the jaw, how far out the object is, and how far the pads' normals point that way."""
+        data = jaw._dynamics.pose(physics.qpos)
+        out = -data.xmat[fingers][:, :, 2].sum(0)
+        out /= jnp.linalg.norm(out)
+        lean = jnp.abs(data.geom_xmat[pads][:, :, 0] @ out)  # they are thinnest in x
+        return out, out @ (physics.objects.bodies.position[0] - data.xpos[fingers].mean(0)), lean
+
+    def pull(physics: Any, mu: Any) -> Any:
+        out, _, _ = frame(physics)
+
+        def step(physics: Any, force: Any) -> Any:
+            sliding = jnp.full(len(tables.sliding), mu)
+            with patch.object(together, "GRAVITY", out * force / mass), patch.object(tables, "sliding", sliding):
+                physics, _ = jaw.simulator._step(physics, jaw.simulator.untouched)
+            return physics, (*frame(physics)[1:], physics.objects.grips.force[0])
+
+        return jax.lax.scan(step, physics, 60 * mu * jnp.arange(STEPS) / STEPS)[1]
+
+    way, lean, normal = (np.asarray(x, float) for x in jax.jit(jax.vmap(pull))(physics, jnp.float32(mu)))
+    for e, friction in enumerate(mu):
+        loose = int(np.argmax(way[e] > way[e, 0] + 1e-4))
+        assert loose > 0, "it is held for ever"
+        found = 60 * friction * loose / STEPS
+        coulomb = normal[e, 0] @ (friction * np.sqrt(1 - lean[e, 0] ** 2) - lean[e, 0])
+        assert abs(found / coulomb - 1) < 0.15, (friction, found, coulomb)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "place", "most"), [("pad", (0.0, 0.0), 5e-4), ("peg_board_icra2026", (-0.02, 0.0), 1e-4)]
+)
+def test_a_finger_pressed_on_something_stops_there(
+    tmp_path: Path, name: str, place: tuple[float, float], most: float
+) -> None:
+    """The arm moves down at its full speed and goes on pressing with full effort."""
+    thing = f"{{object: {name}, position: [{place[0]}, {place[1]}, 0.02]}}"
+    needle = "{object: needle_sh, position: [0.0, 1.0, 0.0]}"
+    text = f"arms:\n  psm_0: {{arm: psm, position: [0.0, 0.0, 0.15]}}\nobjects:\n  thing: {thing}\n  needle: {needle}\n"
+    (tmp_path / "pressing.yaml").write_text(text)
+    simulator = Simulator(sm.load_scene(tmp_path / "pressing.yaml"))
+    objects, scene = simulator._objects, simulator.scene
+    assert objects
+    on_arm = np.flatnonzero(objects.tables.owner < objects.tables.arms)
+    joints = [joint.name for joint in scene.mounts["psm_0"].arm.actuated]
+    down = jnp.zeros(len(joints)).at[joints.index("insertion")].set(1.0).at[-1].set(-1.0)
+
+    def step(physics: Any, _: None) -> Any:
+        physics, _, views = simulator.advance(simulator.command(physics, {"psm_0": down}))
+        return physics, (
+            objects.depths(physics)[on_arm].max(),
+            views["psm_0"].contact_force,
+            jnp.abs(physics.qvel).max(),
+        )
+
+    _, (depth, force, speed) = jax.jit(lambda physics: jax.lax.scan(step, physics, None, length=75))(simulator.home)
+    assert depth.max() < most and force[-1] > 4 and speed[-1] < 1e-2, (depth.max(), force[-1], speed[-1])
