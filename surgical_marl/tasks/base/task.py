@@ -17,6 +17,7 @@ import numpy as np
 
 from surgical_marl.content import unknown
 from surgical_marl.runtime import jax, jnp
+from surgical_marl.scenes.poses import Pose
 from surgical_marl.tasks.base.object_terms import object_terms
 from surgical_marl.tasks.base.options import Options
 from surgical_marl.tasks.base.terms import Picture, Term, arm_terms, picture_terms
@@ -45,6 +46,8 @@ class Start(NamedTuple):
     """The goal of the episode, a named tuple of arrays that the task defines."""
     qpos: Array | None = None
     """Joint positions of the whole scene, [nq]; None if every episode starts at home."""
+    poses: Mapping[str, Pose] = {}
+    """Where free objects lie at rest, by name, without overlaps. Others begin where the scene places them."""
 
 
 class Level(NamedTuple):
@@ -128,6 +131,13 @@ class Task:
     def advance(self, goal: Any, dt: float) -> Any:
         """Return the goal `dt` seconds later."""
         return goal
+
+    def remember(self, world: World) -> Any:
+        """Return the goal with what the task keeps of this step for later ones, such as the best distance so far.
+
+        It is called after the reward of each step, and also at the start of an episode.
+        """
+        return world.goal
 
     def terms(self, agent: str) -> dict[str, Term | Picture]:
         """Return all that an agent may observe, by name."""
