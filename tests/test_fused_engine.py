@@ -23,7 +23,7 @@ from surgical_marl.engines.fused.threefry import episode_keys
 from surgical_marl.engines.mjx import MjxEngine
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.envs.env import Env
-from surgical_marl.plugins.tasks import list_tasks
+from surgical_marl.plugins.tasks import TASKS, list_tasks
 from surgical_marl.robots.arm import CONTROL_MODES, load_arm
 from surgical_marl.tasks.base.path_task import PathTask
 from surgical_marl.tasks.base.paths import DURATION
@@ -36,8 +36,7 @@ ULPS = 10
 # XLA takes 12 s to compile the reference for a small scene and a minute for a large one. `make test` takes one of each
 # kind: arms that touch, each way of control, goals at rest and paths. `pytest -m slow` takes all others. Until then the
 # star's acceleration is compared with C MuJoCo's in test_solver, every primitive with JAX's in test_fused_primitives.
-SEEING = ("ecm", "trimanual_psm_ecm")  # scenes with an endoscope
-PLAYED = [(task, scene) for task in list_tasks() for scene in list_scenes() if task != "match_image" or scene in SEEING]
+PLAYED = [(task, scene) for task in list_tasks() for scene in TASKS.load(task).scenes or list_scenes()]
 ALL = [(task, scene, control) for task, scene in PLAYED for control in CONTROL_MODES]
 QUICK = [("psm", "position"), ("bimanual_psm", "position"), ("ecm", "velocity"), ("ecm", "torque")]
 CASES = [

@@ -25,6 +25,10 @@ _TEAM: dict[str, Callable[[Any, Any], Any]] = {
     "collision": np.logical_or,
     "min_distance": np.minimum,
     "contact_force": np.maximum,
+    "goal_error": np.maximum,
+    "goal_angle": np.maximum,
+    "drop": np.logical_or,
+    "holding": np.logical_or,
 }
 """How values of two arms make one of both; see also `_combine`."""
 
