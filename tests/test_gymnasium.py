@@ -56,7 +56,7 @@ def test_gymnasium_accepts_every_task_on_every_scene_without_a_warning(task: str
 @pytest.mark.parametrize("task", [quick_or_slow(task) for task in sm.list_tasks()])
 def test_every_id_can_be_made_with_its_defaults(task: str) -> None:
     env = gymnasium.make(gymnasium_id(task))
-    assert len(env.unwrapped.batch.agents) == 1
+    assert len(env.unwrapped.batch.agents) == getattr(TASKS.load(task), "hands", 1)
     assert env.observation_space.contains(env.reset(seed=0)[0])
 
 

@@ -156,6 +156,9 @@ def test_a_lifted_needle_that_no_finger_touches_is_dropped_and_one_below_the_pad
     assert not ends(nowhere, 0.0, False, best(lift=0.9))
     height = known.task.tables["points"][5, 2] - known.task.tables["lowest"][5]
     assert ends(np.array([0.0, 0.0, -height - LOST - 0.02]), 0.0, False, best())
+    failed = world(known, np.full(3, np.nan), 0.0, False, best())
+    assert bool(known.task.terminated(failed))
+    assert all(np.isfinite(value) for value in known.task.rewards(failed)["psm_0"].values())
     lifted = known.task.remember(world(known, nowhere, 5.0, True, best())).best.lift
     assert float(lifted) == 1.0 and height > LIFT
 
@@ -171,7 +174,7 @@ def test_the_settings_list_every_weight_as_the_task_has_it() -> None:
         ("psm", "needle_pick needs a scene with a free object that has bars to grip and the site tip; 'psm' has none"),
         (
             "bimanual_psm_needle",
-            "needle_pick needs a scene with one arm, whose jaw has pads, not 'bimanual_psm_needle'",
+            "needle_pick needs a scene with 1 arm whose jaws have pads; 'bimanual_psm_needle' has 2",
         ),
     ],
 )

@@ -20,8 +20,8 @@ class Scripted:
     """The policy of a script, for all environments of a batch.
 
     In each environment joints follow straight lines to where a step wants the tools, all at the same pace. Then the
-    agents wait as the step says, and the next one is planned. Where a step was not good the script starts again. The
-    last step is planned again and again until the episode ends.
+    agents wait as the step says, and the next one is planned. Where a step was not good an earlier one is done again.
+    The last step is planned again and again until the episode ends.
 
     Args:
         env: the environments, with control "position".
@@ -62,7 +62,7 @@ class Scripted:
         after = np.minimum(now + 1, last)
         for number, step in enumerate(self._steps):
             if step.good is not None:
-                after[(now == number) & ~step.good(snapshot)] = 0
+                after[(now == number) & ~step.good(snapshot)] = step.back
         after[began] = 0
         self._now[due] = after
         for agent, tool in self._tools.items():

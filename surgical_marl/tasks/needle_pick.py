@@ -32,7 +32,17 @@ from surgical_marl.cache import cached
 from surgical_marl.robots.rotation import quaternion
 from surgical_marl.runtime import jax
 from surgical_marl.scenes.poses import Pose
-from surgical_marl.tasks.base.grips import bars, frames, joints_at, tool_of, tool_poses
+from surgical_marl.tasks.base.grips import (
+    bar,
+    bars,
+    drawn_about,
+    frames,
+    from_above,
+    joints_at,
+    leaning,
+    lowest_bar,
+    moved,
+)
 from surgical_marl.tasks.base.lying import lying
 from surgical_marl.tasks.base.object_task import NEAR, ObjectGoal, ObjectTask
 from surgical_marl.tasks.base.script import Snapshot, Step, Wish
@@ -54,7 +64,6 @@ SAFE = 0.012
 ABOVE, PRESS, RAISE = 0.01, 0.0019, 0.02
 """How far the oracle's tool tip stops above the wire, goes past it, and lifts it, m. A wire that lies on a pad is at
 the round ends of the fingers. They have to dent the pad, so that their flat faces hold it."""
-DOWN = np.array([0.0, 0.0, -1.0])
 
 
 class PickLevel(NamedTuple):
@@ -84,21 +93,12 @@ class Task(ObjectTask):
 
     def __init__(self, scene: Scene, options: Options) -> None:
         super().__init__(scene, options)
-        if len(scene.agents) != 1 or not _has_pads(scene):
-            raise ValueError(f"needle_pick needs a scene with one arm, whose jaw has pads, not {scene.name!r}")
         self._item = scene.objects[self.object].object
         about = repr((self.object, self.level, self.seed))
         table = cached("needle_pick", lambda: self._draw(scene), about, scene.fingerprint, self._item.content)
-        starts, goals = frames(table[:, :3], table[:, 3:7]), frames(table[:, 7:10], table[:, 10:14])
-        self.grips, self.goals = table[:, 14].astype(int), goals
-        """Of the oracle: the number of the bar that it grips, and the needle's pose at the goal."""
-        sites = np.array([place for place, _ in self._item.sites.values()])
-        self.tables |= {
-            "starts": table[:, :7],
-            "points": goals[:, :3, 3] + goals[:, :3, :3] @ self._item.sites[self.point][0],
-            "turns": goals[:, :3, :3],
-            "lowest": (starts[:, None, :3, 3] + np.einsum("nij,sj->nsi", starts[:, :3, :3], sites))[..., 2].min(1),
-        }
+        self._set_tables(table[:, :7], frames(table[:, 7:10], table[:, 10:14]))
+        self.grips = table[:, 14].astype(int)
+        """Of the oracle: the number of the bar that it grips."""
 
     def start(self, key: Array) -> Start:
         """Return where the needle lies, and the goal."""
@@ -121,99 +121,49 @@ class Task(ObjectTask):
 
     def script(self) -> tuple[Step, ...]:
         """Return how the arm does it: over the wire, down, close, up, to the goal."""
-        (agent,) = self.scene.agents
-        middles, directions = bars(self._item)
+        agent, mount = self.picker, self.scene.mounts[self.picker]
 
-        def grip(seen: Snapshot, beyond: float) -> Wish:
-            needle, number = seen.objects[self.object], self.grips[seen.goal.row]
-            turn = needle[:, :3, :3]
-            place = needle[:, :3, 3] + np.einsum("nij,nj->ni", turn, middles[number])
-            along = _level(np.einsum("nij,nj->ni", turn, directions[number]), self._across)
-            return Wish(tool_poses(place, along, DOWN, np.full(len(place), beyond)), opens=True)
+        def grip(seen: Snapshot, beyond: float) -> dict[str, Wish]:
+            wire = bar(seen.objects[self.object], self._item, self.grips[seen.goal.row])
+            return {agent: Wish(from_above(mount, *wire, beyond), opens=True)}
 
-        def raised(seen: Snapshot) -> Wish:
-            up = seen.tools[agent].copy()
-            up[:, 2, 3] += RAISE
-            return Wish(up)
+        def raised(seen: Snapshot) -> dict[str, Wish]:
+            return {agent: Wish(moved(seen.tools[agent], [0.0, 0.0, RAISE]))}
 
-        def present(seen: Snapshot) -> Wish:
+        def present(seen: Snapshot) -> dict[str, Wish]:
             held = np.linalg.inv(seen.objects[self.object]) @ seen.tools[agent]
-            return Wish(self.goals[seen.goal.row] @ held)
+            return {agent: Wish(self.goals[seen.goal.row] @ held)}
 
         def holds(seen: Snapshot) -> np.ndarray:
             return seen.held[agent][:, self._number]
 
         return (
-            Step(lambda seen: {agent: grip(seen, -ABOVE)}),
-            Step(lambda seen: {agent: grip(seen, PRESS)}, wait=0.1, pace=0.3),
+            Step(lambda seen: grip(seen, -ABOVE)),
+            Step(lambda seen: grip(seen, PRESS), wait=0.1, pace=0.3),
             Step(lambda seen: {agent: Wish()}, wait=0.4, good=holds),
-            Step(lambda seen: {agent: raised(seen)}, wait=0.1, pace=0.3, good=holds),
-            Step(lambda seen: {agent: present(seen)}, wait=0.3, pace=0.6),
+            Step(raised, wait=0.1, pace=0.3, good=holds),
+            Step(present, wait=0.3, pace=0.6),
         )
-
-    # -- where needles and goals are drawn
-
-    @property
-    def _across(self) -> np.ndarray:
-        """The x axis of the tool at home, in the world."""
-        (mount,) = self.scene.mounts.values()
-        return np.asarray(tool_of(mount, mount.arm.home)[:3, 0])
 
     def _draw(self, scene: Scene) -> np.ndarray:
         """Return starts [ROWS, 7] and goals [ROWS, 7] of the needle, and the bar that a tool grips, [ROWS, 1]."""
-        (mount,), rng = scene.mounts.values(), np.random.default_rng(self.seed)
-        middle = mount.position + mount.rotation @ mount.workspace
+        mount, rng = scene.mounts[self.picker], np.random.default_rng(self.seed)
+        middle = (mount.position + mount.rotation @ mount.workspace)[:2]
+        middles, _ = bars(self._item)
 
         def batch(_: bool) -> tuple[np.ndarray, np.ndarray]:
-            place = lying(scene, self.object, ROWS, middle[:2], self.level.spread, rng)
-            starts, number = frames(*place), self._middle_bars(rng)
-            middles, directions = (part[number] for part in bars(self._item))
-            turns, along = starts[:, :3, :3], np.einsum("nij,nj->ni", starts[:, :3, :3], directions)
-            tools = tool_poses(
-                starts[:, :3, 3] + np.einsum("nij,nj->ni", turns, middles),
-                _level(along, self._across),
-                DOWN,
-                np.zeros(ROWS),
-            )
+            place = lying(scene, self.object, ROWS, middle, self.level.spread, rng)
+            starts, number = frames(*place), rng.integers(len(middles) // 4, -(-3 * len(middles) // 4), ROWS)
+            tools = from_above(mount, *bar(starts, self._item, number), 0.0)
             q, good = joints_at(mount, tools)
-            goals = self._goals(rng, np.linalg.inv(tools) @ starts, middle)
-            sites = goals[:, None, :3, 3] + np.einsum("nij,cj->nci", goals[:, :3, :3], bars(self._item)[0])
-            good &= sites[..., 2].min(1) > starts[:, 2, 3] + SAFE
-            good &= joints_at(mount, goals @ np.linalg.inv(starts) @ tools, q)[1]
+            held = np.linalg.inv(tools) @ starts
+            goals = leaning(rng, ROWS, self.level.lean) @ held
+            points = drawn_about(rng, middle, self.level.spread, ROWS, place.position[:, 2] + [[LOW], [HIGH]])
+            goals[:, :3, 3] = points - goals[:, :3, :3] @ self._item.sites[self.point][0]
+            good &= joints_at(mount, goals @ np.linalg.inv(held), q)[1]
+            good &= lowest_bar(goals, self._item) > starts[:, 2, 3] + SAFE
             ends = np.stack([quaternion(goal[:3, :3]) for goal in goals])
             rows = np.concatenate([*place, goals[:, :3, 3], ends, number[:, None]], -1)
             return rows[good], np.zeros(good.sum(), bool)
 
         return choose(scene, batch, ROWS, 0.0)
-
-    def _middle_bars(self, rng: np.random.Generator) -> np.ndarray:
-        count = len(bars(self._item)[0])
-        return rng.integers(count // 4, count - count // 4, ROWS)
-
-    def _goals(self, rng: np.random.Generator, held: np.ndarray, middle: np.ndarray) -> np.ndarray:
-        """Return poses [ROWS, 4, 4] of the needle in a tool that holds it as in `held`, its point about the middle."""
-        bearing, yaw = rng.uniform(-np.pi, np.pi, (2, ROWS))
-        lean, flat = self.level.lean * np.sqrt(rng.random(ROWS)), np.zeros(ROWS)
-        pointing = np.stack([np.sin(lean) * np.cos(bearing), np.sin(lean) * np.sin(bearing), -np.cos(lean)], -1)
-        along = np.stack([np.cos(yaw), np.sin(yaw), flat], -1)
-        along -= np.sum(along * pointing, -1, keepdims=True) * pointing
-        along /= np.linalg.norm(along, axis=-1, keepdims=True)
-        goals = tool_poses(np.zeros((ROWS, 3)), along, pointing, flat) @ held
-        away, bearing = self.level.spread * np.sqrt(rng.random(ROWS)), rng.uniform(-np.pi, np.pi, ROWS)
-        points = np.stack([away * np.cos(bearing), away * np.sin(bearing), rng.uniform(LOW, HIGH, ROWS)], -1)
-        points[:, :2] += middle[:2]
-        points[:, 2] += self.scene.objects[self.object].position[2]
-        goals[:, :3, 3] = points - goals[:, :3, :3] @ self._item.sites[self.point][0]
-        return goals
-
-
-def _level(along: np.ndarray, across: np.ndarray) -> np.ndarray:
-    """Return directions [n, 3] of bars without their vertical part, each the way that turns a tool least."""
-    flat = along * [1.0, 1.0, 0.0]
-    flat /= np.maximum(np.linalg.norm(flat, axis=-1, keepdims=True), 1e-9)
-    return np.where((flat @ across)[:, None] < 0, -flat, flat)
-
-
-def _has_pads(scene: Scene) -> bool:
-    (mount,) = scene.mounts.values()
-    return mount.arm.jaw is not None and len(mount.arm.jaw.pads) == 2

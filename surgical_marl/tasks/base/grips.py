@@ -16,6 +16,7 @@ from surgical_marl.scenes.scene import Mount
 
 CLOSE = 1e-4
 """A pose is reached when inverse kinematics comes this close: m, and parts of unit vectors."""
+DOWN = np.array([0.0, 0.0, -1.0])
 SPARE = 0.05
 """Least distance of a joint from its limits, as a share of its range; the jaw has none."""
 
@@ -42,6 +43,68 @@ def tool_poses(place: Any, along: Any, pointing: Any, beyond: Any = 0.0) -> np.n
     poses[..., :3, :3] = np.stack([along + 0 * z, np.cross(z, along), z], -1)
     poses[..., :3, 3], poses[..., 3, 3] = place + np.asarray(beyond)[..., None] * z, 1.0
     return poses
+
+
+def bar(body: np.ndarray, item: Object, number: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return the middle [n, 3] and the direction [n, 3] of one bar of an object at poses [n, 4, 4].
+
+    Args:
+        body: of the object.
+        item: the object.
+        number: of the bar, or of one for each pose, [n].
+    """
+    middles, directions = (np.broadcast_to(part[number], (len(body), 3)) for part in bars(item))
+    turn = body[:, :3, :3]
+    return body[:, :3, 3] + np.einsum("nij,nj->ni", turn, middles), np.einsum("nij,nj->ni", turn, directions)
+
+
+def from_above(mount: Mount, place: np.ndarray, along: np.ndarray, beyond: float) -> np.ndarray:
+    """Return poses [n, 4, 4] of tools that point down at bars, whichever way round they need to turn least.
+
+    Args:
+        mount: the arm.
+        place: middles of the bars, m, [n, 3].
+        along: their directions, [n, 3], of which the horizontal part counts.
+        beyond: how far the tool tip is past the bar, m.
+    """
+    flat = along * [1.0, 1.0, 0.0]
+    flat /= np.maximum(np.linalg.norm(flat, axis=-1, keepdims=True), 1e-9)
+    flat = np.where((flat @ tool_of(mount, mount.arm.home)[:3, 0])[:, None] < 0, -flat, flat)
+    return tool_poses(place, flat, DOWN, np.full(len(place), beyond))
+
+
+def leaning(rng: np.random.Generator, count: int, lean: float) -> np.ndarray:
+    """Return poses [count, 4, 4] at the origin of tools that lean at random from the vertical, by up to `lean` rad."""
+    bearing, yaw = rng.uniform(-np.pi, np.pi, (2, count))
+    away = lean * np.sqrt(rng.random(count))
+    pointing = np.stack([np.sin(away) * np.cos(bearing), np.sin(away) * np.sin(bearing), -np.cos(away)], -1)
+    along = np.stack([np.cos(yaw), np.sin(yaw), np.zeros(count)], -1)
+    along -= _dot(along, pointing) * pointing
+    return tool_poses(np.zeros((count, 3)), along / np.sqrt(_dot(along, along)), pointing, np.zeros(count))
+
+
+def drawn_about(
+    rng: np.random.Generator, centre: np.ndarray, spread: float, count: int, heights: np.ndarray
+) -> np.ndarray:
+    """Return places [count, 3] in the world within `spread` of a vertical axis, between two heights [2, count], m."""
+    away, bearing = spread * np.sqrt(rng.random(count)), rng.uniform(-np.pi, np.pi, count)
+    low, high = heights
+    places = np.stack([away * np.cos(bearing), away * np.sin(bearing), rng.uniform(low, high)], -1)
+    places[:, :2] += centre
+    return places
+
+
+def lowest_bar(body: np.ndarray, item: Object) -> np.ndarray:
+    """Return the height [n] of the lowest middle of a bar of an object at poses [n, 4, 4], m."""
+    middles, _ = bars(item)
+    return (body[:, None, 2, 3] + np.einsum("nj,cj->nc", body[:, 2, :3], middles)).min(1)
+
+
+def moved(poses: np.ndarray, way: Any) -> np.ndarray:
+    """Return poses [n, 4, 4] shifted by a way [3] or [n, 3] in the world, m."""
+    shifted = poses.copy()
+    shifted[:, :3, 3] += way
+    return shifted
 
 
 def joints_at(mount: Mount, poses: np.ndarray, start: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:

@@ -44,4 +44,6 @@ class Step(NamedTuple):
     pace: float = 1.0
     """Speed, as a share of the joints' own."""
     good: Callable[[Snapshot], np.ndarray] | None = None
-    """Return whether the step was successful, [n] bool; where not, the script starts again."""
+    """Return whether the step was successful, [n] bool; where not, the script goes on with the step `back`."""
+    back: int = 0
+    """Number of a step."""
