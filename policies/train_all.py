@@ -26,14 +26,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 from surgical_marl.content import content_dir, unknown
-from surgical_marl.plugins.tasks import list_tasks
+from surgical_marl.plugins.tasks import list_tasks, scenes_for
 from surgical_marl.runtime import defer_compiler
-from surgical_marl.scenes.placing import scenes_without_objects
 
-PICTURES = {"match_image": ("ecm", "trimanual_psm_ecm")}
-"""Tasks that need an endoscope, and the scenes that have one."""
-FREE = scenes_without_objects()
-PLACES = {f"{task}-{scene}": (task, scene) for task in list_tasks() for scene in PICTURES.get(task, FREE)}
+PLACES = {f"{task}-{scene}": (task, scene) for task in list_tasks() for scene in scenes_for(task)}
 """Task and scene of each policy, by its name."""
 
 

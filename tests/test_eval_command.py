@@ -27,10 +27,9 @@ from surgical_marl.evaluation.goal_set import (
     standard_hashes,
 )
 from surgical_marl.learning import train
-from surgical_marl.plugins.tasks import TASKS, list_tasks
+from surgical_marl.plugins.tasks import TASKS, list_tasks, scenes_for
 from surgical_marl.runs.folder import write_config
 from surgical_marl.runs.settings import NetworkSettings, Settings
-from surgical_marl.scenes.placing import scenes_without_objects
 from tests.helpers.fake_env import FakeEnv
 
 SMALL = Settings(num_envs=8, iterations=1, steps_per_iteration=8, network=NetworkSettings(hidden=(8,)))
@@ -82,13 +81,9 @@ def test_the_page_is_enough_to_compute_a_hash() -> None:
     assert digest.hexdigest() == standard_hashes()["home"]["reach"]["bimanual_psm"]
 
 
-def test_every_scene_without_objects_has_a_standard_goal_set() -> None:
-    looks = {"match_image": ["ecm", "trimanual_psm_ecm"]}  # others run on every scene without objects
+def test_every_task_has_standard_goal_sets_for_its_scenes() -> None:
     assert set(PUBLISHED) == {
-        (start, task, scene)
-        for task in list_tasks()
-        for start in TASKS.load(task).starts
-        for scene in looks.get(task, scenes_without_objects())
+        (start, task, scene) for task in list_tasks() for start in TASKS.load(task).starts for scene in scenes_for(task)
     }
 
 

@@ -17,6 +17,8 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.wrappers import vector
 
 import surgical_marl as sm
+from surgical_marl.plugins.tasks import TASKS
+from surgical_marl.scenes.placing import scenes_without_objects
 
 REACH, MATCH = "surgical_marl/Reach-v0", "surgical_marl/MatchImage-v0"
 STEPS = 5
@@ -32,9 +34,14 @@ QUICK = {("reach", "psm"), ("reach", "bimanual_psm"), ("track", "ecm"), ("match_
 
 def playable() -> list[Any]:
     """Every task on every scene that it can be played on: a few at once, all of them with `-m slow`."""
-    every = [(task, scene) for task in sm.list_tasks() for scene in sm.list_scenes()]
-    good = [pair for pair in every if pair[0] != "match_image" or "ecm" in pair[1]]
+    good = [(task, scene) for task in sm.list_tasks() for scene in TASKS.load(task).scenes or sm.list_scenes()]
     return [pytest.param(*pair, marks=[] if pair in QUICK else pytest.mark.slow) for pair in good]
+
+
+def quick_or_slow(task: str) -> Any:
+    """The task; one whose own scene has objects compiles for half a minute, so only with `-m slow`."""
+    free = TASKS.load(task).default_scene in (None, *scenes_without_objects())
+    return pytest.param(task, marks=[] if free else pytest.mark.slow)
 
 
 @pytest.mark.parametrize(("task", "scene"), playable())
@@ -46,10 +53,10 @@ def test_gymnasium_accepts_every_task_on_every_scene_without_a_warning(task: str
     assert env.spec.max_episode_steps == env.unwrapped.batch.max_steps
 
 
-@pytest.mark.parametrize("task", sm.list_tasks())
+@pytest.mark.parametrize("task", [quick_or_slow(task) for task in sm.list_tasks()])
 def test_every_id_can_be_made_with_its_defaults(task: str) -> None:
     env = gymnasium.make(gymnasium_id(task))
-    assert len(env.unwrapped.batch.agents) == 1
+    assert len(env.unwrapped.batch.agents) == getattr(TASKS.load(task), "hands", 1)
     assert env.observation_space.contains(env.reset(seed=0)[0])
 
 

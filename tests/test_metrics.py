@@ -24,10 +24,12 @@ def random_trajectory(seed: int, lengths: list[int], arms: int) -> Trajectory:
     shape = (max(lengths), len(lengths), arms)
     center = rng.random(shape)
     center[..., 0] = np.nan  # an arm without a remote center
+    error = 10 ** rng.uniform(-4, -2.3, shape)
     return Trajectory(
         lengths=np.array(lengths),
-        error=10 ** rng.uniform(-4, -2.3, shape),
+        error=error,
         success=rng.random(shape) < 0.5,
+        missed=error >= 0.002,
         collision=rng.random(shape) < 0.05,
         distance=rng.normal(0.05, 0.05, shape),
         tip=rng.normal(0.0, 0.01, (*shape, 3)),
@@ -86,9 +88,26 @@ def test_measures_equal_plain_loops(seed: int, lengths: list[int], arms: int, fo
                 assert found[name][episode, arm] == pytest.approx(value, rel=1e-9, nan_ok=True), name
 
 
+def test_an_object_is_dropped_once_and_at_its_goal_from_when_it_stays() -> None:
+    """Two arms of a team and three episodes: it stays there from step 3 on, it leaves at the end, it is dropped."""
+    steps, lengths = 10, np.array([10, 10, 4])
+    missed = np.ones((steps, 3, 2), bool)
+    missed[3:, 0], missed[2:9, 1] = False, False
+    drop = np.zeros((steps, 3, 2))
+    drop[3, 2] = 1.0
+    drop[8, 2] = 1.0  # after its end
+    plain = random_trajectory(0, lengths.tolist(), 2)
+    found = measure(plain._replace(lengths=lengths, missed=missed, terms={"drop": drop}), DT, False)
+    np.testing.assert_allclose(found["time"][0], 4 * DT)
+    assert np.isnan(found["time"][1:]).all()
+    assert found["drop"].tolist() == [[0, 0], [0, 0], [1, 1]]
+    rates = metrics({name: value[None] for name, value in found.items()}, False)
+    assert rates["drop_rate"].reduce(rates["drop_rate"].values.ravel()) == pytest.approx(1 / 3)
+
+
 def test_what_an_episode_does_not_have_is_undefined() -> None:
     still = random_trajectory(0, [6, 1], 1)
-    still.tip[...], still.error[...], still.distance[...] = 0.01, 0.5, np.inf
+    still.tip[...], still.error[...], still.distance[...], still.missed[...] = 0.01, 0.5, np.inf, True
     found = measure(still, DT, False)
     assert np.isnan(found["smoothness"]).all() and np.isnan(found["time"]).all()
     assert (found["path"] == 0).all() and (found["distance"] == np.inf).all()

@@ -19,6 +19,7 @@ from surgical_marl.content import content_dir
 from surgical_marl.envs import costs as safety
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.envs.env import Env
+from surgical_marl.plugins.tasks import TASKS as KNOWN
 from surgical_marl.policies.oracle import oracle
 from surgical_marl.policies.policy import load_policy, zero_policy
 from surgical_marl.robots.arm import load_arm
@@ -28,8 +29,8 @@ from surgical_marl.tasks.base.task import APPROACH, PRECISION
 from surgical_marl.tasks.base.world import World
 from tests.helpers.actions import random_actions
 
-# match_image, whose observations are pictures, has tests of its own
-TASKS, SCENES = [task for task in sm.list_tasks() if task != "match_image"], sm.list_scenes()
+# match_image, whose observations are pictures, and tasks with objects have tests of their own
+TASKS, SCENES = [task for task in sm.list_tasks() if KNOWN.load(task).scenes is None], sm.list_scenes()
 # Scenes of several arms compile for up to a minute: `pytest -m slow` takes them.
 QUICK = [("reach", "psm"), ("track", "psm"), ("follow_path", "psm")]
 CASES = [

@@ -28,7 +28,11 @@ def script(monkeypatch: pytest.MonkeyPatch) -> Any:
 
 
 def test_there_are_twenty_and_those_that_ship_are_left_alone(script: Any, tmp_path: Path) -> None:
-    assert len(script.PLACES) == 20 and script.PLACES["match_image-ecm"] == ("match_image", "ecm")
+    assert (
+        len(script.PLACES) == 22
+        and script.PLACES["needle_pick-psm_needle"]
+        and script.PLACES["match_image-ecm"] == ("match_image", "ecm")
+    )
     arguments = argparse.Namespace(out=tmp_path, runs=tmp_path / "runs", seeds=[0, 3])
     first, second, last = script._jobs("track-psm", arguments, ["num_envs=64"])
     assert first.arguments == ("track", "psm", tmp_path / "runs" / "track-psm" / "seed0", ["seed=0", "num_envs=64"])

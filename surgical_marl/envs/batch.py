@@ -304,6 +304,12 @@ class BatchedEnv:
         return Poses(found.origin, np.array(found.quaternion))  # a copy: a step gives its state away
 
     @property
+    def held(self) -> np.ndarray:
+        """Which arms hold which free objects, [N, k, arms] bool, numpy, in the order of `object_poses` and `agents`."""
+        self._part(".steps", "numpy")
+        return self._free_objects.held(self.engine, self.num_envs)
+
+    @property
     def goal(self) -> SimpleNamespace:
         """What the episodes are after: the fields of the task's goal, [N, ...] each, numpy."""
         names = [name for name in self.engine.carry_shapes if name.startswith(".goal.")]

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from surgical_marl.physics.simulator import Simulator
     from surgical_marl.physics.views import ArmView, Contacts
 
-HIDDEN, NOISE = 2**31 - 1, 2**31 - 2
+HIDDEN, NOISE, PLACES = 2**31 - 1, 2**31 - 2, 2**31 - 3
 """Folded into an episode's key for the draws of a scene's randomisation, so that they are independent of a task's
 draws."""
 
@@ -280,6 +280,7 @@ class Env:
         arms = {agent: moved.arms[agent] for agent in self.agents}  # JAX sorts them by name
         world = World(arms, carry.goal, sensed, self.simulator.objects(carry.physics))
         terms = task.rewards(world)
+        carry = carry._replace(goal=task.remember(world))
         terminated = task.terminated(world)
         truncated = (carry.steps >= max_steps) & ~terminated
         final_observations, final_state = self._observe(task, carry, contacts, arms)
@@ -320,13 +321,14 @@ class Env:
         own = jax.random.fold_in(key, episode)
         start = task.start(own)
         hidden = self.plant.start(jax.random.fold_in(own, HIDDEN), start.qpos)
-        physics = self.plant.at_rest(hidden, start.qpos)
+        poses = self.plant.place(jax.random.fold_in(own, PLACES), start.poses)
+        physics = self.plant.at_rest(hidden, start.qpos, poses)
         contacts, arms = self.simulator.home_contacts, self.simulator.home_views
         if start.qpos is not None:
             contacts, arms = self.simulator.look(physics)
         tips = jnp.stack([view.tool_tip for view in arms.values()])
-        zero = jnp.int32(0)
-        return Carry(physics, start.goal, key, episode, zero, tips, hidden), contacts, arms
+        goal = task.remember(World(arms, start.goal, self._unsensed(), self.simulator.objects(physics)))
+        return Carry(physics, goal, key, episode, jnp.int32(0), tips, hidden), contacts, arms
 
     def _observe(
         self, task: Task, carry: Carry, contacts: Contacts, arms: dict[str, ArmView]

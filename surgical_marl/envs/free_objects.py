@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
 STATE = ".physics.objects.bodies"
 """Where an engine has the centres of mass and the orientations of objects."""
+HELD = ".physics.objects.grips.held"
+"""Where it has for how long arms have held them."""
 
 
 class FreeObjects:
@@ -23,6 +25,14 @@ class FreeObjects:
         centers = [place.object.center for place in scene.free_objects.values()]
         self.count = len(centers)
         self._centers: Any = np.array(centers, np.float32).reshape(-1, 3)
+
+    def held(self, engine: Engine, num_envs: int) -> np.ndarray:
+        """Return which arms hold which objects, [N, k, arms] bool."""
+        if not self.count:
+            return np.zeros((num_envs, 0, 0), bool)
+        from surgical_marl.physics.handling import DWELL
+
+        return np.asarray(engine.read(HELD, "numpy") >= np.float32(DWELL))
 
     def read(self, engine: Engine, num_envs: int, library: str = "numpy", place: str = "") -> Poses:
         """Return poses in arrays of "numpy" or "torch".

@@ -15,7 +15,7 @@ import torch
 
 from surgical_marl.evaluation.goal_set import check_same, describe_goals, episode_seed, goal_hash, read_goals
 from surgical_marl.evaluation.interval import interval
-from surgical_marl.evaluation.metrics import LAST, STAGE, TERMS, Metric, Trajectory, measure, metrics
+from surgical_marl.evaluation.metrics import DROP, LAST, STAGE, SUCCESS_MM, TERMS, Metric, Trajectory, measure, metrics
 from surgical_marl.policies.acting import forget
 
 if TYPE_CHECKING:
@@ -23,7 +23,9 @@ if TYPE_CHECKING:
 
 MAX_BATCH = 1024
 """Episodes run at once; make the environment with num_envs=min(episodes, MAX_BATCH)."""
-INFOS = ("tip_error", "success", "collision", "min_distance")
+ERRORS = ("tip_error", "goal_error")
+"""Infos of how far a tool tip, or an object, is from its goal, m: the first that there is counts."""
+INFOS = ("success", "collision", "min_distance")
 
 
 class Played(NamedTuple):
@@ -146,7 +148,10 @@ def _first_episodes(
         observations = step.observations
         told = [step.infos[agent] for agent in env.agents]
         names = dict.fromkeys(
-            name for info in told for name in info if name in (*INFOS, *LAST) or name.startswith((*TERMS, STAGE))
+            name
+            for info in told
+            for name in info
+            if name in (*ERRORS, *INFOS, *LAST, DROP) or name.startswith((*TERMS, STAGE))
         )
         infos.append({name: np.stack([_numpy(info.get(name, unknown), count) for info in told], -1) for name in names})
         ended = step.terminated | step.truncated
@@ -158,10 +163,12 @@ def _first_episodes(
     else:
         raise RuntimeError(f"{int((lengths == 0).sum())} episodes did not end within max_steps = {env.max_steps}")
     series = {name: np.stack([info[name] for info in infos]).astype(float) for name in infos[0]}
-    success, collision, distance = (series.pop(name) for name in INFOS[1:])
-    error = series.pop(INFOS[0], np.full(success.shape, np.nan))
+    success, collision, distance = (series.pop(name) for name in INFOS)
+    tips, others = (series.pop(name, np.full(success.shape, np.nan)) for name in ERRORS)
+    missed = success == 0 if np.isnan(tips).all() else ~(tips < SUCCESS_MM / 1000)
+    error = np.where(np.isnan(tips), others, tips)
     tip, center = _kinematics(env, np.stack(starts))
-    return Trajectory(lengths, error, success > 0, collision > 0, distance, tip, center, series)
+    return Trajectory(lengths, error, success > 0, missed, collision > 0, distance, tip, center, series)
 
 
 def _kinematics(env: BatchedEnv, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

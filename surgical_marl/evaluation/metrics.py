@@ -12,12 +12,18 @@ HOLD = 0.2
 """How long before the end of an episode the tip must stay near its goal, s."""
 THRESHOLDS_MM = (1, 2, 5)
 SUCCESS_MM = 2
-"""The threshold of team success and of the time to success."""
+"""The threshold of team success, and of the time to success where tool tips have targets."""
+DROP = "drop"
+"""Whether an object was dropped or lost in a step, in `infos` of tasks with objects."""
 TERMS = ("reward_", "cost")
 """Prefixes of the names of reward terms and costs in `infos`."""
 STAGE = "stage_"
 """Prefix of the names of a task's stages there."""
-LAST = {"angle_error": ("angle_error_deg", 180 / math.pi), "image_error": ("image_error", 1.0)}
+LAST = {
+    "angle_error": ("angle_error_deg", 180 / math.pi),
+    "image_error": ("image_error", 1.0),
+    "goal_angle": ("goal_angle_deg", 180 / math.pi),
+}
 """Infos of some agents whose value after the last step counts: name -> name and unit factor of the metric."""
 STILL = 1e-3
 """A tip that moved less than this, in m, has no smoothness, because its motion is noise."""
@@ -29,9 +35,11 @@ class Trajectory(NamedTuple):
     lengths: np.ndarray
     """[E], steps of each episode."""
     error: np.ndarray
-    """[T, E, A], distance of tip and goal after each step, m; NaN in a task without such goals."""
+    """[T, E, A], distance of tip, or object, and goal after each step, m; NaN in a task without such goals."""
     success: np.ndarray
     """[T, E, A] bool, what the task calls success, after each step."""
+    missed: np.ndarray
+    """[T, E, A] bool, not at the goal after each step: what the time to success is measured by."""
     collision: np.ndarray
     """[T, E, A] bool, during each step."""
     distance: np.ndarray
@@ -66,7 +74,7 @@ def measure(trajectory: Trajectory, dt: float, following: bool) -> dict[str, np.
     Returns:
         [E, A] each, in m: `error` at the last step (following: root mean square over the steps); `held`, the largest of
         the last `HOLD` seconds (of all steps); `squared` (mean over the steps, m^2); least `distance`, largest
-        `center`, `path` of the tip. Also `collided`; `time` from which on the error stays below `SUCCESS_MM`, s, and
+        `center`, `path` of the tip. Also `collided`; `time` from which on it is not `missed`, s, and
         `smoothness`, NaN where undefined; the mean of each of the `terms`, at the last step of those in `LAST`.
     """
     lengths, error = trajectory.lengths[:, None], trajectory.error
@@ -75,7 +83,7 @@ def measure(trajectory: Trajectory, dt: float, following: bool) -> dict[str, np.
     squared = np.where(going, np.square(error), 0.0).sum(0) / lengths
     judged = going if following else going & (step > lengths - max(1, round(HOLD / dt)))
     held = _largest(error, judged)
-    last_miss = np.maximum(_largest(step, going & (error >= SUCCESS_MM / 1000)), 0)
+    last_miss = np.maximum(_largest(step, going & trajectory.missed), 0)
     final = lambda values: np.take_along_axis(values, lengths[None] - 1, 0)[0]  # noqa: E731
     moves = np.linalg.norm(np.diff(trajectory.tip, axis=0), axis=-1)
     moves = np.where(going[1:], moves, 0.0)
@@ -87,7 +95,7 @@ def measure(trajectory: Trajectory, dt: float, following: bool) -> dict[str, np.
         "center": np.where(np.isnan(trajectory.center[0]), np.nan, _largest(trajectory.center, going)),
         "success": final(trajectory.success),
         "collided": (trajectory.collision & going).any(0),
-        "time": np.where((held < SUCCESS_MM / 1000) & (not following), dt * (last_miss + 1), np.nan),
+        "time": np.where((trajectory.missed & judged).any(0) | following, np.nan, dt * (last_miss + 1)),
         "path": moves.sum(0),
         "smoothness": _smoothness(moves / dt, trajectory.lengths - 1, dt),
         **{name: _reduced(name, values, going, final) for name, values in trajectory.terms.items()},
@@ -95,11 +103,11 @@ def measure(trajectory: Trajectory, dt: float, following: bool) -> dict[str, np.
 
 
 def _reduced(name: str, values: np.ndarray, going: np.ndarray, final: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    """Reduce over steps: whether a stage was ever reached, the last value of `LAST`, or else the mean."""
+    """Reduce over steps: whether a stage was ever reached or there was a drop, the last of `LAST`, or else the mean."""
     if name in LAST:
         return final(values)
     kept = np.where(going, values, 0.0)
-    return kept.max(0) if name.startswith(STAGE) else kept.sum(0) / going.sum(0)
+    return kept.max(0) if name.startswith((STAGE, DROP)) else kept.sum(0) / going.sum(0)
 
 
 def metrics(measures: Mapping[str, np.ndarray], following: bool) -> dict[str, Metric]:
@@ -127,6 +135,8 @@ def metrics(measures: Mapping[str, np.ndarray], following: bool) -> dict[str, Me
     }
     if following:
         found["rmse_mm"] = Metric(1e6 * measures["squared"], lambda values: np.sqrt(values.mean(-1)))
+    if DROP in measures:
+        found["drop_rate"] = Metric(measures[DROP].max(-1, keepdims=True), _mean)
     for name, (title, unit) in LAST.items():
         if name in measures:
             found[title] = Metric(unit * measures[name], _mean_of_known)

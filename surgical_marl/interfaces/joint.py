@@ -26,6 +26,10 @@ _TEAM: dict[str, Callable[[Any, Any], Any]] = {
     "min_distance": np.minimum,
     "contact_force": np.maximum,
     "contact_overflow": np.maximum,
+    "goal_error": np.maximum,
+    "goal_angle": np.maximum,
+    "drop": np.logical_or,
+    "holding": np.logical_or,
 }
 """How values of two arms make one of both; see also `_combine`."""
 

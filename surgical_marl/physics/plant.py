@@ -12,6 +12,7 @@ ones.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import jax
@@ -20,8 +21,10 @@ import mujoco
 import numpy as np
 from jax import Array
 
+from surgical_marl.physics.bodies import product
 from surgical_marl.physics.simulator import Physics, Simulator
 from surgical_marl.physics.views import ArmView, Contacts
+from surgical_marl.scenes.poses import Pose
 
 Views = dict[str, ArmView]
 
@@ -90,9 +93,38 @@ class Plant:
             pending=jnp.zeros((r.latency, sum(len(mount.arm.actuated) for mount in scene.mounts.values()))),
         )
 
-    def at_rest(self, hidden: Hidden | None, qpos: Array | None = None) -> Physics:
-        """Return all arms at rest at joint positions [nq] of the whole scene, or at home."""
-        physics = self._simulator.home if qpos is None else self._simulator.at(qpos)
+    def place(self, key: Array, poses: Mapping[str, Pose]) -> Mapping[str, Pose]:
+        """Return poses of free objects, shifted and turned about the vertical as far as the scene randomises them.
+
+        Args:
+            key: used for nothing else.
+            poses: by name, where a task places objects. The scene places the others.
+        """
+        shift, angle = self._ranges.object_shift, self._ranges.object_turn
+        free = self._simulator.scene.free_objects
+        if not (free and (shift or angle)):
+            return poses
+        reach = np.array([shift, shift, 0.0, angle], np.float32)
+        draws = jax.random.uniform(key, (len(free), 4), jnp.float32, -1.0, 1.0) * reach
+        placed = {name: Pose(*(np.float32(part) for part in place.pose)) for name, place in free.items()} | dict(poses)
+        upright = lambda angle: jnp.stack([jnp.cos(angle / 2), 0.0, 0.0, jnp.sin(angle / 2)])  # noqa: E731
+        return {
+            name: Pose(pose.position + own[:3], product(upright(own[3]), pose.quaternion))
+            for (name, pose), own in zip(placed.items(), draws, strict=True)
+        }
+
+    def at_rest(
+        self, hidden: Hidden | None, qpos: Array | None = None, poses: Mapping[str, Pose] | None = None
+    ) -> Physics:
+        """Return arms and objects at rest.
+
+        Args:
+            hidden: what was drawn for the episode.
+            qpos: joint positions [nq] of the whole scene; None for home.
+            poses: of free objects by name. The others are where the scene places them.
+        """
+        simulator = self._simulator
+        physics = simulator.at(jnp.asarray(simulator.scene.home, jnp.float32) if qpos is None else qpos, poses)
         return physics if hidden is None else physics._replace(ctrl=hidden.motor)
 
     def command(

@@ -10,6 +10,7 @@ docs/physics.md says how a step is computed and compares it with C MuJoCo.
 from __future__ import annotations
 
 import copy
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -18,12 +19,14 @@ import mujoco
 import numpy as np
 from jax import Array
 
+from surgical_marl.content import unknown
 from surgical_marl.physics.collision import Pairs
 from surgical_marl.physics.dynamics import Dynamics, Physics
 from surgical_marl.physics.solver import Rows, solve
 from surgical_marl.physics.together import Together
 from surgical_marl.physics.views import ArmView, Contacts, ObjectView, Touch
 from surgical_marl.scenes.build import alone
+from surgical_marl.scenes.poses import Pose
 from surgical_marl.scenes.scene import PAYLOAD, Scene
 from surgical_marl.scenes.timing import DECIMATION
 
@@ -97,12 +100,22 @@ class Simulator:
         """Return all arms at home, at rest."""
         return self.at(jnp.asarray(self.scene.home, jnp.float32))
 
-    def at(self, qpos: Array) -> Physics:
-        """Return all arms at rest at joint positions [nq] of the scene, with the commands that keep them there."""
+    def at(self, qpos: Array, poses: Mapping[str, Pose] | None = None) -> Physics:
+        """Return arms and objects at rest.
+
+        Args:
+            qpos: joint positions [nq] of the scene; the commands keep them there.
+            poses: of free objects by name. The others are where the scene places them.
+
+        Raises:
+            ValueError: a name that is not that of a free object.
+        """
         still = jnp.zeros(self.scene.model.nv, jnp.float32)
-        return Physics(
-            qpos, still, still, self._holding(qpos), self._objects.start(self.scene) if self._objects else ()
-        )
+        for name in poses or {}:
+            if name not in self.scene.free_objects:
+                raise unknown(f"free object of scene {self.scene.name!r}", name, list(self.scene.free_objects))
+        objects = self._objects.start(self.scene, poses or {}) if self._objects else ()
+        return Physics(qpos, still, still, self._holding(qpos), objects)
 
     def _holding(self, qpos: Any) -> Any:
         """Return the commands [nu] that keep the arms where they are."""
@@ -329,7 +342,7 @@ class Simulator:
         distance = np.array([mujoco.mj_geomDistance(model, data, a, b, 100.0, None) for a, b in ids])
         still = np.zeros(model.nv)
         contacts: Any = Contacts(distance, np.maximum(-distance, 0.0), 0.0 * distance, np.int32(0))  # type: ignore[arg-type]
-        objects = self._objects.start(self.scene) if self._objects else ()
+        objects = self._objects.start(self.scene, {}) if self._objects else ()
         physics: Any = Physics(self.scene.home, still, still, self._holding(self.scene.home), objects)  # type: ignore[arg-type]
         views = self._view(np, physics, data.site_xpos[list(self._sites.values())], contacts)
         kinds = {"b": jnp.bool_, "i": jnp.int32}

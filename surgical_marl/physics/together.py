@@ -6,7 +6,7 @@ are solved together.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
@@ -26,6 +26,7 @@ from surgical_marl.physics.views import Handled, ObjectView, Touch
 from surgical_marl.robots.rotation import quaternion
 
 if TYPE_CHECKING:
+    from surgical_marl.scenes.poses import Pose
     from surgical_marl.scenes.scene import Scene
 
 GRAVITY = np.array([0.0, 0.0, -9.81], np.float32)
@@ -53,18 +54,23 @@ class Together:
         )
         self._finder = Finder(self.tables)
 
-    def start(self, scene: Scene) -> Objects:
-        """Return the objects at rest where the scene places them."""
+    def start(self, scene: Scene, poses: Mapping[str, Pose]) -> Objects:
+        """Return the objects at rest, at these poses or where the scene places them."""
         tables, places = self.tables, [scene.objects[name] for name in self.names]
         k, f = tables.count, len(tables.fingers)
-        position = np.array([place.position + place.rotation @ place.object.center for place in places])
-        turned = np.array([quaternion(place.rotation) for place in places])
+        centres = np.array([place.position + place.rotation @ place.object.center for place in places])
+        turns = np.array([quaternion(place.rotation) for place in places])
         still = jnp.zeros((k, 6), jnp.float32)
         single = lambda x, *shape: jnp.asarray(x, jnp.float32).reshape(shape)  # noqa: E731
         facing = jnp.zeros((k, f, 4), jnp.float32).at[..., 0].set(1.0)
         zero = lambda *shape: jnp.zeros(shape, jnp.float32)  # noqa: E731
         grips = Grips(zero(k, f, 3), facing, zero(k, f), zero(k, f), zero(k, self._arms))
-        return Objects(Bodies(single(position, k, 3), single(turned, k, 4), still, still), grips)
+        position, turned = single(centres, k, 3), single(turns, k, 4)
+        for name, pose in poses.items():
+            o = self.names.index(name)
+            centre = pose.position + rotation(pose.quaternion) @ jnp.asarray(tables.centers[o])
+            position, turned = position.at[o].set(centre), turned.at[o].set(pose.quaternion)
+        return Objects(Bodies(position, turned, still, still), grips)
 
     def views(self, objects: Objects) -> dict[str, ObjectView]:
         """Return the view of every free object, by name."""

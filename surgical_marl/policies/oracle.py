@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from surgical_marl.envs.observations import proprioception
+from surgical_marl.policies.scripted import Scripted
 from surgical_marl.robots.inverse_kinematics import inverse_kinematics
 
 if TYPE_CHECKING:
@@ -41,11 +42,13 @@ def oracle(env: BatchedEnv, agents: Sequence[str] | None = None) -> Callable[[Ma
     Raises:
         ValueError: the environment has another control mode.
     """
-    if not env.task.has_targets:
+    steps = () if env.task.has_targets else env.task.script()
+    if not env.task.has_targets and not steps:
         raise ValueError(f"the task {env.task_name!r} has no target for tool tips that an oracle could move to")
     if env.control != "position":
         raise ValueError(f"the oracle moves position targets: control must be 'position', not {env.control!r}")
-    return _Oracle(env, env.agents if agents is None else agents)
+    agents = env.agents if agents is None else agents
+    return Scripted(env, steps, agents) if steps else _Oracle(env, agents)
 
 
 class _Oracle:

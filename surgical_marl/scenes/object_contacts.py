@@ -6,17 +6,23 @@ jaw stand for their fingers; elsewhere the shapes are those that touch other arm
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from itertools import combinations, product
 from typing import NamedTuple
 
 import mujoco
 import numpy as np
 
+from surgical_marl.robots.rotation import quaternion, turned
 from surgical_marl.robots.spec import COLLISION_GROUP, PAD_GROUP
 from surgical_marl.scenes.objects import JAW, LINK, Surface
+from surgical_marl.scenes.poses import Pose
 from surgical_marl.scenes.scene import Scene
 
+DRAWS = 64
+"""Draws of the places of objects that are looked at."""
+FAR = 0.05
+"""Distance of objects and arms up to which it is measured, m."""
 RESTING = 1e-5
 """What lies on something at the start may reach this deep into it, m: numbers in files are rounded."""
 
@@ -35,19 +41,49 @@ class Touch(NamedTuple):
 def check_apart(scene: Scene) -> None:
     """Raise ValueError if an object overlaps another one at the start, or an arm at its home.
 
-    Fixed objects may overlap each other.
+    Fixed objects may overlap each other. Where the scene randomises the places of objects, some draws are looked at.
+    """
+    random, rng = scene.randomisation, np.random.default_rng(0)
+    reach = np.array([random.object_shift, random.object_shift, 0.0, random.object_turn])
+    poses, count = {}, DRAWS if reach.any() else 1
+    for name, place in scene.free_objects.items():
+        draws = reach * rng.uniform(-1, 1, (count, 4)) * (np.arange(count) > 0)[:, None]
+        turns = np.stack(
+            [quaternion(turned(np.array([0.0, 0.0, np.degrees(own[3])])) @ place.rotation) for own in draws]
+        )
+        poses[name] = Pose(place.position + draws[:, :3], turns)
+    depths = -distances(scene, poses)
+    for touch, depth in zip(touches(scene), depths.T, strict=True):
+        if depth.max() > RESTING:
+            cure = "move the object" if depth[0] > RESTING else "move the object, or randomise its place less"
+            raise ValueError(
+                f"scene {scene.name!r}: {touch.one!r} and {touch.other!r} overlap at the start by "
+                f"{1000 * depth.max():.3g} mm; {cure}"
+            )
+
+
+def distances(scene: Scene, poses: Mapping[str, Pose]) -> np.ndarray:
+    """Return the distances of all pairs that can touch, below 0 where they overlap, with all arms at home.
+
+    Args:
+        scene: arms and objects.
+        poses: of n each of some free objects, by name. The others are where the scene places them.
+
+    Returns:
+        [n, touches] in the order of `touches`, m; `FAR` for all that are further away.
     """
     model, data = scene.model, mujoco.MjData(scene.model)
     data.qpos[:] = scene.home
-    mujoco.mj_kinematics(model, data)
-    for touch in touches(scene):
-        one, other = (model.geom(name).id for name in (touch.one, touch.other))
-        depth = -mujoco.mj_geomDistance(model, data, one, other, 1.0, None)
-        if depth > RESTING:
-            raise ValueError(
-                f"scene {scene.name!r}: {touch.one!r} and {touch.other!r} overlap at the start by "
-                f"{1000 * depth:.3g} mm; move the object"
-            )
+    pairs = [[model.geom(name).id for name in (touch.one, touch.other)] for touch in touches(scene)]
+    count = max((len(pose.position) for pose in poses.values()), default=1)
+    found = np.full((count, len(pairs)), FAR)
+    for row in range(count):
+        for name, pose in poses.items():
+            mocap = model.body(name).mocapid[0]
+            data.mocap_pos[mocap], data.mocap_quat[mocap] = pose.position[row], pose.quaternion[row]
+        mujoco.mj_kinematics(model, data)
+        found[row] = [mujoco.mj_geomDistance(model, data, one, other, FAR, None) for one, other in pairs]
+    return found
 
 
 class _Side(NamedTuple):

@@ -19,6 +19,7 @@ import numpy as np
 
 from surgical_marl.content import find
 from surgical_marl.robots.rotation import matrix_of, quaternion, turned
+from surgical_marl.scenes.poses import Pose
 from surgical_marl.scenes.shapes import Shape as Shape
 from surgical_marl.scenes.shapes import read_colour, read_number, read_shapes
 from surgical_marl.yaml_file import check_keys, read_mapping, read_vector, read_yaml
@@ -98,6 +99,11 @@ class Placement:
     """Origin of the object's frame in the world, m, [3]. A free object starts here unless a task says otherwise."""
     rotation: np.ndarray
     """Axes of the object's frame in the world, [3, 3]."""
+
+    @property
+    def pose(self) -> Pose:
+        """The same as a pose."""
+        return Pose(self.position, quaternion(self.rotation))
 
 
 def load_object(name: str | Path, colour: Any = None) -> Object:

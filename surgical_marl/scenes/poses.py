@@ -1,11 +1,20 @@
-"""Where the free objects of many environments are, in arrays of numpy or torch."""
+"""Where free objects are: the pose of one, and those of many environments in arrays of numpy or torch."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+
+
+class Pose(NamedTuple):
+    """The frame of an object in the world, [...]."""
+
+    position: Any
+    """Of its origin, m, [..., 3]; for most shapes not the centre of mass."""
+    quaternion: Any
+    """w, x, y, z, of length 1, [..., 4]."""
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,8 @@ from surgical_marl.yaml_file import build
 class Randomisation:
     """Ranges of what is randomised, all zero unless given.
 
-    All values except noise are drawn once per episode, uniformly, and separately for every joint or arm. Jaws get only
-    other gains and friction. docs/randomisation.md has the sources of sensible values.
+    All values except noise are drawn once per episode, uniformly, and separately for every joint, arm or object. Jaws
+    get only other gains and friction. docs/randomisation.md has the sources of sensible values.
     """
 
     offset_angle: float = 0.0
@@ -35,6 +35,10 @@ class Randomisation:
     """Greatest mass at the tool tip, kg."""
     latency: int = 0
     """Greatest number of control steps until an action acts."""
+    object_shift: float = 0.0
+    """Free objects begin up to this far from their place, m, along the world's x and y each."""
+    object_turn: float = 0.0
+    """They begin turned about the vertical by up to this, rad."""
 
     def __bool__(self) -> bool:
         return any(getattr(self, item.name) for item in fields(self))

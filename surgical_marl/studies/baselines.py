@@ -18,12 +18,12 @@ import surgical_marl.evaluation.goal_set
 from surgical_marl.content import BASELINES
 from surgical_marl.evaluation.command import play_all
 from surgical_marl.evaluation.evaluate import summarise
-from surgical_marl.plugins.tasks import TASKS, list_tasks
-from surgical_marl.scenes.placing import scenes_without_objects
+from surgical_marl.plugins.tasks import TASKS, list_tasks, scenes_for
 
 HASHES = Path(surgical_marl.evaluation.goal_set.__file__).with_name("goal_sets.yaml")
 ERRORS = {"median_error_mm": "median error (mm)", "p95_error_mm": "95th percentile (mm)"}
 FIXED = {"success_2mm": "success at 2 mm", "team_success_2mm": "all arms", "time_to_success_s": "time to it (s)"}
+OBJECTS = {"success_rate": "success", "drop_rate": "drops", "time_to_success_s": "time to it (s)"}
 MOVING = {"rmse_mm": "RMSE (mm)", "success_2mm": "success at 2 mm"}
 ALWAYS = {"collision_rate": "collisions", "path_length_mm": "path (mm)", "smoothness": "smoothness",
           "min_distance_mm": "least distance (mm)"}  # fmt: skip
@@ -37,7 +37,7 @@ def main(tasks: list[str]) -> None:
     for task in tasks:
         for start in TASKS.load(task).starts:
             rows = []
-            for scene in sorted(scenes(task), key=lambda name: (name.count("_"), name)):
+            for scene in sorted(scenes_for(task), key=lambda name: (name.count("_"), name)):
                 for policy in BASELINES:
                     asked = {"task": task, "scene": scene, "start": start}
                     result = summarise([play_all([policy], asked, episodes=200, seed=0)[policy]])
@@ -47,13 +47,9 @@ def main(tasks: list[str]) -> None:
     HASHES.write_text("\n".join([*comments, yaml.safe_dump(hashes)]))
 
 
-def scenes(task: str) -> list[str]:
-    """Where a task has a meaning."""
-    return ["ecm", "trimanual_psm_ecm"] if task == "match_image" else scenes_without_objects()
-
-
 def table(rows: list[list[Any]]) -> str:
-    columns = ERRORS | (MOVING if "rmse_mm" in rows[0][2] else FIXED) | ALWAYS
+    result = rows[0][2]
+    columns = ERRORS | (MOVING if "rmse_mm" in result else OBJECTS if "drop_rate" in result else FIXED) | ALWAYS
     columns |= {name: title for name, title in PICTURES.items() if name in rows[0][2]}
     lines = ["| " + " | ".join(["scene", "policy", *columns.values()]) + " |", "|---" * (2 + len(columns)) + "|"]
     for scene, policy, result in rows:
@@ -65,7 +61,7 @@ def table(rows: list[list[Any]]) -> str:
 def cell(name: str, value: float | None, bounds: list[float] | None) -> str:
     if value is None:
         return "-"
-    if name.startswith(("success_", "team_", "collision_")):
+    if name.startswith(("success_", "team_", "collision_", "drop_")):
         return f"{value:.1%}"
     value = 0.0 if abs(value) < 1e-6 else value  # rounding
     span = f" ({bounds[0]:.3g} to {bounds[1]:.3g})" if bounds and name.endswith("error_mm") else ""

@@ -70,6 +70,7 @@ class Task(TipTask):
         "collision": -2.0,
     }  # fmt: skip
     default_scene = "ecm"
+    scenes = ("ecm", "trimanual_psm_ecm")
     senses = ("image_error",)
     wanted = {"median_error_mm": ("below", 2.0)}  # noqa: RUF012
 

@@ -112,9 +112,8 @@ class ScenePicture:
         """Return the current pose of an environment, by its number in the batch."""
         balls: list[Sphere] = []
         env = self._env
-        targets = env.task.targets(env.goal)[index] if env.task.has_targets else []
-        for number, (mount, target) in enumerate(zip(env.scene.mounts.values(), targets, strict=False)):
-            place = mount.rotation @ target + mount.position  # the task has it in its arm's base frame
+        marks = env.task.marks(env.goal)
+        for number, place in enumerate(marks[index] if marks.size else []):
             balls.append((tuple(place), GOAL_RADIUS, COLOURS[number % len(COLOURS)]))
         objects, own = env.object_poses, lambda values: np.array(values[index], float)
         return Pose(own(env.qpos), own(objects.origin), own(objects.quaternion), balls)

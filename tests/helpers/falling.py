@@ -49,7 +49,7 @@ class Falling:
 
     def begin(self, count: int) -> Objects:
         """Return the objects where the scene has them, [count]."""
-        start = self.together.start(self.scene)
+        start = self.together.start(self.scene, {})
         return jax.tree.map(lambda x: jnp.repeat(x[None], count, 0), start)
 
     def play(self, objects: Objects, seconds: float, gravity: np.ndarray = DOWN) -> tuple[Objects, Trace]:

@@ -17,8 +17,10 @@ import numpy as np
 
 from surgical_marl.content import unknown
 from surgical_marl.runtime import jax, jnp
+from surgical_marl.scenes.poses import Pose
 from surgical_marl.tasks.base.object_terms import object_terms
 from surgical_marl.tasks.base.options import Options
+from surgical_marl.tasks.base.script import Step
 from surgical_marl.tasks.base.terms import Picture, Term, arm_terms, picture_terms
 from surgical_marl.tasks.base.world import World
 
@@ -45,6 +47,8 @@ class Start(NamedTuple):
     """The goal of the episode, a named tuple of arrays that the task defines."""
     qpos: Array | None = None
     """Joint positions of the whole scene, [nq]; None if every episode starts at home."""
+    poses: Mapping[str, Pose] = {}
+    """Where free objects lie at rest, by name, without overlaps. Others begin where the scene places them."""
 
 
 class Level(NamedTuple):
@@ -75,6 +79,8 @@ class Task:
     levels: ClassVar[Mapping[str, Any]] = {"default": None}
     starts: ClassVar[tuple[str, ...]] = ("home",)
     """Allowed values of `Options.start`."""
+    scenes: ClassVar[tuple[str, ...] | None] = None
+    """Shipped scenes that it is meant for; None for all without objects. Others may do, too."""
     default_scene: ClassVar[str | None] = None
     """The scene of an environment that is made without one; None where any scene will do."""
     max_steps: int = 100
@@ -128,6 +134,13 @@ class Task:
     def advance(self, goal: Any, dt: float) -> Any:
         """Return the goal `dt` seconds later."""
         return goal
+
+    def remember(self, world: World) -> Any:
+        """Return the goal with what the task keeps of this step for later ones, such as the best distance so far.
+
+        It is called after the reward of each step, and also at the start of an episode.
+        """
+        return world.goal
 
     def terms(self, agent: str) -> dict[str, Term | Picture]:
         """Return all that an agent may observe, by name."""
@@ -198,6 +211,10 @@ class Task:
 
     # -- on the host, for N environments at once
 
+    def script(self) -> tuple[Step, ...]:
+        """Return how arms can do it, if they need more than to bring their tips to `targets`; the oracle follows it."""
+        return ()
+
     def targets(self, goal: Any) -> np.ndarray:
         """Return where tool tips should be, [N, arms, 3], each in its arm's base frame, m, if the task `has_targets`.
 
@@ -205,6 +222,20 @@ class Task:
             goal: fields of the goal, [N, ...] each.
         """
         raise NotImplementedError
+
+    def marks(self, goal: Any) -> np.ndarray:
+        """Return places in the world that pictures of the scene mark as goals, [N, marks, 3], m.
+
+        Args:
+            goal: fields of the goal, [N, ...] each.
+        """
+        if not self.has_targets:
+            return np.zeros((1, 0, 3))
+        mounts, targets = self.scene.mounts.values(), self.targets(goal)
+        own = [
+            t @ mount.rotation.T + mount.position for t, mount in zip(np.moveaxis(targets, 1, 0), mounts, strict=True)
+        ]
+        return np.stack(own, 1)
 
     def goal_content(self, goal: Any) -> list[np.ndarray]:
         """Return the numbers that say what the goals of N episodes are, [N, ...] each.

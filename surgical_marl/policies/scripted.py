@@ -1,0 +1,144 @@
+"""The policy that follows a task's script: inverse kinematics of each step, at the joints' speeds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from surgical_marl.envs.observations import proprioception
+from surgical_marl.tasks.base.grips import frames, joints_at, tool_of
+from surgical_marl.tasks.base.script import Snapshot, Step, Wish
+
+if TYPE_CHECKING:
+    from surgical_marl.envs.batch import BatchedEnv
+
+
+class Scripted:
+    """The policy of a script, for all environments of a batch.
+
+    In each environment joints follow straight lines to where a step wants the tools, all at the same pace. Then the
+    agents wait as the step says, and the next one is planned. Where a step was not good an earlier one is done again.
+    The last step is planned again and again until the episode ends.
+
+    Args:
+        env: the environments, with control "position".
+        steps: the script.
+        agents: those that the policy moves, if others have another one.
+    """
+
+    def __init__(self, env: BatchedEnv, steps: Sequence[Step], agents: Sequence[str]) -> None:
+        self._env, self._steps = env, steps
+        self._tools = {agent: _Tool(env, agent) for agent in env.agents}
+        self._moved = [agent for agent in env.agents if agent in agents]
+        self._now = np.zeros(env.num_envs, int)
+        """Number of each environment's step."""
+        self._left = np.zeros(env.num_envs, int)
+        """Control steps until the next one is planned."""
+
+    def __call__(self, observations: Mapping[str, Any]) -> dict[str, Any]:
+        env = self._env
+        own = env.restated({agent: observations[agent] for agent in self._moved}, "si")
+        seen = {agent: proprioception(observation) for agent, observation in own.items()}
+        for agent in self._moved:
+            self._tools[agent].look(_numpy(seen[agent]))
+        began = _numpy(env.steps) == 0
+        due = np.flatnonzero(began | (self._left <= 0))
+        if len(due):
+            self._plan(due, began[due])
+        self._left -= 1
+        pace = np.array([step.pace for step in self._steps])[self._now]
+        ways = {agent: self._tools[agent].way() for agent in self._moved}
+        furthest = np.max([np.abs(way).max(-1) for way in ways.values()], axis=0)
+        share = np.minimum(1.0, pace / np.maximum(furthest, 1e-9))[:, None]
+        return {agent: _like(seen[agent], self._tools[agent].action(share * way)) for agent, way in ways.items()}
+
+    def _plan(self, due: np.ndarray, began: np.ndarray) -> None:
+        """Plan the next step of the environments `due`; those that `began` an episode start with the first step."""
+        now, last = self._now[due], len(self._steps) - 1
+        snapshot, qpos = self._look(due), np.asarray(self._env.qpos, float)
+        after = np.minimum(now + 1, last)
+        for number, step in enumerate(self._steps):
+            if step.good is not None:
+                after[(now == number) & ~step.good(snapshot)] = step.back
+        after[began] = 0
+        self._now[due] = after
+        for agent, tool in self._tools.items():
+            tool.start(due[began], qpos[:, self._env.scene.qpos_index(agent)])
+        for number in np.unique(after):
+            rows, step = np.flatnonzero(after == number), self._steps[number]
+            wishes = step.plan(_rows(snapshot, rows))
+            for agent, wish in wishes.items():
+                self._tools[agent].send(due[rows], wish)
+            furthest = np.max([np.abs(self._tools[agent].way()[due[rows]]).max(-1) for agent in self._moved], axis=0)
+            self._left[due[rows]] = np.ceil(furthest / step.pace) + round(step.wait / self._env.control_dt) + 1
+
+    def _look(self, due: np.ndarray) -> Snapshot:
+        env = self._env
+        qpos, poses = np.asarray(env.qpos, float)[due], env.object_poses
+        tools = {
+            agent: tool_of(mount, qpos[:, env.scene.qpos_index(agent)]) for agent, mount in env.scene.mounts.items()
+        }
+        every = frames(poses.origin[due], poses.quaternion[due])
+        objects = {name: every[:, number] for number, name in enumerate(env.scene.free_objects)}
+        goal = SimpleNamespace(**{name: np.asarray(value)[due] for name, value in vars(env.goal).items()})
+        held = {agent: env.held[due, :, number] for number, agent in enumerate(env.agents)}
+        return Snapshot(tools, objects, held, goal)
+
+
+class _Tool:
+    """Where the tool of an agent goes."""
+
+    def __init__(self, env: BatchedEnv, agent: str) -> None:
+        self.mount = env.scene.mounts[agent]
+        arm = self.mount.arm
+        self.reach = env.control_dt * arm.speed
+        self.jaw = np.array([arm.jaw is not None and joint.name == arm.jaw.joint for joint in arm.actuated])
+        self.q = np.tile(arm.home, (env.num_envs, 1))
+        self.command = self.q.copy()
+        self.opens = np.zeros(env.num_envs, bool)
+        self.terms = env.observation_terms(agent)
+        if "command" not in self.terms:
+            raise ValueError(f"the oracle needs to observe command of {agent!r}")
+
+    def look(self, observation: np.ndarray) -> None:
+        """Read the commands of the joints."""
+        self.command = observation[:, self.terms["command"]]
+
+    def start(self, rows: np.ndarray, qpos: np.ndarray) -> None:
+        """Stay where the arm is in some environments, with a closed jaw."""
+        self.q[rows], self.opens[rows] = qpos[rows], False
+
+    def send(self, rows: np.ndarray, wish: Wish) -> None:
+        """Go where a wish [rows] says."""
+        if wish.tool is not None:
+            self.q[rows], _ = joints_at(self.mount, wish.tool, self.q[rows])
+        self.opens[rows] = wish.opens
+
+    def way(self) -> np.ndarray:
+        """Return how far the commands have to move, in units of an action of 1, [N, n]."""
+        return np.asarray((self.q - self.command) / self.reach * ~self.jaw)
+
+    def action(self, way: np.ndarray) -> np.ndarray:
+        """Return the action that moves the commands by `way` [N, n] and opens or closes the jaw."""
+        return np.where(self.jaw, np.where(self.opens, 1.0, -1.0)[:, None], way)
+
+
+def _rows(snapshot: Snapshot, rows: np.ndarray) -> Snapshot:
+    """Return some environments of a snapshot."""
+    some = lambda of: {name: value[rows] for name, value in of.items()}  # noqa: E731
+    goal = SimpleNamespace(**some(vars(snapshot.goal)))
+    return Snapshot(some(snapshot.tools), some(snapshot.objects), some(snapshot.held), goal)
+
+
+def _numpy(values: Any) -> np.ndarray:
+    return np.asarray(values.cpu() if hasattr(values, "cpu") else values, dtype=float)
+
+
+def _like(example: Any, action: np.ndarray) -> Any:
+    """Return an action as float32 of the example's library."""
+    if hasattr(example, "new_tensor"):
+        return example.new_tensor(action)
+    return np.asarray(action, np.float32)

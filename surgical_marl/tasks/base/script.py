@@ -1,0 +1,49 @@
+"""A script: how arms can do a task with objects step by step, for the oracle that shows that the task can be done.
+
+A task that has one returns its steps from `Task.script`. They read what the simulation knows, and are computed on the
+host for many environments at once. `surgical_marl/policies/scripted.py` moves the arms.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+
+class Snapshot(NamedTuple):
+    """n environments as they are now, in the world; SI units."""
+
+    tools: Mapping[str, np.ndarray]
+    """Pose of each agent's tool tip, [n, 4, 4]."""
+    objects: Mapping[str, np.ndarray]
+    """Pose of each free object, [n, 4, 4]."""
+    held: Mapping[str, np.ndarray]
+    """Which free objects each agent holds, [n, k] bool."""
+    goal: Any
+    """Fields of the goal, [n, ...] each."""
+
+
+class Wish(NamedTuple):
+    """What an agent should do in n environments."""
+
+    tool: np.ndarray | None = None
+    """Where its tool tip should be, world, [n, 4, 4]; None to stay where it was sent last."""
+    opens: bool = False
+    """Whether the jaw opens; otherwise it closes."""
+
+
+class Step(NamedTuple):
+    """A step of a script: all agents go where they should and wait there."""
+
+    plan: Callable[[Snapshot], Mapping[str, Wish]]
+    """Return what each agent should do. Agents that are not named stay, with the jaw as it is."""
+    wait: float = 0.0
+    """Time after all agents have arrived, s."""
+    pace: float = 1.0
+    """Speed, as a share of the joints' own."""
+    good: Callable[[Snapshot], np.ndarray] | None = None
+    """Return whether the step was successful, [n] bool; where not, the script goes on with the step `back`."""
+    back: int = 0
+    """Number of a step."""
