@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import yaml
 
+import surgical_marl as sm
 from surgical_marl.robots.rotation import matrix_of
 from surgical_marl.scenes.mjcf import mjcf
 from surgical_marl.studies.grasping import CHUNK, OBJECTS, Grasps, Held, judge
@@ -90,10 +91,14 @@ def test_a_grasped_object_moves_as_in_plain_mujoco_at_a_tenth_of_the_step(grasps
 
 @pytest.fixture(scope="module")
 def falling(tmp_path_factory: pytest.TempPathFactory) -> Falling:
-    """A needle, a block and a ring 50 mm above a pad."""
+    """A needle, a block and a ring 50 mm above a pad so wide that nothing rolls off it."""
+    folder = tmp_path_factory.mktemp("falling")
+    pad = yaml.safe_load((Path(sm.__file__).parents[1] / "scenes/objects/pad.yaml").read_text())
+    pad["shapes"][0]["box"]["size"][:2] = [1.0, 1.0]
+    (folder / "wide.yaml").write_text(yaml.safe_dump(pad))
     places = {name: {"object": name, "position": [0, y, 0.05]} for name, y in
               (("needle_sh", -0.05), ("block", 0.0), ("ring", 0.05))}  # fmt: skip
-    return Falling(tmp_path_factory.mktemp("falling"), {"pad": {"object": "pad"}, **places})
+    return Falling(folder, {"pad": {"object": str(folder / "wide.yaml")}, **places})
 
 
 @pytest.mark.parametrize("speed", [0.0, 1.0, 3.0])

@@ -18,7 +18,7 @@ from surgical_marl.physics.bodies import Bodies, free_acceleration, inertias, mo
 from surgical_marl.physics.collision import Pairs
 from surgical_marl.physics.dynamics import Dynamics, Physics
 from surgical_marl.physics.handling import DWELL, Grips, Handling
-from surgical_marl.physics.newton import Newton, Pressed, Problem
+from surgical_marl.physics.newton import Contact, Newton, Pressed, Problem
 from surgical_marl.physics.solver import Rows
 from surgical_marl.physics.tables import Tables
 from surgical_marl.physics.touching import Finder, Joints, Slots
@@ -48,9 +48,10 @@ class Together:
         self.tables = Tables(scene)
         self.names = self.tables.names
         joints, none = scene.model.nv, np.zeros((0, 0), int)
-        self._newton, self._objects_alone = (
+        self._newton, self._objects_alone, self._object_alone = (
             Newton(self.tables.dofs, joints, len(self.names)),
             Newton(none, 0, len(self.names)),
+            Newton(none, 0, 1),
         )
         self._finder = Finder(self.tables)
 
@@ -129,14 +130,33 @@ class Together:
         """Return the objects after a step in which no arm is near."""
         bodies, dt, none = objects.bodies, self._dynamics.dt, jnp.zeros(0)
         masses, free = self._free(bodies)
-        handling = Handling(self.tables, self._objects_alone)
-        felt = handling.feel(slots, None, None, none, bodies, objects.grips, dt)
-        rows = Rows(jnp.zeros((0, 0)), none, none, none, none)
-        problem = Problem(jnp.zeros((0, 0)), none, rows, rows, masses, free, felt.contacts, slots.total)
-        found = self._objects_alone.solve(problem, none, bodies.acceleration).objects
+        felt = Handling(self.tables, self._objects_alone).feel(slots, None, None, none, bodies, objects.grips, dt)
+        found = self._solve_objects(masses, free, felt.contacts, slots.total, bodies.acceleration)
         grips = objects.grips
         loose = grips._replace(force=0 * grips.force, slid=0 * grips.slid, held=0 * grips.held)
         return Objects(moved(bodies, found, dt), loose)
+
+    def _solve_objects(self, masses: Array, free: Array, contacts: Contact, total: Array, start: Array) -> Array:
+        """Return the accelerations [k, 6] of objects that touch no arm: one by one, if none touches another."""
+        none, k = jnp.zeros(0), len(free)
+        rows = Rows(jnp.zeros((0, 0)), none, none, none, none)
+
+        def whole(contacts: Contact) -> Array:
+            problem = Problem(jnp.zeros((0, 0)), none, rows, rows, masses, free, contacts, total)
+            return self._objects_alone.solve(problem, none, start).objects
+
+        def single(row: tuple[Array, ...]) -> Array:
+            number, mass, free, start = row
+            own = contacts._replace(first=jnp.where(contacts.first == number, 0, 1))
+            problem = Problem(jnp.zeros((0, 0)), none, rows, rows, mass[None], free[None], own, total)
+            return self._object_alone.solve(problem, none, start[None]).objects[0]
+
+        def each(_: Contact) -> Array:
+            return jax.lax.map(single, (jnp.arange(k), masses, free, start))
+
+        if k < 2:
+            return whole(contacts)
+        return jax.lax.cond((contacts.second < k).any(), whole, each, contacts)
 
     def _step(
         self, dynamics: Dynamics, physics: Physics, touch: Touch, slots: Slots, joints: Joints
