@@ -11,8 +11,9 @@ from jax import Array
 
 from surgical_marl.physics.bodies import Bodies, conjugate, product, rotation, turn
 from surgical_marl.physics.cone import Cone
-from surgical_marl.physics.newton import SLIPS, Contact, Newton, Pressed
+from surgical_marl.physics.newton import Newton
 from surgical_marl.physics.patches import AWAY, Patch
+from surgical_marl.physics.problem import SLIPS, Contact, Pressed
 from surgical_marl.physics.tables import Tables
 from surgical_marl.physics.touching import AHEAD, MARGIN, Joints, Slots, stored
 
@@ -120,14 +121,14 @@ class Handling:
         """Return how the patches in all slots resist. There are neither joints nor fingers without arms."""
         joint_speeds = self._newton.by_arm(qvel)
         bends = None if joints is None else joints.bends(self.tables, joint_speeds)
-        speeds = _Speeds(joint_speeds, stored(bodies.velocity), bends)
-        at = stored(bodies.position), stored(bodies.quaternion)
+        speeds = _Speeds(joint_speeds, self._newton.by_object(bodies.velocity), bends)
+        at = self._newton.by_object(bodies.position), self._newton.by_object(bodies.quaternion)
         grips = stored(grips)
 
         def one(row: tuple[Patch, Array]) -> Felt:
             patch, number = row
             contact, origin = self._contact(patch, number, joints, at[0])
-            slip = jnp.zeros(3) if fingers is None else self._slip(patch, number, fingers, at, grips)
+            slip = self._slip(patch, number, fingers, at, grips)
             motion = self._motion(contact, patch, number, speeds, origin)
             return Felt(self._resisting(contact, patch, number, slip, motion, dt), slip)
 
@@ -149,10 +150,10 @@ class Handling:
         first, second, arm = (
             jnp.asarray(x.astype(np.int32))[number] for x in (t.first_object, t.second_object, t.owner)
         )
-        origin = jnp.where(first < t.count, position.at[first].get(mode="clip"), patch.centre)
+        origin = jnp.where(first < t.count, position[first], patch.centre)
         offset, jacobian = jnp.zeros(3), jnp.zeros((6, t.most))
         if t.count > 1:
-            offset = jnp.where(second < t.count, position.at[second].get(mode="clip") - origin, 0.0)
+            offset = jnp.where(second < t.count, position[second] - origin, 0.0)
         if joints is not None:
             own = jax.tree.map(lambda x: x.at[arm].get(mode="clip"), joints)
             slides = jnp.asarray(t.slides).at[arm].get(mode="clip")
@@ -191,10 +192,10 @@ class Handling:
         """Return how the two bodies of a contact move relative to each other now."""
         t, places = self.tables, jnp.concatenate([patch.points.place, patch.centre[None]]) - origin
         twist = self._newton.twist(contact, speeds.joints, speeds.objects)
-        spin = speeds.objects.at[contact.first].get(mode="fill", fill_value=0.0)[3:]
+        spin = speeds.objects[contact.first][3:]
         bends = jnp.cross(spin, jnp.cross(spin, places))
         if t.count > 1:
-            spin = speeds.objects.at[contact.second].get(mode="fill", fill_value=0.0)[3:]
+            spin = speeds.objects[contact.second][3:]
             bends -= jnp.cross(spin, jnp.cross(spin, places - contact.offset))
         if t.arms and speeds.bends is not None:
             sign = jnp.asarray(t.sign)[number]
@@ -208,8 +209,10 @@ class Handling:
         """Return the finger that a patch is on, []."""
         return jnp.asarray(self.tables.finger.astype(np.int32))[number]
 
-    def _slip(self, patch: Patch, number: Array, fingers: Fingers, at: tuple[Array, Array], grips: Grips) -> Array:
+    def _slip(self, patch: Patch, number: Array, fingers: Fingers | None, at: Any, grips: Grips) -> Array:
         """Return how far the object has moved along the finger since friction was relaxed, m, [3]; 0 elsewhere."""
+        if fingers is None or not self.tables.grip:
+            return jnp.zeros(3)
         f = self._finger(number)
 
         def moved(_: None) -> Array:
@@ -236,9 +239,12 @@ class Handling:
         Where friction slips, its spring is stretched no further than its force says. `shift` is by how much all arms'
         joints [n] and objects [k, 6] move in the step.
         """
-        t, k, old = self.tables, len(bodies.position), stored(grips)
-        moves = self._newton.by_arm(shift[0]), stored(shift[1])
-        at = stored(bodies.position), stored(bodies.quaternion)
+        t, k = self.tables, len(bodies.position)
+        if not t.grip:
+            return grips
+        old = stored(grips)
+        moves = self._newton.by_arm(shift[0]), self._newton.by_object(shift[1])
+        at = self._newton.by_object(bodies.position), self._newton.by_object(bodies.quaternion)
         normal = jnp.zeros((k, len(t.fingers), 3))
         fresh = grips._replace(force=jnp.zeros_like(grips.force), slid=jnp.zeros_like(grips.slid))
 

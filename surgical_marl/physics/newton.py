@@ -16,7 +16,9 @@ import numpy as np
 from jax import Array
 from jax.lax.linalg import triangular_solve
 
-from surgical_marl.physics.cone import Cone, curvature, forces, wrench
+from surgical_marl.physics.cone import curvature, forces, wrench
+from surgical_marl.physics.problem import SLIPS, Contact, Point, Pressed, Problem, Solution
+from surgical_marl.physics.search import Search
 from surgical_marl.physics.solver import Rows, solve
 from surgical_marl.physics.touching import stored
 
@@ -33,72 +35,6 @@ LOOKS = 6
 """Lengths of a step that are tried at most."""
 TOLERANCE = 1e-2
 """Change of friction in a Newton step, as a share of the normal force, at which sliding contacts have converged."""
-
-
-class Contact(NamedTuple):
-    """A patch between bodies: what resists their relative acceleration. Batches [s]."""
-
-    cone: Cone
-    first: Array
-    """Number of its object, [], at whose centre of mass the twist is taken; that of no object if there is none."""
-    second: Array
-    """Number of the other object, []."""
-    offset: Array
-    """From the origin of the twist to the centre of mass of the other object, m, [3]."""
-    arm: Array
-    """Number of the arm that it is on, []."""
-    jacobian: Array
-    """Twist by velocity of that arm's joints, [6, m]."""
-
-
-class Problem(NamedTuple):
-    """What is to be solved: n joints of a arms, k objects, s contacts."""
-
-    mass: Array
-    """Mass matrix of the arms with the implicit parts of other forces, [n, n]."""
-    smooth: Array
-    """Sum of all other forces on the arms, [n]."""
-    rows: Rows
-    """Friction and limits of joints."""
-    between: Rows
-    """Contacts of arms with arms."""
-    masses: Array
-    """Mass matrices of the objects, [k, 6, 6]."""
-    free: Array
-    """Accelerations of the objects without contacts, [k, 6]."""
-    contacts: Contact
-    total: Array
-    """How many contacts there are, []."""
-
-
-class Pressed(NamedTuple):
-    """The forces of contacts, [s]."""
-
-    normal: Array
-    """Of all points together, N, [s]."""
-    friction: Array
-    """N, [s, 3]."""
-    sides: Array
-    """Which points press, and whether friction slips: bits, [s]."""
-
-
-SLIPS = 1 << 8
-"""The bit of `Pressed.sides` for friction that slips."""
-
-
-class Solution(NamedTuple):
-    """Accelerations of arms [n] and objects [k, 6], forces of contacts and of arms on arms, and passes taken []."""
-
-    arms: Array
-    objects: Array
-    pressed: Pressed
-    between: Array
-    passes: Array
-
-
-class _Point(NamedTuple):
-    arms: Array
-    objects: Array
 
 
 class _Local(NamedTuple):
@@ -127,11 +63,10 @@ class Newton:
         self._own = [np.flatnonzero(row < joints) for row in dofs]
 
     def twist(self, contact: Contact, arms: Array, objects: Array) -> Array:
-        """Return the twist [6] of a contact by motions of arms [a, m] and objects [k, 6], both in memory."""
-        twist = objects.at[contact.first].get(mode="fill", fill_value=0.0)
+        """Return the twist [6] of a contact by motions of arms (`by_arm`) and of objects (`by_object`)."""
+        twist = objects[contact.first]
         if self._objects > 1:
-            other = objects.at[contact.second].get(mode="fill", fill_value=0.0)
-            twist -= _moved_to(other, contact.offset)
+            twist -= _moved_to(objects[contact.second], contact.offset)
         if len(self._dofs):
             still = lambda twist: twist  # noqa: E731
             with_arm = lambda twist: twist + contact.jacobian @ arms[contact.arm]  # noqa: E731
@@ -142,13 +77,17 @@ class Newton:
         """Return what belongs to the joints [n] of all arms by arm, in memory, [a, m]; 0 for joints that are not."""
         return stored(jnp.append(joints, 0.0)[np.minimum(self._dofs, len(joints))])
 
+    def by_object(self, each: Array) -> Array:
+        """Return what belongs to objects [k, ...], and 0 for the one that stands for none, in memory, [k + 1, ...]."""
+        return stored(jnp.concatenate([each, jnp.zeros((1, *each.shape[1:]))]))
+
     def solve(self, problem: Problem, arms: Array, objects: Array) -> Solution:
         """Return the accelerations and forces, beginning with accelerations of arms [n] and objects [k, 6]."""
-        begin, slots = _Point(arms, objects), len(problem.contacts.arm)
+        begin, slots = Point(arms, objects), len(problem.contacts.arm)
         still = jax.tree.map(jnp.zeros_like, begin)
         pressed = Pressed(jnp.zeros(slots), jnp.zeros((slots, 3)), jnp.full(slots, -1, jnp.int32))
         zero = jnp.float32(0.0)
-        search = _Search(begin, still, zero, zero, jnp.float32(jnp.inf), zero, jnp.int32(0))
+        search = Search(begin, still, zero, zero, jnp.float32(jnp.inf), zero, jnp.int32(0))
         state = search, pressed, self._sides(problem, arms), jnp.bool_(False), jnp.int32(0)
 
         def going(state: Any) -> Array:
@@ -170,14 +109,14 @@ class Newton:
                 settled &= ~joined | (jnp.abs(slope) <= TOLERANCE * jnp.abs(search.slope))
             enough = settled | (jnp.abs(slope) <= ENOUGH * jnp.abs(search.slope)) | (search.looks >= LOOKS)
 
-            def on(search: _Search) -> tuple[_Search, Array]:
+            def on(search: Search) -> tuple[Search, Array]:
                 way = self._direction(problem, here, excess, local, felt)
                 slope = -_dot(self._whole(problem, here, excess), way)
                 last = -slope <= LEAST
                 there = jax.tree.map(lambda x, step: jnp.where(last, x + step, x), here, way)
                 return search.begin(there, way, slope), last
 
-            def look(search: _Search) -> _Search:
+            def look(search: Search) -> Search:
                 return search.look(slope, self._growth(problem, here, search.way, local, felt))
 
             stay = lambda search: (search.at(here), settled)  # noqa: E731
@@ -195,12 +134,19 @@ class Newton:
 
     # -- forces at a point
 
-    def _contacts(self, problem: Problem, point: _Point) -> tuple[_Local, Pressed]:
+    def _contacts(self, problem: Problem, point: Point) -> tuple[_Local, Pressed]:
         """Return sums over all contacts, and their forces."""
         k, (a, m) = self._objects, self._dofs.shape
-        arms, objects = self.by_arm(point.arms), stored(point.objects)
+        arms, objects = self.by_arm(point.arms), self.by_object(point.objects)
         inertia = (problem.masses @ (problem.free - point.objects)[..., None])[..., 0]
-        none = _Local(jnp.zeros((a, m)), jnp.zeros((a, m, m)), inertia, problem.masses, jnp.zeros((k, a, 6, m)))
+        more = lambda x: jnp.concatenate([x, jnp.zeros((1, *x.shape[1:]))])  # noqa: E731
+        none = _Local(
+            jnp.zeros((a, m)),
+            jnp.zeros((a, m, m)),
+            more(inertia),
+            more(problem.masses),
+            jnp.zeros((k + 1, a, 6, m)),
+        )
 
         def one(local: _Local, row: tuple[Contact, Array]) -> tuple[_Local, Pressed]:
             contact, number = row
@@ -220,7 +166,9 @@ class Newton:
             return self._add(local, contact, pull, stiff), pressed
 
         rows = problem.contacts, jnp.arange(len(problem.contacts.arm), dtype=jnp.int32)
-        return jax.lax.scan(one, none, rows)
+        local, pressed = jax.lax.scan(one, none, rows)
+        own = {name: getattr(local, name)[:k] for name in ("excess", "object", "coupling")}
+        return local._replace(**own), pressed
 
     def _add(self, local: _Local, contact: Contact, pull: Array, stiff: Array) -> _Local:
         """Return sums with one more contact: the force and torque [6] on its first body, and how they fall [6, 6]."""
@@ -231,14 +179,14 @@ class Newton:
 
             def on_other(parts: tuple[Array, Array]) -> tuple[Array, Array]:
                 shift = _shift(contact.offset)
-                excess = parts[0].at[second].add(-(shift.T @ pull), mode="drop")
-                return excess, parts[1].at[second].add(shift.T @ whole @ shift, mode="drop")
+                excess = parts[0].at[second].add(-(shift.T @ pull))
+                return excess, parts[1].at[second].add(shift.T @ whole @ shift)
 
             parts = jax.lax.cond(both, on_other, lambda parts: parts, (local.excess, local.object))
             local = local._replace(excess=parts[0], object=parts[1])
         local = local._replace(
-            excess=local.excess.at[first].add(pull, mode="drop"),
-            object=local.object.at[first].add(whole, mode="drop"),
+            excess=local.excess.at[first].add(pull),
+            object=local.object.at[first].add(whole),
         )
         if not len(self._dofs):
             return local
@@ -247,17 +195,17 @@ class Newton:
             arm, jacobian = contact.arm, contact.jacobian
             half = stiff @ jacobian
             return local._replace(
-                arm_excess=local.arm_excess.at[arm].add(jacobian.T @ pull, mode="clip"),
-                arm=local.arm.at[arm].add(jacobian.T @ half, mode="clip"),
-                coupling=local.coupling.at[first, arm].add(half, mode="drop"),
+                arm_excess=local.arm_excess.at[arm].add(jacobian.T @ pull),
+                arm=local.arm.at[arm].add(jacobian.T @ half),
+                coupling=local.coupling.at[first, arm].add(half),
             )
 
         return jax.lax.cond(contact.arm < len(self._dofs), on_arm, lambda local: local, local)
 
-    def _excess(self, problem: Problem, point: _Point, local: _Local) -> tuple[_Point, Array]:
+    def _excess(self, problem: Problem, point: Point, local: _Local) -> tuple[Point, Array]:
         """Return the forces that are left over, but for joints' rows, and how those on arms fall, [n, n]."""
         if not len(point.arms):
-            return _Point(point.arms, local.excess), problem.mass
+            return Point(point.arms, local.excess), problem.mass
         excess, stiff = problem.smooth - problem.mass @ point.arms, problem.mass
         for arm, own in enumerate(self._own):
             dofs = self._dofs[arm, own]
@@ -276,9 +224,9 @@ class Newton:
 
         if len(problem.between.low):
             (excess, stiff), _ = jax.lax.scan(press, (excess, stiff), problem.between)
-        return _Point(excess, local.excess), stiff
+        return Point(excess, local.excess), stiff
 
-    def _whole(self, problem: Problem, point: _Point, excess: _Point) -> _Point:
+    def _whole(self, problem: Problem, point: Point, excess: Point) -> Point:
         """Return the forces that are left over, with those of joints' rows."""
         rows = problem.rows
         return excess._replace(arms=excess.arms + rows.jacobian.T @ _clipped(rows, point.arms))
@@ -290,7 +238,7 @@ class Newton:
 
     # -- the way from there
 
-    def _direction(self, problem: Problem, here: _Point, excess: _Point, local: _Local, stiff: Array) -> _Point:
+    def _direction(self, problem: Problem, here: Point, excess: Point, local: _Local, stiff: Array) -> Point:
         """Return the way to the least cost if contacts are linear functions; friction and limits of joints are not.
 
         Objects are eliminated, arms solved (`solver.py`), and objects found from them.
@@ -323,10 +271,10 @@ class Newton:
         found = force
         if n:
             smooth = stiff @ here.arms + force
-            found = solve(stiff, smooth, problem.rows, here.arms, *ITERATIONS)[0] - here.arms
-        return _Point(found, jax.lax.map(back, kept))
+            found = solve(stiff, smooth, problem.rows, here.arms, *ITERATIONS, steady=1)[0] - here.arms
+        return Point(found, jax.lax.map(back, kept))
 
-    def _growth(self, problem: Problem, here: _Point, way: _Point, local: _Local, stiff: Array) -> Array:
+    def _growth(self, problem: Problem, here: Point, way: Point, local: _Local, stiff: Array) -> Array:
         """Return by how much the slope of the cost along a way grows per length of it, []."""
         rows, own = problem.rows, (local.object @ way.objects[..., None])[..., 0]
         total = jnp.sum(way.objects * own)
@@ -342,50 +290,14 @@ class Newton:
         """Return which objects touch an arm, [k]."""
         contacts = problem.contacts
         on_arm = (contacts.arm < len(self._dofs)) & (np.arange(len(contacts.arm)) < problem.total)
-        return jnp.stack([(on_arm & (contacts.first == o)).any() for o in range(self._objects)])
-
-
-class _Search(NamedTuple):
-    """A step from a start along a way, and which lengths of it were tried."""
-
-    start: _Point
-    way: _Point
-    length: Array
-    low: Array
-    """The longest length that was too short."""
-    high: Array
-    """The shortest one that was too long."""
-    slope: Array
-    """Of the cost along the way, at the start."""
-    looks: Array
-    """How many were tried."""
-
-    def here(self) -> _Point:
-        return jax.tree.map(lambda x, way: x + self.length * way, self.start, self.way)
-
-    def at(self, here: _Point) -> _Search:
-        return self._replace(start=here)
-
-    def begin(self, here: _Point, way: _Point, slope: Array) -> _Search:
-        """Return the search along a new way."""
-        zero = jnp.float32(0.0)
-        return _Search(here, way, jnp.float32(1.0), zero, jnp.float32(jnp.inf), slope, jnp.int32(0))
-
-    def look(self, slope: Array, growth: Array) -> _Search:
-        """Return the search with the length that comes next: Newton's method on the slope, within a bracket."""
-        short = slope < 0
-        low, high = jnp.where(short, self.length, self.low), jnp.where(short, self.high, self.length)
-        length = self.length - slope / jnp.maximum(growth, 1e-20)
-        inside = jnp.where(short, length < high, length > low)
-        length = jnp.where(inside, length, jnp.where(high < jnp.inf, (low + high) / 2, 2 * low))
-        return self._replace(length=length, low=low, high=high, looks=self.looks + 1)
+        return (on_arm & (contacts.first == np.arange(self._objects)[:, None])).any(1)
 
 
 def _clipped(rows: Rows, arms: Array) -> Array:
     return jnp.clip(rows.impedance * (rows.reference - rows.jacobian @ arms), rows.low, rows.high)
 
 
-def _dot(one: _Point, other: _Point) -> Array:
+def _dot(one: Point, other: Point) -> Array:
     return jnp.sum(one.arms * other.arms) + jnp.sum(one.objects * other.objects)
 
 

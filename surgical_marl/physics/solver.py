@@ -104,9 +104,16 @@ def relax(mass: Array, smooth: Array, joints: JointRows, qacc: Array) -> Array:
     return jnp.stack(found)
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(4, 5, 6))
+@partial(jax.custom_jvp, nondiff_argnums=(4, 5, 6, 7))
 def solve(
-    mass: Array, smooth: Array, rows: Rows, start: Array, iterations: int, line_search: int, between: int = 0
+    mass: Array,
+    smooth: Array,
+    rows: Rows,
+    start: Array,
+    iterations: int,
+    line_search: int,
+    between: int = 0,
+    steady: int = 2,
 ) -> tuple[Array, Array]:
     """Return the acceleration [n] and the force of each row [r].
 
@@ -115,7 +122,7 @@ def solve(
     concern joints of several arms: then no matrix larger than that of an arm is factorised (`_newton_step`).
 
     There are at most `iterations` Newton steps. A step over which no row changes sides ends at the solution, and a
-    second such step removes its rounding error. After that the search stops.
+    second such step removes its rounding error. After `steady` of them the search stops.
 
     Its derivative is that of the solution (`_differentiate`), whatever the way there.
     """
@@ -132,7 +139,7 @@ def solve(
 
     def unsettled(state: tuple[Array, Array, Array]) -> Array:
         _, settled, count = state
-        return (settled < 2) & (count < iterations)
+        return (settled < steady) & (count < iterations)
 
     def iterate(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         qacc, settled, count = state
@@ -164,7 +171,12 @@ def _newton_step(mass: Array, jacobian: Array, gives: Array, excess: Array, betw
 
 @solve.defjvp
 def _differentiate(
-    iterations: int, line_search: int, between: int, primals: tuple[Any, ...], tangents: tuple[Any, ...]
+    iterations: int,
+    line_search: int,
+    between: int,
+    steady: int,
+    primals: tuple[Any, ...],
+    tangents: tuple[Any, ...],
 ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
     """Return the solution and its derivative, by the implicit function theorem.
 
@@ -172,7 +184,7 @@ def _differentiate(
     system, which is never degenerate. The way to the solution is no use: at rest it divides zero by zero.
     """
     mass, smooth, rows, _ = primals
-    qacc, force = solve(*primals, iterations, line_search, between)
+    qacc, force = solve(*primals, iterations, line_search, between, steady)
 
     def excess(mass: Array, smooth: Array, rows: Rows) -> Array:
         return smooth + rows.jacobian.T @ _force(rows, qacc) - mass @ qacc

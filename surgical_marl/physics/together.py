@@ -18,7 +18,8 @@ from surgical_marl.physics.bodies import Bodies, free_acceleration, inertias, mo
 from surgical_marl.physics.collision import Pairs
 from surgical_marl.physics.dynamics import Dynamics, Physics
 from surgical_marl.physics.handling import DWELL, Grips, Handling
-from surgical_marl.physics.newton import Contact, Newton, Pressed, Problem
+from surgical_marl.physics.newton import Newton
+from surgical_marl.physics.problem import Contact, Pressed, Problem
 from surgical_marl.physics.solver import Rows
 from surgical_marl.physics.tables import Tables
 from surgical_marl.physics.touching import Finder, Joints, Slots
@@ -128,6 +129,8 @@ class Together:
 
     def _step_objects(self, objects: Objects, slots: Slots) -> Objects:
         """Return the objects after a step in which no arm is near."""
+        if not self.names:
+            return objects
         bodies, dt, none = objects.bodies, self._dynamics.dt, jnp.zeros(0)
         masses, free = self._free(bodies)
         felt = Handling(self.tables, self._objects_alone).feel(slots, None, None, none, bodies, objects.grips, dt)

@@ -111,12 +111,12 @@ class Finder:
         pad = lambda x: jnp.concatenate([x, jnp.zeros((1, 3))])[self._tables.dofs]  # noqa: E731
         return stored(Joints(pad(data.xaxis), pad(data.xanchor)))
 
-    def find(self, data: Any, joints: Joints | None, qvel: Array, bodies: Bodies, dt: Any) -> Slots:
+    def find(self, data: Any, joints: Joints, qvel: Array, bodies: Bodies, dt: Any) -> Slots:
         """Return the patches between bodies that are near each other, or will be after a step.
 
         Args:
             data: MJX's data with the poses of the arms.
-            joints: axes of the arms' joints; None without arms.
+            joints: axes of the arms' joints.
             qvel: velocities of the arms' joints.
             bodies: the objects.
             dt: time over which motions are looked ahead, s.
@@ -211,27 +211,20 @@ class Finder:
 
     # -- bodies
 
-    def _place(self, data: Any, joints: Joints | None, qvel: Array, bodies: Bodies, dt: Any) -> Placed:
-        t, turn = self._tables, dt * bodies.velocity[:, 3:]
-        ways = {"objects": Way(dt * bodies.velocity[:, :3] - jnp.cross(turn, bodies.position), turn)}
-        frames, none = rotation(bodies.quaternion), jnp.zeros((0, 3))
-        pads, links = Plate(none, jnp.zeros((0, 3, 3)), none, none), Segments(none, none, none)
-        if joints is not None:
-            frame = jnp.matmul(data.geom_xmat[t.pad_geoms], jnp.asarray(t.pad_axes))
-            pads = Plate(data.geom_xpos[t.pad_geoms], frame, _constant(t.pad_half), _constant(t.pad_radius))
-            half = jnp.asarray(t.link_half)[:, None] * data.geom_xmat[t.near][:, :, 2]
-            centre = data.geom_xpos[t.near]
-            links = Segments(centre - half, centre + half, _constant(t.link_radius))
-            pads = pads._replace(centre=stored(pads.centre), frame=stored(pads.frame))
-            links = links._replace(start=stored(links.start), end=stored(links.end))
-            shift, spin = joints.columns(jnp.asarray(t.slides), jnp.zeros(3))
-            moves = dt * jnp.append(qvel, 0.0)[t.dofs]
-            moves = stored((shift * moves[..., None], spin * moves[..., None]))
-            for kind in t.bodies:
-                ways[kind] = Way(
-                    *jax.lax.map(lambda row: _moved(row[0], row[1], moves), (t.arm_of[kind], t.moves[kind]))
-                )
-        return Placed(stored(bodies.position), stored(frames), pads, links, ways | {"objects": stored(ways["objects"])})
+    def _place(self, data: Any, joints: Joints, qvel: Array, bodies: Bodies, dt: Any) -> Placed:
+        t, turn, frames = self._tables, dt * bodies.velocity[:, 3:], rotation(bodies.quaternion)
+        axes = jnp.matmul(data.geom_xmat[t.pad_geoms], jnp.asarray(t.pad_axes))
+        pads = Plate(stored(data.geom_xpos[t.pad_geoms]), stored(axes), _constant(t.pad_half), _constant(t.pad_radius))
+        centre = data.geom_xpos[t.near]
+        half = jnp.asarray(t.link_half)[:, None] * data.geom_xmat[t.near][:, :, 2]
+        links = Segments(stored(centre - half), stored(centre + half), _constant(t.link_radius))
+        ways = {"objects": stored(Way(dt * bodies.velocity[:, :3] - jnp.cross(turn, bodies.position), turn))}
+        moves, columns = dt * jnp.append(qvel, 0.0)[t.dofs], joints.columns(jnp.asarray(t.slides), jnp.zeros(3))
+        by_joint = stored(tuple(column * moves[..., None] for column in columns))
+        for kind in t.bodies:
+            own = t.arm_of[kind], t.moves[kind]
+            ways[kind] = Way(*jax.lax.map(lambda row: _moved(row[0], row[1], by_joint), own))
+        return Placed(stored(bodies.position), stored(frames), pads, links, ways)
 
     def _capsules(self, placed: Placed, kind: str, i: Array) -> Segments:
         """Return the capsules of one body, [c]."""

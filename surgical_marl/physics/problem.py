@@ -1,0 +1,78 @@
+"""What arms, objects and their contacts leave to be solved, and its solution."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from jax import Array
+
+from surgical_marl.physics.cone import Cone
+from surgical_marl.physics.solver import Rows
+
+
+class Contact(NamedTuple):
+    """A patch between bodies: what resists their relative acceleration. Batches [s]."""
+
+    cone: Cone
+    first: Array
+    """Number of its object, [], at whose centre of mass the twist is taken; that of no object if there is none."""
+    second: Array
+    """Number of the other object, []."""
+    offset: Array
+    """From the origin of the twist to the centre of mass of the other object, m, [3]."""
+    arm: Array
+    """Number of the arm that it is on, []."""
+    jacobian: Array
+    """Twist by velocity of that arm's joints, [6, m]."""
+
+
+class Problem(NamedTuple):
+    """What is to be solved: n joints of a arms, k objects, s contacts."""
+
+    mass: Array
+    """Mass matrix of the arms with the implicit parts of other forces, [n, n]."""
+    smooth: Array
+    """Sum of all other forces on the arms, [n]."""
+    rows: Rows
+    """Friction and limits of joints."""
+    between: Rows
+    """Contacts of arms with arms."""
+    masses: Array
+    """Mass matrices of the objects, [k, 6, 6]."""
+    free: Array
+    """Accelerations of the objects without contacts, [k, 6]."""
+    contacts: Contact
+    total: Array
+    """How many contacts there are, []."""
+
+
+class Pressed(NamedTuple):
+    """The forces of contacts, [s]."""
+
+    normal: Array
+    """Of all points together, N, [s]."""
+    friction: Array
+    """N, [s, 3]."""
+    sides: Array
+    """Which points press, and whether friction slips: bits, [s]."""
+
+
+SLIPS = 1 << 8
+"""The bit of `Pressed.sides` for friction that slips."""
+
+
+class Solution(NamedTuple):
+    """Accelerations of arms [n] and objects [k, 6], forces of contacts and of arms on arms, and passes taken []."""
+
+    arms: Array
+    objects: Array
+    pressed: Pressed
+    between: Array
+    passes: Array
+
+
+class Point(NamedTuple):
+    """Accelerations of arms [n] and objects [k, 6], or forces on them."""
+
+    arms: Array
+    objects: Array
