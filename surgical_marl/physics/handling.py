@@ -256,9 +256,8 @@ class Handling:
                 after = slip + contact.cone.along @ self._newton.twist(contact, *moves)
                 place = contact.first, f
                 own = old._replace(**{name: getattr(old, name)[place] for name in OF_FINGERS})
-                new = self._kept(
-                    patch, number, forces, after, _row(fingers, f), tuple(x[contact.first] for x in at), own
-                )
+                pose = at[0][contact.first], at[1][contact.first]
+                new = self._kept(patch, number, forces, after, _row(fingers, f), pose, own)
                 found = {name: getattr(kept[0], name).at[place].set(y) for name, y in zip(OF_FINGERS, new, strict=True)}
                 return kept[0]._replace(**found), kept[1].at[place].set(patch.frame[0])
 

@@ -114,7 +114,7 @@ class Writer:
 
     def _stacked(self, row: Traced) -> Traced:
         columns, length = [self._all(values) for values in self._columns(row)], self._loop().length
-        together = np.array(columns, np.int32).reshape(len(columns), length).T
+        together = np.array(columns, np.int32).reshape(len(columns), -1 if columns else length).T
         return lower(self._g, together.reshape(length, *row.shape), dtype_of(self._g, row))
 
     def _all(self, values: tuple[Value, ...]) -> list[Value]:
