@@ -15,7 +15,7 @@ from surgical_marl.physics.newton import Newton
 from surgical_marl.physics.patches import AWAY, Patch
 from surgical_marl.physics.problem import SLIPS, Contact, Pressed
 from surgical_marl.physics.tables import Tables
-from surgical_marl.physics.touching import AHEAD, MARGIN, Joints, Slots, stored
+from surgical_marl.physics.touching import AHEAD, MARGIN, Joints, Slots, row_of, stored
 
 DAMPING = 5e-3
 """Damping of a contact in the normal direction, s: this times its stiffness, N s/m."""
@@ -135,7 +135,7 @@ class Handling:
             return Felt(self._resisting(contact, patch, number, slip, motion, dt), slip)
 
         def nothing(_: None) -> Felt:
-            t, shapes = self.tables, jax.eval_shape(lambda: one((_row(slots.patch, 0), slots.number[0])))
+            t, shapes = self.tables, jax.eval_shape(lambda: one((row_of(slots.patch, 0), slots.number[0])))
             none = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
             nobody = (jnp.int32(t.count), jnp.int32(t.count), jnp.int32(t.arms))
             first, second, arm = nobody
@@ -219,7 +219,7 @@ class Handling:
 
         def moved(_: None) -> Array:
             o = jnp.asarray(self.tables.first_object.astype(np.int32))[number]
-            frame = _row(fingers, f)
+            frame = row_of(fingers, f)
             position, quaternion, force = (x[o, f] for x in grips[:3])
             was = frame.position + frame.axes @ position
             turned = product(at[1][o], conjugate(product(frame.quaternion, quaternion)))
@@ -259,7 +259,7 @@ class Handling:
                 place = contact.first, f
                 own = old._replace(**{name: getattr(old, name)[place] for name in OF_FINGERS})
                 pose = at[0][contact.first], at[1][contact.first]
-                new = self._kept(patch, number, forces, after, _row(fingers, f), pose, own)
+                new = self._kept(patch, number, forces, after, row_of(fingers, f), pose, own)
                 found = {name: getattr(kept[0], name).at[place].set(y) for name, y in zip(OF_FINGERS, new, strict=True)}
                 return kept[0]._replace(**found), kept[1].at[place].set(patch.frame[0])
 
@@ -312,10 +312,6 @@ class Handling:
                 opposite = jnp.sum(normal[o, one] * normal[o, other]) <= -OPPOSITE
                 held = held.at[o, a].set(jnp.where(presses & opposite, held[o, a] + dt, 0.0))
         return held
-
-
-def _row(tree: Any, i: Array | int) -> Any:
-    return jax.tree.map(lambda x: x[i], tree)
 
 
 def _quaternion(axes: Array) -> Array:

@@ -19,7 +19,7 @@ from jax.lax.linalg import triangular_solve
 from surgical_marl.physics.cone import curvature, forces, wrench
 from surgical_marl.physics.problem import SLIPS, Contact, Point, Pressed, Problem, Solution
 from surgical_marl.physics.search import Search
-from surgical_marl.physics.solver import Rows, solve
+from surgical_marl.physics.solver import Rows, row_forces, solve
 from surgical_marl.physics.touching import stored
 
 PASSES = 32
@@ -79,7 +79,7 @@ class Newton:
 
     def by_object(self, each: Array) -> Array:
         """Return what belongs to objects [k, ...], and 0 for the one that stands for none, in memory, [k + 1, ...]."""
-        return stored(jnp.concatenate([each, jnp.zeros((1, *each.shape[1:]))]))
+        return stored(_with_none(each))
 
     def solve(self, problem: Problem, arms: Array, objects: Array) -> Solution:
         """Return the accelerations and forces, beginning with accelerations of arms [n] and objects [k, 6]."""
@@ -129,7 +129,7 @@ class Newton:
 
         search, pressed, _, _, count = jax.lax.while_loop(going, iterate, state)
         point = search.start
-        force = _clipped(problem.between, point.arms)
+        force = row_forces(problem.between, point.arms)
         return Solution(point.arms, point.objects, pressed, force, count)
 
     # -- forces at a point
@@ -139,12 +139,11 @@ class Newton:
         k, (a, m) = self._objects, self._dofs.shape
         arms, objects = self.by_arm(point.arms), self.by_object(point.objects)
         inertia = (problem.masses @ (problem.free - point.objects)[..., None])[..., 0]
-        more = lambda x: jnp.concatenate([x, jnp.zeros((1, *x.shape[1:]))])  # noqa: E731
         none = _Local(
             jnp.zeros((a, m)),
             jnp.zeros((a, m, m)),
-            more(inertia),
-            more(problem.masses),
+            _with_none(inertia),
+            _with_none(problem.masses),
             jnp.zeros((k + 1, a, 6, m)),
         )
 
@@ -229,7 +228,7 @@ class Newton:
     def _whole(self, problem: Problem, point: Point, excess: Point) -> Point:
         """Return the forces that are left over, with those of joints' rows."""
         rows = problem.rows
-        return excess._replace(arms=excess.arms + rows.jacobian.T @ _clipped(rows, point.arms))
+        return excess._replace(arms=excess.arms + rows.jacobian.T @ row_forces(rows, point.arms))
 
     def _sides(self, problem: Problem, arms: Array) -> Array:
         """Return which contacts of arms with arms press, [r] bool."""
@@ -280,7 +279,7 @@ class Newton:
         total = jnp.sum(way.objects * own)
         if not len(way.arms):
             return total
-        free = _clipped(rows, here.arms) == rows.impedance * (rows.reference - rows.jacobian @ here.arms)
+        free = row_forces(rows, here.arms) == rows.impedance * (rows.reference - rows.jacobian @ here.arms)
         along = rows.jacobian @ way.arms
         total += way.arms @ (stiff @ way.arms) + jnp.sum(jnp.where(free, rows.impedance * along**2, 0.0))
         joined = jnp.einsum("kacm,am->kc", local.coupling, self.by_arm(way.arms))
@@ -293,8 +292,9 @@ class Newton:
         return (on_arm & (contacts.first == np.arange(self._objects)[:, None])).any(1)
 
 
-def _clipped(rows: Rows, arms: Array) -> Array:
-    return jnp.clip(rows.impedance * (rows.reference - rows.jacobian @ arms), rows.low, rows.high)
+def _with_none(each: Array) -> Array:
+    """Return what belongs to objects [k, ...], and 0 for the one that stands for none, [k + 1, ...]."""
+    return jnp.concatenate([each, jnp.zeros((1, *each.shape[1:]))])
 
 
 def _dot(one: Point, other: Point) -> Array:

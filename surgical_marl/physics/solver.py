@@ -150,7 +150,7 @@ def solve(
         qacc = newton(start)[0]
     else:
         qacc, _, _ = jax.lax.while_loop(unsettled, iterate, (start, jnp.int32(0), jnp.int32(0)))
-    return qacc, _force(rows, qacc)
+    return qacc, row_forces(rows, qacc)
 
 
 def _newton_step(mass: Array, jacobian: Array, gives: Array, excess: Array, between: int) -> Array:
@@ -187,17 +187,17 @@ def _differentiate(
     qacc, force = solve(*primals, iterations, line_search, between, steady)
 
     def excess(mass: Array, smooth: Array, rows: Rows) -> Array:
-        return smooth + rows.jacobian.T @ _force(rows, qacc) - mass @ qacc
+        return smooth + rows.jacobian.T @ row_forces(rows, qacc) - mass @ qacc
 
     _, pull = jax.jvp(excess, (mass, smooth, rows), tangents[:3])
     unbounded = rows.impedance * (rows.reference - rows.jacobian @ qacc)
     gives = jnp.where((unbounded > rows.low) & (unbounded < rows.high), rows.impedance, 0.0)
     change = solve_positive(mass + rows.jacobian.T @ (gives[:, None] * rows.jacobian), pull)
-    _, push = jax.jvp(_force, (rows, qacc), (tangents[2], change))
+    _, push = jax.jvp(row_forces, (rows, qacc), (tangents[2], change))
     return (qacc, force), (change, push)
 
 
-def _force(rows: Rows, qacc: Array) -> Array:
+def row_forces(rows: Rows, qacc: Array) -> Array:
     """Return the force of each row [r] at an acceleration [n]."""
     return jnp.clip(rows.impedance * (rows.reference - rows.jacobian @ qacc), rows.low, rows.high)
 

@@ -167,18 +167,21 @@ class Finder:
         i, j = _numbers(meeting, pair)
         ways = self._ways(placed, meeting, i, j)
         if meeting.first == "objects":
-            centre, bound = placed.position[i], _constant(self._tables.bound)[i]
+            centre, bound = placed.position[i], jnp.asarray(self._tables.bound)[i]
             distance = self._distance(placed, meeting.second, j, centre) - bound
         else:
-            link = _row(self._capsules(placed, "links", i), 0)
-            centre, bound = (link.start + link.end) / 2, _constant(self._tables.link_half + self._tables.link_radius)[i]
+            link = row_of(self._capsules(placed, "links", i), 0)
+            centre, bound = (
+                (link.start + link.end) / 2,
+                jnp.asarray(self._tables.link_half + self._tables.link_radius)[i],
+            )
             distance = self._link_distance(placed, meeting.second, j, link)
         speed = sum(_size(way.shift + jnp.cross(way.turn, centre)) + _size(way.turn) * bound for way in ways if way)
         return distance < NEAR + jnp.minimum(speed, AHEAD)
 
     def _ways(self, placed: Placed, meeting: Meeting, i: Array, j: Array) -> tuple[Way, Way | None]:
         its = placed.ways.get(meeting.second)
-        return _row(placed.ways[meeting.first], i), None if its is None else _row(its, j)
+        return row_of(placed.ways[meeting.first], i), None if its is None else row_of(its, j)
 
     def _patch(self, placed: Placed, meeting: Meeting, start: int, pair: Array) -> tuple[Patch, Array]:
         """Return the patch of two bodies, and whether they touch, 1 or 0."""
@@ -186,7 +189,7 @@ class Finder:
         ways = self._ways(placed, meeting, *_numbers(meeting, pair))
         nearer = ways[0].of(points) - (0.0 if ways[1] is None else ways[1].of(points))
         soon = points.depth + jnp.minimum(nearer, AHEAD)
-        patch = find_patch(points, soon, axes, _constant(self._tables.torsion)[start + pair])
+        patch = find_patch(points, soon, axes, jnp.asarray(self._tables.torsion)[start + pair])
         touches = jnp.maximum(jnp.max(points.depth), jnp.max(soon)) > -NEAR
         return patch, touches.astype(jnp.int32)
 
@@ -214,10 +217,12 @@ class Finder:
     def _place(self, data: Any, joints: Joints, qvel: Array, bodies: Bodies, dt: Any) -> Placed:
         t, turn, frames = self._tables, dt * bodies.velocity[:, 3:], rotation(bodies.quaternion)
         axes = jnp.matmul(data.geom_xmat[t.pad_geoms], jnp.asarray(t.pad_axes))
-        pads = Plate(stored(data.geom_xpos[t.pad_geoms]), stored(axes), _constant(t.pad_half), _constant(t.pad_radius))
+        pads = Plate(
+            stored(data.geom_xpos[t.pad_geoms]), stored(axes), jnp.asarray(t.pad_half), jnp.asarray(t.pad_radius)
+        )
         centre = data.geom_xpos[t.near]
         half = jnp.asarray(t.link_half)[:, None] * data.geom_xmat[t.near][:, :, 2]
-        links = Segments(stored(centre - half), stored(centre + half), _constant(t.link_radius))
+        links = Segments(stored(centre - half), stored(centre + half), jnp.asarray(t.link_radius))
         ways = {"objects": stored(Way(dt * bodies.velocity[:, :3] - jnp.cross(turn, bodies.position), turn))}
         moves, columns = dt * jnp.append(qvel, 0.0)[t.dofs], joints.columns(jnp.asarray(t.slides), jnp.zeros(3))
         by_joint = stored(tuple(column * moves[..., None] for column in columns))
@@ -231,24 +236,24 @@ class Finder:
         t = self._tables
         if kind == "objects":
             frame, at = placed.frames[i], placed.position[i]
-            start, end = (at + _constant(x)[i] @ frame.T for x in (t.start, t.end))
-            return Segments(start, end, _constant(t.radius)[i])
-        of = placed.links if kind == "links" else jax.tree.map(_constant, t.rods)
+            start, end = (at + jnp.asarray(x)[i] @ frame.T for x in (t.start, t.end))
+            return Segments(start, end, jnp.asarray(t.radius)[i])
+        of = placed.links if kind == "links" else jax.tree.map(jnp.asarray, t.rods)
         return jax.tree.map(lambda x: x[i][None], of)
 
     def _plate(self, placed: Placed, kind: str, j: Array) -> Plate:
-        return _row(placed.pads if kind == "pads" else jax.tree.map(_constant, self._tables.plates), j)
+        return row_of(placed.pads if kind == "pads" else jax.tree.map(jnp.asarray, self._tables.plates), j)
 
     def _distance(self, placed: Placed, kind: str, j: Array, point: Array) -> Array:
         """Return a lower bound of the distance of a point from a body, m; exact for plates and capsules."""
         if kind == "objects":
-            return _size(point - placed.position[j]) - _constant(self._tables.bound)[j]
+            return _size(point - placed.position[j]) - jnp.asarray(self._tables.bound)[j]
         if kind in ("pads", "plates"):
             plate = self._plate(placed, kind, j)
             local = (point - plate.centre) @ plate.frame
             beside = local[:2] - jnp.clip(local[:2], -plate.half, plate.half)
             return jnp.sqrt(jnp.sum(beside * beside) + local[2] * local[2]) - plate.radius
-        rod = _row(self._capsules(placed, kind, j), 0)
+        rod = row_of(self._capsules(placed, kind, j), 0)
         way = rod.end - rod.start
         share = jnp.clip((point - rod.start) @ way / jnp.maximum(way @ way, 1e-12), 0.0, 1.0)
         return _size(point - rod.start - share * way) - rod.radius
@@ -256,7 +261,7 @@ class Finder:
     def _link_distance(self, placed: Placed, kind: str, j: Array, link: Segments) -> Array:
         """Return a lower bound of the distance of a link from what is fixed, m; exact for rods."""
         if kind == "rods":
-            return -between_segments(link, _row(self._capsules(placed, kind, j), 0)).depth
+            return -between_segments(link, row_of(self._capsules(placed, kind, j), 0)).depth
         plate = self._plate(placed, kind, j)
         heights = jnp.stack([(end - plate.centre) @ plate.frame[:, 2] for end in (link.start, link.end)])
         beyond = jnp.maximum(jnp.min(heights), -jnp.max(heights))  # on one side of the middle plane, if above 0
@@ -277,11 +282,8 @@ def _moved(arm: Array, moves: Array, joints: tuple[Array, Array]) -> tuple[Array
     return tuple(moves @ of[arm] for of in joints)  # type: ignore[return-value]
 
 
-def _constant(x: Any) -> Array:
-    return jnp.asarray(x)
-
-
-def _row(tree: Any, i: Array | int) -> Any:
+def row_of(tree: Any, i: Array | int) -> Any:
+    """Return one row of all arrays of a tree."""
     return jax.tree.map(lambda x: x[i], tree)
 
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from surgical_marl.envs.observations import proprioception
+from surgical_marl.policies.convert import like, to_numpy
 from surgical_marl.policies.scripted import Scripted
 from surgical_marl.robots.inverse_kinematics import inverse_kinematics
 
@@ -60,13 +61,13 @@ class _Oracle:
 
     def __call__(self, observations: Mapping[str, Any]) -> dict[str, Any]:
         env, arms = self._env, self._arms
-        targets, began = np.asarray(env.task.targets(env.goal), float), _numpy(env.steps) == 0
+        targets, began = np.asarray(env.task.targets(env.goal), float), to_numpy(env.steps) == 0
         own = env.restated({agent: observations[agent] for agent in arms}, "si")
         seen = {agent: proprioception(observation) for agent, observation in own.items()}
-        moves = {agent: arm.move(targets, began, _numpy(seen[agent])) for agent, arm in arms.items()}
+        moves = {agent: arm.move(targets, began, to_numpy(seen[agent])) for agent, arm in arms.items()}
         furthest = np.max([np.abs(move).max(-1) for move in moves.values()], axis=0)
         pace = 1 / np.maximum(furthest, 1)[:, None]
-        return {agent: _like(seen[agent], pace * move) for agent, move in moves.items()}
+        return {agent: like(seen[agent], pace * move) for agent, move in moves.items()}
 
 
 class _Guide:
@@ -92,14 +93,3 @@ class _Guide:
         wanted = np.clip(self.q + self.lead * velocity, self.arm.lower, self.arm.upper)
         command = observation[:, self.terms["command"]]
         return np.asarray((wanted - command) / self.reach * self.moves)
-
-
-def _numpy(values: Any) -> np.ndarray:
-    return np.asarray(values.cpu() if hasattr(values, "cpu") else values, dtype=float)
-
-
-def _like(example: Any, action: np.ndarray) -> Any:
-    """Return an action as float32 of the example's library."""
-    if hasattr(example, "new_tensor"):
-        return example.new_tensor(action)
-    return np.asarray(action, np.float32)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from surgical_marl.envs.observations import proprioception
+from surgical_marl.policies.convert import like, to_numpy
 from surgical_marl.tasks.base.grips import frames, joints_at, tool_of
 from surgical_marl.tasks.base.script import Snapshot, Step, Wish
 
@@ -43,8 +44,8 @@ class Scripted:
         own = env.restated({agent: observations[agent] for agent in self._moved}, "si")
         seen = {agent: proprioception(observation) for agent, observation in own.items()}
         for agent in self._moved:
-            self._tools[agent].look(_numpy(seen[agent]))
-        began = _numpy(env.steps) == 0
+            self._tools[agent].look(to_numpy(seen[agent]))
+        began = to_numpy(env.steps) == 0
         due = np.flatnonzero(began | (self._left <= 0))
         if len(due):
             self._plan(due, began[due])
@@ -53,7 +54,7 @@ class Scripted:
         ways = {agent: self._tools[agent].way() for agent in self._moved}
         furthest = np.max([np.abs(way).max(-1) for way in ways.values()], axis=0)
         share = np.minimum(1.0, pace / np.maximum(furthest, 1e-9))[:, None]
-        return {agent: _like(seen[agent], self._tools[agent].action(share * way)) for agent, way in ways.items()}
+        return {agent: like(seen[agent], self._tools[agent].action(share * way)) for agent, way in ways.items()}
 
     def _plan(self, due: np.ndarray, began: np.ndarray) -> None:
         """Plan the next step of the environments `due`; those that `began` an episode start with the first step."""
@@ -131,14 +132,3 @@ def _rows(snapshot: Snapshot, rows: np.ndarray) -> Snapshot:
     some = lambda of: {name: value[rows] for name, value in of.items()}  # noqa: E731
     goal = SimpleNamespace(**some(vars(snapshot.goal)))
     return Snapshot(some(snapshot.tools), some(snapshot.objects), some(snapshot.held), goal)
-
-
-def _numpy(values: Any) -> np.ndarray:
-    return np.asarray(values.cpu() if hasattr(values, "cpu") else values, dtype=float)
-
-
-def _like(example: Any, action: np.ndarray) -> Any:
-    """Return an action as float32 of the example's library."""
-    if hasattr(example, "new_tensor"):
-        return example.new_tensor(action)
-    return np.asarray(action, np.float32)
