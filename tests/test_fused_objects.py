@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from surgical_marl.bench.grasping import grasps
+from tests.helpers.fused_kernels import gpu_code
 from tests.helpers.object_parity import Beside
 
 COUNT, STEPS, EVERY = 16, 40, 8
@@ -14,7 +15,18 @@ COUNT, STEPS, EVERY = 16, 40, 8
 
 @pytest.mark.parametrize("name", ["psm_needle", pytest.param("bimanual_psm_needle", marks=pytest.mark.slow)])
 def test_a_step_with_objects_is_that_of_the_reference(name: str) -> None:
-    both = Beside(name, COUNT)
+    follow_grasps(Beside(name, COUNT))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["psm_needle", "bimanual_psm_needle"])
+def test_the_code_for_a_gpu_makes_the_same_step(name: str) -> None:
+    with gpu_code():
+        follow_grasps(Beside(name, COUNT))
+
+
+def follow_grasps(both: Beside) -> None:
+    """Close jaws on objects, and compare both engines on the way."""
     simulator, starts = both.simulator, grasps(both.env.scene, COUNT, np.random.default_rng(0))
     qpos, position, quaternion = (x.astype(np.float32) for x in starts[:3])
     now = jax.vmap(simulator.at)(qpos)

@@ -2,20 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import patch
 
 import jax
 
+from surgical_marl.engines.fused import engine, kernel
 from surgical_marl.engines.fused.arrays import make_arrays
 from surgical_marl.engines.fused.emit import Emitter
 from surgical_marl.engines.fused.graph import Graph
-from surgical_marl.engines.fused.kernel import compile_kernels
-from surgical_marl.engines.fused.preludes import LANES
+from surgical_marl.engines.fused.load import load_source
+from surgical_marl.engines.fused.preludes import CUDA
 from surgical_marl.engines.fused.translate import Fields, tables, trace
 
 Stores = list[tuple[str, int, int]]
+
+_ON_A_CPU = {
+    "SM_INF": "__builtin_inff()",
+    "SM_NAN": '__builtin_nanf("")',
+    "DIVF(a,b)": "((a)/(b))",
+    "SQRT(x)": "sqrtf(x)",
+    **{f"{name}{kind}(a,b)": f"({{auto a_=(a);auto b_=(b);a_{sign}b_?a_:b_;}})"
+       for name, sign in (("MAX", ">"), ("MIN", "<")) for kind in "IU"},
+    "MAXF(a,b)": "__builtin_fmaxf(a,b)",
+    "MINF(a,b)": "__builtin_fminf(a,b)",
+    "FINITE(x)": "(fabsf(x)<SM_INF)",
+    "HIDEF(x)": 'asm volatile("":"+x"(x));',
+    "BITS(x)": "({float a_=(x);U r_;__builtin_memcpy(&r_,&a_,4);r_;})",
+    "FLOAT(x)": "({U a_=(x);float r_;__builtin_memcpy(&r_,&a_,4);r_;})",
+}  # fmt: skip
+"""What the macros for CUDA mean that a CPU does not know."""
 
 
 def shapes_of(columns: Any) -> Any:
@@ -37,14 +57,30 @@ def make_stores(
     return graph, stores, layout, inputs, outputs
 
 
+@contextmanager
+def gpu_code() -> Iterator[None]:
+    """Write code as for a GPU, one environment a thread, and run it on the CPU: its faults show without a GPU."""
+    prelude = CUDA
+    for macro, meaning in _ON_A_CPU.items():
+        prelude, found = re.subn(rf"#define {re.escape(macro)} .*", lambda _: f"#define {macro} {meaning}", prelude)  # noqa: B023
+        assert found == 1, macro
+    load = lambda *args, **options: load_source(*args, **{**options, "vector": False})  # noqa: E731
+    with (
+        patch.multiple(kernel, CPU=prelude, LANES=1),
+        patch.multiple(engine, load_source=load, LANES=1),
+    ):
+        yield
+
+
 def run(function: Callable[..., Any], *columns: Any, in_place: bool = False) -> Any:
     """What a kernel of `function`, which is of one environment's arrays, makes of columns [N, ...]."""
     graph, stores, layout, inputs, outputs = make_stores(function, columns, in_place)
-    kernel = compile_kernels({"run": Emitter(graph, stores, vector=True).body()}, "cpu")["run"]
+    body = Emitter(graph, stores, vector=kernel.LANES > 1).body()
+    compiled = kernel.compile_kernels({"run": body}, "cpu")["run"]
     count = len(jax.tree.leaves(columns)[0])
-    stride = -(-count // LANES) * LANES
+    stride = -(-count // kernel.LANES) * kernel.LANES
     arrays: Any = make_arrays("cpu", SimpleNamespace(sizes=layout.sizes), tables(graph), stride, count)
     for leaf, column in zip(jax.tree.leaves(inputs), jax.tree.leaves(columns), strict=True):
         arrays.write(leaf, column)
-    kernel.launch(arrays.all, stride, 0, stride)
+    compiled.launch(arrays.all, stride, 0, stride)
     return jax.tree.map(lambda leaf: arrays.read(leaf, "numpy"), outputs)

@@ -137,14 +137,15 @@ class Emitter(ArrayEmitter):
         """
         self.active.append(condition)
         names, size = dict(self.names), sum(len(self.schedule.regions[r].items) for r in self.schedule.inside[number])
-        if size > LARGE and not self.vector:
+        if size >= LARGE and not self.vector:
             for value in self.schedule.outside[number]:
                 if self._is_array(value) or self.graph.kind(value) == "b":
                     continue
                 if self.names[value].isalnum():
                     kind = TYPES[self.graph.kind(value)]
-                    self.lines.append(f"{kind} h{value}={self._name(value)};HIDE{kind}(h{value})")
-                    self.names[value] = f"h{value}"
+                    hidden = f"h{number}v{value}"  # a branch within this one has another: `F h=h;` takes the new h
+                    self.lines.append(f"{kind} {hidden}={self._name(value)};HIDE{kind}({hidden})")
+                    self.names[value] = hidden
         yield
         self.names = names
         self.active.pop()
