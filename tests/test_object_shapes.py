@@ -53,7 +53,7 @@ PLATE = Plate(jnp.zeros((1, 3)), jnp.eye(3)[None], jnp.asarray(HALF)[None], jnp.
 def touch(pose: jnp.ndarray) -> tuple[Points, Patch]:
     points = on_plate(wire_at(pose), PLATE)
     flat = Points(*(part.reshape(-1, *part.shape[2:]) for part in points))
-    return flat, find_patch(points, points.depth, jnp.eye(3)[:2], jnp.float32(0.002))
+    return flat, find_patch(points, points.depth, len(points.depth), jnp.eye(3)[:2], jnp.float32(0.002))
 
 
 @jax.jit

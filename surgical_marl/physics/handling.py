@@ -12,10 +12,12 @@ from jax import Array
 from surgical_marl.physics.bodies import Bodies, conjugate, product, rotation, turn
 from surgical_marl.physics.cone import Cone
 from surgical_marl.physics.newton import Newton
-from surgical_marl.physics.patches import AWAY, Patch
+from surgical_marl.physics.patches import AWAY, POINTS, Patch
+from surgical_marl.physics.placed import Joints
 from surgical_marl.physics.problem import SLIPS, Contact, Pressed
+from surgical_marl.physics.rows import row_of, stored
 from surgical_marl.physics.tables import Tables
-from surgical_marl.physics.touching import AHEAD, MARGIN, Joints, Slots, row_of, stored
+from surgical_marl.physics.touching import AHEAD, MARGIN, Slots
 
 DAMPING = 5e-3
 """Damping of a contact in the normal direction, s: this times its stiffness, N s/m."""
@@ -127,24 +129,22 @@ class Handling:
         at = self._newton.by_object(bodies.position), self._newton.by_object(bodies.quaternion)
         grips = stored(grips)
 
-        def one(row: tuple[Patch, Array]) -> Felt:
-            patch, number = row
+        def one(n: Array, all_: Felt) -> Felt:
+            patch, number = row_of(slots.patch, n), slots.number[n]
             contact, origin = self._contact(patch, number, joints, at[0])
             slip = self._slip(patch, number, fingers, at, grips)
             motion = self._motion(contact, patch, number, speeds, origin)
-            return Felt(self._resisting(contact, patch, number, slip, motion, dt), slip)
+            felt = Felt(self._resisting(contact, patch, number, slip, motion, dt), slip)
+            return jax.tree.map(lambda x, own: x.at[n].set(own), all_, felt)
 
-        def nothing(_: None) -> Felt:
-            t, shapes = self.tables, jax.eval_shape(lambda: one((row_of(slots.patch, 0), slots.number[0])))
-            none = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-            nobody = (jnp.int32(t.count), jnp.int32(t.count), jnp.int32(t.arms))
-            first, second, arm = nobody
-            return none._replace(contacts=none.contacts._replace(first=first, second=second, arm=arm))
+        return jax.lax.fori_loop(0, slots.found, one, self._nothing(len(slots.number)))
 
-        def each(row: tuple[Patch, Array, Array]) -> Felt:
-            return jax.lax.cond(row[2] < slots.total, lambda row: one(row[:2]), lambda _: nothing(None), row)
-
-        return jax.lax.map(each, (slots.patch, slots.number, np.arange(len(slots.number), dtype=np.int32)))
+    def _nothing(self, slots: int) -> Felt:
+        """Return contacts of nothing."""
+        t, zero = self.tables, lambda *shape: jnp.zeros((slots, *shape))
+        cone = Cone(zero(POINTS, 6), zero(POINTS), zero(POINTS), zero(3, 6), zero(), zero(3), zero())
+        first, second, arm = (jnp.full(slots, number, jnp.int32) for number in (t.count, t.count, t.arms))
+        return Felt(Contact(cone, first, second, zero(3), arm, zero(6, t.most)), zero(3))
 
     def _contact(self, patch: Patch, number: Array, joints: Joints | None, position: Array) -> tuple[Contact, Array]:
         """Return a contact that does not resist yet: what it is between, and its directions; and its twists' origin."""
@@ -250,11 +250,11 @@ class Handling:
         normal = jnp.zeros((k, len(t.fingers), 3))
         fresh = grips._replace(force=jnp.zeros_like(grips.force), slid=jnp.zeros_like(grips.slid))
 
-        def one(kept: tuple[Grips, Array], row: Any) -> tuple[tuple[Grips, Array], None]:
-            patch, number, index, contact, slip, forces = row
-            f = self._finger(number)
+        def one(n: Array, kept: tuple[Grips, Array]) -> tuple[Grips, Array]:
+            number, f = slots.number[n], self._finger(slots.number[n])
 
             def note(kept: tuple[Grips, Array]) -> tuple[Grips, Array]:
+                patch, contact, slip, forces = row_of((slots.patch, felt.contacts, felt.slip, pressed), n)
                 after = slip + contact.cone.along @ self._newton.twist(contact, *moves)
                 place = contact.first, f
                 own = old._replace(**{name: getattr(old, name)[place] for name in OF_FINGERS})
@@ -263,18 +263,9 @@ class Handling:
                 found = {name: getattr(kept[0], name).at[place].set(y) for name, y in zip(OF_FINGERS, new, strict=True)}
                 return kept[0]._replace(**found), kept[1].at[place].set(patch.frame[0])
 
-            is_grip = (f < len(t.fingers)) & (index < slots.total)
-            return jax.lax.cond(is_grip, note, lambda kept: kept, kept), None
+            return jax.lax.cond(f < len(t.fingers), note, lambda kept: kept, kept)
 
-        rows = (
-            slots.patch,
-            slots.number,
-            np.arange(len(slots.number), dtype=np.int32),
-            felt.contacts,
-            felt.slip,
-            pressed,
-        )
-        (grips, normal), _ = jax.lax.scan(one, (fresh, normal), rows)
+        grips, normal = jax.lax.fori_loop(0, slots.found, one, (fresh, normal))
         return grips._replace(held=self._held(normal, grips.force, grips.held, dt))
 
     def _kept(

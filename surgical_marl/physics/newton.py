@@ -17,10 +17,10 @@ from jax import Array
 from jax.lax.linalg import triangular_solve
 
 from surgical_marl.physics.cone import curvature, forces, wrench
-from surgical_marl.physics.problem import SLIPS, Contact, Point, Pressed, Problem, Solution
+from surgical_marl.physics.problem import SLIPS, Contact, Point, Pressed, Problem, Solution, not_pressed
+from surgical_marl.physics.rows import row_of, stored
 from surgical_marl.physics.search import Search
 from surgical_marl.physics.solver import Rows, row_forces, solve
-from surgical_marl.physics.touching import stored
 
 PASSES = 32
 """Evaluations of all forces in a step at most."""
@@ -85,7 +85,7 @@ class Newton:
         """Return the accelerations and forces, beginning with accelerations of arms [n] and objects [k, 6]."""
         begin, slots = Point(arms, objects), len(problem.contacts.arm)
         still = jax.tree.map(jnp.zeros_like, begin)
-        pressed = Pressed(jnp.zeros(slots), jnp.zeros((slots, 3)), jnp.full(slots, -1, jnp.int32))
+        pressed = not_pressed(slots)._replace(sides=jnp.full(slots, -1, jnp.int32))
         zero = jnp.float32(0.0)
         search = Search(begin, still, zero, zero, jnp.float32(jnp.inf), zero, jnp.int32(0))
         state = search, pressed, self._sides(problem, arms), jnp.bool_(False), jnp.int32(0)
@@ -147,25 +147,17 @@ class Newton:
             jnp.zeros((k + 1, a, 6, m)),
         )
 
-        def one(local: _Local, row: tuple[Contact, Array]) -> tuple[_Local, Pressed]:
-            contact, number = row
+        def one(n: Array, sums: tuple[_Local, Pressed]) -> tuple[_Local, Pressed]:
+            local, pressed = sums
+            contact = row_of(problem.contacts, n)
+            found = forces(contact.cone, self.twist(contact, arms, objects))
+            bits = jnp.where(found.normal > 0, 1 << np.arange(len(found.normal), dtype=np.int32), 0)
+            sides = jnp.sum(bits) + jnp.where(found.slips, SLIPS, 0)
+            own = Pressed(jnp.sum(found.normal), found.friction, sides)
+            pressed = jax.tree.map(lambda all_, x: all_.at[n].set(x), pressed, own)
+            return self._add(local, contact, wrench(contact.cone, found), curvature(contact.cone, found)), pressed
 
-            def felt(_: None) -> tuple[Pressed, Array, Array]:
-                found = forces(contact.cone, self.twist(contact, arms, objects))
-                bits = jnp.where(found.normal > 0, 1 << np.arange(len(found.normal), dtype=np.int32), 0)
-                pressed = Pressed(
-                    jnp.sum(found.normal), found.friction, jnp.sum(bits) + jnp.where(found.slips, SLIPS, 0)
-                )
-                return pressed, wrench(contact.cone, found), curvature(contact.cone, found)
-
-            def nothing(_: None) -> tuple[Pressed, Array, Array]:
-                return Pressed(jnp.float32(0.0), jnp.zeros(3), jnp.int32(0)), jnp.zeros(6), jnp.zeros((6, 6))
-
-            pressed, pull, stiff = jax.lax.cond(number < problem.total, felt, nothing, None)
-            return self._add(local, contact, pull, stiff), pressed
-
-        rows = problem.contacts, jnp.arange(len(problem.contacts.arm), dtype=jnp.int32)
-        local, pressed = jax.lax.scan(one, none, rows)
+        local, pressed = jax.lax.fori_loop(0, problem.total, one, (none, not_pressed(len(problem.contacts.arm))))
         own = {name: getattr(local, name)[:k] for name in ("excess", "object", "coupling")}
         return local._replace(**own), pressed
 
@@ -212,17 +204,14 @@ class Newton:
             stiff = stiff.at[np.ix_(dofs, dofs)].add(local.arm[arm][np.ix_(own, own)])
 
         def press(total: tuple[Array, Array], row: Rows) -> tuple[tuple[Array, Array], None]:
-            force = row.impedance * (row.reference - row.jacobian @ point.arms)
-
-            def add(total: tuple[Array, Array]) -> tuple[Array, Array]:
-                whole = row.impedance * row.jacobian
-                return total[0] + force * row.jacobian, total[1] + whole[:, None] * row.jacobian
-
-            touches = (force > 0) & (jnp.abs(row.jacobian).max() > 0)
-            return jax.lax.cond(touches, add, lambda total: total, total), None
+            force = jnp.maximum(row.impedance * (row.reference - row.jacobian @ point.arms), 0.0)
+            whole = jnp.where(force > 0, row.impedance, 0.0) * row.jacobian
+            return (total[0] + force * row.jacobian, total[1] + whole[:, None] * row.jacobian), None
 
         if len(problem.between.low):
-            (excess, stiff), _ = jax.lax.scan(press, (excess, stiff), problem.between)
+            with_rows = lambda total: jax.lax.scan(press, total, problem.between)[0]  # noqa: E731
+            presses = self._sides(problem, point.arms).any()
+            excess, stiff = jax.lax.cond(presses, with_rows, lambda total: total, (excess, stiff))
         return Point(excess, local.excess), stiff
 
     def _whole(self, problem: Problem, point: Point, excess: Point) -> Point:

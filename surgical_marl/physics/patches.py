@@ -11,16 +11,17 @@ manipulation", 1996).
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from surgical_marl.physics.rows import row_of
 from surgical_marl.physics.shapes import Points
 
-SLOTS = 4
+POINTS = 4
 """Points of a patch."""
 AWAY = -100.0
 """Depth, m, of a point that is not there: no scene is so large."""
@@ -40,59 +41,62 @@ class Patch(NamedTuple):
     """A contact of two bodies, [...]."""
 
     points: Points
-    """[..., SLOTS]"""
+    """[..., POINTS]"""
     centre: Array
     """Where friction acts: the mean of the points, weighted by depth, [..., 3]."""
     frame: Array
     """Rows: the normal and two directions along the surface, [..., 3, 3]."""
     radius: Array
     """Torque about the normal that counts as much as a force of 1 N along the surface, m, [...]."""
+    reach: Array
+    """Depth of the deepest point now or after the step, m, [...]."""
 
 
-def find_patch(points: Points, soon: Array, axes: Array, torsion: Array) -> Patch:
+def find_patch(points: Points, soon: Array, count: Any, axes: Array, torsion: Array) -> Patch:
     """Return the patch of a pair of bodies.
 
     Args:
         points: all points at which their shapes may touch, [c, d]: d for each of c shapes.
         soon: their depths after a step with the velocities of now, [c, d]. A point counts by the larger one of both
             depths, so that no part of a fast object comes in unseen.
+        count: how many of the c shapes there are, []; without any, the patch is nothing.
         axes: two directions, [2, 3]: bodies are tilted about those across them.
         torsion: radius of the contact at a point, m, [].
     """
     middle = points.place[0, 0]
 
     def tilted(depth: Array, place: Array, soon: Array) -> Array:
-        """Return the depths of points [d] as the bodies are, and tilted, [d, SLOTS]."""
+        """Return the depths of points [d] as the bodies are, and tilted, [d, POINTS]."""
         reach = jnp.maximum(depth, soon)
         rim = jnp.minimum(reach, ALIKE)[:, None] + TILT * ((place - middle) @ axes.T @ jnp.asarray(_TILTS).T)
         return jnp.concatenate([reach[:, None], rim], 1)
 
-    def deepest(most: Array, row: tuple[Points, Array]) -> tuple[Array, None]:
-        one, soon = row
-        return jnp.maximum(most, jnp.max(tilted(one.depth, one.place, soon), 0)), None
+    def deepest(n: Array, most: Array) -> Array:
+        one, then = row_of((points, soon), n)
+        return jnp.maximum(most, jnp.max(tilted(one.depth, one.place, then), 0))
 
-    most, _ = jax.lax.scan(deepest, jnp.full(SLOTS, 2 * AWAY), (points, soon))
+    most = jax.lax.fori_loop(0, count, deepest, jnp.full(POINTS, 2 * AWAY))
 
-    def add(total: tuple[Array, Points], row: tuple[Points, Array]) -> tuple[tuple[Array, Points], None]:
-        one, soon = row
-        weight = jnp.maximum(tilted(one.depth, one.place, soon) - most + BLEND, 0.0).T  # [SLOTS, d]
+    def add(n: Array, total: tuple[Array, Points]) -> tuple[Array, Points]:
+        one, then = row_of((points, soon), n)
+        weight = jnp.maximum(tilted(one.depth, one.place, then) - most + BLEND, 0.0).T  # [POINTS, d]
         own = Points(weight @ one.depth, weight @ (one.place - middle), weight @ one.normal)
-        return (total[0] + jnp.sum(weight, 1), jax.tree.map(jnp.add, total[1], own)), None
+        return total[0] + jnp.sum(weight, 1), jax.tree.map(jnp.add, total[1], own)
 
-    none = Points(jnp.zeros(SLOTS), jnp.zeros((SLOTS, 3)), jnp.zeros((SLOTS, 3)))
-    (weight, found), _ = jax.lax.scan(add, (jnp.zeros(SLOTS), none), (points, soon))
+    none = Points(jnp.zeros(POINTS), jnp.zeros((POINTS, 3)), jnp.zeros((POINTS, 3)))
+    weight, found = jax.lax.fori_loop(0, count, add, (jnp.zeros(POINTS), none))
     chosen = Points(found.depth / weight, middle + found.place / weight[:, None], _unit(found.normal / weight[:, None]))
-    return _with_frame(chosen, torsion)
+    return _with_frame(chosen, torsion, most[0])
 
 
-def _with_frame(points: Points, torsion: Array) -> Patch:
+def _with_frame(points: Points, torsion: Array, reach: Array) -> Patch:
     weight = jnp.maximum(points.depth, 1e-9)
     weight = weight / jnp.sum(weight)
     centre = weight @ points.place
     spread = jnp.sqrt(jnp.maximum(weight @ jnp.sum((points.place - centre) ** 2, -1), 1e-18))
     # The first point decides where bodies press from opposite sides, as in a fork.
     normal = _unit(weight @ points.normal + 1e-3 * points.normal[0])
-    return Patch(points, centre, tangents(normal), torsion + spread)
+    return Patch(points, centre, tangents(normal), torsion + spread, reach)
 
 
 def _unit(vector: Array) -> Array:
@@ -113,5 +117,5 @@ def tangents(normal: Array) -> Array:
 def no_patch() -> Patch:
     """Return a patch that is not there."""
     none = jnp.zeros(3)
-    points = Points(jnp.full(SLOTS, AWAY), jnp.zeros((SLOTS, 3)), jnp.zeros((SLOTS, 3)))
-    return Patch(points, none, jnp.zeros((3, 3)), jnp.float32(1.0))
+    points = Points(jnp.full(POINTS, AWAY), jnp.zeros((POINTS, 3)), jnp.zeros((POINTS, 3)))
+    return Patch(points, none, jnp.zeros((3, 3)), jnp.float32(1.0), jnp.float32(AWAY))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import jax.numpy as jnp
 from jax import Array
 
 from surgical_marl.physics.cone import Cone
@@ -43,7 +44,7 @@ class Problem(NamedTuple):
     """Accelerations of the objects without contacts, [k, 6]."""
     contacts: Contact
     total: Array
-    """How many contacts there are, []."""
+    """How many contacts there are, []; no more than there is room for."""
 
 
 class Pressed(NamedTuple):
@@ -55,6 +56,11 @@ class Pressed(NamedTuple):
     """N, [s, 3]."""
     sides: Array
     """Which points press, and whether friction slips: bits, [s]."""
+
+
+def not_pressed(slots: int) -> Pressed:
+    """Return forces of none."""
+    return Pressed(jnp.zeros(slots), jnp.zeros((slots, 3)), jnp.zeros(slots, jnp.int32))
 
 
 SLIPS = 1 << 8

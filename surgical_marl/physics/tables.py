@@ -96,6 +96,9 @@ class Tables:
         ends = np.maximum(*(np.linalg.norm(x, axis=-1) for x in (self.start, self.end)))
         self.bound = (ends + self.radius).max(1, initial=0.0)
         """Radius of a ball about the centre of mass that holds the object, m, [k]."""
+        self.middle = (self.start + self.end) / 2
+        self.around = np.linalg.norm(self.end - self.start, axis=-1) / 2 + self.radius
+        """Radius of a ball about the middle of each capsule that holds it, m, [k, c]."""
         objects = [place.object for place in free.values()]
         self.masses = Masses(
             np.array([thing.mass for thing in objects], np.float32),  # type: ignore[arg-type]

@@ -19,10 +19,11 @@ from surgical_marl.physics.collision import Pairs
 from surgical_marl.physics.dynamics import Dynamics, Physics
 from surgical_marl.physics.handling import DWELL, Grips, Handling
 from surgical_marl.physics.newton import Newton
+from surgical_marl.physics.placed import Joints
 from surgical_marl.physics.problem import Contact, Pressed, Problem
 from surgical_marl.physics.solver import Rows
 from surgical_marl.physics.tables import Tables
-from surgical_marl.physics.touching import Finder, Joints, Slots
+from surgical_marl.physics.touching import Finder, Slots
 from surgical_marl.physics.views import Handled, ObjectView, Touch
 from surgical_marl.robots.rotation import quaternion
 
@@ -134,7 +135,7 @@ class Together:
         bodies, dt, none = objects.bodies, self._dynamics.dt, jnp.zeros(0)
         masses, free = self._free(bodies)
         felt = Handling(self.tables, self._objects_alone).feel(slots, None, None, none, bodies, objects.grips, dt)
-        found = self._solve_objects(masses, free, felt.contacts, slots.total, bodies.acceleration)
+        found = self._solve_objects(masses, free, felt.contacts, slots.found, bodies.acceleration)
         grips = objects.grips
         loose = grips._replace(force=0 * grips.force, slid=0 * grips.slid, held=0 * grips.held)
         return Objects(moved(bodies, found, dt), loose)
@@ -177,7 +178,7 @@ class Together:
         closest, touching, between = self._between(dynamics, data, physics.qvel)
         problem = Problem(
             forces.mass + dt * forces.damping, forces.smooth, forces.rows, between, masses, free, felt.contacts,
-            slots.total,
+            slots.found,
         )  # fmt: skip
         found = self._newton.solve(problem, physics.qacc_warmstart, bodies.acceleration)
         qvel = physics.qvel + dt * found.arms

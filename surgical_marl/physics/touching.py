@@ -6,6 +6,7 @@ follows is in proportion to what touches, not to what could.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -13,9 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from surgical_marl.physics.bodies import Bodies, rotation
-from surgical_marl.physics.patches import Patch, find_patch, no_patch
-from surgical_marl.physics.shapes import Plate, Points, Segments, between_segments, on_plate
+from surgical_marl.physics.bodies import Bodies
+from surgical_marl.physics.patches import BLEND, TILT, Patch, find_patch, no_patch
+from surgical_marl.physics.placed import Joints, Placed, Places, Way, size
+from surgical_marl.physics.rows import row_of
+from surgical_marl.physics.shapes import Points, Segments, between_segments, on_plate
 from surgical_marl.physics.tables import Meeting, Tables
 
 SLOTS = 16
@@ -38,78 +41,24 @@ class Slots(NamedTuple):
     number: Array
     """Of each patch in `Tables`, [s]."""
     total: Array
-    """How many were found, []; more than there are slots if some found no room."""
+    """How many there are, []; more than there are slots if some found no room."""
 
-
-class Way(NamedTuple):
-    """How bodies move in a step with the velocities of now: a point p of one by shift + turn x p. World, [n]."""
-
-    shift: Array
-    """m, [n, 3]"""
-    turn: Array
-    """rad, [n, 3]"""
-
-    def of(self, points: Points) -> Array:
-        """Return by how much points come nearer along their normals in the step, if one body [] moves, m, [...]."""
-        return -jnp.sum((self.shift + jnp.cross(self.turn, points.place)) * points.normal, -1)
-
-
-class Joints(NamedTuple):
-    """The axes of the joints of arms, [a, m]. World."""
-
-    axis: Array
-    """[a, m, 3]"""
-    anchor: Array
-    """A point on the axis, [a, m, 3]."""
-
-    def columns(self, slides: Any, place: Array) -> tuple[Array, Array]:
-        """Return the velocity of places [..., 3] and the angular velocity by joint velocity, [..., 3] both."""
-        moving = jnp.where(slides[..., None], self.axis, jnp.cross(self.axis, place - self.anchor))
-        return moving, jnp.where(slides[..., None], 0.0, self.axis)
-
-    def bends(self, tables: Tables, speeds: Array) -> Array:
-        """Return how each joint's motion at these speeds [a, m] bends with those before it, in memory, [a, m, 6].
-
-        The sum over the joints that move a body is its acceleration without joint accelerations: as a twist about the
-        world's origin, without the part that comes from turning past that origin (R. Featherstone, "Rigid Body Dynamics
-        Algorithms", 2008, section 2.8).
-        """
-
-        def of_arm(row: tuple[Joints, Array, Array, Array]) -> Array:
-            joints, slides, before, speed = row
-            moving, turning = (x * speed[:, None] for x in joints.columns(slides, jnp.zeros(3)))
-            lift, spin = before @ moving, before @ turning
-            return jnp.concatenate([jnp.cross(spin, moving) + jnp.cross(lift, turning), jnp.cross(spin, turning)], -1)
-
-        return jax.lax.map(of_arm, (self, tables.slides, tables.before, speeds))
-
-
-class Placed(NamedTuple):
-    """Where all bodies are and how they move."""
-
-    position: Array
-    """Centres of mass of the objects, [k, 3]."""
-    frames: Array
-    """Axes of their frames, [k, 3, 3]."""
-    pads: Plate
-    """[f]"""
-    links: Segments
-    """[l]"""
-    ways: dict[str, Way]
-    """Of what moves, by kind of body."""
+    @property
+    def found(self) -> Array:
+        """How many found room, []: what is in slots beyond is nothing."""
+        return jnp.minimum(self.total, len(self.number))
 
 
 class Finder:
     """Finds the patches of a scene."""
 
     def __init__(self, tables: Tables) -> None:
-        self._tables = tables
+        self._tables, self._places = tables, Places(tables)
         self.slots = min(SLOTS, len(tables.stiffness))
 
     def joints(self, data: Any) -> Joints:
         """Return the axes of the arms' joints, in memory, from MJX's data with poses."""
-        pad = lambda x: jnp.concatenate([x, jnp.zeros((1, 3))])[self._tables.dofs]  # noqa: E731
-        return stored(Joints(pad(data.xaxis), pad(data.xanchor)))
+        return self._places.joints(data)
 
     def find(self, data: Any, joints: Joints, qvel: Array, bodies: Bodies, dt: Any) -> Slots:
         """Return the patches between bodies that are near each other, or will be after a step.
@@ -121,7 +70,7 @@ class Finder:
             bodies: the objects.
             dt: time over which motions are looked ahead, s.
         """
-        placed = self._place(data, joints, qvel, bodies, dt)
+        placed = self._places.place(data, joints, qvel, bodies, dt)
         none, number = jnp.int32(0), 0
         slots = Slots(
             jax.tree.map(lambda x: jnp.broadcast_to(x, (self.slots, *x.shape)), no_patch()),
@@ -142,10 +91,7 @@ class Finder:
         most = min(NEAREST, len(meeting.one))
 
         def look(found: tuple[Array, Array], pair: Array) -> tuple[tuple[Array, Array], None]:
-            pairs, count = found
-            near = self._is_near(placed, meeting, pair)
-            pairs = pairs.at[jnp.where(near, count, most)].set(pair, mode="drop")
-            return (pairs, count + near.astype(jnp.int32)), None
+            return _listed(found, pair, self._is_near(placed, meeting, pair)), None
 
         none = jnp.zeros(most, jnp.int32), jnp.int32(0)
         (pairs, count), _ = jax.lax.scan(look, none, jnp.arange(len(meeting.one), dtype=jnp.int32))
@@ -165,19 +111,17 @@ class Finder:
     def _is_near(self, placed: Placed, meeting: Meeting, pair: Array) -> Array:
         """Return whether two bodies may touch in the next step, []."""
         i, j = _numbers(meeting, pair)
-        ways = self._ways(placed, meeting, i, j)
-        if meeting.first == "objects":
-            centre, bound = placed.position[i], jnp.asarray(self._tables.bound)[i]
-            distance = self._distance(placed, meeting.second, j, centre) - bound
-        else:
-            link = row_of(self._capsules(placed, "links", i), 0)
-            centre, bound = (
-                (link.start + link.end) / 2,
-                jnp.asarray(self._tables.link_half + self._tables.link_radius)[i],
-            )
-            distance = self._link_distance(placed, meeting.second, j, link)
-        speed = sum(_size(way.shift + jnp.cross(way.turn, centre)) + _size(way.turn) * bound for way in ways if way)
-        return distance < NEAR + jnp.minimum(speed, AHEAD)
+        one, other = row_of(placed.balls[meeting.first], i), row_of(placed.balls[meeting.second], j)
+        reach = NEAR + jnp.minimum(one.moves + other.moves, AHEAD)
+
+        def looked_at(_: None) -> Array:
+            if meeting.first == "objects":
+                return self._places.distance(placed, meeting.second, j, one.centre) - one.radius < reach
+            link = self._places.capsule(placed, "links", i, jnp.int32(0))
+            return self._places.link_distance(placed, meeting.second, j, link) < reach
+
+        apart = size(one.centre - other.centre) - one.radius - other.radius
+        return jax.lax.cond(apart < reach, looked_at, lambda _: jnp.bool_(False), None)
 
     def _ways(self, placed: Placed, meeting: Meeting, i: Array, j: Array) -> tuple[Way, Way | None]:
         its = placed.ways.get(meeting.second)
@@ -185,107 +129,71 @@ class Finder:
 
     def _patch(self, placed: Placed, meeting: Meeting, start: int, pair: Array) -> tuple[Patch, Array]:
         """Return the patch of two bodies, and whether they touch, 1 or 0."""
-        points, axes = self._points(placed, meeting, pair)
-        ways = self._ways(placed, meeting, *_numbers(meeting, pair))
-        nearer = ways[0].of(points) - (0.0 if ways[1] is None else ways[1].of(points))
-        soon = points.depth + jnp.minimum(nearer, AHEAD)
-        patch = find_patch(points, soon, axes, jnp.asarray(self._tables.torsion)[start + pair])
-        touches = jnp.maximum(jnp.max(points.depth), jnp.max(soon)) > -NEAR
-        return patch, touches.astype(jnp.int32)
-
-    def _points(self, placed: Placed, meeting: Meeting, pair: Array) -> tuple[Points, Array]:
-        """Return all points [c, d] at which two bodies may touch, and two directions [2, 3] along which they spread."""
         i, j = _numbers(meeting, pair)
-        if meeting.second in ("pads", "plates"):
-            plate = self._plate(placed, meeting.second, j)
-            touch, axes = lambda capsule: on_plate(capsule, plate), plate.frame[:, :2].T
-        else:
-            other = self._capsules(placed, meeting.second, j)
-            touch, axes = lambda capsule: between_segments(capsule, other), jnp.eye(3)[:2]
-        return jax.lax.map(touch, self._capsules(placed, meeting.first, i)), axes
+        touch, axes = self._touch(placed, meeting.second, j)
+        ways, (capsules, count) = self._ways(placed, meeting, i, j), self._near_capsules(placed, meeting, i, j)
+
+        def near(n: Array, found: tuple[Points, Array]) -> tuple[Points, Array]:
+            points = touch(self._places.capsule(placed, meeting.first, i, capsules[n]))
+            nearer = ways[0].of(points) - (0.0 if ways[1] is None else ways[1].of(points))
+            soon = points.depth + jnp.minimum(nearer, AHEAD)
+            return jax.tree.map(lambda all_, x: all_.at[n].set(x), found, (points, soon))
+
+        shape = jax.eval_shape(lambda: touch(self._places.capsule(placed, meeting.first, i, jnp.int32(0))))
+        room = jax.tree.map(lambda x: jnp.zeros((len(capsules), *x.shape)), (shape, shape.depth))
+        points, soon = jax.lax.fori_loop(0, count, near, room)
+        patch = find_patch(points, soon, count, axes, jnp.asarray(self._tables.torsion)[start + pair])
+        return patch, (patch.reach > -NEAR).astype(jnp.int32)
+
+    def _near_capsules(self, placed: Placed, meeting: Meeting, i: Array, j: Array) -> tuple[Array, Array]:
+        """Return the numbers of a body's capsules that may have a part in a patch, and how many they are.
+
+        A capsule has none that is farther away than the one that touches by more than tilting can make up for.
+        """
+        t, c = self._tables, self._tables.radius.shape[1]
+        if meeting.first != "objects" or c == 1:
+            return jnp.zeros(1, jnp.int32), jnp.int32(1)
+        one, moves = row_of(placed.balls["objects"], i), placed.balls[meeting.second].moves[j]
+        reach = NEAR + jnp.minimum(one.moves + moves, AHEAD) + 2 * TILT * one.radius + BLEND
+        frame = placed.frames[i]
+
+        def look(found: tuple[Array, Array], capsule: Array) -> tuple[tuple[Array, Array], None]:
+            middle = one.centre + frame @ jnp.asarray(t.middle)[i, capsule]
+            gap = self._places.distance(placed, meeting.second, j, middle) - jnp.asarray(t.around)[i, capsule]
+            return _listed(found, capsule, gap < reach), None
+
+        none = jnp.zeros(c, jnp.int32), jnp.int32(0)
+        return jax.lax.scan(look, none, jnp.arange(c, dtype=jnp.int32))[0]
+
+    def _touch(self, placed: Placed, kind: str, j: Array) -> tuple[Callable[[Segments], Points], Array]:
+        """Return what finds where a capsule may touch a body, [d], and two axes [2, 3] along which they spread."""
+        if kind in ("pads", "plates"):
+            plate = self._places.plate(placed, kind, j)
+            return lambda capsule: on_plate(capsule, plate), plate.frame[:, :2].T
+        other = self._places.capsules(placed, kind, j)
+        return lambda capsule: between_segments(capsule, other), jnp.eye(3)[:2]
 
     def depths(self, data: Any, joints: Joints, bodies: Bodies) -> Array:
         """Return how deep each pair of bodies overlaps, m, [g]; negative for a distance."""
-        placed, found = self._place(data, joints, jnp.zeros(len(data.qpos)), bodies, 0.0), [jnp.zeros(0)]
+        placed, found = self._places.place(data, joints, jnp.zeros(len(data.qpos)), bodies, 0.0), [jnp.zeros(0)]
         for meeting in self._tables.meetings:
-            deepest = lambda pair, m=meeting: self._points(placed, m, pair)[0].depth.max()  # noqa: E731
+
+            def deepest(pair: Array, meeting: Meeting = meeting) -> Array:
+                i, j = _numbers(meeting, pair)
+                touch, _ = self._touch(placed, meeting.second, j)
+                return jnp.max(jax.lax.map(touch, self._places.capsules(placed, meeting.first, i)).depth)
+
             found.append(jax.lax.map(deepest, np.arange(len(meeting.one), dtype=np.int32)))
         return jnp.concatenate(found)
 
-    # -- bodies
 
-    def _place(self, data: Any, joints: Joints, qvel: Array, bodies: Bodies, dt: Any) -> Placed:
-        t, turn, frames = self._tables, dt * bodies.velocity[:, 3:], rotation(bodies.quaternion)
-        axes = jnp.matmul(data.geom_xmat[t.pad_geoms], jnp.asarray(t.pad_axes))
-        pads = Plate(
-            stored(data.geom_xpos[t.pad_geoms]), stored(axes), jnp.asarray(t.pad_half), jnp.asarray(t.pad_radius)
-        )
-        centre = data.geom_xpos[t.near]
-        half = jnp.asarray(t.link_half)[:, None] * data.geom_xmat[t.near][:, :, 2]
-        links = Segments(stored(centre - half), stored(centre + half), jnp.asarray(t.link_radius))
-        ways = {"objects": stored(Way(dt * bodies.velocity[:, :3] - jnp.cross(turn, bodies.position), turn))}
-        moves, columns = dt * jnp.append(qvel, 0.0)[t.dofs], joints.columns(jnp.asarray(t.slides), jnp.zeros(3))
-        by_joint = stored(tuple(column * moves[..., None] for column in columns))
-        for kind in t.bodies:
-            own = t.arm_of[kind], t.moves[kind]
-            ways[kind] = Way(*jax.lax.map(lambda row: _moved(row[0], row[1], by_joint), own))
-        return Placed(stored(bodies.position), stored(frames), pads, links, ways)
-
-    def _capsules(self, placed: Placed, kind: str, i: Array) -> Segments:
-        """Return the capsules of one body, [c]."""
-        t = self._tables
-        if kind == "objects":
-            frame, at = placed.frames[i], placed.position[i]
-            start, end = (at + jnp.asarray(x)[i] @ frame.T for x in (t.start, t.end))
-            return Segments(start, end, jnp.asarray(t.radius)[i])
-        of = placed.links if kind == "links" else jax.tree.map(jnp.asarray, t.rods)
-        return jax.tree.map(lambda x: x[i][None], of)
-
-    def _plate(self, placed: Placed, kind: str, j: Array) -> Plate:
-        return row_of(placed.pads if kind == "pads" else jax.tree.map(jnp.asarray, self._tables.plates), j)
-
-    def _distance(self, placed: Placed, kind: str, j: Array, point: Array) -> Array:
-        """Return a lower bound of the distance of a point from a body, m; exact for plates and capsules."""
-        if kind == "objects":
-            return _size(point - placed.position[j]) - jnp.asarray(self._tables.bound)[j]
-        if kind in ("pads", "plates"):
-            plate = self._plate(placed, kind, j)
-            local = (point - plate.centre) @ plate.frame
-            beside = local[:2] - jnp.clip(local[:2], -plate.half, plate.half)
-            return jnp.sqrt(jnp.sum(beside * beside) + local[2] * local[2]) - plate.radius
-        rod = row_of(self._capsules(placed, kind, j), 0)
-        way = rod.end - rod.start
-        share = jnp.clip((point - rod.start) @ way / jnp.maximum(way @ way, 1e-12), 0.0, 1.0)
-        return _size(point - rod.start - share * way) - rod.radius
-
-    def _link_distance(self, placed: Placed, kind: str, j: Array, link: Segments) -> Array:
-        """Return a lower bound of the distance of a link from what is fixed, m; exact for rods."""
-        if kind == "rods":
-            return -between_segments(link, row_of(self._capsules(placed, kind, j), 0)).depth
-        plate = self._plate(placed, kind, j)
-        heights = jnp.stack([(end - plate.centre) @ plate.frame[:, 2] for end in (link.start, link.end)])
-        beyond = jnp.maximum(jnp.min(heights), -jnp.max(heights))  # on one side of the middle plane, if above 0
-        return jnp.maximum(beyond, 0.0) - plate.radius - link.radius
+def _listed(found: tuple[Array, Array], number: Array, near: Array) -> tuple[Array, Array]:
+    """Return a list of numbers and its length, with one more if it is near; what has no room is only counted."""
+    numbers, count = found
+    numbers = numbers.at[jnp.where(near, count, len(numbers))].set(number, mode="drop")
+    return numbers, count + near.astype(jnp.int32)
 
 
 def _numbers(meeting: Meeting, pair: Array) -> tuple[Array, Array]:
     """Return the numbers of the two bodies of a pair."""
     return tuple(jnp.asarray(of.astype(np.int32))[pair] for of in (meeting.one, meeting.other))  # type: ignore[return-value]
-
-
-def stored(tree: Any) -> Any:
-    """Return the same arrays: the fused engine keeps what a loop has written in memory, where it can be looked up."""
-    return jax.lax.map(lambda row: row, tree)
-
-
-def _moved(arm: Array, moves: Array, joints: tuple[Array, Array]) -> tuple[Array, Array]:
-    return tuple(moves @ of[arm] for of in joints)  # type: ignore[return-value]
-
-
-def row_of(tree: Any, i: Array | int) -> Any:
-    """Return one row of all arrays of a tree."""
-    return jax.tree.map(lambda x: x[i], tree)
-
-
-def _size(vector: Array) -> Array:
-    return jnp.sqrt(jnp.sum(vector * vector, -1))

@@ -1,0 +1,191 @@
+"""Where the bodies of a scene are and how they move: all that is asked of them before two are looked at closely."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from surgical_marl.physics.bodies import Bodies, rotation
+from surgical_marl.physics.rows import row_of, stored
+from surgical_marl.physics.shapes import Plate, Points, Segments, between_segments
+from surgical_marl.physics.tables import Tables
+
+
+class Way(NamedTuple):
+    """How bodies move in a step with the velocities of now: a point p of one by shift + turn x p. World, [n]."""
+
+    shift: Array
+    """m, [n, 3]"""
+    turn: Array
+    """rad, [n, 3]"""
+
+    def of(self, points: Points) -> Array:
+        """Return by how much points come nearer along their normals in the step, if one body [] moves, m, [...]."""
+        return -jnp.sum((self.shift + jnp.cross(self.turn, points.place)) * points.normal, -1)
+
+
+class Joints(NamedTuple):
+    """The axes of the joints of arms, [a, m]. World."""
+
+    axis: Array
+    """[a, m, 3]"""
+    anchor: Array
+    """A point on the axis, [a, m, 3]."""
+
+    def columns(self, slides: Any, place: Array) -> tuple[Array, Array]:
+        """Return the velocity of places [..., 3] and the angular velocity by joint velocity, [..., 3] both."""
+        moving = jnp.where(slides[..., None], self.axis, jnp.cross(self.axis, place - self.anchor))
+        return moving, jnp.where(slides[..., None], 0.0, self.axis)
+
+    def bends(self, tables: Tables, speeds: Array) -> Array:
+        """Return how each joint's motion at these speeds [a, m] bends with those before it, in memory, [a, m, 6].
+
+        The sum over the joints that move a body is its acceleration without joint accelerations: as a twist about the
+        world's origin, without the part that comes from turning past that origin (R. Featherstone, "Rigid Body Dynamics
+        Algorithms", 2008, section 2.8).
+        """
+
+        def of_arm(row: tuple[Joints, Array, Array, Array]) -> Array:
+            joints, slides, before, speed = row
+            moving, turning = (x * speed[:, None] for x in joints.columns(slides, jnp.zeros(3)))
+            lift, spin = before @ moving, before @ turning
+            return jnp.concatenate([jnp.cross(spin, moving) + jnp.cross(lift, turning), jnp.cross(spin, turning)], -1)
+
+        return jax.lax.map(of_arm, (self, tables.slides, tables.before, speeds))
+
+
+class Ball(NamedTuple):
+    """Balls that hold bodies, [n]. World."""
+
+    centre: Array
+    """m, [n, 3]"""
+    radius: Array
+    """m, [n]"""
+    moves: Array
+    """How far a point of the body goes in a step at most, m, [n]."""
+
+
+class Placed(NamedTuple):
+    """Where all bodies are and how they move."""
+
+    position: Array
+    """Centres of mass of the objects, [k, 3]."""
+    frames: Array
+    """Axes of their frames, [k, 3, 3]."""
+    pads: Plate
+    """[f]"""
+    links: Segments
+    """[l]"""
+    ways: dict[str, Way]
+    """Of what moves, by kind of body."""
+    balls: dict[str, Ball]
+    """Around all bodies, by their kind."""
+
+
+class Places:
+    """Finds where the bodies of a scene are. Kinds of bodies are those of `Tables.meetings`."""
+
+    def __init__(self, tables: Tables) -> None:
+        self._tables = tables
+
+    def joints(self, data: Any) -> Joints:
+        """Return the axes of the arms' joints, in memory, from MJX's data with poses."""
+        pad = lambda x: jnp.concatenate([x, jnp.zeros((1, 3))])[self._tables.dofs]  # noqa: E731
+        return stored(Joints(pad(data.xaxis), pad(data.xanchor)))
+
+    def place(self, data: Any, joints: Joints, qvel: Array, bodies: Bodies, dt: Any) -> Placed:
+        """Return where all bodies are, in memory, and how they move in a step of `dt`, s.
+
+        Args:
+            data: MJX's data with the poses of the arms.
+            joints: axes of the arms' joints.
+            qvel: velocities of the arms' joints.
+            bodies: the objects.
+            dt: duration of a step, s.
+        """
+        t, turn, frames = self._tables, dt * bodies.velocity[:, 3:], rotation(bodies.quaternion)
+        axes = jnp.matmul(data.geom_xmat[t.pad_geoms], jnp.asarray(t.pad_axes))
+        pads = Plate(
+            stored(data.geom_xpos[t.pad_geoms]), stored(axes), jnp.asarray(t.pad_half), jnp.asarray(t.pad_radius)
+        )
+        centre = data.geom_xpos[t.near]
+        half = jnp.asarray(t.link_half)[:, None] * data.geom_xmat[t.near][:, :, 2]
+        links = Segments(stored(centre - half), stored(centre + half), jnp.asarray(t.link_radius))
+        ways = {"objects": stored(Way(dt * bodies.velocity[:, :3] - jnp.cross(turn, bodies.position), turn))}
+        moves, columns = dt * jnp.append(qvel, 0.0)[t.dofs], joints.columns(jnp.asarray(t.slides), jnp.zeros(3))
+        by_joint = stored(tuple(column * moves[..., None] for column in columns))
+        for kind in t.bodies:
+            own = t.arm_of[kind], t.moves[kind]
+            ways[kind] = Way(*jax.lax.map(lambda row: _moved(row[0], row[1], by_joint), own))
+        frames = stored(frames)
+        around = {"objects": (bodies.position, jnp.asarray(t.bound)), "pads": _around(pads), "links": _around(links)}
+        around |= {"plates": _around(t.plates), "rods": _around(t.rods)}
+        balls = {kind: _ball(*ball, ways.get(kind)) for kind, ball in around.items()}
+        return Placed(stored(bodies.position), frames, pads, links, ways, balls)
+
+    def capsules(self, placed: Placed, kind: str, i: Array) -> Segments:
+        """Return all capsules of one body, [c]; there is one but for objects."""
+        if kind == "objects":
+            return jax.vmap(lambda c: self.capsule(placed, kind, i, c))(jnp.arange(self._tables.radius.shape[1]))
+        return jax.tree.map(lambda x: x[None], self.capsule(placed, kind, i, jnp.int32(0)))
+
+    def capsule(self, placed: Placed, kind: str, i: Array, c: Array) -> Segments:
+        """Return one capsule of one body."""
+        t = self._tables
+        if kind != "objects":
+            return row_of(placed.links if kind == "links" else jax.tree.map(jnp.asarray, t.rods), i)
+        frame, at = placed.frames[i], placed.position[i]
+        start, end = (at + frame @ jnp.asarray(x)[i, c] for x in (t.start, t.end))
+        return Segments(start, end, jnp.asarray(t.radius)[i, c])
+
+    def plate(self, placed: Placed, kind: str, j: Array) -> Plate:
+        """Return the plate of one body."""
+        return row_of(placed.pads if kind == "pads" else jax.tree.map(jnp.asarray, self._tables.plates), j)
+
+    def distance(self, placed: Placed, kind: str, j: Array, point: Array) -> Array:
+        """Return a lower bound of the distance of a point from a body, m; exact for plates and capsules."""
+        if kind == "objects":
+            return size(point - placed.position[j]) - jnp.asarray(self._tables.bound)[j]
+        if kind in ("pads", "plates"):
+            plate = self.plate(placed, kind, j)
+            local = (point - plate.centre) @ plate.frame
+            beside = local[:2] - jnp.clip(local[:2], -plate.half, plate.half)
+            return jnp.sqrt(jnp.sum(beside * beside) + local[2] * local[2]) - plate.radius
+        rod = self.capsule(placed, kind, j, jnp.int32(0))
+        way = rod.end - rod.start
+        share = jnp.clip((point - rod.start) @ way / jnp.maximum(way @ way, 1e-12), 0.0, 1.0)
+        return size(point - rod.start - share * way) - rod.radius
+
+    def link_distance(self, placed: Placed, kind: str, j: Array, link: Segments) -> Array:
+        """Return a lower bound of the distance of a link from what is fixed, m; exact for rods."""
+        if kind == "rods":
+            return -between_segments(link, self.capsule(placed, kind, j, jnp.int32(0))).depth
+        plate = self.plate(placed, kind, j)
+        heights = jnp.stack([(end - plate.centre) @ plate.frame[:, 2] for end in (link.start, link.end)])
+        beyond = jnp.maximum(jnp.min(heights), -jnp.max(heights))  # on one side of the middle plane, if above 0
+        return jnp.maximum(beyond, 0.0) - plate.radius - link.radius
+
+
+def _moved(arm: Array, moves: Array, joints: tuple[Array, Array]) -> tuple[Array, Array]:
+    return tuple(moves @ of[arm] for of in joints)  # type: ignore[return-value]
+
+
+def size(vector: Array) -> Array:
+    return jnp.sqrt(jnp.sum(vector * vector, -1))
+
+
+def _around(shapes: Plate | Segments) -> tuple[Array, Array]:
+    """Return centres [n, 3] and radii [n] of balls that hold shapes."""
+    if isinstance(shapes, Plate):
+        return jnp.asarray(shapes.centre), size(jnp.asarray(shapes.half)) + shapes.radius
+    return (shapes.start + shapes.end) / 2, size(shapes.end - shapes.start) / 2 + shapes.radius
+
+
+def _ball(centre: Any, radius: Any, way: Way | None) -> Ball:
+    moves = jnp.zeros(len(centre))
+    if way is not None:
+        moves = size(way.shift + jnp.cross(way.turn, centre)) + size(way.turn) * radius
+    return stored(Ball(jnp.asarray(centre), jnp.asarray(radius), moves))

@@ -1,0 +1,18 @@
+"""Rows of trees of arrays, which loops over bodies and contacts read one at a time."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+from jax import Array
+
+
+def row_of(tree: Any, i: Array | int) -> Any:
+    """Return one row of all arrays of a tree."""
+    return jax.tree.map(lambda x: x[i], tree)
+
+
+def stored(tree: Any) -> Any:
+    """Return the same arrays: the fused engine keeps what a loop has written in memory, where it can be looked up."""
+    return jax.lax.map(lambda row: row, tree)
