@@ -18,6 +18,8 @@ from surgical_marl.engines.fused.schedule import Scheduler
 
 LARGE = 500
 """Least number of operations in a branch whose inputs are hidden from the compiler (`HIDEF`)."""
+COUNTED = 50
+"""Least number of operations in a branch or in a round of a loop that count as work."""
 
 _CODE = {
     "add": "{}+{}", "sub": "{}-{}", "mul": "{}*{}", "neg": "-{}", "lt": "{}<{}", "le": "{}<={}", "gt": "{}>{}",
@@ -47,6 +49,8 @@ class Emitter(ArrayEmitter):
     def body(self) -> str:
         self._postpone_stores()
         self._region(0, self._store)
+        if any(line.startswith("WORK(") for line in self.lines):
+            self.lines = ["I work_=0;", *self.lines, "work.data[t]=work_;"]
         return "\n".join(self.lines)
 
     def _postpone_stores(self) -> None:
@@ -111,11 +115,19 @@ class Emitter(ArrayEmitter):
 
         self.lines.append(f"if(ANY({condition})){{")
         with self._side(number, condition), self._kept(kept, f"NOT({condition})"):
+            self._count(chosen)
             self._region(chosen, take(branch.chosen, True))
         self.lines.append(f"}}\nif(ANY(NOT({condition}))){{" if self.vector else "}else{")
         with self._side(number, f"NOT({condition})"), self._kept(kept, condition):
+            self._count(other)
             self._region(other, take(branch.others, False))
         self.lines.append("}")
+
+    def _count(self, region: int) -> None:
+        """Add the operations of a part that not all environments go through to how much this one had to do."""
+        size = len(self.schedule.regions[region].items)
+        if size >= COUNTED and not self.vector:
+            self.lines.append(f"WORK({size})")
 
     @contextmanager
     def _kept(self, arrays: Iterable[str], condition: str) -> Iterator[None]:
@@ -168,6 +180,8 @@ class Emitter(ArrayEmitter):
 
         active = self.active
         self.active = [f"m{number}"] if tested else active
+        if tested:
+            self._count(self.schedule.inside[number][0])
         self._region(self.schedule.inside[number][0], result)
         self.active = active
         self._next(number, loop)

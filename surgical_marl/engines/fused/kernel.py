@@ -2,7 +2,7 @@
 
 A kernel works on five arrays whose columns are environments: `state` (float32) and `counts` (int32; uint32 by their
 bits) are read and written, `actions` (float32) read, `outs` (float32) and `flags` (uint8) written; and on two arrays of
-constants.
+constants. On a GPU, thread k runs environment `order[k]`, and writes how much there was to do to `work`.
 """
 
 from __future__ import annotations
@@ -42,7 +42,10 @@ def compile_kernels(bodies: dict[str, str], device: str, max_registers: int | No
     module = wp.get_module(f"surgical_marl_{digest}")
     # contraction: a * b + c is one rounding, as on a GPU
     module.options.update(enable_backward=False, cpu_compiler_flags="-march=native -ffp-contract=fast")
-    made = {name: _make(f"{name}_{digest}", source, module, max_registers) for name, source in sources.items()}
+    made = {
+        name: _make(f"{name}_{digest}", source, module, device == "cuda", max_registers)
+        for name, source in sources.items()
+    }
     # Warp itself does not protect a module from two processes that compile it at the same time
     with locked(cache_dir() / "kernels" / module.name), _checked(module.name):
         module.load(wp.get_device(device), block_dim=BLOCK if device == "cuda" else 1)
@@ -85,24 +88,31 @@ def _digest(folders: list[Path]) -> str:
     return "\n".join(f"{file.name} {hashlib.sha256(file.read_bytes()).hexdigest()}" for file in files)
 
 
-def _make(name: str, source: str, module: Any, max_registers: int | None) -> Any:
+def _make(name: str, source: str, module: Any, ordered: bool, max_registers: int | None = None) -> Any:
     def body(
         state: _reals, counts: _wholes, actions: _reals, outs: _reals, flags: _bytes, reals: _reals, wholes: _wholes,
-        stride: int, t: int,
+        work: _wholes, stride: int, t: int,
     ) -> None: ...  # fmt: skip
 
     body.__qualname__ = body.__name__ = f"body_{name}"
     body = wp.func_native(source)(body)
 
-    def kernel(
+    def in_turn(
         state: _reals, counts: _wholes, actions: _reals, outs: _reals, flags: _bytes, reals: _reals, wholes: _wholes,
-        stride: int, start: int, lanes: int,
+        order: _wholes, work: _wholes, stride: int, start: int, lanes: int,
     ) -> None:  # fmt: skip
-        body(state, counts, actions, outs, flags, reals, wholes, stride, start + wp.tid() * lanes)
+        body(state, counts, actions, outs, flags, reals, wholes, work, stride, start + wp.tid() * lanes)
+
+    def in_order(
+        state: _reals, counts: _wholes, actions: _reals, outs: _reals, flags: _bytes, reals: _reals, wholes: _wholes,
+        order: _wholes, work: _wholes, stride: int, start: int, lanes: int,
+    ) -> None:  # fmt: skip
+        body(state, counts, actions, outs, flags, reals, wholes, work, stride, order[start + wp.tid()])
 
     return wp.kernel(
-        kernel, name=name, module=module, enable_backward=False, grid_stride=False, cuda_max_registers=max_registers
-    )
+        in_order if ordered else in_turn, name=name, module=module, enable_backward=False, grid_stride=False,
+        cuda_max_registers=max_registers,
+    )  # fmt: skip
 
 
 class Kernel:

@@ -71,6 +71,7 @@ typedef float F; typedef int I; typedef unsigned int U; typedef bool B;
 #define HIDEF(x) asm volatile("":"+f"(x));
 #define HIDEI(x) asm volatile("":"+r"(x));
 #define HIDEU(x) asm volatile("":"+r"(x));
+#define WORK(n) work_+=n;
 #define BITS(x) __float_as_uint(x)
 #define FLOAT(x) __uint_as_float(x)
 """
