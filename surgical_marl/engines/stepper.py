@@ -24,6 +24,8 @@ class Stepper(Protocol):
     """
 
     agents: tuple[str, ...]
+    decimation: int
+    """Physics steps in a step."""
 
     @property
     def title(self) -> str:

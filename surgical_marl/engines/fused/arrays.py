@@ -24,11 +24,6 @@ _READ = ("outs", "flags", "counts")
 _ROOMS = 3
 """Rooms for results that are kept to be used again: a loop holds the last step's results, and some hold two."""
 
-EVERY = 8
-"""Launches on a GPU after which environments are put in another order."""
-FINENESS = 4
-"""Steps per doubling in which is told how much an environment had to do."""
-
 
 def make_arrays(device: str, source: Source, tables: dict[str, np.ndarray], stride: int, num_envs: int) -> Arrays:
     """Arrays for a program, zero. ValueError if there is no room for them."""
@@ -38,7 +33,7 @@ def make_arrays(device: str, source: Source, tables: dict[str, np.ndarray], stri
 class Arrays(ABC):
     """`all` is what `Kernel.launch` takes; columns from `num_envs` on are padding.
 
-    The last two say in which order a GPU runs environments, and how much each had to do.
+    Its last two are `order`, in which a GPU runs environments, and `work`, how much each had to do.
     """
 
     device: str
@@ -53,12 +48,12 @@ class Arrays(ABC):
                 f"{room // (2 * each)} fit"
             )
         self._buffers = {name: self._zeros(max(source.sizes[name], 1), stride, dtype) for name, dtype in _TYPES.items()}
-        self._order, self._work = self._constant(np.arange(stride, dtype=np.int32)), self._zeros(1, stride, np.int32)[0]
+        self.order, self.work = self._constant(np.arange(stride, dtype=np.int32)), self._zeros(1, stride, np.int32)[0]
         constants = [self._constant(table) for table in tables.values()]
         self.all = [
             *(self._warp(buffer) for buffer in self._buffers.values()),
             *(self._warp(constant) for constant in constants),
-            *(self._warp(array) for array in (self._order, self._work)),
+            *(self._warp(array) for array in (self.order, self.work)),
         ]
 
     @abstractmethod
@@ -187,10 +182,6 @@ class CudaArrays(Arrays):
 
     device = "cuda"
 
-    def __init__(self, source: Source, tables: dict[str, np.ndarray], stride: int, num_envs: int) -> None:
-        super().__init__(source, tables, stride, num_envs)
-        self._launches = 0
-
     def _zeros(self, fields: int, stride: int, dtype: Any) -> Any:
         import torch
 
@@ -220,16 +211,7 @@ class CudaArrays(Arrays):
         return self._cut(tree, {name: self._buffers[name].clone() for name in _READ}, library)
 
     def renew(self) -> None:
-        """Put environments side by side that had about as much to do, so that they go through the same branches.
-
-        Results need no room of their own: a CUDA graph writes to the same place at every replay, so they are copied.
-        """
-        import torch
-
-        if self._launches % EVERY == 1:
-            much = (FINENESS * torch.log2(1.0 + self._work[: self.num_envs])).to(torch.uint8)
-            self._order[: self.num_envs] = torch.argsort(much, stable=True)
-        self._launches += 1
+        pass  # a CUDA graph writes to the same place at every replay, so what is read is copied
 
     def _cut(self, node: Any, copies: dict[str, Any], library: str) -> Any:
         """Return a tree's leaves, taken out of copies of the buffers.

@@ -17,9 +17,9 @@ from surgical_marl.engines.fused.graph import Branch, Graph, Loop, Value
 from surgical_marl.engines.fused.schedule import Scheduler
 
 LARGE = 500
-"""Least number of operations in a branch whose inputs are hidden from the compiler (`HIDEF`)."""
-COUNTED = 50
-"""Least number of operations in a branch or in a round of a loop that count as work."""
+"""Least number of operations in a branch whose inputs are hidden from the compiler (`HIDEF`), or in a branch or a round
+of a loop that counts as work."""
+SYNC = False
 
 _CODE = {
     "add": "{}+{}", "sub": "{}-{}", "mul": "{}*{}", "neg": "-{}", "lt": "{}<{}", "le": "{}<={}", "gt": "{}>{}",
@@ -46,11 +46,13 @@ class Emitter(ArrayEmitter):
         self.active: list[str] = []
         """Conditions of the code's branch: it applies to the environments of a vector for which all of them hold."""
 
+        self.uniform = True
+
     def body(self) -> str:
         self._postpone_stores()
         self._region(0, self._store)
         if any(line.startswith("WORK(") for line in self.lines):
-            self.lines = ["I work_=0;", *self.lines, "work.data[t]=work_;"]
+            self.lines = ["I work_=0;", *self.lines, "work.data[t]=WORKED;"]
         return "\n".join(self.lines)
 
     def _postpone_stores(self) -> None:
@@ -79,6 +81,8 @@ class Emitter(ArrayEmitter):
                 result(index)
             else:
                 group = self.graph.groups[index]
+                if self.uniform and not self.vector and SYNC:
+                    self.lines.append("SYNC")
                 (self._branch if isinstance(group, Branch) else self._loop)(index, group)  # type: ignore[arg-type]
 
     def _store(self, k: int) -> None:
@@ -126,7 +130,7 @@ class Emitter(ArrayEmitter):
     def _count(self, region: int) -> None:
         """Add the operations of a part that not all environments go through to how much this one had to do."""
         size = len(self.schedule.regions[region].items)
-        if size >= COUNTED and not self.vector:
+        if size >= LARGE and not self.vector:
             self.lines.append(f"WORK({size})")
 
     @contextmanager
@@ -147,6 +151,7 @@ class Emitter(ArrayEmitter):
         The compiler takes these names for new values. Without new names it would compute before the branch what both
         sides need, which causes register spills.
         """
+        uniform, self.uniform = self.uniform, False
         self.active.append(condition)
         names, size = dict(self.names), sum(len(self.schedule.regions[r].items) for r in self.schedule.inside[number])
         if size >= LARGE and not self.vector:
@@ -159,7 +164,7 @@ class Emitter(ArrayEmitter):
                     self.lines.append(f"{kind} {hidden}={self._name(value)};HIDE{kind}({hidden})")
                     self.names[value] = hidden
         yield
-        self.names = names
+        self.names, self.uniform = names, uniform
         self.active.pop()
 
     def _loop(self, number: int, loop: Loop) -> None:
@@ -180,10 +185,11 @@ class Emitter(ArrayEmitter):
 
         active = self.active
         self.active = [f"m{number}"] if tested else active
+        uniform, self.uniform = self.uniform, self.uniform and not tested
         if tested:
             self._count(self.schedule.inside[number][0])
         self._region(self.schedule.inside[number][0], result)
-        self.active = active
+        self.active, self.uniform = active, uniform
         self._next(number, loop)
         self.lines.append("}")
         for k in self.schedule.alive[number]:

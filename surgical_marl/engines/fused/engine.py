@@ -21,6 +21,7 @@ import numpy as np
 from surgical_marl.engines.fused.arrays import make_arrays
 from surgical_marl.engines.fused.kernel import compile_kernels, has_cuda
 from surgical_marl.engines.fused.load import load_source
+from surgical_marl.engines.fused.order import Order
 from surgical_marl.engines.fused.preludes import LANES
 from surgical_marl.engines.fused.program import Source
 from surgical_marl.engines.fused.threefry import episode_keys
@@ -55,6 +56,9 @@ class FusedEngine:
         self._stride = -(-num_envs // LANES) * LANES
         self._arrays = make_arrays(self.device, self.source, self._filled_tables(), self._stride, num_envs)
         self._kernels = compile_kernels(self.source.bodies, self.device)
+        self._order: Order | None = None
+        if self.device == "cuda" and any("WORK(" in body for body in self.source.bodies.values()):
+            self._order = Order(self._arrays.order[:num_envs], self._arrays.work[:num_envs], env.decimation)
         vectors = self._stride // LANES
         shares = min(cores(), max(1, num_envs // LEAST_SHARE)) if self.device == "cpu" else 1
         edges = [round(vectors * k / shares) * LANES for k in range(shares + 1)]
@@ -134,6 +138,8 @@ class FusedEngine:
 
     def _launch(self, name: str) -> None:
         self._arrays.renew()
+        if self._order:
+            self._order.renew()
         launch = lambda share: self._kernels[name].launch(self._arrays.all, self._stride, *share)  # noqa: E731
         if len(self._shares) == 1:
             launch(self._shares[0])

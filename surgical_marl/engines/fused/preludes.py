@@ -3,6 +3,8 @@
 Division and square root are CUDA's approximate ones, right to two units in the last place. They take numbers below
 2^-126 for 0, which saves the scaling of such numbers: one instruction in twenty of a physics step. That division gives
 0 for a divisor above 2^126.
+
+`WORKED` is how much there was to do, to the quarter of a doubling: the exponent and two more bits of a float.
 """
 
 from __future__ import annotations
@@ -72,6 +74,8 @@ typedef float F; typedef int I; typedef unsigned int U; typedef bool B;
 #define HIDEI(x) asm volatile("":"+r"(x));
 #define HIDEU(x) asm volatile("":"+r"(x));
 #define WORK(n) work_+=n;
+#define WORKED (max((int)(__float_as_uint((F)work_)>>21)-508,0))
+#define SYNC __syncthreads();
 #define BITS(x) __float_as_uint(x)
 #define FLOAT(x) __uint_as_float(x)
 """
