@@ -12,10 +12,10 @@ from jax import Array
 from surgical_marl.physics.bodies import Bodies, conjugate, product, rotation, turn
 from surgical_marl.physics.cone import Cone
 from surgical_marl.physics.newton import Newton
-from surgical_marl.physics.patches import AWAY, POINTS, Patch
+from surgical_marl.physics.patches import AWAY, Patch
 from surgical_marl.physics.placed import Joints
 from surgical_marl.physics.problem import SLIPS, Contact, Pressed
-from surgical_marl.physics.rows import row_of, stored
+from surgical_marl.physics.rows import room, row_of, stored
 from surgical_marl.physics.tables import Tables
 from surgical_marl.physics.touching import AHEAD, MARGIN, Slots
 
@@ -122,29 +122,25 @@ class Handling:
         self, slots: Slots, joints: Joints | None, fingers: Fingers | None, qvel: Array, bodies: Bodies, grips: Grips,
         dt: Any,
     ) -> Felt:  # fmt: skip
-        """Return how the patches in all slots resist. There are neither joints nor fingers without arms."""
+        """Return how the patches that were found resist. There are neither joints nor fingers without arms."""
         joint_speeds = self._newton.by_arm(qvel)
         bends = None if joints is None else joints.bends(self.tables, joint_speeds)
         speeds = _Speeds(joint_speeds, self._newton.by_object(bodies.velocity), bends)
         at = self._newton.by_object(bodies.position), self._newton.by_object(bodies.quaternion)
         grips = stored(grips)
 
-        def one(n: Array, all_: Felt) -> Felt:
+        def felt(n: Array) -> Felt:
             patch, number = row_of(slots.patch, n), slots.number[n]
             contact, origin = self._contact(patch, number, joints, at[0])
             slip = self._slip(patch, number, fingers, at, grips)
             motion = self._motion(contact, patch, number, speeds, origin)
-            felt = Felt(self._resisting(contact, patch, number, slip, motion, dt), slip)
-            return jax.tree.map(lambda x, own: x.at[n].set(own), all_, felt)
+            return Felt(self._resisting(contact, patch, number, slip, motion, dt), slip)
 
-        return jax.lax.fori_loop(0, slots.found, one, self._nothing(len(slots.number)))
+        def one(n: Array, all_: Felt) -> Felt:
+            return jax.tree.map(lambda x, own: x.at[n].set(own), all_, felt(n))
 
-    def _nothing(self, slots: int) -> Felt:
-        """Return contacts of nothing."""
-        t, zero = self.tables, lambda *shape: jnp.zeros((slots, *shape))
-        cone = Cone(zero(POINTS, 6), zero(POINTS), zero(POINTS), zero(3, 6), zero(), zero(3), zero())
-        first, second, arm = (jnp.full(slots, number, jnp.int32) for number in (t.count, t.count, t.arms))
-        return Felt(Contact(cone, first, second, zero(3), arm, zero(6, t.most)), zero(3))
+        shape = jax.eval_shape(lambda: felt(jnp.int32(0)))
+        return jax.lax.fori_loop(0, slots.found, one, room(shape, len(slots.number)))
 
     def _contact(self, patch: Patch, number: Array, joints: Joints | None, position: Array) -> tuple[Contact, Array]:
         """Return a contact that does not resist yet: what it is between, and its directions; and its twists' origin."""

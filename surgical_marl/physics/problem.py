@@ -59,7 +59,7 @@ class Pressed(NamedTuple):
 
 
 def not_pressed(slots: int) -> Pressed:
-    """Return forces of none."""
+    """Return the forces of contacts that do not press."""
     return Pressed(jnp.zeros(slots), jnp.zeros((slots, 3)), jnp.zeros(slots, jnp.int32))
 
 

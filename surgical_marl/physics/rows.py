@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 from jax import Array
 
 
@@ -16,3 +17,9 @@ def row_of(tree: Any, i: Array | int) -> Any:
 def stored(tree: Any) -> Any:
     """Return the same arrays: the fused engine keeps what a loop has written in memory, where it can be looked up."""
     return jax.lax.map(lambda row: row, tree)
+
+
+def room(tree: Any, rows: int) -> Any:
+    """Return arrays for `rows` trees like this one. They hold nothing that may be read before it is written."""
+    empty = getattr(jax.lax, "empty", jnp.zeros)  # JAX before 0.7 has no other
+    return jax.tree.map(lambda x: empty((rows, *x.shape), x.dtype), tree)

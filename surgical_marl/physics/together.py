@@ -160,7 +160,8 @@ class Together:
 
         if k < 2:
             return whole(contacts)
-        return jax.lax.cond((contacts.second < k).any(), whole, each, contacts)
+        joined = (contacts.second < k) & (np.arange(len(contacts.second)) < total)
+        return jax.lax.cond(joined.any(), whole, each, contacts)
 
     def _step(
         self, dynamics: Dynamics, physics: Physics, touch: Touch, slots: Slots, joints: Joints

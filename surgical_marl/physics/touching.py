@@ -17,7 +17,7 @@ from jax import Array
 from surgical_marl.physics.bodies import Bodies
 from surgical_marl.physics.patches import BLEND, TILT, Patch, find_patch, no_patch
 from surgical_marl.physics.placed import Joints, Placed, Places, Way, size
-from surgical_marl.physics.rows import row_of
+from surgical_marl.physics.rows import room, row_of
 from surgical_marl.physics.shapes import Points, Segments, between_segments, on_plate
 from surgical_marl.physics.tables import Meeting, Tables
 
@@ -72,11 +72,8 @@ class Finder:
         """
         placed = self._places.place(data, joints, qvel, bodies, dt)
         none, number = jnp.int32(0), 0
-        slots = Slots(
-            jax.tree.map(lambda x: jnp.broadcast_to(x, (self.slots, *x.shape)), no_patch()),
-            jnp.zeros(self.slots, jnp.int32),
-            none,
-        )
+        numbers = jnp.zeros(self.slots, jnp.int32)
+        slots = Slots(room(jax.eval_shape(no_patch), self.slots), numbers, none)
         for meeting in self._tables.meetings:
             slots = self._meet(placed, meeting, number, slots)
             number += len(meeting.one)
@@ -140,8 +137,7 @@ class Finder:
             return jax.tree.map(lambda all_, x: all_.at[n].set(x), found, (points, soon))
 
         shape = jax.eval_shape(lambda: touch(self._places.capsule(placed, meeting.first, i, jnp.int32(0))))
-        room = jax.tree.map(lambda x: jnp.zeros((len(capsules), *x.shape)), (shape, shape.depth))
-        points, soon = jax.lax.fori_loop(0, count, near, room)
+        points, soon = jax.lax.fori_loop(0, count, near, room((shape, shape.depth), len(capsules)))
         patch = find_patch(points, soon, count, axes, jnp.asarray(self._tables.torsion)[start + pair])
         return patch, (patch.reach > -NEAR).astype(jnp.int32)
 

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from surgical_marl.physics.rows import room
 from tests.helpers.fused_rows import ROWS
 
 COUNT = 21
@@ -183,6 +184,7 @@ MOVES: dict[str, Block] = {
     "unstack": ("ee", "e", lambda x, y: sum(jnp.unstack(outer(x, y), axis=1)) / 4),
     "pad": ("ie", "i", lambda x, y: lax.pad(x, np.int32(5), [(-1, 2, 1)])[:3]),
     "pad by a value": ("ue", "u", lambda x, y: lax.pad(np.uint32([1, 2]), x[0], [(1, 0, 0)])),
+    "room": ("e", "e", lambda x: lax.fori_loop(0, 3, lambda k, y: y.at[k].set(x[2 - k] / 2), room(x[0], 3))),
     "iota": ("e", "e", lambda x: x + lax.broadcasted_iota(jnp.float32, (3, 3), 1)[2] / 4),
     "sum": ("ee", "e", lambda x, y: outer(x, y).sum(0) / 4),
     "sum whole": ("i", "i", lambda x: x - x.sum()),

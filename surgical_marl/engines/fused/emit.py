@@ -201,7 +201,7 @@ class Emitter(ArrayEmitter):
         kind, name = self.graph.kinds[phi], f"v{phi}"
         if not self._is_array(phi):
             self.lines.append(f"{TYPES[kind]} {name}={self._name(start)};")
-        elif self.graph.ops[start] in ("array", "out") and self._is_free(start, self._place[loop.outs[k]]):
+        elif self.graph.ops[start] in ("array", "out", "room") and self._is_free(start, self._place[loop.outs[k]]):
             name = self.names[start]
         else:
             self._declare(name, kind)
@@ -256,7 +256,10 @@ class Emitter(ArrayEmitter):
             code = _CODE[op].format(*map(self._whole, g.args[value]))
             self.lines.append(f"int v{value}={code};")
             self.names[value], self.wholes[value] = f"SPLATI(v{value})", f"v{value}"
-        elif op != "room":
+        elif op == "room":
+            self._declare(f"v{value}", g.kinds[value])
+            self.names[value] = f"v{value}"
+        else:
             code = self._operation(value)
             self.names[value] = f"v{value}"
             self.lines.append(f"{TYPES[g.kinds[value]]} v{value}={code};")

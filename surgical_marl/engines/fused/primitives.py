@@ -15,6 +15,7 @@ import numpy as np
 from surgical_marl.engines.fused import elementary, linear
 from surgical_marl.engines.fused.graph import Graph, Value
 from surgical_marl.engines.fused.indexing import dynamic_slice, dynamic_update_slice, gather, scatter
+from surgical_marl.engines.fused.memory import unpack
 from surgical_marl.engines.fused.operations import FOLD
 from surgical_marl.engines.fused.scalars import ELEMENTWISE, bitcast, convert, extreme, logic, round_
 from surgical_marl.engines.fused.threefry import threefry
@@ -103,6 +104,13 @@ def _iota(g: Graph, shape: Any, params: Any) -> Traced:
     return np.broadcast_to(np.arange(shape[params["dimension"]]).reshape(middle), shape)
 
 
+def _empty(g: Graph, shape: Any, params: Any) -> Traced:
+    """Return arrays that hold nothing yet, along the first axis."""
+    length, size = shape[0] if shape else 1, int(np.prod(shape[1:], dtype=int))
+    kind = f"{kind_of(params['dtype'])}{length}"
+    return Symbolic(unpack(g, [g.fresh("room", kind=kind) for _ in range(size)], shape, min(len(shape), 1)))
+
+
 # -- random numbers
 
 
@@ -149,6 +157,7 @@ RULES: dict[str, Rule] = {
     "split": _split,
     "unstack": _unstack,
     "pad": _pad,
+    "empty": _empty,
     "iota": _iota,
     "iota_2x32_shape": _iota_pair,
     "gather": gather,
