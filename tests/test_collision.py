@@ -123,7 +123,7 @@ def clustered(count: int) -> tuple[mujoco.MjModel, Any]:
     def deepest(xpos: Any, xmat: Any, cdof: Any, com: Any) -> Any:
         closest = pairs.closest(xpos, xmat)
         touching = pairs.deepest(SimpleNamespace(geom_xpos=xpos, geom_xmat=xmat, cdof=cdof, subtree_com=com), closest)
-        forces = pairs.spread(touching, np.arange(1, SLOTS + 1, dtype=np.float32))
+        forces = pairs.spread(touching.pair, np.arange(1, SLOTS + 1, dtype=np.float32))
         return closest, touching, forces, pairs.overlap(xpos, xmat), pairs.overflow(closest)
 
     return model, jax.jit(deepest)

@@ -141,11 +141,11 @@ class Pairs:
         best, which = jax.lax.top_k(found.ravel(), SLOTS)
         return best, pairs.ravel()[which]
 
-    def spread(self, touching: Touching, values: Array) -> Array:
-        """Return values of the deepest contacts [K] by pair, [P]; 0 for all others."""
+    def spread(self, pair: Array, values: Array) -> Array:
+        """Return the sum of values [K] of each pair, [P], which they are of by its number [K]; 0 for all others."""
         if self.tiles is None:
-            return jnp.where(touching.pair == np.arange(self.count)[:, None], values, 0.0).sum(-1)
-        return jnp.zeros(self.count, values.dtype).at[touching.pair].set(values)
+            return jnp.where(pair == np.arange(self.count)[:, None], values, 0.0).sum(-1)
+        return jnp.zeros(self.count, values.dtype).at[pair].add(values)
 
 
 def _closest(one: Capsule, other: Capsule, is_pair: Any) -> Closest:

@@ -252,7 +252,7 @@ class Simulator:
         start = dynamics.relaxed(forces, physics.qacc_warmstart)
         between = len(touching.pair) if len(physics.qvel) > MOST_JOINED else 0
         qacc, force = solve(forces.mass, forces.smooth, joined, start, *TOUCHING_ITERATIONS, between)
-        each = self._pairs.spread(touching, force[len(forces.rows.low) :])
+        each = self._pairs.spread(touching.pair, force[len(forces.rows.low) :])
         deepest = jnp.maximum(touch.penetration, -closest.distance)
         overflow = jnp.maximum(touch.overflow, self._pairs.overflow(closest))
         hardest = touch._replace(penetration=deepest, force=jnp.maximum(touch.force, each), overflow=overflow)

@@ -42,6 +42,18 @@ class Objects(NamedTuple):
     grips: Grips
 
 
+class _Between(NamedTuple):
+    """Contacts of arms with arms."""
+
+    rows: Rows
+    pair: Array
+    """Which pair each row is of, [r]."""
+    penetration: Array
+    """Of all pairs, m, [P]."""
+    left_out: Array
+    """How many contacts found no row, []."""
+
+
 class Together:
     """The physics of a scene with objects."""
 
@@ -114,8 +126,8 @@ class Together:
         """
         data = self._dynamics.pose(physics.qpos)
         slots, joints = self._find(data, physics)
-        near = self._pairs.overlap(data.geom_xpos, data.geom_xmat) if self._pairs.count else jnp.bool_(False)
-        near |= (self._on_arm(slots) < self._arms).any()
+        overlap = self._pairs.overlap(data.geom_xpos, data.geom_xmat) if self._pairs.count else jnp.bool_(False)
+        near = overlap | (self._on_arm(slots) < self._arms).any()
 
         def alone(physics: Physics, touch: Touch) -> tuple[Physics, Touch]:
             objects = self._step_objects(physics.objects, slots)
@@ -124,7 +136,7 @@ class Together:
             return physics._replace(objects=objects), touch._replace(overflow=left_out)
 
         def together(physics: Physics, touch: Touch) -> tuple[Physics, Touch]:
-            return self._step(self._dynamics.varied(fields), physics, touch, slots, joints)
+            return self._step(self._dynamics.varied(fields), physics, touch, slots, joints, overlap)
 
         return jax.lax.cond(near, together, alone, physics, touch)
 
@@ -164,7 +176,7 @@ class Together:
         return jax.lax.cond(joined.any(), whole, each, contacts)
 
     def _step(
-        self, dynamics: Dynamics, physics: Physics, touch: Touch, slots: Slots, joints: Joints
+        self, dynamics: Dynamics, physics: Physics, touch: Touch, slots: Slots, joints: Joints, overlap: Array
     ) -> tuple[Physics, Touch]:
         """Return the state after a step of all arms and objects together.
 
@@ -176,9 +188,9 @@ class Together:
         fingers = handling.fingers(data)
         felt = handling.feel(slots, joints, fingers, physics.qvel, bodies, grips, dt)
         masses, free = self._free(bodies)
-        closest, touching, between = self._between(dynamics, data, physics.qvel)
+        between = self._between(dynamics, data, physics.qvel, overlap)
         problem = Problem(
-            forces.mass + dt * forces.damping, forces.smooth, forces.rows, between, masses, free, felt.contacts,
+            forces.mass + dt * forces.damping, forces.smooth, forces.rows, between.rows, masses, free, felt.contacts,
             slots.found,
         )  # fmt: skip
         found = self._newton.solve(problem, physics.qacc_warmstart, bodies.acceleration)
@@ -187,26 +199,32 @@ class Together:
         shift = dt * qvel, dt * objects.velocity
         grips = handling.remember(felt, slots, found.pressed, fingers, bodies, shift, grips, dt)
         after = Physics(physics.qpos + shift[0], qvel, found.arms, physics.ctrl, Objects(objects, grips))
-        touch = touch._replace(
+        left_out = jnp.maximum(between.left_out, slots.total - len(slots.number))
+        each = self._pairs.spread(between.pair, found.between) if self._pairs.count else touch.force
+        return after, Touch(
+            penetration=jnp.maximum(touch.penetration, between.penetration),
+            force=jnp.maximum(touch.force, each),
             handled=jnp.maximum(touch.handled, self._hardest(slots, found.pressed)),
-            overflow=jnp.maximum(touch.overflow, slots.total - len(slots.number)),
+            overflow=jnp.maximum(touch.overflow, left_out),
         )
-        if closest is None:
-            return after, touch
-        each = self._pairs.spread(touching, found.between)
-        penetration = jnp.maximum(touch.penetration, -closest.distance)
-        overflow = jnp.maximum(touch.overflow, self._pairs.overflow(closest))
-        return after, touch._replace(penetration=penetration, force=jnp.maximum(touch.force, each), overflow=overflow)
 
-    def _between(self, dynamics: Dynamics, data: Any, qvel: Array) -> tuple[Any, Any, Rows]:
-        """Return where arms are closest to each other (None without pairs), the deepest contacts, and their rows."""
+    def _between(self, dynamics: Dynamics, data: Any, qvel: Array, overlap: Array) -> _Between:
+        """Return the contacts of arms with arms: none, without looking, unless any overlap."""
+
+        def found(_: None) -> _Between:
+            closest = self._pairs.closest(data.geom_xpos, data.geom_xmat)
+            touching = self._pairs.deepest(data, closest)
+            rows = dynamics.contact_rows(touching.jacobian, touching.distance, touching.weight, qvel)
+            return _Between(rows, touching.pair, -closest.distance, self._pairs.overflow(closest))
+
+        def none(_: None) -> _Between:
+            return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(lambda: found(None)))
+
         if not self._pairs.count:
-            none = jnp.zeros(0)
-            return None, None, Rows(jnp.zeros((0, len(qvel))), none, none, none, none)
-        closest = self._pairs.closest(data.geom_xpos, data.geom_xmat)
-        touching = self._pairs.deepest(data, closest)
-        rows = dynamics.contact_rows(touching.jacobian, touching.distance, touching.weight, qvel)
-        return closest, touching, rows
+            empty = jnp.zeros(0)
+            rows = Rows(jnp.zeros((0, len(qvel))), empty, empty, empty, empty)
+            return _Between(rows, empty, empty, jnp.int32(0))
+        return jax.lax.cond(overlap, found, none, None)
 
     def _on_arm(self, slots: Slots) -> Array:
         """Return the arm that the patch in each slot is on, [s]; the number of arms for none."""
