@@ -86,7 +86,7 @@ class Dynamics:
     def relaxed(self, forces: Forces, qacc: Array) -> Array:
         """Return the acceleration [n] from a guess, relaxed with regard to friction and limits."""
         # where `solve` begins: no derivative goes through it
-        return relax(*jax.lax.stop_gradient((forces.mass, forces.smooth, self._joint_rows(forces.rows), qacc)))
+        return relax(*jax.lax.stop_gradient((forces.mass, forces.smooth, self.joint_rows(forces.rows), qacc)))
 
     def step(self, physics: Physics) -> Physics:
         """Return the state after one physics step without contacts."""
@@ -108,7 +108,7 @@ class Dynamics:
         low, high = jnp.where(rubs, -friction, 0.0), jnp.where(rubs, friction, np.inf)
         return Rows(rows.efc_J, rows.efc_D, rows.efc_aref, low, high)
 
-    def _joint_rows(self, rows: Rows) -> JointRows:
+    def joint_rows(self, rows: Rows) -> JointRows:
         """Return constraint rows by joint; each row concerns one joint."""
         n, k = rows.jacobian.shape[1], len(self._rubbing)
         friction, limit = (jnp.zeros(n).at[where].set for where in (self._rubbing, self._limited))

@@ -16,16 +16,15 @@ import numpy as np
 from jax import Array
 from jax.lax.linalg import triangular_solve
 
+from surgical_marl.physics.arms import Arms, Reduced
 from surgical_marl.physics.cone import curvature, forces, wrench
 from surgical_marl.physics.problem import SLIPS, Contact, Point, Pressed, Problem, Solution, not_pressed
 from surgical_marl.physics.rows import row_of, stored
 from surgical_marl.physics.search import Search
-from surgical_marl.physics.solver import Rows, row_forces, solve
+from surgical_marl.physics.solver import Rows, row_forces
 
 PASSES = 32
 """Evaluations of all forces in a step at most."""
-ITERATIONS = (6, 4)
-"""Newton steps for arms alone at most, and line search steps in each, while contacts are linear functions."""
 LEAST = 1e-9
 """Fall of the cost in a Newton step, N m/s2, after which none follows: that of a needle of 0.03 g whose acceleration
 changes by 0.006 m/s2."""
@@ -59,7 +58,7 @@ class Newton:
     """
 
     def __init__(self, dofs: np.ndarray, joints: int, objects: int) -> None:
-        self._dofs, self._objects = dofs, objects
+        self._dofs, self._objects, self._arms = dofs, objects, Arms(dofs, joints)
         self._own = [np.flatnonzero(row < joints) for row in dofs]
 
     def twist(self, contact: Contact, arms: Array, objects: Array) -> Array:
@@ -229,38 +228,39 @@ class Newton:
     def _direction(self, problem: Problem, here: Point, excess: Point, local: _Local, stiff: Array) -> Point:
         """Return the way to the least cost if contacts are linear functions; friction and limits of joints are not.
 
-        Objects are eliminated, arms solved (`solver.py`), and objects found from them.
+        Objects are eliminated, arms solved, each alone if nothing joins them, and objects found from them.
         """
-        n = len(excess.arms)
+        a, m = self._dofs.shape
+        touched = self._touched(problem)
 
-        def eliminate(arms: tuple[Array, Array], row: Any) -> tuple[tuple[Array, Array], Any]:
+        def eliminate(_: None, row: Any) -> tuple[None, Any]:
             own, force, coupling, coupled = row
             factor = jax.lax.linalg.cholesky(own, symmetrize_input=False)
             half = triangular_solve(factor, force[:, None], left_side=True, lower=True)[:, 0]
 
-            def on_arms(arms: tuple[Array, Array]) -> tuple[tuple[Array, Array], Array]:
-                wide = jnp.zeros((6, n))
-                for arm, joints in enumerate(self._own):
-                    wide = wide.at[:, self._dofs[arm, joints]].set(coupling[arm][:, joints])
+            def on_arms(coupling: Array) -> Array:
+                wide = jnp.moveaxis(coupling, 0, 1).reshape(6, a * m)
                 wide = triangular_solve(factor, wide, left_side=True, lower=True)
-                return (arms[0] - wide.T @ wide, arms[1] - wide.T @ half), wide
+                return jnp.moveaxis(wide.reshape(6, a, m), 1, 0)
 
-            alone = lambda arms: (arms, jnp.zeros((6, n)))  # noqa: E731
-            arms, wide = jax.lax.cond(coupled, on_arms, alone, arms) if n else alone(arms)
-            return arms, (factor, half, wide, coupled)
+            wide = jax.lax.cond(coupled, on_arms, jnp.zeros_like, coupling) if a else coupling
+            return None, (factor, half, wide)
 
         def back(row: Any) -> Array:
             factor, half, wide, coupled = row
-            left = jax.lax.cond(coupled, lambda half: half - wide @ found, lambda half: half, half) if n else half
+            arms = lambda half: half - jnp.einsum("acm,am->c", wide, by_arm)  # noqa: E731
+            left = jax.lax.cond(coupled, arms, lambda half: half, half) if a else half
             return triangular_solve(factor, left[:, None], left_side=True, lower=True, transpose_a=True)[:, 0]
 
-        rows = local.object, local.excess, local.coupling, self._coupled(problem)
-        (stiff, force), kept = jax.lax.scan(eliminate, (stiff, excess.arms), rows)
-        found = force
-        if n:
-            smooth = stiff @ here.arms + force
-            found = solve(stiff, smooth, problem.rows, here.arms, *ITERATIONS, steady=1)[0] - here.arms
-        return Point(found, jax.lax.map(back, kept))
+        rows = local.object, local.excess, local.coupling, touched.any(1)
+        _, kept = jax.lax.scan(eliminate, None, rows)
+        found = excess.arms
+        if a:
+            left = Reduced(stiff, excess.arms, here.arms, problem.rows, problem.joints, kept[1], kept[2], touched)
+            joined = (touched.sum(1) > 1).any() | self._sides(problem, here.arms).any()
+            found = jax.lax.cond(joined, self._arms.together, self._arms.each, left) if a > 1 else self._arms.each(left)
+        by_arm = self.by_arm(found)
+        return Point(found, jax.lax.map(back, (*kept, rows[3])))
 
     def _growth(self, problem: Problem, here: Point, way: Point, local: _Local, stiff: Array) -> Array:
         """Return by how much the slope of the cost along a way grows per length of it, []."""
@@ -274,11 +274,12 @@ class Newton:
         joined = jnp.einsum("kacm,am->kc", local.coupling, self.by_arm(way.arms))
         return total + 2 * jnp.sum(way.objects * joined)
 
-    def _coupled(self, problem: Problem) -> Array:
-        """Return which objects touch an arm, [k]."""
+    def _touched(self, problem: Problem) -> Array:
+        """Return which objects touch which arms, [k, a]."""
         contacts = problem.contacts
-        on_arm = (contacts.arm < len(self._dofs)) & (np.arange(len(contacts.arm)) < problem.total)
-        return (on_arm & (contacts.first == np.arange(self._objects)[:, None])).any(1)
+        there = jnp.arange(len(contacts.arm)) < problem.total
+        first = there & (contacts.first == np.arange(self._objects)[:, None])
+        return (first[:, None] & (contacts.arm == np.arange(len(self._dofs))[:, None])).any(-1)
 
 
 def _with_none(each: Array) -> Array:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from surgical_marl.physics.cone import Cone
-from surgical_marl.physics.solver import Rows
+from surgical_marl.physics.solver import JointRows, Rows
 
 
 class Contact(NamedTuple):
@@ -36,6 +36,8 @@ class Problem(NamedTuple):
     """Sum of all other forces on the arms, [n]."""
     rows: Rows
     """Friction and limits of joints."""
+    joints: JointRows
+    """The same by joint."""
     between: Rows
     """Contacts of arms with arms."""
     masses: Array

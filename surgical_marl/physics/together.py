@@ -21,7 +21,7 @@ from surgical_marl.physics.handling import DWELL, Grips, Handling
 from surgical_marl.physics.newton import Newton
 from surgical_marl.physics.placed import Joints
 from surgical_marl.physics.problem import Contact, Pressed, Problem
-from surgical_marl.physics.solver import Rows
+from surgical_marl.physics.solver import JointRows, Rows
 from surgical_marl.physics.tables import Tables
 from surgical_marl.physics.touching import Finder, Slots
 from surgical_marl.physics.views import Handled, ObjectView, Touch
@@ -155,16 +155,16 @@ class Together:
     def _solve_objects(self, masses: Array, free: Array, contacts: Contact, total: Array, start: Array) -> Array:
         """Return the accelerations [k, 6] of objects that touch no arm: one by one, if none touches another."""
         none, k = jnp.zeros(0), len(free)
-        rows = Rows(jnp.zeros((0, 0)), none, none, none, none)
+        rows, joints = Rows(jnp.zeros((0, 0)), none, none, none, none), JointRows(*[none] * len(JointRows._fields))
 
         def whole(contacts: Contact) -> Array:
-            problem = Problem(jnp.zeros((0, 0)), none, rows, rows, masses, free, contacts, total)
+            problem = Problem(jnp.zeros((0, 0)), none, rows, joints, rows, masses, free, contacts, total)
             return self._objects_alone.solve(problem, none, start).objects
 
         def single(row: tuple[Array, ...]) -> Array:
             number, mass, free, start = row
             own = contacts._replace(first=jnp.where(contacts.first == number, 0, 1))
-            problem = Problem(jnp.zeros((0, 0)), none, rows, rows, mass[None], free[None], own, total)
+            problem = Problem(jnp.zeros((0, 0)), none, rows, joints, rows, mass[None], free[None], own, total)
             return self._object_alone.solve(problem, none, start[None]).objects[0]
 
         def each(_: Contact) -> Array:
@@ -190,9 +190,16 @@ class Together:
         masses, free = self._free(bodies)
         between = self._between(dynamics, data, physics.qvel, overlap)
         problem = Problem(
-            forces.mass + dt * forces.damping, forces.smooth, forces.rows, between.rows, masses, free, felt.contacts,
-            slots.found,
-        )  # fmt: skip
+            mass=forces.mass + dt * forces.damping,
+            smooth=forces.smooth,
+            rows=forces.rows,
+            joints=dynamics.joint_rows(forces.rows),
+            between=between.rows,
+            masses=masses,
+            free=free,
+            contacts=felt.contacts,
+            total=slots.found,
+        )
         found = self._newton.solve(problem, physics.qacc_warmstart, bodies.acceleration)
         qvel = physics.qvel + dt * found.arms
         objects = moved(bodies, found.objects, dt)
