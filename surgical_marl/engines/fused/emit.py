@@ -19,7 +19,6 @@ from surgical_marl.engines.fused.schedule import Scheduler
 LARGE = 500
 """Least number of operations in a branch whose inputs are hidden from the compiler (`HIDEF`), or in a branch or a round
 of a loop that counts as work."""
-SYNC = False
 
 _CODE = {
     "add": "{}+{}", "sub": "{}-{}", "mul": "{}*{}", "neg": "-{}", "lt": "{}<{}", "le": "{}<={}", "gt": "{}>{}",
@@ -45,8 +44,6 @@ class Emitter(ArrayEmitter):
         self.stores, self.offsets = stores, table_offsets(graph)
         self.active: list[str] = []
         """Conditions of the code's branch: it applies to the environments of a vector for which all of them hold."""
-
-        self.uniform = True
 
     def body(self) -> str:
         self._postpone_stores()
@@ -81,8 +78,6 @@ class Emitter(ArrayEmitter):
                 result(index)
             else:
                 group = self.graph.groups[index]
-                if self.uniform and not self.vector and SYNC:
-                    self.lines.append("SYNC")
                 (self._branch if isinstance(group, Branch) else self._loop)(index, group)  # type: ignore[arg-type]
 
     def _store(self, k: int) -> None:
@@ -151,7 +146,6 @@ class Emitter(ArrayEmitter):
         The compiler takes these names for new values. Without new names it would compute before the branch what both
         sides need, which causes register spills.
         """
-        uniform, self.uniform = self.uniform, False
         self.active.append(condition)
         names, size = dict(self.names), sum(len(self.schedule.regions[r].items) for r in self.schedule.inside[number])
         if size >= LARGE and not self.vector:
@@ -164,7 +158,7 @@ class Emitter(ArrayEmitter):
                     self.lines.append(f"{kind} {hidden}={self._name(value)};HIDE{kind}({hidden})")
                     self.names[value] = hidden
         yield
-        self.names, self.uniform = names, uniform
+        self.names = names
         self.active.pop()
 
     def _loop(self, number: int, loop: Loop) -> None:
@@ -185,11 +179,10 @@ class Emitter(ArrayEmitter):
 
         active = self.active
         self.active = [f"m{number}"] if tested else active
-        uniform, self.uniform = self.uniform, self.uniform and not tested
         if tested:
             self._count(self.schedule.inside[number][0])
         self._region(self.schedule.inside[number][0], result)
-        self.active, self.uniform = active, uniform
+        self.active = active
         self._next(number, loop)
         self.lines.append("}")
         for k in self.schedule.alive[number]:

@@ -2,7 +2,8 @@
 
 A kernel works on five arrays whose columns are environments: `state` (float32) and `counts` (int32; uint32 by their
 bits) are read and written, `actions` (float32) read, `outs` (float32) and `flags` (uint8) written; and on two arrays of
-constants. On a GPU, thread k runs environment `order[k]`, and writes how much there was to do to `work`.
+constants. If there are large branches, thread k of a GPU runs environment `order[k]`, and writes how much it had to do
+to `work`.
 """
 
 from __future__ import annotations
@@ -24,32 +25,41 @@ from surgical_marl.runtime import cache_dir, prepare_warp
 wp = prepare_warp()
 
 BLOCK = 32
-"""Threads in a CUDA block."""
+"""Threads in a CUDA block: so few that few environments are spread over all multiprocessors."""
+WIDE, MANY = 128, 32768
+"""Threads in a block for code with large branches, from this number of environments on: they are near each other in the
+code, and so find its instructions in the cache."""
 
 _reals: Any = wp.array(dtype=wp.float32)
 _wholes: Any = wp.array(dtype=wp.int32)
 _bytes: Any = wp.array(dtype=wp.uint8)
 
 
-def compile_kernels(bodies: dict[str, str], device: str, max_registers: int | None = None) -> dict[str, Kernel]:
-    """Compile C function bodies into kernels by name, in one module.
+def sorts(bodies: dict[str, str]) -> bool:
+    """Return whether environments differ in how much they have to do: whether there are large branches."""
+    return any("WORK(" in body for body in bodies.values())
+
+
+def compile_kernels(
+    bodies: dict[str, str], device: str, num_envs: int = 0, max_registers: int | None = None
+) -> dict[str, Kernel]:
+    """Compile C function bodies into kernels by name, in one module, for about so many environments.
 
     Warp keeps compiled modules in its cache on disk.
     """
-    prelude = CUDA if device == "cuda" else CPU
+    cuda, ordered = device == "cuda", device == "cuda" and sorts(bodies)
+    block = WIDE if ordered and num_envs >= MANY else BLOCK if cuda else 1
+    prelude = CUDA if cuda else CPU
     sources = {name: f"{prelude}\n{body}\n{UNDEFINE}\n" for name, body in bodies.items()}
     digest = hashlib.sha256("\0".join(sources.values()).encode()).hexdigest()[:16]
     module = wp.get_module(f"surgical_marl_{digest}")
     # contraction: a * b + c is one rounding, as on a GPU
     module.options.update(enable_backward=False, cpu_compiler_flags="-march=native -ffp-contract=fast")
-    made = {
-        name: _make(f"{name}_{digest}", source, module, device == "cuda", max_registers)
-        for name, source in sources.items()
-    }
+    made = {name: _make(f"{name}_{digest}", source, module, ordered, max_registers) for name, source in sources.items()}
     # Warp itself does not protect a module from two processes that compile it at the same time
     with locked(cache_dir() / "kernels" / module.name), _checked(module.name):
-        module.load(wp.get_device(device), block_dim=BLOCK if device == "cuda" else 1)
-    return {name: Kernel(kernel, device) for name, kernel in made.items()}
+        module.load(wp.get_device(device), block_dim=block)
+    return {name: Kernel(kernel, device, block) for name, kernel in made.items()}
 
 
 @contextmanager
@@ -118,8 +128,8 @@ def _make(name: str, source: str, module: Any, ordered: bool, max_registers: int
 class Kernel:
     """One compiled function."""
 
-    def __init__(self, kernel: Any, device: str) -> None:
-        self._kernel, self._device = kernel, device
+    def __init__(self, kernel: Any, device: str, block: int) -> None:
+        self._kernel, self._device, self._block = kernel, device, block
 
     def launch(self, arrays: list[Any], stride: int, start: int, count: int) -> None:
         """Run the environments from `start` up to, but without, `start + count`.
@@ -134,7 +144,7 @@ class Kernel:
             dim=-(-count // lanes),
             inputs=[*arrays, stride, start, lanes],
             device=self._device,
-            block_dim=BLOCK if cuda else 1,
+            block_dim=self._block,
             stream=_torch_stream() if cuda else None,
         )
 

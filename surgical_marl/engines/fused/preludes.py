@@ -75,7 +75,6 @@ typedef float F; typedef int I; typedef unsigned int U; typedef bool B;
 #define HIDEU(x) asm volatile("":"+r"(x));
 #define WORK(n) work_+=n;
 #define WORKED (max((int)(__float_as_uint((F)work_)>>21)-508,0))
-#define SYNC __syncthreads();
 #define BITS(x) __float_as_uint(x)
 #define FLOAT(x) __uint_as_float(x)
 """
