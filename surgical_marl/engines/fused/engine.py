@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from surgical_marl.engines.fused.arrays import make_arrays
-from surgical_marl.engines.fused.kernel import compile_kernels, has_cuda, sorts
+from surgical_marl.engines.fused.kernel import compile_kernels, has_cuda, large_branches
 from surgical_marl.engines.fused.load import load_source
 from surgical_marl.engines.fused.order import Order
 from surgical_marl.engines.fused.preludes import LANES
@@ -57,7 +57,7 @@ class FusedEngine:
         self._arrays = make_arrays(self.device, self.source, self._filled_tables(), self._stride, num_envs)
         self._kernels = compile_kernels(self.source.bodies, self.device, num_envs)
         self._order: Order | None = None
-        if self.device == "cuda" and sorts(self.source.bodies):
+        if self.device == "cuda" and large_branches(self.source.bodies):
             self._order = Order(self._arrays.order[:num_envs], self._arrays.work[:num_envs], env.decimation)
         vectors = self._stride // LANES
         shares = min(cores(), max(1, num_envs // LEAST_SHARE)) if self.device == "cpu" else 1

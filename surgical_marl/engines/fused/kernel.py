@@ -26,18 +26,18 @@ wp = prepare_warp()
 
 BLOCK = 32
 """Threads in a CUDA block: so few that few environments are spread over all multiprocessors."""
-WIDE, MANY = 128, 32768
-"""Threads in a block for code with large branches, from this number of environments on: they are near each other in the
-code, and so find its instructions in the cache."""
+WIDE, MANY, BRANCHES = 128, 32768, 8
+"""Threads in a block for many environments and at least so many large branches, in long code: threads of a block are near
+each other in it, and so find its instructions in the cache."""
 
 _reals: Any = wp.array(dtype=wp.float32)
 _wholes: Any = wp.array(dtype=wp.int32)
 _bytes: Any = wp.array(dtype=wp.uint8)
 
 
-def sorts(bodies: dict[str, str]) -> bool:
-    """Return whether environments differ in how much they have to do: whether there are large branches."""
-    return any("WORK(" in body for body in bodies.values())
+def large_branches(bodies: dict[str, str]) -> int:
+    """Return in how many places environments differ in how much they have to do."""
+    return sum(body.count("WORK(") for body in bodies.values())
 
 
 def compile_kernels(
@@ -47,8 +47,9 @@ def compile_kernels(
 
     Warp keeps compiled modules in its cache on disk.
     """
-    cuda, ordered = device == "cuda", device == "cuda" and sorts(bodies)
-    block = WIDE if ordered and num_envs >= MANY else BLOCK if cuda else 1
+    cuda, branches = device == "cuda", large_branches(bodies)
+    ordered = cuda and branches > 0
+    block = WIDE if cuda and branches >= BRANCHES and num_envs >= MANY else BLOCK if cuda else 1
     prelude = CUDA if cuda else CPU
     sources = {name: f"{prelude}\n{body}\n{UNDEFINE}\n" for name, body in bodies.items()}
     digest = hashlib.sha256("\0".join(sources.values()).encode()).hexdigest()[:16]
