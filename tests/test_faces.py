@@ -22,6 +22,7 @@ from rsl_rl.runners import OnPolicyRunner
 import surgical_marl as sm
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.interfaces.rsl_rl import RslRlVecEnv
+from tests.helpers.scenes import APART
 
 STEPS = 6
 CONTROLS = ("position", "velocity", "torque")
@@ -104,7 +105,7 @@ def test_wrappers_find_random_numbers_that_a_seed_begins_anew() -> None:
 
 @pytest.mark.parametrize("form", [{}, {"num_envs": 2}, {"num_envs": 2, "arrays": "torch"}])
 def test_spaces_are_there_as_dicts_too(form: dict[str, Any]) -> None:
-    env = sm.parallel_env("reach", scene="trimanual_psm_ecm", **form)
+    env = sm.parallel_env("reach", scene=APART, **form)
     for spaces, space in ((env.observation_spaces, env.observation_space), (env.action_spaces, env.action_space)):
         assert list(spaces) == env.possible_agents
         assert all(spaces[agent] is space(agent) for agent in spaces)
@@ -135,7 +136,7 @@ def test_after_an_episode_no_agents_do_nothing() -> None:
 
 def test_black_death_and_padding_make_arms_of_different_kinds_alike() -> None:
     supersuit = pytest.importorskip("supersuit")
-    env = sm.parallel_env("reach", scene="trimanual_psm_ecm", max_steps=STEPS)
+    env = sm.parallel_env("reach", scene=APART, max_steps=STEPS)
     env = supersuit.black_death_v3(supersuit.pad_action_space_v0(supersuit.pad_observations_v0(env)))
     many = supersuit.concat_vec_envs_v1(supersuit.pettingzoo_env_to_vec_env_v1(env), 2, num_cpus=0)
     many.reset(seed=0)
@@ -227,7 +228,7 @@ def test_one_seed_and_the_same_actions_give_the_same_numbers_through_every_face(
     np.testing.assert_array_equal(found, expected)
 
 
-@pytest.mark.parametrize("scene", ["psm", "trimanual_psm_ecm"])
+@pytest.mark.parametrize("scene", ["psm", APART])
 def test_rsl_rls_own_runner_trains_untouched(scene: str) -> None:
     batch = BatchedEnv("reach", scene, num_envs=8, max_steps=STEPS, arrays="torch", engine="fused")
     env = RslRlVecEnv(batch, seed=0)
