@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import itertools
+import subprocess
 import sys
 import threading
 import weakref
@@ -286,6 +287,37 @@ def test_environments_leave_nothing_behind(task: str, scene: str, options: dict[
     for thread in started:  # one that is on its way out may take a moment
         thread.join(10)
     assert not any(thread.is_alive() for thread in started)
+
+
+MANY = """
+import resource, sys, threading
+import numpy as np
+import surgical_marl as sm
+task, scene, count = sys.argv[1], sys.argv[2], int(sys.argv[3])
+for number in range(count):
+    if number == count // 5:
+        first, threads = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, threading.active_count()
+    env = sm.parallel_env(task, scene=scene, engine="fused", device="cpu")
+    env.reset(seed=number)
+    env.step({agent: np.zeros(env.action_space(agent).shape) for agent in env.agents})
+    env.close()
+print(first / 1024, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, threads, threading.active_count())
+"""
+"""Prints the peak of memory, MiB, after a fifth of the environments and after all; then the threads at both times."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("task", "scene", "count"), [("reach", "psm", 1000), ("match_image", "ecm", 200)])
+def test_a_thousand_environments_leave_neither_memory_nor_threads(task: str, scene: str, count: int) -> None:
+    def run(count: int) -> list[float]:
+        command = [sys.executable, "-c", MANY, task, scene, str(count)]
+        return [float(word) for word in subprocess.run(command, capture_output=True, check=True).stdout.split()]
+
+    run(5)  # to compile takes more memory than environments could leave
+    first, last, before, after = run(count)
+    print(f"{task}: {first:.0f} MiB after {count // 5} environments, {last:.0f} after {count}")
+    assert last - first < 20
+    assert before == after
 
 
 def test_without_torchrl_its_face_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
