@@ -9,10 +9,19 @@ from typing import Any
 
 import numpy as np
 import yaml
+from yaml.composer import Composer
+
+# The scanner in C, where PyYAML has it, reads a file in a sixth of the time. Nodes are composed in Python: in C, deeply
+# nested brackets crash the process.
+_BASES = (Composer, yaml.CSafeLoader) if yaml.__with_libyaml__ else (yaml.SafeLoader,)
 
 
-class _Loader(yaml.SafeLoader):
-    """PyYAML's safe loader without aliases. The one in C is faster, but deeply nested brackets crash the process."""
+class _Loader(*_BASES):  # type: ignore[misc]
+    """PyYAML's safe loader without aliases."""
+
+    def __init__(self, text: str) -> None:
+        Composer.__init__(self)
+        _BASES[-1].__init__(self, text)
 
     def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
         if self.check_event(yaml.AliasEvent):

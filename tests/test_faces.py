@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import itertools
+import subprocess
 import sys
 import threading
 import weakref
@@ -22,6 +23,7 @@ from rsl_rl.runners import OnPolicyRunner
 import surgical_marl as sm
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.interfaces.rsl_rl import RslRlVecEnv
+from tests.helpers.scenes import APART
 
 STEPS = 6
 CONTROLS = ("position", "velocity", "torque")
@@ -104,7 +106,7 @@ def test_wrappers_find_random_numbers_that_a_seed_begins_anew() -> None:
 
 @pytest.mark.parametrize("form", [{}, {"num_envs": 2}, {"num_envs": 2, "arrays": "torch"}])
 def test_spaces_are_there_as_dicts_too(form: dict[str, Any]) -> None:
-    env = sm.parallel_env("reach", scene="trimanual_psm_ecm", **form)
+    env = sm.parallel_env("reach", scene=APART, **form)
     for spaces, space in ((env.observation_spaces, env.observation_space), (env.action_spaces, env.action_space)):
         assert list(spaces) == env.possible_agents
         assert all(spaces[agent] is space(agent) for agent in spaces)
@@ -135,7 +137,7 @@ def test_after_an_episode_no_agents_do_nothing() -> None:
 
 def test_black_death_and_padding_make_arms_of_different_kinds_alike() -> None:
     supersuit = pytest.importorskip("supersuit")
-    env = sm.parallel_env("reach", scene="trimanual_psm_ecm", max_steps=STEPS)
+    env = sm.parallel_env("reach", scene=APART, max_steps=STEPS)
     env = supersuit.black_death_v3(supersuit.pad_action_space_v0(supersuit.pad_observations_v0(env)))
     many = supersuit.concat_vec_envs_v1(supersuit.pettingzoo_env_to_vec_env_v1(env), 2, num_cpus=0)
     many.reset(seed=0)
@@ -227,7 +229,7 @@ def test_one_seed_and_the_same_actions_give_the_same_numbers_through_every_face(
     np.testing.assert_array_equal(found, expected)
 
 
-@pytest.mark.parametrize("scene", ["psm", "trimanual_psm_ecm"])
+@pytest.mark.parametrize("scene", ["psm", APART])
 def test_rsl_rls_own_runner_trains_untouched(scene: str) -> None:
     batch = BatchedEnv("reach", scene, num_envs=8, max_steps=STEPS, arrays="torch", engine="fused")
     env = RslRlVecEnv(batch, seed=0)
@@ -285,6 +287,37 @@ def test_environments_leave_nothing_behind(task: str, scene: str, options: dict[
     for thread in started:  # one that is on its way out may take a moment
         thread.join(10)
     assert not any(thread.is_alive() for thread in started)
+
+
+MANY = """
+import resource, sys, threading
+import numpy as np
+import surgical_marl as sm
+task, scene, count = sys.argv[1], sys.argv[2], int(sys.argv[3])
+for number in range(count):
+    if number == count // 5:
+        first, threads = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, threading.active_count()
+    env = sm.parallel_env(task, scene=scene, engine="fused", device="cpu")
+    env.reset(seed=number)
+    env.step({agent: np.zeros(env.action_space(agent).shape) for agent in env.agents})
+    env.close()
+print(first / 1024, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, threads, threading.active_count())
+"""
+"""Prints the peak of memory, MiB, after a fifth of the environments and after all; then the threads at both times."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("task", "scene", "count"), [("reach", "psm", 1000), ("match_image", "ecm", 200)])
+def test_a_thousand_environments_leave_neither_memory_nor_threads(task: str, scene: str, count: int) -> None:
+    def run(count: int) -> list[float]:
+        command = [sys.executable, "-c", MANY, task, scene, str(count)]
+        return [float(word) for word in subprocess.run(command, capture_output=True, check=True).stdout.split()]
+
+    run(5)  # to compile takes more memory than environments could leave
+    first, last, before, after = run(count)
+    print(f"{task}: {first:.0f} MiB after {count // 5} environments, {last:.0f} after {count}")
+    assert last - first < 20
+    assert before == after
 
 
 def test_without_torchrl_its_face_says_so(monkeypatch: pytest.MonkeyPatch) -> None:

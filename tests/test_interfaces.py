@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -16,10 +15,9 @@ from gymnasium.vector import AutoresetMode
 from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test
 
 import surgical_marl as sm
+from tests.helpers.scenes import APART
 
 SCENES = ("psm", "bimanual_psm")
-UNSORTED = str(Path(__file__).parent / "example_plugin" / "example_plugin" / "scenes" / "psm_watched.yaml")
-"""A scene whose agents stand in no order of their names."""
 STEPS = 12
 
 
@@ -137,7 +135,7 @@ def test_gymnasium_accepts_it_without_a_warning(scene: str) -> None:
         check_env(env.unwrapped)
 
 
-@pytest.mark.parametrize("scene", [*SCENES, UNSORTED])
+@pytest.mark.parametrize("scene", [*SCENES, APART])
 def test_both_faces_show_the_same_numbers(scene: str) -> None:
     joint = gymnasium.make("surgical_marl/Reach-v0", scene=scene, max_steps=STEPS)
     team, rng = make(scene), np.random.default_rng(0)

@@ -12,6 +12,7 @@ import pytest
 import surgical_marl as sm
 from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.tasks.base.task import TipTask
+from tests.helpers.scenes import APART
 
 STEPS = 4
 CLOSE = {"atol": 2e-4, "rtol": 1e-4}
@@ -90,8 +91,8 @@ def test_a_scan_under_jit_steps_alike() -> None:
 
 
 def test_spaces_are_pytrees() -> None:
-    env = make("trimanual_psm_ecm")
-    team: Any = sm.parallel_env("reach", scene="trimanual_psm_ecm")
+    env = make(APART)
+    team: Any = sm.parallel_env("reach", scene=APART)
     sample = jax.jit(lambda space, key: space.sample(key))
     for agent in env.agents:
         for own, other in (

@@ -16,7 +16,7 @@ from surgical_marl.scenes.objects import JAW
 from surgical_marl.scenes.placing import scenes_without_objects
 from surgical_marl.scenes.scene import Scene
 
-WITH_OBJECTS = [name for name in sm.list_scenes() if name not in scenes_without_objects()]
+WITH_OBJECTS = sorted({*sm.list_scenes()} - {*scenes_without_objects()})
 
 
 def written(scene: Scene) -> mujoco.MjModel:

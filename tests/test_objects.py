@@ -25,7 +25,7 @@ from surgical_marl.vision.endoscope import Endoscope
 PAGE = (Path(__file__).parents[1] / "docs" / "your_own_object.md").read_text()
 FILE, SCENE = re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)
 (CODE,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
-WITH_OBJECTS = [name for name in sm.list_scenes() if name not in scenes_without_objects()]
+WITH_OBJECTS = sorted({*sm.list_scenes()} - {*scenes_without_objects()})
 FREE = [name for name in sm.list_objects() if load_object(name).free]
 
 

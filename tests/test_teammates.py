@@ -15,6 +15,7 @@ from gymnasium.utils.env_checker import check_env
 import surgical_marl as sm
 from surgical_marl.policies.oracle import oracle
 from surgical_marl.policies.policy import load_policy
+from tests.helpers.scenes import APART
 
 REACH = "surgical_marl/Reach-v0"
 SHIPPED = "reach-bimanual_psm"
@@ -118,8 +119,8 @@ def test_teammates_forget_where_episodes_begin() -> None:
 
 
 def test_without_an_agent_the_arms_that_have_no_teammate_are_one() -> None:
-    env = make({"ecm_0": "frozen"}, agent=None, scene="trimanual_psm_ecm")
-    team = sm.parallel_env("reach", scene="trimanual_psm_ecm", max_steps=STEPS, device="cpu")
+    env = make({"ecm_0": "frozen"}, agent=None, scene=APART)
+    team = sm.parallel_env("reach", scene=APART, max_steps=STEPS, device="cpu")
     assert env.action_space.shape == (14,)
     observation, observations = env.reset(seed=1)[0], team.reset(seed=1)[0]
     np.testing.assert_array_equal(observation, np.concatenate([observations["psm_0"], observations["psm_1"]]))

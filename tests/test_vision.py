@@ -18,6 +18,7 @@ from surgical_marl.policies.layout import Layout
 from surgical_marl.policies.policy import load_policy, random_policy, zero_policy
 from surgical_marl.runs.settings import Settings, load_config
 from surgical_marl.scenes.load import load_scene
+from tests.helpers.scenes import WATCHED
 
 SMALL = [
     "num_envs=8",
@@ -39,7 +40,7 @@ def made(scene: str, arrays: str = "torch") -> BatchedEnv:
 
 @pytest.mark.parametrize("grouping, seer", [("type", "ecm"), ("agent", "ecm_0"), ("joint", "joint")])
 def test_networks_are_shown_both_pictures_channels_first(grouping: Any, seer: str) -> None:
-    env = made("trimanual_psm_ecm")
+    env = made(WATCHED)
     observations, *_ = env.reset(0)
     layout = Layout(env, grouping)
     groups = layout.stack(observations)

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from surgical_marl.engines.fused.operations import COMMUTATIVE, DTYPES, FOLD, KINDS, RESULT, combined_bounds
+from surgical_marl.engines.fused.operations import COMMUTATIVE, DTYPES, FOLD, KIND_OF, RESULT, combined_bounds
 
 Value = int
 
@@ -77,16 +77,17 @@ class Graph:
 
     def constant(self, value: Any) -> Value:
         """Return the constant of a numpy scalar."""
-        kind = KINDS[value.dtype.name]
-        key = (kind, "nan" if value != value else value.item() if value != 0 else 0)  # -0 is 0
+        kind = KIND_OF[value.dtype]
+        number = value.item()
+        key = (kind, "nan" if number != number else number or 0)  # -0 is 0
         found = self._constant_ids.get(key)
         if found is None:
             found = self._constant_ids[key] = ~len(self.constants)
-            self.constants.append(value if value != 0 else DTYPES[kind](0))
+            self.constants.append(value if number else DTYPES[kind](0))
         return found
 
     def kind(self, value: Value) -> str:
-        return self.kinds[value] if value >= 0 else KINDS[self.constants[~value].dtype.name]
+        return self.kinds[value] if value >= 0 else KIND_OF[self.constants[~value].dtype]
 
     def node(self, op: str, *args: Any, kind: str) -> Value:
         """Return a node as it is, not simplified; equal nodes are shared."""
@@ -319,7 +320,7 @@ class Graph:
         table = self.tables[number]
         if index < 0 and number not in self.inputs:
             return self.constant(table[int(self.constants[~index])])
-        return self.node("lookup", number, index, kind=KINDS[table.dtype.name])
+        return self.node("lookup", number, index, kind=KIND_OF[table.dtype])
 
     def dtype(self, value: Value) -> type:
         """Return the numpy type of a value."""

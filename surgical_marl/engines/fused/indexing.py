@@ -15,7 +15,7 @@ import numpy as np
 
 from surgical_marl.engines.fused.graph import Graph, Value
 from surgical_marl.engines.fused.memory import depth, pack, unpack, view
-from surgical_marl.engines.fused.operations import KINDS
+from surgical_marl.engines.fused.operations import KIND_OF
 from surgical_marl.engines.fused.scalars import convert
 from surgical_marl.engines.fused.traced import Symbolic, Table, Traced, lift
 
@@ -167,7 +167,7 @@ def _choose(
 
 def look_up(g: Graph, operand: np.ndarray | Table, fixed: list[int], moving: dict[int, Value]) -> Value:
     """Return the element of a table at the places `fixed`, plus the values `moving` on some axes."""
-    kind = KINDS[operand.dtype.name]
+    kind = KIND_OF[operand.dtype]
     if isinstance(operand, Table):
         number = operand.number
     else:

@@ -10,6 +10,8 @@ import numpy as np
 
 KINDS = {"float32": "f", "int32": "i", "uint32": "u", "bool": "b"}
 DTYPES = {kind: np.dtype(name).type for name, kind in KINDS.items()}
+KIND_OF = {np.dtype(name): kind for name, kind in KINDS.items()}
+"""By dtype: a dtype's name is written anew, in Python, each time it is asked for."""
 
 COMMUTATIVE = {"add", "mul", "min", "max", "and", "or", "xor", "eq", "ne"}
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from surgical_marl.engines.fused.graph import Graph, Value
-from surgical_marl.engines.fused.operations import DTYPES, KINDS
+from surgical_marl.engines.fused.operations import DTYPES, KIND_OF
 
 
 class Symbolic:
@@ -57,10 +57,10 @@ def kind_of(dtype: Any) -> str:
     Raises:
         Unsupported: there is no kind for this dtype.
     """
-    name = np.dtype(dtype).name
-    if name not in KINDS:
-        raise Unsupported(f"arrays of {name}")
-    return KINDS[name]
+    dtype = np.dtype(dtype)
+    if dtype not in KIND_OF:
+        raise Unsupported(f"arrays of {dtype.name}")
+    return KIND_OF[dtype]
 
 
 def dtype_of(graph: Graph, array: Traced | Table) -> Any:
@@ -92,6 +92,7 @@ def lower(graph: Graph, ids: np.ndarray, dtype: Any) -> Traced:
 
 def each(function: Callable[..., Value], g: Graph, shape: tuple[int, ...], *arrays: Traced) -> Symbolic:
     """`function(graph, *values)` of the elements, which are broadcast to `shape`."""
-    columns = [np.broadcast_to(lift(g, array), shape).ravel().tolist() for array in arrays]
+    lifted = [lift(g, array) for array in arrays]
+    columns = [(x if x.shape == shape else np.broadcast_to(x, shape)).ravel().tolist() for x in lifted]
     flat = [function(g, *elements) for elements in zip(*columns, strict=True)]
     return Symbolic(np.array(flat, np.int32).reshape(shape))
