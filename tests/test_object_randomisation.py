@@ -141,7 +141,7 @@ def test_both_engines_step_varied_objects_alike(tmp_path: Path) -> None:
     now = now._replace(objects=now.objects._replace(bodies=bodies), ctrl=np.array(now.ctrl) - 0.03)
     for k in range(16):
         now = both.step(now, compared=k % 5 == 0)
-    assert (now.objects.grips.force.max((1, 2)) > 1.0).mean() > 0.5
+    assert (now.objects.grips.force.max((1, 2)) > 1.0).mean() > 0.25
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,8 @@ from surgical_marl.cli.flags import whole
 from surgical_marl.studies.command import make_parser, run
 from surgical_marl.studies.shaking import CHUNK, CLOSING, OBJECTS, Grasps, Seen
 
+SLIP, TURN = 2e-4, np.radians(1.0)
+"""An object that has moved or turned further than this in a jaw has slipped, m and rad."""
 LOST = 2e-3
 """An object that has moved this far in a jaw counts as dropped, m."""
 BATCH = 250
@@ -27,6 +29,7 @@ COLUMNS = {
     "grasps": "grasps",
     "struck": "struck",
     "dropped": "dropped, of these struck",
+    "slipped": "slipped",
     "slip_mm": "slip: 95 %, worst (mm)",
     "turn_deg": "turn: 95 %, worst (degrees)",
     "overlap_mm": "deepest overlap (mm)",
@@ -70,7 +73,7 @@ def hold(name: str, arms: int, count: int, seconds: float, first: int = 0, share
 
 
 def figures(name: str, arms: int, held: Held) -> dict[str, object]:
-    """Return the figures of an object. Slip and turn are those of grasps that were neither dropped nor struck.
+    """Return the figures of an object. Slips and turns are those of grasps that were neither dropped nor struck.
 
     Raises:
         ValueError: there is no such grasp.
@@ -85,6 +88,7 @@ def figures(name: str, arms: int, held: Held) -> dict[str, object]:
         "grasps": len(kept),
         "struck": int(held.struck.sum()),
         "dropped": [int(held.dropped.sum()), int((held.dropped & held.struck).sum())],
+        "slipped": int(((held.slip > SLIP) | (held.turn > TURN))[kept].sum()),
         "slip_mm": spread(1000 * held.slip, 4),
         "turn_deg": spread(np.degrees(held.turn), 3),
         "overlap_mm": round(1000 * float(held.overlap.max()), 4),
