@@ -13,6 +13,7 @@ import yaml
 
 from surgical_marl.bench.grasping import grasps
 from surgical_marl.content import find
+from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.physics.plant import Hidden, Plant
 from surgical_marl.physics.simulator import Simulator
 from surgical_marl.physics.tables import Tables
@@ -157,3 +158,14 @@ def test_a_wrong_range_is_one_sentence(tmp_path: Path, wrong: str, words: str) -
     with pytest.raises(ValueError, match=words) as error:
         load_scene(scene_file(tmp_path, wrong))
     assert "\n" not in str(error.value)
+
+
+def test_poses_of_environments_are_those_of_objects_of_their_size(tmp_path: Path) -> None:
+    """`object_poses` is where the frames of needles are that lie on the pad, whatever their centres of mass."""
+    env = BatchedEnv("reach", scene_file(tmp_path, "{object_size: 0.3}"), num_envs=4, engine="mjx")
+    env.reset(0)
+    size, place = env.carry()[".hidden.objects.size"][:, 0], env.scene.objects["needle"]
+    height = place.position[2] + (size - 1) * place.object.shapes[0].size[0]
+    expected = np.stack([*np.tile(place.position[:2, None], (1, 4)), height], 1)
+    assert np.ptp(size) > 0.01
+    np.testing.assert_allclose(env.object_poses.origin[:, 0], expected, atol=1e-6)
