@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
 
@@ -14,7 +15,7 @@ import pytest
 import surgical_marl as sm
 from surgical_marl.physics import together
 from surgical_marl.physics.simulator import Simulator
-from surgical_marl.studies.grasping import CHUNK, CLOSING, Grasps
+from surgical_marl.studies.shaking import CLOSING, Grasps
 
 STEPS = 240
 FRICTIONS = (0.12, 0.18, 0.25)
@@ -44,13 +45,11 @@ def test_a_held_object_breaks_away_at_the_force_that_coulomb_says(tmp_path: Path
     assert jaw.simulator._objects
     tables = jaw.simulator._objects.tables
     mass, fingers, pads = float(tables.masses.mass[0]), tables.bodies["pads"], tables.pad_geoms
-    closing = np.zeros((len(held), CLOSING * CHUNK, 7), np.float32)
-    closing[..., -1] = -1
-    physics, _ = jaw.play(jaw.begin(held, seed=3), closing, held)
+    physics, _ = jaw.play(jaw.begin(held, seed=3), jaw.still(len(held), CLOSING), held)
 
     def frame(physics: Any) -> tuple[Any, Any, Any]:
         """Return the way out of the jaw, how far out the object is, and how far the pads' normals point that way."""
-        data = jaw._dynamics.pose(physics.qpos)
+        data = jaw.simulator._together.pose(physics.qpos)
         out = -data.xmat[fingers][:, :, 2].sum(0)
         out /= jnp.linalg.norm(out)
         lean = jnp.abs(data.geom_xmat[pads][:, :, 0] @ out)  # they are thinnest in x
@@ -99,9 +98,22 @@ def test_a_finger_pressed_on_something_stops_there(
         physics, _, views = simulator.advance(simulator.command(physics, {"psm_0": down}))
         return physics, (
             objects.depths(physics)[on_arm].max(),
-            views["psm_0"].contact_force,
+            views["psm_0"].bump_force,
             jnp.abs(physics.qvel).max(),
         )
 
     _, (depth, force, speed) = jax.jit(lambda physics: jax.lax.scan(step, physics, None, length=75))(simulator.home)
     assert depth.max() < most and force[-1] > 4 and speed[-1] < 1e-2, (depth.max(), force[-1], speed[-1])
+
+
+def test_a_grip_is_no_bump() -> None:
+    """The force of a finger on a needle counts in `contact_force` alone, that of another part of the arm in both."""
+    together = Simulator(sm.load_scene("psm_needle"))._objects
+    assert together
+    tables, ours = together.tables, together.tables.owner < together.tables.arms
+    bump = int(np.flatnonzero(ours & (tables.finger == len(tables.fingers)))[0])
+    number = jnp.array([tables.grip[0, 0], tables.grip[0, 1], bump])
+    for total, expected in ((2, [[20.0], [0.0]]), (3, [[20.0], [3.0]])):
+        slots: Any = SimpleNamespace(number=number, total=total)
+        pressed: Any = SimpleNamespace(normal=jnp.array([20.0, 19.0, 3.0]))
+        np.testing.assert_array_equal(together._hardest(slots, pressed), expected)

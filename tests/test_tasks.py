@@ -199,7 +199,7 @@ def test_the_settings_list_every_weight_as_the_task_has_it(task: str) -> None:
 
 def test_each_cost_counts_one_broken_limit() -> None:
     arm = load_arm("psm")
-    fine = {"qpos": arm.home, "min_distance": np.inf, "contact_force": 0.0}
+    fine = {"qpos": arm.home, "min_distance": np.inf, "bump_force": 0.0}
 
     def broken(speed: float = 0.0, **change: Any) -> set[str]:
         view: Any = SimpleNamespace(**{**fine, **change})
@@ -207,11 +207,11 @@ def test_each_cost_counts_one_broken_limit() -> None:
 
     assert broken() == set()
     assert broken(min_distance=0.9 * safety.NEAR) == {"distance"}
-    assert broken(contact_force=1.1 * safety.FORCE) == {"force"}
+    assert broken(bump_force=1.1 * safety.FORCE) == {"force"}
     assert broken(speed=1.1 * safety.SPEED) == {"speed"}
     for joint, value in ((0, arm.upper[0]), (2, arm.lower[2])):
         assert broken(qpos=np.where(np.arange(7) == joint, value, arm.home)) == {"limit"}
-    assert broken(min_distance=0.0, contact_force=9.0) == {"distance", "force"}
+    assert broken(min_distance=0.0, bump_force=9.0) == {"distance", "force"}
 
 
 def test_the_tips_speed_is_what_it_moved() -> None:

@@ -27,13 +27,13 @@ class PhysicsAlone(Env):
 
     def reset(self, key: Array, episode: Array | int = 0, parameters: Any = None) -> State:
         """Return the state at home."""
-        carry = Carry(self.simulator.home, (), key, jnp.int32(episode), jnp.int32(0))
+        carry = Carry(self.simulator.home, (), key, jnp.int32(episode), jnp.int32(0), hidden=self.plant.start(key))
         return self._state(carry, carry.physics, self.simulator.home_contacts.distance)
 
     def step(self, carry: Carry, actions: dict[str, Array], parameters: Any = None) -> State:
         """Do one physics step; there are no actions."""
         _, distance = self.simulator._look(carry.physics.qpos)
-        physics, _ = self.simulator._step(carry.physics, self.simulator.untouched)
+        physics, _ = self.plant.actual(carry.hidden)._step(carry.physics, self.simulator.untouched)
         return self._state(carry, physics, distance)
 
     @property

@@ -22,8 +22,8 @@ NEAR = 0.005
 """Least distance between arms, m: half the clearance of targets (`workspace.CLEARANCE`), and the way that a tool at
 0.25 m/s moves in a control step."""
 FORCE = 1.0
-"""Greatest contact force, N. It is our own choice: more than that of a graze, which `collision` reports anyway, and
-less than that of an arm that pushes."""
+"""Greatest contact force but for a grip, N. It is our own choice: more than that of a graze, which `collision` reports
+anyway, and less than that of an arm that pushes."""
 LIMIT = 0.01
 """A joint that is this near to a limit, as a share of its range, is at the limit."""
 SPEED = 0.2
@@ -39,8 +39,8 @@ def costs(arm: Arm, view: ArmView, tip_speed: Array) -> dict[str, Array]:
         tip_speed: mean speed of its tool tip during the control step, m/s.
 
     Returns:
-        `distance` to another arm, contact `force`, a joint's `limit` (except the jaw's, because a closed jaw rests
-        there), tip `speed`.
+        `distance` to another arm, contact `force` (except that of a grip), a joint's `limit` (except the jaw's, because
+        a closed jaw rests there), tip `speed`.
     """
     moves = np.array([arm.jaw is None or joint.name != arm.jaw.joint for joint in arm.actuated])
     edge = LIMIT * (arm.upper - arm.lower)
@@ -48,7 +48,7 @@ def costs(arm: Arm, view: ArmView, tip_speed: Array) -> dict[str, Array]:
     q = view.qpos[np.flatnonzero(moves)]
     return {
         "distance": view.min_distance < NEAR,
-        "force": view.contact_force > FORCE,
+        "force": view.bump_force > FORCE,
         "limit": jnp.any((q < low) | (q > high)),
         "speed": tip_speed > SPEED,
     }

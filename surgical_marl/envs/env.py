@@ -241,7 +241,7 @@ class Env:
         task, _ = self._bound(parameters)
         carry, contacts, arms = self._start(task, key, jnp.int32(episode))
         observations, state = self._observe(task, carry, contacts, arms)
-        world = World(arms, carry.goal, self._unsensed(), self.simulator.objects(carry.physics))
+        world = World(arms, carry.goal, self._unsensed(), self.plant.objects(carry.physics, carry.hidden))
         nothing = jax.tree.map(jnp.zeros_like, task.reward_terms(world))
         return State(
             carry=carry,
@@ -278,7 +278,7 @@ class Env:
         task, max_steps = self._bound(parameters)
         carry, contacts = moved.carry, moved.contacts
         arms = {agent: moved.arms[agent] for agent in self.agents}  # JAX sorts them by name
-        world = World(arms, carry.goal, sensed, self.simulator.objects(carry.physics))
+        world = World(arms, carry.goal, sensed, self.plant.objects(carry.physics, carry.hidden))
         terms = task.rewards(world)
         carry = carry._replace(goal=task.remember(world))
         terminated = task.terminated(world)
@@ -327,7 +327,7 @@ class Env:
         if start.qpos is not None:
             contacts, arms = self.simulator.look(physics)
         tips = jnp.stack([view.tool_tip for view in arms.values()])
-        goal = task.remember(World(arms, start.goal, self._unsensed(), self.simulator.objects(physics)))
+        goal = task.remember(World(arms, start.goal, self._unsensed(), self.plant.objects(physics, hidden)))
         return Carry(physics, goal, key, episode, jnp.int32(0), tips, hidden), contacts, arms
 
     def _observe(
@@ -336,7 +336,7 @@ class Env:
         """Return what policies observe, and what critics observe, of arms that are as in `arms`."""
         noise = jax.random.fold_in(jax.random.fold_in(jax.random.fold_in(carry.key, carry.episode), NOISE), carry.steps)
         measured = self.plant.measure(carry.physics, carry.hidden, contacts, arms, noise)
-        world = World(measured, carry.goal, objects=self.simulator.objects(carry.physics))
+        world = World(measured, carry.goal, objects=self.plant.objects(carry.physics, carry.hidden))
         observations, every = {}, []
         for agent, seen in self.observed.items():
             observations[agent] = seen.read(task, world)

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
 STATE = ".physics.objects.bodies"
 """Where an engine has the centres of mass and the orientations of objects."""
+SIZE = ".hidden.objects.size"
+"""Where it has by what their lengths are multiplied, if the scene randomises objects."""
 HELD = ".physics.objects.grips.held"
 """Where it has for how long arms have held them."""
 
@@ -48,4 +50,6 @@ class FreeObjects:
         position, quaternion = (engine.read(f"{place}{STATE}.{part}", library) for part in ("position", "quaternion"))
         if library == "torch" and isinstance(self._centers, np.ndarray):
             self._centers = position.new_tensor(self._centers)  # once: it waits for the device
-        return frames(position, quaternion, self._centers)
+        if SIZE not in engine.carry_shapes:
+            return frames(position, quaternion, self._centers)
+        return frames(position, quaternion, engine.read(f"{place}{SIZE}", library)[..., None] * self._centers)

@@ -23,7 +23,8 @@ from jax import Array
 
 from surgical_marl.physics.bodies import product
 from surgical_marl.physics.simulator import Physics, Simulator
-from surgical_marl.physics.views import ArmView, Contacts
+from surgical_marl.physics.variation import Factors
+from surgical_marl.physics.views import ArmView, Contacts, ObjectView
 from surgical_marl.scenes.poses import Pose
 
 Views = dict[str, ArmView]
@@ -49,6 +50,8 @@ class Hidden(NamedTuple):
     """The newest commands of the motors, on the motors' side of the play, [nu]."""
     pending: Array
     """The last actions of all agents, newest first, [greatest latency, n]."""
+    objects: Factors | None = None
+    """Factors of the free objects; None if the scene randomises none of them."""
 
 
 class Plant:
@@ -91,7 +94,17 @@ class Plant:
             motor=(simulator.home if qpos is None else simulator.at(qpos)).ctrl
             + believed,  # so that the arms stay where they are
             pending=jnp.zeros((r.latency, sum(len(mount.arm.actuated) for mount in scene.mounts.values()))),
+            objects=self._factors(jax.random.fold_in(key, len(Hidden._fields))),
         )
+
+    def _factors(self, key: Array) -> Factors | None:
+        """Draw what free objects are like. If their mass isn't drawn, it grows with the cube of their size."""
+        r, count = self._ranges, len(self._simulator.scene.free_objects)
+        shares = np.array([r.object_size, r.object_mass, r.object_friction], np.float32)
+        if not (count and shares.any()):
+            return None
+        size, mass, friction = 1 + jax.random.uniform(key, (3, count), jnp.float32, -1.0, 1.0) * shares[:, None]
+        return Factors(size, mass if r.object_mass else size**3, friction)
 
     def place(self, key: Array, poses: Mapping[str, Pose]) -> Mapping[str, Pose]:
         """Return poses of free objects, shifted and turned about the vertical as far as the scene randomises them.
@@ -123,7 +136,7 @@ class Plant:
             qpos: joint positions [nq] of the whole scene; None for home.
             poses: of free objects by name. The others are where the scene places them.
         """
-        simulator = self._simulator
+        simulator = self.actual(hidden)
         physics = simulator.at(jnp.asarray(simulator.scene.home, jnp.float32) if qpos is None else qpos, poses)
         return physics if hidden is None else physics._replace(ctrl=hidden.motor)
 
@@ -150,12 +163,19 @@ class Plant:
 
     def advance(self, physics: Physics, hidden: Hidden | None) -> tuple[Physics, Contacts, Views]:
         """Advance physics by one control step, as `Simulator.advance` does, with the drawn values in place."""
-        simulator = self._simulator
-        if hidden is not None:
-            simulator = simulator.varied(
-                hidden.stiffness, hidden.damping, hidden.friction, hidden.payload, hidden.offset
-            )
-        return simulator.advance(physics)
+        return self.actual(hidden).advance(physics)
+
+    def objects(self, physics: Physics, hidden: Hidden | None) -> dict[str, ObjectView]:
+        """Return the true view of every free object, by name."""
+        return self.actual(hidden).objects(physics)
+
+    def actual(self, hidden: Hidden | None) -> Simulator:
+        """Return the simulator with the drawn values in place."""
+        if hidden is None:
+            return self._simulator
+        return self._simulator.varied(
+            hidden.stiffness, hidden.damping, hidden.friction, hidden.payload, hidden.offset, hidden.objects
+        )
 
     def measure(self, physics: Physics, hidden: Hidden | None, contacts: Contacts, views: Views, key: Array) -> Views:
         """Return the views as the encoders report them, for arms whose true views are `views`.

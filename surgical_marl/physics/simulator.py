@@ -24,6 +24,7 @@ from surgical_marl.physics.collision import Pairs
 from surgical_marl.physics.dynamics import Dynamics, Physics
 from surgical_marl.physics.solver import Rows, solve
 from surgical_marl.physics.together import Together
+from surgical_marl.physics.variation import Factors
 from surgical_marl.physics.views import ArmView, Contacts, ObjectView, Touch
 from surgical_marl.scenes.build import alone
 from surgical_marl.scenes.poses import Pose
@@ -170,14 +171,18 @@ class Simulator:
     def untouched(self) -> Touch:
         """Return the touch of a control step so far, at its beginning."""
         none = jnp.zeros(self._pairs.count, jnp.float32)
-        return Touch(none, none, jnp.zeros(len(self.scene.agents) if self._objects else 0, jnp.float32), jnp.int32(0))
+        arms = len(self.scene.agents) if self._objects else 0
+        return Touch(none, none, jnp.zeros((2, arms), jnp.float32), jnp.int32(0))
 
     def objects(self, physics: Physics) -> dict[str, ObjectView]:
         """Return the view of every free object of the scene, by name."""
         return self._objects.views(physics.objects) if self._objects else {}
 
-    def varied(self, stiffness: Array, damping: Array, friction: Array, payload: Array, offset: Array) -> Simulator:
-        """Return a copy of this simulator whose arms differ from their models.
+    def varied(
+        self, stiffness: Array, damping: Array, friction: Array, payload: Array, offset: Array,
+        objects: Factors | None = None,
+    ) -> Simulator:  # fmt: skip
+        """Return a copy of this simulator whose arms and objects differ from their models.
 
         Args:
             stiffness: factors of the stiffness of every actuator, [nu].
@@ -185,6 +190,7 @@ class Simulator:
             friction: factors of the friction of every joint, [nv].
             payload: masses at the tool tips, [arms], kg; used only if the scene has room for them.
             offset: by how much the controllers of joints misread their positions, [nq], rad or m.
+            objects: factors of the free objects; None if they are as in their files.
         """
         model, varied, nominal = self._together.model, copy.copy(self), self.scene.model
         by_position = nominal.actuator_biasprm[:, 1] != 0
@@ -202,6 +208,8 @@ class Simulator:
             "dof_damping": model.dof_damping * friction,
             "body_mass": model.body_mass.at[np.array(bodies, int)].set(payload[: len(bodies)]),
         }
+        if objects is not None and self._objects:
+            varied._objects = self._objects.varied(objects)
         return varied
 
     def look(self, physics: Physics) -> tuple[Contacts, dict[str, ArmView]]:
@@ -268,9 +276,10 @@ class Simulator:
             physics: the state.
             tips: tool tips in the world, [arms, 3].
             contacts: of arms with each other.
-            handled: the largest force of objects and fixed things on each arm, N, [arms]; None without any.
+            handled: as in `Touch`, [2, arms]; None without any objects.
         """
         views = {}
+        most = np.zeros((2, len(self.scene.agents)), np.float32) if handled is None else handled
         for i, agent in enumerate(self.scene.agents):
             mount, touching = self.scene.mounts[agent], self._touching[agent]
             nearest = xp.zeros(3)
@@ -286,7 +295,8 @@ class Simulator:
                 nearest_tip=nearest @ mount.rotation.astype(tips.dtype),
                 min_distance=contacts.distance[near].min(initial=np.inf),
                 collision=contacts.penetration[touching].max(initial=0.0) > 0,
-                contact_force=contacts.force[touching].max(initial=0.0 if handled is None else handled[i]),
+                contact_force=contacts.force[touching].max(initial=most[0, i]),
+                bump_force=contacts.force[touching].max(initial=most[1, i]),
                 contact_overflow=contacts.overflow,
                 handles=self._objects.handles(physics.objects, i) if self._objects else {},
             )

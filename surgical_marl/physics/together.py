@@ -6,6 +6,7 @@ are solved together.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -24,6 +25,7 @@ from surgical_marl.physics.problem import Contact, Pressed, Problem
 from surgical_marl.physics.solver import JointRows, Rows
 from surgical_marl.physics.tables import Tables
 from surgical_marl.physics.touching import Finder, Slots
+from surgical_marl.physics.variation import Factors, grown, varied
 from surgical_marl.physics.views import Handled, ObjectView, Touch
 from surgical_marl.robots.rotation import quaternion
 
@@ -68,10 +70,19 @@ class Together:
             Newton(none, 0, 1),
         )
         self._finder = Finder(self.tables)
+        self._nominal = self.tables
+        self._factors: Factors | None = None
+
+    def varied(self, factors: Factors) -> Together:
+        """Return the physics of objects that differ from their files."""
+        own = copy.copy(self)
+        own.tables, own._factors = varied(self._nominal, factors), factors
+        own._finder = Finder(own.tables)
+        return own
 
     def start(self, scene: Scene, poses: Mapping[str, Pose]) -> Objects:
         """Return the objects at rest, at these poses or where the scene places them."""
-        tables, places = self.tables, [scene.objects[name] for name in self.names]
+        tables, places = self._nominal, [scene.objects[name] for name in self.names]
         k, f = tables.count, len(tables.fingers)
         centres = np.array([place.position + place.rotation @ place.object.center for place in places])
         turns = np.array([quaternion(place.rotation) for place in places])
@@ -85,13 +96,19 @@ class Together:
             o = self.names.index(name)
             centre = pose.position + rotation(pose.quaternion) @ jnp.asarray(tables.centers[o])
             position, turned = position.at[o].set(centre), turned.at[o].set(pose.quaternion)
+        if self._factors is not None:
+            position += grown(tables, self._factors, rotation(turned))
         return Objects(Bodies(position, turned, still, still), grips)
 
     def views(self, objects: Objects) -> dict[str, ObjectView]:
         """Return the view of every free object, by name."""
         frames, centers = rotation(objects.bodies.quaternion), jnp.asarray(self.tables.centers)
         origins = objects.bodies.position - (frames @ centers[..., None])[..., 0]
-        return {n: ObjectView(origins[o], frames[o], objects.bodies.velocity[o]) for o, n in enumerate(self.names)}
+        sizes = [1.0] * len(self.names) if self._factors is None else self._factors.size
+        return {
+            name: ObjectView(origins[o], frames[o], objects.bodies.velocity[o], sizes[o])
+            for o, name in enumerate(self.names)
+        }
 
     def handles(self, objects: Objects, arm: int) -> dict[str, Handled]:
         """Return how an arm handles every free object, by name."""
@@ -239,9 +256,11 @@ class Together:
         return jnp.where(np.arange(len(slots.number)) < slots.total, arm, self._arms)
 
     def _hardest(self, slots: Slots, pressed: Pressed) -> Array:
-        """Return the largest normal force of a patch on each arm, N, [a]."""
+        """Return the largest normal force of a patch on each arm, N, and of one that is not a finger's, [2, a]."""
         mine = self._on_arm(slots)[:, None] == np.arange(self._arms)
-        return jnp.max(jnp.where(mine, pressed.normal[:, None], 0.0), 0, initial=0.0)
+        bumps = jnp.asarray(self.tables.finger == len(self.tables.fingers))[slots.number]
+        force = jnp.stack([pressed.normal, jnp.where(bumps, pressed.normal, 0.0)])
+        return jnp.max(jnp.where(mine, force[..., None], 0.0), 1, initial=0.0)
 
     def _free(self, bodies: Bodies) -> tuple[Array, Array]:
         """Return the mass matrices [k, 6, 6] of the objects, and their accelerations [k, 6] without contacts."""

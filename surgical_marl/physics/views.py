@@ -33,7 +33,8 @@ class Touch(NamedTuple):
     force: Array
     """N"""
     handled: Array
-    """The largest force of an object or of a fixed thing on each arm, N, [a]; [0] in a scene without objects."""
+    """The largest force of an object or of a fixed thing on each arm, N, and the largest one that is not a finger's on
+    a free object, [2, a]; [2, 0] in a scene without objects."""
     overflow: Array
     """As in `Contacts`, []."""
 
@@ -58,6 +59,9 @@ class ObjectView(NamedTuple):
     """Axes of its frame, [3, 3]."""
     velocity: Array
     """Of the centre of mass, then angular, [6]."""
+    size: Array | float = 1.0
+    """By what all its lengths are multiplied, []; 1 unless the scene randomises sizes. Sites are at this times their
+    places in the object's file."""
 
 
 class ArmView(NamedTuple):
@@ -78,6 +82,8 @@ class ArmView(NamedTuple):
     """Whether it touched another arm or itself during the step, []."""
     contact_force: Array
     """The largest normal force on it during the step, N, []."""
+    bump_force: Array
+    """Likewise, but for what its fingers do to free objects: a grip is no bump."""
     contact_overflow: Array
     """`Contacts.overflow` of the whole scene."""
     handles: Mapping[str, Handled] = {}

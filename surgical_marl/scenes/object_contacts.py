@@ -6,6 +6,7 @@ jaw stand for their fingers; elsewhere the shapes are those that touch other arm
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterator, Mapping
 from itertools import combinations, product
 from typing import NamedTuple
@@ -41,38 +42,42 @@ class Touch(NamedTuple):
 def check_apart(scene: Scene) -> None:
     """Raise ValueError if an object overlaps another one at the start, or an arm at its home.
 
-    Fixed objects may overlap each other. Where the scene randomises the places of objects, some draws are looked at.
+    Fixed objects may overlap each other. Where the scene randomises places or sizes of objects, some draws are looked
+    at.
     """
     random, rng = scene.randomisation, np.random.default_rng(0)
-    reach = np.array([random.object_shift, random.object_shift, 0.0, random.object_turn])
-    poses, count = {}, DRAWS if reach.any() else 1
+    reach = np.array([random.object_shift, random.object_shift, 0.0, random.object_turn, random.object_size])
+    poses, sizes, count = {}, {}, DRAWS if reach.any() else 1
     for name, place in scene.free_objects.items():
-        draws = reach * rng.uniform(-1, 1, (count, 4)) * (np.arange(count) > 0)[:, None]
+        draws = reach * rng.uniform(-1, 1, (count, 5)) * (np.arange(count) > 0)[:, None]
         turns = np.stack(
             [quaternion(turned(np.array([0.0, 0.0, np.degrees(own[3])])) @ place.rotation) for own in draws]
         )
-        poses[name] = Pose(place.position + draws[:, :3], turns)
-    depths = -distances(scene, poses)
+        growth = [0.0, 0.0, place.object.height(place.rotation)] * draws[:, 4:] if reach[4] else 0.0
+        poses[name], sizes[name] = Pose(place.position + draws[:, :3] + growth, turns), 1 + draws[:, 4]
+    depths = -distances(scene, poses, sizes)
     for touch, depth in zip(touches(scene), depths.T, strict=True):
         if depth.max() > RESTING:
-            cure = "move the object" if depth[0] > RESTING else "move the object, or randomise its place less"
+            what = "place or size" if random.object_size else "place"
+            cure = "move the object" if depth[0] > RESTING else f"move the object, or randomise its {what} less"
             raise ValueError(
                 f"scene {scene.name!r}: {touch.one!r} and {touch.other!r} overlap at the start by "
                 f"{1000 * depth.max():.3g} mm; {cure}"
             )
 
 
-def distances(scene: Scene, poses: Mapping[str, Pose]) -> np.ndarray:
+def distances(scene: Scene, poses: Mapping[str, Pose], sizes: Mapping[str, np.ndarray] | None = None) -> np.ndarray:
     """Return the distances of all pairs that can touch, below 0 where they overlap, with all arms at home.
 
     Args:
         scene: arms and objects.
         poses: of n each of some free objects, by name. The others are where the scene places them.
+        sizes: by what the lengths of some of these are multiplied, [n] each.
 
     Returns:
         [n, touches] in the order of `touches`, m; `FAR` for all that are further away.
     """
-    model, data = scene.model, mujoco.MjData(scene.model)
+    model, data = copy.copy(scene.model), mujoco.MjData(scene.model)
     data.qpos[:] = scene.home
     pairs = [[model.geom(name).id for name in (touch.one, touch.other)] for touch in touches(scene)]
     count = max((len(pose.position) for pose in poses.values()), default=1)
@@ -81,6 +86,10 @@ def distances(scene: Scene, poses: Mapping[str, Pose]) -> np.ndarray:
         for name, pose in poses.items():
             mocap = model.body(name).mocapid[0]
             data.mocap_pos[mocap], data.mocap_quat[mocap] = pose.position[row], pose.quaternion[row]
+        for name, size in (sizes or {}).items():
+            own = model.geom_bodyid == model.body(name).id
+            for lengths, given in ((model.geom_size, scene.model.geom_size), (model.geom_pos, scene.model.geom_pos)):
+                lengths[own] = size[row] * given[own]
         mujoco.mj_kinematics(model, data)
         found[row] = [mujoco.mj_geomDistance(model, data, one, other, FAR, None) for one, other in pairs]
     return found

@@ -89,6 +89,16 @@ class Object:
         """How it feels to what touches it."""
         return Surface(*self.friction, self.stiffness)
 
+    def height(self, rotation: np.ndarray) -> float:
+        """Return how high the origin of its frame is above its lowest point, m, if its axes are `rotation` [3, 3].
+
+        It is made of capsules and spheres.
+        """
+        half = [part.size[1] * abs(rotation[2] @ part.rotation[:, 2]) if part.kind == "capsule" else 0.0
+                for part in self.shapes]  # fmt: skip
+        return max(part.size[0] + long - rotation[2] @ part.position
+                   for part, long in zip(self.shapes, half, strict=True))  # fmt: skip
+
 
 @dataclass(frozen=True)
 class Placement:

@@ -33,7 +33,7 @@ def frames(position: Any, quaternion: Any, centers: Any) -> Poses:
     Args:
         position: of the centres of mass in the world, m, [N, k, 3].
         quaternion: w, x, y, z, of length 1, [N, k, 4].
-        centers: of mass in the objects' own frames, m, [k, 3], in the same library and on the same device.
+        centers: of mass in the objects' own frames, m, [k, 3] or [N, k, 3], in the same library and on the same device.
     """
     if isinstance(position, np.ndarray):
         cross = np.cross
@@ -41,6 +41,6 @@ def frames(position: Any, quaternion: Any, centers: Any) -> Poses:
         import torch
 
         cross = torch.linalg.cross
-    centers, real, axis = centers[None], quaternion[..., :1], quaternion[..., 1:]
+    real, axis = quaternion[..., :1], quaternion[..., 1:]
     sideways = 2 * cross(axis, centers)
     return Poses(position - (centers + real * sideways + cross(axis, sideways)), quaternion)

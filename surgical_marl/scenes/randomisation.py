@@ -8,6 +8,9 @@ from typing import Any
 
 from surgical_marl.yaml_file import build
 
+SHARES = "stiffness", "damping", "friction", "object_size", "object_mass", "object_friction"
+"""Ranges that are shares of a value."""
+
 
 @dataclass(frozen=True)
 class Randomisation:
@@ -39,6 +42,12 @@ class Randomisation:
     """Free objects begin up to this far from their place, m, along the world's x and y each."""
     object_turn: float = 0.0
     """They begin turned about the vertical by up to this, rad."""
+    object_size: float = 0.0
+    """All their lengths are off by up to this share. Mass grows with their cube, unless `object_mass` is given."""
+    object_mass: float = 0.0
+    """Their masses are off by up to this share of their value, whatever their size."""
+    object_friction: float = 0.0
+    """Their coefficients of friction likewise."""
 
     def __bool__(self) -> bool:
         return any(getattr(self, item.name) for item in fields(self))
@@ -52,7 +61,7 @@ def read_randomisation(settings: Any, path: Path) -> Randomisation:
     where = f"{path}, randomisation"
     found: Randomisation = build(Randomisation, {} if settings is None else settings, where)
     for item in fields(found):
-        value, relative = getattr(found, item.name), item.name in ("stiffness", "damping", "friction")
+        value, relative = getattr(found, item.name), item.name in SHARES
         if value < 0 or (relative and value >= 1):
             good = "from 0 to less than 1" if relative else "0 or more"
             raise ValueError(f"{where}: {item.name} must be {good}, not {value:g}")

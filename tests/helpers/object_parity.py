@@ -21,9 +21,12 @@ class Beside:
     def __init__(self, scene: str, count: int) -> None:
         self.env = Env("reach", scene)
         self.simulator = simulator = self.env.simulator
-        self._step = jax.jit(jax.vmap(lambda physics: simulator._step(physics, simulator.untouched)[0]))
         self._engine = make_engine(PhysicsAlone(self.env), count, "fused", "cpu")
         self._engine.reset(0)
+        plant = self.env.plant
+        drawn = jax.vmap(plant.start)(self._engine.read(".key", "numpy"))
+        step = jax.vmap(lambda physics, hidden: plant.actual(hidden)._step(physics, simulator.untouched)[0])
+        self._step = jax.jit(lambda physics: step(physics, drawn))
 
     def step(self, now: Any, compared: bool = True) -> Any:
         """Return the reference's states [n] after a step, once the fused engine's are found to be the same.

@@ -134,7 +134,7 @@ class ObjectTask(Task):
     def now(self, world: World) -> Now:
         """Return what is measured in a world."""
         body, goal = world.objects[self.object], world.goal
-        place = lambda points: body.position + points @ body.rotation.T  # noqa: E731
+        place = lambda points: body.position + body.size * points @ body.rotation.T  # noqa: E731
         reach, part, held, touched = {}, {}, {}, {}
         for agent, view in world.arms.items():
             mount, handled = self.scene.mounts[agent], view.handles[self.object]
@@ -239,7 +239,7 @@ class ObjectTask(Task):
 
         def to_object(world: World) -> Array:
             body = world.objects[name]
-            away = local(body.position + self._middles @ body.rotation.T) - world.arms[agent].tool_tip
+            away = local(body.position + body.size * self._middles @ body.rotation.T) - world.arms[agent].tool_tip
             return away[jnp.argmin(jnp.sum(away * away, -1))]
 
         def target(world: World) -> Array:
@@ -247,7 +247,7 @@ class ObjectTask(Task):
 
         def to_target(world: World) -> Array:
             body = world.objects[name]
-            return target(world) - local(body.position + body.rotation @ self._point)
+            return target(world) - local(body.position + body.size * body.rotation @ self._point)
 
         def target_rotation(world: World) -> Array:
             return (turn.T @ self.tables["turns"][world.goal.row])[:, :2].T.ravel()
