@@ -114,7 +114,9 @@ class _Tool:
 
     def send(self, rows: np.ndarray, wish: Wish) -> None:
         """Go where a wish [rows] says."""
-        if wish.tool is not None:
+        if wish.joints is not None:
+            self.q[rows] = wish.joints
+        elif wish.tool is not None:
             self.q[rows], _ = joints_at(self.mount, wish.tool, self.q[rows])
         self.opens[rows] = wish.opens
 

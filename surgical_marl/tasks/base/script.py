@@ -32,6 +32,8 @@ class Wish(NamedTuple):
     """Where its tool tip should be, world, [n, 4, 4]; None to stay where it was sent last."""
     opens: bool = False
     """Whether the jaw opens; otherwise it closes."""
+    joints: np.ndarray | None = None
+    """Where its joints should be instead, [n, joints]."""
 
 
 class Step(NamedTuple):
