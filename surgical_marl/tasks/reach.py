@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from surgical_marl.runtime import jax
-from surgical_marl.tasks.base.crossing import crossing_table
+from surgical_marl.tasks.base.crossing import Crossing, crossing_table
 from surgical_marl.tasks.base.options import Options
 from surgical_marl.tasks.base.script import Snapshot, Step, Wish
 from surgical_marl.tasks.base.task import Goal, Level, Start, TipTask
@@ -64,6 +64,7 @@ class Task(TipTask):
         "crossing": Level(0.02, 1.0),
     }
     starts = ("home", "random")
+    _crossing: Crossing | None = None
     wanted = {  # noqa: RUF012
         "median_error_mm": ("below", 1.0),
         "success_2mm": ("at least", 0.99),
@@ -72,7 +73,6 @@ class Task(TipTask):
 
     def __init__(self, scene: Scene, options: Options) -> None:
         super().__init__(scene, options)
-        self._crossing = None
         if options.difficulty == "crossing":
             if self.starts_at != "home":
                 raise ValueError(f"difficulty 'crossing' has starts of its own: leave start {self.starts_at!r} out")
