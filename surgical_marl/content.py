@@ -18,6 +18,9 @@ from pathlib import Path
 KINDS = ("arms", "scenes", "objects", "configs", "policies")
 BASELINES = ("zero", "random", "oracle")
 """Policies that need no learning. They have no task and scene of their own."""
+PARTNERS = ("frozen", "random", "delayed", "oracle")
+"""Partners that every team can be given: one who keeps still, one who moves at random, one who does what the team's own
+policy does, but starts late, and the oracle."""
 
 _PACKAGE = Path(__file__).resolve().parent
 _NOUNS = {"arms": "arm", "scenes": "scene", "objects": "object", "configs": "config", "policies": "run or policy"}

@@ -29,7 +29,7 @@ def script(monkeypatch: pytest.MonkeyPatch) -> Any:
 
 def test_there_are_twenty_and_those_that_ship_are_left_alone(script: Any, tmp_path: Path) -> None:
     assert (
-        len(script.PLACES) == 22
+        len(script.PLACES) == 24
         and script.PLACES["needle_pick-psm_needle"]
         and script.PLACES["match_image-ecm"] == ("match_image", "ecm")
     )

@@ -1,4 +1,4 @@
-"""The command `surgical-marl`: train, eval, list, check, export, bench, doctor."""
+"""The command `surgical-marl`: train, eval, crossplay, list, check, export, bench, doctor."""
 
 from __future__ import annotations
 
@@ -13,13 +13,14 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from surgical_marl.bench.workload import BENCHED, Workload
+from surgical_marl.cli.evaluating import add_crossplay, add_eval
 from surgical_marl.cli.flags import add_flags, flagged, given, one_of, whole
-from surgical_marl.content import BASELINES, find, list_arms, list_objects, list_policies, list_scenes, unknown
+from surgical_marl.content import find, list_arms, list_objects, list_policies, list_scenes, unknown
 from surgical_marl.plugins.algorithms import list_algorithms
 from surgical_marl.plugins.tasks import list_tasks
 from surgical_marl.runs.settings import Settings
 from surgical_marl.runtime import defer_compiler
-from surgical_marl.tasks.base.options import Options, choices
+from surgical_marl.tasks.base.options import choices
 
 _LISTS = {
     "tasks": list_tasks,
@@ -87,7 +88,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(prog="surgical-marl", description="Surgical robot arms that learn together.")
     parser.add_argument("--version", action="version", version=f"%(prog)s {_version()}")
-    commands = parser.add_subparsers(required=True, metavar="{train,eval,list,check,export,bench,doctor}")
+    commands = parser.add_subparsers(required=True, metavar="{train,eval,crossplay,list,check,export,bench,doctor}")
 
     train = commands.add_parser(
         "train",
@@ -105,20 +106,8 @@ def _parser() -> argparse.ArgumentParser:
     )
     train.set_defaults(command=_train, name="train")
 
-    evaluate = commands.add_parser("eval", help="measure policies on a fixed set of goals (docs/evaluation.md)")
-    what = f"a run folder, a policy's name, {', '.join(BASELINES)}; or runs that differ by their seed, for its spread"
-    evaluate.add_argument("policies", nargs="+", metavar="RUN_OR_POLICY", help=what)
-    evaluate.add_argument("--task", help="of a policy that is not trained")
-    evaluate.add_argument("--scene", help="likewise: a name (see `list scenes`) or a .yaml file")
-    add_flags(evaluate, Options, ("control", "difficulty", "start"), default="the policy's own")
-    add_flags(evaluate, Options, ("goals",), default="held_out")
-    evaluate.add_argument("--episodes", type=whole(1, 1_000_000), default=200, metavar="N")
-    evaluate.add_argument("--seed", type=whole(0), default=0, metavar="S")
-    evaluate.add_argument("--against", type=Path, metavar="FILE.json", help="an older result to compare with")
-    evaluate.add_argument("--json", action="store_true", help="one JSON object instead of a table")
-    evaluate.add_argument("--csv", type=Path, metavar="FILE.csv", help="a row for each run and agent")
-    evaluate.add_argument("--figure", type=Path, metavar="FILE.png", help="success against threshold, and the errors")
-    evaluate.set_defaults(command=_eval, name="eval")
+    add_eval(commands)
+    add_crossplay(commands)
 
     names = commands.add_parser("list", help="list tasks, scenes, arms, objects, algorithms and policies")
     names.add_argument("kind", nargs="?", type=one_of(tuple(_LISTS)), metavar="|".join(_LISTS))
@@ -288,33 +277,6 @@ def _train(arguments: argparse.Namespace) -> None:
     run = train(settings, out=out, resume=resume)
     if is_first():
         judge(run)
-
-
-def _eval(arguments: argparse.Namespace) -> None:
-    policies = arguments.policies
-    if baselines := [policy for policy in policies if policy in BASELINES]:
-        if len(policies) > 1:
-            raise ValueError(f"{baselines[0]!r} is not a run of the same training: evaluate it alone")
-        if None in (arguments.task, arguments.scene):
-            good = f"--task ({', '.join(list_tasks())}) and --scene ({', '.join(list_scenes())})"
-            raise ValueError(f"eval {baselines[0]} needs {good}")
-    if arguments.task not in (None, *list_tasks()):
-        raise unknown("task", arguments.task, list_tasks())
-    if arguments.scene is not None:
-        find("scenes", arguments.scene)
-    for policy in policies:
-        if policy not in BASELINES and not Path(policy).is_dir() and policy not in list_policies():
-            raise unknown("run or policy", policy, [*list_policies(), *BASELINES])
-    for flag, path, suffix in (("--csv", arguments.csv, ".csv"), ("--figure", arguments.figure, ".png")):
-        if path and not (path.suffix == suffix and path.parent.is_dir()):
-            raise ValueError(f"cannot write {flag} {path}: name a {suffix} file in a folder that exists")
-
-    from surgical_marl.evaluation.command import CHOSEN, OWN, play_all, read_result, report
-
-    older = None if arguments.against is None else (str(arguments.against), read_result(arguments.against))
-    asked = {key: getattr(arguments, key) for key in (*OWN, *CHOSEN)}
-    played = play_all(policies, asked, arguments.episodes, arguments.seed)
-    print(report(played, older, arguments.json, arguments.csv, arguments.figure))
 
 
 def _run_folder(settings: Any) -> Path:

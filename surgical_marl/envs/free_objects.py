@@ -25,13 +25,13 @@ class FreeObjects:
 
     def __init__(self, scene: Scene) -> None:
         centers = [place.object.center for place in scene.free_objects.values()]
-        self.count = len(centers)
+        self.count, self._arms = len(centers), len(scene.agents)
         self._centers: Any = np.array(centers, np.float32).reshape(-1, 3)
 
     def held(self, engine: Engine, num_envs: int) -> np.ndarray:
         """Return which arms hold which objects, [N, k, arms] bool."""
         if not self.count:
-            return np.zeros((num_envs, 0, 0), bool)
+            return np.zeros((num_envs, 0, self._arms), bool)
         from surgical_marl.physics.handling import DWELL
 
         return np.asarray(engine.read(HELD, "numpy") >= np.float32(DWELL))

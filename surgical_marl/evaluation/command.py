@@ -14,6 +14,7 @@ from surgical_marl.evaluation.evaluate import MAX_BATCH, Played, difference, pla
 from surgical_marl.evaluation.report import ABOUT, format_table, write_csv
 from surgical_marl.files import write_atomic
 from surgical_marl.policies.policy import load_policy
+from surgical_marl.policies.team import Team
 from surgical_marl.runs.environment import make_env
 from surgical_marl.runs.folder import read_settings
 from surgical_marl.runs.settings import Settings
@@ -22,36 +23,55 @@ OWN, CHOSEN = ("task", "scene", "control"), ("difficulty", "start", "goals")
 """Options that a trained policy determines, and options that can be chosen for any policy."""
 
 
-def play_all(policies: Sequence[str], asked: Mapping[str, str | None], episodes: int, seed: int) -> dict[str, Played]:
+def play_all(
+    policies: Sequence[str],
+    asked: Mapping[str, str | None],
+    episodes: int,
+    seed: int,
+    partners: Mapping[str, str] | None = None,
+) -> dict[str, Played]:
     """Return the episodes of each policy, on the same goals.
 
     Args:
         policies: runs or shipped policies of one task and scene, or one of `BASELINES` alone.
         asked: options of `OWN` and `CHOSEN`; None leaves an option out. Goals are held-out ones by default; all other
             defaults are those of the trained policy, which also refuses other values of `OWN`.
+        partners: agent -> who moves it instead, see `surgical_marl.policies.team.Team`.
 
     Raises:
         ValueError: something is unknown, or does not fit together.
     """
+    env = make_env(common_settings(policies, asked), min(episodes, MAX_BATCH))
+    played = {}
+    for policy in policies:
+        acting = Team(env, find_policy(policy), partners or {})
+        print(f"evaluating {policy}: {episodes} episodes", file=sys.stderr)
+        run = play(env, acting, episodes, seed)
+        played[policy] = run._replace(about={**run.about, "partners": dict(partners)}) if partners else run
+    return played
+
+
+def common_settings(policies: Sequence[str], asked: Mapping[str, str | None]) -> Settings:
+    """Return the settings of the environment that policies of one task and scene are evaluated in.
+
+    Raises ValueError as `play_all` does.
+    """
     if len(set(policies)) < len(policies):
         raise ValueError(f"{max(policies, key=policies.count)!r} is named twice")
     given = {"goals": "held_out", **{key: value for key, value in asked.items() if value is not None}}
-    settings = {policy: _settings(policy, given) for policy in policies}
-    first = settings[policies[0]]
+    trained = [policy for policy in policies if policy not in BASELINES]
+    settings = {policy: _settings(policy, given) for policy in trained or policies}
+    name, first = next(iter(settings.items()))
     for policy, other in settings.items():
         for key in (*OWN, *CHOSEN, "max_steps"):
             if (theirs := getattr(other, key)) != (ours := getattr(first, key)):
-                raise ValueError(
-                    f"{policy} has {key} {theirs!r} and {policies[0]} has {ours!r}: evaluate them one at a time"
-                )
-    env = make_env(first, min(episodes, MAX_BATCH))
-    played = {}
-    for policy in policies:
-        source = policy if policy in BASELINES else find("policies", policy)
-        acting = load_policy(source, env)
-        print(f"evaluating {policy}: {episodes} episodes", file=sys.stderr)
-        played[policy] = play(env, acting, episodes, seed)
-    return played
+                raise ValueError(f"{policy} has {key} {theirs!r} and {name} has {ours!r}: evaluate them one at a time")
+    return first
+
+
+def find_policy(name: str) -> str | Path:
+    """Return the folder of a run or policy; a name of `BASELINES` stays as it is."""
+    return name if name in BASELINES else find("policies", name)
 
 
 def report(

@@ -38,6 +38,7 @@ def format_table(result: Mapping[str, Any], others: Mapping[str, Mapping[str, An
     columns = result["agents"] if others is None else others
     words = "{task} in {scene}, {difficulty}, {control} control, {goals} goals, {start} start: {episodes} episodes"
     what = f"{words.format(**result)}, seed {result['seed']}"
+    what += "".join(f", {agent} is {who}" for agent, who in result.get("partners", {}).items())
     goals = f"goal set {result['goal_set']:.12} ({'standard' if is_standard(result) else 'not a standard one'})"
     rows = [["", "all", "95 % interval", *columns]]
     for name, bounds in result["intervals"].items():

@@ -29,9 +29,9 @@ ITERATIONS = 8
 def oracle(env: BatchedEnv, agents: Sequence[str] | None = None) -> Callable[[Mapping[str, Any]], dict[str, Any]]:
     """Make the oracle of an environment with control "position", for all of its tasks.
 
-    Joints follow straight lines in joint space, all arms at the same pace; `tasks/base/workspace.py` has checked these
-    paths. For moving targets, commands lead by the joints' lag: a control step, plus damping over stiffness of their
-    drives.
+    If the task has a script, the arms follow it. Otherwise joints follow straight lines in joint space, all arms at the
+    same pace; `tasks/base/workspace.py` has checked these paths. For moving targets, commands lead by the joints' lag:
+    a control step, plus damping over stiffness of their drives.
 
     Args:
         agents: the agents that the oracle moves, if others have another policy. Only these are kept at the same pace.
@@ -43,11 +43,11 @@ def oracle(env: BatchedEnv, agents: Sequence[str] | None = None) -> Callable[[Ma
     Raises:
         ValueError: the environment has another control mode.
     """
-    steps = () if env.task.has_targets else env.task.script()
-    if not env.task.has_targets and not steps:
-        raise ValueError(f"the task {env.task_name!r} has no target for tool tips that an oracle could move to")
     if env.control != "position":
         raise ValueError(f"the oracle moves position targets: control must be 'position', not {env.control!r}")
+    steps = env.task.script()
+    if not env.task.has_targets and not steps:
+        raise ValueError(f"the task {env.task_name!r} has no target for tool tips that an oracle could move to")
     agents = env.agents if agents is None else agents
     return Scripted(env, steps, agents) if steps else _Oracle(env, agents)
 

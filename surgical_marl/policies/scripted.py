@@ -99,7 +99,7 @@ class _Tool:
         self.jaw = np.array([arm.jaw is not None and joint.name == arm.jaw.joint for joint in arm.actuated])
         self.q = np.tile(arm.home, (env.num_envs, 1))
         self.command = self.q.copy()
-        self.opens = np.zeros(env.num_envs, bool)
+        self.opens = np.zeros(env.num_envs)
         self.terms = env.observation_terms(agent)
         if "command" not in self.terms:
             raise ValueError(f"the oracle needs to observe command of {agent!r}")
@@ -110,11 +110,13 @@ class _Tool:
 
     def start(self, rows: np.ndarray, qpos: np.ndarray) -> None:
         """Stay where the arm is in some environments, with a closed jaw."""
-        self.q[rows], self.opens[rows] = qpos[rows], False
+        self.q[rows], self.opens[rows] = qpos[rows], 0.0
 
     def send(self, rows: np.ndarray, wish: Wish) -> None:
         """Go where a wish [rows] says."""
-        if wish.tool is not None:
+        if wish.joints is not None:
+            self.q[rows] = wish.joints
+        elif wish.tool is not None:
             self.q[rows], _ = joints_at(self.mount, wish.tool, self.q[rows])
         self.opens[rows] = wish.opens
 
@@ -124,7 +126,12 @@ class _Tool:
 
     def action(self, way: np.ndarray) -> np.ndarray:
         """Return the action that moves the commands by `way` [N, n] and opens or closes the jaw."""
-        return np.where(self.jaw, np.where(self.opens, 1.0, -1.0)[:, None], way)
+        jaw = self.mount.arm.jaw
+        if jaw is None:
+            return way
+        aim = jaw.closed + self.opens * (jaw.open - jaw.closed)
+        wider = (self.opens >= 1.0)[:, None] | (self.command < aim[:, None] - 1e-6)
+        return np.where(self.jaw, np.where(wider, 1.0, -1.0), way)
 
 
 def _rows(snapshot: Snapshot, rows: np.ndarray) -> Snapshot:

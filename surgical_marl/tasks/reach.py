@@ -15,15 +15,23 @@ Randomisation goals from a normal distribution about the point in front of each 
               1.5 s without collision (`surgical_marl/tasks/base/workspace.py`). Arms start at home, or with
               `start=random` at postures as far from those at the goals as joints can move in 1.5 s.
 Difficulty    standard deviation of the goals: easy 30 mm, default 50 mm (the paper's), hard 70 mm. Hard: in a quarter
-of the episodes of several arms the straight joint-space paths from home collide unless one arm waits.
+              of the episodes of several arms the straight joint-space paths from home collide unless one arm waits.
+              Crossing: two arms change places in every episode, which is truncated after 200 control steps (4 s). Each
+              goal is inside the other arm's shaft as it stands at the start, so one arm has to make way first
+              (`surgical_marl/tasks/base/crossing.py`).
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
 
 from surgical_marl.runtime import jax
+from surgical_marl.tasks.base.crossing import Crossing, crossing_table
 from surgical_marl.tasks.base.options import Options
+from surgical_marl.tasks.base.script import Snapshot, Step, Wish
 from surgical_marl.tasks.base.task import Goal, Level, Start, TipTask
 from surgical_marl.tasks.base.workspace import start_table, target_table
 
@@ -33,11 +41,30 @@ if TYPE_CHECKING:
     from surgical_marl.scenes.scene import Scene
 
 
+NEAR = 0.005
+"""The oracle lets an arm follow when the other one's tip is this near to where it goes, m."""
+
+
+class CrossingGoal(NamedTuple):
+    """The goal of an episode in which arms change places."""
+
+    targets: Array
+    """Where the tool tips should be, [arms, 3], m, each in its arm's base frame."""
+    row: Array
+    """Row of the tables."""
+
+
 class Task(TipTask):
     """Target reaching with fixed goals."""
 
-    levels = {"easy": Level(0.03, 0.0), "default": Level(0.05, 0.0), "hard": Level(0.07, 0.25)}  # noqa: RUF012
+    levels = {  # noqa: RUF012
+        "easy": Level(0.03, 0.0),
+        "default": Level(0.05, 0.0),
+        "hard": Level(0.07, 0.25),
+        "crossing": Level(0.02, 1.0),
+    }
     starts = ("home", "random")
+    _crossing: Crossing | None = None
     wanted = {  # noqa: RUF012
         "median_error_mm": ("below", 1.0),
         "success_2mm": ("at least", 0.99),
@@ -46,7 +73,14 @@ class Task(TipTask):
 
     def __init__(self, scene: Scene, options: Options) -> None:
         super().__init__(scene, options)
-        if self.starts_at == "home":
+        if options.difficulty == "crossing":
+            if self.starts_at != "home":
+                raise ValueError(f"difficulty 'crossing' has starts of its own: leave start {self.starts_at!r} out")
+            self._crossing = crossing_table(scene, self.level.extent, self.seed)
+            self.max_steps = 200
+            begin = {agent: way[0] for agent, way in self._crossing.ways.items()}
+            self.tables = {"targets": self._crossing.targets, "postures": scene.full_qpos(begin)}
+        elif self.starts_at == "home":
             self.tables["targets"] = target_table(scene, self.level.extent, self.level.crossing, self.seed)
         else:
             self.tables |= start_table(scene, self.level.extent, self.seed)
@@ -54,5 +88,30 @@ class Task(TipTask):
     def start(self, key: Array) -> Start:
         """Return goals of all arms, and postures if these are drawn too."""
         row = jax.random.randint(key, (), 0, len(self.tables["targets"]))
-        postures = self.tables.get("postures")
-        return Start(Goal(self.tables["targets"][row]), None if postures is None else postures[row])
+        postures, targets = self.tables.get("postures"), self.tables["targets"][row]
+        goal = Goal(targets) if self._crossing is None else CrossingGoal(targets, row)
+        return Start(goal, None if postures is None else postures[row])
+
+    def script(self) -> tuple[Step, ...]:
+        """Return how arms change places: one draws its tool back, the other goes, then the first one follows.
+
+        Where arms don't change places there is no script, and the oracle brings their tips straight to the targets.
+        """
+        known = self._crossing
+        if known is None:
+            return ()
+        aims = {
+            agent: mount.arm.forward_kinematics(known.ways[agent])[..., :3, 3] @ mount.rotation.T + mount.position
+            for agent, mount in self.scene.mounts.items()
+        }
+
+        def move(number: int, seen: Snapshot) -> dict[str, Wish]:
+            return {agent: Wish(joints=way[number, seen.goal.row]) for agent, way in known.ways.items()}
+
+        def there(number: int, seen: Snapshot) -> np.ndarray:
+            """Return whether the tools of all arms are where a move ends, [n] bool."""
+            off = [tool[:, :3, 3] - aims[agent][number, seen.goal.row] for agent, tool in seen.tools.items()]
+            return np.asarray(np.linalg.norm(off, axis=-1).max(0) < NEAR)
+
+        steps = [Step(partial(move, n), good=partial(there, n), back=n - 1) for n in range(1, 4)]
+        return (*steps, Step(partial(move, 4)))

@@ -30,8 +30,10 @@ class Wish(NamedTuple):
 
     tool: np.ndarray | None = None
     """Where its tool tip should be, world, [n, 4, 4]; None to stay where it was sent last."""
-    opens: bool = False
-    """Whether the jaw opens; otherwise it closes."""
+    opens: float = 0.0
+    """How far the jaw opens, as a share of its way; at 0 it closes, and then presses."""
+    joints: np.ndarray | None = None
+    """Where its joints should be instead, [n, joints]."""
 
 
 class Step(NamedTuple):

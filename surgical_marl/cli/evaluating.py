@@ -1,0 +1,115 @@
+"""The commands that measure policies: eval and crossplay."""
+
+from __future__ import annotations
+
+# Only light imports here, as in main.py.
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from surgical_marl.cli.flags import add_flags, whole
+from surgical_marl.content import BASELINES, PARTNERS, find, list_policies, list_scenes, unknown
+from surgical_marl.plugins.tasks import list_tasks
+from surgical_marl.tasks.base.options import Options
+
+
+def add_eval(commands: Any) -> None:
+    """Add the command eval."""
+    parser = commands.add_parser("eval", help="measure policies on a fixed set of goals (docs/evaluation.md)")
+    what = f"a run folder, a policy's name, {', '.join(BASELINES)}; or runs that differ by their seed, for its spread"
+    parser.add_argument("policies", nargs="+", metavar="RUN_OR_POLICY", help=what)
+    _add_options(parser)
+    who = f"who moves an agent instead: a run folder, a policy's name, {', '.join(PARTNERS)}; can be given again"
+    parser.add_argument("--partner", action="append", default=[], metavar="ROLE=POLICY", help=who)
+    parser.add_argument("--against", type=Path, metavar="FILE.json", help="an older result to compare with")
+    parser.add_argument("--json", action="store_true", help="one JSON object instead of a table")
+    parser.add_argument("--csv", type=Path, metavar="FILE.csv", help="a row for each run and agent")
+    parser.add_argument("--figure", type=Path, metavar="FILE.png", help="success against threshold, and the errors")
+    parser.set_defaults(command=_eval, name="eval")
+
+
+def add_crossplay(commands: Any) -> None:
+    """Add the command crossplay."""
+    parser = commands.add_parser("crossplay", help="let teams play each other's roles (docs/crossplay.md)")
+    what = f"run folders and policies of one task and scene, {', '.join(BASELINES)}"
+    parser.add_argument("teams", nargs="+", metavar="RUN_OR_POLICY", help=what)
+    _add_options(parser)
+    parser.add_argument("--json", action="store_true", help="one JSON object instead of tables")
+    parser.add_argument("--figure", type=Path, metavar="FILE.png", help="heat maps of the success")
+    parser.set_defaults(command=_crossplay, name="crossplay")
+
+
+def _add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the flags that say which episodes are played."""
+    parser.add_argument("--task", help="of a policy that is not trained")
+    parser.add_argument("--scene", help="likewise: a name (see `list scenes`) or a .yaml file")
+    add_flags(parser, Options, ("control", "difficulty", "start"), default="the policy's own")
+    add_flags(parser, Options, ("goals",), default="held_out")
+    parser.add_argument("--episodes", type=whole(1, 1_000_000), default=200, metavar="N")
+    parser.add_argument("--seed", type=whole(0), default=0, metavar="S")
+
+
+def _eval(arguments: argparse.Namespace) -> None:
+    policies = arguments.policies
+    baselines = [policy for policy in policies if policy in BASELINES]
+    if baselines and len(policies) > 1:
+        raise ValueError(f"{baselines[0]!r} is not a run of the same training: evaluate it alone")
+    _check(arguments, policies)
+    partners = _partners(arguments.partner)
+    _check_files(("--csv", arguments.csv, ".csv"), ("--figure", arguments.figure, ".png"))
+
+    from surgical_marl.evaluation.command import CHOSEN, OWN, play_all, read_result, report
+
+    older = None if arguments.against is None else (str(arguments.against), read_result(arguments.against))
+    asked = {key: getattr(arguments, key) for key in (*OWN, *CHOSEN)}
+    played = play_all(policies, asked, arguments.episodes, arguments.seed, partners)
+    print(report(played, older, arguments.json, arguments.csv, arguments.figure))
+
+
+def _crossplay(arguments: argparse.Namespace) -> None:
+    _check(arguments, arguments.teams)
+    _check_files(("--figure", arguments.figure, ".png"))
+
+    from surgical_marl.evaluation.command import CHOSEN, OWN
+    from surgical_marl.evaluation.crossplay import crossplay, report
+
+    asked = {key: getattr(arguments, key) for key in (*OWN, *CHOSEN)}
+    result = crossplay(arguments.teams, asked, arguments.episodes, arguments.seed)
+    print(report(result, arguments.json, arguments.figure))
+
+
+def _check(arguments: argparse.Namespace, policies: Sequence[str]) -> None:
+    """Raise ValueError unless the task, the scene and the policies exist, and say what is played."""
+    trained = [policy for policy in policies if policy not in BASELINES]
+    if not trained and None in (arguments.task, arguments.scene):
+        good = f"--task ({', '.join(list_tasks())}) and --scene ({', '.join(list_scenes())})"
+        raise ValueError(f"{arguments.name} {policies[0]} needs {good}")
+    if arguments.task not in (None, *list_tasks()):
+        raise unknown("task", arguments.task, list_tasks())
+    if arguments.scene is not None:
+        find("scenes", arguments.scene)
+    for policy in trained:
+        if not Path(policy).is_dir() and policy not in list_policies():
+            raise unknown("run or policy", policy, [*list_policies(), *BASELINES])
+
+
+def _partners(given: Sequence[str]) -> dict[str, str]:
+    """Return agent -> policy of flags ROLE=POLICY."""
+    found: dict[str, str] = {}
+    for text in given:
+        role, _, policy = text.partition("=")
+        if not (role and policy):
+            raise ValueError(f"--partner must be ROLE=POLICY such as psm_0=frozen, not {text!r}")
+        if role in found:
+            raise ValueError(f"--partner names {role!r} twice")
+        if policy not in PARTNERS and not Path(policy).is_dir() and policy not in list_policies():
+            raise unknown("partner", policy, [*list_policies(), *PARTNERS])
+        found[role] = policy
+    return found
+
+
+def _check_files(*files: tuple[str, Path | None, str]) -> None:
+    for flag, path, suffix in files:
+        if path and not (path.suffix == suffix and path.parent.is_dir()):
+            raise ValueError(f"cannot write {flag} {path}: name a {suffix} file in a folder that exists")

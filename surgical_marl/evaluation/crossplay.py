@@ -1,0 +1,170 @@
+"""Runs `surgical-marl crossplay`: teams play each other's roles, and with partners that any team can be given."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from surgical_marl.content import PARTNERS, find
+from surgical_marl.evaluation.command import common_settings, find_policy
+from surgical_marl.evaluation.evaluate import MAX_BATCH, Played, play
+from surgical_marl.evaluation.interval import interval
+from surgical_marl.evaluation.metrics import Metric
+from surgical_marl.files import write_atomic
+from surgical_marl.policies.oracle import oracle
+from surgical_marl.policies.team import Team
+from surgical_marl.runs.environment import make_env
+from surgical_marl.scenes.load import load_scene
+
+if TYPE_CHECKING:
+    from surgical_marl.envs.batch import BatchedEnv
+
+
+def crossplay(teams: Sequence[str], asked: Mapping[str, str | None], episodes: int, seed: int) -> dict[str, Any]:
+    """Play the episodes of `surgical-marl crossplay`, all on the same goals.
+
+    Args:
+        teams: runs, shipped policies or names of `BASELINES`, of one task and scene.
+        asked: as for `surgical_marl.evaluation.command.play_all`.
+        episodes: of each pairing.
+        seed: of the goals.
+
+    Returns:
+        The object that `surgical-marl crossplay --json` prints, see docs/crossplay.md.
+
+    Raises:
+        ValueError: something is unknown, teams don't fit together, or the scene has a single agent.
+    """
+    settings = common_settings(teams, asked)
+    if len(load_scene(find("scenes", settings.scene)).agents) < 2:
+        raise ValueError(f"crossplay needs a scene with several agents, and {settings.scene!r} has one")
+    env = make_env(settings, min(episodes, MAX_BATCH))
+    known: dict[tuple[str, tuple[tuple[str, str], ...]], Played] = {}
+
+    def played(team: str, role: str = "", partner: str = "") -> Played:
+        partners = {} if role == "" or partner == team else {role: partner}
+        key = team, tuple(partners.items())
+        if key not in known:
+            print(f"playing {team}" + "".join(f", {role} is {who}" for role, who in partners.items()), file=sys.stderr)
+            known[key] = play(env, Team(env, find_policy(team), partners), episodes, seed)
+        return known[key]
+
+    roles = env.agents[1:] if len(env.agents) == 2 else env.agents  # of two, one is the other one's transpose
+    cells = {role: [[played(team, role, other) for other in teams] for team in teams] for role in roles}
+    partners = {
+        team: {role: {who: _cell(played(team, role, who), role) for who in _partners(env)} for role in env.agents}
+        for team in teams
+    }
+    alone = [played(team) for team in teams]
+    mixed = [played(team, role, other) for role in roles for team in teams for other in teams if other != team]
+    found = {"self_play": _mean(alone), "cross_play": _mean(mixed) if mixed else None}
+    return {
+        **alone[0].about,
+        "teams": list(teams),
+        "roles": list(env.agents),
+        "matrices": {role: [[_cell(one) for one in row] for row in rows] for role, rows in cells.items()},
+        **found,
+        "partners": partners,
+    }
+
+
+def _partners(env: BatchedEnv) -> tuple[str, ...]:
+    """Return the partners that there are for a task: some have no oracle."""
+    try:
+        oracle(env)
+    except ValueError:
+        return tuple(who for who in PARTNERS if who != "oracle")
+    return PARTNERS
+
+
+def _cell(run: Played, role: str = "") -> dict[str, float]:
+    """Return the shares of a pairing's episodes in which all arms succeed, and in which any collides.
+
+    With the `role` of a partner also the share of the other arms that succeed.
+    """
+    success, collided = run.measures["success"], run.measures["collided"]
+    cell = {"team_success": float(success.all(-1).mean()), "collision_rate": float(collided.any(-1).mean())}
+    others = [i for i, agent in enumerate(run.agents) if agent != role]
+    return {**cell, "others_success": float(success[:, others].mean())} if role else cell
+
+
+def _mean(runs: Sequence[Played]) -> dict[str, Any]:
+    """Return the mean team success of pairings, and its 95 % interval over pairings and episodes."""
+    success = np.stack([run.measures["success"].all(-1, keepdims=True) for run in runs]).astype(float)
+    bounds = interval(Metric(success, lambda values: values.mean(-1)))
+    return {"team_success": float(success.mean()), "interval": bounds}
+
+
+def report(result: Mapping[str, Any], as_json: bool, figure: Path | None) -> str:
+    """Draw the figure if one is asked for, and return what goes to stdout. ValueError if it cannot be written."""
+    if figure:
+        try:
+            _draw(figure, result)
+        except OSError as error:
+            raise ValueError(f"cannot write {error.filename}: {error.strerror}") from None
+    return json.dumps(result) if as_json else format_table(result)
+
+
+def format_table(result: Mapping[str, Any]) -> str:
+    """Return what `crossplay` returned as plain text."""
+    words = "{task} in {scene}, {difficulty}, {control} control, {goals} goals, {start} start: {episodes} episodes"
+    parts = [f"{words.format(**result)}, seed {result['seed']}"]
+    for key, title in (("self_play", "self-play"), ("cross_play", "cross-play")):
+        if (found := result[key]) is not None:
+            bounds = "" if found["interval"] is None else " ({:.1%} to {:.1%})".format(*found["interval"])
+            parts.append(f"{title}: team success {found['team_success']:.1%}{bounds}")
+    for role, rows in result["matrices"].items():
+        head = [f"{role} is of", *result["teams"]]
+        lines = [[team, *map(_text, row)] for team, row in zip(result["teams"], rows, strict=True)]
+        parts.append(_columns([head, *lines]))
+    lines = [
+        [f"{team}, {role}", *map(_text, cells.values())]
+        for team, roles in result["partners"].items()
+        for role, cells in roles.items()
+    ]
+    whos = next(iter(next(iter(result["partners"].values())).values()))
+    parts.append(_columns([["team, and role of the partner", *whos], *lines]))
+    parts.append("each cell: team success, others' success if there is a partner, collision rate")
+    return "\n\n".join(parts)
+
+
+def _text(cell: Mapping[str, float]) -> str:
+    names = ("team_success", "others_success", "collision_rate")
+    return " ".join(f"{cell[name]:.1%}" for name in names if name in cell)
+
+
+def _columns(rows: Sequence[Sequence[str]]) -> str:
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return "\n".join(
+        "  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]).rstrip() for row in rows
+    )
+
+
+def _draw(path: Path, result: Mapping[str, Any]) -> None:
+    """Draw the matrices, and the success with partners, as heat maps in a PNG."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    teams = result["teams"]
+    panels = [(f"{role} is of", teams, teams, rows) for role, rows in result["matrices"].items()]
+    lines = {f"{team}\n{role}": cells for team, roles in result["partners"].items() for role, cells in roles.items()}
+    whos = list(next(iter(lines.values())))
+    panels.append(("that role is", list(lines), whos, [list(cells.values()) for cells in lines.values()]))
+    figure = Figure(figsize=(1 + 4 * len(panels), 1.5 + 0.6 * len(lines)), layout="constrained")
+    FigureCanvasAgg(figure)
+    figure.suptitle("team success: {task} in {scene}, {difficulty}, {episodes} episodes".format(**result), fontsize=11)
+    for axis, (title, names, columns, rows) in zip(np.atleast_1d(figure.subplots(1, len(panels))), panels, strict=True):
+        values = np.array([[cell["team_success"] for cell in row] for row in rows])
+        axis.imshow(values, vmin=0.0, vmax=1.0, cmap="viridis", aspect="auto")
+        axis.set_xticks(range(len(columns)), columns, rotation=30, ha="right", fontsize=8)
+        axis.set_yticks(range(len(names)), names, fontsize=8)
+        axis.set_title(title, fontsize=9)
+        for (row, column), value in np.ndenumerate(values):
+            colour = "black" if value > 0.6 else "white"
+            axis.text(column, row, f"{value:.0%}", ha="center", va="center", color=colour, fontsize=8)
+    write_atomic(path, lambda temporary: figure.savefig(temporary, format="png", dpi=150))

@@ -1,0 +1,76 @@
+"""A team in which partners play some of the roles.
+
+policy = Team(env, "reach-bimanual_psm", {"psm_1": "frozen"})
+actions = policy(observations)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from surgical_marl.content import BASELINES, PARTNERS, unknown
+from surgical_marl.policies.acting import forget
+from surgical_marl.policies.convert import like, to_numpy
+from surgical_marl.policies.oracle import oracle
+from surgical_marl.policies.policy import find_run, load_policy
+from surgical_marl.policies.teammates import Teammates
+from surgical_marl.runs.folder import read_settings
+
+if TYPE_CHECKING:
+    from surgical_marl.envs.batch import BatchedEnv
+
+DELAY = 0.5
+"""Time for which a "delayed" partner keeps still at the start of an episode, s."""
+
+
+class Team:
+    """The policy of a team with partners.
+
+    Args:
+        env: the environments that it acts in.
+        name: a run folder, or the name of a policy that ships, or "zero", "random" or "oracle".
+        partners: agent -> who moves it instead: such a name, or "frozen", or "delayed": what the team itself would do,
+            but not before `DELAY`.
+
+    Raises:
+        ValueError: an agent or a policy does not exist, or a policy is of another task or scene.
+    """
+
+    def __init__(self, env: BatchedEnv, name: str | Path, partners: Mapping[str, str]) -> None:
+        for agent, who in partners.items():
+            if agent not in env.agents:
+                raise unknown("role", agent, env.agents)
+            check_fits(who, env)
+        self._env = env
+        self._late = [agent for agent, who in partners.items() if who == "delayed"]
+        others = {agent: who for agent, who in partners.items() if who != "delayed"}
+        own = [agent for agent in env.agents if agent not in others]
+        self._own = oracle(env, own) if name == "oracle" else load_policy(name, env)
+        self._mates = Teammates(env, others)
+
+    def __call__(self, observations: Mapping[str, Any]) -> dict[str, Any]:
+        actions = {**self._own(observations), **self._mates.actions(observations)}
+        begun = (to_numpy(self._env.steps) * self._env.control_dt >= DELAY)[:, None]
+        late = {agent: like(actions[agent], np.where(begun, to_numpy(actions[agent]), 0.0)) for agent in self._late}
+        return {**actions, **late}
+
+    def reset(self, ended: Any = None) -> None:
+        """Tell all that episodes begin: in all environments, or where the last one `ended`, [N] bool."""
+        forget(self._own, ended)
+        self._mates.forget(ended)
+
+
+def check_fits(who: str, env: BatchedEnv) -> None:
+    """Raise ValueError if a policy was trained for another task, scene or control than those of an environment."""
+    if who in (*PARTNERS, *BASELINES):
+        return
+    settings = read_settings(find_run(who))
+    own = {"task": env.task_name, "scene": env.scene.name, "control": env.control}
+    theirs = {"task": settings.task, "scene": Path(settings.scene).stem, "control": settings.control}
+    for key, value in own.items():
+        if theirs[key] != value:
+            raise ValueError(f"{who} is of {key} {theirs[key]!r}, not {value!r}: a partner must be of the same")

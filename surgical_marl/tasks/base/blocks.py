@@ -1,0 +1,47 @@
+"""Blocks that stand on pegs, on the host: where they are, and how a jaw grips them, a finger between block and peg."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from surgical_marl.scenes.scene import Mount, Scene
+from surgical_marl.tasks.base.grips import DOWN, frames, tool_of, tool_poses
+
+OUT = 0.0009
+"""How far outside the bar the middle between the fingers is before they close, m: the inner one is near the peg."""
+
+
+def upright(place: np.ndarray, yaw: np.ndarray) -> np.ndarray:
+    """Return poses [n, 4, 4] at places [n, 3], turned about z by `yaw` [n], degrees."""
+    half = np.radians(yaw) / 2
+    return frames(place, np.stack([np.cos(half), 0 * half, 0 * half, np.sin(half)], -1))
+
+
+def gripping(mount: Mount, body: np.ndarray, site: np.ndarray, beyond: float) -> np.ndarray:
+    """Return poses [n, 4, 4] of tools that point down at a bar of blocks at poses [n, 4, 4], a finger in the hole.
+
+    Args:
+        mount: the arm.
+        body: of the blocks.
+        site: middle of the bar in the block's frame, [3] or [n, 3].
+        beyond: how far the tool tip is past the bar, m.
+    """
+    way = np.einsum("nij,nj->ni", body[:, :3, :3], np.broadcast_to(site * [1.0, 1.0, 0.0], (len(body), 3)))
+    outward = way * [1.0, 1.0, 0.0] / np.linalg.norm(way[:, :2], axis=-1, keepdims=True)
+    along = np.cross(np.array([0.0, 0.0, 1.0]), outward)
+    along = np.where((along @ tool_of(mount, mount.arm.home)[:3, 0])[:, None] < 0, -along, along)
+    place = body[:, :3, 3] + np.einsum("nij,nj->ni", body[:, :3, :3], np.broadcast_to(site, (len(body), 3)))
+    return tool_poses(place + OUT * outward, along, DOWN, np.full(len(body), beyond))
+
+
+def find_pegs(scene: Scene, task: str) -> np.ndarray:
+    """Return where the axes of pegs meet the plate in the world, [pegs, 3], m. ValueError if there is no peg."""
+    found = [
+        place.position + place.rotation @ site
+        for place in scene.objects.values()
+        for name, (site, _) in place.object.sites.items()
+        if name.startswith("peg_")
+    ]
+    if not found:
+        raise ValueError(f"{task} needs a scene with a board that has sites peg_0, peg_1, ...; {scene.name!r} has none")
+    return np.array(found)
