@@ -54,6 +54,14 @@ def test_blocks_and_goals_are_on_pegs_of_their_sides(difficulty: str, side: int)
     assert (least > -RESTING).all()
 
 
+def test_a_kernel_of_one_level_does_not_serve_another_one() -> None:
+    """One arm or two move the block: what is compiled differs, though tables have the same shapes."""
+    easy, default = env("easy"), env("default")
+    assert easy.task.tables.keys() == default.task.tables.keys() and easy.content != default.content
+    needles = [Env("needle_pick", "psm_needle", difficulty=d, observe={"psm_0": ["qpos"]}) for d in ("default", "hard")]
+    assert needles[0].content != needles[1].content
+
+
 def test_in_the_exchange_both_tools_grip_bars_of_their_sides_clear_of_the_wall() -> None:
     task: Any = env().task
     number = task._grasps

@@ -158,13 +158,13 @@ class Env:
     def content(self) -> bytes:
         """All that a step depends on besides code and `parameters`.
 
-        This is the model, with its masses and gains, and the options.
+        This is the model, with its masses and gains, the options, and the task's constants.
         """
         model = np.empty(mujoco.mj_sizeModel(self.scene.model), np.uint8)
         mujoco.mj_saveModel(self.scene.model, None, model)
         observed = {agent: (seen.names, seen.unseen) for agent, seen in self.observed.items()}
         how = (self.scene.control, self.decimation, self.scene.randomisation, self.options.start, self.scaled, observed)
-        return self.scene.fingerprint + f"{self.task_name} {how}".encode() + model.tobytes()
+        return self.scene.fingerprint + f"{self.task_name} {self.task.constants} {how}".encode() + model.tobytes()
 
     @property
     def classes(self) -> tuple[type, ...]:

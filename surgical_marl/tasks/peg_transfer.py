@@ -126,6 +126,11 @@ class Task(ObjectTask):
         self.grips = table[:, 14].astype(int)
         """Of the oracle: the number of the site that the first arm grips."""
 
+    @property
+    def constants(self) -> tuple[Any, ...]:
+        """Those of every such task, and whether the block is handed over."""
+        return *super().constants, self.level.handover
+
     def start(self, key: Array) -> Start:
         """Return where the block stands, and the goal."""
         row = jax.random.randint(key, (), 0, ROWS)
@@ -285,8 +290,6 @@ class Task(ObjectTask):
         """Return the numbers of the sites next to some, clockwise."""
         first = self._grasps[0]
         return np.asarray(first + (number - first - 1) % len(self._grasps))
-
-    # -- where blocks and goals are drawn
 
     def _draw(self, scene: Scene) -> np.ndarray:
         """Return starts [ROWS, 7] and goals [ROWS, 7] of the block, and the site that the first arm grips [ROWS, 1]."""

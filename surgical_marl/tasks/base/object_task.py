@@ -116,6 +116,11 @@ class ObjectTask(Task):
         self.oriented = bool(self.level.oriented)
         """Whether the goal has an orientation."""
 
+    @property
+    def constants(self) -> tuple[Any, ...]:
+        """Whether the goal has an orientation, and the arms that pick and present."""
+        return self.oriented, self.picker, self.presenter
+
     def _set_tables(self, starts: np.ndarray, goals: np.ndarray) -> None:
         """Set the tables from starts [rows, 7] and from poses [rows, 4, 4] of the object at its goals."""
         item = self.scene.objects[self.object].object

@@ -115,6 +115,14 @@ class Task:
         self.watched: dict[str, tuple[str, ...]] = {}
         """Agent -> pictures that `sense` reads, whether or not the agent observes them."""
 
+    @property
+    def constants(self) -> tuple[Any, ...]:
+        """What the functions read from `self` beside `tables` and `weights`, if it differs between levels.
+
+        A kernel that was compiled for other constants does not serve the task.
+        """
+        return ()
+
     @classmethod
     def summary(cls) -> str:
         """Return the first line of the task's description: the docstring of its module, or of the class."""
