@@ -64,7 +64,7 @@ def c_mujoco(workload: Workload, course: Course) -> Contender:
 
 
 def mujoco_warp(workload: Workload, course: Course) -> Contender:
-    """Return MuJoCo Warp, which comes with MJX: a lap of the course as one CUDA graph, or step by step on a CPU.
+    """Return MuJoCo Warp, which comes with MJX; on a GPU a step is a CUDA graph, as in its own benchmark.
 
     Raises:
         ValueError: after a lap its state is not finite.
@@ -76,22 +76,22 @@ def mujoco_warp(workload: Workload, course: Course) -> Contender:
     contacts, rows = _most(model, states, _controls(course))
     with wp.ScopedDevice(workload.where):
         while True:
-            lap, data, short = _warp_lap(wp, workload, course, model, states, contacts, rows)
+            lap, step, data, short = _warp_lap(wp, workload, course, model, states, contacts, rows)
             if not short:
                 break
             contacts, rows = 2 * contacts, 2 * rows
         if not np.isfinite(data.qpos.numpy()).all():
             raise ValueError(f"MuJoCo Warp: after a lap on scene {workload.scene!r} the state is not finite")
-        replay = lap
+        replay = step
         if workload.where == "cuda":
             with wp.ScopedCapture() as capture:
-                lap()
+                step()
             replay = lambda: wp.capture_launch(capture.graph)  # noqa: E731
     compile_s = time.perf_counter() - start
 
     def run() -> None:
         with wp.ScopedDevice(workload.where):
-            replay()
+            lap(replay)
 
     return Contender(workload.count, workload.where, compile_s, cpu_clock(run, wp.synchronize), None, HOLD * LAPS)
 
@@ -127,8 +127,8 @@ def _most(model: mujoco.MjModel, states: np.ndarray, controls: np.ndarray) -> tu
 
 def _warp_lap(
     wp: Any, workload: Workload, course: Course, model: mujoco.MjModel, states: np.ndarray, contacts: int, rows: int
-) -> tuple[Callable[[], None], Any, bool]:
-    """Return what makes a lap, its data after one, and whether that needed more room for contacts or rows."""
+) -> tuple[Callable[[Callable[[], None]], None], Callable[[], None], Any, bool]:
+    """Return what makes a lap of steps, a step, its data after a lap, and whether that needed more room than there is."""
     from mujoco.mjx.third_party import mujoco_warp as library
 
     count, nq = workload.count, model.nq
@@ -139,13 +139,16 @@ def _warp_lap(
     data.qvel.assign(tile(states[:, 1 + nq :], count).astype(np.float32))
     commands = [wp.array(tile(each, count).astype(np.float32), dtype=float) for each in course.commands]
 
-    def lap() -> None:
+    def step() -> None:
+        library.step(warped, data)
+
+    def lap(step: Callable[[], None]) -> None:
         for command in commands:
             wp.copy(data.ctrl, command)
             for _ in range(HOLD):
-                library.step(warped, data)
+                step()
 
-    lap()
+    lap(step)
     kinds = library.OverflowType
     full = kinds.NEFC | kinds.NJMAX_NNZ | kinds.BROADPHASE | kinds.NARROWPHASE
-    return lap, data, bool((data.overflow.numpy() & int(full)).any())
+    return lap, step, data, bool((data.overflow.numpy() & int(full)).any())
