@@ -128,7 +128,7 @@ def _most(model: mujoco.MjModel, states: np.ndarray, controls: np.ndarray) -> tu
 def _warp_lap(
     wp: Any, workload: Workload, course: Course, model: mujoco.MjModel, states: np.ndarray, contacts: int, rows: int
 ) -> tuple[Callable[[Callable[[], None]], None], Callable[[], None], Any, bool]:
-    """Return what makes a lap of steps, a step, its data after a lap, and whether that needed more room than there is."""
+    """Return what makes a lap of steps, a step, its data after a lap, and whether it lacked room."""
     from mujoco.mjx.third_party import mujoco_warp as library
 
     count, nq = workload.count, model.nq
