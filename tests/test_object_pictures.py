@@ -48,6 +48,21 @@ def env(tmp_path_factory: pytest.TempPathFactory) -> BatchedEnv:
     return BatchedEnv("reach", str(path), num_envs=ENVS, max_steps=STEPS, observe={"ecm_0": terms})
 
 
+@pytest.mark.parametrize("each", [(), (5,)], ids=["the same size", "sizes of their own"])
+def test_frames_are_about_centres_of_mass_in_both_libraries(each: tuple[int, ...]) -> None:
+    rng = np.random.default_rng(0)
+    position, centers = rng.normal(size=(5, 2, 3)), rng.normal(size=(*each, 2, 3))
+    quaternion = rng.normal(size=(5, 2, 4))
+    quaternion /= np.linalg.norm(quaternion, axis=-1, keepdims=True)
+    found = frames(position, quaternion, centers)
+    turns = np.array([[matrix_of(one) for one in row] for row in quaternion])
+    expected = position - (turns @ np.broadcast_to(centers, position.shape)[..., None])[..., 0]
+    np.testing.assert_allclose(found.origin, expected, atol=1e-12)
+    tensors = frames(*map(torch.from_numpy, (position, quaternion, centers)))
+    np.testing.assert_allclose(tensors.origin.numpy(), expected, atol=1e-12)
+
+
+@pytest.mark.slow
 def test_poses_are_of_the_frames_of_falling_objects(env: BatchedEnv) -> None:
     """They turn about their centres of mass, which is not where the stick has its origin."""
     env.reset(seed=0)

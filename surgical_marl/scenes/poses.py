@@ -35,12 +35,12 @@ def frames(position: Any, quaternion: Any, centers: Any) -> Poses:
         quaternion: w, x, y, z, of length 1, [N, k, 4].
         centers: of mass in the objects' own frames, m, [k, 3] or [N, k, 3], in the same library and on the same device.
     """
+    real, axis = quaternion[..., :1], quaternion[..., 1:]
     if isinstance(position, np.ndarray):
         cross = np.cross
     else:
         import torch
 
-        cross = torch.linalg.cross
-    real, axis = quaternion[..., :1], quaternion[..., 1:]
+        cross, centers = torch.linalg.cross, torch.broadcast_to(centers, axis.shape)
     sideways = 2 * cross(axis, centers)
     return Poses(position - (centers + real * sideways + cross(axis, sideways)), quaternion)
