@@ -8,7 +8,6 @@ import jax.numpy as jnp
 from jax import Array
 
 from surgical_marl.envs.env import Carry, Env, State
-from surgical_marl.physics.dynamics import Physics
 from surgical_marl.physics.views import Contacts
 
 
@@ -28,30 +27,32 @@ class PhysicsAlone(Env):
     def reset(self, key: Array, episode: Array | int = 0, parameters: Any = None) -> State:
         """Return the state at home."""
         carry = Carry(self.simulator.home, (), key, jnp.int32(episode), jnp.int32(0), hidden=self.plant.start(key))
-        return self._state(carry, carry.physics, self.simulator.home_contacts.distance)
+        return bare_state(carry, self.simulator.home_contacts.distance)
 
     def step(self, carry: Carry, actions: dict[str, Array], parameters: Any = None) -> State:
         """Do one physics step; there are no actions."""
         _, distance = self.simulator._look(carry.physics.qpos)
         physics, _ = self.plant.actual(carry.hidden)._step(carry.physics, self.simulator.untouched)
-        return self._state(carry, physics, distance)
+        return bare_state(carry._replace(physics=physics), distance)
 
     @property
     def pauses(self) -> bool:
         """Always False: there are no pictures."""
         return False
 
-    def _state(self, carry: Carry, physics: Physics, distance: Array) -> State:
-        nothing: Any = {}
-        return State(
-            carry=carry._replace(physics=physics),
-            observations=nothing,
-            state=nothing,
-            rewards=nothing,
-            terminated=nothing,
-            truncated=nothing,
-            final_observations=nothing,
-            final_state=nothing,
-            infos=nothing,
-            contacts=Contacts(distance, nothing, nothing, nothing),
-        )
+
+def bare_state(carry: Carry, distance: Array, infos: Any = None) -> State:
+    """Return a state of what is carried, the distances of all pairs that can touch, and some infos alone."""
+    nothing: Any = {}
+    return State(
+        carry=carry,
+        observations=nothing,
+        state=nothing,
+        rewards=nothing,
+        terminated=nothing,
+        truncated=nothing,
+        final_observations=nothing,
+        final_state=nothing,
+        infos=nothing if infos is None else infos,
+        contacts=Contacts(distance, nothing, nothing, nothing),
+    )

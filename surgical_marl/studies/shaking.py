@@ -17,11 +17,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from surgical_marl.bench.physics import bare_state
 from surgical_marl.engines.choose import Engine, make_engine
 from surgical_marl.envs.env import Carry, Env, State
 from surgical_marl.physics.bodies import rotation
 from surgical_marl.physics.dynamics import Physics
-from surgical_marl.physics.views import Contacts
 from surgical_marl.robots.rotation import quaternion
 from surgical_marl.scenes.grasps import Jaw
 
@@ -136,20 +136,8 @@ class Watched(Env):
         )
 
     def _state(self, carry: Carry, seen: Seen) -> State:
-        nothing: Any = {}
         _, distance = self.simulator._look(carry.physics.qpos)
-        return State(
-            carry=carry,
-            observations=nothing,
-            state=nothing,
-            rewards=nothing,
-            terminated=nothing,
-            truncated=nothing,
-            final_observations=nothing,
-            final_state=nothing,
-            infos={"seen": seen._asdict()},
-            contacts=Contacts(distance, nothing, nothing, nothing),
-        )
+        return bare_state(carry, distance, {"seen": seen._asdict()})
 
 
 class Grasps:
