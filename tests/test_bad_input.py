@@ -168,6 +168,7 @@ def test_whole_numbers_and_values_beyond_single_precision_are_clipped() -> None:
             np.testing.assert_array_equal(one, two)
 
 
+@pytest.mark.slow
 def test_nan_is_refused_by_the_reference_engine_too() -> None:
     """Its JAX arrays would be NaN for ever."""
     env = BatchedEnv("reach", "psm", num_envs=1, engine="mjx", arrays="jax")

@@ -25,6 +25,7 @@ def test_a_trajectory_is_optimised_by_gradient() -> None:
     assert errors[0] > 20 and errors[-1] < 2
 
 
+@pytest.mark.slow
 def test_ppo_earns_more_than_at_first() -> None:
     rewards = run("jax_ppo.py", r"reward (-?[\d.]+)")
     assert np.mean(rewards[-3:]) > np.mean(rewards[:3]) + 0.1

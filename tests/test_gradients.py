@@ -61,6 +61,7 @@ def smooth(tmp_path: Path) -> str:
     return str(scene)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scene", [*SCENES, pytest.param("smooth", marks=pytest.mark.slow)])
 def test_the_reverse_derivative_is_that_of_finite_differences(scene: str, request: pytest.FixtureRequest) -> None:
     """From rest without a motion, and in motion; over the first step alone, and over 20 of PSM, ECM and smooth joints.

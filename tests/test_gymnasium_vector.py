@@ -89,6 +89,7 @@ def test_resets_between_go_on_as_single_environments_do(mode: AutoresetMode) -> 
     assert_all_same(sequence(make(autoreset_mode=mode)), sequence(make_sync(mode)))
 
 
+@pytest.mark.slow
 def test_pictures_as_observations_follow_the_modes_too() -> None:
     options = {"num_envs": 2, "max_steps": 2, "device": "cpu"}
     match = "surgical_marl/MatchImage-v0"

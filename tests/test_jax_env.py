@@ -31,7 +31,7 @@ def assert_close(one: Any, other: Any) -> None:
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, **CLOSE), one, other)
 
 
-@pytest.mark.parametrize("scene", ["psm", "bimanual_psm"])
+@pytest.mark.parametrize("scene", ["psm", pytest.param("bimanual_psm", marks=pytest.mark.slow)])
 def test_it_plays_what_the_pettingzoo_face_plays_over_several_episodes(scene: str) -> None:
     env, rng = make(scene), np.random.default_rng(0)
     team: Any = sm.parallel_env("reach", scene=scene, max_steps=STEPS)

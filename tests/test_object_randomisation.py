@@ -106,6 +106,7 @@ def test_what_lies_on_something_lies_there_whatever_its_size(tmp_path: Path) -> 
     np.testing.assert_allclose(needle.position[:, 2], height, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_a_varied_object_slides_where_coulomb_says(tmp_path: Path) -> None:
     """Sleds on a plane that slopes by 0.5: those with less friction than that move as fast as Coulomb says."""
     feet = [{"sphere": {"radius": 0.001, "position": [x, y, 0]}} for x, y in ((0.01, 0), (-0.01, 0.01), (-0.01, -0.01))]

@@ -71,7 +71,8 @@ def test_held_out_goals_are_none_of_training(task: str, scene: str, name: str) -
     assert len(held_out) > 1000 and not trained & held_out
 
 
-@pytest.mark.parametrize("engine", ["fused", pytest.param("mjx", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", ["fused", "mjx"])
 def test_random_starts_are_collision_free_postures(engine: str) -> None:
     env = BatchedEnv("reach", "bimanual_psm", num_envs=64, engine=engine, start="random", max_steps=2)
     observations, _, infos = env.reset(seed=0)
