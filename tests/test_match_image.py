@@ -21,7 +21,7 @@ from surgical_marl.vision.endoscope import SIZE, Endoscope
 from tests.helpers.actions import random_actions
 from tests.helpers.scenes import WATCHED
 
-SCENES = ("ecm", WATCHED)
+SCENES = ("ecm", pytest.param(WATCHED, marks=pytest.mark.slow))
 COUNT, STEPS = 3, 4
 
 

@@ -162,6 +162,7 @@ def test_the_example_algorithm_is_listed_trained_and_loaded(
     assert "unknown algorithm 'sop', did you mean 'spo'" in done.stderr
 
 
+@pytest.mark.slow
 def test_the_example_task_and_scene_have_all_that_shipped_ones_have(
     example: Callable[[str], subprocess.CompletedProcess[str]],
 ) -> None:
