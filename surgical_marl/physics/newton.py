@@ -233,7 +233,7 @@ class Newton:
         a, m = self._dofs.shape
         touched = self._touched(problem)
 
-        def eliminate(_: None, row: Any) -> tuple[None, Any]:
+        def eliminate(row: Any) -> Any:
             own, force, coupling, coupled = row
             factor = jax.lax.linalg.cholesky(own, symmetrize_input=False)
             half = triangular_solve(factor, force[:, None], left_side=True, lower=True)[:, 0]
@@ -244,7 +244,7 @@ class Newton:
                 return jnp.moveaxis(wide.reshape(6, a, m), 1, 0)
 
             wide = jax.lax.cond(coupled, on_arms, jnp.zeros_like, coupling) if a else coupling
-            return None, (factor, half, wide)
+            return factor, half, wide
 
         def back(row: Any) -> Array:
             factor, half, wide, coupled = row
@@ -253,7 +253,7 @@ class Newton:
             return triangular_solve(factor, left[:, None], left_side=True, lower=True, transpose_a=True)[:, 0]
 
         rows = local.object, local.excess, local.coupling, touched.any(1)
-        _, kept = jax.lax.scan(eliminate, None, rows)
+        kept = jax.lax.map(eliminate, rows)
         found = excess.arms
         if a:
             left = Reduced(stiff, excess.arms, here.arms, problem.rows, problem.joints, kept[1], kept[2], touched)
