@@ -30,6 +30,8 @@ stiff as a capsule that lies flat, on its two ends."""
 FASTEST = 0.04
 """Speed at which an overlap is pushed out at most, m/s: a deep one, as after a fall within one step, meets more
 damping. The force of something that is pressed in grows with its overlap nevertheless."""
+HITS = 0.5
+"""Speed of approach from which on two bodies hit each other and no longer slide, m/s: twenty steps of gravity."""
 SHEAR = 0.8
 """Stiffness of a contact along the surface, relative to that of a point along the normal (R. D. Mindlin, 1949: 2 (1 -
 nu) / (2 - nu) for materials of Poisson's ratio nu, 0.8 for 0.33)."""
@@ -177,13 +179,17 @@ class Handling:
         stiffness = jnp.asarray(t.stiffness)[number]
         k = near * SHARE * stiffness
         rate = k * jnp.maximum(dt + DAMPING * jnp.clip(reach / FIRM, 0.0, 1.0), points.depth / FASTEST)
-        push = jnp.where(near > 0, k * points.depth - rate * speed, AWAY)
+        rubbed = cone.along @ motion.twist + dt / 2 * jnp.append(patch.frame[1:] @ motion.bends[-1], 0.0)
+        coefficient = jnp.asarray(t.sliding)[number]
+        # The cone lifts what slides by this speed times a step, as if the surfaces came closer (docs/physics.md). So they
+        # part that much faster here, at the sliding speed of now; but not in an impact, which may stop the sliding.
+        lifts = coefficient * jnp.sqrt(jnp.sum(rubbed * rubbed)) * jnp.clip(1 + speed / HITS, 0.0, 1.0)
+        push = jnp.where(near > 0, k * points.depth - rate * (speed + lifts), AWAY)
         k, remembers = SHEAR * stiffness, self._finger(number) < len(t.fingers)
         springs = jnp.where(remembers, k, 0.0)
         drag = jnp.where(remembers, k * (dt + DAMPING), k * CREEP)
-        rubbed = cone.along @ motion.twist + dt / 2 * jnp.append(patch.frame[1:] @ motion.bends[-1], 0.0)
         pull = -springs * slip - drag * rubbed
-        resisting = Cone(cone.normal, dt * rate, push, cone.along, dt * drag, pull, jnp.asarray(t.sliding)[number])
+        resisting = Cone(cone.normal, dt * rate, push, cone.along, dt * drag, pull, coefficient)
         return contact._replace(cone=resisting)
 
     def _motion(self, contact: Contact, patch: Patch, number: Array, speeds: _Speeds, origin: Array) -> _Motion:
