@@ -101,6 +101,18 @@ class RslRlVecEnv(VecEnv):
         groups = {name: value.to(self.device) for name, value in carry["observations"].items()}
         self._observations = TensorDict(groups, batch_size=[self.num_envs])
 
+    def place(self, chosen: Tensor, carry: Mapping[str, Tensor]) -> None:
+        """Let the environments `chosen` [n] go on from other states.
+
+        Args:
+            chosen: their numbers.
+            carry: name of a part of the carry -> its new values, [n, ...]. Other parts stay as they are.
+        """
+        for name, values in carry.items():
+            now = self.env.engine.read(name, "torch")
+            now[chosen] = values.to(now.dtype)
+            self.env.engine.write(name, now)
+
     def _group(self, observations: Mapping[str, Any], state: Any) -> TensorDict:
         groups = {**self.layout.stack(observations), "state": state.clone()}
         return TensorDict(groups, batch_size=[self.num_envs])

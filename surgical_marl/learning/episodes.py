@@ -24,11 +24,14 @@ class Episodes:
     Attributes:
         collided: `[N]` bool, whether the running episode of each environment had a collision so
             far.
+        moved: `[N]` bool, whether the running episode went on from a state of the oracle. Such episodes count neither
+            as successful nor as failed.
     """
 
     def __init__(self, agents: Sequence[str], terms: Sequence[str], acting: int, num_envs: int, device: str) -> None:
         self.agents, self.terms, self._acting = list(agents), list(terms), acting
         self.collided = torch.zeros(num_envs, dtype=torch.bool, device=device)
+        self.moved = torch.zeros_like(self.collided)
         self._totals = torch.zeros(len(ENDED) + len(self.terms), device=device)
 
     def add(self, rewards: Tensor, dones: Tensor, infos: Mapping[str, Mapping[str, Tensor]]) -> None:
@@ -47,9 +50,15 @@ class Episodes:
                 self.collided.float(),
             ]
         )
-        sums = torch.where(dones, ended, 0.0).sum(-1)
+        sums = torch.where(dones & ~self.moved, ended, 0.0).sum(-1)
         self._totals += torch.cat([sums, rewards.mean()[None], self._mean_terms(infos, rewards)])
         self.collided &= ~dones
+        self.moved &= ~dones
+
+    def move(self, moved: Tensor) -> None:
+        """Note which environments, `[N]` bool, go on from another state now."""
+        self.collided &= ~moved
+        self.moved |= moved
 
     def _mean_terms(self, infos: Mapping[str, Mapping[str, Tensor]], rewards: Tensor) -> Tensor:
         """Each reward term's part of the mean reward, `[T]`; an arm without a term has none of it."""

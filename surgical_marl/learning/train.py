@@ -56,6 +56,7 @@ CHANGEABLE = {
     "team_reward",
     "ppo",
     "constraint",
+    "oracle_states",
 }
 # Except these, which determine the content of a checkpoint.
 FIXED = {"ppo.normalise_values", "constraint.cost"}

@@ -17,6 +17,7 @@ from surgical_marl.learning.configuration import rsl_rl_config
 from surgical_marl.learning.constraint import METRICS
 from surgical_marl.learning.episodes import ENDED, Episodes
 from surgical_marl.learning.graphs import Replayed
+from surgical_marl.learning.oracle_states import OracleStates
 from surgical_marl.plugins.algorithms import ALGORITHMS
 from surgical_marl.runs.settings import Settings
 
@@ -95,6 +96,8 @@ class Trainer:
         self._stop = torch.zeros(1, device=device)
         self._marks = torch.zeros(len(self._names["observations"]) + len(self._names["values"]), device=device)
         self._values = torch.zeros(sum(map(len, self._names.values())), device=device)
+        wanted = settings.oracle_states.share > 0
+        self._oracle_states = OracleStates(settings, self.env.layout, device) if wanted else None
         self._samples = settings.steps_per_iteration * env.num_envs * distributed.size()
         self._read = 0.0
         self.rollout = Replayed(self._rollout, enabled=self._cuda and self.env.capturable)
@@ -110,6 +113,7 @@ class Trainer:
     def iterate(self) -> Report:
         """Do one rollout and one update; return the report, which `row` reads."""
         started = time.perf_counter()
+        self._place()
         self.rollout()
         self._stop.fill_(self.stop_wanted)
         self.update()
@@ -121,6 +125,26 @@ class Trainer:
         arrived = torch.cuda.Event()
         arrived.record()
         return Report(self.iteration, self.env_steps, started, host, arrived)
+
+    def _place(self) -> None:
+        """Let some environments go on from states of the oracle, as the settings say."""
+        asked, states = self.settings.oracle_states, self._oracle_states
+        fading = max(0.0, 1.0 - self.iteration / (asked.until * self.settings.iterations))
+        count = round(asked.share * fading * self.env.num_envs)
+        if states is None or not count:
+            return
+        chosen = torch.randperm(self.env.num_envs, device=self.env.device)[:count]
+        carry, seen = states.draw(count)
+        with torch.inference_mode():
+            self.env.place(chosen, carry)
+            for name, kept in self._observations.items():
+                kept[chosen] = seen[name]
+        moved = torch.zeros(self.env.num_envs, dtype=torch.bool, device=self.env.device)
+        moved[chosen] = True
+        self.algorithm.memory.clear(moved)
+        if self.algorithm.constraint is not None:
+            self.algorithm.constraint.broken &= ~moved
+        self.episodes.move(moved)
 
     def close(self) -> None:
         """Release the CUDA graphs."""
@@ -223,6 +247,7 @@ class Trainer:
                 "observations": self._observations.to_dict(),
                 "memory": self.algorithm.memory.state_dict(),
                 "broken": None if constraint is None else constraint.broken,
+                "moved": self.episodes.moved,
             },
             "collided": self.episodes.collided,
             "random": torch.get_rng_state(),
@@ -248,6 +273,8 @@ class Trainer:
             kept.copy_(state["env"]["observations"][name])
         if self.algorithm.constraint is not None:
             self.algorithm.constraint.broken.copy_(state["env"]["broken"])
+        if "moved" in state["env"]:  # a checkpoint of an older version lacks it
+            self.episodes.moved.copy_(state["env"]["moved"])
         if self.algorithm.actor.is_recurrent:
             self.algorithm.memory.load_state_dict(state["env"]["memory"])
         self.episodes.collided.copy_(state["collided"])

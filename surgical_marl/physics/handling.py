@@ -181,8 +181,8 @@ class Handling:
         rate = k * jnp.maximum(dt + DAMPING * jnp.clip(reach / FIRM, 0.0, 1.0), points.depth / FASTEST)
         rubbed = cone.along @ motion.twist + dt / 2 * jnp.append(patch.frame[1:] @ motion.bends[-1], 0.0)
         coefficient = jnp.asarray(t.sliding)[number]
-        # The cone lifts what slides by this speed times a step, as if the surfaces came closer (docs/physics.md). So they
-        # part that much faster here, at the sliding speed of now; but not in an impact, which may stop the sliding.
+        # The cone lifts what slides by this speed times a step, as if the surfaces came closer (docs/physics.md). So
+        # they part that much faster here, at the sliding speed of now; not in an impact, which may stop the sliding.
         lifts = coefficient * jnp.sqrt(jnp.sum(rubbed * rubbed)) * jnp.clip(1 + speed / HITS, 0.0, 1.0)
         push = jnp.where(near > 0, k * points.depth - rate * (speed + lifts), AWAY)
         k, remembers = SHEAR * stiffness, self._finger(number) < len(t.fingers)

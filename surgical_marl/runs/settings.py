@@ -53,6 +53,20 @@ class ConstraintSettings(Checked):
 
 
 @dataclass(frozen=True)
+class OracleStatesSettings(Checked):
+    """Starts along the oracle's episodes (see `learning/oracle_states.py`).
+
+    share: of the environments that go on from a state of the oracle after each iteration, at the beginning. until: the
+    share of the run's iterations by which this has fallen to none, in a straight line.
+    """
+
+    prefix: ClassVar[str] = "oracle_states."
+
+    share: float = number(0.0, 0.0, 1.0)
+    until: float = number(1.0, 0.001, 1.0)
+
+
+@dataclass(frozen=True)
 class NetworkSettings(Checked):
     """Actor and critic: an MLP of this shape for each, with an optional GRU or LSTM cell before it."""
 
@@ -86,6 +100,7 @@ class Settings(Options):
     team_reward: bool = False
     ppo: PPOSettings = field(default_factory=PPOSettings)
     constraint: ConstraintSettings = field(default_factory=ConstraintSettings)
+    oracle_states: OracleStatesSettings = field(default_factory=OracleStatesSettings)
     network: NetworkSettings = field(default_factory=NetworkSettings)
 
     def __post_init__(self) -> None:
