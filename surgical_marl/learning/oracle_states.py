@@ -58,7 +58,7 @@ class OracleStates:
     def __init__(self, settings: Settings, layout: Layout, device: str) -> None:
         if any(layout.pictures.values()):
             raise ValueError("oracle_states.share must be 0 where agents observe pictures")
-        env = make_env(settings, EPISODES)
+        env = make_env(settings, EPISODES, "numpy")
         try:
             tables = repr([(name, np.asarray(table).tobytes()) for name, table in sorted(env.task.tables.items())])
             about = (describe(env.env.parameters), str(env.max_steps), tables)
@@ -86,8 +86,8 @@ def _record(env: BatchedEnv) -> np.ndarray:
     for step in trange(1, env.max_steps, desc="the oracle's episodes", unit="step", leave=False, disable=None):
         result = env.step(policy(observations))
         observations = result.observations
-        goes_on &= ~np.asarray(result.terminated | result.truncated)
-        success = np.all([np.asarray(result.infos[agent]["success"]) for agent in env.agents], axis=0)
+        goes_on &= ~(result.terminated | result.truncated)
+        success = np.all([result.infos[agent]["success"] for agent in env.agents], axis=0)
         solved = np.where((solved < 0) & success & goes_on, step, solved)
         if step % EVERY == 0:
             at = np.flatnonzero(goes_on)
@@ -101,12 +101,10 @@ def _record(env: BatchedEnv) -> np.ndarray:
     return np.concatenate(rows)[np.random.default_rng(0).choice(useful, STATES)]
 
 
-def _joined(env: BatchedEnv, observations: dict[str, Tensor], state: Tensor) -> np.ndarray:
+def _joined(env: BatchedEnv, observations: dict[str, np.ndarray], state: np.ndarray) -> np.ndarray:
     """Return the parts of `_shapes` side by side, [N, columns] float32, which holds all whole numbers in them."""
-    every = (
-        env.carry() | {agent: np.asarray(seen) for agent, seen in observations.items()} | {"state": np.asarray(state)}
-    )
-    return np.concatenate([np.asarray(every[name], np.float32).reshape(env.num_envs, -1) for name in _shapes(env)], 1)
+    every = {**env.carry(), **observations, "state": state}
+    return np.concatenate([every[name].reshape(env.num_envs, -1) for name in _shapes(env)], 1, dtype=np.float32)
 
 
 def _shapes(env: BatchedEnv) -> dict[str, tuple[int, ...]]:

@@ -6,12 +6,12 @@ from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.runs.settings import Settings
 
 
-def make_env(settings: Settings, num_envs: int | None = None) -> BatchedEnv:
-    """Make the environment of a run, with torch tensors; `num_envs` replaces the setting."""
+def make_env(settings: Settings, num_envs: int | None = None, arrays: str = "torch") -> BatchedEnv:
+    """Make the environment of a run; `num_envs` replaces the setting."""
     return BatchedEnv(
         **settings.of_environment(),
         num_envs=num_envs or settings.num_envs,
         engine=settings.engine,
         device=settings.device,
-        arrays="torch",
+        arrays=arrays,
     )
