@@ -135,6 +135,18 @@ def test_rewards_are_of_the_team_and_of_each_stage_once() -> None:
     assert [value("psm_0", name) for name in ("receive", "passed", "meet", "grasp", "carry")] == [0] * 5
 
 
+@pytest.mark.parametrize(("number", "counts"), [(2, True), (1, False), (6, False)])
+def test_only_a_useful_grip_is_rewarded(number: int, counts: bool) -> None:
+    """The tools are at another bar each time; the way to the middle half is what `meet` and `to_useful` measure."""
+    task: Any = env().task
+    for held in ((True, True), (False, True)):
+        seen = world(env(), held, held, number)
+        terms = task.reward_terms(seen)["psm_0"]
+        assert float(terms["receive"] + terms["passed"]) == counts
+    away = np.linalg.norm(task.terms("psm_1")["to_useful"].read(seen))
+    assert (away < 1e-6) == counts and 0.02 - float(terms["meet"]) == pytest.approx(away, abs=1e-6)
+
+
 def test_the_settings_list_every_weight_as_the_task_has_it() -> None:
     settings = yaml.safe_load((content_dir("configs") / f"{TASK}.yaml").read_text())
     assert settings["reward"] == dict(env().task.weights)

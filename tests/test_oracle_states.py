@@ -16,7 +16,7 @@ from surgical_marl.runs.settings import NetworkSettings, OracleStatesSettings, S
 
 SETTINGS = Settings(
     task="reach", scene="psm", num_envs=64, iterations=4, steps_per_iteration=4, device="cpu",
-    oracle_states=OracleStatesSettings(share=0.5, until=0.5), network=NetworkSettings(hidden=(8,)),
+    oracle_states=OracleStatesSettings(rate=12.5, until=0.5), network=NetworkSettings(hidden=(8,)),
 )  # fmt: skip
 
 
@@ -79,5 +79,5 @@ def test_training_with_them_goes_on_bit_for_bit(trainer: Trainer) -> None:
 def test_pictures_are_refused() -> None:
     seeing = replace(SETTINGS, scene="trimanual_psm_ecm", observe={"ecm_0": ("qpos", "command", "image")})
     env = make_env(seeing, 2)
-    with pytest.raises(ValueError, match=r"oracle_states.share must be 0 where agents observe pictures"):
+    with pytest.raises(ValueError, match=r"oracle_states.rate must be 0 where agents observe pictures"):
         OracleStates(seeing, Layout(env), "cpu")

@@ -57,7 +57,7 @@ class OracleStates:
 
     def __init__(self, settings: Settings, layout: Layout, device: str) -> None:
         if any(layout.pictures.values()):
-            raise ValueError("oracle_states.share must be 0 where agents observe pictures")
+            raise ValueError("oracle_states.rate must be 0 where agents observe pictures")
         env = make_env(settings, EPISODES, "numpy")
         try:
             tables = repr([(name, np.asarray(table).tobytes()) for name, table in sorted(env.task.tables.items())])
@@ -97,7 +97,7 @@ def _record(env: BatchedEnv) -> np.ndarray:
     last = solved[np.concatenate(numbers)]
     useful = np.flatnonzero((last >= 0) & (np.concatenate(steps) <= last + BEYOND))
     if not len(useful):
-        raise ValueError(f"oracle_states.share must be 0 for {env.task_name}: its oracle never succeeded")
+        raise ValueError(f"oracle_states.rate must be 0 for {env.task_name}: its oracle never succeeded")
     return np.concatenate(rows)[np.random.default_rng(0).choice(useful, STATES)]
 
 

@@ -96,7 +96,7 @@ class Trainer:
         self._stop = torch.zeros(1, device=device)
         self._marks = torch.zeros(len(self._names["observations"]) + len(self._names["values"]), device=device)
         self._values = torch.zeros(sum(map(len, self._names.values())), device=device)
-        wanted = settings.oracle_states.share > 0
+        wanted = settings.oracle_states.rate > 0
         self._oracle_states = OracleStates(settings, self.env.layout, device) if wanted else None
         self._samples = settings.steps_per_iteration * env.num_envs * distributed.size()
         self._read = 0.0
@@ -130,7 +130,8 @@ class Trainer:
         """Let some environments go on from states of the oracle, as the settings say."""
         asked, states = self.settings.oracle_states, self._oracle_states
         fading = max(0.0, 1.0 - self.iteration / (asked.until * self.settings.iterations))
-        count = round(asked.share * fading * self.env.num_envs)
+        share = asked.rate * fading * self.settings.steps_per_iteration / self.env.max_episode_length
+        count = round(min(share, 1.0) * self.env.num_envs)
         if states is None or not count:
             return
         chosen = torch.randperm(self.env.num_envs, device=self.env.device)[:count]

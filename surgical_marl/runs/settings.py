@@ -56,13 +56,13 @@ class ConstraintSettings(Checked):
 class OracleStatesSettings(Checked):
     """Starts along the oracle's episodes (see `learning/oracle_states.py`).
 
-    share: of the environments that go on from a state of the oracle after each iteration, at the beginning. until: the
-    share of the run's iterations by which this has fallen to none, in a straight line.
+    rate: how often an environment goes on from a state of the oracle, on average in the time of an episode, at the
+    beginning of a run. until: the share of the run's iterations by which this has fallen to never, in a straight line.
     """
 
     prefix: ClassVar[str] = "oracle_states."
 
-    share: float = number(0.0, 0.0, 1.0)
+    rate: float = number(0.0, 0.0, 1000.0)
     until: float = number(1.0, 0.001, 1.0)
 
 

@@ -3,13 +3,14 @@
 The needle lies where only the first arm reaches, and the goal is where only the second one does.
 
 Agents        the two arms of the scene whose jaws have pads. The first picks, the second presents.
-Observation   as in `needle_pick`, and whether the other arm holds the needle, the way to the other tool tip, and the
-              least distance between the arms.
+Observation   as in `needle_pick`, and the way to the nearest part of the needle's middle half, whether the other arm
+              holds the needle, the way to the other tool tip, and the least distance between the arms.
 Action        one number in [-1, 1] for every joint; the jaw opens above 0 and closes otherwise.
 Reward        the same for both arms, but for `clearance` and `collision`; weights in brackets. Progress over the best
               of the episode so far: `reach` (20 / m), `grasp` (2) and `lift` (2) of the first arm; `meet`, from the
-              second tool to the held needle (10 / m); `receive`, when both hold it (4); `passed`, when the second holds
-              it alone (4); then `carry` (10 / m), and `turn` (2 / rad, where the goal has an orientation).
+              second tool to the middle half of the held needle (10 / m); `receive`, when both hold it (4), and
+              `passed`, when the second holds it alone (4), there; then `carry` (10 / m), and `turn` (2 / rad, where the
+              goal has an orientation).
               `precision` (0.1), `success` (0.2), `drop` (-2), `clearance` (-1), `collision` (-2).
 Success       the second arm alone holds the needle, in its middle half; its point is within 2 mm of the goal, and it is
               turned within 10 degrees of it, if the goal has an orientation.
@@ -47,9 +48,10 @@ from surgical_marl.tasks.base.grips import (
     tool_poses,
 )
 from surgical_marl.tasks.base.lying import lying
-from surgical_marl.tasks.base.object_task import NEAR, Best, Now, ObjectTask
+from surgical_marl.tasks.base.object_task import FAR, NEAR, Best, Now, ObjectTask, known
 from surgical_marl.tasks.base.script import Snapshot, Step, Wish
 from surgical_marl.tasks.base.task import Start
+from surgical_marl.tasks.base.terms import Picture, Term
 from surgical_marl.tasks.base.workspace import choose
 from surgical_marl.tasks.needle_pick import ABOVE, HIGH, LOW, PRESS, RAISE, SAFE, PickLevel
 
@@ -76,11 +78,11 @@ class Team(NamedTuple):
     """The best that both arms did so far, [] float32 each."""
 
     meet: Array
-    """Least distance of the second tool from the needle while that was held, m."""
+    """Least distance of the second tool from the needle's middle half while the needle was held, m."""
     receive: Array
-    """1 once both held it."""
+    """1 once both held it, the second one in its middle half."""
     passed: Array
-    """1 once the second arm held it alone."""
+    """1 once the second arm held it alone, there."""
 
 
 class HandoverGoal(NamedTuple):
@@ -128,33 +130,52 @@ class Task(ObjectTask):
 
     # -- what is measured
 
-    def further(self, team: Team, now: Now) -> Team:
+    def further(self, world: World, now: Now) -> Team:
         """Return the best of both arms with what is measured now."""
-        first, second = now.held[self.picker], now.held[self.presenter]
-        way = now.reach[self.presenter]
+        team, first, second = world.goal.team, now.held[self.picker], now.held[self.presenter]
+        away, there = self._to_useful(world, self.presenter), self._usefully(now) & (now.lift >= 1.0)
+        way = known(jnp.sqrt(jnp.sum(away * away)))
         single = lambda x: x.astype(jnp.float32)  # noqa: E731
         return Team(
             jnp.where(team.meet < 0, way, jnp.where(first | second, jnp.minimum(team.meet, way), team.meet)),
-            jnp.maximum(team.receive, single(first & second & (now.lift >= 1.0))),
-            jnp.maximum(team.passed, single(self.presents(now) & (now.lift >= 1.0))),
+            jnp.maximum(team.receive, single(first & second & there)),
+            jnp.maximum(team.passed, single(self.presents(now) & there)),
         )
 
     def remember(self, world: World) -> Any:
         """Return the goal with the best so far."""
-        goal = super().remember(world)
-        return goal._replace(team=self.further(goal.team, self.now(world)))
+        return super().remember(world)._replace(team=self.further(world, self.now(world)))
 
     def reward_terms(self, world: World) -> dict[str, dict[str, Array]]:
         """Return the terms of every task that brings an object to a goal, and `meet` (m), `receive` and `passed`."""
-        team = world.goal.team
-        new = self.further(team, self.now(world))
+        team, new = world.goal.team, self.further(world, self.now(world))
         more = {"meet": team.meet - new.meet, "receive": new.receive - team.receive, "passed": new.passed - team.passed}
         return {agent: {**terms, **more} for agent, terms in super().reward_terms(world).items()}
 
     def at_goal(self, now: Now) -> Array:
         """Return whether the needle is at its goal, and the second arm alone holds it there, in its middle half."""
-        useful = jnp.any(now.part[self.presenter] == self._useful)
-        return super().at_goal(now) & useful
+        return super().at_goal(now) & self._usefully(now)
+
+    def _usefully(self, now: Now) -> Array:
+        """Return whether the second tool is at the needle's middle half."""
+        return jnp.any(now.part[self.presenter] == self._useful)
+
+    # -- what agents observe
+
+    def terms(self, agent: str) -> dict[str, Term | Picture]:
+        """Return the terms of every such task, and `to_useful` [3], from the tool tip to the needle's middle half."""
+        far = np.full(3, FAR)
+        return {**super().terms(agent), "to_useful": Term(lambda world: self._to_useful(world, agent), -far, far)}
+
+    def observes(self, agent: str) -> tuple[str, ...]:
+        """Return the terms of every such task, and `to_useful` after `to_object`."""
+        names = super().observes(agent)
+        after = names.index("to_object") + 1
+        return (*names[:after], "to_useful", *names[after:])
+
+    def _to_useful(self, world: World, agent: str) -> Array:
+        """Return the way from a tool tip to the needle's middle half, in the arm's base frame, m, [3]."""
+        return self.way_to_bars(world, agent, self._useful)
 
     def reached(self, world: Any) -> dict[str, dict[str, Array]]:
         """Return which stages are reached now, for both arms."""

@@ -146,14 +146,14 @@ class ObjectTask(Task):
             tip = view.tool_tip @ mount.rotation.T.astype(np.float32) + mount.position.astype(np.float32)
             away = place(self._middles) - tip
             square = jnp.sum(away * away, -1)
-            reach[agent], part[agent] = _known(jnp.sqrt(jnp.min(square))), jnp.argmin(square)
+            reach[agent], part[agent] = known(jnp.sqrt(jnp.min(square))), jnp.argmin(square)
             held[agent], touched[agent] = handled.holding, handled.force > 0
         lowest = jnp.min(place(self._sites)[:, 2]) - self.tables["lowest"][goal.row]
         off = place(self._point) - self.tables["points"][goal.row]
         chord = body.rotation - self.tables["turns"][goal.row]
         half = jnp.sqrt(jnp.sum(chord * chord)) / np.float32(np.sqrt(8))  # of rotations: sine of half the angle
         dropped = ((goal.best.lift >= 1.0) & ~_any(touched)) | ~(lowest >= -LOST)  # lost, too, if it is not a number
-        error, angle = _known(jnp.sqrt(jnp.sum(off * off))), _known(2 * jnp.arcsin(jnp.minimum(half, 1.0)))
+        error, angle = known(jnp.sqrt(jnp.sum(off * off))), known(2 * jnp.arcsin(jnp.minimum(half, 1.0)))
         lift = jnp.where(lowest > 0, jnp.minimum(lowest / LIFT, 1.0), 0.0)
         return Now(reach, part, held, touched, lift, error, angle, dropped)
 
@@ -242,11 +242,6 @@ class ObjectTask(Task):
         turn, origin = mount.rotation.astype(np.float32), mount.position.astype(np.float32)
         local = lambda point: (point - origin) @ turn  # noqa: E731
 
-        def to_object(world: World) -> Array:
-            body = world.objects[name]
-            away = local(body.position + body.size * self._middles @ body.rotation.T) - world.arms[agent].tool_tip
-            return away[jnp.argmin(jnp.sum(away * away, -1))]
-
         def target(world: World) -> Array:
             return local(self.tables["points"][world.goal.row])
 
@@ -261,17 +256,30 @@ class ObjectTask(Task):
             held = [view.handles[name].holding for other, view in world.arms.items() if other != agent]
             return jnp.stack(held).any().astype(jnp.float32)[None]
 
-        far, reach, one = np.full(3, FAR), mount.arm.reach, np.ones(1)
+        far, reach, one, every = np.full(3, FAR), mount.arm.reach, np.ones(1), np.arange(len(self._middles))
         others = {"others_hold": Term(others_hold, 0 * one, one)} if len(self.scene.agents) > 1 else {}
         return {
             **super().terms(agent),
-            "to_object": Term(to_object, -far, far),
+            "to_object": Term(lambda world: self.way_to_bars(world, agent, every), -far, far),
             "target": Term(target, *reach),
             "to_target": Term(to_target, -far, far),
             "target_rotation": Term(target_rotation, -np.ones(6), np.ones(6)),
             "best_lift": Term(lambda world: world.goal.best.lift[None], 0 * one, one),
             **others,
         }
+
+    def way_to_bars(self, world: World, agent: str, bars: np.ndarray) -> Array:
+        """Return the way from a tool tip to the nearest of some bars of the object, in the arm's base frame, m, [3].
+
+        Args:
+            world: where arms and objects are.
+            agent: the arm.
+            bars: numbers of bars.
+        """
+        mount, body = self.scene.mounts[agent], world.objects[self.object]
+        places = body.position + body.size * self._middles[bars] @ body.rotation.T - mount.position.astype(np.float32)
+        away = places @ mount.rotation.astype(np.float32) - world.arms[agent].tool_tip
+        return away[jnp.argmin(jnp.sum(away * away, -1))]
 
     def observes(self, agent: str) -> tuple[str, ...]:
         """Return the terms of the agent itself, of the object and of the goal, then those of the other arms."""
@@ -309,6 +317,6 @@ def _any(of: dict[str, Array]) -> Array:
     return jnp.stack(list(of.values())).any()
 
 
-def _known(value: Array) -> Array:
+def known(value: Array) -> Array:
     """Return a distance or an angle; a large one where the physics has failed, so that no reward is lost with it."""
     return jnp.where(value < UNKNOWN, value, UNKNOWN)
