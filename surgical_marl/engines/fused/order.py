@@ -17,7 +17,8 @@ EVERY = 32
 class Order:
     """The order of environments: `order` [N] holds their numbers, and `work` [N] is written by kernels.
 
-    Sorting is stable, so that neighbours that do the same remain neighbours, and read neighbouring memory.
+    Those with the most to do come first: others run beside them, where they would be waited for at the end. Sorting is
+    stable, so that neighbours that do the same remain neighbours, and read neighbouring memory.
     """
 
     def __init__(self, order: Any, work: Any, decimation: int) -> None:
@@ -29,5 +30,5 @@ class Order:
         import torch
 
         if self._launches % self._every == 1 % self._every:
-            self._order.copy_(torch.argsort(self._work.to(torch.uint8), stable=True))
+            self._order.copy_(torch.argsort(self._work.to(torch.uint8), descending=True, stable=True))
         self._launches += 1
