@@ -345,7 +345,7 @@ def test_a_thousand_environments_leave_neither_memory_nor_threads(
     run(5)  # to compile takes more memory than environments could leave
     (memory, *later), (threads, *afterwards) = zip(*run(count), strict=True)
     print(f"{task}, {scene}, {engine}: {memory:.1f} MiB after {count // 5} environments, then", *later, *afterwards)
-    assert max(later) - memory < 2
+    assert max(later) - memory < 5  # 6 kB an environment
     assert afterwards == [threads] * len(afterwards)
 
 
