@@ -84,7 +84,7 @@ def find(kind: str, name_or_path: str | os.PathLike[str]) -> Path:
 def unknown(noun: str, value: object, good: Sequence[str]) -> ValueError:
     """Return the error for a name that does not exist: it names the value, the nearest good one and all good ones."""
     near = difflib.get_close_matches(str(value), good, n=1)
-    hint = f", did you mean {near[0]!r}" if near else ""
+    hint = f", did you mean {near[0]!r}" if near else ", and no such file" if str(value).endswith(".yaml") else ""
     return ValueError(f"unknown {noun} {str(value)!r}{hint} (choose from {', '.join(good) or 'none'})")
 
 

@@ -43,7 +43,7 @@ def test_a_shipped_name_goes_before_a_folder_of_that_name(tmp_path: Path, monkey
     "kind, value, words",
     [
         ("scenes", "bimanual_pms", ["'bimanual_pms'", "did you mean 'bimanual_psm'", "psm"]),
-        ("scenes", "./missing.yaml", ["'./missing.yaml'", "psm"]),
+        ("scenes", "./missing.yaml", ["'./missing.yaml', and no such file", "psm"]),
         ("arms", "psn", ["unknown arm 'psn'", "did you mean 'psm'"]),
         ("policies", "", ["unknown run or policy ''"]),
         ("scenes", ".", ["unknown scene '.'"]),

@@ -109,7 +109,14 @@ def test_a_copy_of_a_closed_environment_is_closed() -> None:
         copy.deepcopy(env).reset()
 
 
-@pytest.mark.parametrize(("task", "scene"), [("reach", "psm"), ("match_image", "ecm")])
+@pytest.mark.parametrize(
+    ("task", "scene"),
+    [
+        ("reach", "psm"),
+        ("match_image", "ecm"),
+        pytest.param("needle_handover", "bimanual_psm_needle", marks=pytest.mark.slow),
+    ],
+)
 def test_a_worker_with_warm_caches_imports_nothing_that_takes_long(task: str, scene: str) -> None:
     """Also where an episode ends and the next one begins."""
     code = f"""

@@ -141,6 +141,9 @@ def _limit_of_make() -> int | None:
     `make` gives it to a wrapper, which ends episodes, and tells the environment nothing, which would still end them at
     the task's own limit. So it is read from where `make` is.
     """
+    # Gymnasium has no other way. The spec that `make` sets says None, and the wrapper comes after it. A function among
+    # the `additional_wrappers` of an id would see the wrapper, but `make_vec` refuses ids that have some. A limit in
+    # the registration would be one for all options of a task, and `max_steps` could not go beyond it.
     caller = sys._getframe(2)
     asked = caller.f_locals.get("max_episode_steps") if caller.f_code is gymnasium.make.__code__ else None
     return asked if asked != -1 else None

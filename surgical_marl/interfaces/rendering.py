@@ -42,11 +42,13 @@ class Rendering:
     def render(self) -> np.ndarray | None:
         """Return a picture [H, W, 3] uint8 with mode "rgb_array", show it with "human", do nothing with None.
 
+        Who closes the window sees no more of the environment, and steps take no longer than without one.
+
         Raises:
             ValueError: no episode has begun, or the environment is closed.
         """
         self.batch.check_open()
-        if self.mode is None:
+        if self.mode is None or self._closed_by_hand():
             return None
         from surgical_marl.view.record import ScenePicture
 
@@ -73,11 +75,19 @@ class Rendering:
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "_picture": None, "_window": None}
 
+    def _closed_by_hand(self) -> bool:
+        if self._window is None:
+            return False
+        from matplotlib import pyplot
+
+        return not pyplot.fignum_exists(self._window.figure.number)
+
     def _show(self, drawn: np.ndarray) -> None:
         from matplotlib import pyplot
 
         if self._window is None:
-            figure = pyplot.figure(self.batch.env.title, frameon=False)
+            with pyplot.rc_context({"toolbar": "None"}):  # its buttons are for plots
+                figure = pyplot.figure(self.batch.env.title, frameon=False)
             axes = figure.add_axes((0, 0, 1, 1))
             axes.set_axis_off()
             self._window = axes.imshow(drawn)
