@@ -30,8 +30,10 @@ stiff as a capsule that lies flat, on its two ends."""
 FASTEST = 0.04
 """Speed at which an overlap is pushed out at most, m/s: a deep one, as after a fall within one step, meets more
 damping. The force of something that is pressed in grows with its overlap nevertheless."""
-HITS = 0.5
-"""Speed of approach from which on two bodies hit each other and no longer slide, m/s: twenty steps of gravity."""
+STOPS = 2.0
+"""Speed that friction takes from sliding in an impact, relative to the coefficient of friction times the speed of
+approach: 1 for a body that can't turn, 3.5 for a ball. With less, what hits and then sticks goes in; with more, what
+slides on bounces."""
 SHEAR = 0.8
 """Stiffness of a contact along the surface, relative to that of a point along the normal (R. D. Mindlin, 1949: 2 (1 -
 nu) / (2 - nu) for materials of Poisson's ratio nu, 0.8 for 0.33)."""
@@ -182,10 +184,12 @@ class Handling:
         rubbed = cone.along @ motion.twist + dt / 2 * jnp.append(patch.frame[1:] @ motion.bends[-1], 0.0)
         coefficient = jnp.asarray(t.sliding)[number]
         # The cone lifts what slides by this speed times a step, as if the surfaces came closer (docs/physics.md). So
-        # they part that much faster here, at the sliding speed of now; not in an impact, which may stop the sliding.
-        lifts = coefficient * jnp.sqrt(jnp.sum(rubbed * rubbed)) * jnp.clip(1 + speed / HITS, 0.0, 1.0)
+        # they part that much faster here, at the speed at which they slide on. Nothing slides for long in a jaw.
+        remembers, sliding = self._finger(number) < len(t.fingers), jnp.sqrt(jnp.sum(rubbed * rubbed))
+        slows = coefficient * (STOPS * jnp.maximum(-speed, 0.0) + 9.81 * dt)
+        lifts = jnp.where(remembers, 0.0, coefficient * jnp.maximum(sliding - slows, 0.0))
         push = jnp.where(near > 0, k * points.depth - rate * (speed + lifts), AWAY)
-        k, remembers = SHEAR * stiffness, self._finger(number) < len(t.fingers)
+        k = SHEAR * stiffness
         springs = jnp.where(remembers, k, 0.0)
         drag = jnp.where(remembers, k * (dt + DAMPING), k * CREEP)
         pull = -springs * slip - drag * rubbed
