@@ -297,6 +297,7 @@ ARC = "arc: {radius: 0.0015, degrees: 180.0, wire: 0.001, segments: 4, tilt: [0.
         (ARC, "mesh: {file: clip.stl}", "unknown shape in .* 'mesh' .choose from capsule, sphere, box, plane, arc"),
         (ARC, "cylinder: {radius: 1}", "'cylinder'"),
         (ARC, "plane: {}", "a plane has no end"),
+        (ARC, "box: {size: [0.001, 0.001, 0.001]}", "a box can't be part of a free object"),
         (ARC, "capsule", "must map one of"),
         (ARC, "sphere: {radius: 0}", "shape 2, sphere, radius must be a finite number above 0, not 0"),
         (ARC, "sphere: {radius: .inf}", "radius must be a finite number above 0, not inf"),

@@ -58,13 +58,17 @@ class Forces(NamedTuple):
 
 
 def forces(cone: Cone, twist: Array) -> Forces:
-    """Return the forces at an acceleration of the two bodies [6]: the nearest in the cone to those that stick.
+    """Return the forces at an acceleration of the two bodies [6]."""
+    return nearest(cone, cone.push - cone.stiff * (cone.normal @ twist), cone.pull - cone.rub * (cone.along @ twist))
+
+
+def nearest(cone: Cone, push: Array, pull: Array) -> Forces:
+    """Return the forces in the cone that are nearest to those that stick: normal ones [s] and friction [3].
 
     Where friction slips it gives way by an unknown amount, and the normal forces grow with it. It is the root of a
     concave function, piecewise linear with a corner at each point: Newton's method from the far end never overshoots.
     """
     mu, rub, stiff = cone.coefficient, cone.rub, cone.stiff
-    push, pull = cone.push - stiff * (cone.normal @ twist), cone.pull - rub * (cone.along @ twist)
     size = jnp.sqrt(jnp.sum(pull * pull))
     amount = size / rub
     for _ in range(len(stiff)):
@@ -102,3 +106,23 @@ def curvature(cone: Cone, felt: Forces) -> Array:
     packed = jnp.sum(packed, 0) + rub * (jnp.sum(turning, 0) + (ahead - across) * rubs[_FIRST] * rubs[_SECOND])
     packed += soft * (raised[_FIRST] * mixed[_SECOND] + raised[_SECOND] * mixed[_FIRST])
     return packed[_PACKED]
+
+
+def fall(cone: Cone, felt: Forces, normal: Array, along: Array) -> Array:
+    """Return by how much the forces' power along a way falls per length of it, []: `curvature` on that way alone.
+
+    Args:
+        cone: the contact.
+        felt: its forces.
+        normal: acceleration along the normal of each point per length, [s].
+        along: acceleration along the surface and about the normal, as in `Cone.along`, [3].
+    """
+    presses = felt.normal > 0
+    pressed = jnp.where(presses, cone.stiff, 0.0)
+    rub = jnp.where(presses.any(), cone.rub, 0.0)
+    grown = cone.coefficient**2 * jnp.sum(pressed)
+    soft = jnp.where(felt.slips, 1 / (cone.rub + grown), 0.0)
+    across, ahead = jnp.where(felt.slips, felt.left, 1.0), jnp.where(felt.slips, grown * soft, 1.0)
+    rubs, raised = felt.way @ along, cone.coefficient * (pressed @ normal)
+    turning = across * jnp.sum(along * along) + (ahead - across) * rubs**2
+    return jnp.sum(pressed * normal**2) + rub * turning + soft * raised * (2 * rub * rubs - raised)

@@ -8,6 +8,7 @@ is replaced by one that is larger and concerns each of them alone. The step then
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -17,25 +18,30 @@ from jax import Array
 from jax.lax.linalg import triangular_solve
 
 from surgical_marl.physics.arms import Arms, Reduced
-from surgical_marl.physics.cone import curvature, forces, wrench
+from surgical_marl.physics.cone import curvature, fall, forces, nearest, wrench
 from surgical_marl.physics.problem import SLIPS, Contact, Point, Pressed, Problem, Solution, not_pressed
-from surgical_marl.physics.rows import row_of, stored
-from surgical_marl.physics.search import Search
+from surgical_marl.physics.rows import room, row_of, stored
+from surgical_marl.physics.search import search
 from surgical_marl.physics.solver import Rows, row_forces
 
-PASSES = 16
-"""Evaluations of all forces in a step at most. One physics step in 500 takes more: a light needle between a finger and
-the pad that this presses on, for instance. There its speed is then up to 7 mm/s off after a step. A GPU waits for the
-last one of its environments, and twice as many would take it twice as long."""
+PASSES = 12
+"""Newton steps at most. A GPU waits for the last one of its environments (docs/physics.md)."""
 LEAST = 1e-7
 """Fall of the cost in a Newton step, N m/s2, after which none follows: that of a needle of 0.03 g whose acceleration
 changes by 0.06 m/s2."""
-ENOUGH = 0.3
-"""A step is long enough if the slope at its end is at most this share of that at its beginning."""
-LOOKS = 6
-"""Lengths of a step that are tried at most."""
 TOLERANCE = 1e-2
 """Change of friction in a Newton step, as a share of the normal force, at which sliding contacts have converged."""
+
+
+class _Line(NamedTuple):
+    """A contact along a way."""
+
+    push: Array
+    """Normal forces that stick, at the beginning, N, [s]; friction likewise, `pull` [3]."""
+    pull: Array
+    normal: Array
+    """Acceleration along the normals per length of the way, [s]; along the surface, `along` [3]."""
+    along: Array
 
 
 class _Local(NamedTuple):
@@ -84,54 +90,84 @@ class Newton:
 
     def solve(self, problem: Problem, arms: Array, objects: Array) -> Solution:
         """Return the accelerations and forces, beginning with accelerations of arms [n] and objects [k, 6]."""
-        begin, slots = Point(arms, objects), len(problem.contacts.arm)
-        still = jax.tree.map(jnp.zeros_like, begin)
+        slots, no, zero = len(problem.contacts.arm), jnp.bool_(False), jnp.float32(0.0)
         pressed = not_pressed(slots)._replace(sides=jnp.full(slots, -1, jnp.int32))
-        zero = jnp.float32(0.0)
-        search = Search(begin, still, zero, zero, jnp.float32(jnp.inf), zero, jnp.int32(0))
-        state = search, pressed, self._sides(problem, arms), jnp.bool_(False), jnp.int32(0)
+        state = Point(arms, objects), pressed, self._sides(problem, arms), (no, zero), no, jnp.int32(0)
 
         def going(state: Any) -> Array:
-            _, _, _, settled, count = state
+            settled, count = state[-2:]
             return ~settled & (count < PASSES)
 
         def iterate(state: Any) -> Any:
-            search, before, sides, _, count = state
-            here = search.here()
+            here, before, sides, (whole, left), _, count = state
             local, pressed = self._contacts(problem, here)
             excess, felt = self._excess(problem, here, local)
-            slope = -_dot(self._whole(problem, here, excess), search.way)
             new_sides = self._sides(problem, here.arms)
-            same = (pressed.sides == before.sides).all() & (new_sides == sides).all() & (search.length == 1)
+            same = whole & (pressed.sides == before.sides).all() & (new_sides == sides).all()
             turned = jnp.sum((pressed.friction - before.friction) ** 2, -1) > TOLERANCE**2 * pressed.normal**2
             settled = same & ~(turned & (pressed.sides >= SLIPS)).any()
             if self._objects > 1:  # a step in which two objects press on each other falls short
                 joined = ((problem.contacts.second < self._objects) & (pressed.sides > 0)).any()
-                settled &= ~joined | (jnp.abs(slope) <= TOLERANCE * jnp.abs(search.slope))
-            enough = settled | (jnp.abs(slope) <= ENOUGH * jnp.abs(search.slope)) | (search.looks >= LOOKS)
+                settled &= ~joined | (left <= TOLERANCE)
 
-            def on(search: Search) -> tuple[Search, Array]:
+            def on(here: Point) -> Any:
                 way = self._direction(problem, here, excess, local, felt)
                 slope = -_dot(self._whole(problem, here, excess), way)
                 last = -slope <= LEAST
-                there = jax.tree.map(lambda x, step: jnp.where(last, x + step, x), here, way)
-                return search.begin(there, way, slope), last
+                searched = lambda _: search(slope, self._line(problem, here, way))  # noqa: E731
+                length, end = jax.lax.cond(last, lambda _: (jnp.float32(1.0), zero), searched, None)
+                there = jax.tree.map(lambda x, step: x + length * step, here, way)
+                return there, (length == 1, jnp.abs(end) / jnp.maximum(-slope, 1e-20)), last
 
-            def look(search: Search) -> Search:
-                return search.look(slope, self._growth(problem, here, search.way, local, felt))
+            stay = lambda here: (here, (whole, left), settled)  # noqa: E731
+            here, step, settled = jax.lax.cond(settled, stay, on, here)
+            return here, pressed, new_sides, step, settled, count + 1
 
-            stay = lambda search: (search.at(here), settled)  # noqa: E731
-            accept = lambda search: jax.lax.cond(settled, stay, on, search)  # noqa: E731
-            search, settled = jax.lax.cond(enough, accept, lambda search: (look(search), settled), search)
-            pressed, sides = jax.tree.map(
-                lambda new, old: jnp.where(enough, new, old), (pressed, new_sides), (before, sides)
-            )
-            return search, pressed, sides, settled, count + 1
+        here, pressed, _, _, _, count = jax.lax.while_loop(going, iterate, state)
+        return Solution(here.arms, here.objects, pressed, row_forces(problem.between, here.arms), count)
 
-        search, pressed, _, _, count = jax.lax.while_loop(going, iterate, state)
-        point = search.start
-        force = row_forces(problem.between, point.arms)
-        return Solution(point.arms, point.objects, pressed, force, count)
+    def _line(self, problem: Problem, here: Point, way: Point) -> Callable[[Array], tuple[Array, Array]]:
+        """Return what measures the slope of the cost at a length of a way, and by how much it grows per length.
+
+        What all lengths have in common is computed once: the speeds of contacts along the way, and of rows.
+        """
+        arms, objects = self.by_arm(here.arms), self.by_object(here.objects)
+        arms_way, objects_way = self.by_arm(way.arms), self.by_object(way.objects)
+
+        def line(n: Array) -> _Line:
+            contact = row_of(problem.contacts, n)
+            cone, at, by = contact.cone, self.twist(contact, arms, objects), self.twist(contact, arms_way, objects_way)
+            push, pull = cone.push - cone.stiff * (cone.normal @ at), cone.pull - cone.rub * (cone.along @ at)
+            return _Line(push, pull, cone.normal @ by, cone.along @ by)
+
+        def note(n: Array, all_: _Line) -> _Line:
+            return jax.tree.map(lambda x, own: x.at[n].set(own), all_, line(n))
+
+        shape = jax.eval_shape(lambda: line(jnp.int32(0)))
+        lines = jax.lax.fori_loop(0, problem.total, note, room(shape, len(problem.contacts.arm)))
+        inertia = problem.masses @ jnp.stack([problem.free - here.objects, way.objects], -1)
+        power, growth = jnp.sum(way.objects[..., None] * inertia, (0, 1))
+        rows = [_along(own, here.arms, way.arms) for own in (problem.rows, problem.between) if len(own.low)]
+        if len(way.arms):
+            power += way.arms @ (problem.smooth - problem.mass @ here.arms)
+            growth += way.arms @ (problem.mass @ way.arms)
+
+        def measure(length: Array) -> tuple[Array, Array]:
+            def add(n: Array, sums: tuple[Array, Array]) -> tuple[Array, Array]:
+                own, cone = row_of(lines, n), row_of(problem.contacts.cone, n)
+                push, pull = own.push - length * cone.stiff * own.normal, own.pull - length * cone.rub * own.along
+                felt = nearest(cone, push, pull)
+                power = felt.normal @ own.normal + felt.friction @ own.along
+                return sums[0] - power, sums[1] + fall(cone, felt, own.normal, own.along)
+
+            slope, grows = jax.lax.fori_loop(0, problem.total, add, (length * growth - power, growth))
+            for at, by, along, low, high in rows:
+                force = at - length * by
+                slope -= along @ jnp.clip(force, low, high)
+                grows += along @ jnp.where((force > low) & (force < high), by, 0.0)
+            return slope, grows
+
+        return measure
 
     # -- forces at a point
 
@@ -264,18 +300,6 @@ class Newton:
         by_arm = self.by_arm(found)
         return Point(found, jax.lax.map(back, (*kept, rows[3])))
 
-    def _growth(self, problem: Problem, here: Point, way: Point, local: _Local, stiff: Array) -> Array:
-        """Return by how much the slope of the cost along a way grows per length of it, []."""
-        rows, own = problem.rows, (local.object @ way.objects[..., None])[..., 0]
-        total = jnp.sum(way.objects * own)
-        if not len(way.arms):
-            return total
-        free = row_forces(rows, here.arms) == rows.impedance * (rows.reference - rows.jacobian @ here.arms)
-        along = rows.jacobian @ way.arms
-        total += way.arms @ (stiff @ way.arms) + jnp.sum(jnp.where(free, rows.impedance * along**2, 0.0))
-        joined = jnp.einsum("kacm,am->kc", local.coupling, self.by_arm(way.arms))
-        return total + 2 * jnp.sum(way.objects * joined)
-
     def _touched(self, problem: Problem) -> Array:
         """Return which objects touch which arms, [k, a]."""
         contacts = problem.contacts
@@ -287,6 +311,12 @@ class Newton:
 def _with_none(each: Array) -> Array:
     """Return what belongs to objects [k, ...], and 0 for the one that stands for none, [k + 1, ...]."""
     return jnp.concatenate([each, jnp.zeros((1, *each.shape[1:]))])
+
+
+def _along(rows: Rows, arms: Array, way: Array) -> tuple[Array, ...]:
+    """Return forces of rows without bounds, by how much they fall per length of a way, its speeds, and the bounds."""
+    along = rows.jacobian @ way
+    return rows.impedance * (rows.reference - rows.jacobian @ arms), rows.impedance * along, along, rows.low, rows.high
 
 
 def _dot(one: Point, other: Point) -> Array:

@@ -2,46 +2,57 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
-from surgical_marl.physics.problem import Point
+ENOUGH = 0.1
+"""A length is good if the slope there is at most this share of that at the beginning."""
+LOOKS = 10
+"""Lengths that are tried at most."""
 
 
-class Search(NamedTuple):
-    """A step from a start along a way, and which lengths of it were tried."""
+class _Tried(NamedTuple):
+    """Which lengths were tried."""
 
-    start: Point
-    way: Point
     length: Array
+    """The one to try next, or the last one."""
     low: Array
-    """The longest length that was too short."""
+    """The longest that was too short."""
     high: Array
-    """The shortest one that was too long."""
+    """The shortest that was too long."""
     slope: Array
-    """Of the cost along the way, at the start."""
+    """At the last one."""
     looks: Array
-    """How many were tried."""
+    """How many there were."""
+    done: Array
 
-    def here(self) -> Point:
-        return jax.tree.map(lambda x, way: x + self.length * way, self.start, self.way)
 
-    def at(self, here: Point) -> Search:
-        return self._replace(start=here)
+def search(begin: Array, measure: Callable[[Array], tuple[Array, Array]]) -> tuple[Array, Array]:
+    """Return a length at which the slope of a convex function is small, and the slope there.
 
-    def begin(self, here: Point, way: Point, slope: Array) -> Search:
-        """Return the search along a new way."""
-        zero = jnp.float32(0.0)
-        return Search(here, way, jnp.float32(1.0), zero, jnp.float32(jnp.inf), slope, jnp.int32(0))
+    Newton's method on the slope, within a bracket. The first length is 1.
 
-    def look(self, slope: Array, growth: Array) -> Search:
-        """Return the search with the length that comes next: Newton's method on the slope, within a bracket."""
-        short = slope < 0
-        low, high = jnp.where(short, self.length, self.low), jnp.where(short, self.high, self.length)
-        length = self.length - slope / jnp.maximum(growth, 1e-20)
-        inside = jnp.where(short, length < high, length > low)
-        length = jnp.where(inside, length, jnp.where(high < jnp.inf, (low + high) / 2, 2 * low))
-        return self._replace(length=length, low=low, high=high, looks=self.looks + 1)
+    Args:
+        begin: slope at length 0, below 0, [].
+        measure: from a length to the slope there, and by how much it grows per length.
+    """
+    zero = jnp.float32(0.0)
+
+    def look(tried: _Tried) -> _Tried:
+        slope, growth = measure(tried.length)
+        looks = tried.looks + 1
+        done, short = (jnp.abs(slope) <= -ENOUGH * begin) | (looks >= LOOKS), slope < 0
+        low, high = jnp.where(short, tried.length, tried.low), jnp.where(short, tried.high, tried.length)
+        length = tried.length - slope / jnp.maximum(growth, 1e-20)
+        length = jnp.where(
+            (length > low) & (length < high), length, jnp.where(high < jnp.inf, (low + high) / 2, 2 * low)
+        )
+        return _Tried(jnp.where(done, tried.length, length), low, high, slope, looks, done)
+
+    start = _Tried(jnp.float32(1.0), zero, jnp.float32(jnp.inf), zero, jnp.int32(0), jnp.bool_(False))
+    found = jax.lax.while_loop(lambda tried: ~tried.done, look, start)
+    return found.length, found.slope

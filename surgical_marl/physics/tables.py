@@ -85,11 +85,6 @@ class Tables:
         self.radius = np.full(shape, 2 * AWAY, np.float32)  # of capsules that are not there
         for o, place in enumerate(free.values()):
             for c, part in enumerate(place.object.shapes):
-                if part.kind not in ("capsule", "sphere"):
-                    name = place.object.name
-                    raise ValueError(
-                        f"object {name!r}: a free object is made of capsules and spheres, not a {part.kind}"
-                    )
                 half = part.size[1] * part.rotation[:, 2] if part.kind == "capsule" else np.zeros(3)
                 middle = part.position - place.object.center
                 self.start[o, c], self.end[o, c], self.radius[o, c] = middle - half, middle + half, part.size[0]

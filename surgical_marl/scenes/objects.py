@@ -163,7 +163,9 @@ def _density(settings: dict[str, Any], free: bool, shapes: tuple[Shape, ...], wh
     if len(given) != 1:
         raise ValueError(f"{where}: a free object needs either its mass (kg) or its density (kg/m3)")
     if any(shape.kind == "plane" for shape in shapes):
-        raise ValueError(f"{where}: a plane has no end, so it can't be part of a free object; take a box")
+        raise ValueError(f"{where}: a plane has no end, so it can't be part of a free object; take capsules")
+    if any(shape.kind == "box" for shape in shapes):
+        raise ValueError(f"{where}: a box can't be part of a free object; build it of capsules, with round edges")
     value = read_number(settings[given[0]], f"{where}: {given[0]}", above=0.0)
     return value if given == ["density"] else value / sum(shape.volume for shape in shapes)
 
