@@ -1,0 +1,69 @@
+"""The search along a line, and what it knows of contacts: against the whole curvature, and on random convex functions."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from surgical_marl.physics.cone import Cone, curvature, fall, forces, wrench
+from surgical_marl.physics.search import ENOUGH, search
+
+POINTS = 4
+
+
+def drawn(rng: np.random.Generator) -> Cone:
+    """A contact that sticks, slips, presses or is apart, by chance."""
+    single = lambda *shape: jnp.asarray(rng.standard_normal(shape), jnp.float32)  # noqa: E731
+    stiff, rub = rng.uniform(0.1, 10, POINTS), rng.uniform(0.1, 10)
+    return Cone(
+        single(POINTS, 6), jnp.asarray(stiff, jnp.float32), 3 * single(POINTS), single(3, 6), jnp.float32(rub),
+        3 * single(3), jnp.float32(rng.uniform(0.1, 1)),
+    )  # fmt: skip
+
+
+@jax.jit
+def along(cone: Cone, at: jax.Array, way: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """How the power of the forces falls along a way: by `fall`, and by the whole curvature."""
+    felt = forces(cone, at)
+    return fall(cone, felt, cone.normal @ way, cone.along @ way), way @ curvature(cone, felt) @ way
+
+
+def test_what_falls_along_a_way_is_the_curvature_there() -> None:
+    rng = np.random.default_rng(0)
+    seen = set()
+    for _ in range(100):
+        cone, (at, way) = drawn(rng), jnp.asarray(rng.standard_normal((2, 6)), jnp.float32)
+        one, other = along(cone, at, way)
+        assert float(one) == pytest.approx(float(other), rel=1e-4, abs=1e-4)
+        felt = forces(cone, at)
+        seen.add((bool(felt.slips), bool((felt.normal > 0).any())))
+        ahead = (wrench(cone, forces(cone, at + 1e-3 * way)) - wrench(cone, forces(cone, at - 1e-3 * way))) @ way
+        assert -float(ahead) > -1e-3, "the cost is convex"
+    assert seen == {(False, True), (True, True), (True, False)}
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    begin=st.floats(1e-3, 1e3),
+    corners=st.lists(st.tuples(st.floats(1e-3, 10.0), st.floats(1e-2, 1e4)), max_size=6),
+    growth=st.floats(1e-1, 1e2),
+)
+def test_a_length_is_found_where_the_slope_is_small(
+    begin: float, corners: list[tuple[float, float]], growth: float
+) -> None:
+    """Of a slope that grows with a corner here and there, as where points begin to press."""
+
+    def measure(length: jax.Array) -> tuple[jax.Array, jax.Array]:
+        slope, grows = begin * (growth * length - 1), begin * jnp.float32(growth)
+        for place, more in corners:
+            slope += begin * more * jnp.maximum(length - place, 0.0)
+            grows += jnp.where(length > place, begin * more, 0.0)
+        return slope, grows
+
+    length, slope = search(jnp.float32(-begin), measure)
+    assert 0 < float(length) <= 1 / growth * (1 + ENOUGH) + 1e-6
+    assert abs(float(slope)) <= ENOUGH * begin
