@@ -76,6 +76,11 @@ def test_training_with_them_goes_on_bit_for_bit(trainer: Trainer) -> None:
     assert torch.equal(*ends)
 
 
+def test_another_control_is_refused(trainer: Trainer) -> None:
+    with pytest.raises(ValueError, match="oracle_states.rate must be 0 with control 'torque'"):
+        OracleStates(replace(SETTINGS, control="torque"), trainer.env.layout, "cpu")
+
+
 def test_pictures_are_refused() -> None:
     seeing = replace(SETTINGS, scene="trimanual_psm_ecm", observe={"ecm_0": ("qpos", "command", "image")})
     env = make_env(seeing, 2)

@@ -1,4 +1,4 @@
-"""The search along a line, and what it knows of contacts: against the whole curvature, and on random convex functions."""
+"""The search along a line, and what it knows of contacts: the whole curvature, and random convex functions."""
 
 from __future__ import annotations
 

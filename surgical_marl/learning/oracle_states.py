@@ -52,10 +52,15 @@ class OracleStates:
         observations: what agents and critics observe there, [STATES, ...] for each group of the layout.
 
     Raises:
-        ValueError: the task has no oracle, its oracle never succeeds, or an agent observes pictures.
+        ValueError: the control is not "position", the task has no oracle, its oracle never succeeds, or an agent
+            observes pictures.
     """
 
     def __init__(self, settings: Settings, layout: Layout, device: str) -> None:
+        if settings.control != "position":
+            raise ValueError(
+                f"oracle_states.rate must be 0 with control {settings.control!r}: the oracle needs position"
+            )
         if any(layout.pictures.values()):
             raise ValueError("oracle_states.rate must be 0 where agents observe pictures")
         env = make_env(settings, EPISODES, "numpy")
