@@ -77,7 +77,7 @@ def test_training_with_them_goes_on_bit_for_bit(trainer: Trainer) -> None:
 
 
 def test_another_control_is_refused(trainer: Trainer) -> None:
-    with pytest.raises(ValueError, match="oracle_states.rate must be 0 with control 'torque'"):
+    with pytest.raises(ValueError, match=r"oracle_states.rate must be 0 with control 'torque'"):
         OracleStates(replace(SETTINGS, control="torque"), trainer.env.layout, "cpu")
 
 
