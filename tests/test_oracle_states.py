@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +12,6 @@ import torch
 
 from surgical_marl.learning.oracle_states import EPISODES, OracleStates
 from surgical_marl.learning.trainer import Trainer
-from surgical_marl.policies.layout import Layout
 from surgical_marl.runs.environment import make_env
 from surgical_marl.runs.settings import NetworkSettings, OracleStatesSettings, Settings
 
@@ -82,7 +83,6 @@ def test_another_control_is_refused(trainer: Trainer) -> None:
 
 
 def test_pictures_are_refused() -> None:
-    seeing = replace(SETTINGS, scene="trimanual_psm_ecm", observe={"ecm_0": ("qpos", "command", "image")})
-    env = make_env(seeing, 2)
+    seeing: Any = SimpleNamespace(pictures={"ecm": {"image": None}})
     with pytest.raises(ValueError, match=r"oracle_states.rate must be 0 where agents observe pictures"):
-        OracleStates(seeing, Layout(env), "cpu")
+        OracleStates(SETTINGS, seeing, "cpu")
