@@ -91,13 +91,7 @@ def wrench(cone: Cone, felt: Forces) -> Array:
 
 def curvature(cone: Cone, felt: Forces) -> Array:
     """Return by how much the wrench falls per acceleration, [6, 6]."""
-    presses = felt.normal > 0
-    pressed = jnp.where(presses, cone.stiff, 0.0)
-    rub = jnp.where(presses.any(), cone.rub, 0.0)
-    grown = cone.coefficient**2 * jnp.sum(pressed)
-    soft = jnp.where(felt.slips, 1 / (cone.rub + grown), 0.0)
-    ahead = jnp.where(felt.slips, grown * soft, 1.0)
-    across = jnp.where(felt.slips, felt.left, 1.0)
+    pressed, rub, soft, ahead, across = _gives(cone, felt)
     rubs = felt.way @ cone.along
     turning = across * cone.along[:, _FIRST] * cone.along[:, _SECOND]
     raised = cone.coefficient * (pressed @ cone.normal)
@@ -117,12 +111,21 @@ def fall(cone: Cone, felt: Forces, normal: Array, along: Array) -> Array:
         normal: acceleration along the normal of each point per length, [s].
         along: acceleration along the surface and about the normal, as in `Cone.along`, [3].
     """
-    presses = felt.normal > 0
-    pressed = jnp.where(presses, cone.stiff, 0.0)
-    rub = jnp.where(presses.any(), cone.rub, 0.0)
-    grown = cone.coefficient**2 * jnp.sum(pressed)
-    soft = jnp.where(felt.slips, 1 / (cone.rub + grown), 0.0)
-    across, ahead = jnp.where(felt.slips, felt.left, 1.0), jnp.where(felt.slips, grown * soft, 1.0)
+    pressed, rub, soft, ahead, across = _gives(cone, felt)
     rubs, raised = felt.way @ along, cone.coefficient * (pressed @ normal)
     turning = across * jnp.sum(along * along) + (ahead - across) * rubs**2
     return jnp.sum(pressed * normal**2) + rub * turning + soft * raised * (2 * rub * rubs - raised)
+
+
+def _gives(cone: Cone, felt: Forces) -> tuple[Array, Array, Array, Array, Array]:
+    """Return by how much forces fall per acceleration.
+
+    Those along the normals of points that press, [s]; friction that sticks, []; the amount by which friction that slips
+    gives way per force, []; and the shares of friction that are left along its own direction and across it, [].
+    """
+    presses = felt.normal > 0
+    pressed = jnp.where(presses, cone.stiff, 0.0)
+    grown = cone.coefficient**2 * jnp.sum(pressed)
+    soft = jnp.where(felt.slips, 1 / (cone.rub + grown), 0.0)
+    ahead, across = jnp.where(felt.slips, grown * soft, 1.0), jnp.where(felt.slips, felt.left, 1.0)
+    return pressed, jnp.where(presses.any(), cone.rub, 0.0), soft, ahead, across
