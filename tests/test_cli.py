@@ -45,6 +45,7 @@ TRAIN = ["train", "reach", "--scene", "psm"]
         (["train"], ["TASK", "reach", "--scene", "bimanual_psm"]),
         (["train", "reach"], ["--scene", "bimanual_psm"]),
         (["train", "num_envs=4"], ["TASK", "--scene"]),
+        (["train", "needle_pick", "num_envs=0"], ["num_envs", "not 0"]),  # its scene goes without saying
         (["train", "reech", "--scene", "psm"], ["'reech'", "did you mean 'reach'"]),
         (["train", "reach", "--scene", "psmm"], ["'psmm'", "did you mean 'psm'", "bimanual_psm"]),
         (["train", "reach", "--scene", "./none.yaml"], ["'./none.yaml'"]),

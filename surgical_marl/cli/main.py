@@ -93,7 +93,7 @@ def _parser() -> argparse.ArgumentParser:
     train = commands.add_parser(
         "train",
         help="train a policy, then evaluate it",
-        usage="%(prog)s TASK --scene SCENE [options] [key=value ...]\n"
+        usage="%(prog)s TASK [--scene SCENE] [options] [key=value ...]\n"
         "       %(prog)s --resume DIR [options] [key=value ...]",
         epilog="key=value sets anything in configs/, such as ppo.learning_rate=3e-4",
     )
@@ -247,6 +247,10 @@ def _doctor(arguments: argparse.Namespace) -> None:
 def _train(arguments: argparse.Namespace) -> None:
     if arguments.task is not None and arguments.task not in list_tasks():
         raise unknown("task", arguments.task, list_tasks())
+    if arguments.task is not None and arguments.scene is None and not arguments.resume:
+        from surgical_marl.plugins.tasks import TASKS
+
+        arguments.scene = TASKS.load(arguments.task).default_scene
     if arguments.scene is not None:
         find("scenes", arguments.scene)
     if not arguments.resume and None in (arguments.task, arguments.scene):
