@@ -75,16 +75,18 @@ def falling(tmp_path_factory: pytest.TempPathFactory) -> Falling:
 def test_what_falls_on_a_pad_comes_to_rest_there(falling: Falling, speed: float) -> None:
     """Within 2 s, whatever way it is turned; then it drifts by less than 0.1 mm in 10 s.
 
-    But for one in 24: a block that stands on an edge may chatter on it for ever (docs/physics.md).
+    But for one of 24 that are let go at rest: a block on an edge may chatter there for ever (docs/physics.md).
     """
     rng = np.random.default_rng(0)
     down = np.broadcast_to([0, 0, -speed, 0, 0, 0], (8, 3, 6))
     objects, path = falling.play(thrown(falling.begin(8), quaternion=random_turns(rng, 8, 3), velocity=down), 2.0)
     assert path.position[..., 2].min() > 0, "something fell through"
-    assert path.depth.max() < 5e-4 and np.sum(path.depth[:, -1] > 1e-5) <= 1
-    assert np.sum(np.abs(path.velocity[:, -1, :, :3]).max(-1) > 1e-3) <= 1
+    chattering = 1 if speed == 0.0 else 0
+    assert path.depth.max() < 5e-4 and np.sum(path.depth[:, -1] >= 1e-5) <= chattering
+    assert np.sum(np.abs(path.velocity[:, -1, :, :3]).max(-1) >= 1e-3) <= chattering
     _, later = falling.play(objects, 2.0)
-    assert np.sum(5 * np.linalg.norm(later.position[:, -1] - path.position[:, -1], axis=-1) > 1e-4) <= 1
+    drift = 5 * np.linalg.norm(later.position[:, -1] - path.position[:, -1], axis=-1)
+    assert np.sum(drift >= 1e-4) <= chattering
 
 
 def test_a_spinning_body_keeps_its_angular_momentum(tmp_path: Path) -> None:

@@ -65,9 +65,9 @@ class OracleStates:
             raise ValueError("oracle_states.rate must be 0 where agents observe pictures")
         env = make_env(settings, EPISODES, "numpy")
         try:
-            tables = repr([(name, np.asarray(table).tobytes()) for name, table in sorted(env.task.tables.items())])
-            about = (describe(env.env.parameters), str(env.max_steps), tables)
-            rows = cached("oracle_states", lambda: _record(env), env.env.content, *about, roots=env.env.roots)
+            tables = (np.asarray(table).tobytes() for _, table in sorted(env.task.tables.items()))
+            about = env.env.content, describe(env.env.parameters).encode(), str(env.max_steps).encode()
+            rows = cached("oracle_states", lambda: _record(env), *about, *tables, roots=env.env.roots)
             cut = dict(zip(_shapes(env), _cut(rows, env), strict=True))
         finally:
             env.close()

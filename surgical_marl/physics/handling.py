@@ -15,7 +15,7 @@ from surgical_marl.physics.newton import Newton
 from surgical_marl.physics.patches import AWAY, Patch
 from surgical_marl.physics.placed import Joints
 from surgical_marl.physics.problem import SLIPS, Contact, Pressed
-from surgical_marl.physics.rows import room, row_of, stored
+from surgical_marl.physics.rows import filled, row_of, stored
 from surgical_marl.physics.tables import Tables
 from surgical_marl.physics.touching import AHEAD, MARGIN, Slots
 
@@ -140,11 +140,8 @@ class Handling:
             motion = self._motion(contact, patch, number, speeds, origin)
             return Felt(self._resisting(contact, patch, number, slip, motion, dt), slip)
 
-        def one(n: Array, all_: Felt) -> Felt:
-            return jax.tree.map(lambda x, own: x.at[n].set(own), all_, felt(n))
-
-        shape = jax.eval_shape(lambda: felt(jnp.int32(0)))
-        return jax.lax.fori_loop(0, slots.found, one, room(shape, len(slots.number)))
+        found: Felt = filled(felt, slots.found, len(slots.number))
+        return found
 
     def _contact(self, patch: Patch, number: Array, joints: Joints | None, position: Array) -> tuple[Contact, Array]:
         """Return a contact that does not resist yet: what it is between, and its directions; and its twists' origin."""

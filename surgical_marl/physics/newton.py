@@ -20,7 +20,7 @@ from jax.lax.linalg import triangular_solve
 from surgical_marl.physics.arms import Arms, Reduced
 from surgical_marl.physics.cone import curvature, fall, forces, nearest, wrench
 from surgical_marl.physics.problem import SLIPS, Contact, Point, Pressed, Problem, Solution, not_pressed
-from surgical_marl.physics.rows import room, row_of, stored
+from surgical_marl.physics.rows import filled, row_of, stored
 from surgical_marl.physics.search import search
 from surgical_marl.physics.solver import Rows, row_forces
 
@@ -140,11 +140,7 @@ class Newton:
             push, pull = cone.push - cone.stiff * (cone.normal @ at), cone.pull - cone.rub * (cone.along @ at)
             return _Line(push, pull, cone.normal @ by, cone.along @ by)
 
-        def note(n: Array, all_: _Line) -> _Line:
-            return jax.tree.map(lambda x, own: x.at[n].set(own), all_, line(n))
-
-        shape = jax.eval_shape(lambda: line(jnp.int32(0)))
-        lines = jax.lax.fori_loop(0, problem.total, note, room(shape, len(problem.contacts.arm)))
+        lines = filled(line, problem.total, len(problem.contacts.arm))
         inertia = problem.masses @ jnp.stack([problem.free - here.objects, way.objects], -1)
         power, growth = jnp.sum(way.objects[..., None] * inertia, (0, 1))
         rows = [_along(own, here.arms, way.arms) for own in (problem.rows, problem.between) if len(own.low)]

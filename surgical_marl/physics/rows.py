@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -23,3 +24,13 @@ def room(tree: Any, rows: int) -> Any:
     """Return arrays for `rows` trees like this one. They hold nothing that may be read before it is written."""
     empty = getattr(jax.lax, "empty", jnp.zeros)  # JAX before 0.7 has no other
     return jax.tree.map(lambda x: empty((rows, *x.shape), x.dtype), tree)
+
+
+def filled(row: Callable[[Array], Any], found: Array, rows: int) -> Any:
+    """Return arrays for `rows` trees, of which the first `found` are `row(0)`, `row(1)` and so on."""
+    shape = jax.eval_shape(lambda: row(jnp.int32(0)))
+
+    def note(n: Array, all_: Any) -> Any:
+        return jax.tree.map(lambda x, own: x.at[n].set(own), all_, row(n))
+
+    return jax.lax.fori_loop(0, found, note, room(shape, rows))
