@@ -17,6 +17,7 @@ from surgical_marl.scenes.poses import Poses, frames
 from surgical_marl.scenes.scene import Scene
 from surgical_marl.view import record
 from surgical_marl.vision.endoscope import CHANNELS, Endoscope
+from tests.helpers.devices import DEVICES, skip_where_warp_lacks
 from tests.test_endoscope import cast
 
 POSES, ENVS, STEPS = 8, 2, 4
@@ -111,20 +112,12 @@ def anywhere(scene: Scene, seed: int = 0) -> Poses:
     return Poses(origin.astype(np.float32), quaternion.astype(np.float32))
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-def test_a_gpu_draws_what_a_cpu_draws() -> None:
+@pytest.mark.parametrize("device", DEVICES)
+def test_the_endoscope_agrees_with_the_rays_of_c_mujoco_at_any_poses(device: str) -> None:
+    skip_where_warp_lacks(device)
     scene = sm.load_scene("trimanual_psm_ecm_pegs")
     poses, qpos = anywhere(scene), np.repeat(scene.home[None], POSES, 0)
-    on_cpu = Endoscope(scene, POSES, channels=CHANNELS).render(qpos, poses).segmentation
-    given = Poses(*(torch.from_numpy(part).cuda() for part in vars(poses).values()))
-    drawn = Endoscope(scene, POSES, "cuda", channels=CHANNELS).render(torch.from_numpy(qpos).float().cuda(), given)
-    assert (drawn.segmentation.cpu().numpy() == on_cpu).mean() > 0.99
-
-
-def test_the_endoscope_agrees_with_the_rays_of_c_mujoco_at_any_poses() -> None:
-    scene = sm.load_scene("trimanual_psm_ecm_pegs")
-    poses, qpos = anywhere(scene), np.repeat(scene.home[None], POSES, 0)
-    endoscope = Endoscope(scene, POSES, channels=CHANNELS)
+    endoscope = Endoscope(scene, POSES, device, channels=CHANNELS)
     drawn = endoscope.render(qpos, poses)
     rays = [cast(scene, scene.home, "left", *pose) for pose in zip(poses.origin, poses.quaternion, strict=True)]
     geoms, depths = map(np.array, zip(*rays, strict=True))
@@ -136,9 +129,9 @@ def test_the_endoscope_agrees_with_the_rays_of_c_mujoco_at_any_poses() -> None:
         colour = np.array(place.object.shapes[0].colour)
         assert len(seen) > 100 and seen.mean(0).argmax() == colour.argmax()
 
-    given = Poses(*map(torch.from_numpy, vars(poses).values()))
-    tensors = endoscope.render(torch.from_numpy(qpos), given)
-    np.testing.assert_array_equal(tensors.rgb.numpy(), drawn.rgb)
+    given = Poses(*(torch.from_numpy(part).to(device) for part in vars(poses).values()))
+    tensors = endoscope.render(torch.from_numpy(qpos).to(device), given)
+    np.testing.assert_array_equal(tensors.rgb.cpu().numpy(), drawn.rgb)
     # without poses, objects are where the scene places them, whatever was drawn before
     placed = mujoco.MjData(scene.model)
     home = Poses(*(np.repeat(part[None], POSES, 0) for part in (placed.mocap_pos, placed.mocap_quat)))
@@ -203,6 +196,7 @@ def test_poses_of_a_wrong_shape_are_named() -> None:
     scene = sm.load_scene("trimanual_psm_ecm_needle")
     with pytest.raises(ValueError, match=r"objects.origin of shape \(1, 2, 3\) must be \(1, 1, 3\)"):
         Endoscope(scene).render(scene.home[None], Poses(np.zeros((1, 2, 3)), np.zeros((1, 2, 4))))
+    skip_where_warp_lacks("cpu")
     bare = sm.load_scene("ecm")
     none = Poses(np.zeros((1, 0, 3)), np.zeros((1, 0, 4)))
     np.testing.assert_array_equal(

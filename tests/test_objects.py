@@ -21,6 +21,7 @@ from surgical_marl.scenes.check import check
 from surgical_marl.scenes.objects import Object, load_object
 from surgical_marl.scenes.placing import scenes_without_objects
 from surgical_marl.vision.endoscope import Endoscope
+from tests.helpers.devices import skip_where_warp_lacks
 
 PAGE = (Path(__file__).parents[1] / "docs" / "your_own_object.md").read_text()
 FILE, SCENE = re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)
@@ -225,6 +226,7 @@ def test_the_ecm_sees_tips_and_free_objects_from_its_home(name: str) -> None:
 
 
 def test_the_endoscope_sees_a_needle_and_names_it() -> None:
+    skip_where_warp_lacks("cpu")
     scene = sm.load_scene("trimanual_psm_ecm_needle")
     endoscope = Endoscope(scene, width=128, height=128, channels=("segmentation",))
     seen = endoscope.labels[endoscope.render(scene.home[None].astype(np.float32)).segmentation]

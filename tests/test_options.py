@@ -138,7 +138,7 @@ def test_pictures_are_terms_of_any_task(start: str) -> None:
     """Over an episode's end, against an endoscope of its own: the next episode's pictures, and the last of this one."""
     pictures = ["image_right", "ecm_0/depth"]
     env = BatchedEnv("reach", "ecm", num_envs=3, start=start, max_steps=2, observe={"ecm_0": ["qpos", *pictures]})
-    eye = Endoscope(env.scene, 3, stereo=True, channels=("rgb", "depth"))
+    eye = Endoscope(env.scene, 3, env.device, stereo=True, channels=("rgb", "depth"))
     space = env.observation_space("ecm_0")
     assert list(env.observation_terms("ecm_0")) == ["qpos"] and set(space) == {"proprioception", *pictures}
     found, *_ = env.reset(seed=0)
