@@ -9,6 +9,8 @@ import torch
 
 import surgical_marl as sm
 from surgical_marl.envs.batch import BatchedEnv
+from surgical_marl.plugins.tasks import TASKS
+from surgical_marl.scenes.placing import scenes_without_objects
 
 pytest.importorskip("torchrl")
 from torchrl.envs import MarlGroupMapType, check_env_specs
@@ -22,10 +24,29 @@ def batched(scene: str = "bimanual_psm", task: str = "reach", **options: Any) ->
     return BatchedEnv(task, scene, num_envs=COUNT, max_steps=STEPS, arrays="torch", engine="fused", **options)
 
 
+def playable() -> list[Any]:
+    """`reach` on every scene, and tasks of vectors on their own. With objects to compile takes minutes: `-m slow`."""
+    good = [("reach", scene) for scene in sm.list_scenes()]
+    for task in sm.list_tasks():
+        good += [(task, scene) for scene in TASKS.load(task).scenes or () if task != "match_image"]
+    free = scenes_without_objects()
+    return [pytest.param(*pair, marks=[] if pair[1] in free else pytest.mark.slow) for pair in good]
+
+
 @pytest.mark.parametrize("grouping", [None, MarlGroupMapType.ONE_GROUP_PER_AGENT])
-@pytest.mark.parametrize("scene", sm.list_scenes())
-def test_torchrl_accepts_every_scene(scene: str, grouping: Any) -> None:
-    check_env_specs(TorchRLEnv(batched(scene), grouping), return_contiguous=True, seed=0)
+@pytest.mark.parametrize(("task", "scene"), playable())
+def test_torchrl_accepts_every_scene(task: str, scene: str, grouping: Any) -> None:
+    check_env_specs(TorchRLEnv(batched(scene, task), grouping), return_contiguous=True, seed=0)
+
+
+@pytest.mark.parametrize(("task", "scene"), playable())
+def test_all_agents_are_one_group_if_they_are_alike(task: str, scene: str) -> None:
+    env, one = batched(scene, task), MarlGroupMapType.ALL_IN_ONE_GROUP
+    if len(env.types) == 1:
+        check_env_specs(TorchRLEnv(env, one), return_contiguous=True, seed=0)
+    else:
+        with pytest.raises(ValueError, match="they observe unlike things"):
+            TorchRLEnv(env, one)
 
 
 @pytest.mark.parametrize("scene", ["ecm", "trimanual_psm_ecm"])
@@ -36,9 +57,16 @@ def test_torchrl_accepts_pictures(scene: str) -> None:
     assert pictures.dtype == torch.uint8 and pictures.shape == (COUNT, 1, 1, 64, 64, 3)
 
 
-def test_agents_of_a_kind_are_a_group_with_the_numbers_of_the_batch() -> None:
+@pytest.mark.parametrize(
+    ("task", "scene"),
+    [
+        ("reach", "trimanual_psm_ecm"),
+        pytest.param("peg_transfer", "trimanual_psm_ecm_pegs", marks=pytest.mark.slow),
+    ],
+)
+def test_agents_of_a_kind_are_a_group_with_the_numbers_of_the_batch(task: str, scene: str) -> None:
     """Over the ends of episodes: "next" is the last of an episode, and the reset that follows is the next one."""
-    env, plain = TorchRLEnv(batched("trimanual_psm_ecm")), batched("trimanual_psm_ecm")
+    env, plain = TorchRLEnv(batched(scene, task)), batched(scene, task)
     assert env.group_map == {"ecm": ["ecm_0"], "psm": ["psm_0", "psm_1"]}
     env.set_seed(7)
     data, (observations, state, _) = env.reset(), plain.reset(7)
