@@ -36,9 +36,19 @@ def cached(
 ) -> np.ndarray:
     """Return what `compute` returns, from disk if it was computed before from the same content, code and libraries.
 
+    Args: see `cached_arrays`.
+    """
+    return cached_arrays(kind, lambda: {"array": compute()}, *content, roots=(compute.__module__, *roots))["array"]
+
+
+def cached_arrays(
+    kind: str, compute: Callable[[], dict[str, np.ndarray]], *content: str | bytes, roots: Iterable[str] = ()
+) -> dict[str, np.ndarray]:
+    """Return what `compute` returns, arrays by name, as `cached` does with one.
+
     Args:
         kind: folder within the cache.
-        compute: the work. Its array appears on disk completely or not at all. If the cache fails, that is no error.
+        compute: the work. Its arrays appear on disk completely or not at all. If the cache fails, that is no error.
         content: data that the result depends on.
         roots: modules whose code `compute` runs, besides the module that it is defined in and all that they import.
     """
@@ -47,18 +57,18 @@ def cached(
         data = part.encode() if isinstance(part, str) else part
         digest.update(len(data).to_bytes(8, "little") + data)
     path = cache_dir() / kind / f"{digest.hexdigest()[:32]}.npz"
-    if (array := _load(path)) is not None:
-        return array
+    if (arrays := _load(path)) is not None:
+        return arrays
     with locked(path):
-        if (array := _load(path)) is not None:  # another process has made the file meanwhile
-            return array
-        array = compute()
+        if (arrays := _load(path)) is not None:  # another process has made the file meanwhile
+            return arrays
+        arrays = compute()
         with contextlib.suppress(OSError):
             path.parent.mkdir(parents=True, exist_ok=True)
             with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
-                np.savez(file, array=array)
+                np.savez(file, **arrays)  # type: ignore[arg-type]  # a name can be that of no option
             os.replace(file.name, path)
-    return array
+    return arrays
 
 
 @contextlib.contextmanager
@@ -76,14 +86,13 @@ def locked(path: Path) -> Iterator[None]:
         yield
 
 
-def _load(path: Path) -> np.ndarray | None:
-    """Return the array in a file of the cache; None if the file is not there, or is damaged."""
+def _load(path: Path) -> dict[str, np.ndarray] | None:
+    """Return the arrays in a file of the cache; None if the file is not there, or is damaged."""
     try:
         with path.open("rb") as file, np.load(file) as found:
-            array: np.ndarray = found["array"]
+            return dict(found)
     except (OSError, ValueError, EOFError, KeyError, BadZipFile, zlib.error):
         return None
-    return array
 
 
 @functools.cache

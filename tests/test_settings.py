@@ -93,6 +93,7 @@ def test_the_shipped_settings_load() -> None:
         ("constraint.limit=2", "constraint.limit must be a number from 0 to 1, not 2"),
         ("constraint.kp=-1", "constraint.kp must be a number from 0 to"),
         ("ppo.normalise_values=1", "ppo.normalise_values must be true or false, not 1"),
+        ("imitation.steps=-1", "imitation.steps must be a whole number from 0"),
         ("network.recurrent=rnn", "network.recurrent must be one of none, gru, lstm, not 'rnn'"),
         ("max_steps=0", "max_steps must be a whole number from 1"),
         ("ppo.mini_batches=999999", "ppo.mini_batches must be at most num_envs"),
@@ -102,6 +103,11 @@ def test_bad_settings_are_named(override: str, message: str) -> None:
     with pytest.raises(ValueError, match=message) as error:
         load_config("reach", "psm", [override])
     assert "\n" not in str(error.value)
+
+
+def test_recurrent_networks_do_not_imitate() -> None:
+    with pytest.raises(ValueError, match=r"imitation.steps must be 0 with network.recurrent 'gru', not 5"):
+        load_config("reach", "psm", ["network.recurrent=gru", "imitation.steps=5"])
 
 
 def test_whole_rollouts_need_an_environment_each() -> None:

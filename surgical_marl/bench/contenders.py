@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import time
 from collections.abc import Callable
 from typing import Any
@@ -16,6 +17,7 @@ from surgical_marl.bench.rivals import RIVALS, Contender
 from surgical_marl.bench.workload import Workload
 from surgical_marl.content import unknown
 from surgical_marl.engines.choose import Engine, make_engine
+from surgical_marl.engines.fused.order import EVERY
 from surgical_marl.envs.batch import BatchedEnv
 
 ENGINES = ("fused", "mjx", *RIVALS)
@@ -70,7 +72,10 @@ def _batched(name: str, workload: Workload, course: Course) -> Contender:
     step_physics()  # compiles
     _wait(physics)
     if cuda and name == "fused":
-        clocks = cuda_clock(step_physics, HOLD * LAPS), cuda_clock(step_env, hold * LAPS)
+        # long enough that environments are sorted as often as in any long run
+        physics_cycle = math.lcm(HOLD * LAPS, EVERY)
+        env_cycle = math.lcm(hold * LAPS, max(1, EVERY // workload.decimation))
+        clocks = cuda_clock(step_physics, physics_cycle), cuda_clock(step_env, env_cycle)
     else:
         clocks = cpu_clock(step_physics, lambda: _wait(physics)), cpu_clock(step_env, lambda: _wait(batch.engine))
     return Contender(count, workload.where, compile_s, *clocks, bytes_per_env=_bytes_per_env(batch.engine))

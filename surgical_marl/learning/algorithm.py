@@ -54,6 +54,8 @@ class Algorithm(PPO):
             all arms (see `surgical_marl.policies.layout.Layout`).
         central_critic: whether the critic sees the whole state, instead of what each agent sees.
         losses: `LOSSES` of the last update, `[5]`; always at the same place in memory.
+        imitates: whether the actor has imitated demonstrations. Its observations are then normalised as those were:
+            what it has learned would be lost if inputs were scaled anew, by what all environments see at the start.
     """
 
     grouping: ClassVar[Grouping] = "type"
@@ -85,6 +87,9 @@ class Algorithm(PPO):
         self._cuda = torch.device(self.device).type == "cuda"
         self.optimizer = torch.optim.Adam(self.parameters(), lr=self._rate, fused=True, capturable=self._cuda)
         self.losses = torch.zeros(len(LOSSES), device=self.device)
+        self.imitates = False
+        # 0 while only the critic learns, 1 afterwards.
+        self._acting = torch.ones((), device=self.device)
         # Sums over the mini-batches of an update, of all `LOSSES` but the learning rate.
         self._sums = torch.zeros(len(LOSSES) - 1, device=self.device)
 
@@ -137,7 +142,8 @@ class Algorithm(PPO):
         entropy = actor.output_entropy.mean()
         ratio = torch.exp(log_prob - batch.old_actions_log_prob)
         surrogate = -self.surrogate(ratio, batch.advantages).mean()
-        return surrogate - self.entropy_coef * entropy, torch.stack([surrogate, entropy, divergence]).detach()
+        loss = self._acting * (surrogate - self.entropy_coef * entropy)
+        return loss, torch.stack([surrogate, entropy, divergence]).detach()
 
     def surrogate(self, ratio: Tensor, advantages: Tensor) -> Tensor:
         """Return the surrogate objective of each action, `[..., A]`: here the clipped one of PPO.
@@ -174,6 +180,16 @@ class Algorithm(PPO):
             self.constraint.update()
             advantages = self.constraint.weigh(advantages.unflatten(-1, (-1, 2)))
         storage.advantages.copy_(distributed.standardised(advantages))
+
+    def hold_actor(self, held: bool, rate: float) -> None:
+        """Let only the critic learn, or both again.
+
+        Args:
+            held: whether the networks that act stay as they are.
+            rate: the learning rate from now on; while the actor is held nothing adapts it.
+        """
+        self._acting.fill_(not held)
+        self._rate.fill_(rate)
 
     def update(self) -> dict[str, float]:
         """Learn from the stored rollout; return mean losses, KL and the learning rate (see `LOSSES`)."""
@@ -235,7 +251,8 @@ class Algorithm(PPO):
     def conclude(self) -> None:
         """End an update: the normalisers learn from its observations, and `losses` are written."""
         observations = self.storage.observations.flatten(0, 1)
-        self.actor.update_normalization(observations)
+        if not self.imitates:
+            self.actor.update_normalization(observations)
         self.critic.update_normalization(observations)
         count = self.num_mini_batches * self.num_learning_epochs
         self.losses.copy_(torch.cat([self._sums / count, self._rate[None]]))

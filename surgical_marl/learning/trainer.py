@@ -15,9 +15,10 @@ from surgical_marl.learning import distributed, faults
 from surgical_marl.learning.algorithm import LOSSES, Algorithm
 from surgical_marl.learning.configuration import rsl_rl_config
 from surgical_marl.learning.constraint import METRICS
+from surgical_marl.learning.demonstrations import Demonstrations
 from surgical_marl.learning.episodes import ENDED, Episodes
 from surgical_marl.learning.graphs import Replayed
-from surgical_marl.learning.oracle_states import OracleStates
+from surgical_marl.learning.imitation import RATE, imitate
 from surgical_marl.plugins.algorithms import ALGORITHMS
 from surgical_marl.runs.settings import Settings
 
@@ -96,8 +97,9 @@ class Trainer:
         self._stop = torch.zeros(1, device=device)
         self._marks = torch.zeros(len(self._names["observations"]) + len(self._names["values"]), device=device)
         self._values = torch.zeros(sum(map(len, self._names.values())), device=device)
-        wanted = settings.oracle_states.rate > 0
-        self._oracle_states = OracleStates(settings, self.env.layout, device) if wanted else None
+        wanted = settings.oracle_states.rate > 0 or settings.imitation.steps > 0
+        self._demonstrations = Demonstrations(settings, self.env.layout, device) if wanted else None
+        self.algorithm.imitates = settings.imitation.steps > 0
         self._samples = settings.steps_per_iteration * env.num_envs * distributed.size()
         self._read = 0.0
         self.rollout = Replayed(self._rollout, enabled=self._cuda and self.env.capturable)
@@ -113,6 +115,7 @@ class Trainer:
     def iterate(self) -> Report:
         """Do one rollout and one update; return the report, which `row` reads."""
         started = time.perf_counter()
+        self._imitate()
         self._place()
         self.rollout()
         self._stop.fill_(self.stop_wanted)
@@ -126,16 +129,29 @@ class Trainer:
         arrived.record()
         return Report(self.iteration, self.env_steps, started, host, arrived)
 
+    def _imitate(self) -> None:
+        """Let the actor imitate the oracle before the first iteration, and then the critic learn first."""
+        asked = self.settings.imitation
+        if self._demonstrations is None or not asked.steps:
+            return
+        if self.iteration == 0:
+            imitate(self.algorithm.actor, self._demonstrations, asked.steps)
+            if distributed.size() > 1:
+                self.algorithm.broadcast_parameters()
+        if self.iteration in (0, asked.hold):
+            held = self.iteration < asked.hold
+            self.algorithm.hold_actor(held, RATE if held else self.settings.ppo.learning_rate)
+
     def _place(self) -> None:
         """Let some environments go on from states of the oracle, as the settings say."""
-        asked, states = self.settings.oracle_states, self._oracle_states
+        asked, demonstrations = self.settings.oracle_states, self._demonstrations
         fading = max(0.0, 1.0 - self.iteration / (asked.until * self.settings.iterations))
         share = asked.rate * fading * self.settings.steps_per_iteration / self.env.max_episode_length
         count = round(min(share, 1.0) * self.env.num_envs)
-        if states is None or not count:
+        if demonstrations is None or not count:
             return
         chosen = torch.randperm(self.env.num_envs, device=self.env.device)[:count]
-        carry, seen = states.draw(count)
+        carry, seen = demonstrations.draw(count)
         with torch.inference_mode():
             self.env.place(chosen, carry)
             for name, kept in self._observations.items():

@@ -54,7 +54,7 @@ class ConstraintSettings(Checked):
 
 @dataclass(frozen=True)
 class OracleStatesSettings(Checked):
-    """Starts along the oracle's episodes (see `learning/oracle_states.py`).
+    """Starts along the oracle's episodes (see `learning/demonstrations.py`).
 
     rate: how often an environment goes on from a state of the oracle, on average in the time of an episode, at the
     beginning of a run. until: the share of the run's iterations by which this has fallen to never, in a straight line.
@@ -64,6 +64,20 @@ class OracleStatesSettings(Checked):
 
     rate: float = number(0.0, 0.0, 1000.0)
     until: float = number(1.0, 0.001, 1.0)
+
+
+@dataclass(frozen=True)
+class ImitationSettings(Checked):
+    """Imitation of the oracle's actions before the first iteration (see `learning/imitation.py`).
+
+    steps: gradient steps; 0 for none. hold: iterations in which only the critic learns then, because what it says
+    before would spoil what was imitated.
+    """
+
+    prefix: ClassVar[str] = "imitation."
+
+    steps: int = number(0, 0, 1_000_000)
+    hold: int = number(10, 0, 1_000_000)
 
 
 @dataclass(frozen=True)
@@ -101,6 +115,7 @@ class Settings(Options):
     ppo: PPOSettings = field(default_factory=PPOSettings)
     constraint: ConstraintSettings = field(default_factory=ConstraintSettings)
     oracle_states: OracleStatesSettings = field(default_factory=OracleStatesSettings)
+    imitation: ImitationSettings = field(default_factory=ImitationSettings)
     network: NetworkSettings = field(default_factory=NetworkSettings)
 
     def __post_init__(self) -> None:
@@ -110,6 +125,11 @@ class Settings(Options):
             raise ValueError(
                 "ppo.mini_batches must be at most num_envs * steps_per_iteration "
                 f"= {samples}, not {self.ppo.mini_batches}"
+            )
+        if self.network.recurrent != "none" and self.imitation.steps:
+            raise ValueError(
+                f"imitation.steps must be 0 with network.recurrent {self.network.recurrent!r}, "
+                f"not {self.imitation.steps}: single steps are imitated"
             )
         if self.network.recurrent != "none" and self.ppo.mini_batches > self.num_envs:
             raise ValueError(

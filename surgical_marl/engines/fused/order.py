@@ -10,8 +10,8 @@ from __future__ import annotations
 
 from typing import Any
 
-EVERY = 32
-"""Physics steps after which environments are sorted."""
+EVERY = 64
+"""Physics steps after which environments are sorted. Work that is captured in a CUDA graph must be as long at least."""
 
 
 class Order:

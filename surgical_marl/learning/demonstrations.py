@@ -1,0 +1,204 @@
+"""The oracle's episodes as demonstrations: states to go on from, and actions to imitate.
+
+By chance hardly any arm picks a needle up, hands it over and presents it. From a state along a demonstration it is a
+short way to the next reward. Such starts are known as reference state initialisation (X. B. Peng et al., 2018, arXiv
+1804.02717; T. Salimans and R. Chen, 2018, arXiv 1812.03381). Environments are moved between two rollouts. Returns are
+bootstrapped there anyway, so that this cuts nothing off.
+
+Imitation of the oracle's actions before reinforcement learning is behaviour cloning, as in A. Rajeswaran et al., 2018,
+arXiv 1709.10087. While the oracle acts its arms are disturbed, so that its actions show how to come back to its way (M.
+Laskey et al., 2017, arXiv 1703.09327).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+from tqdm import trange
+
+from surgical_marl.cache import cached_arrays
+from surgical_marl.engines.stepper import describe
+from surgical_marl.policies.layout import Layout
+from surgical_marl.policies.oracle import oracle
+from surgical_marl.runs.environment import make_env
+from surgical_marl.runs.settings import Settings
+
+if TYPE_CHECKING:
+    from surgical_marl.envs.batch import BatchedEnv
+
+EPISODES = 512
+"""Episodes that the oracle plays."""
+STATES = 8192
+"""States that are kept of them."""
+EVERY = 4
+"""Control steps between two states of an episode."""
+BEYOND = 25
+"""States and actions are kept up to so many control steps after the oracle's first success."""
+OWN = (".key", ".episode")
+"""Parts of a carry that an environment keeps, whatever state it goes on from: its next episodes are drawn with them."""
+DISTURBED, LASTS = 0.1, 0.8
+"""Standard deviation of what is added to the actions of all joints but jaws, and how much of it lasts to the next step.
+With 0.3 an arm that holds a needle misses most handovers."""
+WAITING = 0.25
+"""Below this all joints wait for time to pass, or come back from a disturbance."""
+
+
+class Demonstrations:
+    """What is kept of the oracle's episodes, on the device of a run.
+
+    Args:
+        settings: the run. The oracle plays its task, with the goals of training.
+        layout: how agents are stacked.
+
+    Attributes:
+        carry: name in `Engine.carry_shapes` -> [STATES, ...].
+        observations: what agents and critics observe there, [STATES, ...] for each group of the layout.
+        shown: what agents observe in [n] other steps, likewise, without "state".
+        actions: what the oracle does then, flat joint actions [n, sum] in [-1, 1].
+
+    Raises:
+        ValueError: the control is not "position", the task has no oracle, its oracle never succeeds, or an agent
+            observes pictures.
+    """
+
+    def __init__(self, settings: Settings, layout: Layout, device: str) -> None:
+        neither = "oracle_states.rate and imitation.steps must be 0"
+        if settings.control != "position":
+            raise ValueError(f"{neither} with control {settings.control!r}: the oracle needs position")
+        if any(layout.pictures.values()):
+            raise ValueError(f"{neither} where agents observe pictures")
+        env = make_env(settings, EPISODES, "numpy")
+        try:
+            tables = (np.asarray(table).tobytes() for _, table in sorted(env.task.tables.items()))
+            about = env.env.content, describe(env.env.parameters).encode(), str(env.max_steps).encode()
+            rows = cached_arrays("demonstrations", lambda: _record(env), *about, *tables, roots=env.env.roots)
+            states, pairs = (
+                {name: torch.from_numpy(part).to(device) for name, part in _cut(rows[kind], shapes)}
+                for kind, shapes in (("states", _shapes(env)), ("pairs", {**_seen(env), **_moved(env)}))
+            )
+            agents = env.agents
+        finally:
+            env.close()
+        if not len(rows["states"]):
+            raise ValueError(f"{neither} for {settings.task}: its oracle never succeeded")
+        groups = {**layout.stack({agent: states.pop(agent) for agent in agents}), "state": states.pop("state")}
+        self.carry: dict[str, Tensor] = states
+        self.observations = TensorDict(groups, batch_size=[len(rows["states"])])
+        shown = layout.stack({agent: pairs[agent] for agent in agents})
+        self.shown = TensorDict(shown, batch_size=[len(rows["pairs"])])
+        self.actions = torch.cat([pairs[f"action of {agent}"] for agent in layout.agents], -1)
+
+    def draw(self, count: int) -> tuple[dict[str, Tensor], TensorDict]:
+        """Draw `count` states: their carry, and what is observed in them."""
+        chosen = torch.randint(len(self.observations), (count,), device=self.actions.device)
+        return {name: part[chosen] for name, part in self.carry.items()}, self.observations[chosen]
+
+
+def _record(env: BatchedEnv) -> dict[str, np.ndarray]:
+    """Return `states` [STATES, columns of `_shapes`] and `pairs` [n, columns of `_seen` and `_moved`] float32.
+
+    Both are of episodes in which the oracle succeeded.
+    """
+    policy, rng = oracle(env), np.random.default_rng(0)
+    observations, state, _ = env.reset(seed=0)
+    goes_on, solved = np.ones(env.num_envs, bool), np.full(env.num_envs, -1)
+    disturbance, shapes = _Disturbance(env, rng), {"states": _shapes(env), "pairs": {**_seen(env), **_moved(env)}}
+    rows: dict[str, list[np.ndarray]] = {kind: [] for kind in shapes}
+    places: dict[str, list[np.ndarray]] = {kind: [] for kind in shapes}
+
+    def keep(kind: str, step: int, which: np.ndarray, parts: Mapping[str, np.ndarray]) -> None:
+        at = np.flatnonzero(which)
+        rows[kind].append(_joined([parts[name] for name in shapes[kind]], at))
+        places[kind].append(np.stack([at, np.full(len(at), step)]))
+
+    for step in trange(env.max_steps, desc="the oracle's episodes", unit="step", leave=False, disable=None):
+        actions = {agent: np.clip(action, -1.0, 1.0) for agent, action in policy(observations).items()}
+        if step and step % EVERY == 0:
+            keep("states", step, goes_on, {**env.carry(), **observations, "state": state})
+        moves = (solved >= 0) | ~_waits(env, actions, observations)
+        keep("pairs", step, goes_on & moves, {**observations, **{f"action of {a}": x for a, x in actions.items()}})
+        result = env.step(disturbance.added(actions))
+        observations, state = result.observations, result.state
+        goes_on &= ~(result.terminated | result.truncated)
+        success = np.all([result.infos[agent]["success"] for agent in env.agents], axis=0)
+        solved = np.where((solved < 0) & success & goes_on, step, solved)
+    found = {}
+    for kind, (numbers, steps) in ((kind, np.concatenate(places[kind], 1)) for kind in shapes):
+        useful = np.flatnonzero((solved[numbers] >= 0) & (steps <= solved[numbers] + BEYOND))
+        chosen = rng.choice(useful, STATES) if kind == "states" and len(useful) else useful
+        found[kind] = np.concatenate(rows[kind])[chosen]
+    return found
+
+
+class _Disturbance:
+    """What is added to actions: random numbers that change slowly, but nothing for jaws."""
+
+    def __init__(self, env: BatchedEnv, rng: np.random.Generator) -> None:
+        self._rng = rng
+        self._free = {agent: ~_jaw(env, agent) for agent in env.agents}
+        self._now = {agent: np.zeros((env.num_envs, free.size)) for agent, free in self._free.items()}
+
+    def added(self, actions: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Return disturbed actions [N, n] by agent."""
+        found = {}
+        for agent, action in actions.items():
+            fresh = self._rng.normal(0.0, DISTURBED * np.sqrt(1 - LASTS**2), action.shape)
+            self._now[agent] = LASTS * self._now[agent] + fresh * self._free[agent]
+            found[agent] = np.clip(action + self._now[agent], -1.0, 1.0).astype(np.float32)
+        return found
+
+
+def _waits(env: BatchedEnv, actions: Mapping[str, np.ndarray], observations: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return whether the oracle waits, [N]: no joint moves, and jaws are commanded to where they are commanded already.
+
+    Imitated, such a pair would have an arm wait forever, because what it observes does not change.
+    """
+    waits = np.ones(env.num_envs, bool)
+    for agent, action in actions.items():
+        arm, jaw = env.scene.mounts[agent].arm, _jaw(env, agent)
+        waits &= (np.abs(action[:, ~jaw]) < WAITING).all(-1)
+        if arm.jaw is not None:
+            own = env.restated({agent: observations[agent]}, "si")[agent]
+            command = own[:, env.observation_terms(agent)["command"]][:, jaw]
+            ends = np.where(action[:, jaw] > 0, arm.jaw.open, arm.jaw.closed)
+            waits &= (np.abs(ends - command) < 1e-3).all(-1)
+    return waits
+
+
+def _jaw(env: BatchedEnv, agent: str) -> np.ndarray:
+    """Return which numbers of an agent's action move its jaw, bool."""
+    arm = env.scene.mounts[agent].arm
+    return np.array([arm.jaw is not None and joint.name == arm.jaw.joint for joint in arm.actuated])
+
+
+def _seen(env: BatchedEnv) -> dict[str, tuple[int, ...]]:
+    return {agent: env.observation_space(agent).shape or () for agent in env.agents}
+
+
+def _moved(env: BatchedEnv) -> dict[str, tuple[int, ...]]:
+    return {f"action of {agent}": env.action_space(agent).shape or () for agent in env.agents}
+
+
+def _shapes(env: BatchedEnv) -> dict[str, tuple[int, ...]]:
+    """Return name -> shape of what is kept of one environment: of its carry, of what each agent and critics observe."""
+    carry = {name: shape for name, shape in env.engine.carry_shapes.items() if name not in OWN}
+    return {**carry, **_seen(env), "state": env.state_space.shape}
+
+
+def _joined(parts: Sequence[np.ndarray], rows: np.ndarray) -> np.ndarray:
+    """Return some rows of parts [N, ...] side by side, float32, which holds all whole numbers in them."""
+    return np.concatenate([part[rows].reshape(len(rows), -1) for part in parts], 1, dtype=np.float32)
+
+
+def _cut(rows: np.ndarray, shapes: Mapping[str, tuple[int, ...]]) -> Iterator[tuple[str, np.ndarray]]:
+    """Yield the names and parts [n, ...] that `_joined` has put side by side."""
+    first = 0
+    for name, shape in shapes.items():
+        size = int(np.prod(shape))
+        yield name, rows[:, first : first + size].reshape(len(rows), *shape)
+        first += size

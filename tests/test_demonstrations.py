@@ -1,0 +1,149 @@
+"""The oracle's episodes: states that fit their observations, environments that go on from them, and imitation."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from surgical_marl.learning.demonstrations import EPISODES, Demonstrations, _waits
+from surgical_marl.learning.imitation import RATE, imitate
+from surgical_marl.learning.trainer import Trainer
+from surgical_marl.runs.environment import make_env
+from surgical_marl.runs.settings import ImitationSettings, NetworkSettings, OracleStatesSettings, Settings
+
+SETTINGS = Settings(
+    task="reach", scene="psm", num_envs=64, iterations=4, steps_per_iteration=4, device="cpu",
+    oracle_states=OracleStatesSettings(rate=12.5, until=0.5), network=NetworkSettings(hidden=(8,)),
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def trainer() -> Trainer:
+    return Trainer(SETTINGS, make_env(SETTINGS))
+
+
+def test_states_are_what_is_observed_in_them(trainer: Trainer) -> None:
+    states = Demonstrations(SETTINGS, trainer.env.layout, "cpu")
+    carry, seen = states.draw(32)
+    trainer.env.place(torch.arange(32), carry)
+    steps = trainer.env.env.steps[:32]
+    terms = trainer.env.env.observation_terms("psm_0")
+    qpos = trainer.env.env.qpos[:32, :7]  # without the second finger
+    np.testing.assert_array_equal(seen["psm"][:, 0, terms["qpos"]].numpy(), qpos)
+    assert len(np.unique(steps)) > 8
+    assert len(np.unique(carry[".goal.targets"].numpy().round(6), axis=0)) > 8, f"of {EPISODES} episodes"
+    solved = seen["psm"][:, 0, terms["to_target"]].norm(dim=-1) < 0.002
+    assert 0 < solved.float().mean() < 1
+
+
+def test_a_share_of_the_environments_goes_on_and_fades(trainer: Trainer) -> None:
+    def moved() -> float:
+        trainer.episodes.moved.zero_()
+        trainer._place()
+        return float(trainer.episodes.moved.float().mean())
+
+    keys = trainer.env.env.engine.read(".key", "numpy")
+    shares = []
+    for trainer.iteration in range(4):
+        shares.append(moved())
+    assert shares == [0.5, 0.25, 0.0, 0.0]
+    np.testing.assert_array_equal(trainer.env.env.engine.read(".key", "numpy"), keys)
+
+
+def test_an_episode_that_was_moved_is_not_counted(trainer: Trainer) -> None:
+    trainer.iteration = 0
+    trainer._place()
+    moved = trainer.episodes.moved.clone()
+    trainer.env.episode_length_buf = torch.full((64,), trainer.env.max_episode_length - 1)
+    trainer.episodes.take()
+    trainer._rollout()
+    assert trainer.episodes.take()[0] == (~moved).sum()
+    assert not trainer.episodes.moved.any()
+
+
+def test_training_with_them_goes_on_bit_for_bit(trainer: Trainer) -> None:
+    trainer.iteration = 0
+    kept = trainer.state()
+    ends = []
+    for _ in range(2):
+        again = Trainer(SETTINGS, make_env(SETTINGS))
+        again.set_state(kept)
+        again.iterate()
+        ends.append(torch.cat([weight.detach().ravel() for weight in again.algorithm.parameters()]))
+    assert torch.equal(*ends)
+
+
+def test_waiting_is_not_shown(trainer: Trainer) -> None:
+    env = make_env(SETTINGS, 4, "numpy")
+    observations, *_ = env.reset(seed=0)  # at home, with closed jaws
+    actions = np.zeros((4, 7), np.float32)
+    actions[:, -1] = [-1.0, 1.0, -1.0, -1.0]
+    actions[2, 0] = 0.5
+    assert _waits(env, {"psm_0": actions}, observations).tolist() == [True, False, False, True]
+
+
+def test_what_is_shown_leads_to_the_target(trainer: Trainer) -> None:
+    found = Demonstrations(SETTINGS, trainer.env.layout, "cpu")
+    assert found.actions.shape == (len(found.shown), 7)
+    assert found.actions.abs().max() <= 1
+    arm, terms = trainer.env.env.scene.mounts["psm_0"].arm, trainer.env.env.observation_terms("psm_0")
+    seen = found.shown["psm"][:, 0].numpy().astype(float)
+    q, way = seen[:, terms["qpos"]], seen[:, terms["to_target"]]
+    far = np.linalg.norm(way, axis=-1) > 0.01
+    step = 0.01 * found.actions.numpy() * arm.speed
+    moved = (arm.forward_kinematics(q + step) - arm.forward_kinematics(q))[:, :3, 3]
+    assert ((moved * way).sum(-1) > 0)[far].mean() > 0.98  # the tip comes nearer
+
+
+def test_imitation_fits_the_actions_and_leaves_the_deviation(trainer: Trainer) -> None:
+    actor = Trainer(SETTINGS, make_env(SETTINGS)).algorithm.actor
+    found = Demonstrations(SETTINGS, trainer.env.layout, "cpu")
+    deviation = {name: weight.clone() for name, weight in actor.named_parameters() if "distribution" in name}
+    assert deviation
+
+    def error() -> float:
+        with torch.no_grad():
+            return float((actor(found.shown) - found.actions).square().mean())
+
+    before = error()
+    imitate(actor, found, steps=300)
+    assert error() < 0.3 * before
+    for name, weight in actor.named_parameters():
+        assert name not in deviation or torch.equal(weight, deviation[name])
+
+
+def test_the_critic_learns_alone_after_imitation() -> None:
+    settings = replace(SETTINGS, imitation=ImitationSettings(steps=5, hold=2))
+    trainer = Trainer(settings, make_env(settings))
+    algorithm = trainer.algorithm
+
+    def weights(model: Any) -> torch.Tensor:
+        return torch.cat([weight.detach().ravel() for weight in model.parameters()])
+
+    trainer.iterate()
+    actor, critic = weights(algorithm.actor), weights(algorithm.critic)
+    assert float(algorithm._rate) == pytest.approx(RATE)
+    trainer.iterate()
+    assert torch.equal(weights(algorithm.actor), actor)
+    assert not torch.equal(weights(algorithm.critic), critic)
+    trainer.iterate()
+    assert not torch.equal(weights(algorithm.actor), actor)
+    assert float(algorithm._rate) != pytest.approx(RATE)
+
+
+def test_another_control_is_refused(trainer: Trainer) -> None:
+    with pytest.raises(ValueError, match=r"oracle_states.rate and imitation.steps must be 0 with control 'torque'"):
+        Demonstrations(replace(SETTINGS, control="torque"), trainer.env.layout, "cpu")
+
+
+def test_pictures_are_refused() -> None:
+    seeing: Any = SimpleNamespace(pictures={"ecm": {"image": None}})
+    with pytest.raises(
+        ValueError, match=r"oracle_states.rate and imitation.steps must be 0 where agents observe pictures"
+    ):
+        Demonstrations(SETTINGS, seeing, "cpu")
