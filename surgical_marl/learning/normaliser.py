@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from rsl_rl.modules import EmpiricalNormalization
 from torch import Tensor, nn
 
 from surgical_marl.learning import distributed
+from surgical_marl.policies.normaliser import LimitedNormaliser
 
 
-class Normaliser(EmpiricalNormalization):
-    """rsl_rl's normaliser, with an update in place that a CUDA graph can repeat."""
+class Normaliser(LimitedNormaliser):
+    """A normaliser with an update in place that a CUDA graph can repeat."""
 
     def update(self, x: Tensor) -> None:
         """Learn from the batches `[B, d]` of all processes while training."""

@@ -12,6 +12,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from surgical_marl.policies.encoder import ENCODER, PICTURES, PictureModel
+from surgical_marl.policies.normaliser import LimitedNormaliser
 from surgical_marl.policies.recurrent import RecurrentModel, RecurrentPictureModel
 from surgical_marl.runs.settings import NetworkSettings
 
@@ -187,7 +188,10 @@ def make_model(
         (False, True): RecurrentModel,
         (True, True): RecurrentPictureModel,
     }
-    return kinds[pictures, recurrent != "none"](observations, {"all": groups}, "all", width, **model)
+    made = kinds[pictures, recurrent != "none"](observations, {"all": groups}, "all", width, **model)
+    if made.obs_normalization:
+        made.obs_normalizer = LimitedNormaliser(made.obs_dim)
+    return made
 
 
 def network_config(network: NetworkSettings) -> dict[str, Any]:
