@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -40,22 +42,20 @@ def test_the_factor_is_cholesky_s_elsewhere() -> None:
 @pytest.mark.parametrize("linked", [[], [(0, 2)], [(2, 3), (0, 2)], [(0, 1), (1, 2), (2, 3), (0, 3)]])
 def test_objects_are_eliminated_as_from_a_dense_matrix(linked: list[tuple[int, int]]) -> None:
     rng, size = np.random.default_rng(len(linked)), 6 * OBJECTS
-    own, pairs = np.zeros((OBJECTS, 6, 6)), np.zeros((OBJECTS, OBJECTS, 6, 6))
+    blocks = np.zeros((OBJECTS, OBJECTS, 6, 6))
     for o in range(OBJECTS):
         root = rng.standard_normal((6, 6))
-        own[o] = root @ root.T + np.eye(6)
-    for one, other in linked:
+        blocks[o, o] = root @ root.T + np.eye(6)
+    for pair in linked:
         left, right = rng.standard_normal((2, 6, 3))
-        own[one], own[other] = own[one] + left @ left.T, own[other] + right @ right.T
-        pairs[one, other], pairs[other, one] = -left @ right.T, -right @ left.T
+        for (one, its), (other, others) in product(zip(pair, (left, -right), strict=True), repeat=2):
+            blocks[one, other] += its @ others.T
     force, coupling = rng.standard_normal((OBJECTS, 6)), rng.standard_normal((OBJECTS, ARMS, 6, JOINTS))
     coupled = np.array([True, False, True, True])
     coupling[~coupled] = 0
     arms = rng.standard_normal((ARMS, JOINTS))
 
-    dense = pairs.transpose(0, 2, 1, 3).reshape(size, size) + np.kron(np.eye(OBJECTS), np.ones((6, 6))) * np.tile(
-        own.reshape(size, 6), (1, OBJECTS)
-    )
+    dense = blocks.transpose(0, 2, 1, 3).reshape(size, size)
     wide = coupling.transpose(0, 2, 1, 3).reshape(size, -1)
     ways = np.linalg.solve(dense, force.ravel() - wide @ arms.ravel()).reshape(OBJECTS, 6)
     single = lambda array: jnp.asarray(array, jnp.float32)  # noqa: E731
@@ -66,10 +66,11 @@ def test_objects_are_eliminated_as_from_a_dense_matrix(linked: list[tuple[int, i
         np.testing.assert_allclose(divided.T @ half, wide.T @ np.linalg.solve(dense, force.ravel()), atol=5e-3)
         np.testing.assert_allclose(divided.T @ divided, wide.T @ np.linalg.solve(dense, wide), atol=5e-3)
 
-    together = elimination.touching(single(own), single(pairs), single(force), single(coupling))
+    together = elimination.touching(single(blocks), single(force), single(coupling))
     compared(together, elimination.ways_touching(together, single(arms)))
     if not linked:
-        alone = elimination.apart(single(own), single(force), single(coupling), jnp.asarray(coupled))
+        own = single(blocks[np.arange(OBJECTS), np.arange(OBJECTS)])
+        alone = elimination.apart(own, single(force), single(coupling), jnp.asarray(coupled))
         compared(alone, elimination.ways_apart(alone, single(arms), jnp.asarray(coupled)))
 
 

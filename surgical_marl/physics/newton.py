@@ -28,6 +28,8 @@ PASSES = 12
 LEAST = 1e-7
 """Fall of the cost in a Newton step, N m/s2, after which none follows: that of a needle of 0.03 g whose acceleration
 changes by 0.06 m/s2."""
+_OTHERS = np.array([[0, 1], [1, 0], [1, 1]])
+"""Of which of a contact's two bodies there are blocks, besides that of the first one alone."""
 TOLERANCE = 1e-2
 """Change of friction in a Newton step, as a share of the normal force, at which sliding contacts have converged."""
 
@@ -53,7 +55,7 @@ class _Local(NamedTuple):
     excess: Array
     """[k, 6]"""
     object: Array
-    """[k, 6, 6]"""
+    """[k, 6, 6]; if there are several objects, each with each one, [k, k, 6, 6]."""
     coupling: Array
     """[k, a, 6, m]"""
 
@@ -172,7 +174,7 @@ class Newton:
             jnp.zeros((a, m)),
             jnp.zeros((a, m, m)),
             _with_none(inertia),
-            _with_none(problem.masses),
+            self._masses(problem),
             jnp.zeros((k + 1, a, 6, m)),
         )
 
@@ -187,8 +189,27 @@ class Newton:
             return self._add(local, contact, found), pressed
 
         local, pressed = jax.lax.fori_loop(0, problem.total, one, (none, not_pressed(len(problem.contacts.arm))))
-        own = {name: getattr(local, name)[:k] for name in ("excess", "object", "coupling")}
-        return local._replace(**own), pressed
+        own = local.object[:k] if k < 2 else local.object.reshape(k + 1, k + 1, 6, 6)[:k, :k]
+        return local._replace(excess=local.excess[:k], object=own, coupling=local.coupling[:k]), pressed
+
+    def _masses(self, problem: Problem) -> Array:
+        """Return the blocks of masses alone, as `_add` adds to them, with those of no object."""
+        if self._objects < 2:
+            return _with_none(problem.masses)
+
+        def note(blocks: Array, row: tuple[Array, Array]) -> tuple[Array, None]:
+            return self._grown(blocks, row[0], row[0], row[1]), None
+
+        none = jnp.zeros((self._objects + 1) ** 2 * 36)
+        return jax.lax.scan(note, none, (jnp.arange(self._objects), problem.masses))[0]
+
+    def _grown(self, blocks: Array, first: Array, second: Array, block: Array) -> Array:
+        """Return blocks with more [6, 6] of two objects. Those of several objects are one array in memory."""
+        if self._objects < 2:
+            return blocks.at[first].add(block)
+        at = (36 * ((self._objects + 1) * first + second),)
+        more = jax.lax.dynamic_slice(blocks, at, (36,)) + block.ravel()
+        return jax.lax.dynamic_update_slice(blocks, more, at)
 
     def _add(self, local: _Local, contact: Contact, felt: Forces) -> _Local:
         """Return sums with one more contact."""
@@ -197,15 +218,21 @@ class Newton:
         if self._objects > 1:
 
             def on_other(parts: tuple[Array, Array]) -> tuple[Array, Array]:
-                moved = _moved_cone(contact)
-                pulled = parts[0].at[second].add(-wrench(moved, felt))
-                return pulled, parts[1].at[second].add(curvature(moved, felt))
+                both = jax.tree.map(lambda *x: stored(jnp.stack(x)), cone, _moved_cone(contact))
+                bodies = jnp.stack([first, second])
+
+                def add(blocks: Array, pair: Array) -> tuple[Array, None]:
+                    block = between(row_of(both, pair[0]), row_of(both, pair[1]), felt)
+                    return self._grown(blocks, bodies[pair[0]], bodies[pair[1]], block), None
+
+                pulled = parts[0].at[second].add(wrench(row_of(both, 1), felt))
+                return pulled, jax.lax.scan(add, parts[1], jnp.asarray(_OTHERS))[0]
 
             touches = second < self._objects
             parts = jax.lax.cond(touches, on_other, lambda parts: parts, (local.excess, local.object))
             local = local._replace(excess=parts[0], object=parts[1])
-        own = local.excess.at[first].add(pull), local.object.at[first].add(stiff)
-        local = local._replace(excess=own[0], object=own[1])
+        grown = self._grown(local.object, first, first, stiff)
+        local = local._replace(excess=local.excess.at[first].add(pull), object=grown)
         if not len(self._dofs):
             return local
 
@@ -261,17 +288,11 @@ class Newton:
         Objects are eliminated, arms solved, each alone if nothing joins them, and objects found from them.
         """
         touched, linked = self._touched(problem), jnp.bool_(False)
-        apart = lambda _: elimination.apart(local.object, local.excess, local.coupling, touched.any(1))  # noqa: E731
         if self._objects > 1:
             linked = ((problem.contacts.second < self._objects) & (pressed.normal > 0)).any()
-
-            def touching(_: None) -> elimination.Eliminated:
-                pairs = self._pairs(problem, here)
-                return elimination.touching(local.object, pairs, local.excess, local.coupling)
-
-            gone = jax.lax.cond(linked, touching, apart, None)
+            gone = elimination.touching(local.object, local.excess, local.coupling)
         else:
-            gone = apart(None)
+            gone = elimination.apart(local.object, local.excess, local.coupling, touched.any(1))
         found = excess.arms
         if len(self._dofs):
             on = touched | (linked & touched.any(0))  # what an object touches moves those that it touches
@@ -280,30 +301,9 @@ class Newton:
             each, several = self._arms.each, len(self._dofs) > 1
             found = jax.lax.cond(joined, self._arms.together, each, left) if several else each(left)
         by_arm = self.by_arm(found)
-        ways_apart = lambda gone: elimination.ways_apart(gone, by_arm, touched.any(1))  # noqa: E731
-        if self._objects < 2:
-            return Point(found, ways_apart(gone))
-        ways_touching = lambda gone: elimination.ways_touching(gone, by_arm)  # noqa: E731
-        return Point(found, jax.lax.cond(linked, ways_touching, ways_apart, gone))
-
-    def _pairs(self, problem: Problem, point: Point) -> Array:
-        """Return how forces on each object fall with the acceleration of each other one, [k, k, 6, 6]."""
-        contacts, (arms, objects) = problem.contacts, (self.by_arm(point.arms), self.by_object(point.objects))
-
-        def add(n: Array, pairs: Array) -> Array:
-            contact = row_of(contacts, n)
-
-            def both(pairs: Array) -> Array:
-                felt = forces(contact.cone, self.twist(contact, arms, objects))
-                block = -between(contact.cone, _moved_cone(contact), felt)
-                first, second = contact.first, contact.second
-                return pairs.at[first, second].add(block).at[second, first].add(block.T)
-
-            return jax.lax.cond(contact.second < self._objects, both, lambda pairs: pairs, pairs)
-
-        none = jnp.zeros((self._objects, self._objects, 6, 6))
-        pairs: Array = jax.lax.fori_loop(0, problem.total, add, none)
-        return pairs
+        if self._objects > 1:
+            return Point(found, elimination.ways_touching(gone, by_arm))
+        return Point(found, elimination.ways_apart(gone, by_arm, touched.any(1)))
 
     def _touched(self, problem: Problem) -> Array:
         """Return which objects touch which arms, [k, a]."""
@@ -334,13 +334,13 @@ def _moved_to(twist: Array, offset: Array) -> Array:
 
 
 def _moved_cone(contact: Contact) -> Cone:
-    """Return the cone with its twists at the centre of mass of the other object.
+    """Return the cone with its twists at the centre of mass of the other object, and as that one feels it.
 
     Its rows are moved before anything is made of them: in float32 a curvature about one body's centre, moved to that of
     a small one, would be wrong by more than that one's inertia.
     """
     shift, cone = _shift(contact.offset), contact.cone
-    return cone._replace(normal=cone.normal @ shift, along=cone.along @ shift)
+    return cone._replace(normal=-cone.normal @ shift, along=-cone.along @ shift)
 
 
 def _shift(offset: Array) -> Array:
