@@ -25,8 +25,6 @@ COUNT, STEPS = 16, 10
 SEEDS = st.integers(0, 2**32 - 1)
 SCENES = [pytest.param(seed, marks=pytest.mark.slow) for seed in range(12)]
 """Each is compiled, which takes seconds; hypothesis draws states in it."""
-UNSOLVED = 8
-"""A scene in which a small sphere gains energy in an impact: four steps of line search do not find the solution."""
 
 
 def random_part(rng: np.random.Generator) -> dict[str, Any]:
@@ -71,11 +69,7 @@ def states(scene: Falling, rng: np.random.Generator, low: float, high: float) ->
     return thrown(scene.begin(COUNT), position=position, quaternion=turns, velocity=velocity)
 
 
-@pytest.mark.parametrize(
-    "scene",
-    [*SCENES[:UNSOLVED], *SCENES[UNSOLVED + 1 :],
-     pytest.param(UNSOLVED, marks=[pytest.mark.slow, pytest.mark.xfail(reason="an impact that is not solved")])],
-)  # fmt: skip
+@pytest.mark.parametrize("scene", SCENES)
 @settings(max_examples=10, deadline=None, derandomize=True)
 @given(seed=SEEDS)
 def test_what_moves_without_arms_gains_no_energy(scene: int, seed: int) -> None:

@@ -102,6 +102,21 @@ def curvature(cone: Cone, felt: Forces) -> Array:
     return packed[_PACKED]
 
 
+def between(cone: Cone, other: Cone, felt: Forces) -> Array:
+    """Return by how much the wrench falls per acceleration of another body, [6, 6].
+
+    `other` is the cone with its twists at that body's origin. With that of the same body this is the `curvature`.
+    """
+    pressed, rub, soft, ahead, across = _gives(cone, felt)
+    (rubs, raised), (its, its_raised) = (
+        (felt.way @ own.along, own.coefficient * (pressed @ own.normal)) for own in (cone, other)
+    )
+    mixed, its_mixed = rub * rubs - raised / 2, rub * its - its_raised / 2
+    whole = (pressed[:, None] * cone.normal).T @ other.normal
+    whole += rub * (across * cone.along.T @ other.along + (ahead - across) * jnp.outer(rubs, its))
+    return whole + soft * (jnp.outer(raised, its_mixed) + jnp.outer(mixed, its_raised))
+
+
 def fall(cone: Cone, felt: Forces, normal: Array, along: Array) -> Array:
     """Return by how much the forces' power along a way falls per length of it, []: `curvature` on that way alone.
 

@@ -2,8 +2,7 @@
 
 All forces are gradients of convex functions of the acceleration (`solver.py`, `cone.py`), and so is their sum. A Newton
 step is a linear system in which each object is six numbers that only meet arms, so objects are eliminated first: what
-is left is as large as the arms, whatever the number of objects. Where two objects touch, the curvature of their contact
-is replaced by one that is larger and concerns each of them alone. The step then falls short, but still goes down.
+is left is as large as the arms, whatever the number of objects. Objects that touch each other are eliminated together.
 """
 
 from __future__ import annotations
@@ -15,10 +14,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.lax.linalg import triangular_solve
 
+from surgical_marl.physics import elimination
 from surgical_marl.physics.arms import Arms, Reduced
-from surgical_marl.physics.cone import curvature, fall, forces, nearest, wrench
+from surgical_marl.physics.cone import Cone, Forces, between, curvature, fall, forces, nearest, wrench
 from surgical_marl.physics.problem import SLIPS, Contact, Point, Pressed, Problem, Solution, not_pressed
 from surgical_marl.physics.rows import filled, row_of, stored
 from surgical_marl.physics.search import search
@@ -29,6 +28,8 @@ PASSES = 12
 LEAST = 1e-7
 """Fall of the cost in a Newton step, N m/s2, after which none follows: that of a needle of 0.03 g whose acceleration
 changes by 0.06 m/s2."""
+_OTHERS = np.array([[0, 1], [1, 0], [1, 1]])
+"""Of which of a contact's two bodies there are blocks, besides that of the first one alone."""
 TOLERANCE = 1e-2
 """Change of friction in a Newton step, as a share of the normal force, at which sliding contacts have converged."""
 
@@ -54,7 +55,7 @@ class _Local(NamedTuple):
     excess: Array
     """[k, 6]"""
     object: Array
-    """[k, 6, 6]"""
+    """[k, 6, 6]; if there are several objects, each with each one, [k, k, 6, 6]."""
     coupling: Array
     """[k, a, 6, m]"""
 
@@ -90,38 +91,35 @@ class Newton:
 
     def solve(self, problem: Problem, arms: Array, objects: Array) -> Solution:
         """Return the accelerations and forces, beginning with accelerations of arms [n] and objects [k, 6]."""
-        slots, no, zero = len(problem.contacts.arm), jnp.bool_(False), jnp.float32(0.0)
+        slots, no = len(problem.contacts.arm), jnp.bool_(False)
         pressed = not_pressed(slots)._replace(sides=jnp.full(slots, -1, jnp.int32))
-        state = Point(arms, objects), pressed, self._sides(problem, arms), (no, zero), no, jnp.int32(0)
+        state = Point(arms, objects), pressed, self._sides(problem, arms), no, no, jnp.int32(0)
 
         def going(state: Any) -> Array:
             settled, count = state[-2:]
             return ~settled & (count < PASSES)
 
         def iterate(state: Any) -> Any:
-            here, before, sides, (whole, left), _, count = state
+            here, before, sides, whole, _, count = state
             local, pressed = self._contacts(problem, here)
             excess, felt = self._excess(problem, here, local)
             new_sides = self._sides(problem, here.arms)
             same = whole & (pressed.sides == before.sides).all() & (new_sides == sides).all()
             turned = jnp.sum((pressed.friction - before.friction) ** 2, -1) > TOLERANCE**2 * pressed.normal**2
             settled = same & ~(turned & (pressed.sides >= SLIPS)).any()
-            if self._objects > 1:  # a step in which two objects press on each other falls short
-                joined = ((problem.contacts.second < self._objects) & (pressed.sides > 0)).any()
-                settled &= ~joined | (left <= TOLERANCE)
 
             def on(here: Point) -> Any:
-                way = self._direction(problem, here, excess, local, felt)
+                way = self._direction(problem, here, pressed, excess, local, felt)
                 slope = -_dot(self._whole(problem, here, excess), way)
                 last = -slope <= LEAST
                 searched = lambda _: search(slope, self._line(problem, here, way))  # noqa: E731
-                length, end = jax.lax.cond(last, lambda _: (jnp.float32(1.0), zero), searched, None)
+                length = jax.lax.cond(last, lambda _: jnp.float32(1.0), searched, None)
                 there = jax.tree.map(lambda x, step: x + length * step, here, way)
-                return there, (length == 1, jnp.abs(end) / jnp.maximum(-slope, 1e-20)), last
+                return there, length == 1, last
 
-            stay = lambda here: (here, (whole, left), settled)  # noqa: E731
-            here, step, settled = jax.lax.cond(settled, stay, on, here)
-            return here, pressed, new_sides, step, settled, count + 1
+            stay = lambda here: (here, whole, settled)  # noqa: E731
+            here, whole, settled = jax.lax.cond(settled, stay, on, here)
+            return here, pressed, new_sides, whole, settled, count + 1
 
         here, pressed, _, _, _, count = jax.lax.while_loop(going, iterate, state)
         return Solution(here.arms, here.objects, pressed, row_forces(problem.between, here.arms), count)
@@ -176,7 +174,7 @@ class Newton:
             jnp.zeros((a, m)),
             jnp.zeros((a, m, m)),
             _with_none(inertia),
-            _with_none(problem.masses),
+            self._masses(problem),
             jnp.zeros((k + 1, a, 6, m)),
         )
 
@@ -188,30 +186,53 @@ class Newton:
             sides = jnp.sum(bits) + jnp.where(found.slips, SLIPS, 0)
             own = Pressed(jnp.sum(found.normal), found.friction, sides)
             pressed = jax.tree.map(lambda all_, x: all_.at[n].set(x), pressed, own)
-            return self._add(local, contact, wrench(contact.cone, found), curvature(contact.cone, found)), pressed
+            return self._add(local, contact, found), pressed
 
         local, pressed = jax.lax.fori_loop(0, problem.total, one, (none, not_pressed(len(problem.contacts.arm))))
-        own = {name: getattr(local, name)[:k] for name in ("excess", "object", "coupling")}
-        return local._replace(**own), pressed
+        own = local.object[:k] if k < 2 else local.object.reshape(k + 1, k + 1, 6, 6)[:k, :k]
+        return local._replace(excess=local.excess[:k], object=own, coupling=local.coupling[:k]), pressed
 
-    def _add(self, local: _Local, contact: Contact, pull: Array, stiff: Array) -> _Local:
-        """Return sums with one more contact: the force and torque [6] on its first body, and how they fall [6, 6]."""
-        first, second, whole = contact.first, contact.second, stiff
-        if self._objects > 1:  # twice the curvature on each alone is more than the curvature on both
-            both = second < self._objects
-            whole = jnp.where(both, 2.0, 1.0) * stiff
+    def _masses(self, problem: Problem) -> Array:
+        """Return the blocks of masses alone, as `_add` adds to them, with those of no object."""
+        if self._objects < 2:
+            return _with_none(problem.masses)
+
+        def note(blocks: Array, row: tuple[Array, Array]) -> tuple[Array, None]:
+            return self._grown(blocks, row[0], row[0], row[1]), None
+
+        none = jnp.zeros((self._objects + 1) ** 2 * 36)
+        return jax.lax.scan(note, none, (jnp.arange(self._objects), problem.masses))[0]
+
+    def _grown(self, blocks: Array, first: Array, second: Array, block: Array) -> Array:
+        """Return blocks with more [6, 6] of two objects. Those of several objects are one array in memory."""
+        if self._objects < 2:
+            return blocks.at[first].add(block)
+        at = (36 * ((self._objects + 1) * first + second),)
+        more = jax.lax.dynamic_slice(blocks, at, (36,)) + block.ravel()
+        return jax.lax.dynamic_update_slice(blocks, more, at)
+
+    def _add(self, local: _Local, contact: Contact, felt: Forces) -> _Local:
+        """Return sums with one more contact."""
+        first, second, cone = contact.first, contact.second, contact.cone
+        pull, stiff = wrench(cone, felt), curvature(cone, felt)
+        if self._objects > 1:
 
             def on_other(parts: tuple[Array, Array]) -> tuple[Array, Array]:
-                shift = _shift(contact.offset)
-                excess = parts[0].at[second].add(-(shift.T @ pull))
-                return excess, parts[1].at[second].add(shift.T @ whole @ shift)
+                both = jax.tree.map(lambda *x: stored(jnp.stack(x)), cone, _moved_cone(contact))
+                bodies = jnp.stack([first, second])
 
-            parts = jax.lax.cond(both, on_other, lambda parts: parts, (local.excess, local.object))
+                def add(blocks: Array, pair: Array) -> tuple[Array, None]:
+                    block = between(row_of(both, pair[0]), row_of(both, pair[1]), felt)
+                    return self._grown(blocks, bodies[pair[0]], bodies[pair[1]], block), None
+
+                pulled = parts[0].at[second].add(wrench(row_of(both, 1), felt))
+                return pulled, jax.lax.scan(add, parts[1], jnp.asarray(_OTHERS))[0]
+
+            touches = second < self._objects
+            parts = jax.lax.cond(touches, on_other, lambda parts: parts, (local.excess, local.object))
             local = local._replace(excess=parts[0], object=parts[1])
-        local = local._replace(
-            excess=local.excess.at[first].add(pull),
-            object=local.object.at[first].add(whole),
-        )
+        grown = self._grown(local.object, first, first, stiff)
+        local = local._replace(excess=local.excess.at[first].add(pull), object=grown)
         if not len(self._dofs):
             return local
 
@@ -259,42 +280,30 @@ class Newton:
 
     # -- the way from there
 
-    def _direction(self, problem: Problem, here: Point, excess: Point, local: _Local, stiff: Array) -> Point:
+    def _direction(
+        self, problem: Problem, here: Point, pressed: Pressed, excess: Point, local: _Local, stiff: Array
+    ) -> Point:
         """Return the way to the least cost if contacts are linear functions; friction and limits of joints are not.
 
         Objects are eliminated, arms solved, each alone if nothing joins them, and objects found from them.
         """
-        a, m = self._dofs.shape
-        touched = self._touched(problem)
-
-        def eliminate(row: Any) -> Any:
-            own, force, coupling, coupled = row
-            factor = jax.lax.linalg.cholesky(own, symmetrize_input=False)
-            half = triangular_solve(factor, force[:, None], left_side=True, lower=True)[:, 0]
-
-            def on_arms(coupling: Array) -> Array:
-                wide = jnp.moveaxis(coupling, 0, 1).reshape(6, a * m)
-                wide = triangular_solve(factor, wide, left_side=True, lower=True)
-                return jnp.moveaxis(wide.reshape(6, a, m), 1, 0)
-
-            wide = jax.lax.cond(coupled, on_arms, jnp.zeros_like, coupling) if a else coupling
-            return factor, half, wide
-
-        def back(row: Any) -> Array:
-            factor, half, wide, coupled = row
-            arms = lambda half: half - jnp.einsum("acm,am->c", wide, by_arm)  # noqa: E731
-            left = jax.lax.cond(coupled, arms, lambda half: half, half) if a else half
-            return triangular_solve(factor, left[:, None], left_side=True, lower=True, transpose_a=True)[:, 0]
-
-        rows = local.object, local.excess, local.coupling, touched.any(1)
-        kept = jax.lax.map(eliminate, rows)
+        touched, linked = self._touched(problem), jnp.bool_(False)
+        if self._objects > 1:
+            linked = ((problem.contacts.second < self._objects) & (pressed.normal > 0)).any()
+            gone = elimination.touching(local.object, local.excess, local.coupling)
+        else:
+            gone = elimination.apart(local.object, local.excess, local.coupling, touched.any(1))
         found = excess.arms
-        if a:
-            left = Reduced(stiff, excess.arms, here.arms, problem.rows, problem.joints, kept[1], kept[2], touched)
-            joined = (touched.sum(1) > 1).any() | self._sides(problem, here.arms).any()
-            found = jax.lax.cond(joined, self._arms.together, self._arms.each, left) if a > 1 else self._arms.each(left)
+        if len(self._dofs):
+            on = touched | (linked & touched.any(0))  # what an object touches moves those that it touches
+            left = Reduced(stiff, excess.arms, here.arms, problem.rows, problem.joints, gone.half, gone.wide, on)
+            joined = (on.sum(1) > 1).any() | self._sides(problem, here.arms).any()
+            each, several = self._arms.each, len(self._dofs) > 1
+            found = jax.lax.cond(joined, self._arms.together, each, left) if several else each(left)
         by_arm = self.by_arm(found)
-        return Point(found, jax.lax.map(back, (*kept, rows[3])))
+        if self._objects > 1:
+            return Point(found, elimination.ways_touching(gone, by_arm))
+        return Point(found, elimination.ways_apart(gone, by_arm, touched.any(1)))
 
     def _touched(self, problem: Problem) -> Array:
         """Return which objects touch which arms, [k, a]."""
@@ -322,6 +331,16 @@ def _dot(one: Point, other: Point) -> Array:
 def _moved_to(twist: Array, offset: Array) -> Array:
     """Return the twist [6] at a place from that of a body whose centre of mass is `offset` [3] away."""
     return jnp.concatenate([twist[:3] - jnp.cross(twist[3:], offset), twist[3:]])
+
+
+def _moved_cone(contact: Contact) -> Cone:
+    """Return the cone with its twists at the centre of mass of the other object, and as that one feels it.
+
+    Its rows are moved before anything is made of them: in float32 a curvature about one body's centre, moved to that of
+    a small one, would be wrong by more than that one's inertia.
+    """
+    shift, cone = _shift(contact.offset), contact.cone
+    return cone._replace(normal=-cone.normal @ shift, along=-cone.along @ shift)
 
 
 def _shift(offset: Array) -> Array:

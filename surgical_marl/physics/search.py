@@ -24,15 +24,13 @@ class _Tried(NamedTuple):
     """The longest that was too short."""
     high: Array
     """The shortest that was too long."""
-    slope: Array
-    """At the last one."""
     looks: Array
     """How many there were."""
     done: Array
 
 
-def search(begin: Array, measure: Callable[[Array], tuple[Array, Array]]) -> tuple[Array, Array]:
-    """Return a length at which the slope of a convex function is small, and the slope there.
+def search(begin: Array, measure: Callable[[Array], tuple[Array, Array]]) -> Array:
+    """Return a length at which the slope of a convex function is small.
 
     Newton's method on the slope, within a bracket. The first length is 1.
 
@@ -40,7 +38,6 @@ def search(begin: Array, measure: Callable[[Array], tuple[Array, Array]]) -> tup
         begin: slope at length 0, below 0, [].
         measure: from a length to the slope there, and by how much it grows per length.
     """
-    zero = jnp.float32(0.0)
 
     def look(tried: _Tried) -> _Tried:
         slope, growth = measure(tried.length)
@@ -51,8 +48,8 @@ def search(begin: Array, measure: Callable[[Array], tuple[Array, Array]]) -> tup
         length = jnp.where(
             (length > low) & (length < high), length, jnp.where(high < jnp.inf, (low + high) / 2, 2 * low)
         )
-        return _Tried(jnp.where(done, tried.length, length), low, high, slope, looks, done)
+        return _Tried(jnp.where(done, tried.length, length), low, high, looks, done)
 
-    start = _Tried(jnp.float32(1.0), zero, jnp.float32(jnp.inf), zero, jnp.int32(0), jnp.bool_(False))
-    found = jax.lax.while_loop(lambda tried: ~tried.done, look, start)
-    return found.length, found.slope
+    start = _Tried(jnp.float32(1.0), jnp.float32(0.0), jnp.float32(jnp.inf), jnp.int32(0), jnp.bool_(False))
+    found: _Tried = jax.lax.while_loop(lambda tried: ~tried.done, look, start)
+    return found.length
