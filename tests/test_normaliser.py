@@ -1,4 +1,4 @@
-"""Normalised observations: what is far off the mean is limited, in networks that learn and in those that were loaded."""
+"""Normalised observations: what is far off the mean is limited, in networks that learn and in loaded ones."""
 
 from __future__ import annotations
 
