@@ -138,7 +138,7 @@ class Trainer:
             imitate(self.algorithm.actor, self._demonstrations, asked.steps)
             if distributed.size() > 1:
                 self.algorithm.broadcast_parameters()
-        if self.iteration in (0, asked.hold):
+        if self.iteration <= asked.hold:  # a run may have been resumed within these iterations
             held = self.iteration < asked.hold
             self.algorithm.hold_actor(held, RATE if held else self.settings.ppo.learning_rate)
 
