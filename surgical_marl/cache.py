@@ -66,7 +66,7 @@ def cached_arrays(
         with contextlib.suppress(OSError):
             path.parent.mkdir(parents=True, exist_ok=True)
             with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
-                np.savez(file, **arrays)  # type: ignore[arg-type]  # a name can be that of no option
+                np.savez(file, **arrays)  # type: ignore[arg-type]  # the one option is no array's name
             os.replace(file.name, path)
     return arrays
 

@@ -10,7 +10,6 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
-import torch
 import yaml
 from pettingzoo.test import parallel_api_test, parallel_seed_test
 
@@ -28,6 +27,7 @@ from surgical_marl.tasks.base.paths import KNOT, SEGMENTS
 from surgical_marl.tasks.base.task import APPROACH, PRECISION
 from surgical_marl.tasks.base.world import World
 from tests.helpers.actions import random_actions
+from tests.helpers.devices import needs_cuda
 
 # match_image, whose observations are pictures, and tasks with objects have tests of their own
 TASKS, SCENES = [task for task in sm.list_tasks() if KNOWN.load(task).scenes is None], sm.list_scenes()
@@ -113,7 +113,7 @@ def test_the_oracle_moves_one_arm_without_waiting_for_others() -> None:
     assert (errors[:, 1] < 0.002).mean() >= 0.98 and np.median(errors[:, 0]) > 0.01
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@needs_cuda
 def test_the_oracle_takes_tensors_on_a_gpu() -> None:
     env = BatchedEnv("reach", "psm", num_envs=50, device="cuda", arrays="torch")
     observations, *_ = env.reset(0)

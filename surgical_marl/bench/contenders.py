@@ -17,7 +17,7 @@ from surgical_marl.bench.rivals import RIVALS, Contender
 from surgical_marl.bench.workload import Workload
 from surgical_marl.content import unknown
 from surgical_marl.engines.choose import Engine, make_engine
-from surgical_marl.engines.fused.order import EVERY
+from surgical_marl.engines.fused.order import launches
 from surgical_marl.envs.batch import BatchedEnv
 
 ENGINES = ("fused", "mjx", *RIVALS)
@@ -73,8 +73,8 @@ def _batched(name: str, workload: Workload, course: Course) -> Contender:
     _wait(physics)
     if cuda and name == "fused":
         # long enough that environments are sorted as often as in any long run
-        physics_cycle = math.lcm(HOLD * LAPS, EVERY)
-        env_cycle = math.lcm(hold * LAPS, max(1, EVERY // workload.decimation))
+        physics_cycle = math.lcm(HOLD * LAPS, launches(1))
+        env_cycle = math.lcm(hold * LAPS, launches(workload.decimation))
         clocks = cuda_clock(step_physics, physics_cycle), cuda_clock(step_env, env_cycle)
     else:
         clocks = cpu_clock(step_physics, lambda: _wait(physics)), cpu_clock(step_env, lambda: _wait(batch.engine))

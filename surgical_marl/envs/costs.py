@@ -42,7 +42,7 @@ def costs(arm: Arm, view: ArmView, tip_speed: Array) -> dict[str, Array]:
         `distance` to another arm, contact `force` (except that of a grip), a joint's `limit` (except the jaw's, because
         a closed jaw rests there), tip `speed`.
     """
-    moves = np.array([arm.jaw is None or joint.name != arm.jaw.joint for joint in arm.actuated])
+    moves = ~arm.moves_jaw
     edge = LIMIT * (arm.upper - arm.lower)
     low, high = ((arm.lower + edge)[moves].astype(np.float32), (arm.upper - edge)[moves].astype(np.float32))
     q = view.qpos[np.flatnonzero(moves)]

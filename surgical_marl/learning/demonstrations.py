@@ -79,7 +79,7 @@ class Demonstrations:
             rows = cached_arrays("demonstrations", lambda: _record(env), *about, *tables, roots=env.env.roots)
             states, pairs = (
                 {name: torch.from_numpy(part).to(device) for name, part in _cut(rows[kind], shapes)}
-                for kind, shapes in (("states", _shapes(env)), ("pairs", {**_seen(env), **_moved(env)}))
+                for kind, shapes in _shapes(env).items()
             )
             agents = env.agents
         finally:
@@ -100,14 +100,14 @@ class Demonstrations:
 
 
 def _record(env: BatchedEnv) -> dict[str, np.ndarray]:
-    """Return `states` [STATES, columns of `_shapes`] and `pairs` [n, columns of `_seen` and `_moved`] float32.
+    """Return `states` [STATES, columns] and `pairs` [n, columns] float32, with the columns that `_shapes` names.
 
     Both are of episodes in which the oracle succeeded.
     """
     policy, rng = oracle(env), np.random.default_rng(0)
     observations, state, _ = env.reset(seed=0)
     goes_on, solved = np.ones(env.num_envs, bool), np.full(env.num_envs, -1)
-    disturbance, shapes = _Disturbance(env, rng), {"states": _shapes(env), "pairs": {**_seen(env), **_moved(env)}}
+    disturbance, shapes = _Disturbance(env, rng), _shapes(env)
     rows: dict[str, list[np.ndarray]] = {kind: [] for kind in shapes}
     places: dict[str, list[np.ndarray]] = {kind: [] for kind in shapes}
 
@@ -140,7 +140,7 @@ class _Disturbance:
 
     def __init__(self, env: BatchedEnv, rng: np.random.Generator) -> None:
         self._rng = rng
-        self._free = {agent: ~_jaw(env, agent) for agent in env.agents}
+        self._free = {agent: ~env.scene.mounts[agent].arm.moves_jaw for agent in env.agents}
         self._now = {agent: np.zeros((env.num_envs, free.size)) for agent, free in self._free.items()}
 
     def added(self, actions: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -160,7 +160,8 @@ def _waits(env: BatchedEnv, actions: Mapping[str, np.ndarray], observations: Map
     """
     waits = np.ones(env.num_envs, bool)
     for agent, action in actions.items():
-        arm, jaw = env.scene.mounts[agent].arm, _jaw(env, agent)
+        arm = env.scene.mounts[agent].arm
+        jaw = arm.moves_jaw
         waits &= (np.abs(action[:, ~jaw]) < WAITING).all(-1)
         if arm.jaw is not None:
             own = env.restated({agent: observations[agent]}, "si")[agent]
@@ -170,24 +171,15 @@ def _waits(env: BatchedEnv, actions: Mapping[str, np.ndarray], observations: Map
     return waits
 
 
-def _jaw(env: BatchedEnv, agent: str) -> np.ndarray:
-    """Return which numbers of an agent's action move its jaw, bool."""
-    arm = env.scene.mounts[agent].arm
-    return np.array([arm.jaw is not None and joint.name == arm.jaw.joint for joint in arm.actuated])
+def _shapes(env: BatchedEnv) -> dict[str, dict[str, tuple[int, ...]]]:
+    """Return name -> shape of what is kept of one environment.
 
-
-def _seen(env: BatchedEnv) -> dict[str, tuple[int, ...]]:
-    return {agent: env.observation_space(agent).shape or () for agent in env.agents}
-
-
-def _moved(env: BatchedEnv) -> dict[str, tuple[int, ...]]:
-    return {f"action of {agent}": env.action_space(agent).shape or () for agent in env.agents}
-
-
-def _shapes(env: BatchedEnv) -> dict[str, tuple[int, ...]]:
-    """Return name -> shape of what is kept of one environment: of its carry, of what each agent and critics observe."""
+    Of `states` that is its carry and what each agent and critics observe, of `pairs` what agents observe and do.
+    """
     carry = {name: shape for name, shape in env.engine.carry_shapes.items() if name not in OWN}
-    return {**carry, **_seen(env), "state": env.state_space.shape}
+    seen = {agent: env.observation_space(agent).shape or () for agent in env.agents}
+    done = {f"action of {agent}": env.action_space(agent).shape or () for agent in env.agents}
+    return {"states": {**carry, **seen, "state": env.state_space.shape}, "pairs": {**seen, **done}}
 
 
 def _joined(parts: Sequence[np.ndarray], rows: np.ndarray) -> np.ndarray:

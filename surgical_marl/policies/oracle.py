@@ -78,7 +78,7 @@ class _Guide:
         self.dt = env.control_dt
         self.reach = self.dt * self.arm.speed
         self.lead = self.dt + np.array([joint.drive.damping / joint.drive.stiffness for joint in joints])
-        self.moves = np.array([self.arm.jaw is None or joint.name != self.arm.jaw.joint for joint in joints])
+        self.moves = ~self.arm.moves_jaw
         self.q = np.tile(self.arm.home, (env.num_envs, 1))
         self.terms = env.observation_terms(agent)
         if missing := {"qpos", "command"} - self.terms.keys():

@@ -96,7 +96,7 @@ class _Tool:
         self.mount = env.scene.mounts[agent]
         arm = self.mount.arm
         self.reach = env.control_dt * arm.speed
-        self.jaw = np.array([arm.jaw is not None and joint.name == arm.jaw.joint for joint in arm.actuated])
+        self.jaw = arm.moves_jaw
         self.q = np.tile(arm.home, (env.num_envs, 1))
         self.command = self.q.copy()
         self.opens = np.zeros(env.num_envs)

@@ -97,6 +97,11 @@ class Arm:
         return tuple(joint for joint in self.joints if joint.leader == joint.name)
 
     @property
+    def moves_jaw(self) -> np.ndarray:
+        """Which of `actuated` is the joint of the jaw, bool, shape [n]."""
+        return np.array([self.jaw is not None and joint.name == self.jaw.joint for joint in self.actuated])
+
+    @property
     def home(self) -> np.ndarray:
         """Joint positions at the start of an episode, shape [n]."""
         return np.array([joint.drive.home for joint in self.actuated])

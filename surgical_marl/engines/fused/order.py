@@ -14,6 +14,11 @@ EVERY = 64
 """Physics steps after which environments are sorted. Work that is captured in a CUDA graph must be as long at least."""
 
 
+def launches(decimation: int) -> int:
+    """Return after how many launches of so many physics steps each environments are sorted."""
+    return max(1, EVERY // decimation)
+
+
 class Order:
     """The order of environments: `order` [N] holds their numbers, and `work` [N] is written by kernels.
 
@@ -23,7 +28,7 @@ class Order:
 
     def __init__(self, order: Any, work: Any, decimation: int) -> None:
         self._order, self._work = order, work
-        self._every, self._launches = max(1, EVERY // decimation), 0
+        self._every, self._launches = launches(decimation), 0
 
     def renew(self) -> None:
         """Sort environments if it is time, before a launch."""

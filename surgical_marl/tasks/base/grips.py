@@ -123,7 +123,7 @@ def joints_at(mount: Mount, poses: np.ndarray, start: np.ndarray | None = None) 
     own[:, :3, 3] = (poses[:, :3, 3] - mount.position) @ mount.rotation
     q = inverse_kinematics(arm, own, start, starts=1)
     off = np.abs(arm.forward_kinematics(q) - own).max((1, 2))
-    moves = np.array([arm.jaw is None or joint.name != arm.jaw.joint for joint in arm.actuated])
+    moves = ~arm.moves_jaw
     spare = (np.minimum(q - arm.lower, arm.upper - q) / (arm.upper - arm.lower))[:, moves].min(-1)
     return q, (off < CLOSE) & (spare > SPARE)
 

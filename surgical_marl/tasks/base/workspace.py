@@ -154,8 +154,7 @@ def _draw_starts(scene: Scene, spread: float, seed: int) -> np.ndarray:
 
 def _away(rng: np.random.Generator, arm: Arm, q: np.ndarray) -> np.ndarray:
     """Return joint positions [N, n] from which an arm can move to `q` in `TIME`; the jaw stays."""
-    jaw = np.array([arm.jaw is not None and joint.name == arm.jaw.joint for joint in arm.actuated])
-    furthest = TIME * arm.speed * ~jaw
+    furthest = TIME * arm.speed * ~arm.moves_jaw
     return rng.uniform(np.maximum(q - furthest, arm.lower), np.minimum(q + furthest, arm.upper))
 
 
