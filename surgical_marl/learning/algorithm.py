@@ -184,12 +184,19 @@ class Algorithm(PPO):
     def hold_actor(self, held: bool, rate: float) -> None:
         """Let only the critic learn, or both again.
 
+        The optimiser then begins anew for the actor. Its means of squared gradients would still be near zero, after all
+        the gradients that were held, so that its first steps would be many times too long.
+
         Args:
             held: whether the networks that act stay as they are.
             rate: the learning rate from now on; while the actor is held nothing adapts it.
         """
         self._acting.fill_(not held)
         self._rate.fill_(rate)
+        if not held:
+            for weight in self.actor.parameters():
+                for kept in self.optimizer.state[weight].values():
+                    kept.zero_()
 
     def update(self) -> dict[str, float]:
         """Learn from the stored rollout; return mean losses, KL and the learning rate (see `LOSSES`)."""

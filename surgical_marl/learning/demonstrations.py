@@ -31,8 +31,6 @@ from surgical_marl.runs.settings import Settings
 if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv
 
-EPISODES = 512
-"""Episodes that the oracle plays."""
 STATES = 8192
 """States that are kept of them."""
 EVERY = 4
@@ -72,10 +70,10 @@ class Demonstrations:
             raise ValueError(f"{neither} with control {settings.control!r}: the oracle needs position")
         if any(layout.pictures.values()):
             raise ValueError(f"{neither} where agents observe pictures")
-        env = make_env(settings, EPISODES, "numpy")
+        env = make_env(settings, settings.oracle_episodes, "numpy")
         try:
             tables = (np.asarray(table).tobytes() for _, table in sorted(env.task.tables.items()))
-            about = env.env.content, describe(env.env.parameters).encode(), str(env.max_steps).encode()
+            about = env.env.content, describe(env.env.parameters).encode(), f"{env.max_steps} {env.num_envs}".encode()
             rows = cached_arrays("demonstrations", lambda: _record(env), *about, *tables, roots=env.env.roots)
             states, pairs = (
                 {name: torch.from_numpy(part).to(device) for name, part in _cut(rows[kind], shapes)}

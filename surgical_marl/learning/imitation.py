@@ -9,12 +9,11 @@ from surgical_marl.learning.demonstrations import Demonstrations
 from surgical_marl.learning.graphs import Replayed
 from surgical_marl.policies.networks import MultiAgentActor
 
-BATCH = 1024
 RATE = 1e-3
-"""Size of a mini-batch, and the learning rate at the start; it falls to nothing in the form of a cosine."""
+"""Learning rate at the start; it falls to nothing in the form of a cosine."""
 
 
-def imitate(actor: MultiAgentActor, demonstrations: Demonstrations, steps: int) -> None:
+def imitate(actor: MultiAgentActor, demonstrations: Demonstrations, steps: int, batch_size: int) -> None:
     """Let an actor's mean actions become those of the oracle, in the least squares sense; its deviation stays as it is.
 
     Its normalisers of observations learn from the demonstrations first.
@@ -23,6 +22,7 @@ def imitate(actor: MultiAgentActor, demonstrations: Demonstrations, steps: int) 
         actor: without recurrent networks.
         demonstrations: on the actor's device.
         steps: gradient steps, of Adam.
+        batch_size: pairs of observation and action in each.
     """
     shown, actions = demonstrations.shown, demonstrations.actions
     cuda = actions.is_cuda
@@ -33,7 +33,7 @@ def imitate(actor: MultiAgentActor, demonstrations: Demonstrations, steps: int) 
 
     def descend() -> None:
         rate.copy_(RATE * (1 + torch.cos(torch.pi * done / steps)) / 2)
-        chosen = torch.randint(len(actions), (BATCH,), device=actions.device)
+        chosen = torch.randint(len(actions), (batch_size,), device=actions.device)
         loss = nn.functional.mse_loss(actor(shown[chosen]), actions[chosen])
         optimizer.zero_grad()
         loss.backward()

@@ -135,7 +135,7 @@ class Trainer:
         if self._demonstrations is None or not asked.steps:
             return
         if self.iteration == 0:
-            imitate(self.algorithm.actor, self._demonstrations, asked.steps)
+            imitate(self.algorithm.actor, self._demonstrations, asked.steps, asked.batch_size)
             if distributed.size() > 1:
                 self.algorithm.broadcast_parameters()
         if self.iteration <= asked.hold:  # a run may have been resumed within these iterations

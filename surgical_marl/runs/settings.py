@@ -70,13 +70,14 @@ class OracleStatesSettings(Checked):
 class ImitationSettings(Checked):
     """Imitation of the oracle's actions before the first iteration (see `learning/imitation.py`).
 
-    steps: gradient steps; 0 for none. hold: iterations in which only the critic learns then, because what it says
-    before would spoil what was imitated.
+    steps: gradient steps; 0 for none. batch_size: pairs of observation and action in each of them. hold: iterations in
+    which only the critic learns then, because what it says before would spoil what was imitated.
     """
 
     prefix: ClassVar[str] = "imitation."
 
     steps: int = number(0, 0, 1_000_000)
+    batch_size: int = number(1024, 1, 1_000_000)
     hold: int = number(10, 0, 1_000_000)
 
 
@@ -99,7 +100,8 @@ class Settings(Options):
 
     algo: the name of a learning algorithm (see `list_algorithms`); a run can be read even if its algorithm is not
     installed. team_reward: every agent gets the sum of all rewards, instead of its own. precision: of the networks'
-    matrix products on a GPU; on a CPU it is always float32.
+    matrix products on a GPU; on a CPU it is always float32. oracle_episodes: how many the oracle plays, for
+    `oracle_states` and `imitation`.
     """
 
     algo: str = choice("mappo", "learning algorithm (see `list algorithms`)")
@@ -114,6 +116,7 @@ class Settings(Options):
     team_reward: bool = False
     ppo: PPOSettings = field(default_factory=PPOSettings)
     constraint: ConstraintSettings = field(default_factory=ConstraintSettings)
+    oracle_episodes: int = number(512, 1, 100_000)
     oracle_states: OracleStatesSettings = field(default_factory=OracleStatesSettings)
     imitation: ImitationSettings = field(default_factory=ImitationSettings)
     network: NetworkSettings = field(default_factory=NetworkSettings)
