@@ -63,6 +63,30 @@ def test_a_gpu_has_settings_of_its_own(reach: Callable[[str], None], monkeypatch
             load_config("reach", "psm", ["device=cpu"])
 
 
+def test_a_difficulty_has_settings_of_its_own(reach: Callable[[str], None]) -> None:
+    reach(
+        "num_envs: 64\ncuda: {num_envs: 128}\n"
+        "difficulties: {hard: {num_envs: 32, ppo: {gamma: 0.9}, cuda: {num_envs: 256}}}\n"
+        "scenes: {ecm: {ppo: {gamma: 0.8}}}\n"
+    )
+
+    def asked(scene: str, *overrides: str) -> tuple[int, float]:
+        settings = load_config("reach", scene, ["device=cpu", *overrides])
+        return settings.num_envs, settings.ppo.gamma
+
+    assert asked("psm") == (64, 0.99)
+    assert asked("psm", "difficulty=hard") == (32, 0.9)
+    assert asked("psm", "difficulty=hard", "device=cuda") == (256, 0.9)
+    assert asked("psm", "device=cuda") == (128, 0.99)
+    assert asked("ecm", "difficulty=hard") == (32, 0.8)
+    reach("difficulty: hard\ndifficulties: {hard: {num_envs: 16}}\n")
+    assert asked("psm") == (16, 0.99)
+    assert asked("psm", "difficulty=easy") == (4096, 0.99)
+    reach("difficulties: {hard: {speed: 1}}\n")
+    with pytest.raises(ValueError, match="unknown setting 'speed'"):
+        asked("psm", "difficulty=hard")
+
+
 def test_the_shipped_settings_load() -> None:
     settings = load_config("reach", "bimanual_psm")
     assert settings.network == NetworkSettings()

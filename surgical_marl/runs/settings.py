@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields, is_dataclass
+from functools import reduce
 from pathlib import Path
 from typing import Any, ClassVar, Literal, get_type_hints
 
@@ -147,10 +148,11 @@ def load_config(task: str, scene: str, overrides: Iterable[str] = ()) -> Setting
     They come from the following parts; a later part overrides an earlier one:
 
     1. the task's file
-    2. on a GPU, the section `cuda` of that file
-    3. the scene's own section in that file
-    4. on a GPU, the section `cuda` in the scene's section
-    5. the overrides
+    2. the section of the difficulty under `difficulties` in that file
+    3. the section of the scene under `scenes` in that file
+    4. the overrides
+
+    On a GPU each of the first three is followed by the section `cuda` in it.
 
     Args:
         task: a name of `list_tasks()`. Its file is the one of that name in `configs/`, if there is one.
@@ -165,17 +167,24 @@ def load_config(task: str, scene: str, overrides: Iterable[str] = ()) -> Setting
     values: dict[str, Any] = {}
     if task in list_configs():  # a task without settings uses the defaults
         values = _read_yaml(find("configs", task))
-    scenes = as_mapping("scenes", values.pop("scenes", None) or {})
-    own = dict(as_mapping(f"scenes.{scene}", scenes.get(scene) or {}))
-    on_gpu = as_mapping("cuda", values.pop("cuda", None) or {})
-    own_on_gpu = as_mapping(f"scenes.{scene}.cuda", own.pop("cuda", None) or {})
-    for section in (values, on_gpu, own, own_on_gpu):
-        _reject_unknown(section, without=("task", "scene"))
     overrides = list(overrides)
-    device = _override(_merge(values, own), overrides).get("device", "auto")
-    if (on_gpu or own_on_gpu) and (device == "cuda" or (device == "auto" and has_cuda())):
-        values, own = _merge(values, on_gpu), _merge(own, own_on_gpu)
-    settings = _build({**_override(_merge(values, own), overrides), "task": task, "scene": scene})
+    scenes, difficulties = (as_mapping(name, values.pop(name, None) or {}) for name in ("scenes", "difficulties"))
+    difficulty = str(_override(values, overrides).get("difficulty", "default"))
+    parts = {
+        "": values,
+        f"difficulties.{difficulty}": difficulties.get(difficulty) or {},
+        f"scenes.{scene}": scenes.get(scene) or {},
+    }
+    layers, on_gpu = [], []
+    for name, part in parts.items():
+        layers.append(dict(as_mapping(name, part)))
+        on_gpu.append(as_mapping(f"{name}.cuda".lstrip("."), layers[-1].pop("cuda", None) or {}))
+        for section in (layers[-1], on_gpu[-1]):
+            _reject_unknown(section, without=("task", "scene"))
+    device = _override(reduce(_merge, layers), overrides).get("device", "auto")
+    if any(on_gpu) and (device == "cuda" or (device == "auto" and has_cuda())):
+        layers = [_merge(*pair) for pair in zip(layers, on_gpu, strict=True)]
+    settings = _build({**_override(reduce(_merge, layers), overrides), "task": task, "scene": scene})
     ALGORITHMS.check(settings.algo)
     return settings
 
