@@ -1,6 +1,6 @@
 """Trains the policies that ship, one for every task and scene, evaluates them and exports them here.
 
-    python policies/train_all.py                                        # all 20, three seeds each, four at a time
+    python policies/train_all.py                                        # all of them, three seeds each, four at a time
     python policies/train_all.py --evaluate                             # only evaluate those that are here, anew
     python policies/train_all.py --only reach-psm track-psm --seeds 0 1 2 --jobs 4 iterations=500
 
@@ -26,11 +26,18 @@ from pathlib import Path
 from typing import NamedTuple
 
 from surgical_marl.content import content_dir, unknown
+from surgical_marl.envs.env import Env
 from surgical_marl.plugins.tasks import list_tasks, scenes_for
+from surgical_marl.runs.settings import own_levels
 from surgical_marl.runtime import defer_compiler
 
-PLACES = {f"{task}-{scene}": (task, scene) for task in list_tasks() for scene in scenes_for(task)}
-"""Task and scene of each policy, by its name."""
+PLACES = {
+    f"{task}-{scene}{end}": (task, scene, level)
+    for task in list_tasks()
+    for scene in scenes_for(task)
+    for end, level in (("", "default"), *((f"-{level}", level) for level in own_levels(task)))
+}
+"""Task, scene and difficulty of each policy, by its name. A level with settings of its own has policies of its own."""
 
 
 class Job(NamedTuple):
@@ -47,7 +54,7 @@ class Job(NamedTuple):
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", nargs="+", metavar="POLICY", default=list(PLACES), help="<task>-<scene>")
+    parser.add_argument("--only", nargs="+", metavar="POLICY", help="<task>-<scene>[-<difficulty>]")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2], metavar="S")
     parser.add_argument("--jobs", type=int, default=4, metavar="J", help="processes at a time")
     parser.add_argument("--runs", type=Path, default=Path("runs/policies"), metavar="DIR")
@@ -55,8 +62,10 @@ def main() -> int:
     parser.add_argument("--evaluate", action="store_true", help="train nothing: evaluate the policies in --out anew")
     arguments, overrides = parser.parse_known_args()
     # `--only a b key=value` leaves overrides among the names.
-    names = [name for name in arguments.only if "=" not in name]
-    overrides += [name for name in arguments.only if "=" in name]
+    there = [name for name in PLACES if (arguments.out / name).exists()]
+    only = arguments.only or (there if arguments.evaluate else [n for n, place in PLACES.items() if _fits(*place)])
+    names = [name for name in only if "=" not in name]
+    overrides += [name for name in only if "=" in name]
     for name in names:
         if name not in PLACES:
             parser.error(str(unknown("policy", name, list(PLACES))))
@@ -77,14 +86,24 @@ def main() -> int:
     return 1 if failed else 0
 
 
+def _fits(task: str, scene: str, difficulty: str) -> bool:
+    """Return whether a scene's arms can do a task at a level of difficulty."""
+    try:
+        return difficulty == "default" or bool(Env(task, scene, difficulty=difficulty))
+    except ValueError:
+        return False
+
+
 def _jobs(name: str, arguments: argparse.Namespace, overrides: Sequence[str]) -> list[Job]:
     """What is left to do for one policy."""
     out, folder = arguments.out / name, arguments.runs / name
     if out.exists():
         return []
     runs = {seed: folder / f"seed{seed}" for seed in arguments.seeds}
+    task, scene, difficulty = PLACES[name]
+    own = [*([f"difficulty={difficulty}"] if difficulty != "default" else []), *overrides]
     trainings = [
-        Job(name, path.name, train, (*PLACES[name], path, [f"seed={seed}", *overrides]), folder / f"{path.name}.log")
+        Job(name, path.name, train, (task, scene, path, [f"seed={seed}", *own]), folder / f"{path.name}.log")
         for seed, path in runs.items()
     ]
     sources = [str(path) for path in runs.values()]

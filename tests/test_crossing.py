@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,8 @@ from surgical_marl.policies.policy import zero_policy
 from surgical_marl.robots.inverse_kinematics import inverse_kinematics
 from surgical_marl.scenes.scene import Scene
 from surgical_marl.tasks.base.crossing import APART, BEYOND, FARTHEST, NEAREST, PASS, crossing_table, shaft
+from surgical_marl.tasks.base.grips import tool_of
+from surgical_marl.tasks.base.script import Snapshot
 from surgical_marl.tasks.base.workspace import CLEARANCE
 
 PAIR = ("psm_0", "psm_1")
@@ -114,6 +117,32 @@ def test_the_oracle_does_it_and_nobody_does_with_a_partner_who_stays(env: Batche
         both, zero = oracle(env, [agent]), zero_policy(env)
         result = evaluate(env, lambda seen, both=both, zero=zero: {**zero(seen), **both(seen)}, 16, 0)  # type: ignore[misc]
         assert result["success_2mm"] == 0.0 and result["collision_rate"] == 0.0
+
+
+def test_the_oracle_goes_on_beside_an_arm_that_is_ahead_of_the_script() -> None:
+    task = known("bimanual_psm")
+    first, script, ways = task.script()[0], task.script(), task._crossing.ways
+    row = np.array([0])
+    goes = next(agent for agent in PAIR if np.array_equal(ways[agent][0, 0], ways[agent][1, 0]))
+    gives = next(agent for agent in PAIR if agent != goes)
+    assert set(first.plan(seen(task, row, {})))  # both arms are told where to be
+
+    def good(**shares: float) -> bool:
+        """Whether the first move is over where `goes` is so far on the way to its goal, and `gives` makes way."""
+        at = {goes: shares["goes"], gives: shares["gives"]}
+        begin = {agent: ways[agent][0, 0] for agent in PAIR}
+        end = {goes: ways[goes][4, 0], gives: ways[gives][1, 0]}
+        q = {agent: (1 - at[agent]) * begin[agent] + at[agent] * end[agent] for agent in PAIR}
+        return bool(script[0].good(seen(task, row, q))[0])
+
+    assert good(goes=0.0, gives=1.0) and good(goes=1.0, gives=1.0)
+    assert not good(goes=0.5, gives=1.0) and not good(goes=0.0, gives=0.5)
+
+
+def seen(task: Any, row: np.ndarray, q: dict[str, np.ndarray]) -> Snapshot:
+    """What a script sees in an episode of this row, with arms at joint positions [joints]."""
+    tools = {agent: tool_of(task.scene.mounts[agent], posture[None]) for agent, posture in q.items()}
+    return Snapshot(tools=tools, objects={}, held={}, goal=SimpleNamespace(row=row))
 
 
 @pytest.mark.parametrize("scene, count", [("psm", 1), ("bimanual_star", 0)])

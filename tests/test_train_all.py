@@ -27,16 +27,22 @@ def script(monkeypatch: pytest.MonkeyPatch) -> Any:
     return train_all
 
 
-def test_there_are_twenty_and_those_that_ship_are_left_alone(script: Any, tmp_path: Path) -> None:
-    assert (
-        len(script.PLACES) == 24
-        and script.PLACES["needle_pick-psm_needle"]
-        and script.PLACES["match_image-ecm"] == ("match_image", "ecm")
-    )
+def test_every_task_and_scene_has_a_policy_and_those_that_ship_are_left_alone(script: Any, tmp_path: Path) -> None:
+    assert script.PLACES["needle_pick-psm_needle"]
+    assert script.PLACES["match_image-ecm"] == ("match_image", "ecm", "default")
+    levels = [name for name in script.PLACES if name.endswith("-crossing")]
+    assert len(script.PLACES) == 24 + len(levels) and "reach-bimanual_psm-crossing" in levels
+    own = ("reach", "bimanual_psm", "crossing")
+    assert script.PLACES["reach-bimanual_psm-crossing"] == own and script._fits(*own)
+    assert not script._fits("reach", "psm", "crossing") and script._fits("reach", "psm", "default")
+    known = {path.parent.name for path in (ROOT / "policies").glob("*/config.yaml")}
+    assert known <= script.PLACES.keys()
     arguments = argparse.Namespace(out=tmp_path, runs=tmp_path / "runs", seeds=[0, 3])
     first, second, last = script._jobs("track-psm", arguments, ["num_envs=64"])
     assert first.arguments == ("track", "psm", tmp_path / "runs" / "track-psm" / "seed0", ["seed=0", "num_envs=64"])
     assert second.what == "seed3" and not second.needs
+    (crossing, *_) = script._jobs("reach-bimanual_psm-crossing", arguments, [])
+    assert crossing.arguments[3] == ["seed=0", "difficulty=crossing"]
     assert (last.what, last.needs, len(last.arguments[0])) == ("export", 2, 2)
     (tmp_path / "track-psm").mkdir()
     assert script._jobs("track-psm", arguments, []) == []

@@ -189,6 +189,13 @@ def load_config(task: str, scene: str, overrides: Iterable[str] = ()) -> Setting
     return settings
 
 
+def own_levels(task: str) -> list[str]:
+    """Return the levels of difficulty for which a task's file has settings of their own."""
+    if task not in list_configs():
+        return []
+    return list(as_mapping("difficulties", _read_yaml(find("configs", task)).get("difficulties") or {}))
+
+
 def read_config(path: Path, overrides: Iterable[str] = ()) -> Settings:
     """Read the settings from the `config.yaml` of a run, with overrides as for `load_config`."""
     values = _read_yaml(path)

@@ -109,9 +109,13 @@ class Task(TipTask):
             return {agent: Wish(joints=way[number, seen.goal.row]) for agent, way in known.ways.items()}
 
         def there(number: int, seen: Snapshot) -> np.ndarray:
-            """Return whether the tools of all arms are where a move ends, [n] bool."""
-            off = [tool[:, :3, 3] - aims[agent][number, seen.goal.row] for agent, tool in seen.tools.items()]
-            return np.asarray(np.linalg.norm(off, axis=-1).max(0) < NEAR)
+            """Return whether the tools of all arms are about where this move or a later one ends, [n] bool.
+
+            An arm with a policy of its own may be ahead of the script.
+            """
+            ends = {agent: aim[number:, seen.goal.row] for agent, aim in aims.items()}
+            off = [np.linalg.norm(tool[:, :3, 3] - ends[agent], axis=-1).min(0) for agent, tool in seen.tools.items()]
+            return np.asarray(np.max(off, 0) < NEAR)
 
         steps = [Step(partial(move, n), good=partial(there, n), back=n - 1) for n in range(1, 4)]
         return (*steps, Step(partial(move, 4)))
