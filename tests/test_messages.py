@@ -22,7 +22,7 @@ from surgical_marl.learning.demonstrations import Demonstrations
 from surgical_marl.policies.layout import Layout
 from surgical_marl.policies.onnx_file import write_onnx
 from surgical_marl.policies.oracle import oracle
-from surgical_marl.policies.policy import load_actor, load_policy
+from surgical_marl.policies.policy import load_actor, load_policy, untrained_policy
 from surgical_marl.policies.team import check_fits
 from surgical_marl.runs.folder import read_settings
 from surgical_marl.runs.settings import ImitationSettings, NetworkSettings, PPOSettings, Settings
@@ -168,6 +168,15 @@ def test_a_run_remembers_them_and_its_policy_speaks(run: Path) -> None:
             check_fits(str(run), made(**other))
     with pytest.raises(ValueError, match="of 42 observations and 9 actions"):
         load_policy(run, made(knowledge="one"))
+
+
+def test_words_mean_something_before_anything_is_learned() -> None:
+    """Arms begin near rest. Their words depend on what they observe: else nobody would learn to listen."""
+    env = made(knowledge="one", messages=K)
+    actions = untrained_policy(env, SMALL)(env.reset(seed=0)[0])
+    for action in actions.values():
+        assert np.abs(action[:, :JOINTS]).max() < 0.1 * np.abs(action[:, JOINTS:]).max()
+    assert not np.isclose(actions["psm_0"][0, JOINTS:], actions["psm_0"][1, JOINTS:]).any()
 
 
 def test_onnx_speaks_too(run: Path, tmp_path: Path) -> None:

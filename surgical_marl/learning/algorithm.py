@@ -322,7 +322,7 @@ class Algorithm(PPO):
             constraint = Constraint(layout, env.num_envs, **bounds).to(device)
         per_agent = 1 if constraint is None else 2
         num_values = per_agent * layout.num_agents
-        actor = MultiAgentActor(obs, layout.action_sizes, **cfg["actor"])
+        actor = MultiAgentActor(obs, layout.action_sizes, layout.messages, **cfg["actor"])
         if cls.central_critic:
             critic: nn.Module = make_model(obs, ["state"], num_values, **cfg["critic"])
         else:

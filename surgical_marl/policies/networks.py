@@ -99,13 +99,19 @@ class MultiAgentModel(nn.Module):
 
 
 class MultiAgentActor(MultiAgentModel):
-    """A Gaussian policy for each agent type; log-probabilities and entropies are per agent."""
+    """A Gaussian policy for each agent type; log-probabilities and entropies are per agent.
 
-    def __init__(self, observations: TensorDict, outputs: Mapping[str, int], **model: Any) -> None:
+    Args:
+        observations, outputs, model: as of `MultiAgentModel`.
+        messages: how many numbers at the end of each output are a message.
+    """
+
+    def __init__(self, observations: TensorDict, outputs: Mapping[str, int], messages: int = 0, **model: Any) -> None:
         super().__init__(observations, outputs, **model)
         with torch.no_grad():
             for policy in self._models():
-                policy.mlp[-1].weight.mul_(OUTPUT_GAIN)
+                # A message tells something from the start: nobody learns to listen to noise, nor to speak to the deaf.
+                policy.mlp[-1].weight[: len(policy.mlp[-1].weight) - messages].mul_(OUTPUT_GAIN)
                 policy.mlp[-1].bias.zero_()
 
     def alone(self, group: str) -> MultiAgentActor:

@@ -151,7 +151,8 @@ def _describe(groups: Mapping[str, list[int]]) -> str:
 
 
 def _actor(settings: Settings, env: BatchedEnv, layout: Layout) -> MultiAgentActor:
-    return MultiAgentActor(_samples(env, layout), layout.action_sizes, **actor_config(settings.network)).eval()
+    config = actor_config(settings.network)
+    return MultiAgentActor(_samples(env, layout), layout.action_sizes, layout.messages, **config).eval()
 
 
 def acting_policy(actor: MultiAgentActor, layout: Layout, device: str) -> Policy:
