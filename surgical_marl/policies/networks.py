@@ -125,7 +125,7 @@ class MultiAgentActor(MultiAgentModel):
         super().__init__(observations, outputs, **model)
         with torch.no_grad():
             for policy in self._models():
-                # A message tells something from the start: nobody learns to listen to noise, nor to speak to the deaf.
+                # A message tells something from the start, so that it pays to listen (docs/algorithms.md#messages).
                 policy.mlp[-1].weight[: len(policy.mlp[-1].weight) - messages].mul_(OUTPUT_GAIN)
                 policy.mlp[-1].bias.zero_()
 
