@@ -8,10 +8,12 @@ from typing import Any
 
 import pytest
 import torch
+from tensordict import TensorDict
 from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
 
 from surgical_marl.learning.trainer import Trainer
 from surgical_marl.plugins.algorithms import list_algorithms
+from surgical_marl.policies.networks import make_model
 from surgical_marl.runtime import no_collection
 from tests.helpers.fake_env import FakeEnv
 from tests.helpers.runs import ALL, COUNTS, OPTIONS, SIZES, SMALL
@@ -68,6 +70,14 @@ def test_nothing_waits_and_all_stays_in_place(
         training.update()
     assert not waits.found
     assert [part.data_ptr() for part in kept(training)] == places
+
+
+def test_attention_waits_for_nothing() -> None:
+    sample = TensorDict({"arm": torch.randn(4, 9)}, batch_size=[4])
+    model = make_model(sample, ["arm"], 2, hidden_dims=[8], attention=2, entities=(((3, 4), (5, 6)), ((7, 8),)))
+    with Waits() as waits:
+        model(sample).sum().backward()
+    assert not waits.found and all(weight.grad is not None for weight in model.parameters())
 
 
 def kept(training: Trainer) -> list[torch.Tensor]:

@@ -44,7 +44,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     """Add the flags that say which episodes are played."""
     parser.add_argument("--task", help="of a policy that is not trained")
     parser.add_argument("--scene", help="likewise: a name (see `list scenes`) or a .yaml file")
-    add_flags(parser, Options, ("control", "difficulty", "start"), default="the policy's own")
+    add_flags(parser, Options, ("control", "knowledge", "messages", "difficulty", "start"), default="the policy's own")
     add_flags(parser, Options, ("goals",), default="held_out")
     parser.add_argument("--episodes", type=whole(1, 1_000_000), default=200, metavar="N")
     parser.add_argument("--seed", type=whole(0), default=0, metavar="S")

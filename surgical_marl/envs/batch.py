@@ -42,8 +42,8 @@ class BatchStep(NamedTuple):
     """[N, d]; of the next episode where one ended. For an agent that sees pictures a dict of it, as "proprioception",
     and of the pictures, [N, H, W, C] each."""
     state: Any
-    """[N, S], for a centralised critic, likewise of the next episode: all observations but pictures, what agents were
-    not shown of them, and `Task.privileged`."""
+    """[N, S], for a centralised critic, likewise of the next episode, the same whoever knows what: all observations
+    but pictures, what agents were not shown of them, `Task.privileged` and messages."""
     rewards: dict[str, Any]
     terminated: Any
     """[N] bool"""
@@ -72,7 +72,7 @@ class BatchedEnv:
         arrays: library of the arrays that come back, "numpy", "torch" or "jax". Don't write into what you get: it may
             share memory with the engine.
         options: further fields of `surgical_marl.tasks.base.options.Options`: control, difficulty, start, max_steps,
-            decimation, reward, observe.
+            decimation, reward, observe, knowledge, messages.
 
     Raises:
         ValueError: naming what is unknown or out of range.
@@ -102,13 +102,10 @@ class BatchedEnv:
         self._engine: Engine | None = make_engine(self.env, num_envs, engine, device)
         self.num_envs, self.arrays = num_envs, arrays
         self.agents = list(self.env.agents)
+        self.scene = self.env.scene
         self.types = self._types()
-        self.task, self.task_name, self.scene, self.control = (
-            self.env.task,
-            task,
-            self.env.scene,
-            self.env.scene.control,
-        )
+        self.task, self.task_name = self.env.task, task
+        self.control = self.scene.control
         self.max_steps, self.control_dt = self.env.max_steps, self.env.control_dt
         self.device = self.engine.device
         self.action_spaces = {agent: self.env.action_space(agent) for agent in self.agents}
@@ -162,9 +159,15 @@ class BatchedEnv:
             kinds: dict[Any, list[str]] = {}
             for agent in agents:
                 seen = self.env.observed[agent]
-                kinds.setdefault((seen.names, tuple(seen.pictures)), []).append(agent)
+                names = tuple(self._of_type(name) for name in seen.names)
+                kinds.setdefault((names, tuple(seen.pictures)), []).append(agent)
             found |= {name if k == 0 else f"{name}-seeing-{k + 1}": list(own) for k, own in enumerate(kinds.values())}
         return found
+
+    def _of_type(self, term: str) -> str:
+        """Return the name of a term; if it is a teammate's, with the type of its arm for the teammate's name."""
+        mate, stroke, name = term.partition("/")
+        return f"{self.scene.mounts[mate].arm.name}/{name}" if stroke else term
 
     def observation_terms(self, agent: str) -> dict[str, slice]:
         """Return the names of what an agent observes, and where each stands in its vector.

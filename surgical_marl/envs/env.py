@@ -20,7 +20,8 @@ from gymnasium import spaces
 
 from surgical_marl.cache import cached
 from surgical_marl.engines.stepper import describe
-from surgical_marl.envs.costs import costs
+from surgical_marl.envs.infos import infos
+from surgical_marl.envs.knowledge import Knowledge
 from surgical_marl.envs.observations import Scale
 from surgical_marl.envs.observed import Observed
 from surgical_marl.plugins.tasks import TASKS
@@ -55,6 +56,8 @@ class Carry(NamedTuple):
     """Tool tips [arms, 3], each in its arm's base frame, m: the next step computes their speed from it."""
     hidden: Hidden | None = None
     """Values that were drawn for the arms in this episode (`surgical_marl/physics/plant.py`)."""
+    messages: Any = ()
+    """What each arm said in the last step, [arms, K]; () without messages."""
 
 
 class State(NamedTuple):
@@ -64,7 +67,8 @@ class State(NamedTuple):
     observations: dict[str, Array]
     """[d] each, of the new episode where one ended."""
     state: Array
-    """The global state for a centralised critic: all observations, terms left out of them, and `Task.privileged`."""
+    """The global state for a centralised critic, the same whoever knows what: all that the task shows agents, all that
+    a scene or a call shows them of their own in addition, `Task.privileged`, and all messages."""
     rewards: dict[str, Array]
     terminated: Array
     truncated: Array
@@ -122,8 +126,11 @@ class Env:
                 raise ValueError(
                     f"observe names {agent!r}, which is not an agent of the scene ({', '.join(self.agents)})"
                 )
-        self.scaled = self.options.observations == "scaled"
-        self.observed = {agent: Observed(self.task, agent, chosen.get(agent), self.scaled) for agent in self.agents}
+        self.scaled, self.messages = self.options.observations == "scaled", self.options.messages
+        if self.messages and len(self.agents) < 2:
+            raise ValueError(f"messages must be 0 in a scene of one arm such as {scene!r}, not {self.messages}")
+        known = {a: Knowledge(self.task, a, self.options.knowledge, self.messages) for a in self.agents}
+        self.observed = {a: Observed(self.task, own, chosen.get(a), self.scaled) for a, own in known.items()}
 
     @property
     def title(self) -> str:
@@ -162,9 +169,10 @@ class Env:
         """
         model = np.empty(mujoco.mj_sizeModel(self.scene.model), np.uint8)
         mujoco.mj_saveModel(self.scene.model, None, model)
-        observed = {agent: (seen.names, seen.unseen) for agent, seen in self.observed.items()}
-        how = (self.scene.control, self.decimation, self.scene.randomisation, self.options.start, self.scaled, observed)
-        return self.scene.fingerprint + f"{self.task_name} {self.task.constants} {how}".encode() + model.tobytes()
+        observed = {agent: (seen.names, seen.stated) for agent, seen in self.observed.items()}
+        how = (self.scene.control, self.decimation, self.scene.randomisation, self.options.start, self.scaled)
+        about = f"{self.task_name} {self.task.constants} {how} {observed} {self.messages}"
+        return self.scene.fingerprint + about.encode() + model.tobytes()
 
     @property
     def classes(self) -> tuple[type, ...]:
@@ -207,12 +215,12 @@ class Env:
         """Return the length of an agent's action.
 
         An action has one number for each actuated joint, in joint order. The last one, if the arm has a jaw, is the
-        jaw's command: open (> 0) or closed.
+        jaw's command: open (> 0) or closed. The numbers of a message follow, if there are `messages`.
         """
-        return len(self.scene.mounts[agent].arm.actuated)
+        return len(self.scene.mounts[agent].arm.actuated) + self.messages
 
     def action_space(self, agent: str) -> spaces.Box:
-        """[-1, 1] for every actuated joint."""
+        """[-1, 1] for every actuated joint, and every number of a message."""
         return spaces.Box(-1.0, 1.0, (self.num_actions(agent),), np.float32)
 
     def observation_space(self, agent: str) -> spaces.Box:
@@ -222,8 +230,10 @@ class Env:
     @property
     def state_space(self) -> spaces.Box:
         """Bounds of `State.state`."""
-        every = [self.observed[agent].bounds(unseen) for agent in self.agents for unseen in (False, True)]
+        every = [self.observed[agent].bounds(stated=True) for agent in self.agents]
         every.append(self._privileged_scale.bounds if self.scaled else self.task.privileged_bounds)
+        ends = np.ones(len(self.agents) * self.messages)
+        every.append((-ends, ends))
         return _box(*map(np.concatenate, zip(*every, strict=True)))
 
     @cached_property
@@ -266,12 +276,23 @@ class Env:
     def move(self, carry: Carry, actions: dict[str, Array], parameters: Any = None) -> Moved:
         """Do the first half of a step: physics, and the goals after it."""
         task, _ = self._bound(parameters)
+        actions, messages = self._part(actions)
         physics, hidden = self.plant.command(carry.physics, carry.hidden, actions)
         physics, contacts, arms = self.plant.advance(physics, hidden)
         goal = task.advance(carry.goal, self.control_dt)
         tips = jnp.stack([view.tool_tip for view in arms.values()])
-        after = carry._replace(physics=physics, hidden=hidden, goal=goal, tips=tips, steps=carry.steps + 1)
+        after = carry._replace(
+            physics=physics, hidden=hidden, goal=goal, tips=tips, steps=carry.steps + 1, messages=messages
+        )
         return Moved(after, carry.tips, contacts, arms)
+
+    def _part(self, actions: dict[str, Array]) -> tuple[dict[str, Array], Any]:
+        """Return what actions command the joints, and the messages in them as in `Carry`."""
+        if not self.messages:
+            return actions, ()
+        ends = {agent: self.num_actions(agent) - self.messages for agent in self.agents}
+        said = jnp.stack([actions[agent][end:] for agent, end in ends.items()])
+        return {agent: actions[agent][:end] for agent, end in ends.items()}, jnp.clip(said, -1.0, 1.0)
 
     def finish(self, moved: Moved, sensed: dict[str, Array], parameters: Any = None) -> State:
         """Do the second half of a step: observations, reward, and a reset if the step ends the episode."""
@@ -328,7 +349,8 @@ class Env:
             contacts, arms = self.simulator.look(physics)
         tips = jnp.stack([view.tool_tip for view in arms.values()])
         goal = task.remember(World(arms, start.goal, self._unsensed(), self.plant.objects(physics, hidden)))
-        return Carry(physics, goal, key, episode, jnp.int32(0), tips, hidden), contacts, arms
+        silence = jnp.zeros((len(self.agents), self.messages)) if self.messages else ()
+        return Carry(physics, goal, key, episode, jnp.int32(0), tips, hidden, silence), contacts, arms
 
     def _observe(
         self, task: Task, carry: Carry, contacts: Contacts, arms: dict[str, ArmView]
@@ -336,46 +358,23 @@ class Env:
         """Return what policies observe, and what critics observe, of arms that are as in `arms`."""
         noise = jax.random.fold_in(jax.random.fold_in(jax.random.fold_in(carry.key, carry.episode), NOISE), carry.steps)
         measured = self.plant.measure(carry.physics, carry.hidden, contacts, arms, noise)
-        world = World(measured, carry.goal, objects=self.plant.objects(carry.physics, carry.hidden))
-        observations, every = {}, []
-        for agent, seen in self.observed.items():
-            observations[agent] = seen.read(task, world)
-            every += [observations[agent], seen.read(task, world, unseen=True)]
+        objects = self.plant.objects(carry.physics, carry.hidden)
+        world = World(measured, carry.goal, objects=objects, messages=carry.messages)
+        observations = {agent: seen.read(task, world) for agent, seen in self.observed.items()}
+        every = [
+            observations[agent] if seen.stated == seen.names else seen.read(task, world, stated=True)
+            for agent, seen in self.observed.items()
+        ]
         privileged = task.privileged(carry.goal)
         every.append(self._privileged_scale.apply(privileged) if self.scaled else privileged)
+        if self.messages:
+            every.append(carry.messages.ravel())
         return observations, jnp.concatenate(every)
 
     def _infos(
         self, task: Task, world: World, before: Array, after: Carry, terms: dict[str, dict[str, Array]]
     ) -> dict[str, dict[str, Array]]:
-        success, stages, metrics = task.success(world), task.reached(world), task.metrics(world)
-        speeds, infos = jnp.linalg.norm(after.tips - before, axis=-1) / np.float32(self.control_dt), {}
-        for i, (agent, view) in enumerate(world.arms.items()):
-            broken = costs(self.scene.mounts[agent].arm, view, speeds[i])
-            infos[agent] = {
-                "success": success[agent],
-                "collision": view.collision,
-                "min_distance": view.min_distance,
-                "contact_force": view.contact_force,
-                "contact_overflow": view.contact_overflow,
-                **{f"stage_{name}": reached for name, reached in stages[agent].items()},
-                **{f"reward_{name}": value for name, value in terms[agent].items()},
-                **_handling(view),
-                "cost": sum((cost.astype(jnp.float32) for cost in broken.values()), start=jnp.float32(0.0)),
-                **{f"cost_{name}": cost for name, cost in broken.items()},
-                **metrics[agent],
-            }
-        return infos
-
-
-def _handling(view: ArmView) -> dict[str, Array]:
-    """Return the infos about the objects that an arm handles; none in a scene without free objects."""
-    if not view.handles:
-        return {}
-    infos = {"holding": jnp.stack([handled.holding for handled in view.handles.values()]).any()}
-    for name, handled in view.handles.items():
-        infos |= {f"{name}_{field}": value for field, value in handled._asdict().items()}
-    return infos
+        return infos(self.scene, task, world, after.tips - before, self.control_dt, terms)
 
 
 def _box(low: np.ndarray, high: np.ndarray) -> spaces.Box:

@@ -186,9 +186,18 @@ def _limits(result: Mapping[str, Any], settings: Settings) -> str:
     return "\n".join([
         "## Limits\n", *missed, *met, *(none if result["collision_rate"] == 0 else []),
         f"- Made for {settings.control} control, difficulty `{settings.difficulty}` and the arm poses of this scene.",
+        *_words(settings),
         "- The goals of the evaluation were never drawn in training, but they are of the same distribution.",
         "- Trained and tested in simulation only. Not fit for use on a patient or near one.\n",
     ])  # fmt: skip
+
+
+def _words(settings: Settings) -> list[str]:
+    """Return who knows what and how much agents tell each other, where that is not as usual."""
+    if settings.knowledge == "task" and not settings.messages:
+        return []
+    said = f"says {settings.messages} numbers to its teammates in each step" if settings.messages else "says nothing"
+    return [f"- Made for `knowledge: {settings.knowledge}`; each agent {said}."]
 
 
 def _files(folder: Path) -> str:

@@ -19,7 +19,8 @@ from surgical_marl.runs.environment import make_env
 from surgical_marl.runs.folder import read_settings
 from surgical_marl.runs.settings import Settings
 
-OWN, CHOSEN = ("task", "scene", "control"), ("difficulty", "start", "goals")
+OWN = ("task", "scene", "control", "knowledge", "messages")
+CHOSEN = ("difficulty", "start", "goals")
 """Options that a trained policy determines, and options that can be chosen for any policy."""
 
 

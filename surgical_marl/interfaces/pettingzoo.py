@@ -212,8 +212,9 @@ def parallel_env(
         render_mode: of one environment: None, "rgb_array" for pictures, or "human" for a window that follows.
         options: `control` ("position", "velocity" or "torque"), `difficulty` (a level of the task), `start` ("home" or
             "random"), `max_steps` (control steps until truncation), `decimation` (physics steps a control step),
-            `reward` (weights of reward terms, as in {"collision": -5}) and `observe` (terms that agents see, as in
-            {"ecm_0": ["qpos", "image"]}): see `surgical_marl.tasks.base.options.Options`.
+            `reward` (weights of reward terms, as in {"collision": -5}), `knowledge` ("task", "all", "own" or "one": who
+            knows what), `messages` (numbers that an agent says to its teammates in a step) and `observe` (terms that
+            agents see, as in {"ecm_0": ["qpos", "image"]}): see `surgical_marl.tasks.base.options.Options`.
 
     Raises:
         ValueError: naming the unknown value and the good ones.

@@ -23,7 +23,7 @@ from surgical_marl.learning.normaliser import share_normalisers
 from surgical_marl.learning.storage import MultiAgentStorage
 from surgical_marl.learning.values import ValueScale
 from surgical_marl.policies.layout import Grouping
-from surgical_marl.policies.networks import MultiAgentActor, MultiAgentModel, make_model
+from surgical_marl.policies.networks import MultiAgentActor, MultiAgentModel, make_actor, make_model
 from surgical_marl.policies.recurrent import Memory
 
 LOSSES = ("value_loss", "surrogate_loss", "entropy", "kl", "learning_rate")
@@ -329,7 +329,7 @@ class Algorithm(PPO):
             constraint = Constraint(layout, env.num_envs, **bounds).to(device)
         per_agent = 1 if constraint is None else 2
         num_values = per_agent * layout.num_agents
-        actor = MultiAgentActor(obs, layout.action_sizes, **cfg["actor"])
+        actor = make_actor(obs, env.env, layout, cfg["actor"])
         if cls.central_critic:
             critic: nn.Module = make_model(obs, ["state"], num_values, **cfg["critic"])
         else:

@@ -134,11 +134,12 @@ def _record(env: BatchedEnv) -> dict[str, np.ndarray]:
 
 
 class _Disturbance:
-    """What is added to actions: random numbers that change slowly, but nothing for jaws."""
+    """What is added to actions: random numbers that change slowly, but nothing for jaws and messages."""
 
     def __init__(self, env: BatchedEnv, rng: np.random.Generator) -> None:
         self._rng = rng
-        self._free = {agent: ~env.scene.mounts[agent].arm.moves_jaw for agent in env.agents}
+        joints = {agent: ~env.scene.mounts[agent].arm.moves_jaw for agent in env.agents}
+        self._free = {agent: np.pad(free, (0, env.env.messages)) for agent, free in joints.items()}
         self._now = {agent: np.zeros((env.num_envs, free.size)) for agent, free in self._free.items()}
 
     def added(self, actions: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -157,9 +158,9 @@ def _waits(env: BatchedEnv, actions: Mapping[str, np.ndarray], observations: Map
     Imitated, such a pair would have an arm wait forever, because what it observes does not change.
     """
     waits = np.ones(env.num_envs, bool)
-    for agent, action in actions.items():
+    for agent, whole in actions.items():
         arm = env.scene.mounts[agent].arm
-        jaw = arm.moves_jaw
+        jaw, action = arm.moves_jaw, whole[:, : len(arm.moves_jaw)]
         waits &= (np.abs(action[:, ~jaw]) < WAITING).all(-1)
         if arm.jaw is not None:
             own = env.restated({agent: observations[agent]}, "si")[agent]

@@ -37,6 +37,7 @@ class Layout:
         groups: the arms of each group.
         counts: agents acting in each group.
         action_sizes: width of the action of one agent of each group.
+        messages: numbers at the end of an agent's action that its teammates hear; 0 for one joint agent.
         pictures: of each group name -> space of the pictures that one agent sees, in the order of the stack.
     """
 
@@ -46,6 +47,7 @@ class Layout:
         self.agents = [agent for members in types.values() for agent in members]
         widths = {agent: int(np.prod(env.action_space(agent).shape)) for agent in self.agents}
         self._widths = list(widths.values())
+        self.messages = 0 if grouping == "joint" else env.env.options.messages
         if grouping == "joint":
             self.groups = {"joint": self.agents}
             self.counts = {"joint": 1}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from rsl_rl.models import MLPModel
@@ -11,10 +11,15 @@ from rsl_rl.modules.distribution import GaussianDistribution
 from tensordict import TensorDict
 from torch import Tensor, nn
 
+from surgical_marl.policies.attention import AttentionModel, find_entities
 from surgical_marl.policies.encoder import ENCODER, PICTURES, PictureModel
+from surgical_marl.policies.layout import Layout
 from surgical_marl.policies.normaliser import LimitedNormaliser
 from surgical_marl.policies.recurrent import RecurrentModel, RecurrentPictureModel
 from surgical_marl.runs.settings import NetworkSettings
+
+if TYPE_CHECKING:
+    from surgical_marl.envs.batch import BatchedEnv
 
 # A small last layer starts every arm near its rest, which is where exploration is safe and
 # gradients are largest.
@@ -27,13 +32,20 @@ class MultiAgentModel(nn.Module):
     Args:
         observations: a sample of the groups, `[N, n, d]` each, and pictures `[N, n, C, H, W]` where there are any.
         outputs: width of the output of one agent, by type.
+        each: type -> arguments of `make_model` for its network alone.
         model: further arguments of `make_model`.
 
     Attributes:
         is_recurrent: whether the networks are recurrent; `hidden_state` is then `[N, A, S]`.
     """
 
-    def __init__(self, observations: TensorDict, outputs: Mapping[str, int], **model: Any) -> None:
+    def __init__(
+        self,
+        observations: TensorDict,
+        outputs: Mapping[str, int],
+        each: Mapping[str, Mapping[str, Any]] | None = None,
+        **model: Any,
+    ) -> None:
         super().__init__()
         self.counts = {name: observations[name].shape[-2] for name in outputs}
         self.outputs = dict(outputs)
@@ -44,7 +56,10 @@ class MultiAgentModel(nn.Module):
             batch_size=observations.batch_size,
         )
         self.models = nn.ModuleDict(
-            {name: make_model(sample, seen[name], width, **model) for name, width in outputs.items()}
+            {
+                name: make_model(sample, seen[name], width, **model, **(each or {}).get(name, {}))
+                for name, width in outputs.items()
+            }
         )
 
         first = next(iter(self._models()))
@@ -99,13 +114,19 @@ class MultiAgentModel(nn.Module):
 
 
 class MultiAgentActor(MultiAgentModel):
-    """A Gaussian policy for each agent type; log-probabilities and entropies are per agent."""
+    """A Gaussian policy for each agent type; log-probabilities and entropies are per agent.
 
-    def __init__(self, observations: TensorDict, outputs: Mapping[str, int], **model: Any) -> None:
+    Args:
+        observations, outputs, model: as of `MultiAgentModel`.
+        messages: how many numbers at the end of each output are a message.
+    """
+
+    def __init__(self, observations: TensorDict, outputs: Mapping[str, int], messages: int = 0, **model: Any) -> None:
         super().__init__(observations, outputs, **model)
         with torch.no_grad():
             for policy in self._models():
-                policy.mlp[-1].weight.mul_(OUTPUT_GAIN)
+                # A message tells something from the start, so that it pays to listen (docs/algorithms.md#messages).
+                policy.mlp[-1].weight[: len(policy.mlp[-1].weight) - messages].mul_(OUTPUT_GAIN)
                 policy.mlp[-1].bias.zero_()
 
     def alone(self, group: str) -> MultiAgentActor:
@@ -166,7 +187,7 @@ class Gaussian(GaussianDistribution):
 
 
 def make_model(
-    observations: TensorDict, groups: list[str], width: int, recurrent: str = "none", **model: Any
+    observations: TensorDict, groups: list[str], width: int, recurrent: str = "none", attention: int = 0, **model: Any
 ) -> nn.Module:
     """Make an MLP, with an encoder before it if there are pictures, and with a recurrent cell if that is asked for.
 
@@ -175,6 +196,7 @@ def make_model(
         groups: names of the groups that the network sees.
         width: of its output.
         recurrent: "gru", "lstm" or "none".
+        attention: heads of attention, which then needs `entities`; 0 for none.
         model: further arguments of rsl_rl's models.
     """
     pictures = any(group.endswith(PICTURES) for group in groups)
@@ -182,8 +204,10 @@ def make_model(
         model["cnn_cfg"] = ENCODER
     if recurrent != "none":
         model["recurrent"] = recurrent
-    kinds = {
-        (False, False): MLPModel,
+    if attention:
+        model["attention"] = attention
+    kinds: dict[tuple[bool, bool], Any] = {
+        (False, False): AttentionModel if attention else MLPModel,
         (True, False): PictureModel,
         (False, True): RecurrentModel,
         (True, True): RecurrentPictureModel,
@@ -192,6 +216,24 @@ def make_model(
     if made.obs_normalization:
         made.obs_normalizer = LimitedNormaliser(made.obs_dim)
     return made
+
+
+def make_actor(observations: TensorDict, env: BatchedEnv, layout: Layout, config: Mapping[str, Any]) -> MultiAgentActor:
+    """Make the actor of the agents of an environment.
+
+    Args:
+        observations: a sample of the groups of the layout.
+        env: the environment.
+        layout: how its agents are stacked.
+        config: of `actor_config`.
+
+    Raises:
+        ValueError: attention, and nothing to attend to.
+    """
+    each = None
+    if config.get("attention"):
+        each = {name: {"entities": found} for name, found in find_entities(env, layout).items()}
+    return MultiAgentActor(observations, layout.action_sizes, messages=layout.messages, each=each, **config)
 
 
 def network_config(network: NetworkSettings) -> dict[str, Any]:
@@ -205,6 +247,7 @@ def network_config(network: NetworkSettings) -> dict[str, Any]:
 
 
 def actor_config(network: NetworkSettings) -> dict[str, Any]:
-    """Arguments of `MultiAgentActor`, likewise."""
+    """Arguments of `make_actor`, likewise. Critics have no attention: they see the state, which all agents share."""
     gaussian = {"class_name": Gaussian, "init_std": network.init_std, "std_type": "log"}
-    return {**network_config(network), "distribution_cfg": gaussian}
+    heads = {"attention": network.attention} if network.attention else {}  # rsl_rl's own networks know of none
+    return {**network_config(network), "distribution_cfg": gaussian, **heads}

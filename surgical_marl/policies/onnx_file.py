@@ -7,7 +7,8 @@ The inputs of such a file, for N agents of its type at once:
     image, ...   [N, H, W, 3] uint8, each picture that the agent sees, by its name (depth: [N, H, W, 1] float32, m)
     memory       [N, S] float32, of a recurrent network: zeros when an episode begins, then the last `next_memory`
 
-and gives `action` [N, a] float32 in [-1, 1], without exploration noise, and `next_memory` if it is recurrent.
+and gives `action` [N, a] float32 in [-1, 1], without exploration noise, and `next_memory` if it is recurrent. With the
+setting `messages` the last K numbers of an action are for the term `messages` of its teammates' next observations.
 Observations are normalised inside.
 """
 

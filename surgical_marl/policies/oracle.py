@@ -16,7 +16,7 @@ import numpy as np
 
 from surgical_marl.envs.observations import proprioception
 from surgical_marl.policies.convert import like, to_numpy
-from surgical_marl.policies.scripted import Scripted
+from surgical_marl.policies.scripted import Scripted, without_words
 from surgical_marl.robots.inverse_kinematics import inverse_kinematics
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ def oracle(env: BatchedEnv, agents: Sequence[str] | None = None) -> Callable[[Ma
 
     Returns:
         A policy: observations {agent: [N, d]} of `env` as it stands -> actions {agent: [N, a]} of the same library, of
-        the agents that it moves.
+        the agents that it moves. It says nothing: its messages are zeros.
 
     Raises:
         ValueError: the environment has another control mode.
@@ -67,7 +67,7 @@ class _Oracle:
         moves = {agent: arm.move(targets, began, to_numpy(seen[agent])) for agent, arm in arms.items()}
         furthest = np.max([np.abs(move).max(-1) for move in moves.values()], axis=0)
         pace = 1 / np.maximum(furthest, 1)[:, None]
-        return {agent: like(seen[agent], pace * move) for agent, move in moves.items()}
+        return {agent: like(seen[agent], without_words(env, pace * move)) for agent, move in moves.items()}
 
 
 class _Guide:

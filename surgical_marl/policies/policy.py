@@ -20,7 +20,7 @@ from surgical_marl.content import find, list_policies
 from surgical_marl.envs.observations import each, proprioception
 from surgical_marl.policies.acting import Policy, forget
 from surgical_marl.policies.layout import GROUPINGS, Grouping, Layout
-from surgical_marl.policies.networks import MultiAgentActor, actor_config
+from surgical_marl.policies.networks import MultiAgentActor, actor_config, make_actor
 from surgical_marl.policies.oracle import oracle
 from surgical_marl.policies.recurrent import cleared
 from surgical_marl.policies.weights import read_weights
@@ -151,7 +151,7 @@ def _describe(groups: Mapping[str, list[int]]) -> str:
 
 
 def _actor(settings: Settings, env: BatchedEnv, layout: Layout) -> MultiAgentActor:
-    return MultiAgentActor(_samples(env, layout), layout.action_sizes, **actor_config(settings.network)).eval()
+    return make_actor(_samples(env, layout), env, layout, actor_config(settings.network)).eval()
 
 
 def acting_policy(actor: MultiAgentActor, layout: Layout, device: str) -> Policy:

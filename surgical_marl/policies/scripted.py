@@ -54,7 +54,8 @@ class Scripted:
         ways = {agent: self._tools[agent].way() for agent in self._moved}
         furthest = np.max([np.abs(way).max(-1) for way in ways.values()], axis=0)
         share = np.minimum(1.0, pace / np.maximum(furthest, 1e-9))[:, None]
-        return {agent: like(seen[agent], self._tools[agent].action(share * way)) for agent, way in ways.items()}
+        moves = {agent: self._tools[agent].action(share * way) for agent, way in ways.items()}
+        return {agent: like(seen[agent], without_words(env, move)) for agent, move in moves.items()}
 
     def _plan(self, due: np.ndarray, began: np.ndarray) -> None:
         """Plan the next step of the environments `due`; those that `began` an episode start with the first step."""
@@ -87,6 +88,11 @@ class Scripted:
         goal = SimpleNamespace(**{name: np.asarray(value)[due] for name, value in vars(env.goal).items()})
         held = {agent: env.held[due, :, number] for number, agent in enumerate(env.agents)}
         return Snapshot(tools, objects, held, goal)
+
+
+def without_words(env: BatchedEnv, moves: np.ndarray) -> np.ndarray:
+    """Return the actions [N, n + K] that move joints by `moves` [N, n] and say nothing: messages of zeros."""
+    return np.pad(moves, ((0, 0), (0, env.env.messages)))
 
 
 class _Tool:

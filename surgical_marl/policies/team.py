@@ -65,12 +65,18 @@ class Team:
 
 
 def check_fits(who: str, env: BatchedEnv) -> None:
-    """Raise ValueError if a policy was trained for another task, scene or control than those of an environment."""
+    """Raise ValueError if a policy was trained for another environment than this one.
+
+    Task, scene, control, knowledge and the length of messages must be the same.
+    """
     if who in (*PARTNERS, *BASELINES):
         return
     settings = read_settings(find_run(who))
-    own = {"task": env.task_name, "scene": env.scene.name, "control": env.control}
-    theirs = {"task": settings.task, "scene": Path(settings.scene).stem, "control": settings.control}
+    asked = env.env.options
+    own = {"task": env.task_name, "scene": env.scene.name, "control": env.control,
+           "knowledge": asked.knowledge, "messages": asked.messages}  # fmt: skip
+    theirs = {"task": settings.task, "scene": Path(settings.scene).stem, "control": settings.control,
+              "knowledge": settings.knowledge, "messages": settings.messages}  # fmt: skip
     for key, value in own.items():
         if theirs[key] != value:
             raise ValueError(f"{who} is of {key} {theirs[key]!r}, not {value!r}: a partner must be of the same")

@@ -84,7 +84,10 @@ class ImitationSettings(Checked):
 
 @dataclass(frozen=True)
 class NetworkSettings(Checked):
-    """Actor and critic: an MLP of this shape for each, with an optional GRU or LSTM cell before it."""
+    """Actor and critic: an MLP of this shape for each, with an optional GRU or LSTM cell before it.
+
+    attention: heads with which the actor attends to teammates and objects (see `policies/attention.py`); 0 for none.
+    """
 
     prefix: ClassVar[str] = "network."
 
@@ -93,6 +96,14 @@ class NetworkSettings(Checked):
     normalise_observations: bool = True
     init_std: float = number(0.5, 0.001, 10.0)
     recurrent: Literal["none", "gru", "lstm"] = "none"
+    attention: int = number(0, 0, 16)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.attention and self.recurrent != "none":
+            raise ValueError(
+                f"network.attention must be 0 with network.recurrent {self.recurrent!r}, not {self.attention}"
+            )
 
 
 @dataclass(frozen=True)

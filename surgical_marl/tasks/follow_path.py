@@ -49,7 +49,7 @@ class Task(PathTask):
         """Return those of `reach`, and `to_path_ahead` [9], the ways from the tip to three points ahead, m."""
         terms = super().terms(agent)
         low, high = (np.tile(getattr(terms["to_target"], end), len(AHEAD)) for end in ("low", "high"))
-        return {**terms, "to_path_ahead": Term(lambda w: self._ahead(w, agent), low, high)}
+        return {**terms, "to_path_ahead": Term(lambda w: self._ahead(w, agent), low, high, "goal")}
 
     def observes(self, agent: str) -> tuple[str, ...]:
         """Return what is observed in `reach`, then the points ahead."""

@@ -105,6 +105,11 @@ class Task(TipTask):
         vector = tuple(name for name in super().observes(agent) if name not in ("target", "to_target"))
         return (*vector, "image", "target") if agent == self.camera else vector
 
+    @property
+    def informed(self) -> str:
+        """The camera's agent, which alone sees the target picture."""
+        return self.camera
+
     def privileged(self, goal: PictureGoal) -> Array:
         """Return the joint positions of the camera's arm at the hidden pose."""
         return self.tables["joints"][goal.row]

@@ -165,7 +165,8 @@ class Task(ObjectTask):
     def terms(self, agent: str) -> dict[str, Term | Picture]:
         """Return the terms of every such task, and `to_useful` [3], from the tool tip to the needle's middle half."""
         far = np.full(3, FAR)
-        return {**super().terms(agent), "to_useful": Term(lambda world: self._to_useful(world, agent), -far, far)}
+        useful = Term(lambda world: self._to_useful(world, agent), -far, far, "object")
+        return {**super().terms(agent), "to_useful": useful}
 
     def observes(self, agent: str) -> tuple[str, ...]:
         """Return the terms of every such task, and `to_useful` after `to_object`."""

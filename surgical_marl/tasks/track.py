@@ -39,7 +39,7 @@ class Task(PathTask):
         i, fastest = self.scene.agents.index(agent), np.full(3, 2 * max(level.speed for level in self.levels.values()))
         return {
             **super().terms(agent),
-            "target_velocity": Term(lambda w: self.velocities(w.goal)[i], -fastest, fastest),
+            "target_velocity": Term(lambda w: self.velocities(w.goal)[i], -fastest, fastest, "goal"),
         }
 
     def observes(self, agent: str) -> tuple[str, ...]:

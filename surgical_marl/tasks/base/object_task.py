@@ -257,14 +257,14 @@ class ObjectTask(Task):
             return jnp.stack(held).any().astype(jnp.float32)[None]
 
         far, reach, one, every = np.full(3, FAR), mount.arm.reach, np.ones(1), np.arange(len(self._middles))
-        others = {"others_hold": Term(others_hold, 0 * one, one)} if len(self.scene.agents) > 1 else {}
+        others = {"others_hold": Term(others_hold, 0 * one, one, "others")} if len(self.scene.agents) > 1 else {}
         return {
             **super().terms(agent),
-            "to_object": Term(lambda world: self.way_to_bars(world, agent, every), -far, far),
-            "target": Term(target, *reach),
-            "to_target": Term(to_target, -far, far),
-            "target_rotation": Term(target_rotation, -np.ones(6), np.ones(6)),
-            "best_lift": Term(lambda world: world.goal.best.lift[None], 0 * one, one),
+            "to_object": Term(lambda world: self.way_to_bars(world, agent, every), -far, far, "object"),
+            "target": Term(target, *reach, "team_goal"),
+            "to_target": Term(to_target, -far, far, "team_goal"),
+            "target_rotation": Term(target_rotation, -np.ones(6), np.ones(6), "team_goal"),
+            "best_lift": Term(lambda world: world.goal.best.lift[None], 0 * one, one, "object"),
             **others,
         }
 
@@ -288,6 +288,11 @@ class ObjectTask(Task):
         goal = ("target", "to_target", *(("target_rotation",) if self.oriented else ()))
         others = ("others_hold",) if len(self.scene.agents) > 1 else ()
         return (*own[:4], "contact_force", *seen, "to_object", *goal, "best_lift", *others, *own[4:])
+
+    @property
+    def informed(self) -> str:
+        """The arm that picks the object up: it knows where the other one has to bring it."""
+        return self.picker
 
     def marks(self, goal: Any) -> np.ndarray:
         """Return where the point should be, [N, 1, 3]."""

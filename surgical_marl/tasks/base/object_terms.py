@@ -52,8 +52,8 @@ def _terms(scene: Scene, agent: str, name: str) -> dict[str, Term]:
 
     space, fast = np.full(3, WIDE), np.repeat([FASTEST, SPINNING], 3)
     return {
-        f"{name}_position": Term(position, -space, space),
-        f"{name}_rotation": Term(rotation, -np.ones(6), np.ones(6)),
-        f"{name}_velocity": Term(velocity, -fast, fast),
-        f"{name}_grip": Term(grip, np.zeros(3), np.array([STRONGEST, 1.0, FURTHEST])),
+        f"{name}_position": Term(position, -space, space, "object"),
+        f"{name}_rotation": Term(rotation, -np.ones(6), np.ones(6), "object"),
+        f"{name}_velocity": Term(velocity, -fast, fast, "object"),
+        f"{name}_grip": Term(grip, np.zeros(3), np.array([STRONGEST, 1.0, FURTHEST]), "arm"),
     }

@@ -56,6 +56,10 @@ class Options(Checked):
         decimation: physics steps per control step.
         reward: weights of reward terms that replace the task's own, as in {"collision": -5}.
         observations: "si" for metres, radians and newtons, or "scaled" for numbers from -1 to 1 between their bounds.
+        knowledge: who knows what (docs/tasks.md). "task": what the task shows each arm. "all": every arm also knows the
+            joints, tips and goals of the others. "own": nothing about other arms. "one": one arm knows the goals of
+            all, and the others none.
+        messages: numbers that each agent says with its action in each step, and its teammates observe after the step.
         observe: agent -> names of the observation terms that it observes, instead of the task's own choice, as in
             {"ecm_0": ["qpos", "image"]}.
 
@@ -72,6 +76,8 @@ class Options(Checked):
     max_steps: int | None = number(None, 1, 1_000_000, "control steps of an episode")
     decimation: int = number(DECIMATION, 1, 1_000_000, "physics steps a control step")
     observations: Literal["si", "scaled"] = choice("si", "units of observations, or numbers from -1 to 1")
+    knowledge: Literal["task", "all", "own", "one"] = choice("task", "who knows what of other arms and of goals")
+    messages: int = number(0, 0, 64, "numbers that an agent says to its teammates in a step")
     reward: Mapping[str, float] = field(default_factory=dict)
     observe: Mapping[str, Sequence[str]] = field(default_factory=dict)
 

@@ -158,6 +158,11 @@ class Task:
         """Return the names of the terms that it observes unless a scene or a call chooses others."""
         return tuple(name for name, term in arm_terms(self.scene, agent).items() if name != "contact_force")
 
+    @property
+    def informed(self) -> str:
+        """The agent that knows the goals of all at knowledge "one"; the others don't."""
+        return self.scene.agents[0]
+
     def privileged(self, goal: Any) -> Array:
         """Return what only critics see: numbers of the goal that no agent observes, [p]."""
         return jnp.zeros(0, jnp.float32)
@@ -277,8 +282,10 @@ class TipTask(Task):
         """Return the terms of every task, `target` [3], and `to_target` [3] from the tip."""
         i, tip = self.scene.agents.index(agent), self.scene.mounts[agent].arm.reach
         targets = {
-            "target": Term(lambda world: world.goal.targets[i], *tip),
-            "to_target": Term(lambda world: world.goal.targets[i] - world.arms[agent].tool_tip, *tip.minus(tip)),
+            "target": Term(lambda world: world.goal.targets[i], *tip, "goal"),
+            "to_target": Term(
+                lambda world: world.goal.targets[i] - world.arms[agent].tool_tip, *tip.minus(tip), "goal"
+            ),
         }
         return {**super().terms(agent), **targets}
 

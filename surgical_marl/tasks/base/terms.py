@@ -7,7 +7,7 @@ the names and slices within it all follow from this declaration.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 STRONGEST = 100.0
 """Bound of an observed contact force, N."""
 EYES, CHANNELS = ("left", "right"), ("rgb", "depth")
+About = Literal["arm", "others", "object", "goal", "team_goal", "messages"]
+"""What a term tells: of the arm itself, of other arms, of objects and what cameras show; where this arm itself should
+be, or what all arms are after together; what other arms said. Levels of knowledge go by it (`envs/knowledge.py`)."""
 
 
 class Term(NamedTuple):
@@ -32,6 +35,8 @@ class Term(NamedTuple):
     low: np.ndarray
     """Least value, [d]: what is observed is clipped to the bounds."""
     high: np.ndarray
+    about: About | None = None
+    """What it tells. A task whose terms don't say so can be played at knowledge "task" alone."""
 
 
 class Picture(NamedTuple):
@@ -44,6 +49,11 @@ class Picture(NamedTuple):
     table: str | None = None
     """For a target picture: the name of the task's table of postures `qpos` [rows, nq]. An episode has the picture of
     row `goal.row`."""
+
+    @property
+    def about(self) -> About:
+        """What it tells: a target picture the goal, any other one what the camera sees."""
+        return "object" if self.table is None else "goal"
 
 
 def arm_terms(scene: Scene, agent: str) -> dict[str, Term]:
@@ -60,15 +70,15 @@ def arm_terms(scene: Scene, agent: str) -> dict[str, Term]:
     of: Callable[[str], Callable[[World], Array]] = lambda name: lambda world: getattr(world.arms[agent], name)  # noqa: E731
     single: Callable[[str], Callable[[World], Array]] = lambda name: lambda world: of(name)(world)[None]  # noqa: E731
     terms = {
-        "qpos": Term(of("qpos"), *joints),
-        "qvel": Term(of("qvel"), -speed, speed),
-        "tool_tip": Term(of("tool_tip"), *arm.reach),
-        "command": Term(of("command"), *commands),
+        "qpos": Term(of("qpos"), *joints, "arm"),
+        "qvel": Term(of("qvel"), -speed, speed, "arm"),
+        "tool_tip": Term(of("tool_tip"), *arm.reach, "arm"),
+        "command": Term(of("command"), *commands, "arm"),
     }
     if len(scene.agents) > 1:
-        terms["to_nearest_tip"] = Term(of("nearest_tip"), *ways_between_tips(scene))
-        terms["min_distance"] = Term(single("min_distance"), *distances_between_arms(scene))
-    terms["contact_force"] = Term(single("contact_force"), np.zeros(1), np.full(1, STRONGEST))
+        terms["to_nearest_tip"] = Term(of("nearest_tip"), *ways_between_tips(scene), "others")
+        terms["min_distance"] = Term(single("min_distance"), *distances_between_arms(scene), "others")
+    terms["contact_force"] = Term(single("contact_force"), np.zeros(1), np.full(1, STRONGEST), "arm")
     return terms
 
 
@@ -94,7 +104,7 @@ def read_vector(terms: dict[str, Term], names: tuple[str, ...], world: World) ->
     """Return the terms of these names one after the other, each clipped to its bounds, [d] float32."""
     parts = []
     for name in names:
-        low, high = (bound.astype(np.float32) for bound in terms[name][1:])
+        low, high = (bound.astype(np.float32) for bound in (terms[name].low, terms[name].high))
         parts.append(jnp.clip(terms[name].read(world).astype(jnp.float32), low, high))
     return jnp.concatenate(parts) if parts else jnp.zeros(0, jnp.float32)
 

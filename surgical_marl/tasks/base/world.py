@@ -21,3 +21,5 @@ class World(NamedTuple):
     """The numbers that `Task.sense` computed from the pictures, by the names in `Task.senses`."""
     objects: Mapping[str, ObjectView] = {}
     """The view of each free object of the scene."""
+    messages: Array | tuple[()] = ()
+    """What each arm said in the last step, [arms, K]; () without messages, and where rewards are computed."""

@@ -53,7 +53,8 @@ class Salute(sm.Task):
         """Return those of every task, and `to_posture` [n], what each joint lacks."""
         n = len(self.scene.mounts[agent].arm.actuated)
         bound = np.full(n, 10.0)
-        return {**super().terms(agent), "to_posture": Term(lambda world: self._lack(world, agent), -bound, bound)}
+        lack = Term(lambda world: self._lack(world, agent), -bound, bound, "goal")
+        return {**super().terms(agent), "to_posture": lack}
 
     def observes(self, agent: str) -> tuple[str, ...]:
         """Return what every task shows, and what the joints lack; the endoscope's picture too."""
