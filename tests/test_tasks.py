@@ -187,8 +187,25 @@ def test_weights_replace_those_of_single_terms() -> None:
     view = SimpleNamespace(tool_tip=error, min_distance=np.float32(APPROACH / 4), collision=np.bool_(True))
     goal = SimpleNamespace(targets=np.zeros((2, 3), np.float32))
     found = env.task.rewards(World({"psm_0": view}, goal))["psm_0"]
-    expected = {"distance": -0.03, "precision": 0.5 * np.exp(-0.6), "clearance": -0.75, "collision": -5}
+    expected = {"distance": -0.03, "precision": 0.5 * np.exp(-0.6), "clearance": -0.75, "collision": -5,
+                "action_change": 0.0}  # fmt: skip
     assert {name: float(value) for name, value in found.items()} == pytest.approx(expected, rel=1e-5)
+
+
+def test_an_action_is_compared_with_the_one_before_it_in_its_episode() -> None:
+    env = BatchedEnv("reach", "bimanual_psm", num_envs=3, max_steps=4, reward={"action_change": -0.5})
+    env.reset(0)
+    env.steps = np.array([0, 1, 2])  # episodes end at different times
+    rng, last = np.random.default_rng(0), {agent: np.zeros((3, 7), np.float32) for agent in env.agents}
+    for _ in range(6):
+        actions = {agent: action * 1.5 for agent, action in random_actions(env, rng).items()}  # beyond their bounds too
+        step = env.step(actions)
+        ended = (step.terminated | step.truncated)[:, None]
+        for agent, action in actions.items():
+            action = np.clip(action, -1.0, 1.0)
+            change = np.square(action - last[agent]).sum(-1)
+            np.testing.assert_allclose(step.infos[agent]["reward_action_change"], -0.5 * change, rtol=1e-5)
+            last[agent] = np.where(ended, 0.0, action)
 
 
 @pytest.mark.parametrize("task", TASKS)

@@ -58,6 +58,8 @@ class Carry(NamedTuple):
     """Values that were drawn for the arms in this episode (`surgical_marl/physics/plant.py`)."""
     messages: Any = ()
     """What each arm said in the last step, [arms, K]; () without messages."""
+    actions: Any = ()
+    """What the joints of all arms were commanded in the last step, in [-1, 1]; zeros at the start of an episode."""
 
 
 class State(NamedTuple):
@@ -95,6 +97,8 @@ class Moved(NamedTuple):
     """Tool tips before it, as in `Carry`."""
     contacts: Contacts
     arms: dict[str, ArmView]
+    changes: Array
+    """How the actions of all arms differ from the last ones."""
 
 
 class Env:
@@ -131,6 +135,11 @@ class Env:
             raise ValueError(f"messages must be 0 in a scene of one arm such as {scene!r}, not {self.messages}")
         known = {a: Knowledge(self.task, a, self.options.knowledge, self.messages) for a in self.agents}
         self.observed = {a: Observed(self.task, own, chosen.get(a), self.scaled) for a, own in known.items()}
+
+    @property
+    def _joints(self) -> list[int]:
+        """How many joints of each arm an action commands."""
+        return [len(mount.arm.actuated) for mount in self.scene.mounts.values()]
 
     @property
     def title(self) -> str:
@@ -217,7 +226,7 @@ class Env:
         An action has one number for each actuated joint, in joint order. The last one, if the arm has a jaw, is the
         jaw's command: open (> 0) or closed. The numbers of a message follow, if there are `messages`.
         """
-        return len(self.scene.mounts[agent].arm.actuated) + self.messages
+        return self._joints[self.agents.index(agent)] + self.messages
 
     def action_space(self, agent: str) -> spaces.Box:
         """[-1, 1] for every actuated joint, and every number of a message."""
@@ -262,7 +271,7 @@ class Env:
             truncated=jnp.bool_(False),
             final_observations=observations,
             final_state=state,
-            infos=self._infos(task, world, carry.tips, carry, nothing),
+            infos=infos(self.scene, task, world, jnp.zeros_like(carry.tips), self.control_dt, nothing),
             contacts=contacts,
         )
 
@@ -277,14 +286,16 @@ class Env:
         """Do the first half of a step: physics, and the goals after it."""
         task, _ = self._bound(parameters)
         actions, messages = self._part(actions)
+        commanded = jnp.clip(jnp.concatenate([actions[agent] for agent in self.agents]), -1.0, 1.0)
         physics, hidden = self.plant.command(carry.physics, carry.hidden, actions)
         physics, contacts, arms = self.plant.advance(physics, hidden)
         goal = task.advance(carry.goal, self.control_dt)
         tips = jnp.stack([view.tool_tip for view in arms.values()])
         after = carry._replace(
-            physics=physics, hidden=hidden, goal=goal, tips=tips, steps=carry.steps + 1, messages=messages
-        )
-        return Moved(after, carry.tips, contacts, arms)
+            physics=physics, hidden=hidden, goal=goal, tips=tips, steps=carry.steps + 1, messages=messages,
+            actions=commanded,
+        )  # fmt: skip
+        return Moved(after, carry.tips, contacts, arms, commanded - carry.actions)
 
     def _part(self, actions: dict[str, Array]) -> tuple[dict[str, Array], Any]:
         """Return what actions command the joints, and the messages in them as in `Carry`."""
@@ -299,7 +310,9 @@ class Env:
         task, max_steps = self._bound(parameters)
         carry, contacts = moved.carry, moved.contacts
         arms = {agent: moved.arms[agent] for agent in self.agents}  # JAX sorts them by name
-        world = World(arms, carry.goal, sensed, self.plant.objects(carry.physics, carry.hidden))
+        objects, ends = self.plant.objects(carry.physics, carry.hidden), np.cumsum(self._joints)[:-1]
+        changes = dict(zip(self.agents, jnp.split(moved.changes, ends), strict=True))
+        world = World(arms, carry.goal, sensed, objects, changes=changes)
         terms = task.rewards(world)
         carry = carry._replace(goal=task.remember(world))
         terminated = task.terminated(world)
@@ -322,7 +335,7 @@ class Env:
             truncated=truncated,
             final_observations=final_observations,
             final_state=final_state,
-            infos=self._infos(task, world, moved.tips, carry, terms),
+            infos=infos(self.scene, task, world, carry.tips - moved.tips, self.control_dt, terms),
             contacts=contacts,
         )
 
@@ -350,7 +363,8 @@ class Env:
         tips = jnp.stack([view.tool_tip for view in arms.values()])
         goal = task.remember(World(arms, start.goal, self._unsensed(), self.plant.objects(physics, hidden)))
         silence = jnp.zeros((len(self.agents), self.messages)) if self.messages else ()
-        return Carry(physics, goal, key, episode, jnp.int32(0), tips, hidden, silence), contacts, arms
+        rest = jnp.zeros(sum(self._joints))
+        return Carry(physics, goal, key, episode, jnp.int32(0), tips, hidden, silence, rest), contacts, arms
 
     def _observe(
         self, task: Task, carry: Carry, contacts: Contacts, arms: dict[str, ArmView]
@@ -370,11 +384,6 @@ class Env:
         if self.messages:
             every.append(carry.messages.ravel())
         return observations, jnp.concatenate(every)
-
-    def _infos(
-        self, task: Task, world: World, before: Array, after: Carry, terms: dict[str, dict[str, Array]]
-    ) -> dict[str, dict[str, Array]]:
-        return infos(self.scene, task, world, after.tips - before, self.control_dt, terms)
 
 
 def _box(low: np.ndarray, high: np.ndarray) -> spaces.Box:

@@ -104,7 +104,9 @@ def _also(run: str) -> dict[str, Any]:
     The results are named after what differs: "training goals", and "random starts" where the task has them.
     """
     asked = {"training goals": {"goals": "training"}}
-    if "random" in TASKS.load(read_settings(find("policies", run)).task).starts:
+    settings = read_settings(find("policies", run))
+    task = TASKS.load(settings.task)
+    if "random" in task.starts and not getattr(task.levels[settings.difficulty], "own_starts", False):
         asked["random starts"] = {"start": "random"}
     return {name: summarise([play_all([run], other, EPISODES, SEED)[run]]) for name, other in asked.items()}
 

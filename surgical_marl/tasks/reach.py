@@ -61,7 +61,7 @@ class Task(TipTask):
         "easy": Level(0.03, 0.0),
         "default": Level(0.05, 0.0),
         "hard": Level(0.07, 0.25),
-        "crossing": Level(0.02, 1.0),
+        "crossing": Level(0.02, 1.0, own_starts=True),
     }
     starts = ("home", "random")
     _crossing: Crossing | None = None
@@ -73,7 +73,7 @@ class Task(TipTask):
 
     def __init__(self, scene: Scene, options: Options) -> None:
         super().__init__(scene, options)
-        if options.difficulty == "crossing":
+        if self.level.own_starts:
             if self.starts_at != "home":
                 raise ValueError(f"difficulty 'crossing' has starts of its own: leave start {self.starts_at!r} out")
             self._crossing = crossing_table(scene, self.level.extent, self.seed)

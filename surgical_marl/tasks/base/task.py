@@ -60,6 +60,8 @@ class Level(NamedTuple):
     """Share of episodes, 0 to 1, in which the paths of two arms' tool tips cross; unused with one arm."""
     speed: float = 0.0
     """Greatest speed of a target, m/s."""
+    own_starts: bool = False
+    """Whether arms begin where the level says, which leaves no choice of a start."""
 
 
 class Task:
@@ -105,10 +107,11 @@ class Task:
         self.scene, self.level, self.starts_at = scene, self.levels[options.difficulty], options.start
         self.seed = SEEDS[options.goals]
         """Seed of the draws on the host: held-out goals come from another seed than those of training."""
+        own = {"action_change": 0.0, **self.weights}
         for name in options.reward:
-            if name not in self.weights:
-                raise unknown("reward term", name, list(self.weights))
-        self.weights = {**self.weights, **options.reward}
+            if name not in own:
+                raise unknown("reward term", name, list(own))
+        self.weights = {**own, **options.reward}
         self.tables: dict[str, np.ndarray] = {}
         self.postures: dict[str, np.ndarray] = {}
         """Tables of `qpos` of the whole scene, [rows, nq] each, for target pictures."""
@@ -175,13 +178,15 @@ class Task:
     def reward_terms(self, world: World) -> dict[str, dict[str, Array]]:
         """Return agent -> reward term -> its value before weighting, for the step that led here.
 
-        The terms of every task: `clearance`, up to 1 as another arm comes nearer than `APPROACH`, and `collision`, 0 or
-            1.
+        The terms of every task: `clearance`, up to 1 as another arm comes nearer than `APPROACH`; `collision`, 0 or 1;
+        and `action_change`, the sum of squares of how the action differs from the last one, whose weight is 0 where a
+        task says nothing of it.
         """
         return {
             agent: {
                 "clearance": jnp.clip(1.0 - view.min_distance / APPROACH, 0.0, 1.0),
                 "collision": view.collision.astype(jnp.float32),
+                "action_change": jnp.sum(jnp.square(world.changes[agent])) if world.changes else jnp.float32(0.0),
             }
             for agent, view in world.arms.items()
         }

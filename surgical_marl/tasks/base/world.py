@@ -23,3 +23,5 @@ class World(NamedTuple):
     """The view of each free object of the scene."""
     messages: Array | tuple[()] = ()
     """What each arm said in the last step, [arms, K]; () without messages, and where rewards are computed."""
+    changes: Mapping[str, Array] = {}
+    """How each agent's action differs from its last one, [n], without words; only where rewards are computed."""
