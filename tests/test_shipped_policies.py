@@ -37,7 +37,10 @@ def test_a_folder_is_whole(name: str) -> None:
     weights = {path.stem for path in folder.glob("*.safetensors")}
     assert weights and weights == {path.stem for path in folder.glob("*.onnx")}
     assert not [path for path in folder.iterdir() if path.suffix in (".pt", ".pkl", ".tmp")]
-    assert name == f"{result['task']}-{result['scene']}" and is_standard(result)
+    level = "" if result["difficulty"] == "default" else f"-{result['difficulty']}"
+    assert name == f"{result['task']}-{result['scene']}{level}" and is_standard(result)
+    page = (folder / "README.md").read_text()
+    assert bool(level) == ("--difficulty" in page) and result["difficulty"] in page
     assert len(result["seeds"]["runs"]) >= 3
     assert all(read_origin(folder)["origin"].values())
 

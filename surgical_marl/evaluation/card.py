@@ -155,18 +155,32 @@ def _with_interval(key: str, result: Mapping[str, Any]) -> str:
 def _how_trained(folder: Path, settings: Settings) -> str:
     last, notes = _training(folder), read_origin(folder)
     device, commit, started = (notes["origin"].get(key) or "unknown" for key in ("device", "commit", "started"))
-    command = f"surgical-marl train {settings.task} --scene {settings.scene} --seed {settings.seed}"
+    level = "" if settings.difficulty == "default" else f" --difficulty {settings.difficulty}"
+    command = f"surgical-marl train {settings.task} --scene {settings.scene}{level} --seed {settings.seed}"
     steps = f"{last['env_steps']:,.0f} environment steps in {last['seconds']:,.0f} s of rollouts and updates"
     return f"""## How it was trained
 
 With `{command}`. `config.yaml` holds all settings of that training.
 
+{_imitation(settings, last["iteration"])}\
 - {settings.algo}, {settings.num_envs:,} environments, {last["iteration"]:,.0f} iterations: {steps}.
 - On {device}, started {started}, commit `{commit}`.
 - {", ".join(f"{name} {version}" for name, version in notes["versions"].items())}.
 
 ![learning curve]({CURVE})
 """
+
+
+def _imitation(settings: Settings, iterations: float) -> str:
+    """Return the line about imitation, or nothing."""
+    asked = settings.imitation
+    if not asked.steps:
+        return ""
+    alone = "all" if asked.hold >= iterations else f"the first {asked.hold:,}"
+    return (
+        f"- Imitation of {settings.oracle_episodes:,} episodes of the oracle first, {asked.steps:,} steps of "
+        f"{asked.batch_size:,} pairs. In {alone} iterations only the critic learned then.\n"
+    )
 
 
 def _training(folder: Path) -> dict[str, float]:

@@ -68,15 +68,18 @@ def goal_hash(about: Mapping[str, Any], goals: Iterable[np.ndarray]) -> str:
 
 def is_standard(result: Mapping[str, Any]) -> bool:
     """Return whether a result is of a goal set that this version publishes for its task, scene and start."""
-    scenes = standard_hashes().get(result.get("start", ""), {}).get(result["task"], {})
+    known = standard_hashes()
+    kind = result["difficulty"] if result.get("difficulty") in known else result.get("start", "")
+    scenes = known.get(kind, {}).get(result["task"], {})
     return bool(result["goal_set"] == scenes.get(result["scene"]))
 
 
 @cache
 def standard_hashes() -> dict[str, dict[str, dict[str, str]]]:
-    """Return the hashes of the standard goal sets by start, task and scene.
+    """Return the hashes of the standard goal sets by start, task and scene; by difficulty if it has starts of its own.
 
-    These are the goal sets that `surgical-marl eval` plays if no option chooses others, and with `--start random`.
+    These are the goal sets that `surgical-marl eval` plays if no option chooses others, with `--start random`, and with
+    `--difficulty` of such a level.
     """
     found: dict[str, dict[str, dict[str, str]]] = yaml.safe_load(_FILE.read_text())
     return found
