@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import cache
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import gymnasium
 import mujoco
@@ -18,8 +18,10 @@ from surgical_marl.content import content_dir
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.envs.env import Env
 from surgical_marl.evaluation.evaluate import evaluate
+from surgical_marl.physics.views import Handled, ObjectView
 from surgical_marl.policies.oracle import oracle
 from surgical_marl.policies.policy import load_policy, zero_policy
+from surgical_marl.tasks.base.grips import frames
 from surgical_marl.tasks.base.viewing import CLOSE, FARTHEST, FILL, NEAREST, Eye
 from surgical_marl.tasks.base.workspace import CLEARANCE
 from surgical_marl.tasks.base.world import World
@@ -110,7 +112,7 @@ def test_the_middle_is_off_by_its_angle_in_half_fields_of_view() -> None:
     assert behind[0] > 5 and depth < 0
 
 
-def world(q: np.ndarray, targets: dict[str, np.ndarray], known: Env | None = None, found: float = 0.0) -> World:
+def world(q: Any, targets: dict[str, Any], known: Env | None = None, handles: dict[str, Any] | None = None) -> World:
     """Tools at home, the endoscope at joint positions, targets in the world."""
     known = known or env()
     arms: dict[str, Any] = {}
@@ -118,13 +120,13 @@ def world(q: np.ndarray, targets: dict[str, np.ndarray], known: Env | None = Non
         own = np.asarray(q if agent == CAMERA else mount.arm.home, np.float32)
         arms[agent] = SimpleNamespace(
             qpos=own, tool_tip=np.float32(mount.arm.forward_kinematics(own)[:3, 3]),
-            min_distance=np.float32(0.1), collision=np.bool_(False),
+            min_distance=np.float32(0.1), collision=np.bool_(False), handles=handles or {},
         )  # fmt: skip
     local = [(targets.get(a, m.position) - m.position) @ m.rotation for a, m in known.scene.mounts.items()]
     work: Any = SimpleNamespace(targets=np.array(local, np.float32))
     zero: Any = np.float32(0.0)
     origin: Any = np.float32(Eye(known.scene.mounts[CAMERA]).pose(q)[1] + [0.003, 0.0, 0.004])
-    return World(arms, ViewGoal(work, np.int32(0), zero, np.float32(found), origin))  # type: ignore[arg-type]
+    return World(arms, ViewGoal(work, np.int32(0), zero, zero, origin))  # type: ignore[arg-type]
 
 
 def tips() -> np.ndarray:
@@ -173,6 +175,41 @@ def test_a_way_is_hidden_if_its_own_tool_is_out_of_view() -> None:
     terms: Any = env().task.terms("psm_0")
     value = {name: np.asarray(terms[name].read(seen)) for name in ("tip_seen", "target_seen", "to_target")}
     assert value["target_seen"][3] == 1 and value["tip_seen"][3] == 0 and not value["to_target"].any()
+
+
+@cache
+def over_a_needle() -> Env:
+    return Env(TASK, SCENES[1])
+
+
+@pytest.mark.parametrize(("looks_at", "shown"), [("needle", True), ("goal", False)])
+def test_an_object_is_hidden_out_of_view_and_so_is_its_goal(looks_at: str, shown: bool) -> None:
+    """Needle and goal are 0.3 m apart, so a near view shows one of them; the camera knows of both."""
+    scene, task = over_a_needle().scene, cast("Any", over_a_needle().task)
+    known, work = Eye(scene.mounts[CAMERA]), task.work
+    start = np.asarray(work.tables["starts"][3], float)
+    goal = np.asarray(work.tables["points"][3], float)
+    pose = frames(start[None, :3], start[None, 3:])[0]
+    there = pose[:3, 3] if shown else goal
+    around = there + np.array([[0.03, 0.0, 0.0], [-0.03, 0.0, 0.0]])
+    q = known.look_at(around[None], known.mount.arm.home[None], 40)[0]
+    work_goal: Any = SimpleNamespace(row=np.int32(3), best=SimpleNamespace(lift=np.float32(0.0)))
+    handled = Handled(np.float32(1.0), np.bool_(True), np.float32(0.0))  # type: ignore[arg-type]
+    seen = world(q, {}, over_a_needle(), {"needle": handled})
+    body: Any = ObjectView(np.float32(pose[:3, 3]), np.float32(pose[:3, :3]), np.ones(6, np.float32))  # type: ignore[arg-type]
+    seen = seen._replace(goal=seen.goal._replace(work=work_goal), objects={"needle": body})
+    terms: Any = task.terms("psm_1")
+    read = lambda name: np.asarray(terms[name].read(seen))  # noqa: E731
+    for name in ("needle_position", "needle_rotation", "needle_velocity", "needle_seen", "others_hold"):
+        assert read(name).any() == shown, name
+    for name in ("target", "target_rotation", "target_seen"):
+        assert read(name).any() != shown, name
+    assert not read("to_target").any() and not read("to_object").any() and read("needle_grip").any()
+    axes, origin = known.pose(q)
+    both = np.asarray(task.terms(CAMERA)["work_in_view"].read(seen)).reshape(2, 4)
+    middle = pose[:3, 3] + pose[:3, :3] @ task._middle
+    np.testing.assert_allclose(both[:, :3], (np.array([middle, goal]) - origin) @ axes, atol=1e-5)
+    assert both[:, 3].tolist() == [shown, not shown]
 
 
 def test_rewards_are_the_teams_and_say_what_is_in_view() -> None:
@@ -300,6 +337,14 @@ def test_an_episode_is_that_of_the_mjx_engine() -> None:
             for name in ("in_view", "searching", "success"):
                 np.testing.assert_array_equal(found.infos[agent][name], expected.infos[agent][name])
         np.testing.assert_array_equal(found.truncated, expected.truncated)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scene", SCENES[1:])
+def test_the_oracle_shows_work_with_objects(scene: str) -> None:
+    many = BatchedEnv(TASK, scene, num_envs=200, engine="fused", device="cpu", goals="held_out")
+    found = evaluate(many, load_policy("oracle", many), 200, 0)
+    assert found["success_rate"] >= 0.95 and found["in_view_rate"] >= 0.99 and found["object_in_view_rate"] >= 0.99
 
 
 def test_the_settings_list_every_weight_as_the_task_has_it() -> None:
