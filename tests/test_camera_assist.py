@@ -90,17 +90,20 @@ def test_a_good_view_is_centred_and_as_near_as_all_that_is_to_be_seen_allows() -
     """Of postures that look at it: the middle is on the axis, and the outermost place at `FILL` of the picture."""
     rng = np.random.default_rng(1)
     middle = rng.normal(0, 0.01, (50, 1, 3)) + np.array([0.0, 0.0, 0.05])
-    places = middle + rng.uniform(-0.03, 0.03, (50, 4, 3))
+    places = middle + rng.uniform(-0.05, 0.05, (50, 4, 3))
     known = eye()
     q = known.look_at(places, np.tile(known.mount.arm.home, (50, 1)), 40)
     axes, origin = known.pose(q)
     local = (places - origin[:, None]) @ axes
     fill = np.abs(local[..., :2]).max(-1) / local[..., 2] / np.tan(known.half)
-    np.testing.assert_allclose((local.max(1) + local.min(1))[:, :2] / 2, 0, atol=1e-3)
-    closest = local[..., 2].min(1)
-    assert ((np.abs(fill.max(1) - FILL) < 0.01) | (np.abs(closest - CLOSE) < 1e-3)).all()
+    away = np.linalg.norm(local[..., :2], axis=-1)
+    angles = np.arctan2(away, local[..., 2])[..., None] * local[..., :2] / away[..., None]
+    np.testing.assert_allclose((angles.max(1) + angles.min(1)) / 2, 0, atol=0.01)
+    nearest = local[..., 2].min(1)
+    assert ((np.abs(fill.max(1) - FILL) < 0.01) | (np.abs(nearest - CLOSE) < 1e-3)).all()
+    assert (fill.max(1) < FILL + 0.01).all() and (nearest > CLOSE - 1e-3).all()
     off, depth = known.aim(local)
-    np.testing.assert_allclose(np.linalg.norm(off, axis=-1), 0, atol=0.01)
+    np.testing.assert_allclose(np.linalg.norm(off, axis=-1), 0, atol=0.02)
     np.testing.assert_allclose(depth, 0, atol=0.02)
 
 

@@ -13,7 +13,7 @@ Action        one number in [-1, 1] for every joint; the jaw opens above 0 and c
 Reward        the team's; weights in brackets, beside work with objects a tenth of them. The terms of the work, the mean
               of both tools. `in_view`, the share of what is to be seen that is in view (1); `centring`, the angle
               between the view's axis and the middle of that, in half fields of view, at most 3 (-0.5); `depth`, how far
-              that middle is from a good distance, as a share of it, at most 1 (-0.5); `travel` of the endoscope's tip
+              all that is from a good distance, as a share of it, at most 1 (-0.5); `travel` of the endoscope's tip
               (-10 / m). And for each agent its own `clearance` and `collision`, as in the work. To be seen are the
               tools' tips and the object; in `reach` instead of an object the targets.
 Success       of a tool that of its work; of the camera that both tools succeed and all is in view.
@@ -364,13 +364,16 @@ class Task(BaseTask):
         return found
 
     def attend(self, seen: Snapshot) -> dict[str, Wish]:
-        """Return the wish that the endoscope looks at what is to be seen, at each control step."""
+        """Return the wish that the endoscope looks at what is to be seen, and at the goal of an object on its way."""
         places = [seen.tools[agent][:, :3, 3] for agent in self.tools]
         if self.object is None:
             places += list(np.moveaxis(self.marks(seen.goal), 1, 0))
         else:
-            body = seen.objects[self.object]
+            work: Any = self.work
+            body, held = seen.objects[self.object], seen.held[work.presenter]
             places.append(body[:, :3, 3] + body[:, :3, :3] @ self._middle.astype(float))
+            brought = held[:, list(self.scene.free_objects).index(self.object)]
+            places.append(np.where(brought[:, None], self.marks(seen.goal)[:, 0], places[-1]))
         return {self.camera: Wish(joints=self._eye.look_at(np.stack(places, 1), seen.qpos[self.camera], FOLLOWING))}
 
 

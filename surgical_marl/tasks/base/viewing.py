@@ -25,8 +25,9 @@ NEAREST = 0.02
 """Least distance along the view at which a point is in view, m: `match_image` keeps as far away from what it sees."""
 FARTHEST = 0.3
 """Greatest one, m: there a pixel of a picture of 64 x 64 is 5.4 mm wide, more than half a tool's shaft of 8 mm."""
-CLOSE = 0.05
-"""What is nearest is at least so far away at a good distance, m: there a square picture of 60 degrees is 58 mm wide."""
+CLOSE = 0.1
+"""What is nearest is at least so far away at a good distance, m: there a square picture of 60 degrees is 115 mm wide.
+Tools part faster than an endoscope draws back."""
 FILL = 0.6
 """At a good distance what is looked at fills this share of the picture, from its middle to its nearest edge."""
 LONGEST = 0.2
@@ -75,14 +76,15 @@ class Eye:
         """Return how far the view is from points [..., k, 3] of the endoscope's frame.
 
         Returns:
-            The angle between the view's axis and the middle of the points' box, as shares of half the field of view to
-            the left and up, [..., 2]: 1 at the picture's edge. And the distance of that middle along the view, less
-            the good one, as a share of that, [...].
+            The middle of the points' box in the picture, as angles from the view's axis to the left and up, in half
+            fields of view, [..., 2]: 1 is the picture's edge. And the distance of the middle of their box in space
+            along the view, less the good one, as a share of that, [...].
         """
         xp = points.__array_namespace__()
+        aside = xp.sqrt(xp.sum(points[..., :2] ** 2, -1) + np.float32(1e-12))
+        angles = (xp.arctan2(aside, points[..., 2]) / np.float32(self.half) / aside)[..., None] * points[..., :2]
+        off = (angles.max(-2) + angles.min(-2)) / 2
         middle = (points.max(-2) + points.min(-2)) / 2
-        aside = xp.sqrt(xp.sum(middle[..., :2] ** 2, -1) + np.float32(1e-12))
-        off = (xp.arctan2(aside, middle[..., 2]) / np.float32(self.half) / aside)[..., None] * middle[..., :2]
         side, depth = xp.maximum(abs(points[..., 0]), abs(points[..., 1])), middle[..., 2]
         far = xp.maximum(side / np.float32(FILL * np.tan(self.half)), np.float32(CLOSE))
         good = xp.clip(depth + xp.max(far - points[..., 2], -1), np.float32(CLOSE), np.float32(FARTHEST))
