@@ -15,7 +15,20 @@ import torch
 
 from surgical_marl.evaluation.goal_set import check_same, describe_goals, episode_seed, goal_hash, read_goals
 from surgical_marl.evaluation.interval import interval
-from surgical_marl.evaluation.metrics import DROP, LAST, STAGE, SUCCESS_MM, TERMS, Metric, Trajectory, measure, metrics
+from surgical_marl.evaluation.metrics import (
+    DROP,
+    LAST,
+    SEARCHING,
+    STAGE,
+    SUCCESS_MM,
+    TERMS,
+    TRAVEL,
+    VIEWED,
+    Metric,
+    Trajectory,
+    measure,
+    metrics,
+)
 from surgical_marl.policies.acting import forget
 
 if TYPE_CHECKING:
@@ -26,6 +39,8 @@ MAX_BATCH = 1024
 ERRORS = ("tip_error", "goal_error")
 """Infos of how far a tool tip, or an object, is from its goal, m: the first that there is counts."""
 INFOS = ("success", "collision", "min_distance")
+KEPT = (*ERRORS, *INFOS, *LAST, *VIEWED, *TRAVEL, DROP, SEARCHING)
+"""Names of infos that metrics are computed from, besides those that begin like `TERMS` and `STAGE`."""
 
 
 class Played(NamedTuple):
@@ -148,10 +163,7 @@ def _first_episodes(
         observations = step.observations
         told = [step.infos[agent] for agent in env.agents]
         names = dict.fromkeys(
-            name
-            for info in told
-            for name in info
-            if name in (*ERRORS, *INFOS, *LAST, DROP) or name.startswith((*TERMS, STAGE))
+            name for info in told for name in info if name in KEPT or name.startswith((*TERMS, STAGE))
         )
         infos.append({name: np.stack([_numpy(info.get(name, unknown), count) for info in told], -1) for name in names})
         ended = step.terminated | step.truncated

@@ -25,6 +25,16 @@ LAST = {
     "goal_angle": ("goal_angle_deg", 180 / math.pi),
 }
 """Infos of some agents whose value after the last step counts: name -> name and unit factor of the metric."""
+VIEWED = {
+    "in_view": ("in_view_rate", 1.0),
+    "object_in_view": ("object_in_view_rate", 1.0),
+    "centre_error": ("centre_error", 1.0),
+}
+"""Infos of what an endoscope sees, whose mean over the steps that are not `SEARCHING` counts, likewise."""
+SEARCHING = "searching"
+"""Whether an endoscope may still look for what it is to show, in `infos` of tasks with such a search."""
+TRAVEL = {"camera_travel": ("camera_travel_mm", 1000.0)}
+"""Infos of how far something moved in a step, whose sum counts, likewise."""
 STILL = 1e-3
 """A tip that moved less than this, in m, has no smoothness, because its motion is noise."""
 
@@ -49,8 +59,8 @@ class Trajectory(NamedTuple):
     center: np.ndarray
     """[T, E, A], distance of the shaft from its remote center at the start of each step, m; NaN without one."""
     terms: Mapping[str, np.ndarray]
-    """Reward terms, costs, stages and what `LAST` has, of each step, by their names in `infos`, [T, E, A]; NaN for an
-    agent that has none."""
+    """Reward terms, costs, stages, `SEARCHING` and what `LAST`, `VIEWED` and `TRAVEL` have, of each step, by their
+    names in `infos`, [T, E, A]; NaN for an agent that has none."""
 
 
 class Metric(NamedTuple):
@@ -75,7 +85,8 @@ def measure(trajectory: Trajectory, dt: float, following: bool) -> dict[str, np.
         [E, A] each, in m: `error` at the last step (following: root mean square over the steps); `held`, the largest of
         the last `HOLD` seconds (of all steps); `squared` (mean over the steps, m^2); least `distance`, largest
         `center`, `path` of the tip. Also `collided`; `time` from which on it is not `missed`, s, and
-        `smoothness`, NaN where undefined; the mean of each of the `terms`, at the last step of those in `LAST`.
+        `smoothness`, NaN where undefined; the mean of each of the `terms`, over the steps that count of those in
+        `VIEWED`, NaN if there are none; at the last step of those in `LAST`, over all steps together of `TRAVEL`.
     """
     lengths, error = trajectory.lengths[:, None], trajectory.error
     step = np.arange(1, len(error) + 1)[:, None, None]
@@ -87,6 +98,7 @@ def measure(trajectory: Trajectory, dt: float, following: bool) -> dict[str, np.
     final = lambda values: np.take_along_axis(values, lengths[None] - 1, 0)[0]  # noqa: E731
     moves = np.linalg.norm(np.diff(trajectory.tip, axis=0), axis=-1)
     moves = np.where(going[1:], moves, 0.0)
+    shown = going & (trajectory.terms[SEARCHING] == 0) if SEARCHING in trajectory.terms else going
     return {
         "error": np.sqrt(squared) if following else final(error),
         "held": held,
@@ -98,16 +110,27 @@ def measure(trajectory: Trajectory, dt: float, following: bool) -> dict[str, np.
         "time": np.where((trajectory.missed & judged).any(0) | following, np.nan, dt * (last_miss + 1)),
         "path": moves.sum(0),
         "smoothness": _smoothness(moves / dt, trajectory.lengths - 1, dt),
-        **{name: _reduced(name, values, going, final) for name, values in trajectory.terms.items()},
+        **{
+            name: _reduced(name, values, shown if name in VIEWED else going, final)
+            for name, values in trajectory.terms.items()
+        },
     }
 
 
-def _reduced(name: str, values: np.ndarray, going: np.ndarray, final: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    """Reduce over steps: whether a stage was ever reached or there was a drop, the last of `LAST`, or else the mean."""
+def _reduced(name: str, values: np.ndarray, where: np.ndarray, final: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """Reduce steps: whether a stage was ever reached or there was a drop, last of `LAST`, sum of `TRAVEL`, else mean.
+
+    Args:
+        where: [T, E, 1], the steps that count.
+        final: returns the values at the last steps.
+    """
     if name in LAST:
         return final(values)
-    kept = np.where(going, values, 0.0)
-    return kept.max(0) if name.startswith((STAGE, DROP)) else kept.sum(0) / going.sum(0)
+    kept = np.where(where, values, 0.0)
+    if name in TRAVEL:
+        return kept.sum(0)
+    with np.errstate(invalid="ignore"):
+        return kept.max(0) if name.startswith((STAGE, DROP)) else kept.sum(0) / where.sum(0)
 
 
 def metrics(measures: Mapping[str, np.ndarray], following: bool) -> dict[str, Metric]:
@@ -137,7 +160,7 @@ def metrics(measures: Mapping[str, np.ndarray], following: bool) -> dict[str, Me
         found["rmse_mm"] = Metric(1e6 * measures["squared"], lambda values: np.sqrt(values.mean(-1)))
     if DROP in measures:
         found["drop_rate"] = Metric(measures[DROP].max(-1, keepdims=True), _mean)
-    for name, (title, unit) in LAST.items():
+    for name, (title, unit) in (LAST | VIEWED | TRAVEL).items():
         if name in measures:
             found[title] = Metric(unit * measures[name], _mean_of_known)
     return found | {

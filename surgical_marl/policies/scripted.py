@@ -22,7 +22,8 @@ class Scripted:
 
     In each environment joints follow straight lines to where a step wants the tools, all at the same pace. Then the
     agents wait as the step says, and the next one is planned. Where a step was not good an earlier one is done again.
-    The last step is planned again and again until the episode ends.
+    The last step is planned again and again until the episode ends. Agents that attend to what the others do
+    (`Task.attends`) follow no step, and nobody waits for them.
 
     Args:
         env: the environments, with control "position".
@@ -34,6 +35,9 @@ class Scripted:
         self._env, self._steps = env, steps
         self._tools = {agent: _Tool(env, agent) for agent in env.agents}
         self._moved = [agent for agent in env.agents if agent in agents]
+        self._attending = [agent for agent in self._moved if agent in env.task.attends]
+        self._led = [agent for agent in self._moved if agent not in env.task.attends]
+        """Agents that follow the script."""
         self._now = np.zeros(env.num_envs, int)
         """Number of each environment's step."""
         self._left = np.zeros(env.num_envs, int)
@@ -47,15 +51,28 @@ class Scripted:
             self._tools[agent].look(to_numpy(seen[agent]))
         began = to_numpy(env.steps) == 0
         due = np.flatnonzero(began | (self._left <= 0))
-        if len(due):
+        if len(due) and self._led:
             self._plan(due, began[due])
         self._left -= 1
         pace = np.array([step.pace for step in self._steps])[self._now]
-        ways = {agent: self._tools[agent].way() for agent in self._moved}
-        furthest = np.max([np.abs(way).max(-1) for way in ways.values()], axis=0)
-        share = np.minimum(1.0, pace / np.maximum(furthest, 1e-9))[:, None]
-        moves = {agent: self._tools[agent].action(share * way) for agent, way in ways.items()}
+        share = np.minimum(1.0, pace / np.maximum(self._furthest(), 1e-9))[:, None]
+        ways = {agent: share * self._tools[agent].way() for agent in self._led} | self._attend()
+        moves = {agent: self._tools[agent].action(ways[agent]) for agent in self._moved}
         return {agent: like(seen[agent], without_words(env, move)) for agent, move in moves.items()}
+
+    def _attend(self) -> dict[str, np.ndarray]:
+        """Return how far the commands of agents that attend to others move, in units of an action of 1, [N, n]."""
+        if not self._attending:
+            return {}
+        every = np.arange(self._env.num_envs)
+        wishes = self._env.task.attend(self._look(every))
+        for agent in self._attending:
+            self._tools[agent].send(every, wishes[agent])
+        return {agent: np.clip(self._tools[agent].way(), -1.0, 1.0) for agent in self._attending}
+
+    def _furthest(self, rows: Any = slice(None)) -> np.ndarray:
+        """Return the longest way of a joint in some environments, in units of an action of 1, [n]."""
+        return np.max([np.abs(self._tools[agent].way()[rows]).max(-1) for agent in self._led], axis=0, initial=0.0)
 
     def _plan(self, due: np.ndarray, began: np.ndarray) -> None:
         """Plan the next step of the environments `due`; those that `began` an episode start with the first step."""
@@ -74,20 +91,19 @@ class Scripted:
             wishes = step.plan(_rows(snapshot, rows))
             for agent, wish in wishes.items():
                 self._tools[agent].send(due[rows], wish)
-            furthest = np.max([np.abs(self._tools[agent].way()[due[rows]]).max(-1) for agent in self._moved], axis=0)
+            furthest = self._furthest(due[rows])
             self._left[due[rows]] = np.ceil(furthest / step.pace) + round(step.wait / self._env.control_dt) + 1
 
     def _look(self, due: np.ndarray) -> Snapshot:
         env = self._env
         qpos, poses = np.asarray(env.qpos, float)[due], env.object_poses
-        tools = {
-            agent: tool_of(mount, qpos[:, env.scene.qpos_index(agent)]) for agent, mount in env.scene.mounts.items()
-        }
+        joints = {agent: qpos[:, env.scene.qpos_index(agent)] for agent in env.agents}
+        tools = {agent: tool_of(mount, joints[agent]) for agent, mount in env.scene.mounts.items()}
         every = frames(poses.origin[due], poses.quaternion[due])
         objects = {name: every[:, number] for number, name in enumerate(env.scene.free_objects)}
         goal = SimpleNamespace(**{name: np.asarray(value)[due] for name, value in vars(env.goal).items()})
         held = {agent: env.held[due, :, number] for number, agent in enumerate(env.agents)}
-        return Snapshot(tools, objects, held, goal)
+        return Snapshot(tools, objects, held, goal, joints)
 
 
 def without_words(env: BatchedEnv, moves: np.ndarray) -> np.ndarray:
@@ -144,4 +160,5 @@ def _rows(snapshot: Snapshot, rows: np.ndarray) -> Snapshot:
     """Return some environments of a snapshot."""
     some = lambda of: {name: value[rows] for name, value in of.items()}  # noqa: E731
     goal = SimpleNamespace(**some(vars(snapshot.goal)))
-    return Snapshot(some(snapshot.tools), some(snapshot.objects), some(snapshot.held), goal)
+    objects, qpos = some(snapshot.objects), some(snapshot.qpos)
+    return Snapshot(some(snapshot.tools), objects, some(snapshot.held), goal, qpos)

@@ -27,6 +27,8 @@ OBJECTS = {"success_rate": "success", "drop_rate": "drops", "time_to_success_s":
 MOVING = {"rmse_mm": "RMSE (mm)", "success_2mm": "success at 2 mm"}
 ALWAYS = {"collision_rate": "collisions", "path_length_mm": "path (mm)", "smoothness": "smoothness",
           "min_distance_mm": "least distance (mm)"}  # fmt: skip
+VIEWS = {"in_view_rate": "tools in view", "centre_error": "centre error (half fields of view)",
+         "camera_travel_mm": "camera travel (mm)"}  # fmt: skip
 PICTURES = {"image_error": "image error (grey levels)", "angle_error_deg": "angle error (degrees)"}
 
 
@@ -50,7 +52,7 @@ def main(tasks: list[str]) -> None:
 def table(rows: list[list[Any]]) -> str:
     result = rows[0][2]
     columns = ERRORS | (MOVING if "rmse_mm" in result else OBJECTS if "drop_rate" in result else FIXED) | ALWAYS
-    columns |= {name: title for name, title in PICTURES.items() if name in rows[0][2]}
+    columns |= {name: title for name, title in (PICTURES | VIEWS).items() if name in rows[0][2]}
     lines = ["| " + " | ".join(["scene", "policy", *columns.values()]) + " |", "|---" * (2 + len(columns)) + "|"]
     for scene, policy, result in rows:
         cells = (cell(name, result[name], result["intervals"][name]) for name in columns)
@@ -61,7 +63,7 @@ def table(rows: list[list[Any]]) -> str:
 def cell(name: str, value: float | None, bounds: list[float] | None) -> str:
     if value is None:
         return "-"
-    if name.startswith(("success_", "team_", "collision_", "drop_")):
+    if name.startswith(("success_", "team_", "collision_", "drop_", "in_view_")):
         return f"{value:.1%}"
     value = 0.0 if abs(value) < 1e-6 else value  # rounding
     span = f" ({bounds[0]:.3g} to {bounds[1]:.3g})" if bounds and name.endswith("error_mm") else ""

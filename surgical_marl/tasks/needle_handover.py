@@ -2,11 +2,11 @@
 
 The needle lies where only the first arm reaches, and the goal is where only the second one does.
 
-Agents        the two arms of the scene whose jaws have pads. The first picks, the second presents.
+Agents        the arms of the scene. The first one whose jaw has pads picks, the second such one presents.
 Observation   as in `needle_pick`, and the way to the nearest part of the needle's middle half, whether the other arm
               holds the needle, the way to the other tool tip, and the least distance between the arms.
 Action        one number in [-1, 1] for every joint; the jaw opens above 0 and closes otherwise.
-Reward        the same for both arms, but for `clearance` and `collision`; weights in brackets. Progress over the best
+Reward        the same for all arms, but for `clearance` and `collision`; weights in brackets. Progress over the best
               of the episode so far: `reach` (20 / m), `grasp` (2) and `lift` (2) of the first arm; `meet`, from the
               second tool to the middle half of the held needle (10 / m); `receive`, when both hold it (4), and
               `passed`, when the second holds it alone (4), there; then `carry` (10 / m), and `turn` (2 / rad, where the
@@ -104,7 +104,7 @@ class Task(ObjectTask):
     }
     weights = {**ObjectTask.weights, "meet": 10.0, "receive": 4.0, "passed": 4.0, "carry": 10.0, "clearance": 0.0}  # noqa: RUF012
     default_scene = "bimanual_psm_needle"
-    scenes = ("bimanual_psm_needle",)
+    scenes = ("bimanual_psm_needle", "trimanual_psm_ecm_needle")
     hands = 2
     max_steps = 500
     stages = ("reached", "grasped", "lifted", "received", "passed", "at_goal")

@@ -23,6 +23,8 @@ class Snapshot(NamedTuple):
     """Which free objects each agent holds, [n, k] bool."""
     goal: Any
     """Fields of the goal, [n, ...] each."""
+    qpos: Mapping[str, np.ndarray]
+    """Positions of each agent's joints, [n, joints]."""
 
 
 class Wish(NamedTuple):

@@ -20,7 +20,7 @@ from surgical_marl.runtime import jax, jnp
 from surgical_marl.scenes.poses import Pose
 from surgical_marl.tasks.base.object_terms import object_terms
 from surgical_marl.tasks.base.options import Options
-from surgical_marl.tasks.base.script import Step
+from surgical_marl.tasks.base.script import Snapshot, Step, Wish
 from surgical_marl.tasks.base.terms import Picture, Term, arm_terms, picture_terms
 from surgical_marl.tasks.base.world import World
 
@@ -96,6 +96,8 @@ class Task:
     """Whether goals move. If so, every step of an episode counts in its evaluation, and not only the last ones."""
     has_targets: ClassVar[bool] = False
     """Whether `targets` says where tool tips should be."""
+    attends: tuple[str, ...] = ()
+    """Agents that follow no script but what the others do, as `attend` says."""
     wanted: ClassVar[Mapping[str, tuple[str, float]]] = {}
     """What a trained policy should reach: metric -> ("below" or "at least", number)."""
 
@@ -232,6 +234,10 @@ class Task:
     def script(self) -> tuple[Step, ...]:
         """Return how arms can do it, if they need more than to bring their tips to `targets`; the oracle follows it."""
         return ()
+
+    def attend(self, seen: Snapshot) -> Mapping[str, Wish]:
+        """Return what agents of `attends` should do now; the oracle asks at every control step."""
+        raise NotImplementedError
 
     def targets(self, goal: Any) -> np.ndarray:
         """Return where tool tips should be, [N, arms, 3], each in its arm's base frame, m, if the task `has_targets`.

@@ -1,0 +1,387 @@
+"""Camera assistance: the endoscope shows the tools their work, and the tools see nothing else.
+
+The scene says what the tools work at: `reach` where there is no free object, `needle_handover` if it is a needle,
+`peg_transfer` if it is a block.
+
+Agents        the arms of the scene: one endoscope, the camera, and two tools.
+Observation   of a tool: what it observes at its work, but what depends on a place is 0 unless that place, and its own
+              tip where that counts, is in view. Instead of the way to the nearest tip it observes, in the endoscope's
+              frame, `tip_seen`, `other_tips_seen`, `target_seen` and that of the object: each a position and 1, or
+              zeros out of view. And the endoscope's axes in its own base frame, which the joints of both arms say. Of
+              the camera: its joints, and all these places in its frame, whether or not they are in view, with a flag.
+Action        one number in [-1, 1] for every joint; the jaw opens above 0 and closes otherwise.
+Reward        the team's; weights in brackets, beside work with objects a tenth of them. The terms of the work, the mean
+              of both tools. `in_view`, the share of what is to be seen that is in view (1); `centring`, the angle
+              between the view's axis and the middle of that, in half fields of view, at most 3 (-0.5); `depth`, how far
+              all that is from a good distance, as a share of it, at most 1 (-0.5); `travel` of the endoscope's tip
+              (-10 / m). And for each agent its own `clearance` and `collision`, as in the work. To be seen are the
+              tools' tips and the object; in `reach` instead of an object the targets.
+Success       of a tool that of its work; of the camera that both tools succeed and all is in view.
+Termination   as in the work; an episode is truncated after the work's control steps and 100 more (2 s).
+Randomisation the endoscope starts in a posture drawn about one that looks at the tools' home, clear of the tools on
+              the straight way there. Goals are those of the work; in `reach` those at which the endoscope can see the
+              tools at home, their targets and so all between at once. Tools start at home.
+Difficulty    that of the work; and how far the endoscope is turned away at the start, at most, about each of yaw, pitch
+              and roll: easy 12 degrees, so that all is in view, default 35, hard 60.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from surgical_marl.cache import cached
+from surgical_marl.robots.inverse_kinematics import inverse_kinematics
+from surgical_marl.runtime import jax, jnp
+from surgical_marl.tasks import reach
+from surgical_marl.tasks.base.assisting import ROWS, draw_postures, find_roles, later, of_work, visible_targets, work_in
+from surgical_marl.tasks.base.grips import bars
+from surgical_marl.tasks.base.object_task import FAR, ObjectTask
+from surgical_marl.tasks.base.options import Options
+from surgical_marl.tasks.base.script import Snapshot, Step, Wish
+from surgical_marl.tasks.base.task import Start
+from surgical_marl.tasks.base.task import Task as BaseTask
+from surgical_marl.tasks.base.terms import Picture, Term
+from surgical_marl.tasks.base.viewing import Eye, Sights, hidden, seen_places
+from surgical_marl.tasks.base.workspace import TIME
+
+if TYPE_CHECKING:
+    from jax import Array
+
+    from surgical_marl.scenes.scene import Scene
+    from surgical_marl.tasks.base.world import World
+
+SEARCH = TIME
+"""Time in which the endoscope may look for the tools, s, unless it sees all before: as arms may take in `reach`."""
+LATER = 100
+"""Control steps that an episode has beyond those of the work."""
+FOLLOWING = 6
+"""Steps of `Eye.look_at` from the last posture."""
+FURTHEST_OFF, WORST_DEPTH = 3.0, 1.0
+"""Greatest values of the terms `centring` and `depth`."""
+GOAL = "goal"
+"""Name of the place where an object should be."""
+VIEW = {"in_view": 1.0, "centring": -0.5, "depth": -0.5, "travel": -10.0}
+"""Weights of the terms of the view beside those of `reach`, which like them count in each step."""
+BESIDE_OBJECTS = 0.1
+"""Their share beside the work with objects, whose progress counts once."""
+SELF = ("clearance", "collision", "action_change")
+"""Terms of each arm for itself."""
+
+
+class Level(NamedTuple):
+    """A level of difficulty."""
+
+    turn: float
+    """How far the endoscope is turned away at the start, at most, rad."""
+    sees: bool
+    """Whether it sees both tools at the start."""
+
+
+class ViewGoal(NamedTuple):
+    """The goal of an episode, and what the endoscope has done by now."""
+
+    work: Any
+    """Goal of the tools' work."""
+    row: Array
+    """Row of the table of postures."""
+    time: Array
+    """Since the start, s, []."""
+    found: Array
+    """1 once all was in view at once, []."""
+    origin: Array
+    """Where the endoscope's tip was after the last step, world, m, [3]."""
+
+
+class Task(BaseTask):
+    """A camera and two tools."""
+
+    levels = {  # noqa: RUF012
+        "easy": Level(np.radians(12.0), True),
+        "default": Level(np.radians(35.0), False),
+        "hard": Level(np.radians(60.0), False),
+    }
+    default_scene = "trimanual_psm_ecm"
+    scenes = ("trimanual_psm_ecm", "trimanual_psm_ecm_needle", "trimanual_psm_ecm_pegs")
+    wanted = {"in_view_rate": ("at least", 0.999)}  # noqa: RUF012
+
+    def __init__(self, scene: Scene, options: Options) -> None:
+        self.camera, self.tools = find_roles(scene)
+        name, work = work_in(scene)
+        self.work: BaseTask = work(scene, replace(options, task=name, reward={}, start="home"))
+        share = BESIDE_OBJECTS if scene.free_objects else 1.0
+        self.weights = {**self.work.weights, **{name: share * weight for name, weight in VIEW.items()}}
+        super().__init__(scene, options)
+        self._eye = Eye(scene.mounts[self.camera])
+        self.attends = (self.camera,)
+        self.object = self.work.object if isinstance(self.work, ObjectTask) else None
+        self.max_steps = (self.work.max_steps if self.object else reach.Task.max_steps) + LATER
+        self.stages = ("found", *(self.work.stages or ("at_goal",)))  # type: ignore[misc]
+        camera, tools, about = self.camera, self.tools, (repr((self.seed, self.level)), scene.fingerprint)
+        if self.object is None:
+            targets, level = self.work.tables["targets"], repr(self.work.level)
+            seen = cached("camera_assist_goals", lambda: visible_targets(scene, camera, tools, targets), level, *about)
+            self.work.tables["targets"] = seen
+        else:
+            self._middle = bars(scene.objects[self.object].object)[0].mean(0).astype(np.float32)
+        draw = lambda: draw_postures(scene, camera, tools, self.level.turn, self.level.sees, self.seed)  # noqa: E731
+        tables = {f"work_{name}": table for name, table in self.work.tables.items()}
+        self.tables = {"postures": cached("camera_assist", draw, camera, *about), **tables}
+
+    @property
+    def constants(self) -> tuple[Any, ...]:
+        """Those of the work."""
+        return type(self.work).__module__, *self.work.constants
+
+    def bound(self, weights: Mapping[str, Array], tables: Mapping[str, Array]) -> Any:
+        """Return the task, and its work, with other weights and tables."""
+        task = super().bound(weights, tables)
+        own = {name.removeprefix("work_"): table for name, table in tables.items() if name.startswith("work_")}
+        task.work = self.work.bound(weights, own)
+        return task
+
+    def start(self, key: Array) -> Start:
+        """Return how the work starts, with a posture of the endoscope."""
+        begin = self.work.start(key)
+        row = jax.random.randint(jax.random.fold_in(key, 1), (), 0, ROWS)
+        zero = jnp.float32(0.0)
+        goal = ViewGoal(begin.goal, row, zero, zero, jnp.zeros(3, jnp.float32))
+        return Start(goal, self.tables["postures"][row], begin.poses)
+
+    def advance(self, goal: Any, dt: float) -> Any:
+        """Return the goal of the work, and the time, `dt` seconds later."""
+        return goal._replace(work=self.work.advance(goal.work, dt), time=goal.time + np.float32(dt))
+
+    # -- what is in view
+
+    def places(self, world: World) -> dict[str, Array]:
+        """Return what can be seen, in the world, m, [3] each: tips by agent, free objects by name, goals.
+
+        The goal of an object is called `GOAL`; the target of a tool in `reach` is `<agent>/target`.
+        """
+        found, goal = {agent: self._of(agent, world.arms[agent].tool_tip) for agent in self.tools}, world.goal.work
+        if self.object is None:
+            targets = {f"{a}/target": self._of(a, goal.targets[self.scene.agents.index(a)]) for a in self.tools}
+            return found | targets
+        for name, body in world.objects.items():
+            own = name == self.object
+            found[name] = body.position + (body.size * body.rotation @ self._middle if own else np.float32(0.0))
+        return {**found, GOAL: self.work.tables["points"][goal.row]}
+
+    @property
+    def wanted_in_view(self) -> tuple[str, ...]:
+        """The places that are to be seen: both tips and the object, or their targets."""
+        return *self.tools, *([self.object] if self.object else [f"{agent}/target" for agent in self.tools])
+
+    def sights(self, world: World) -> Sights:
+        """Return what the endoscope sees."""
+        axes, origin = self._eye.pose(world.arms[self.camera].qpos)
+        seen = {name: (place - origin) @ axes for name, place in self.places(world).items()}
+        return Sights(seen, {name: self._eye.sees(place) for name, place in seen.items()}, origin)
+
+    def _of(self, agent: str, point: Array) -> Array:
+        """Return a point of an arm's base frame in the world, [3], m."""
+        mount = self.scene.mounts[agent]
+        return point @ mount.rotation.T.astype(np.float32) + mount.position.astype(np.float32)
+
+    def _inside(self, world: World) -> World:
+        """Return the world of the work."""
+        return world._replace(goal=world.goal.work)
+
+    def remember(self, world: World) -> Any:
+        """Return the goal with what the work keeps, whether all has been in view, and where the endoscope's tip is."""
+        _, visible, origin = self.sights(world)
+        found = jnp.maximum(world.goal.found, self._all(visible).astype(jnp.float32))
+        return world.goal._replace(work=self.work.remember(self._inside(world)), found=found, origin=origin)
+
+    def _all(self, visible: Mapping[str, Array]) -> Array:
+        return jnp.stack([visible[name] for name in self.wanted_in_view]).all()
+
+    # -- what agents get
+
+    def reward_terms(self, world: World) -> dict[str, dict[str, Array]]:
+        """Return the team's terms, of the work and of the view, and those of each arm for itself."""
+        work = self.work.reward_terms(self._inside(world))
+        names = [name for name in work[self.tools[0]] if name not in SELF]
+        team = {name: jnp.stack([work[agent][name] for agent in self.tools]).mean() for name in names}
+        seen, visible, origin = self.sights(world)
+        off, depth = self._eye.aim(jnp.stack([seen[name] for name in self.wanted_in_view]))
+        shares = jnp.stack([visible[name] for name in self.wanted_in_view]).astype(jnp.float32)
+        team |= {
+            "in_view": shares.mean(),
+            "centring": _at_most(jnp.sqrt(jnp.sum(off * off) + 1e-12), FURTHEST_OFF),
+            "depth": _at_most(jnp.abs(depth), WORST_DEPTH),
+            "travel": self._travel(world, origin),
+        }
+        return {agent: {**team, **{name: work[agent][name] for name in SELF}} for agent in world.arms}
+
+    def _travel(self, world: World, origin: Array) -> Array:
+        """Return how far the endoscope's tip has moved in this step, m, []."""
+        way = origin - world.goal.origin
+        return _at_most(jnp.sqrt(jnp.sum(way * way) + 1e-18), FAR)
+
+    def success(self, world: World) -> dict[str, Array]:
+        """Return whether each tool succeeds at its work; of the camera whether both do and all is in view."""
+        work = self.work.success(self._inside(world))
+        _, visible, _ = self.sights(world)
+        both = jnp.stack([work[agent] for agent in self.tools]).all()
+        return {agent: both & self._all(visible) if agent == self.camera else work[agent] for agent in world.arms}
+
+    def reached(self, world: World) -> dict[str, dict[str, Array]]:
+        """Return whether all was in view by now, and the stages of the work, or whether the tools succeed."""
+        _, visible, _ = self.sights(world)
+        found = {"found": (world.goal.found > 0) | self._all(visible)}
+        work, done = self.work.reached(self._inside(world)), self.success(world)
+        return {agent: {**found, **(work[agent] or {"at_goal": done[agent]})} for agent in world.arms}
+
+    def metrics(self, world: World) -> dict[str, dict[str, Array]]:
+        """Return what the work does; of the camera, where that has a tip's error, that of the tool with the larger one.
+
+        `in_view`: whether the tool is in view; of the camera the share of the tools that are. Of the camera also
+        `object_in_view`, likewise of the object or the targets; `centre_error`, the term `centring` without its bound,
+        and `camera_travel`, m. `searching`: whether the endoscope may still look for the tools.
+        """
+        work = self.work.metrics(self._inside(world))
+        if self.object is None:
+            worst = jnp.stack([work[agent]["tip_error"] for agent in self.tools]).max()
+            work = {**work, self.camera: {"tip_error": worst}}
+        seen, visible, origin = self.sights(world)
+        names, single = self.wanted_in_view, lambda x: x.astype(jnp.float32)
+        off, _ = self._eye.aim(jnp.stack([seen[name] for name in names]))
+        things = [single(visible[name]) for name in names if name not in self.tools]
+        found = (world.goal.found > 0) | self._all(visible)
+        view = {agent: {"in_view": single(visible[agent])} for agent in self.tools}
+        view[self.camera] = {
+            "in_view": jnp.stack([single(visible[agent]) for agent in self.tools]).mean(),
+            "object_in_view": jnp.stack(things).mean(),
+            "centre_error": jnp.sqrt(jnp.sum(off * off) + 1e-12),
+            "camera_travel": self._travel(world, origin),
+        }
+        searching = single(~found & (world.goal.time < SEARCH))
+        return {agent: {**work[agent], **view[agent], "searching": searching} for agent in world.arms}
+
+    def terminated(self, world: World) -> Array:
+        """Return whether the work ends here."""
+        return self.work.terminated(self._inside(world))
+
+    # -- what agents observe
+
+    def terms(self, agent: str) -> dict[str, Term | Picture]:
+        """Return the terms of the work, hidden from tools out of view, and those of the view."""
+        return self._tool_terms(agent) if agent in self.tools else {**self._work_terms(agent), **self._views()}
+
+    def _work_terms(self, agent: str) -> dict[str, Term | Picture]:
+        """Return the terms of the work, of a world of this task."""
+        inside = lambda read: lambda world: read(self._inside(world))  # noqa: E731
+        terms = self.work.terms(agent)
+        return {n: t._replace(read=inside(t.read)) if isinstance(t, Term) else t for n, t in terms.items()}
+
+    def _tool_terms(self, agent: str) -> dict[str, Term | Picture]:
+        """Return all that a tool may observe."""
+        terms, needs = self._work_terms(agent), self._needs(agent)
+        for name, term in terms.items():
+            if name in needs and isinstance(term, Term):
+                terms[name] = hidden(term, self.sights, needs[name])
+        mount, others = self.scene.mounts[agent], [tool for tool in self.tools if tool != agent]
+
+        def axes(world: World) -> Array:
+            found, _ = self._eye.pose(world.arms[self.camera].qpos)
+            return (mount.rotation.T.astype(np.float32) @ found)[:, :2].T.ravel()
+
+        target = GOAL if self.object else f"{agent}/target"
+        things = {f"{self.object}_seen": seen_places(self.sights, self.object)} if self.object else {}
+        return {
+            **terms,
+            "tip_seen": seen_places(self.sights, agent),
+            "other_tips_seen": seen_places(self.sights, *others),
+            "target_seen": seen_places(self.sights, target, about="team_goal" if self.object else "goal"),
+            **things,
+            "endoscope_axes": Term(axes, -np.ones(6), np.ones(6), "object"),
+        }
+
+    def _needs(self, agent: str) -> dict[str, tuple[str, ...]]:
+        """Return the terms of a tool's work that depend on places, and these."""
+        if self.object is None:
+            target = f"{agent}/target"
+            return {"target": (target,), "to_target": (agent, target)}
+        found = {f"{n}_{p}": (n,) for n in self.scene.free_objects for p in ("position", "rotation", "velocity")}
+        touch = dict.fromkeys(("to_object", "to_useful"), (agent, self.object))
+        goal = dict.fromkeys(("target", "target_rotation"), (GOAL,))
+        return {**found, **touch, **goal, "to_target": (self.object, GOAL), "others_hold": (self.object,)}
+
+    def _views(self) -> dict[str, Term | Picture]:
+        """Return the terms of the camera: it has to know where to look."""
+        things = (self.object, GOAL) if self.object else tuple(f"{agent}/target" for agent in self.tools)
+        return {
+            "tips_in_view": seen_places(self.sights, *self.tools, always=True),
+            "work_in_view": seen_places(self.sights, *things, always=True, about="goal"),
+        }
+
+    def observes(self, agent: str) -> tuple[str, ...]:
+        """Return what a tool observes at its work and what it sees; of the camera its joints and the view."""
+        if agent == self.camera:
+            return "qpos", "qvel", "tool_tip", "command", "min_distance", *self._views()
+        work = (name for name in self.work.observes(agent) if name != "to_nearest_tip")
+        things = (f"{self.object}_seen",) if self.object else ()
+        return *work, "tip_seen", "other_tips_seen", "target_seen", *things, "endoscope_axes"
+
+    @property
+    def informed(self) -> str:
+        """The camera: it shows where the goals are."""
+        return self.camera
+
+    def privileged(self, goal: Any) -> Array:
+        """Return what critics see of the work."""
+        return self.work.privileged(goal.work)
+
+    @property
+    def privileged_bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Bounds of `privileged`."""
+        return self.work.privileged_bounds
+
+    # -- on the host
+
+    def goal_content(self, goal: Any) -> list[np.ndarray]:
+        """Return what the goals of the work are, and where the endoscope begins."""
+        work, postures = self.work.goal_content(of_work(goal)), np.asarray(self.tables["postures"], float)
+        return [*work, postures[goal.row][:, self.scene.qpos_index(self.camera)]]
+
+    def marks(self, goal: Any) -> np.ndarray:
+        """Return what the work marks, without the camera's target."""
+        marks = self.work.marks(of_work(goal))
+        return marks if self.object else marks[:, [self.scene.agents.index(agent) for agent in self.tools]]
+
+    def script(self) -> tuple[Step, ...]:
+        """Return how the tools do their work, once all has been in view: they don't move unseen."""
+        waiting = Step(lambda _: {}, good=lambda seen: np.asarray(seen.goal.found > 0))
+        work = tuple(later(step) for step in self.work.script()) or (Step(self._to_targets),)
+        return waiting, *work
+
+    def _to_targets(self, seen: Snapshot) -> dict[str, Wish]:
+        """Return the wishes that tools are at their targets, on the way that was checked: straight from home."""
+        targets, found = self.work.targets(of_work(seen.goal)), {}
+        for agent in self.tools:
+            own = targets[:, self.scene.agents.index(agent)]
+            found[agent] = Wish(joints=inverse_kinematics(self.scene.mounts[agent].arm, own, starts=1))
+        return found
+
+    def attend(self, seen: Snapshot) -> dict[str, Wish]:
+        """Return the wish that the endoscope looks at what is to be seen, and at the goal of an object on its way."""
+        places = [seen.tools[agent][:, :3, 3] for agent in self.tools]
+        if self.object is None:
+            places += list(np.moveaxis(self.marks(seen.goal), 1, 0))
+        else:
+            work: Any = self.work
+            body, held = seen.objects[self.object], seen.held[work.presenter]
+            places.append(body[:, :3, 3] + body[:, :3, :3] @ self._middle.astype(float))
+            brought = held[:, list(self.scene.free_objects).index(self.object)]
+            places.append(np.where(brought[:, None], self.marks(seen.goal)[:, 0], places[-1]))
+        return {self.camera: Wish(joints=self._eye.look_at(np.stack(places, 1), seen.qpos[self.camera], FOLLOWING))}
+
+
+def _at_most(value: Array, limit: float) -> Array:
+    """Return a value, and the limit where it is larger, or where the physics has failed."""
+    return jnp.where(value < limit, value, limit)
