@@ -32,6 +32,7 @@ def random_trajectory(seed: int, lengths: list[int], arms: int) -> Trajectory:
         missed=error >= 0.002,
         collision=rng.random(shape) < 0.05,
         distance=rng.normal(0.05, 0.05, shape),
+        changes=rng.random(shape),
         tip=rng.normal(0.0, 0.01, (*shape, 3)),
         center=center,
         terms={"cost": rng.random(shape)},
@@ -49,6 +50,7 @@ def expected(trajectory: Trajectory, episode: int, arm: int, following: bool) ->
     while first_good > 0 and error[first_good - 1] < 0.002:
         first_good -= 1
     speed = [math.dist(a, b) / DT for a, b in itertools.pairwise(tip)]
+    changes = [float(trajectory.changes[n, episode, arm]) for n in range(1, count) if error[n - 1] < 0.002]
     return {
         "error": math.sqrt(squared) if following else error[-1],
         "held": held,
@@ -60,6 +62,7 @@ def expected(trajectory: Trajectory, episode: int, arm: int, following: bool) ->
         "path": DT * math.fsum(speed),
         "cost": math.fsum(trajectory.terms["cost"][:count, episode, arm]) / count,
         "smoothness": arc_length(speed) if DT * math.fsum(speed) >= 0.001 else math.nan,
+        "action_change": math.sqrt(math.fsum(changes) / len(changes)) if changes else math.nan,
     }
 
 
@@ -109,7 +112,7 @@ def test_what_an_episode_does_not_have_is_undefined() -> None:
     still = random_trajectory(0, [6, 1], 1)
     still.tip[...], still.error[...], still.distance[...], still.missed[...] = 0.01, 0.5, np.inf, True
     found = measure(still, DT, False)
-    assert np.isnan(found["smoothness"]).all() and np.isnan(found["time"]).all()
+    assert all(np.isnan(found[name]).all() for name in ("smoothness", "time", "action_change"))
     assert (found["path"] == 0).all() and (found["distance"] == np.inf).all()
     one_step = measure(random_trajectory(0, [1], 2), DT, False)
     assert (one_step["path"] == 0).all()

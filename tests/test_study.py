@@ -19,7 +19,7 @@ from surgical_marl.runs.folder import write_config, write_metrics
 from surgical_marl.runs.settings import Settings, load_config
 from surgical_marl.studies import study, study_report, study_runs
 
-MEASURES = ("error", "held", "squared", "distance", "center", "path", "time", "smoothness")
+MEASURES = ("error", "held", "squared", "distance", "center", "path", "time", "smoothness", "action_change")
 
 
 @pytest.fixture

@@ -157,9 +157,12 @@ def _first_episodes(
     """Play the first episodes of the first `count` environments, which have just been reset."""
     lengths = np.zeros(count, int)
     starts, infos, unknown = [], [], np.full(count, np.nan)
+    acted: list[list[np.ndarray]] = []
     for number in range(1, env.max_steps + 1):
         starts.append(np.array(env.qpos[:count], float))
-        step = env.step(dict(policy(observations)))
+        actions = dict(policy(observations))
+        acted.append([np.clip(_numpy(actions[agent], count), -1.0, 1.0) for agent in env.agents])
+        step = env.step(actions)
         observations = step.observations
         told = [step.infos[agent] for agent in env.agents]
         names = dict.fromkeys(
@@ -180,7 +183,13 @@ def _first_episodes(
     missed = success == 0 if np.isnan(tips).all() else ~(tips < SUCCESS_MM / 1000)
     error = np.where(np.isnan(tips), others, tips)
     tip, center = _kinematics(env, np.stack(starts))
-    return Trajectory(lengths, error, success > 0, missed, collision > 0, distance, tip, center, series)
+    changes = np.stack([_changes(np.stack(own)) for own in zip(*acted, strict=True)], -1)
+    return Trajectory(lengths, error, success > 0, missed, collision > 0, distance, changes, tip, center, series)
+
+
+def _changes(actions: np.ndarray) -> np.ndarray:
+    """Return the mean square of how actions [T, E, n] differ from those of the step before, [T, E]; first 0."""
+    return np.square(np.diff(actions.astype(float), axis=0, prepend=actions[:1])).mean(-1)
 
 
 def _kinematics(env: BatchedEnv, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -54,6 +54,8 @@ class Trajectory(NamedTuple):
     """[T, E, A] bool, during each step."""
     distance: np.ndarray
     """[T, E, A], least distance to any other arm after each step, m; inf for an arm alone."""
+    changes: np.ndarray
+    """[T, E, A], mean square of how each step's action differs from that of the step before."""
     tip: np.ndarray
     """[T, E, A, 3], in the base frame at the start of each step, m."""
     center: np.ndarray
@@ -84,9 +86,10 @@ def measure(trajectory: Trajectory, dt: float, following: bool) -> dict[str, np.
     Returns:
         [E, A] each, in m: `error` at the last step (following: root mean square over the steps); `held`, the largest of
         the last `HOLD` seconds (of all steps); `squared` (mean over the steps, m^2); least `distance`, largest
-        `center`, `path` of the tip. Also `collided`; `time` from which on it is not `missed`, s, and
-        `smoothness`, NaN where undefined; the mean of each of the `terms`, over the steps that count of those in
-        `VIEWED`, NaN if there are none; at the last step of those in `LAST`, over all steps together of `TRAVEL`.
+        `center`, `path` of the tip. Also `collided`; `time` from which on it is not `missed`, s, `smoothness`, and
+        `action_change`, the root mean square in steps that begin at the goal, NaN where undefined; the mean of each of
+        the `terms`, over the steps that count of those in `VIEWED`, NaN if there are none; at the last step of those in
+        `LAST`, over all steps together of `TRAVEL`.
     """
     lengths, error = trajectory.lengths[:, None], trajectory.error
     step = np.arange(1, len(error) + 1)[:, None, None]
@@ -98,6 +101,9 @@ def measure(trajectory: Trajectory, dt: float, following: bool) -> dict[str, np.
     final = lambda values: np.take_along_axis(values, lengths[None] - 1, 0)[0]  # noqa: E731
     moves = np.linalg.norm(np.diff(trajectory.tip, axis=0), axis=-1)
     moves = np.where(going[1:], moves, 0.0)
+    settled = going[1:] & ~trajectory.missed[:-1]
+    with np.errstate(invalid="ignore"):
+        change = np.sqrt(np.where(settled, trajectory.changes[1:], 0.0).sum(0) / settled.sum(0))
     shown = going & (trajectory.terms[SEARCHING] == 0) if SEARCHING in trajectory.terms else going
     return {
         "error": np.sqrt(squared) if following else final(error),
@@ -110,6 +116,7 @@ def measure(trajectory: Trajectory, dt: float, following: bool) -> dict[str, np.
         "time": np.where((trajectory.missed & judged).any(0) | following, np.nan, dt * (last_miss + 1)),
         "path": moves.sum(0),
         "smoothness": _smoothness(moves / dt, trajectory.lengths - 1, dt),
+        "action_change": change,
         **{
             name: _reduced(name, values, shown if name in VIEWED else going, final)
             for name, values in trajectory.terms.items()
@@ -153,6 +160,7 @@ def metrics(measures: Mapping[str, np.ndarray], following: bool) -> dict[str, Me
         "time_to_success_s": Metric(measures["time"], _mean_of_known),
         "path_length_mm": Metric(mm["path"], _mean),
         "smoothness": Metric(measures["smoothness"], _mean_of_known),
+        "action_change": Metric(measures["action_change"], _mean_of_known),
         "min_distance_mm": Metric(mm["distance"], lambda values: values.min(-1), extreme=True),
         "remote_center_error_mm": Metric(mm["center"], lambda values: np.fmax.reduce(values, -1), extreme=True),
     }

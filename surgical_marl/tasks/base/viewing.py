@@ -149,9 +149,7 @@ def hidden(term: Term, sights: Callable[[World], Sights], needs: tuple[str, ...]
     return Term(read, np.minimum(term.low, 0.0), np.maximum(term.high, 0.0), term.about)
 
 
-def seen_places(
-    sights: Callable[[World], Sights], *names: str, always: bool = False, about: About = "object"
-) -> Term:
+def seen_places(sights: Callable[[World], Sights], *names: str, always: bool = False, about: About = "object") -> Term:
     """Return a term of places in the endoscope's frame, m, each with a flag that it is in view, [4 each].
 
     Places out of view are zeros, but not if they are `always` known. What a camera shows is `about` objects, unless it
