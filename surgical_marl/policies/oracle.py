@@ -67,7 +67,9 @@ class _Oracle:
         moves = {agent: arm.move(targets, began, to_numpy(seen[agent])) for agent, arm in arms.items()}
         furthest = np.max([np.abs(move).max(-1) for move in moves.values()], axis=0)
         pace = 1 / np.maximum(furthest, 1)[:, None]
-        return {agent: like(seen[agent], without_words(env, pace * move)) for agent, move in moves.items()}
+        # 0 closes a jaw as -1 does, but an actor that imitates it would open the jaw as often as not.
+        moves = {agent: np.where(arms[agent].moves, pace * move, -1.0) for agent, move in moves.items()}
+        return {agent: like(seen[agent], without_words(env, move)) for agent, move in moves.items()}
 
 
 class _Guide:
