@@ -40,7 +40,7 @@ from surgical_marl.scenes.poses import Pose
 from surgical_marl.tasks.base.blocks import OUT, as_numbers, find_pegs, upright
 from surgical_marl.tasks.base.grips import frames
 from surgical_marl.tasks.base.object_task import NEAR, Best, Now, ObjectTask
-from surgical_marl.tasks.base.object_terms import object_terms
+from surgical_marl.tasks.base.object_terms import AT_HAND, PARTS, object_terms
 from surgical_marl.tasks.base.peg_script import SETTINGS, Transfer
 from surgical_marl.tasks.base.peg_trial import APART, POOL, Trial, Turns, draw_trials, in_turn
 from surgical_marl.tasks.base.script import Snapshot, Step
@@ -130,7 +130,7 @@ class Task(ObjectTask):
         self.turns: Turns | None = None
         """At `hard` whose turn it is."""
         if self.level.trial:
-            self.turns, self.max_steps, self.called = Turns(scene, self.object), 9000, "object"
+            self.turns, self.max_steps, self.called = Turns(scene, self.object), 9000, AT_HAND
             self._transfers = [self._transfer(name, back) for back in (False, True) for name in self.turns.blocks]
             self._set_trials(cached("peg_transfer", self._draw_trials, *content), options)
         else:
@@ -302,10 +302,11 @@ class Task(ObjectTask):
         found = super().terms(agent)
         if self.turns is None:
             return found
-        for name, term in object_terms(self.scene, agent).items():
-            if name.startswith(f"{self.object}_"):
-                read = lambda world, term=term: term.read(self.at_hand(world))  # noqa: E731
-                found[name.replace(self.object, self.called, 1)] = term._replace(read=read)
+        own = object_terms(self.scene, agent)
+        for part in PARTS:
+            term = own[f"{self.object}_{part}"]
+            read = lambda world, term=term: term.read(self.at_hand(world))  # noqa: E731
+            found[f"{self.called}_{part}"] = term._replace(read=read)
         return found
 
     def goal_content(self, goal: Any) -> list[np.ndarray]:

@@ -9,6 +9,7 @@ import numpy as np
 
 from surgical_marl.runtime import jnp
 from surgical_marl.tasks.base.grips import bars, frames
+from surgical_marl.tasks.base.object_terms import PARTS
 from surgical_marl.tasks.base.task import PRECISION, Task
 from surgical_marl.tasks.base.terms import Picture, Term
 
@@ -99,7 +100,9 @@ class ObjectTask(Task):
 
     def __init__(self, scene: Scene, options: Options) -> None:
         super().__init__(scene, options)
-        self.object = self.called = find_object(scene, options.task, (self.point,))
+        self.object = find_object(scene, options.task, (self.point,))
+        self.called = self.object
+        """What the terms about it begin with that agents observe."""
         holders = [agent for agent, mount in scene.mounts.items() if mount.arm.jaw and len(mount.arm.jaw.pads) == 2]
         if len(holders) != self.hands:
             raise ValueError(
@@ -293,7 +296,7 @@ class ObjectTask(Task):
     def observes(self, agent: str) -> tuple[str, ...]:
         """Return the terms of the agent itself, of the object and of the goal, then those of the other arms."""
         own, name = super().observes(agent), self.called
-        seen = tuple(f"{name}_{part}" for part in ("position", "rotation", "velocity", "grip"))
+        seen = tuple(f"{name}_{part}" for part in PARTS)
         goal = ("target", "to_target", *(("target_rotation",) if self.oriented else ()))
         others = ("others_hold",) if len(self.scene.agents) > 1 else ()
         return (*own[:4], "contact_force", *seen, "to_object", *goal, "best_lift", *others, *own[4:])
