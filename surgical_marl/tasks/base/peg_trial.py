@@ -121,9 +121,9 @@ def draw_trials(
     """
     found = []
     for pegs, can in zip(sides, possible, strict=True):
-        pools = [_standing(rng, peg - base, shift, can) for peg in pegs]
         sets = np.array(_sets(pegs, blocks))
-        if not len(sets) or not all(map(len, pools)):
+        pools = [_standing(rng, peg - base, shift, can) for peg in pegs] if len(sets) else []
+        if not pools or not all(map(len, pools)):
             raise ValueError(f"a trial of {blocks} blocks needs as many pegs 30 mm apart on each side, all in reach")
         chosen = rng.permuted(sets[rng.integers(len(sets), size=count)], axis=1)
         found.append([[pools[peg][rng.integers(len(pools[peg]))] for peg in row] for row in chosen])
