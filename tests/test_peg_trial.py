@@ -11,6 +11,7 @@ import jax
 import numpy as np
 import pytest
 
+from surgical_marl.content import content_dir
 from surgical_marl.engines.choose import make_engine
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.envs.env import Env
@@ -21,13 +22,17 @@ from surgical_marl.scenes.object_contacts import RESTING, distances
 from surgical_marl.scenes.poses import Pose
 from surgical_marl.tasks.base.peg_trial import APART
 from surgical_marl.tasks.base.world import World
-from tests.helpers.scenes import SIX_BLOCKS
 
 TASK, SCENE = "peg_transfer", "bimanual_psm_pegs"
 BLUE, RED = "block_blue", "block_red"
 FIRST, SECOND, BOTH, NONE = {"psm_0"}, {"psm_1"}, {"psm_0", "psm_1"}, set[str]()
 HIGH = np.array([0.0, 0.0, 0.05])
 """From a block that stands on the plate to one that is clear of the pegs, m."""
+
+DIGITS = (".physics.qpos", *(f".physics.objects.bodies.{part}" for part in ("position", "quaternion", "velocity")))
+
+FORCE = 0.1
+"""What 0.1 um, some units in the last place of a coordinate, are worth in a contact of 1e6 N/m, N."""
 
 
 @cache
@@ -205,14 +210,16 @@ def test_a_block_that_falls_off_the_board_ends_the_trial(block: str) -> None:
 
 
 def test_six_blocks_stand_on_the_outer_columns_and_more_than_pegs_allow_are_refused(tmp_path: Path) -> None:
-    own: Any = Env(TASK, SIX_BLOCKS, difficulty="hard").task
+    own: Any = Env(TASK, "bimanual_psm_pegs_fls", difficulty="hard").task
     places = own.tables["places"].reshape(-1, 12, 6, 7)
     assert own.turns.count == 12 and (places[:, 0, :, 0] < 0).all() and (places[:, 6, :, 0] > 0).all()
     columns = np.abs(places[..., 0])
     assert ((np.abs(columns - 0.04) < 0.0016) | (np.abs(columns - 0.08) < 0.0016)).all()
     seven = tmp_path / "seven.yaml"
     more = "  block_white: {object: block, position: [-0.06, 0.0, 0.0]}\n"
-    seven.write_text(Path(SIX_BLOCKS).read_text().replace("view:", f"{more}view:"))
+    seven.write_text(
+        (content_dir("scenes") / "bimanual_psm_pegs_fls.yaml").read_text().replace("view:", f"{more}view:")
+    )
     with pytest.raises(ValueError, match="a trial of 7 blocks needs as many pegs 30 mm apart"):
         Env(TASK, str(seven), difficulty="hard")
 
@@ -220,16 +227,16 @@ def test_six_blocks_stand_on_the_outer_columns_and_more_than_pegs_allow_are_refu
 @pytest.mark.slow
 def test_both_engines_play_the_same_trial() -> None:
     """A step of each from states along the oracle's transfers: what is counted is the same, and what is observed is as
-    near as the reference is to itself when the last digit of the joints changes."""
+    near as the reference is to itself when the last digits of joints and blocks change."""
     many = BatchedEnv(TASK, SCENE, num_envs=16, difficulty="hard", engine="fused", device="cpu")
     acting, reference = load_policy("oracle", many), make_engine(many.env, 16, "mjx", "cpu")
     seen, placed = many.reset(0)[0], 0.0
     reference.reset(0)
 
     def expected(carry: dict[str, np.ndarray], actions: dict[str, Any], way: float) -> Any:
-        moved = np.nextafter(carry[".physics.qpos"], np.float32(way)) if way else carry[".physics.qpos"]
-        for name, value in {**carry, ".physics.qpos": moved}.items():
-            reference.write(name, value)
+        for name, value in carry.items():
+            changed = way and name in DIGITS
+            reference.write(name, np.nextafter(value, np.float32(way)) if changed else value)
         reference.step({agent: np.float32(np.clip(action, -1, 1)) for agent, action in actions.items()})
         return jax.tree.map(np.array, reference.outcome("numpy"))
 
@@ -242,7 +249,10 @@ def test_both_engines_play_the_same_trial() -> None:
                 found, (same, *others) = step.observations[agent], [own["observations"][agent] for own in outcomes]
                 response = np.max([np.abs(other - same).max(0) for other in others], 0)
                 allowed = 1e-4 * (np.abs(same).max(0) + 0.1) + 10 * response
-                assert (np.abs(found - same).max(0) <= allowed).all(), (number, agent)
+                for term in ("contact_force", "object_grip"):
+                    allowed[many.observation_terms(agent)[term].start] += FORCE
+                off = np.abs(found - same).max(0)
+                assert (off <= allowed).all(), (number, agent, np.flatnonzero(off > allowed), off / allowed)
                 for name in ("success", "score", "score_time", "drop", "stage_passed", "reward_placed"):
                     np.testing.assert_array_equal(outcomes[0]["infos"][agent][name], step.infos[agent][name], name)
         seen, placed = step.observations, placed + step.infos["psm_0"]["reward_placed"].sum()

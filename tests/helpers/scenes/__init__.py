@@ -6,5 +6,3 @@ APART = str(Path(__file__).parent / "apart.yaml")
 """Arms of two kinds that never touch, in no order of their names."""
 WATCHED = str(Path(__file__).parent / "watched.yaml")
 """A PSM, tissue, and an ECM that sees them."""
-SIX_BLOCKS = str(Path(__file__).with_name("six_blocks.yaml"))
-"""The peg board with six blocks."""
