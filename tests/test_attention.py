@@ -78,6 +78,14 @@ def test_teammates_and_objects_are_the_entities() -> None:
     assert set(things) == set.union(*(inside(name) for name in terms if name.startswith("needle_")))
 
 
+def test_the_object_whose_turn_it_is_is_an_entity_as_one_that_stays_the_same() -> None:
+    found = []
+    for level in ("default", "hard"):
+        env = BatchedEnv("peg_transfer", "bimanual_psm_pegs", difficulty=level, engine="mjx", device="cpu")
+        found.append(find_entities(env, Layout(env)))
+    assert found[0] == found[1] and [len(kind) for kind in found[0]["psm"]] == [1]
+
+
 def test_teammates_of_a_type_are_a_kind_and_mere_voices_are_one() -> None:
     make = lambda **options: BatchedEnv("reach", "trimanual_psm_ecm", engine="mjx", device="cpu", **options)  # noqa: E731
     seeing, hearing = make(knowledge="all"), make(messages=2)

@@ -108,6 +108,18 @@ def test_an_object_is_dropped_once_and_at_its_goal_from_when_it_stays() -> None:
     assert rates["drop_rate"].reduce(rates["drop_rate"].values.ravel()) == pytest.approx(1 / 3)
 
 
+def test_the_score_of_a_trial_is_that_of_its_last_step() -> None:
+    lengths = [3, 5]
+    played = random_trajectory(0, lengths, 2)
+    points = np.array([[0, 1], [1, 1], [1, 2], [9, 2], [9, 3]], float)[..., None].repeat(2, -1)
+    told = {"score": points, "score_time": 10 * points}
+    found = metrics(
+        {name: values[None] for name, values in measure(played._replace(terms=told), DT, False).items()}, False
+    )
+    assert found["score"].values[0].tolist() == [[1, 1], [3, 3]]
+    assert found["score_time_s"].values[0].tolist() == [[10, 10], [30, 30]]
+
+
 def test_what_an_episode_does_not_have_is_undefined() -> None:
     still = random_trajectory(0, [6, 1], 1)
     still.tip[...], still.error[...], still.distance[...], still.missed[...] = 0.01, 0.5, np.inf, True

@@ -22,8 +22,9 @@ from surgical_marl.scenes.object_contacts import RESTING, distances
 from surgical_marl.scenes.poses import Pose
 from surgical_marl.tasks.base.blocks import find_pegs, gripping, upright
 from surgical_marl.tasks.base.object_task import Best
+from surgical_marl.tasks.base.peg_script import ABOVE_WALL
 from surgical_marl.tasks.base.world import World
-from surgical_marl.tasks.peg_transfer import ABOVE_WALL, CLEAR, SHIFT, PegGoal, Team
+from surgical_marl.tasks.peg_transfer import CLEAR, SHIFT, PegGoal, Team
 
 TASK, SCENE = "peg_transfer", "bimanual_psm_pegs"
 ROW = 5
@@ -62,16 +63,21 @@ def test_a_kernel_of_one_level_does_not_serve_another_one() -> None:
     assert needles[0].content != needles[1].content
 
 
-def test_in_the_exchange_both_tools_grip_bars_of_their_sides_clear_of_the_wall() -> None:
-    task: Any = env().task
-    number = task._grasps
-    block = task._exchange(number)
+@pytest.mark.parametrize("turn, left, right", [(0, "psm_0", "psm_1"), (2, "psm_1", "psm_0")])
+def test_in_the_exchange_both_tools_grip_bars_of_their_sides_clear_of_the_wall(
+    turn: int, left: str, right: str
+) -> None:
+    """Of the giver on its own side and the taker on its own, there and back."""
+    task: Any = env("hard").task
+    way, number = task._transfers[turn], np.arange(3)
+    assert (way.giver, way.taker) == (left, right)
+    block = way.exchange(number)
     np.testing.assert_allclose(block[:, :3, 3], np.tile([0.0, 0.0, ABOVE_WALL], (3, 1)), atol=1e-9)
     tips = {}
-    for agent, grip in (("psm_0", number), ("psm_1", task._next(number))):
+    for agent, grip in ((way.giver, number), (way.taker, way.taken(number))):
         mount = task.scene.mounts[agent]
-        assert task._reaches(mount, block, grip).all()
-        tips[agent] = gripping(mount, block, task._sites[grip], 0.0)[:, :3, 3]
+        assert way.reaches(agent, block, grip).all()
+        tips[agent] = gripping(mount, block, way.sites[grip], 0.0)[:, :3, 3]
     assert (tips["psm_0"][:, 0] < -0.004).all() and (tips["psm_1"][:, 0] > 0.004).all()
     assert ABOVE_WALL - 0.0075 > 0.07 + 0.01  # underside of the block, top of the wall
 

@@ -20,7 +20,8 @@ from surgical_marl.scenes.load import load_scene
 
 CARD, CLIP, EVALUATION = "README.md", "clip.mp4", "evaluation.json"
 SHOWN = ("median_error_mm", "p95_error_mm", "rmse_mm", "success_1mm", "success_2mm", "success_5mm", "team_success_2mm",
-         "success_rate", "collision_rate", "time_to_success_s", "image_error", "angle_error_deg")  # fmt: skip
+         "success_rate", "score", "score_time_s", "collision_rate", "time_to_success_s", "image_error",
+         "angle_error_deg")  # fmt: skip
 COLUMNS = (
     *("policy", "median error of the worst arm (mm)", "on training goals (mm)", "RMSE (mm)", "within 2 mm"),
     *("from random starts", "collisions", "median error of each training seed (mm)", "training", "misses"),

@@ -23,6 +23,8 @@ LAST = {
     "angle_error": ("angle_error_deg", 180 / math.pi),
     "image_error": ("image_error", 1.0),
     "goal_angle": ("goal_angle_deg", 180 / math.pi),
+    "score": ("score", 1.0),
+    "score_time": ("score_time_s", 1.0),
 }
 """Infos of some agents whose value after the last step counts: name -> name and unit factor of the metric."""
 VIEWED = {

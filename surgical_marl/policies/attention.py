@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from surgical_marl.envs.knowledge import MESSAGES
 from surgical_marl.policies.layout import Layout
-from surgical_marl.tasks.base.object_terms import object_terms
+from surgical_marl.tasks.base.object_terms import AT_HAND, PARTS
 
 if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv
@@ -96,9 +96,8 @@ def _entities(env: BatchedEnv, agent: str) -> Entities:
             own[MESSAGES] = slice(said.start + number * each, said.start + (number + 1) * each)
         kind = (scene.mounts[mate].arm.name, *own) if len(own) > (said is not None) else ()
         found.setdefault(kind, []).append(_columns(own))
-    for thing in scene.free_objects:
-        names = [name for name in object_terms(scene, agent) if name in terms and name.startswith(f"{thing}_")]
-        own = {name.removeprefix(f"{thing}_"): terms[name] for name in names}
+    for thing in (*scene.free_objects, AT_HAND):
+        own = {part: terms[name] for part in PARTS if (name := f"{thing}_{part}") in terms}
         found.setdefault(("object", *own), []).append(_columns(own))
     kinds = tuple(tuple(kind) for kind in found.values() if kind[0])
     if not kinds:

@@ -80,8 +80,9 @@ class Scripted:
         snapshot, qpos = self._look(due), np.asarray(self._env.qpos, float)
         after = np.minimum(now + 1, last)
         for number, step in enumerate(self._steps):
-            if step.good is not None:
-                after[(now == number) & ~step.good(snapshot)] = step.back
+            if step.good is not None and (now == number).any():
+                missed = np.flatnonzero((now == number) & ~step.good(snapshot))
+                after[missed] = step.back(_rows(snapshot, missed)) if callable(step.back) else step.back
         after[began] = 0
         self._now[due] = after
         for agent, tool in self._tools.items():

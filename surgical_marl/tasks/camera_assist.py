@@ -111,6 +111,10 @@ class Task(BaseTask):
     def __init__(self, scene: Scene, options: Options) -> None:
         self.camera, self.tools = find_roles(scene)
         name, work = work_in(scene)
+        if getattr(work.levels.get(options.difficulty), "trial", False):
+            raise ValueError(
+                f"difficulty of camera_assist must be easy or default where the work is {name}, not 'hard'"
+            )
         self.work: BaseTask = work(scene, replace(options, task=name, reward={}, start="home"))
         share = BESIDE_OBJECTS if scene.free_objects else 1.0
         self.weights = {**self.work.weights, **{name: share * weight for name, weight in VIEW.items()}}

@@ -17,7 +17,15 @@ Termination   when the block, once lifted, is touched by no finger and is on no 
 Randomisation the block stands on any peg of the first arm's side of the wall, turned and shifted at random as far as
               the peg lets it. Its goal is a free peg of the other side, if `easy` of the same side. Kept only if the
               arms reach their grips, off their joints' limits. Arms start at home.
-Difficulty    easy: one arm moves the block to one of the nearest pegs, 20 or 30 mm away. default: over the wall.
+Difficulty    easy: one arm moves the block to one of the nearest pegs, 20 or 30 mm away. default: over the wall. hard:
+              a trial of three minutes by the rules of the challenge. All blocks of the scene start on pegs of the first
+              arm's side, 30 mm or more apart, and go over the wall one after the other, and then back, again and again.
+              What is said above holds for the block whose turn it is: agents observe it as `object_position` and so on,
+              as many numbers as at `default`, and arms have the roles of its direction. `placed` (25) is a point: the
+              block stands on its goal peg in its turn, after both arms held it and then the second one alone. Then
+              comes the next block, and progress is paid anew. Blocks that are moved out of turn are no points. A drop
+              ends nothing; a block that falls off the board does. Success: all have been there and back. In training
+              episodes start with any turn.
 """
 
 from __future__ import annotations
@@ -27,26 +35,29 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from surgical_marl.cache import cached
-from surgical_marl.robots.rotation import quaternion, turned
 from surgical_marl.runtime import jax, jnp
 from surgical_marl.scenes.poses import Pose
-from surgical_marl.tasks.base.blocks import OUT, find_pegs, gripping, upright
-from surgical_marl.tasks.base.grips import frames, joints_at, moved, tool_of
+from surgical_marl.tasks.base.blocks import OUT, as_numbers, find_pegs, upright
+from surgical_marl.tasks.base.grips import frames
 from surgical_marl.tasks.base.object_task import NEAR, Best, Now, ObjectTask
-from surgical_marl.tasks.base.script import Snapshot, Step, Wish
+from surgical_marl.tasks.base.object_terms import AT_HAND, PARTS, object_terms
+from surgical_marl.tasks.base.peg_script import SETTINGS, Transfer
+from surgical_marl.tasks.base.peg_trial import APART, POOL, Trial, Turns, draw_trials, in_turn
+from surgical_marl.tasks.base.script import Snapshot, Step
 from surgical_marl.tasks.base.task import Start
 from surgical_marl.tasks.base.workspace import choose
 
 if TYPE_CHECKING:
     from jax import Array
 
-    from surgical_marl.scenes.scene import Mount, Scene
+    from surgical_marl.scenes.scene import Scene
     from surgical_marl.tasks.base.options import Options
+    from surgical_marl.tasks.base.terms import Picture, Term
     from surgical_marl.tasks.base.world import World
 
 ROWS = 2048
-ABOVE_WALL = 0.09
-"""Height of the block's middle in the exchange, m in the world: its underside is 12 mm above the wall."""
+TRIALS = 512
+"""Trials that the tables at `hard` are of."""
 AROUND = 0.0035
 """A block is around a peg where the axes of its hole and of the peg are nearer than this, m. Up to 2.7 mm are free."""
 STANDS = 0.002
@@ -55,15 +66,6 @@ SHIFT = 0.0015
 """Greatest distance of a block from its peg's axis at the start, m."""
 CLEAR = 0.024
 """Height of a block's underside above the plate from which on it is clear of the pegs, m: these are 20 mm high."""
-PAST, WIDE = 0.0025, 0.45
-"""How far the oracle's tool tip goes past the bar, m, and the share by which its jaw opens: one finger goes between bar
-and peg."""
-OVER, RAISE, AWAY = 0.012, 0.030, 0.035
-"""How far the tool tip stops above the bar, how far it lifts the block, and how far an arm is from the wall before and
-after the exchange, m."""
-SIDE = 150.0
-"""In the exchange the first tool grips the bar that is this way from the block's axis, degrees about z; the second tool
-grips the next one clockwise, at 30 degrees."""
 
 
 class PegLevel(NamedTuple):
@@ -73,6 +75,8 @@ class PegLevel(NamedTuple):
     """Greatest distance of the goal from the start, m."""
     handover: bool
     """Whether the goal is on the other side of the wall."""
+    trial: bool = False
+    """Whether all blocks are moved in turn, there and back."""
     oriented: bool = False
     """Whether the goal has an orientation."""
 
@@ -95,15 +99,17 @@ class PegGoal(NamedTuple):
     """Row of the tables."""
     best: Best
     team: Team
+    trial: Any = ()
+    """At `hard` what happened in the `Trial` so far."""
 
 
 class Task(ObjectTask):
     """Moving a block from peg to peg."""
 
-    levels = {"easy": PegLevel(0.032, False), "default": PegLevel(1.0, True)}  # noqa: RUF012
+    levels = {"easy": PegLevel(0.032, False), "default": PegLevel(1.0, True), "hard": PegLevel(1.0, True, True)}  # noqa: RUF012
     weights = {  # noqa: RUF012
         **ObjectTask.weights, "carry": 20.0, "receive": 4.0, "passed": 4.0, "over": 4.0, "success": 0.5,
-        "clearance": 0.0,
+        "placed": 25.0, "clearance": 0.0,
     }  # fmt: skip
     default_scene = "bimanual_psm_pegs"
     scenes = ("bimanual_psm_pegs", "trimanual_psm_ecm_pegs")
@@ -119,33 +125,81 @@ class Task(ObjectTask):
             self.presenter, self.max_steps = self.picker, 300
         self._item = scene.objects[self.object].object
         self._pegs = find_pegs(scene, options.task).astype(np.float32)
-        self._grasps = np.array([i for i, name in enumerate(self._item.sites) if name.startswith("grasp_")])
-        about = repr((self.object, self.level, self.seed, SHIFT, PAST, OUT, OVER, RAISE, CLEAR, ABOVE_WALL, SIDE))
-        table = cached("peg_transfer", lambda: self._draw(scene), about, scene.fingerprint, self._item.content)
-        self._set_tables(table[:, :7], frames(table[:, 7:10], table[:, 10:14]))
-        self.grips = table[:, 14].astype(int)
-        """Of the oracle: the number of the site that the first arm grips."""
+        about = repr((self.object, self.level, self.seed, SHIFT, OUT, SETTINGS, APART, POOL, TRIALS))
+        content = about, scene.fingerprint, self._item.content
+        self.turns: Turns | None = None
+        """At `hard` whose turn it is."""
+        if self.level.trial:
+            self.turns, self.max_steps, self.called = Turns(scene, self.object), 9000, AT_HAND
+            self._transfers = [self._transfer(name, back) for back in (False, True) for name in self.turns.blocks]
+            self._set_trials(cached("peg_transfer", self._draw_trials, *content), options)
+        else:
+            self._transfers = [self._transfer(self.object, False)]
+            table = cached("peg_transfer", self._draw, *content)
+            self._set_tables(table[:, :7], frames(table[:, 7:10], table[:, 10:14]))
+
+    def _set_trials(self, places: np.ndarray, options: Options) -> None:
+        """Set the tables from where all blocks stand at the beginning of each turn, [rows, blocks * 7].
+
+        Trials begin with the first turn. In training they begin with any turn, so that both directions are learned.
+        """
+        turns, rows = self.turns, np.arange(len(places))
+        assert turns is not None
+        each = places.reshape(len(rows), -1, 7)
+        end = each[turns.following(rows), turns.number(rows), :3]
+        pegs = self._pegs[np.linalg.norm(end[:, None, :2] - self._pegs[:, :2], axis=-1).argmin(1)]
+        goals = upright(pegs - self._item.sites[self.point][0], np.zeros(len(rows)))
+        self._set_tables(each[rows, turns.number(rows)], goals)
+        first = rows if options.goals == "training" else rows - rows % turns.count
+        self.tables |= {"places": places, "first": first}
 
     @property
     def constants(self) -> tuple[Any, ...]:
-        """Those of every such task, and whether the block is handed over."""
-        return *super().constants, self.level.handover
+        """Those of every such task, whether the block is handed over, and the blocks that are moved in turn."""
+        return *super().constants, self.level.handover, () if self.turns is None else self.turns.blocks
 
     def start(self, key: Array) -> Start:
-        """Return where the block stands, and the goal."""
-        row = jax.random.randint(key, (), 0, ROWS)
-        place = self.tables["starts"][row]
-        goal = PegGoal(row, self.nothing, Team(*[jnp.float32(0.0)] * 3))
-        return Start(goal, poses={self.object: Pose(place[:3], place[3:])})
+        """Return where the blocks stand, and the goal."""
+        team = Team(*[jnp.float32(0.0)] * 3)
+        if self.turns is None:
+            row = jax.random.randint(key, (), 0, ROWS)
+            place = self.tables["starts"][row]
+            return Start(PegGoal(row, self.nothing, team), poses={self.object: Pose(place[:3], place[3:])})
+        first = self.tables["first"]
+        row = first[jax.random.randint(key, (), 0, first.shape[0])]
+        own = self.tables["places"][row].reshape(-1, 7)
+        poses = {name: Pose(own[i, :3], own[i, 3:]) for i, name in enumerate(self.turns.blocks)}
+        return Start(PegGoal(row, self.nothing, team, Trial(*[jnp.float32(0.0)] * 4)), poses=poses)
+
+    def advance(self, goal: Any, dt: float) -> Any:
+        """Return the goal `dt` seconds later."""
+        if self.turns is None:
+            return goal
+        return goal._replace(trial=goal.trial._replace(time=goal.trial.time + np.float32(dt)))
 
     # -- what is measured
 
+    def at_hand(self, world: World) -> World:
+        """Return the world in which the block whose turn it is has the name `self.object`."""
+        return world if self.turns is None else self.turns.at_hand(world, self.object)
+
     def now(self, world: World) -> Now:
-        """Return what is measured in a world; a block that is around a peg is not dropped."""
+        """Return what is measured in a world; a block that is around a peg is not dropped.
+
+        At `hard` what belongs to each arm is that of its role in this turn, and a block is dropped only once.
+        """
         now = super().now(world)
         away = self._base(world)[:2] - self._pegs[:, :2]
         around = jnp.min(jnp.sum(away * away, -1)) < AROUND**2
-        return now._replace(dropped=now.dropped & ~(around & (self._height(world) > -STANDS)))
+        dropped = now.dropped & ~(around & (self._height(world) > -STANDS))
+        if self.turns is None:
+            return now._replace(dropped=dropped)
+        dropped &= world.goal.trial.fallen <= 0
+        parts: dict[str, Any] = {
+            name: self.turns.roles(world.goal.row, getattr(now, name), self.picker, self.presenter)
+            for name in ("reach", "part", "held", "touched")
+        }
+        return now._replace(dropped=dropped, **parts)
 
     def further(self, world: World, now: Now) -> Team:
         """Return what the arms have done by now, and whether this was the first time or not."""
@@ -160,23 +214,62 @@ class Task(ObjectTask):
     def stands(self, world: World) -> Array:
         """Return whether the block stands on its goal peg and no finger touches it, [] bool."""
         away = (self._base(world) - self.tables["points"][world.goal.row])[:2]
-        loose = jnp.stack([view.handles[self.object].force <= 0 for view in world.arms.values()]).all()
+        arms = self.at_hand(world).arms.values()
+        loose = jnp.stack([view.handles[self.object].force <= 0 for view in arms]).all()
         return loose & (jnp.sum(away * away) < AROUND**2) & (jnp.abs(self._height(world)) < STANDS)
 
+    def placed(self, world: World) -> Array:
+        """Return whether a point is made now: the block stands on its goal peg, and was handed over, [] bool."""
+        team = world.goal.team
+        return self.stands(world) & (team.receive > 0) & (team.passed > 0)
+
     def remember(self, world: World) -> Any:
-        """Return the goal with the best so far."""
-        return super().remember(world)._replace(team=self.further(world, self.now(world)))
+        """Return the goal with the best so far. At `hard` it becomes that of the next turn when a block is placed."""
+        now = self.now(world)
+        goal = super().remember(world)._replace(team=self.further(world, now))
+        if self.turns is None:
+            return goal
+        placed, trial = self.placed(world), goal.trial
+        lifted = jnp.stack(list(now.held.values())).any() & (now.lift >= 1.0)
+        fallen = jnp.where(lifted | placed, 0.0, jnp.maximum(trial.fallen, now.dropped.astype(jnp.float32)))
+        score, scored = self._score(world)
+        following = PegGoal(self.turns.following(goal.row), self.nothing, Team(*[jnp.float32(0.0)] * 3), trial)
+        goal = jax.tree.map(lambda new, old: jnp.where(placed, new, old), following, goal)
+        goal = goal._replace(trial=Trial(score, scored, trial.time, fallen))
+        return super().remember(world._replace(goal=goal))
+
+    def _score(self, world: World) -> tuple[Array, Array]:
+        """Return the points of a trial, and the time of the last one, s, with what is placed now."""
+        placed, trial = self.placed(world), world.goal.trial
+        return trial.score + placed.astype(jnp.float32), jnp.where(placed, trial.time, trial.scored)
+
+    def terminated(self, world: World) -> Array:
+        """Return whether the block has been dropped or lost; at `hard` whether any block is below the plate's top."""
+        if self.turns is None:
+            return super().terminated(world)
+        heights = jnp.stack([world.objects[name].position[2] for name in self.turns.blocks])
+        return ~(heights >= self._pegs[0, 2]).all()
+
+    def metrics(self, world: World) -> dict[str, dict[str, Array]]:
+        """Return those of all tasks with objects, and at `hard` `score` and `score_time`, s."""
+        found = super().metrics(world)
+        if self.turns is None:
+            return found
+        score, scored = self._score(world)
+        return {agent: {**own, "score": score, "score_time": scored} for agent, own in found.items()}
 
     def reward_terms(self, world: World) -> dict[str, dict[str, Array]]:
-        """Return the terms of every task that brings an object to a goal, and `receive`, `passed` and `over`."""
+        """Return the terms of every task that brings an object to a goal, `receive`, `passed`, `over` and `placed`."""
         new = self.further(world, self.now(world))
         more = {name: value - best for name, value, best in zip(Team._fields, new, world.goal.team, strict=True)}
         more["success"] = self.stands(world).astype(jnp.float32)
+        more["placed"] = jnp.float32(0.0) if self.turns is None else self.placed(world).astype(jnp.float32)
         return {agent: {**terms, **more} for agent, terms in super().reward_terms(world).items()}
 
     def success(self, world: World) -> dict[str, Array]:
-        """Return whether the block stands on its goal peg, for all agents."""
-        return dict.fromkeys(world.arms, self.stands(world))
+        """Return whether the block stands on its goal peg; at `hard` whether all have been there and back."""
+        done = self.stands(world) if self.turns is None else self._score(world)[0] >= self.turns.count
+        return dict.fromkeys(world.arms, done)
 
     def reached(self, world: World) -> dict[str, dict[str, Array]]:
         """Return which stages are reached now, for all arms; of one arm `received` and `passed` are those of a hold."""
@@ -195,107 +288,65 @@ class Task(ObjectTask):
 
     def _base(self, world: World) -> Array:
         """Return the middle of the block's underside in the world, [3], m."""
-        body = world.objects[self.object]
+        body = self.at_hand(world).objects[self.object]
         return body.position + body.rotation @ self._point
 
     def _height(self, world: World) -> Array:
         """Return its height above the plate, [] m."""
         return self._base(world)[2] - self._pegs[0, 2]
 
+    # -- what agents observe
+
+    def terms(self, agent: str) -> dict[str, Term | Picture]:
+        """Return the terms of every task with objects; at `hard` also those of the block whose turn it is."""
+        found = super().terms(agent)
+        if self.turns is None:
+            return found
+        own = object_terms(self.scene, agent)
+        for part in PARTS:
+            term = own[f"{self.object}_{part}"]
+            read = lambda world, term=term: term.read(self.at_hand(world))  # noqa: E731
+            found[f"{self.called}_{part}"] = term._replace(read=read)
+        return found
+
+    def goal_content(self, goal: Any) -> list[np.ndarray]:
+        """Return where the block begins and should be; at `hard` where all blocks begin, and all goals of the trial."""
+        if self.turns is None:
+            return super().goal_content(goal)
+        points, places = (np.asarray(self.tables[name], float) for name in ("points", "places"))
+        row = np.asarray(goal.row)
+        every = (row - row % self.turns.count)[:, None] + np.arange(self.turns.count)
+        return [places[row], points[every]]
+
     # -- the oracle
 
     def script(self) -> tuple[Step, ...]:
-        """Return how the arms do it: lift the block, hand it over above the wall if needed, lower it on the peg."""
-        agent = self.presenter
-        over = lambda seen, height: self.goals[seen.goal.row][:, :3, 3] + np.array([0.0, 0.0, height])  # noqa: E731
-        place = (
-            Step(lambda seen: self._carry(seen, over(seen, RAISE)), wait=0.1, pace=0.5),
-            Step(lambda seen: self._carry(seen, over(seen, RAISE / 2)), pace=0.3),
-            Step(lambda seen: self._carry(seen, over(seen, 0.0005)), wait=0.1, pace=0.3),
-            Step(lambda seen: {agent: Wish(opens=WIDE)}, wait=0.2),
-            Step(lambda seen: _shifted(seen, agent, [0, 0, RAISE / 2], WIDE), pace=0.3),
-            Step(lambda seen: {agent: Wish(opens=WIDE)}),
-        )
-        return (*self._pick(), *(self._pass_on() if self.level.handover else ()), *place)
+        """Return how the arms move the block, or at `hard` all blocks in turn.
 
-    def _pick(self) -> tuple[Step, ...]:
-        """Return how the first arm lifts the block off its peg."""
-        agent, number = self.picker, lambda seen: self.grips[seen.goal.row]
-        holds = lambda seen: seen.held[agent][:, self._number]  # noqa: E731
-        return (
-            Step(lambda seen: self._grip(seen, agent, number(seen), -OVER), wait=0.1),
-            Step(lambda seen: self._grip(seen, agent, number(seen), PAST), wait=0.1, pace=0.3),
-            Step(lambda seen: {agent: Wish()}, wait=0.3, good=holds),
-            Step(lambda seen: _shifted(seen, agent, [0, 0, RAISE / 2]), pace=0.3, good=holds),
-            Step(lambda seen: _shifted(seen, agent, [0, 0, RAISE / 2]), wait=0.1, pace=0.4),
-        )
+        There each turn begins with a step that looks whose it is, so that a block that was not placed is tried again.
+        """
+        if self.turns is None:
+            return self._transfers[0].steps()
+        length = 1 + len(self._transfers[0].steps())
 
-    def _pass_on(self) -> tuple[Step, ...]:
-        """Return how the first arm hands the block over above the wall, and the second one takes it aside."""
-        giver, taker = self.picker, self.presenter
-        across = _across(self.scene, giver, taker)
+        def of_turn(seen: Snapshot) -> np.ndarray:
+            return np.asarray(1 + length * (seen.goal.row % self.turns.count))  # type: ignore[union-attr]
 
-        def offer(seen: Snapshot, way: Any) -> dict[str, Wish]:
-            grip = self.grips[seen.goal.row]
-            there = self._exchange(grip)
-            held = np.linalg.inv(seen.objects[self.object]) @ seen.tools[giver]
-            taken = gripping(self.scene.mounts[taker], there, self._sites[self._next(grip)], 0.0)
-            waits = moved(taken, AWAY * across + [0.0, 0.0, OVER])
-            return {giver: Wish(moved(there, way) @ held), taker: Wish(waits, opens=WIDE)}
+        look = Step(lambda seen: {}, good=lambda seen: np.zeros(len(seen.goal.row), bool), back=of_turn)
+        turns = [(*own.steps(1 + length * number), look) for number, own in enumerate(self._transfers)]
+        return (look, *(step for turn in turns for step in turn))
 
-        def take(seen: Snapshot, beyond: float) -> dict[str, Wish]:
-            return self._grip(seen, taker, self._next(self.grips[seen.goal.row]), beyond)
+    def _transfer(self, name: str, back: bool) -> Transfer:
+        giver, taker = (self.presenter, self.picker) if back else (self.picker, self.presenter)
+        return Transfer(self.scene, name, giver, taker, back, lambda seen: self.goals[seen.goal.row])
 
-        def aside(seen: Snapshot) -> dict[str, Wish]:
-            return self._carry(seen, self._place + AWAY * across)
+    # -- where blocks and goals are
 
-        return (
-            Step(lambda seen: offer(seen, [0.0, 0.0, 0.01] - AWAY * across), pace=0.6),
-            Step(lambda seen: offer(seen, [0.0, 0.0, 0.0]), wait=0.2, pace=0.5),
-            Step(lambda seen: take(seen, -OVER), wait=0.1, pace=0.6),
-            Step(lambda seen: take(seen, PAST), wait=0.1, pace=0.3),
-            Step(lambda seen: {taker: Wish()}, wait=0.3, good=lambda s: s.held[taker][:, self._number], back=7),
-            Step(lambda seen: {giver: Wish(opens=WIDE)}, wait=0.2),
-            Step(lambda seen: _shifted(seen, giver, [0, 0, RAISE / 2], WIDE), pace=0.3),
-            Step(lambda seen: _shifted(seen, giver, -AWAY * across, WIDE), pace=0.6),
-            Step(aside, pace=0.5),
-        )
-
-    def _grip(self, seen: Snapshot, agent: str, number: np.ndarray, beyond: float) -> dict[str, Wish]:
-        tool = gripping(self.scene.mounts[agent], seen.objects[self.object], self._sites[number], beyond)
-        return {agent: Wish(tool, opens=WIDE)}
-
-    def _carry(self, seen: Snapshot, place: np.ndarray) -> dict[str, Wish]:
-        """Return the wish that the held block is upright at a place [n, 3], turned so that the tool turns least."""
-        agent = self.presenter
-        held = np.linalg.inv(seen.objects[self.object]) @ seen.tools[agent]
-        home = tool_of(self.scene.mounts[agent], self.scene.mounts[agent].arm.home)[:3, 0]
-        yaw = np.arctan2(home[1], home[0]) - np.arctan2(held[:, 1, 0], held[:, 0, 0])
-        if agent == self.picker:  # nothing turns it on the way
-            yaw = np.arctan2(self.goals[seen.goal.row][:, 1, 0], self.goals[seen.goal.row][:, 0, 0])
-        return {agent: Wish(upright(np.broadcast_to(place, (len(held), 3)), np.degrees(yaw)) @ held)}
-
-    @property
-    def _place(self) -> np.ndarray:
-        """Where the block's middle is in the exchange, [3], m."""
-        first, second = (self.scene.mounts[agent].position for agent in (self.picker, self.presenter))
-        return np.array([*((first + second) / 2)[:2], ABOVE_WALL])
-
-    def _exchange(self, number: np.ndarray) -> np.ndarray:
-        """Return poses [n, 4, 4] of the block in the exchange, whose site of these numbers [n] the first tool grips."""
-        site = self._sites[number]
-        return upright(np.tile(self._place, (len(site), 1)), SIDE - np.degrees(np.arctan2(site[:, 1], site[:, 0])))
-
-    def _next(self, number: np.ndarray) -> np.ndarray:
-        """Return the numbers of the sites next to some, clockwise."""
-        first = self._grasps[0]
-        return np.asarray(first + (number - first - 1) % len(self._grasps))
-
-    def _draw(self, scene: Scene) -> np.ndarray:
-        """Return starts [ROWS, 7] and goals [ROWS, 7] of the block, and the site that the first arm grips [ROWS, 1]."""
-        rng, first, last = np.random.default_rng(self.seed), scene.mounts[self.picker], scene.mounts[self.presenter]
-        from_pegs, to_pegs = (self._side(scene, agent) for agent in (self.picker, self.presenter))
-        base, home = self._item.sites[self.point][0], tool_of(first, first.arm.home)[:3, 0]
+    def _draw(self) -> np.ndarray:
+        """Return starts [ROWS, 7] and goals [ROWS, 7] of the block."""
+        rng, way = np.random.default_rng(self.seed), self._transfers[0]
+        from_pegs, to_pegs = (self._side(agent) for agent in (self.picker, self.presenter))
+        base = self._item.sites[self.point][0]
 
         def batch(_: bool) -> tuple[np.ndarray, np.ndarray]:
             one, other = (
@@ -308,42 +359,31 @@ class Task(ObjectTask):
             bearing = rng.uniform(-np.pi, np.pi, ROWS)
             place = one - base + np.stack([shift * np.cos(bearing), shift * np.sin(bearing), 0 * yaw], -1)
             starts, goals = upright(place, yaw), upright(other - base, yaw)
-            along = [np.abs(gripping(first, starts, self._sites[i], 0.0)[:, :3, 0] @ home) for i in self._grasps]
-            number = self._grasps[np.argmax(along, 0)]
-            good &= self._reaches(first, starts, number)
             if self.level.handover:
-                there = self._exchange(number)
-                good &= self._reaches(first, there, number) & self._reaches(last, there, self._next(number))
+                good &= way.possible(starts)
             else:
-                good &= self._reaches(last, goals, number)
-            turn = np.stack([quaternion(turned(np.array([0.0, 0.0, own]))) for own in yaw])
-            rows = np.concatenate([place, turn, goals[:, :3, 3], turn, number[:, None]], -1)[good]
+                number = way.aligned(starts)
+                good &= way.reaches(self.picker, starts, number) & way.reaches(self.picker, goals, number)
+            rows = np.concatenate([as_numbers(starts), as_numbers(goals)], -1)[good]
             return rows, np.zeros(len(rows), bool)
 
-        return choose(scene, batch, ROWS, 0.0)
+        return choose(self.scene, batch, ROWS, 0.0)
 
-    def _side(self, scene: Scene, agent: str) -> np.ndarray:
-        """Return the pegs [n, 3] that are nearer to an arm than to others with a jaw, and free of other blocks."""
-        pegs = find_pegs(scene, "peg_transfer")
+    def _draw_trials(self) -> np.ndarray:
+        """Return where all blocks stand at the beginning of each turn, [TRIALS * turns, blocks * 7]."""
+        rng, sides = np.random.default_rng(self.seed), (self._side(self.picker), self._side(self.presenter))
+        blocks = len(self._transfers) // 2
+        there, back = self._transfers[0], self._transfers[blocks]
+        base = self._item.sites[self.point][0]
+        poses = draw_trials(rng, TRIALS, blocks, sides, (there.possible, back.possible), SHIFT, base)
+        return as_numbers(in_turn(poses)).reshape(-1, blocks * 7)
+
+    def _side(self, agent: str) -> np.ndarray:
+        """Return the pegs [n, 3] that are nearer to an arm than to others with a jaw, and free of blocks that stay."""
+        pegs, mounts = find_pegs(self.scene, "peg_transfer"), self.scene.mounts
         away = lambda place: np.linalg.norm((pegs - place)[:, :2], axis=-1)  # noqa: E731
-        mount, jaws = scene.mounts[agent], [own for name, own in scene.mounts.items() if name != agent and own.arm.jaw]
-        taken = [place.position for name, place in scene.free_objects.items() if name != self.object]
-        good = [away(mount.position) < away(other.position) for other in jaws]
+        jaws = [own for name, own in mounts.items() if name != agent and own.arm.jaw]
+        moved = (self.object,) if self.turns is None else self.turns.blocks
+        taken = [place.position for name, place in self.scene.free_objects.items() if name not in moved]
+        good = [away(mounts[agent].position) < away(other.position) for other in jaws]
         return pegs[np.all([*good, *(away(place) > 0.01 for place in taken)], axis=0)]
-
-    def _reaches(self, mount: Mount, body: np.ndarray, number: np.ndarray) -> np.ndarray:
-        """Return whether an arm reaches its grip on blocks at poses [n, 4, 4], and `RAISE` / 2 above, [n] bool."""
-        tools = gripping(mount, body, self._sites[number], PAST)
-        q, good = joints_at(mount, tools)
-        return good & joints_at(mount, moved(tools, [0.0, 0.0, RAISE / 2]), q)[1]
-
-
-def _shifted(seen: Snapshot, agent: str, way: Any, opens: float = 0.0) -> dict[str, Wish]:
-    """Return the wish that a tool goes some way in the world, [3], m."""
-    return {agent: Wish(moved(seen.tools[agent], way), opens)}
-
-
-def _across(scene: Scene, one: str, other: str) -> np.ndarray:
-    """Return the horizontal direction from an arm to another one, [3]."""
-    way = (scene.mounts[other].position - scene.mounts[one].position) * [1.0, 1.0, 0.0]
-    return np.asarray(way / np.linalg.norm(way))

@@ -126,5 +126,6 @@ def later(step: Step) -> Step:
     def inside(call: Any) -> Any:
         return lambda seen: call(seen._replace(goal=of_work(seen.goal)))
 
-    good = None if step.good is None else inside(step.good)
-    return step._replace(plan=inside(step.plan), good=good, back=step.back + 1)
+    good, before = None if step.good is None else inside(step.good), step.back
+    back = (lambda seen: inside(before)(seen) + 1) if callable(before) else before + 1
+    return step._replace(plan=inside(step.plan), good=good, back=back)

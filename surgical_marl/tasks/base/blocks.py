@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from surgical_marl.robots.rotation import quaternion
 from surgical_marl.scenes.scene import Mount, Scene
 from surgical_marl.tasks.base.grips import DOWN, frames, tool_of, tool_poses
 
@@ -15,6 +16,12 @@ def upright(place: np.ndarray, yaw: np.ndarray) -> np.ndarray:
     """Return poses [n, 4, 4] at places [n, 3], turned about z by `yaw` [n], degrees."""
     half = np.radians(yaw) / 2
     return frames(place, np.stack([np.cos(half), 0 * half, 0 * half, np.sin(half)], -1))
+
+
+def as_numbers(poses: np.ndarray) -> np.ndarray:
+    """Return poses [..., 4, 4] as places and quaternions [..., 7]."""
+    turns = np.array([quaternion(turn) for turn in poses[..., :3, :3].reshape(-1, 3, 3)])
+    return np.concatenate([poses[..., :3, 3], turns.reshape(*poses.shape[:-2], 4)], -1)
 
 
 def gripping(mount: Mount, body: np.ndarray, site: np.ndarray, beyond: float) -> np.ndarray:

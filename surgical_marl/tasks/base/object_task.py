@@ -9,6 +9,7 @@ import numpy as np
 
 from surgical_marl.runtime import jnp
 from surgical_marl.tasks.base.grips import bars, frames
+from surgical_marl.tasks.base.object_terms import PARTS
 from surgical_marl.tasks.base.task import PRECISION, Task
 from surgical_marl.tasks.base.terms import Picture, Term
 
@@ -100,6 +101,8 @@ class ObjectTask(Task):
     def __init__(self, scene: Scene, options: Options) -> None:
         super().__init__(scene, options)
         self.object = find_object(scene, options.task, (self.point,))
+        self.called = self.object
+        """What the terms about it begin with that agents observe."""
         holders = [agent for agent, mount in scene.mounts.items() if mount.arm.jaw and len(mount.arm.jaw.pads) == 2]
         if len(holders) != self.hands:
             raise ValueError(
@@ -136,8 +139,16 @@ class ObjectTask(Task):
 
     # -- what is measured
 
+    def at_hand(self, world: World) -> World:
+        """Return the world in which the object to be moved now has the name `self.object`: this one, if there is one.
+
+        A task that moves several objects alike, one after the other, returns another one.
+        """
+        return world
+
     def now(self, world: World) -> Now:
         """Return what is measured in a world."""
+        world = self.at_hand(world)
         body, goal = world.objects[self.object], world.goal
         place = lambda points: body.position + body.size * points @ body.rotation.T  # noqa: E731
         reach, part, held, touched = {}, {}, {}, {}
@@ -246,14 +257,15 @@ class ObjectTask(Task):
             return local(self.tables["points"][world.goal.row])
 
         def to_target(world: World) -> Array:
-            body = world.objects[name]
+            body = self.at_hand(world).objects[name]
             return target(world) - local(body.position + body.size * body.rotation @ self._point)
 
         def target_rotation(world: World) -> Array:
             return (turn.T @ self.tables["turns"][world.goal.row])[:, :2].T.ravel()
 
         def others_hold(world: World) -> Array:
-            held = [view.handles[name].holding for other, view in world.arms.items() if other != agent]
+            arms = self.at_hand(world).arms
+            held = [view.handles[name].holding for other, view in arms.items() if other != agent]
             return jnp.stack(held).any().astype(jnp.float32)[None]
 
         far, reach, one, every = np.full(3, FAR), mount.arm.reach, np.ones(1), np.arange(len(self._middles))
@@ -276,15 +288,15 @@ class ObjectTask(Task):
             agent: the arm.
             bars: numbers of bars.
         """
-        mount, body = self.scene.mounts[agent], world.objects[self.object]
+        mount, body = self.scene.mounts[agent], self.at_hand(world).objects[self.object]
         places = body.position + body.size * self._middles[bars] @ body.rotation.T - mount.position.astype(np.float32)
         away = places @ mount.rotation.astype(np.float32) - world.arms[agent].tool_tip
         return away[jnp.argmin(jnp.sum(away * away, -1))]
 
     def observes(self, agent: str) -> tuple[str, ...]:
         """Return the terms of the agent itself, of the object and of the goal, then those of the other arms."""
-        own, name = super().observes(agent), self.object
-        seen = tuple(f"{name}_{part}" for part in ("position", "rotation", "velocity", "grip"))
+        own, name = super().observes(agent), self.called
+        seen = tuple(f"{name}_{part}" for part in PARTS)
         goal = ("target", "to_target", *(("target_rotation",) if self.oriented else ()))
         others = ("others_hold",) if len(self.scene.agents) > 1 else ()
         return (*own[:4], "contact_force", *seen, "to_object", *goal, "best_lift", *others, *own[4:])

@@ -49,5 +49,5 @@ class Step(NamedTuple):
     """Speed, as a share of the joints' own."""
     good: Callable[[Snapshot], np.ndarray] | None = None
     """Return whether the step was successful, [n] bool; where not, the script goes on with the step `back`."""
-    back: int = 0
-    """Number of a step."""
+    back: int | Callable[[Snapshot], np.ndarray] = 0
+    """Number of a step, or what returns one for each environment, [n]."""
