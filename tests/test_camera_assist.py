@@ -363,6 +363,7 @@ def test_the_settings_list_every_weight_as_the_task_has_it() -> None:
         ("bimanual_psm", {}, "has no endoscope: no arm of psm_0, psm_1 has a camera"),
         ("ecm", {}, "camera_assist needs a scene with one endoscope and two other arms; 'ecm' has ecm_0"),
         (SCENE, {"difficulty": "crossing"}, "unknown difficulty 'crossing' .*easy, default, hard"),
+        ("trimanual_psm_ecm_pegs", {"difficulty": "hard"}, "must be easy or default where the work is peg_transfer"),
         (SCENE, {"reward": {"in_vew": 1}}, "unknown reward term 'in_vew', did you mean 'in_view'"),
         (SCENE, {"start": "random"}, "unknown start of task 'camera_assist' 'random'"),
     ],
