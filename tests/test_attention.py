@@ -98,6 +98,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return train.train(SMALL, out=tmp_path_factory.mktemp("runs") / "run")
 
 
+@pytest.mark.slow
 def test_a_policy_with_attention_is_saved_loaded_and_written_as_onnx(run: Path, tmp_path: Path) -> None:
     assert read_settings(run) == SMALL
     env = BatchedEnv("reach", "bimanual_psm", num_envs=3, knowledge="all", engine="mjx", device="cpu")

@@ -142,7 +142,7 @@ def test_the_oracle_goes_on_beside_an_arm_that_is_ahead_of_the_script() -> None:
 def seen(task: Any, row: np.ndarray, q: dict[str, np.ndarray]) -> Snapshot:
     """What a script sees in an episode of this row, with arms at joint positions [joints]."""
     tools = {agent: tool_of(task.scene.mounts[agent], posture[None]) for agent, posture in q.items()}
-    return Snapshot(tools=tools, objects={}, held={}, goal=SimpleNamespace(row=row))
+    return Snapshot(tools=tools, objects={}, held={}, goal=SimpleNamespace(row=row), qpos={})
 
 
 @pytest.mark.parametrize("scene, count", [("psm", 1), ("bimanual_star", 0)])

@@ -18,6 +18,7 @@ from gymnasium.wrappers import vector
 
 import surgical_marl as sm
 from surgical_marl.plugins.tasks import TASKS
+from surgical_marl.scenes.load import load_scene
 from surgical_marl.scenes.placing import scenes_without_objects
 
 REACH, MATCH = "surgical_marl/Reach-v0", "surgical_marl/MatchImage-v0"
@@ -39,9 +40,10 @@ def playable() -> list[Any]:
 
 
 def quick_or_slow(task: str) -> Any:
-    """The task; one whose own scene has objects compiles for half a minute, so only with `-m slow`."""
-    free = TASKS.load(task).default_scene in (None, *scenes_without_objects())
-    return pytest.param(task, marks=[] if free else pytest.mark.slow)
+    """The task; one whose own scene has objects or many arms compiles for half a minute, so only with `-m slow`."""
+    own = TASKS.load(task).default_scene
+    quick = own is None or (own in scenes_without_objects() and len(load_scene(own).agents) == 1)
+    return pytest.param(task, marks=[] if quick else pytest.mark.slow)
 
 
 @pytest.mark.parametrize(("task", "scene"), playable())
@@ -56,7 +58,8 @@ def test_gymnasium_accepts_every_task_on_every_scene_without_a_warning(task: str
 @pytest.mark.parametrize("task", [quick_or_slow(task) for task in sm.list_tasks()])
 def test_every_id_can_be_made_with_its_defaults(task: str) -> None:
     env = gymnasium.make(gymnasium_id(task))
-    assert len(env.unwrapped.batch.agents) == getattr(TASKS.load(task), "hands", 1)
+    own = TASKS.load(task).default_scene
+    assert len(env.unwrapped.batch.agents) == (1 if own is None else len(load_scene(own).agents))
     assert env.observation_space.contains(env.reset(seed=0)[0])
 
 

@@ -152,7 +152,8 @@ def test_critics_see_the_same_whoever_knows_what() -> None:
         np.testing.assert_array_equal(state, states[0])
 
 
-@pytest.mark.parametrize("level", ["one", pytest.param("all", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("level", ["one", "all"])
 def test_both_engines_show_the_same(level: str) -> None:
     env = Env("reach", "bimanual_psm", knowledge=level, messages=3, decimation=1, max_steps=3)
     engines = [make_engine(env, 4, kind, "cpu") for kind in ("mjx", "fused")]

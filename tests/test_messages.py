@@ -157,6 +157,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return train.train(SMALL, out=tmp_path_factory.mktemp("runs") / "run")
 
 
+@pytest.mark.slow
 def test_a_run_remembers_them_and_its_policy_speaks(run: Path) -> None:
     assert read_settings(run) == SMALL
     env = made(knowledge="one", messages=K)
@@ -179,6 +180,7 @@ def test_words_mean_something_before_anything_is_learned() -> None:
     assert not np.isclose(actions["psm_0"][0, JOINTS:], actions["psm_0"][1, JOINTS:]).any()
 
 
+@pytest.mark.slow
 def test_onnx_speaks_too(run: Path, tmp_path: Path) -> None:
     env = made(knowledge="one", messages=K)
     actor, layout = load_actor(run, env)

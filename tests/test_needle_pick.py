@@ -117,7 +117,7 @@ def test_rewards_are_progress_over_the_best_while_it_is_held() -> None:
     terms = known.task.reward_terms(world(known, off, 5.0, True, best()))["psm_0"]
     expected = {"reach": 0.03, "grasp": 1, "lift": 1, "carry": 0.047, "turn": 0,
                 "precision": np.exp(-0.003 / PRECISION), "success": 0, "drop": 0, "clearance": 0,
-                "collision": 0}  # fmt: skip
+                "collision": 0, "action_change": 0}  # fmt: skip
     assert {name: float(value) for name, value in terms.items()} == pytest.approx(expected, abs=2e-6)
     known.task.reward_terms(world(known, off, 5.0, True, best()))
     again = known.task.remember(world(known, off, 5.0, True, best()))

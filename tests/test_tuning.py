@@ -59,7 +59,7 @@ def test_slower_trials_are_pruned_and_the_best_is_confirmed(tmp_path: Path, monk
     ("argv", "words"),
     [
         (["--scene", "nope"], "unknown scene 'nope'"),
-        (["--task", "nope"], "unknown task 'nope' (choose from follow_path,"),
+        (["--task", "nope"], "unknown task 'nope' (choose from camera_assist,"),
         (["--success", "2"], "2"),
         (["num_env=3"], "did you mean 'num_envs'"),
         (["--seeds", "0"], "argument --seeds: must be a whole number of 1 or more, not '0'"),
