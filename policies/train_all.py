@@ -26,7 +26,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 from surgical_marl.content import content_dir, unknown
-from surgical_marl.envs.env import Env
 from surgical_marl.plugins.tasks import list_tasks, scenes_for
 from surgical_marl.runs.settings import own_levels
 from surgical_marl.runtime import defer_compiler
@@ -34,8 +33,9 @@ from surgical_marl.runtime import defer_compiler
 PLACES = {
     f"{task}-{scene}{end}": (task, scene, level)
     for task in list_tasks()
+    for levels in [(("", "default"), *((f"-{level}", level) for level in own_levels(task)))]
     for scene in scenes_for(task)
-    for end, level in (("", "default"), *((f"-{level}", level) for level in own_levels(task)))
+    for end, level in levels
 }
 """Task, scene and difficulty of each policy, by its name. A level with settings of its own has policies of its own."""
 
@@ -88,6 +88,8 @@ def main() -> int:
 
 def _fits(task: str, scene: str, difficulty: str) -> bool:
     """Return whether a scene's arms can do a task at a level of difficulty."""
+    from surgical_marl.envs.env import Env
+
     try:
         return difficulty == "default" or bool(Env(task, scene, difficulty=difficulty))
     except ValueError:

@@ -175,10 +175,7 @@ def load_config(task: str, scene: str, overrides: Iterable[str] = ()) -> Setting
         ValueError: unknown task, algorithm or key, or a value of the wrong type or out of range.
     """
     TASKS.check(task)
-    values: dict[str, Any] = {}
-    if task in list_configs():  # a task without settings uses the defaults
-        values = _read_yaml(find("configs", task))
-    overrides = list(overrides)
+    values, overrides = _read_task(task), list(overrides)
     scenes, difficulties = (as_mapping(name, values.pop(name, None) or {}) for name in ("scenes", "difficulties"))
     difficulty = str(_override(values, overrides).get("difficulty", "default"))
     parts = {
@@ -202,9 +199,7 @@ def load_config(task: str, scene: str, overrides: Iterable[str] = ()) -> Setting
 
 def own_levels(task: str) -> list[str]:
     """Return the levels of difficulty for which a task's file has settings of their own."""
-    if task not in list_configs():
-        return []
-    return list(as_mapping("difficulties", _read_yaml(find("configs", task)).get("difficulties") or {}))
+    return list(as_mapping("difficulties", _read_task(task).get("difficulties") or {}))
 
 
 def read_config(path: Path, overrides: Iterable[str] = ()) -> Settings:
@@ -225,6 +220,11 @@ def config_text(settings: Settings, notes: Mapping[str, Mapping[str, Any]]) -> s
     values["network"]["hidden"] = list(settings.network.hidden)
     values["observe"] = {agent: list(names) for agent, names in settings.observe.items()}
     return yaml.safe_dump({**values, **notes}, sort_keys=False)
+
+
+def _read_task(task: str) -> dict[str, Any]:
+    """Return what a task's file says; a task without one uses the defaults."""
+    return _read_yaml(find("configs", task)) if task in list_configs() else {}
 
 
 def _read_yaml(path: Path) -> dict[str, Any]:
