@@ -20,7 +20,7 @@ from surgical_marl.scenes.load import load_scene
 
 CARD, CLIP, EVALUATION = "README.md", "clip.mp4", "evaluation.json"
 SHOWN = ("median_error_mm", "p95_error_mm", "rmse_mm", "success_1mm", "success_2mm", "success_5mm", "team_success_2mm",
-         "success_rate", "score", "score_time_s", "collision_rate", "time_to_success_s", "image_error",
+         "success_rate", "score", "score_time_s", "drop_rate", "collision_rate", "time_to_success_s", "image_error",
          "angle_error_deg")  # fmt: skip
 COLUMNS = (
     *("policy", "median error of the worst arm (mm)", "on training goals (mm)", "RMSE (mm)", "within 2 mm"),
@@ -159,12 +159,15 @@ def _how_trained(folder: Path, settings: Settings) -> str:
     level = "" if settings.difficulty == "default" else f" --difficulty {settings.difficulty}"
     command = f"surgical-marl train {settings.task} --scene {settings.scene}{level} --seed {settings.seed}"
     steps = f"{last['env_steps']:,.0f} environment steps in {last['seconds']:,.0f} s of rollouts and updates"
+    iterations = f"{last['iteration']:,.0f}"
+    if last["iteration"] < settings.iterations:
+        iterations += f" of {settings.iterations:,}"  # it was stopped
     return f"""## How it was trained
 
 With `{command}`. `config.yaml` holds all settings of that training.
 
 {_imitation(settings, last["iteration"])}\
-- {settings.algo}, {settings.num_envs:,} environments, {last["iteration"]:,.0f} iterations: {steps}.
+- {settings.algo}, {settings.num_envs:,} environments, {iterations} iterations: {steps}.
 - On {device}, started {started}, commit `{commit}`.
 - {", ".join(f"{name} {version}" for name, version in notes["versions"].items())}.
 
