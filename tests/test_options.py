@@ -102,16 +102,17 @@ def test_both_engines_begin_at_the_same_postures() -> None:
         assert np.allclose(found[0][agent], found[1][agent], atol=1e-5)
 
 
-def test_the_oracle_reaches_its_goals_from_any_start() -> None:
+@pytest.mark.parametrize(("task", "scene"), [("reach", "bimanual_psm"), ("track", "psm")])
+def test_the_oracle_reaches_its_goals_from_any_start(task: str, scene: str) -> None:
     from surgical_marl.policies.oracle import oracle
 
-    env = BatchedEnv("reach", "bimanual_psm", num_envs=64, start="random")
+    env = BatchedEnv(task, scene, num_envs=64, start="random")
     observations, *_ = env.reset(seed=0)
     act = oracle(env)
-    for _ in range(env.max_steps - 1):
+    for _ in range(99):
         observations, step = (found := env.step(act(observations))).observations, found
     errors = np.concatenate([step.infos[agent]["tip_error"] for agent in env.agents])
-    assert (errors < 0.002).mean() > 0.98
+    assert (errors < 0.002).mean() > 0.99
 
 
 def test_terms_can_be_left_out_and_added() -> None:

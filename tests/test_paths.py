@@ -118,13 +118,20 @@ def test_paths_that_do_not_fit_are_one_sentence() -> None:
         loops_and_lines(np.random.default_rng(0), 64, np.zeros(3), Level(0.02, 0.0, 0.1))
 
 
+@pytest.mark.parametrize("start", ["home", "random"])
 @pytest.mark.parametrize("draw", [walks, pytest.param(loops_and_lines, marks=pytest.mark.slow)])
-def test_arms_can_follow_their_paths_together(draw: object) -> None:
+def test_arms_can_follow_their_paths_together(draw: object, start: str) -> None:
     """At ten times as many moments as were checked: in reach, within joint limits and speeds, and apart."""
     scene = load_scene("bimanual_psm")
-    table = path_table(scene, draw, Level(0.05, 0.1, 0.02))[::64]  # type: ignore[arg-type]
+    found = path_table(scene, draw, Level(0.05, 0.1, 0.02), start=start)  # type: ignore[arg-type]
+    table = found["paths"][::64]
     points = np.moveaxis(spline.evaluate(np.moveaxis(table, 2, 1), np.linspace(0, SEGMENTS, 251)), 1, 2)
-    q = {agent: np.tile(mount.arm.home, (len(table), 1)) for agent, mount in scene.mounts.items()}
+    begin = np.tile(scene.home, (len(table), 1)) if start == "home" else found["postures"][::64]
+    assert np.ptp(begin, axis=0).any() == (start == "random")
+    q = {agent: begin[:, scene.qpos_index(agent)] for agent in scene.agents}
+    for i, (agent, mount) in enumerate(scene.mounts.items()):
+        tips = mount.arm.forward_kinematics(q[agent])[:, :3, 3]
+        np.testing.assert_allclose(points[:, 0, i], tips, atol=1e-6)
     for moment in range(1, 251):
         for i, (agent, mount) in enumerate(scene.mounts.items()):
             arm, last = mount.arm, q[agent]

@@ -23,7 +23,9 @@ if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv
 
 ITERATIONS = 8
-"""Steps of inverse kinematics from the last joint positions; the first of an episode takes more."""
+"""Steps of inverse kinematics from the last joint positions."""
+FIRST, STARTS = 20, 8
+"""Its steps in the first of an episode, and from how many postures: from a random one alone it may end at a limit."""
 
 
 def oracle(env: BatchedEnv, agents: Sequence[str] | None = None) -> Callable[[Mapping[str, Any]], dict[str, Any]]:
@@ -89,8 +91,10 @@ class _Guide:
     def move(self, targets: np.ndarray, began: np.ndarray, observation: np.ndarray) -> np.ndarray:
         """Return how far the commands have to move to targets [N, arms, 3], in units of an action of 1, [N, n]."""
         before = np.where(began[:, None], observation[:, self.terms["qpos"]], self.q)
-        iterations = 20 if began.any() else ITERATIONS
-        self.q = inverse_kinematics(self.arm, targets[:, self.index], before, starts=1, iterations=iterations)
+        aims, rows = targets[:, self.index], np.flatnonzero(began)
+        self.q = inverse_kinematics(self.arm, aims, before, starts=1, iterations=ITERATIONS)
+        if len(rows):
+            self.q[rows] = inverse_kinematics(self.arm, aims[rows], before[rows], starts=STARTS, iterations=FIRST)
         velocity = np.where(began[:, None], 0.0, (self.q - before) / self.dt)
         wanted = np.clip(self.q + self.lead * velocity, self.arm.lower, self.arm.upper)
         command = observation[:, self.terms["command"]]

@@ -72,6 +72,8 @@ HEIGHT = 0.06
 """Of the exchange above the pad, m."""
 BACK, DEEP, AWAY = 0.015, 0.003, 0.025
 """The second tool comes from so far, its tip goes so far past the wire, and the first one leaves so far, m."""
+THERE = 0.01
+"""The second tool comes once the needle is nearer than this to where it is handed over, m."""
 
 
 class Team(NamedTuple):
@@ -213,6 +215,12 @@ class Task(ObjectTask):
             waits = moved(taken := self._taken(there), -2 * BACK * taken[:, :3, 2])
             return {giver: Wish(there @ held), taker: Wish(waits, opens=True)}
 
+        def offered(seen: Snapshot) -> np.ndarray:
+            """Return whether the needle is there: a giver with a policy of its own takes its own time."""
+            needle = seen.objects[self.object]
+            there = self._exchange(np.linalg.inv(needle) @ seen.tools[giver])
+            return np.asarray(np.linalg.norm((there - needle)[:, :3, 3], axis=-1) < THERE)
+
         def take(seen: Snapshot, back: float) -> dict[str, Wish]:
             taken = self._taken(seen.objects[self.object])
             return {taker: Wish(moved(taken, -back * taken[:, :3, 2]), opens=True)}
@@ -233,7 +241,7 @@ class Task(ObjectTask):
             Step(lambda seen: grip(seen, PRESS), wait=0.1, pace=0.3),
             Step(lambda seen: {giver: Wish()}, wait=0.4, good=holds(giver)),
             Step(raised, wait=0.1, pace=0.3, good=holds(giver)),
-            Step(offer, wait=0.3, pace=0.6),
+            Step(offer, wait=0.3, pace=0.6, good=offered, back=4),
             Step(lambda seen: take(seen, BACK), wait=0.1),
             Step(lambda seen: take(seen, -DEEP), wait=0.1, pace=0.3),
             Step(lambda seen: {taker: Wish()}, wait=0.4, good=holds(taker), back=4),

@@ -33,6 +33,7 @@ class PathTask(TipTask):
     """A task whose targets move along paths of `surgical_marl/tasks/base/paths.py`, which `draw` draws."""
 
     max_steps = 250
+    starts = ("home", "random")
     follows = True
     wanted: ClassVar = {"rmse_mm": ("below", 2.0)}
 
@@ -43,14 +44,16 @@ class PathTask(TipTask):
 
     def __init__(self, scene: Scene, options: Options) -> None:
         super().__init__(scene, options)
-        table = path_table(scene, self.draw, self.level, self.seed)
-        closed = np.isclose(table[:, :3], table[:, -3:], rtol=0, atol=1e-7).all(axis=(1, 2, 3))
-        self.tables |= {"paths": table.astype(np.float32), "closed": closed}
+        self.tables |= path_table(scene, self.draw, self.level, self.seed, self.starts_at)
+        paths = self.tables["paths"]
+        closed = np.isclose(paths[:, :3], paths[:, -3:], rtol=0, atol=1e-7).all(axis=(1, 2, 3))
+        self.tables |= {"paths": paths.astype(np.float32), "closed": closed}
 
     def start(self, key: Array) -> Start:
-        """Return a path, at its start."""
+        """Return a path, at its start, and a posture if these are drawn too."""
         row, time = jax.random.randint(key, (), 0, len(self.tables["paths"])), jnp.float32(0.0)
-        return Start(PathGoal(self.along(row, time), row, time))
+        postures = self.tables.get("postures")
+        return Start(PathGoal(self.along(row, time), row, time), None if postures is None else postures[row])
 
     def advance(self, goal: PathGoal, dt: float) -> PathGoal:
         """Return the goal with its targets `dt` seconds further on their paths."""

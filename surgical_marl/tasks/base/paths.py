@@ -1,18 +1,20 @@
 """Moving targets that a scene's arms can follow. The host draws them once, and environments look them up.
 
-A path is a uniform cubic B-spline (`tasks/base/spline.py`) for each arm. It starts at the tool tip of the arm at home
-and lasts an episode. A draw is kept only if all arms can follow it together: inverse kinematics follows it within joint
-limits and joint speeds, and the arms stay apart. An environment picks a row of the table and a time.
+A path is a uniform cubic B-spline (`tasks/base/spline.py`) for each arm. It starts at the tool tip of the arm, at home
+or in a random posture, and lasts an episode. A draw is kept only if all arms can follow it together: inverse kinematics
+follows it within joint limits and joint speeds, and the arms stay apart. An environment picks a row of the table and a
+time.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from itertools import pairwise
 
 import numpy as np
 
 from surgical_marl.cache import cached
+from surgical_marl.robots.arm import Arm
 from surgical_marl.robots.inverse_kinematics import inverse_kinematics
 from surgical_marl.scenes.scene import Scene
 from surgical_marl.tasks.base import spline
@@ -40,6 +42,8 @@ TURNING = 4.0
 circle in `DURATION` takes 1.3 rad/s."""
 SLOWEST = 0.5
 """Share of the greatest speed that the slowest of these paths has."""
+AWAY = 0.25
+"""How far from home a joint of a random start posture is at most, as a share of its range."""
 
 Draw = Callable[[np.random.Generator, int, np.ndarray, Level], np.ndarray]
 
@@ -55,7 +59,7 @@ def walks(rng: np.random.Generator, count: int, start: np.ndarray, level: Level)
     Args:
         rng: source of randomness.
         count: how many.
-        start: position of the target at the start, where it is at rest, [3], m.
+        start: position of the target at the start, where it is at rest, [3] or for each [count, 1, 3], m.
         level: with the extent and the greatest speed.
 
     Returns:
@@ -127,40 +131,57 @@ def _onwards(rng: np.random.Generator, count: int) -> np.ndarray:
     return np.concatenate([np.zeros((1, count, 3)), way]).swapaxes(0, 1)
 
 
-def path_table(scene: Scene, draw: Draw, level: Level, seed: int = 0) -> np.ndarray:
+def path_table(scene: Scene, draw: Draw, level: Level, seed: int = 0, start: str = "home") -> dict[str, np.ndarray]:
     """Return paths that all arms of a scene can follow at once.
 
     Args:
         draw: `walks` or `loops_and_lines`.
         level: extent, greatest speed, and the share of rows in which two paths cross.
         seed: of the draws; the same seed gives the same table.
+        start: "home", or "random" for postures in which each joint but the jaw is up to `AWAY` of its range from home.
 
     Returns:
-        Control points [ROWS, SEGMENTS + 3, arms, 3] in each arm's base frame, m. Kept on disk by content.
+        `paths`, control points [ROWS, SEGMENTS + 3, arms, 3] in each arm's base frame, m; with random starts also
+        `postures` [ROWS, nq], `qpos` of the scene. Kept on disk by content.
 
     Raises:
         ValueError: if fewer than one draw in a hundred can be kept.
     """
-    numbers = (ROWS, DURATION, SEGMENTS, CHECKS, HEADROOM, CROSSING, WAYPOINTS, WILD, TURNING, SLOWEST, CLEARANCE)
-    settings = repr((draw.__name__, level, seed, numbers))
+    numbers = (ROWS, DURATION, SEGMENTS, CHECKS, HEADROOM, CROSSING, WAYPOINTS, WILD, TURNING, SLOWEST, CLEARANCE, AWAY)
+    settings = repr((draw.__name__, level, seed, numbers, start))
     speeds = repr([mount.arm.speed.tolist() for mount in scene.mounts.values()])
-    return cached("paths", lambda: _draw(scene, draw, level, seed), settings, speeds, scene.fingerprint)
+    table = cached("paths", lambda: _draw(scene, draw, level, seed, start), settings, speeds, scene.fingerprint)
+    nq = scene.model.nq
+    paths = table[:, nq:].reshape(len(table), SEGMENTS + 3, -1, 3)
+    return {"paths": paths} if start == "home" else {"paths": paths, "postures": table[:, :nq]}
 
 
-def _draw(scene: Scene, draw: Draw, level: Level, seed: int) -> np.ndarray:
-    rng, mounts = np.random.default_rng(seed), list(scene.mounts.values())
+def _draw(scene: Scene, draw: Draw, level: Level, seed: int, start: str) -> np.ndarray:
+    """Return postures and paths of `path_table` side by side, [ROWS, nq + control points]."""
+    rng, mounts = np.random.default_rng(seed), scene.mounts
 
     def batch(only_crossing: bool) -> tuple[np.ndarray, np.ndarray]:
-        homes = [mount.arm.forward_kinematics(mount.arm.home)[:3, 3] for mount in mounts]
-        drawn = [draw(rng, ROWS, home, level) for home in homes]
-        table = np.stack(drawn, axis=2)
+        begin = {agent: _begin(rng, mount.arm, ROWS, start) for agent, mount in mounts.items()}
+        tips = [mounts[agent].arm.forward_kinematics(q)[:, None, :3, 3] for agent, q in begin.items()]
+        table = np.stack([draw(rng, ROWS, tip, level) for tip in tips], axis=2)
         cross = _cross(scene, table)
         if only_crossing:
-            table, cross = table[cross], cross[cross]
-        fine = _can_follow(scene, table)
-        return table[fine], cross[fine]
+            table, begin, cross = table[cross], {agent: q[cross] for agent, q in begin.items()}, cross[cross]
+        fine = _can_follow(scene, table, begin)
+        flat = table.reshape(len(table), (SEGMENTS + 3) * len(mounts) * 3)  # there may be no row
+        return np.concatenate([scene.full_qpos(begin), flat], -1)[fine], cross[fine]
 
     return choose(scene, batch, ROWS, level.crossing if len(mounts) > 1 else 0.0)
+
+
+def _begin(rng: np.random.Generator, arm: Arm, count: int, start: str) -> np.ndarray:
+    """Return joint positions [count, n] that an arm starts from; the jaw is always as at home."""
+    if start == "home":
+        return np.tile(arm.home, (count, 1))
+    furthest = AWAY * (arm.upper - arm.lower) * ~arm.moves_jaw
+    return rng.uniform(
+        np.maximum(arm.home - furthest, arm.lower), np.minimum(arm.home + furthest, arm.upper), (count, len(arm.home))
+    )
 
 
 def _points(table: np.ndarray) -> np.ndarray:
@@ -169,10 +190,10 @@ def _points(table: np.ndarray) -> np.ndarray:
     return np.moveaxis(spline.evaluate(curves, np.linspace(0, SEGMENTS, CHECKS + 1)), 1, 2)
 
 
-def _can_follow(scene: Scene, table: np.ndarray) -> np.ndarray:
-    """Return which rows of a table all arms can follow, [N] bool."""
-    points, fine = _points(table), np.ones(len(table), dtype=bool)
-    q = {a: np.broadcast_to(m.arm.home, (len(table), len(m.arm.home))) for a, m in scene.mounts.items()}
+def _can_follow(scene: Scene, table: np.ndarray, begin: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return which rows of a table all arms can follow from joint positions [N, n] of each agent, [N] bool."""
+    points, q = _points(table), dict(begin)
+    fine = (scene.clearance(q) > CLEARANCE) & (scene.clearance(q, within=True) > 0)
     for moment in range(1, CHECKS + 1):
         for i, (agent, mount) in enumerate(scene.mounts.items()):
             arm, last = mount.arm, q[agent]
