@@ -46,7 +46,7 @@ def beyond(scene: Scene, q: dict[str, np.ndarray]) -> np.ndarray:
 @pytest.mark.parametrize("scene", SCENES)
 def test_each_goal_is_inside_the_other_arms_shaft_at_the_start(scene: str) -> None:
     task = known(scene)
-    begin = {agent: way[0] for agent, way in task._crossing.ways.items()}
+    begin = {agent: way[0] for agent, way in task.ways.items()}
     for i, agent in enumerate(PAIR):
         mount, other = task.scene.mounts[agent], task.scene.mounts[PAIR[1 - i]]
         goal = task.tables["targets"][:, i] @ mount.rotation.T + mount.position
@@ -60,7 +60,7 @@ def test_each_goal_is_inside_the_other_arms_shaft_at_the_start(scene: str) -> No
 @pytest.mark.parametrize("scene", SCENES)
 def test_arms_are_apart_at_both_ends_and_lines_to_their_tips_cross_at_the_goals_alone(scene: str) -> None:
     task = known(scene)
-    ways = task._crossing.ways
+    ways = task.ways
     begin, end = ({agent: way[k] for agent, way in ways.items()} for k in (0, -1))
     assert task.scene.clearance(begin).min() > CLEARANCE and task.scene.clearance(end).min() > APART
     assert beyond(task.scene, end).min() > BEYOND
@@ -74,7 +74,7 @@ def test_no_posture_at_a_goal_is_free_while_the_other_arm_stays() -> None:
     """However the wrist is bent: inverse kinematics from postures all over the joints' ranges."""
     task, rng = known("bimanual_psm"), np.random.default_rng(0)
     rows = np.repeat(np.arange(0, 2048, 16), 16)
-    begin = {agent: way[0, rows] for agent, way in task._crossing.ways.items()}
+    begin = {agent: way[0, rows] for agent, way in task.ways.items()}
     for i, agent in enumerate(PAIR):
         arm, targets = task.scene.mounts[agent].arm, task.tables["targets"][rows, i]
         start = rng.uniform(arm.lower, arm.upper, (len(rows), 7))
@@ -88,12 +88,12 @@ def test_no_posture_at_a_goal_is_free_while_the_other_arm_stays() -> None:
 
 def test_straight_ways_collide_and_a_way_with_one_arm_drawn_back_is_free() -> None:
     task = known("bimanual_psm", "held_out")
-    ways, shares = task._crossing.ways, np.linspace(0, 1, 33)[:, None, None]
+    ways, shares = task.ways, np.linspace(0, 1, 33)[:, None, None]
     lines = lambda a, b: {agent: way[a] + shares * (way[b] - way[a]) for agent, way in ways.items()}  # noqa: E731
     assert task.scene.clearance(lines(0, 4)).min(0).max() < 0
     for move in range(4):
         assert task.scene.clearance(lines(move, move + 1)).min() > 0.9 * PASS
-    assert 0.1 < task._crossing.first.mean() < 0.9
+    assert 0.1 < crossing_table(task.scene, task.level.extent, task.seed).first.mean() < 0.9
     assert not np.isin(task.tables["targets"], known("bimanual_psm").tables["targets"]).any()
 
 
@@ -121,7 +121,7 @@ def test_the_oracle_does_it_and_nobody_does_with_a_partner_who_stays(env: Batche
 
 def test_the_oracle_goes_on_beside_an_arm_that_is_ahead_of_the_script() -> None:
     task = known("bimanual_psm")
-    first, script, ways = task.script()[0], task.script(), task._crossing.ways
+    first, script, ways = task.script()[0], task.script(), task.ways
     row = np.array([0])
     goes = next(agent for agent in PAIR if np.array_equal(ways[agent][0, 0], ways[agent][1, 0]))
     gives = next(agent for agent in PAIR if agent != goes)

@@ -112,7 +112,7 @@ def test_the_oracle_reaches_its_goals_from_any_start(task: str, scene: str) -> N
     for _ in range(99):
         observations, step = (found := env.step(act(observations))).observations, found
     errors = np.concatenate([step.infos[agent]["tip_error"] for agent in env.agents])
-    assert (errors < 0.002).mean() > 0.99
+    assert errors.max() < 0.002
 
 
 def test_terms_can_be_left_out_and_added() -> None:

@@ -29,13 +29,15 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from surgical_marl.runtime import jax
-from surgical_marl.tasks.base.crossing import Crossing, crossing_table
+from surgical_marl.tasks.base.crossing import crossing_table
 from surgical_marl.tasks.base.options import Options
 from surgical_marl.tasks.base.script import Snapshot, Step, Wish
 from surgical_marl.tasks.base.task import Goal, Level, Start, TipTask
 from surgical_marl.tasks.base.workspace import start_table, target_table
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from jax import Array
 
     from surgical_marl.scenes.scene import Scene
@@ -45,8 +47,8 @@ NEAR = 0.005
 """The oracle lets an arm follow when the other one's tip is this near to where it goes, m."""
 
 
-class CrossingGoal(NamedTuple):
-    """The goal of an episode in which arms change places."""
+class RowGoal(NamedTuple):
+    """The goal of an episode to which a way of the joints is known."""
 
     targets: Array
     """Where the tool tips should be, [arms, 3], m, each in its arm's base frame."""
@@ -64,7 +66,8 @@ class Task(TipTask):
         "crossing": Level(0.02, 1.0, own_starts=True),
     }
     starts = ("home", "random")
-    _crossing: Crossing | None = None
+    ways: Mapping[str, np.ndarray] | None = None
+    """Joint positions on the way from the start to the targets, of each agent, [moves + 1, rows, n], if known."""
     wanted = {  # noqa: RUF012
         "median_error_mm": ("below", 1.0),
         "success_2mm": ("at least", 0.99),
@@ -76,37 +79,42 @@ class Task(TipTask):
         if self.level.own_starts:
             if self.starts_at != "home":
                 raise ValueError(f"difficulty 'crossing' has starts of its own: leave start {self.starts_at!r} out")
-            self._crossing = crossing_table(scene, self.level.extent, self.seed)
+            known = crossing_table(scene, self.level.extent, self.seed)
             self.max_steps = 200
-            begin = {agent: way[0] for agent, way in self._crossing.ways.items()}
-            self.tables = {"targets": self._crossing.targets, "postures": scene.full_qpos(begin)}
+            self._set_ways(known.ways, known.targets)
         elif self.starts_at == "home":
             self.tables["targets"] = target_table(scene, self.level.extent, self.level.crossing, self.seed)
         else:
-            self.tables |= start_table(scene, self.level.extent, self.seed)
+            self._set_ways(*start_table(scene, self.level.extent, self.seed))
+
+    def _set_ways(self, ways: Mapping[str, np.ndarray], targets: np.ndarray) -> None:
+        begin = {agent: way[0] for agent, way in ways.items()}
+        self.ways, self.tables = ways, {"targets": targets, "postures": self.scene.full_qpos(begin)}
 
     def start(self, key: Array) -> Start:
         """Return goals of all arms, and postures if these are drawn too."""
         row = jax.random.randint(key, (), 0, len(self.tables["targets"]))
         postures, targets = self.tables.get("postures"), self.tables["targets"][row]
-        goal = Goal(targets) if self._crossing is None else CrossingGoal(targets, row)
+        goal = Goal(targets) if self.ways is None else RowGoal(targets, row)
         return Start(goal, None if postures is None else postures[row])
 
     def script(self) -> tuple[Step, ...]:
-        """Return how arms change places: one draws its tool back, the other goes, then the first one follows.
+        """Return how arms go the ways that are known, all at the same pace.
 
-        Where arms don't change places there is no script, and the oracle brings their tips straight to the targets.
+        Where they change places one draws its tool back, the other goes, then the first one follows. Where no way is
+        known there is no script, and the oracle brings their tips straight to the targets.
         """
-        known = self._crossing
-        if known is None:
+        ways = self.ways
+        if ways is None:
             return ()
+        last = len(next(iter(ways.values()))) - 1
         aims = {
-            agent: mount.arm.forward_kinematics(known.ways[agent])[..., :3, 3] @ mount.rotation.T + mount.position
+            agent: mount.arm.forward_kinematics(ways[agent])[..., :3, 3] @ mount.rotation.T + mount.position
             for agent, mount in self.scene.mounts.items()
         }
 
         def move(number: int, seen: Snapshot) -> dict[str, Wish]:
-            return {agent: Wish(joints=way[number, seen.goal.row]) for agent, way in known.ways.items()}
+            return {agent: Wish(joints=way[number, seen.goal.row]) for agent, way in ways.items()}
 
         def there(number: int, seen: Snapshot) -> np.ndarray:
             """Return whether the tools of all arms are about where this move or a later one ends, [n] bool.
@@ -117,5 +125,5 @@ class Task(TipTask):
             off = [np.linalg.norm(tool[:, :3, 3] - ends[agent], axis=-1).min(0) for agent, tool in seen.tools.items()]
             return np.asarray(np.max(off, 0) < NEAR)
 
-        steps = [Step(partial(move, n), good=partial(there, n), back=n - 1) for n in range(1, 4)]
-        return (*steps, Step(partial(move, 4)))
+        steps = [Step(partial(move, n), good=partial(there, n), back=n - 1) for n in range(1, last)]
+        return (*steps, Step(partial(move, last)))

@@ -55,7 +55,7 @@ def target_table(scene: Scene, spread: float, crossing: float = 0.0, seed: int =
     return cached("targets", lambda: _draw(scene, spread, crossing, seed), settings, scene.fingerprint)
 
 
-def start_table(scene: Scene, spread: float, seed: int = 0) -> dict[str, np.ndarray]:
+def start_table(scene: Scene, spread: float, seed: int = 0) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Return postures to start from, and targets that all arms of a scene can reach from there.
 
     Targets are drawn as for `target_table`. From the posture at the targets every joint except the jaw is moved away by
@@ -67,8 +67,8 @@ def start_table(scene: Scene, spread: float, seed: int = 0) -> dict[str, np.ndar
         seed: of the draws; the same seed gives the same table.
 
     Returns:
-        `postures` [TABLE_SIZE, nq], `qpos` of the scene, and `targets` [TABLE_SIZE, arms, 3] in each arm's base frame,
-        m. Kept on disk by content.
+        Joint positions of each agent at the start and at its target, [2, TABLE_SIZE, n], and targets [TABLE_SIZE, arms,
+        3] in each arm's base frame, m. Kept on disk by content.
 
     Raises:
         ValueError: fewer than one draw in a hundred can be kept.
@@ -76,7 +76,9 @@ def start_table(scene: Scene, spread: float, seed: int = 0) -> dict[str, np.ndar
     settings = repr([spread, seed, *(mount.arm.speed.tolist() for mount in scene.mounts.values())])
     table = cached("starts", lambda: _draw_starts(scene, spread, seed), settings, scene.fingerprint)
     nq = scene.model.nq
-    return {"postures": table[:, :nq], "targets": table[:, nq:].reshape(len(table), -1, 3)}
+    ends = np.stack([table[:, :nq], table[:, nq : 2 * nq]])
+    ways = {agent: ends[..., scene.qpos_index(agent)] for agent in scene.agents}
+    return ways, table[:, 2 * nq :].reshape(len(table), -1, 3)
 
 
 def choose(
@@ -135,7 +137,7 @@ def _draw(scene: Scene, spread: float, crossing: float, seed: int) -> np.ndarray
 
 
 def _draw_starts(scene: Scene, spread: float, seed: int) -> np.ndarray:
-    """Return postures and targets of `start_table` side by side, [TABLE_SIZE, nq + 3 arms]."""
+    """Return postures and targets of `start_table` side by side, [TABLE_SIZE, 2 nq + 3 arms]."""
     rng = np.random.default_rng(seed)
 
     def batch(_: bool) -> tuple[np.ndarray, np.ndarray]:
@@ -146,7 +148,8 @@ def _draw_starts(scene: Scene, spread: float, seed: int) -> np.ndarray:
         for share in np.linspace(0.0, 1.0, PATH_POINTS + 1):
             way = {agent: (1 - share) * starts[agent] + share * q for agent, q in goals.items()}
             good &= (scene.clearance(way) > CLEARANCE) & (scene.clearance(way, within=True) > 0)
-        rows = np.concatenate([scene.full_qpos(starts), targets.reshape(len(targets), -1)], -1)[good]
+        ends = scene.full_qpos(starts), scene.full_qpos(goals)
+        rows = np.concatenate([*ends, targets.reshape(len(targets), -1)], -1)[good]
         return rows, np.zeros(len(rows), bool)
 
     return choose(scene, batch, TABLE_SIZE, 0.0)
