@@ -1,4 +1,4 @@
-"""Finds what touches objects and what is fixed in the world: at most `SLOTS` patches at a time.
+"""Finds what touches objects and what is fixed in the world: at most `SLOTS` patches at a time; more are counted.
 
 Pairs of bodies that are far from each other cost a distance of a ball. What is found is kept in slots, so that all that
 follows is in proportion to what touches, not to what could.
@@ -20,9 +20,8 @@ from surgical_marl.physics.placed import Joints, Placed, Places, Way, size
 from surgical_marl.physics.rows import room, row_of
 from surgical_marl.physics.shapes import Points, Segments, between_segments, on_plate
 from surgical_marl.physics.tables import Meeting, Tables
+from surgical_marl.scenes.object_contacts import SLOTS
 
-SLOTS = 16
-"""Patches at one time; more are counted, and not felt."""
 NEAREST = 16
 """Pairs of two kinds of body that are near at one time; more are counted as patches that found no room."""
 MARGIN = 2e-4

@@ -20,6 +20,9 @@ from surgical_marl.scenes.objects import JAW, LINK, Surface
 from surgical_marl.scenes.poses import Pose
 from surgical_marl.scenes.scene import Scene
 
+SLOTS = 16
+"""Contacts of objects that a scene can feel at one time, each between two bodies. A fixed shape is a body of its
+own."""
 DRAWS = 64
 """Draws of the places of objects that are looked at."""
 FAR = 0.05
