@@ -25,10 +25,13 @@ POINTS = 4
 """Points of a patch."""
 AWAY = -100.0
 """Depth, m, of a point that is not there: no scene is so large."""
-TILT = 0.1
-"""By which a body is tilted to find the rim of a contact, rad. A firm grip dents a wire that is bent to a radius of 8
-mm over 0.7 mm to each side, where its direction differs by 0.08 rad. With a narrower rim nothing in a patch would stop
-the wire from turning while the jaw closes, and it would be thrown about."""
+TILT = 0.03
+"""By which a body is tilted to find the rim of a contact, rad. A wider rim may leave out what carries an object that
+lies on a blunt edge, for what comes down only if it turns further: it would rock there for ever."""
+TILT_IN_JAW = 0.1
+"""By which it is tilted between fingers, rad. A firm grip dents a wire that is bent to a radius of 8 mm over 0.7 mm to
+each side, where its direction differs by 0.08 rad. With a narrower rim nothing in a patch would stop the wire from
+turning while the jaw closes, and it would be thrown about."""
 BLEND = 1e-5
 """Difference in depth over which the place of a point goes from one of two candidates to the other, m: a quarter of the
 overlap of a firm grip."""
@@ -53,7 +56,7 @@ class Patch(NamedTuple):
     """Depth of the deepest point now or after the step, m, [...]."""
 
 
-def find_patch(points: Points, soon: Array, count: Any, axes: Array, torsion: Array) -> Patch:
+def find_patch(points: Points, soon: Array, count: Any, axes: Array, tilt: float, torsion: Array) -> Patch:
     """Return the patch of a pair of bodies.
 
     Args:
@@ -62,6 +65,7 @@ def find_patch(points: Points, soon: Array, count: Any, axes: Array, torsion: Ar
             depths, so that no part of a fast object comes in unseen.
         count: how many of the c shapes there are, []; without any, the patch is nothing.
         axes: two directions, [2, 3]: bodies are tilted about those across them.
+        tilt: by how much, rad.
         torsion: radius of the contact at a point, m, [].
     """
     middle = points.place[0, 0]
@@ -69,7 +73,7 @@ def find_patch(points: Points, soon: Array, count: Any, axes: Array, torsion: Ar
     def tilted(depth: Array, place: Array, soon: Array) -> Array:
         """Return the depths of points [d] as the bodies are, and tilted, [d, POINTS]."""
         reach = jnp.maximum(depth, soon)
-        rim = jnp.minimum(reach, ALIKE)[:, None] + TILT * ((place - middle) @ axes.T @ jnp.asarray(_TILTS).T)
+        rim = jnp.minimum(reach, ALIKE)[:, None] + tilt * ((place - middle) @ axes.T @ jnp.asarray(_TILTS).T)
         return jnp.concatenate([reach[:, None], rim], 1)
 
     def deepest(n: Array, most: Array) -> Array:

@@ -15,7 +15,7 @@ import numpy as np
 from jax import Array
 
 from surgical_marl.physics.bodies import Bodies
-from surgical_marl.physics.patches import BLEND, TILT, Patch, find_patch, no_patch
+from surgical_marl.physics.patches import BLEND, TILT, TILT_IN_JAW, Patch, find_patch, no_patch
 from surgical_marl.physics.placed import Joints, Placed, Places, Way, size
 from surgical_marl.physics.rows import room, row_of
 from surgical_marl.physics.shapes import Points, Segments, between_segments, on_plate
@@ -137,7 +137,8 @@ class Finder:
 
         shape = jax.eval_shape(lambda: touch(self._places.capsule(placed, meeting.first, i, jnp.int32(0))))
         points, soon = jax.lax.fori_loop(0, count, near, room((shape, shape.depth), len(capsules)))
-        patch = find_patch(points, soon, count, axes, jnp.asarray(self._tables.torsion)[start + pair])
+        torsion = jnp.asarray(self._tables.torsion)[start + pair]
+        patch = find_patch(points, soon, count, axes, _tilt(meeting), torsion)
         return patch, (patch.reach > -NEAR).astype(jnp.int32)
 
     def _near_capsules(self, placed: Placed, meeting: Meeting, i: Array, j: Array) -> tuple[Array, Array]:
@@ -149,7 +150,7 @@ class Finder:
         if meeting.first != "objects" or c == 1:
             return jnp.zeros(1, jnp.int32), jnp.int32(1)
         one, moves = row_of(placed.balls["objects"], i), placed.balls[meeting.second].moves[j]
-        reach = NEAR + jnp.minimum(one.moves + moves, AHEAD) + 2 * TILT * one.radius + BLEND
+        reach = NEAR + jnp.minimum(one.moves + moves, AHEAD) + 2 * _tilt(meeting) * one.radius + BLEND
         frame = placed.frames[i]
 
         def look(found: tuple[Array, Array], capsule: Array) -> tuple[tuple[Array, Array], None]:
@@ -180,6 +181,11 @@ class Finder:
 
             found.append(jax.lax.map(deepest, np.arange(len(meeting.one), dtype=np.int32)))
         return jnp.concatenate(found)
+
+
+def _tilt(meeting: Meeting) -> float:
+    """Return by how much bodies are tilted to find the rim of their contact, rad."""
+    return TILT_IN_JAW if meeting.second == "pads" else TILT
 
 
 def _listed(found: tuple[Array, Array], number: Array, near: Array) -> tuple[Array, Array]:

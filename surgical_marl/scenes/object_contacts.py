@@ -94,8 +94,35 @@ def distances(scene: Scene, poses: Mapping[str, Pose], sizes: Mapping[str, np.nd
             for lengths, given in ((model.geom_size, scene.model.geom_size), (model.geom_pos, scene.model.geom_pos)):
                 lengths[own] = size[row] * given[own]
         mujoco.mj_kinematics(model, data)
-        found[row] = [mujoco.mj_geomDistance(model, data, one, other, FAR, None) for one, other in pairs]
+        found[row] = [distance(model, data, one, other, FAR) for one, other in pairs]
     return found
+
+
+def distance(model: mujoco.MjModel, data: mujoco.MjData, one: int, other: int, most: float = 1.0) -> float:
+    """Return the distance of two geoms, below 0 where they overlap, m; `most` if they are further away.
+
+    It is C MuJoCo's (3.17), but for a capsule whose axis goes through a box: there that is above 0 in 3 % of random
+    poses.
+    """
+    found = float(mujoco.mj_geomDistance(model, data, one, other, most, None))
+    kinds = {int(model.geom_type[geom]): geom for geom in (one, other)}
+    box, capsule = kinds.get(mujoco.mjtGeom.mjGEOM_BOX), kinds.get(mujoco.mjtGeom.mjGEOM_CAPSULE)
+    if found < 0 or box is None or capsule is None:
+        return found
+    radius, half = model.geom_size[capsule, :2]
+    if not _meets_box(model, data, box, capsule, half):
+        return found
+    return -float(radius)
+
+
+def _meets_box(model: mujoco.MjModel, data: mujoco.MjData, box: int, capsule: int, half: float) -> bool:
+    """Return whether the axis of a capsule, of this half length, has a point within a box."""
+    axes = data.geom_xmat[box].reshape(3, 3)
+    middle = (data.geom_xpos[capsule] - data.geom_xpos[box]) @ axes
+    way = half * data.geom_xmat[capsule].reshape(3, 3)[:, 2] @ axes
+    way = np.where(np.abs(way) < 1e-12, 1e-12, way)
+    ends = (np.stack([-model.geom_size[box], model.geom_size[box]]) - middle) / way
+    return bool(max(-1.0, ends.min(0).max()) <= min(1.0, ends.max(0).min()))
 
 
 class _Side(NamedTuple):
