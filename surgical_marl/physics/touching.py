@@ -138,7 +138,8 @@ class Finder:
         shape = jax.eval_shape(lambda: touch(self._places.capsule(placed, meeting.first, i, jnp.int32(0))))
         points, soon = jax.lax.fori_loop(0, count, near, room((shape, shape.depth), len(capsules)))
         torsion = jnp.asarray(self._tables.torsion)[start + pair]
-        patch = find_patch(points, soon, count, axes, _tilt(meeting), torsion)
+        centre = placed.balls["objects"].centre[i] if meeting.first == "objects" and meeting.second != "pads" else None
+        patch = find_patch(points, soon, count, axes, _tilt(meeting), torsion, centre)
         return patch, (patch.reach > -NEAR).astype(jnp.int32)
 
     def _near_capsules(self, placed: Placed, meeting: Meeting, i: Array, j: Array) -> tuple[Array, Array]:
