@@ -202,7 +202,7 @@ def test_a_capsule_overlaps_with_the_box_that_it_goes_through() -> None:
         off = np.linalg.norm(np.maximum(np.abs(points) - box, 0), axis=1).min()
         if off == 0:
             through += mujoco.mj_geomDistance(model, data, 0, 1, 1.0, None) > 0
-            assert max(distance(model, data, 0, 1), distance(model, data, 1, 0)) < -0.9 * capsule[0]
+            assert max(distance(model, data, 0, 1), distance(model, data, 1, 0)) <= -capsule[0]
         elif off > 1e-5:  # what the axis only just misses the points may miss too
             assert distance(model, data, 0, 1) == pytest.approx(off - capsule[0], abs=1e-5)
     assert through > 5, "C MuJoCo's distance is right: `distance` can be it alone"

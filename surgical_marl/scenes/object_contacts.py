@@ -107,19 +107,18 @@ def distance(model: mujoco.MjModel, data: mujoco.MjData, one: int, other: int, m
     found = float(mujoco.mj_geomDistance(model, data, one, other, most, None))
     kinds = {int(model.geom_type[geom]): geom for geom in (one, other)}
     box, capsule = kinds.get(mujoco.mjtGeom.mjGEOM_BOX), kinds.get(mujoco.mjtGeom.mjGEOM_CAPSULE)
-    if found < 0 or box is None or capsule is None:
+    if box is None or capsule is None or not _goes_through(model, data, box, capsule):
         return found
-    radius, half = model.geom_size[capsule, :2]
-    if not _meets_box(model, data, box, capsule, half):
-        return found
-    return -float(radius)
+    return min(found, -float(model.geom_size[capsule, 0]))
 
 
-def _meets_box(model: mujoco.MjModel, data: mujoco.MjData, box: int, capsule: int, half: float) -> bool:
-    """Return whether the axis of a capsule, of this half length, has a point within a box."""
+def _goes_through(model: mujoco.MjModel, data: mujoco.MjData, box: int, capsule: int) -> bool:
+    """Return whether the axis of a capsule has a point within a box."""
+    apart, half = data.geom_xpos[capsule] - data.geom_xpos[box], model.geom_size[capsule, 1]
+    if apart @ apart > (half + np.linalg.norm(model.geom_size[box])) ** 2:
+        return False
     axes = data.geom_xmat[box].reshape(3, 3)
-    middle = (data.geom_xpos[capsule] - data.geom_xpos[box]) @ axes
-    way = half * data.geom_xmat[capsule].reshape(3, 3)[:, 2] @ axes
+    middle, way = apart @ axes, half * data.geom_xmat[capsule].reshape(3, 3)[:, 2] @ axes
     way = np.where(np.abs(way) < 1e-12, 1e-12, way)
     ends = (np.stack([-model.geom_size[box], model.geom_size[box]]) - middle) / way
     return bool(max(-1.0, ends.min(0).max()) <= min(1.0, ends.max(0).min()))
