@@ -88,7 +88,7 @@ def find_patch(
         return _with_frame(chosen, torsion, reach)
     rim, reach = _supports(points, soon, count, middle, rims, limits)
     lean = LEAN * _beyond(axes @ centre, rim.place @ axes.T) @ axes
-    deepest, _ = _supports(points, soon, count, middle, lean[None], np.float32([-AWAY]))
+    deepest, _ = _supports(points, soon, count, middle, lean[None], np.full(1, -AWAY, np.float32))
     chosen = Points(*(jnp.concatenate(parts) for parts in zip(deepest, rim, strict=True)))
     return _with_frame(chosen, torsion, reach)
 
