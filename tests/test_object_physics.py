@@ -10,6 +10,7 @@ import pytest
 import yaml
 
 import surgical_marl as sm
+from surgical_marl.physics.handling import FASTEST
 from surgical_marl.physics.together import Objects
 from surgical_marl.robots.rotation import quaternion, turned
 from surgical_marl.studies.grasping import Held, judge
@@ -154,7 +155,7 @@ def test_an_object_slides_where_coulomb_says(tmp_path: Path) -> None:
 def test_what_falls_on_a_board_and_on_pegs_comes_to_rest_there(tmp_path: Path) -> None:
     """Blocks around pegs, upright or aslant, and needles on top, from where nothing overlaps.
 
-    Nothing gains energy, and then they drift by less than 0.1 mm in 10 s.
+    Then they drift by less than 0.1 mm in 10 s. No step adds energy but by pushing out what an impact has left inside.
     """
     places = {
         "block": {"object": "block", "position": [-0.06, 0.0, 0.0076]},
@@ -170,5 +171,5 @@ def test_what_falls_on_a_board_and_on_pegs_comes_to_rest_there(tmp_path: Path) -
     path = comes_to_rest(falling, jax.tree.map(lambda x: x[apart], start))
     assert path.position[..., 2].min() > 0
     energy = falling.energy(path).sum(-1)
-    gained = np.diff(energy, axis=1)
-    assert gained.max() <= 1e-3 * energy[0, 0], np.unravel_index(gained.argmax(), gained.shape)
+    gained, pushed_out = np.diff(energy, axis=1), falling.masses.mass.sum() * FASTEST**2 / 2
+    assert gained.max() <= pushed_out, np.unravel_index(gained.argmax(), gained.shape)
