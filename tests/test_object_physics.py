@@ -10,9 +10,12 @@ import pytest
 import yaml
 
 import surgical_marl as sm
+from surgical_marl.physics.handling import FASTEST
+from surgical_marl.physics.together import Objects
+from surgical_marl.robots.rotation import quaternion, turned
 from surgical_marl.studies.grasping import Held, judge
 from surgical_marl.studies.shaking import CHUNK, OBJECTS, Grasps
-from tests.helpers.falling import Falling, random_turns, thrown
+from tests.helpers.falling import Falling, Trace, random_turns, thrown
 
 # -- what a jaw holds
 
@@ -74,20 +77,39 @@ def falling(tmp_path_factory: pytest.TempPathFactory) -> Falling:
 
 @pytest.mark.parametrize("speed", [*(pytest.param(speed, marks=pytest.mark.slow) for speed in (0.0, 1.0)), 3.0])
 def test_what_falls_on_a_pad_comes_to_rest_there(falling: Falling, speed: float) -> None:
-    """Within 2 s, whatever way it is turned; then it drifts by less than 0.1 mm in 10 s.
-
-    But for one of 24 that are let go at rest: a block on an edge may chatter there for ever (docs/physics.md).
-    """
+    """Within 2 s, whatever way it is turned; then it drifts by less than 0.1 mm in 10 s."""
     rng = np.random.default_rng(0)
     down = np.broadcast_to([0, 0, -speed, 0, 0, 0], (8, 3, 6))
-    objects, path = falling.play(thrown(falling.begin(8), quaternion=random_turns(rng, 8, 3), velocity=down), 2.0)
+    start = thrown(falling.begin(8), quaternion=random_turns(rng, 8, 3), velocity=down)
+    path = comes_to_rest(falling, start)
     assert path.position[..., 2].min() > 0, "something fell through"
-    chattering = 1 if speed == 0.0 else 0
-    assert path.depth.max() < 5e-4 and np.sum(path.depth[:, -1] >= 1e-5) <= chattering
-    assert np.sum(np.abs(path.velocity[:, -1, :, :3]).max(-1) >= 1e-3) <= chattering
+    assert path.depth.max() < 5e-4
+
+
+@pytest.mark.slow
+def test_what_is_put_down_on_a_blunt_edge_or_flat_comes_to_rest_there(falling: Falling) -> None:
+    """A block on a corner, which is 4.5 mm wide, a needle and a ring on their sides, turned about the vertical.
+
+    Each is supported by more points than a contact has.
+    """
+    corner = turned(np.array([0.0, 0.0, 30.0]))  # the post at -30 degrees comes to lie on x
+    ways = {"needle_sh": np.eye(3), "block": turned(np.array([0.0, 90.0, 0.0])) @ corner, "ring": np.eye(3)}
+    yaws = [turned(np.array([0.0, 0.0, angle])) for angle in np.arange(0.0, 360.0, 22.5) + 3.0]
+    turns = [[quaternion(yaw @ ways[name]) for name in falling.names] for yaw in yaws]
+    start = falling.begin(len(yaws))
+    place = np.array(start.bodies.position)
+    place[..., 2] = [2e-4 + falling.scene.objects[name].object.height(ways[name]) for name in falling.names]
+    path = comes_to_rest(falling, thrown(start, position=place, quaternion=np.array(turns)))
+    assert np.abs(path.position[:, -1, :, 2] - place[..., 2]).max() < 3e-4, "something rolled over"
+
+
+def comes_to_rest(falling: Falling, start: Objects) -> Trace:
+    """Return what objects do in 2 s; after that they lie still, and go on to do so."""
+    objects, path = falling.play(start, 2.0)
+    assert path.depth[:, -1].max() < 1e-5 and np.abs(path.velocity[:, -1, :, :3]).max() < 1e-3
     _, later = falling.play(objects, 2.0)
-    drift = 5 * np.linalg.norm(later.position[:, -1] - path.position[:, -1], axis=-1)
-    assert np.sum(drift >= 1e-4) <= chattering
+    assert 5 * np.linalg.norm(later.position[:, -1] - path.position[:, -1], axis=-1).max() < 1e-4
+    return path
 
 
 def test_a_spinning_body_keeps_its_angular_momentum(tmp_path: Path) -> None:
@@ -133,7 +155,7 @@ def test_an_object_slides_where_coulomb_says(tmp_path: Path) -> None:
 def test_what_falls_on_a_board_and_on_pegs_comes_to_rest_there(tmp_path: Path) -> None:
     """Blocks around pegs, upright or aslant, and needles on top, from where nothing overlaps.
 
-    Then they drift by less than 0.1 mm in 10 s. One needle of eight may rock on a peg for ever (docs/physics.md).
+    Then they drift by less than 0.1 mm in 10 s. No step adds energy but by pushing out what an impact has left inside.
     """
     places = {
         "block": {"object": "block", "position": [-0.06, 0.0, 0.0076]},
@@ -146,9 +168,8 @@ def test_what_falls_on_a_board_and_on_pegs_comes_to_rest_there(tmp_path: Path) -
     start = thrown(start, position=np.array(start.bodies.position) + shift)
     apart = np.flatnonzero(np.asarray(jax.vmap(falling.depth)(start)) < 0)[:8]
     assert len(apart) == 8
-    objects, path = falling.play(jax.tree.map(lambda x: x[apart], start), 2.0)
-    assert path.position[..., 2].min() > 0 and np.sum(path.depth[:, -1] >= 1e-5) <= 1
+    path = comes_to_rest(falling, jax.tree.map(lambda x: x[apart], start))
+    assert path.position[..., 2].min() > 0
     energy = falling.energy(path).sum(-1)
-    assert (np.diff(energy, axis=1) <= 1e-3 * energy[:, :1]).all()
-    _, later = falling.play(objects, 2.0)
-    assert 5 * np.linalg.norm(later.position[:, -1] - path.position[:, -1], axis=-1).max() < 1e-4
+    gained, pushed_out = np.diff(energy, axis=1), falling.masses.mass.sum() * FASTEST**2 / 2
+    assert gained.max() <= pushed_out, np.unravel_index(gained.argmax(), gained.shape)

@@ -25,10 +25,21 @@ POINTS = 4
 """Points of a patch."""
 AWAY = -100.0
 """Depth, m, of a point that is not there: no scene is so large."""
-TILT = 0.1
-"""By which a body is tilted to find the rim of a contact, rad. A firm grip dents a wire that is bent to a radius of 8
-mm over 0.7 mm to each side, where its direction differs by 0.08 rad. With a narrower rim nothing in a patch would stop
-the wire from turning while the jaw closes, and it would be thrown about."""
+TILT = 0.03
+"""By which a body is tilted to find the rim of a contact, rad. A wider rim may leave out what carries an object that
+lies on a blunt edge, for what comes down only if it turns further: it would rock there for ever."""
+TILT_IN_JAW = 0.1
+"""By which it is tilted between fingers, rad. A firm grip dents a wire that is bent to a radius of 8 mm over 0.7 mm to
+each side, where its direction differs by 0.08 rad. With a narrower rim nothing in a patch would stop the wire from
+turning while the jaw closes, and it would be thrown about."""
+LEAN = 0.005
+"""By which a body is tilted to find its deepest point, rad, if three points of the rim do not bear its weight: to the
+side on which they don't. Those of a half circle that lies flat do not in most directions, and without this it would
+rock on them for ever."""
+ASIDE = 1e-3
+"""How far beyond them the weight is where this tilt is whole, m, and how far within where there is none."""
+SHORT = 1e-4
+"""Two points of the rim that are nearer than this count less as an edge, m."""
 BLEND = 1e-5
 """Difference in depth over which the place of a point goes from one of two candidates to the other, m: a quarter of the
 overlap of a firm grip."""
@@ -53,7 +64,9 @@ class Patch(NamedTuple):
     """Depth of the deepest point now or after the step, m, [...]."""
 
 
-def find_patch(points: Points, soon: Array, count: Any, axes: Array, torsion: Array) -> Patch:
+def find_patch(
+    points: Points, soon: Array, count: Any, axes: Array, tilt: float, torsion: Array, centre: Array | None = None
+) -> Patch:
     """Return the patch of a pair of bodies.
 
     Args:
@@ -62,32 +75,66 @@ def find_patch(points: Points, soon: Array, count: Any, axes: Array, torsion: Ar
             depths, so that no part of a fast object comes in unseen.
         count: how many of the c shapes there are, []; without any, the patch is nothing.
         axes: two directions, [2, 3]: bodies are tilted about those across them.
+        tilt: by how much, rad.
         torsion: radius of the contact at a point, m, [].
+        centre: where the weight of one of the bodies acts, [3]. The deepest point is then looked for under a slight
+            tilt of this body if the other three do not bear its weight. None: under no tilt.
     """
     middle = points.place[0, 0]
+    rims, limits = tilt * jnp.asarray(_TILTS) @ axes, np.full(len(_TILTS), ALIKE, np.float32)
+    if centre is None:
+        tilts = jnp.concatenate([jnp.zeros((1, 3)), rims])
+        chosen, reach = _supports(points, soon, count, middle, tilts, np.append(np.float32(-AWAY), limits))
+        return _with_frame(chosen, torsion, reach)
+    rim, reach = _supports(points, soon, count, middle, rims, limits)
+    lean = LEAN * _beyond(axes @ centre, rim.place @ axes.T) @ axes
+    deepest, _ = _supports(points, soon, count, middle, lean[None], np.full(1, -AWAY, np.float32))
+    chosen = Points(*(jnp.concatenate(parts) for parts in zip(deepest, rim, strict=True)))
+    return _with_frame(chosen, torsion, reach)
+
+
+def _beyond(point: Array, corners: Array) -> Array:
+    """Return the way on which a point [2] leaves a triangle, [2]: 0 well within, of length 1 beyond an edge.
+
+    The corners [3, 2] go around to the left.
+    """
+    along = jnp.roll(corners, -1, 0) - corners
+    out = jnp.stack([along[:, 1], -along[:, 0]], 1)
+    out = out / jnp.sqrt(jnp.sum(out * out, 1, keepdims=True) + SHORT**2)
+    beyond = jnp.sum(out * (point - corners), 1)
+    return jnp.clip((1 + beyond / ASIDE) / 2, 0.0, 1.0) @ out
+
+
+def _supports(
+    points: Points, soon: Array, count: Any, middle: Array, tilts: Array, limits: np.ndarray
+) -> tuple[Points, Array]:
+    """Return the points that are deepest under p tilts, [p], and the largest depth of all without any, m, [].
+
+    Under each tilt depths beyond a limit [p] count as that.
+    """
 
     def tilted(depth: Array, place: Array, soon: Array) -> Array:
-        """Return the depths of points [d] as the bodies are, and tilted, [d, POINTS]."""
-        reach = jnp.maximum(depth, soon)
-        rim = jnp.minimum(reach, ALIKE)[:, None] + TILT * ((place - middle) @ axes.T @ jnp.asarray(_TILTS).T)
-        return jnp.concatenate([reach[:, None], rim], 1)
+        """Return the depths of points [d], tilted, [d, p]."""
+        return jnp.minimum(jnp.maximum(depth, soon)[:, None], limits) + (place - middle) @ tilts.T
 
-    def deepest(n: Array, most: Array) -> Array:
+    def deepest(n: Array, most: tuple[Array, Array]) -> tuple[Array, Array]:
         one, then = row_of((points, soon), n)
-        return jnp.maximum(most, jnp.max(tilted(one.depth, one.place, then), 0))
+        under = jnp.max(tilted(one.depth, one.place, then), 0)
+        return jnp.maximum(most[0], under), jnp.maximum(most[1], jnp.max(jnp.maximum(one.depth, then)))
 
-    most = jax.lax.fori_loop(0, count, deepest, jnp.full(POINTS, 2 * AWAY))
+    most, reach = jax.lax.fori_loop(0, count, deepest, (jnp.full(len(tilts), 2 * AWAY), jnp.float32(2 * AWAY)))
 
     def add(n: Array, total: tuple[Array, Points]) -> tuple[Array, Points]:
         one, then = row_of((points, soon), n)
-        weight = jnp.maximum(tilted(one.depth, one.place, then) - most + BLEND, 0.0).T  # [POINTS, d]
+        weight = jnp.maximum(tilted(one.depth, one.place, then) - most + BLEND, 0.0).T  # [p, d]
         own = Points(weight @ one.depth, weight @ (one.place - middle), weight @ one.normal)
         return total[0] + jnp.sum(weight, 1), jax.tree.map(jnp.add, total[1], own)
 
-    none = Points(jnp.zeros(POINTS), jnp.zeros((POINTS, 3)), jnp.zeros((POINTS, 3)))
-    weight, found = jax.lax.fori_loop(0, count, add, (jnp.zeros(POINTS), none))
-    chosen = Points(found.depth / weight, middle + found.place / weight[:, None], _unit(found.normal / weight[:, None]))
-    return _with_frame(chosen, torsion, most[0])
+    zeros = jnp.zeros((len(tilts), 3))
+    weight, found = jax.lax.fori_loop(0, count, add, (zeros[:, 0], Points(zeros[:, 0], zeros, zeros)))
+    return Points(
+        found.depth / weight, middle + found.place / weight[:, None], _unit(found.normal / weight[:, None])
+    ), reach
 
 
 def _with_frame(points: Points, torsion: Array, reach: Array) -> Patch:

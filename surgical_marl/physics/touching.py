@@ -1,4 +1,4 @@
-"""Finds what touches objects and what is fixed in the world: at most `SLOTS` patches at a time.
+"""Finds what touches objects and what is fixed in the world: at most `SLOTS` patches at a time; more are counted.
 
 Pairs of bodies that are far from each other cost a distance of a ball. What is found is kept in slots, so that all that
 follows is in proportion to what touches, not to what could.
@@ -15,14 +15,13 @@ import numpy as np
 from jax import Array
 
 from surgical_marl.physics.bodies import Bodies
-from surgical_marl.physics.patches import BLEND, TILT, Patch, find_patch, no_patch
+from surgical_marl.physics.patches import BLEND, TILT, TILT_IN_JAW, Patch, find_patch, no_patch
 from surgical_marl.physics.placed import Joints, Placed, Places, Way, size
 from surgical_marl.physics.rows import room, row_of
 from surgical_marl.physics.shapes import Points, Segments, between_segments, on_plate
 from surgical_marl.physics.tables import Meeting, Tables
+from surgical_marl.scenes.object_contacts import SLOTS
 
-SLOTS = 16
-"""Patches at one time; more are counted, and not felt."""
 NEAREST = 16
 """Pairs of two kinds of body that are near at one time; more are counted as patches that found no room."""
 MARGIN = 2e-4
@@ -138,7 +137,9 @@ class Finder:
 
         shape = jax.eval_shape(lambda: touch(self._places.capsule(placed, meeting.first, i, jnp.int32(0))))
         points, soon = jax.lax.fori_loop(0, count, near, room((shape, shape.depth), len(capsules)))
-        patch = find_patch(points, soon, count, axes, jnp.asarray(self._tables.torsion)[start + pair])
+        torsion = jnp.asarray(self._tables.torsion)[start + pair]
+        centre = placed.balls["objects"].centre[i] if meeting.first == "objects" and meeting.second != "pads" else None
+        patch = find_patch(points, soon, count, axes, _tilt(meeting), torsion, centre)
         return patch, (patch.reach > -NEAR).astype(jnp.int32)
 
     def _near_capsules(self, placed: Placed, meeting: Meeting, i: Array, j: Array) -> tuple[Array, Array]:
@@ -150,7 +151,7 @@ class Finder:
         if meeting.first != "objects" or c == 1:
             return jnp.zeros(1, jnp.int32), jnp.int32(1)
         one, moves = row_of(placed.balls["objects"], i), placed.balls[meeting.second].moves[j]
-        reach = NEAR + jnp.minimum(one.moves + moves, AHEAD) + 2 * TILT * one.radius + BLEND
+        reach = NEAR + jnp.minimum(one.moves + moves, AHEAD) + 2 * _tilt(meeting) * one.radius + BLEND
         frame = placed.frames[i]
 
         def look(found: tuple[Array, Array], capsule: Array) -> tuple[tuple[Array, Array], None]:
@@ -181,6 +182,11 @@ class Finder:
 
             found.append(jax.lax.map(deepest, np.arange(len(meeting.one), dtype=np.int32)))
         return jnp.concatenate(found)
+
+
+def _tilt(meeting: Meeting) -> float:
+    """Return by how much bodies are tilted to find the rim of their contact, rad."""
+    return TILT_IN_JAW if meeting.second == "pads" else TILT
 
 
 def _listed(found: tuple[Array, Array], number: Array, near: Array) -> tuple[Array, Array]:

@@ -24,6 +24,7 @@ from surgical_marl.robots.spec import COLLISION_GROUP, build_spec
 from surgical_marl.robots.urdf import Faults
 from surgical_marl.scenes.build import set_physics
 from surgical_marl.scenes.contacts import collision_geoms, neighbours
+from surgical_marl.scenes.crowding import crowding
 from surgical_marl.scenes.load import load_scene
 from surgical_marl.scenes.objects import load_object
 from surgical_marl.scenes.scene import Scene
@@ -290,3 +291,6 @@ def _scene_findings(scene: Scene) -> Iterator[str]:
                 f"{where}: the workspace point {mount.workspace.tolist()} of {agent} is {1000 * off:.3g} mm out of its "
                 "reach; it is in the arm's base frame, in m"
             )
+    crowded = crowding(scene)
+    if crowded:
+        yield f"{where}: {crowded}"

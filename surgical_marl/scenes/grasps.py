@@ -16,7 +16,7 @@ import numpy as np
 from surgical_marl.robots.inverse_kinematics import inverse_kinematics
 from surgical_marl.robots.rotation import quaternion, turned
 from surgical_marl.robots.spec import PAD_GROUP
-from surgical_marl.scenes.object_contacts import touches
+from surgical_marl.scenes.object_contacts import distance, touches
 from surgical_marl.scenes.scene import Scene
 
 GAP = 3e-5
@@ -178,8 +178,7 @@ class Jaw:
         shapes = range(body.geomadr[0], body.geomadr[0] + body.geomnum[0])
         side = (data.geom_xpos[self._pads] - data.xpos[self._link]) @ data.xmat[self._link, ::3]
         left, right = (
-            min(mujoco.mj_geomDistance(model, data, shape, pad, 1.0, None) for shape in shapes)
-            for pad in self._pads[np.argsort(side)]
+            min(distance(model, data, shape, pad) for shape in shapes) for pad in self._pads[np.argsort(side)]
         )
         return left, right
 
@@ -188,7 +187,7 @@ class Jaw:
         model, prefix = self.scene.model, f"{name}/"
         self._put(name, frame)
         return all(
-            mujoco.mj_geomDistance(model, self._data, model.geom(one).id, model.geom(other).id, 1.0, None) > 0
+            distance(model, self._data, model.geom(one).id, model.geom(other).id) > 0
             for one, other in self._touches
             if one.startswith(prefix) or other.startswith(prefix)
         )

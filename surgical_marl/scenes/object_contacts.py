@@ -20,6 +20,9 @@ from surgical_marl.scenes.objects import JAW, LINK, Surface
 from surgical_marl.scenes.poses import Pose
 from surgical_marl.scenes.scene import Scene
 
+SLOTS = 16
+"""Contacts of objects that a scene can feel at one time, each between two bodies. A fixed shape is a body of its
+own."""
 DRAWS = 64
 """Draws of the places of objects that are looked at."""
 FAR = 0.05
@@ -91,8 +94,34 @@ def distances(scene: Scene, poses: Mapping[str, Pose], sizes: Mapping[str, np.nd
             for lengths, given in ((model.geom_size, scene.model.geom_size), (model.geom_pos, scene.model.geom_pos)):
                 lengths[own] = size[row] * given[own]
         mujoco.mj_kinematics(model, data)
-        found[row] = [mujoco.mj_geomDistance(model, data, one, other, FAR, None) for one, other in pairs]
+        found[row] = [distance(model, data, one, other, FAR) for one, other in pairs]
     return found
+
+
+def distance(model: mujoco.MjModel, data: mujoco.MjData, one: int, other: int, most: float = 1.0) -> float:
+    """Return the distance of two geoms, below 0 where they overlap, m; `most` if they are further away.
+
+    It is C MuJoCo's (3.17), but for a capsule whose axis goes through a box: there that is above 0 in 3 % of random
+    poses.
+    """
+    found = float(mujoco.mj_geomDistance(model, data, one, other, most, None))
+    kinds = {int(model.geom_type[geom]): geom for geom in (one, other)}
+    box, capsule = kinds.get(mujoco.mjtGeom.mjGEOM_BOX), kinds.get(mujoco.mjtGeom.mjGEOM_CAPSULE)
+    if box is None or capsule is None or not _goes_through(model, data, box, capsule):
+        return found
+    return min(found, -float(model.geom_size[capsule, 0]))
+
+
+def _goes_through(model: mujoco.MjModel, data: mujoco.MjData, box: int, capsule: int) -> bool:
+    """Return whether the axis of a capsule has a point within a box."""
+    apart, half = data.geom_xpos[capsule] - data.geom_xpos[box], model.geom_size[capsule, 1]
+    if apart @ apart > (half + np.linalg.norm(model.geom_size[box])) ** 2:
+        return False
+    axes = data.geom_xmat[box].reshape(3, 3)
+    middle, way = apart @ axes, half * data.geom_xmat[capsule].reshape(3, 3)[:, 2] @ axes
+    way = np.where(np.abs(way) < 1e-12, 1e-12, way)
+    ends = (np.stack([-model.geom_size[box], model.geom_size[box]]) - middle) / way
+    return bool(max(-1.0, ends.min(0).max()) <= min(1.0, ends.max(0).min()))
 
 
 class _Side(NamedTuple):
