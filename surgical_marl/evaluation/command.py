@@ -10,15 +10,18 @@ from pathlib import Path
 from typing import Any
 
 from surgical_marl.content import BASELINES, find
+from surgical_marl.evaluation.episodes import EPISODES, write_played
 from surgical_marl.evaluation.evaluate import MAX_BATCH, Played, difference, play, summarise
 from surgical_marl.evaluation.report import ABOUT, format_table, write_csv
 from surgical_marl.files import write_atomic
 from surgical_marl.policies.policy import load_policy
 from surgical_marl.policies.team import Team
 from surgical_marl.runs.environment import make_env
-from surgical_marl.runs.folder import read_settings
+from surgical_marl.runs.folder import read_metrics, read_settings
 from surgical_marl.runs.settings import Settings
 
+RESULT, FILM = "eval.json", "video.mp4"
+"""Files that `judge` adds to a run."""
 OWN = ("task", "scene", "control", "knowledge", "messages")
 CHOSEN = ("difficulty", "start", "goals")
 """Options that a trained policy determines, and options that can be chosen for any policy."""
@@ -116,21 +119,24 @@ def report(
 def judge(run: Path) -> None:
     """Do what `surgical-marl train` does after training.
 
-    Evaluate the run on the standard goals, write and print the result, and film the policy.
+    Evaluate the run on the standard goals, write and print the result, keep the episodes, and film the policy.
     """
     print("evaluating 200 episodes", file=sys.stderr)
     env = make_env(read_settings(run, ["engine=auto", "device=auto", "goals=held_out"]), num_envs=200)
     policy = load_policy(run, env)
-    result = summarise([play(env, policy, episodes=200, seed=0)])
+    played = play(env, policy, episodes=200, seed=0)
+    rows = read_metrics(run)
+    result = {**summarise([played]), **({"iteration": int(rows[-1]["iteration"])} if rows else {})}
     text = json.dumps(result, indent=2) + "\n"
-    write_atomic(run / "eval.json", lambda path: path.write_text(text))
+    write_played(run / EPISODES, played)
+    write_atomic(run / RESULT, lambda path: path.write_text(text))
     print(format_table(result))
     print(run, flush=True)
 
     from surgical_marl.view.record import record
 
     print("recording a video", file=sys.stderr)
-    record(env, policy, run / "video.mp4")
+    record(env, policy, run / FILM)
 
 
 def read_result(path: Path) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from surgical_marl.evaluation.interval import interval
 from surgical_marl.evaluation.metrics import (
     DROP,
     LAST,
+    PEAK,
     SEARCHING,
     STAGE,
     SUCCESS_MM,
@@ -39,7 +40,7 @@ MAX_BATCH = 1024
 ERRORS = ("tip_error", "goal_error")
 """Infos of how far a tool tip, or an object, is from its goal, m: the first that there is counts."""
 INFOS = ("success", "collision", "min_distance")
-KEPT = (*ERRORS, *INFOS, *LAST, *VIEWED, *TRAVEL, DROP, SEARCHING)
+KEPT = (*ERRORS, *INFOS, *LAST, *VIEWED, *TRAVEL, *PEAK, DROP, SEARCHING)
 """Names of infos that metrics are computed from, besides those that begin like `TERMS` and `STAGE`."""
 
 

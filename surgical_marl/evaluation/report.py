@@ -77,7 +77,7 @@ def _csv_row(result: Mapping[str, Any], agent: str | None) -> dict[str, Any]:
     return row
 
 
-UNITS = {"_mm": " (mm)", "_s": " (s)", "_deg": " (degrees)", "image_error": "image error (grey levels)"}
+UNITS = {"_mm": " (mm)", "_s": " (s)", "_deg": " (degrees)", "_n": " (N)", "image_error": "image error (grey levels)"}
 """Units of metrics, by the suffix of their names."""
 
 

@@ -167,6 +167,8 @@ def read_metrics(run: Path) -> list[dict[str, float]]:
     rows: list[dict[str, float]] = []
     with (run / METRICS).open(newline="", errors="replace") as file, contextlib.suppress(ValueError):
         for row in csv.DictReader(line for line in file if line.endswith("\n")):
+            if None in row:  # cells without a column
+                break
             rows.append({key: float(cell or "nan") for key, cell in row.items()})
     return rows
 
