@@ -21,7 +21,7 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter, FuncFormatter, MaxNLocator, NullFormatter, PercentFormatter
+from matplotlib.ticker import EngFormatter, FuncFormatter, MaxNLocator, MultipleLocator, NullFormatter
 
 WIDTH, HEIGHT = 360, 200
 """Size of a chart in pixels of the page: as wide as a phone, so that its text is not shrunk there."""
@@ -193,11 +193,12 @@ def _scale(axis: Axes, which: str, scale: Scale) -> None:
         getattr(axis, f"set_{which}scale")("log")
         own.set_minor_formatter(NullFormatter())
     else:
-        own.set_major_locator(MaxNLocator(5 if which == "x" else 4))
+        whole = scale.limits == SHARE.limits
+        own.set_major_locator(MultipleLocator(0.25) if whole else MaxNLocator(5 if which == "x" else 4))
     if scale.limits is not None:
         getattr(axis, f"set_{which}lim")(*scale.limits)
     if scale.write is percent:
-        own.set_major_formatter(PercentFormatter(1.0))
+        own.set_major_formatter(FuncFormatter(lambda value, _: f"{100 * value:z.3g}%"))
     elif scale.log:
         own.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     else:

@@ -63,8 +63,7 @@ def render(runs: Sequence[Run]) -> str:
         made=time.strftime("%Y-%m-%d %H:%M %Z"),
         heading=heading,
         about=_about(str(task)),
-        runs=runs,
-        groups=groups,
+        statuses=_statuses(runs),
         tiles=tables.tiles(runs[0]) if len(runs) == 1 else [],
         overview=tables.runs(groups),
         differences=tables.settings_that_differ(groups),
@@ -98,12 +97,23 @@ def _about(task: str) -> str:
         return ""
 
 
+def _statuses(runs: Sequence[Run]) -> list[tuple[str, str, bool]]:
+    """Return who, what and whether all is well, each sentence once for all runs that it holds for."""
+    found: dict[tuple[str, bool], list[str]] = {}
+    for run in runs:
+        found.setdefault((run.status, run.finished), []).append(run.name)
+    for run in runs:
+        for note in run.notes:
+            found.setdefault((note, False), []).append(run.name)
+    return [(", ".join(names), text, good) for (text, good), names in found.items()]
+
+
 def _evaluation(drawing: Drawing, groups: Sequence[Group]) -> list[Section]:
     every = [run for group in groups for run in group.runs]
     first = next((run.result for run in every if run.result is not None), None)
     if first is None:
         return []
-    words = "{episodes} episodes of {goals} goals, {difficulty}, {control} control, {start} start".format(**first)
+    words = "{episodes} episodes of {goals} goals, difficulty {difficulty}, {control} control, {start} start".format(**first)
     notes = [f"Without exploration noise: {words}; goal set {first['goal_set']:.12}."]
     if any(run.result is not None and run.result["goal_set"] != first["goal_set"] for run in every):
         notes.append("Not all runs were evaluated on the same goals, so that their numbers compare only roughly.")
@@ -185,8 +195,8 @@ def _clip(path: Path, label: str) -> Clip:
 
 def video_address(path: Path) -> Markup:
     """Return a video as the address of an HTML page that needs no file: a data URI."""
-    kind = {".webm": "webm", ".gif": "gif"}.get(path.suffix, "mp4")
-    return Markup(f"data:video/{kind};base64,{base64.b64encode(path.read_bytes()).decode()}")
+    kind = {".webm": "video/webm", ".gif": "image/gif"}.get(path.suffix, "video/mp4")
+    return Markup(f"data:{kind};base64,{base64.b64encode(path.read_bytes()).decode()}")
 
 
 def _template() -> jinja2.Template:

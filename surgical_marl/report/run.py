@@ -157,7 +157,7 @@ def _is_older(result: Mapping[str, Any], columns: Mapping[str, np.ndarray]) -> b
 
 def _why_not_evaluated(folder: Path) -> str:
     if (folder / CHECKPOINT).is_file():
-        return "This run was not evaluated yet: `surgical-marl report RUN --evaluate` does it."
+        return "This run was not evaluated yet: surgical-marl report RUN --evaluate does it."
     lacks = f" and no {METRICS}" if not (folder / METRICS).is_file() else ""
     return f"This run has no {CHECKPOINT}{lacks}, so that it cannot be evaluated."
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from surgical_marl.evaluation.metrics import TERMS
 from surgical_marl.evaluation.report import title
-from surgical_marl.report.charts import NUMBER, SHARE, Chart, Drawing, Line, Scale, Text, plain
+from surgical_marl.report.charts import NUMBER, SHARE, Chart, Drawing, Line, Scale, Text, percent, plain
 from surgical_marl.report.groups import Curve, Group, curve
 
 MAIN = ("success_rate", "tip_error_mm", "reward", "collision_rate")
@@ -21,6 +21,7 @@ TITLES = {
     "seconds": "seconds of an iteration",
 }
 _KNOWN = ("iteration", "env_steps", "episodes", *MAIN, "steps_per_s", "seconds")
+LOG = ("tip_error_mm", "learning_rate")
 ROWS = 9
 """Rows of the table beside a curve."""
 
@@ -65,7 +66,7 @@ def _chart(drawing: Drawing, groups: Sequence[Group], name: str) -> Chart | None
         band = (found.low, found.high) if several else None
         lines.append(Line(number, found.x, found.mean, band, found.single if several else ()))
     values = np.concatenate([y for found in curves.values() for _, y in found.single])
-    scale = SHARE if share else _log_scale(values) if name in ("tip_error_mm", "learning_rate") else NUMBER
+    scale = _share_scale(values) if share else _log_scale(values) if name in LOG else NUMBER
     words = TITLES.get(name, title(name.removeprefix("reward_") if name != "reward" else name))
     words = f"reward: {words}" if name.startswith("reward_") else words
     x_label = "environment steps" if _has(groups, "env_steps") else "iterations"
@@ -106,6 +107,12 @@ def _table(
         ])  # fmt: skip
     head = [x_label, *(groups[number].label for number in curves)]
     return head, [[f"{x:,.0f}", *cells] for x, *cells in zip(grid, *columns, strict=True)]
+
+
+def _share_scale(values: np.ndarray) -> Scale:
+    """Return a scale to 100 %, or to less if all shares are small, as those of collisions."""
+    most = float(values.max())
+    return SHARE if most > 0.2 else Scale(percent, (-0.02 * max(1.1 * most, 0.01), max(1.1 * most, 0.01)))
 
 
 def _log_scale(values: np.ndarray) -> Scale:
