@@ -21,7 +21,7 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter, FuncFormatter, MaxNLocator, MultipleLocator, NullFormatter
+from matplotlib.ticker import EngFormatter, FuncFormatter, LogLocator, MaxNLocator, MultipleLocator, NullFormatter
 
 WIDTH, HEIGHT = 360, 200
 """Size of a chart in pixels of the page: as wide as a phone, so that its text is not shrunk there."""
@@ -191,6 +191,8 @@ def _scale(axis: Axes, which: str, scale: Scale) -> None:
     own = getattr(axis, f"{which}axis")
     if scale.log:
         getattr(axis, f"set_{which}scale")("log")
+        low, high = scale.limits or getattr(axis, f"get_{which}lim")()
+        own.set_major_locator(LogLocator(subs=(1, 2, 5) if high < 30 * low else (1,)))
         own.set_minor_formatter(NullFormatter())
     else:
         whole = scale.limits == SHARE.limits

@@ -66,7 +66,7 @@ def _chart(drawing: Drawing, groups: Sequence[Group], name: str) -> Chart | None
         band = (found.low, found.high) if several else None
         lines.append(Line(number, found.x, found.mean, band, found.single if several else ()))
     values = np.concatenate([y for found in curves.values() for _, y in found.single])
-    scale = _share_scale(values) if share else _log_scale(values) if name in LOG else NUMBER
+    scale = _share_scale(name, values) if share else _log_scale(values) if name in LOG else NUMBER
     words = TITLES.get(name, title(name.removeprefix("reward_") if name != "reward" else name))
     words = f"reward: {words}" if name.startswith("reward_") else words
     x_label = "environment steps" if _has(groups, "env_steps") else "iterations"
@@ -109,10 +109,10 @@ def _table(
     return head, [[f"{x:,.0f}", *cells] for x, *cells in zip(grid, *columns, strict=True)]
 
 
-def _share_scale(values: np.ndarray) -> Scale:
-    """Return a scale to 100 %, or to less if all shares are small, as those of collisions."""
+def _share_scale(name: str, values: np.ndarray) -> Scale:
+    """Return a scale to 100 %, or to less for what should be small, and is."""
     most = float(values.max())
-    return SHARE if most > 0.2 else Scale(percent, (-0.02 * max(1.1 * most, 0.01), max(1.1 * most, 0.01)))
+    return SHARE if most > 0.2 or name == "success_rate" else Scale(percent, (-0.02 * max(1.1 * most, 0.01), max(1.1 * most, 0.01)))
 
 
 def _log_scale(values: np.ndarray) -> Scale:
