@@ -89,7 +89,9 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(prog="surgical-marl", description="Surgical robot arms that learn together.")
     parser.add_argument("--version", action="version", version=f"%(prog)s {_version()}")
-    commands = parser.add_subparsers(required=True, metavar="{train,eval,crossplay,report,list,check,export,bench,doctor}")
+    commands = parser.add_subparsers(
+        required=True, metavar="{train,eval,crossplay,report,list,check,export,bench,doctor}"
+    )
 
     train = commands.add_parser(
         "train",

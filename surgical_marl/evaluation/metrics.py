@@ -129,8 +129,10 @@ def measure(trajectory: Trajectory, dt: float, following: bool) -> dict[str, np.
 
 
 def _reduced(name: str, values: np.ndarray, where: np.ndarray, final: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    """Reduce steps: whether a stage was ever reached or there was a drop, largest of `PEAK`, last of `LAST`, sum of
-    `TRAVEL`, else mean.
+    """Reduce steps to one number: their mean, unless the name asks for something else.
+
+    That is whether a stage was ever reached or there was a drop, the largest of `PEAK`, the last of `LAST`, or the sum
+    of `TRAVEL`.
 
     Args:
         where: [T, E, 1], the steps that count.

@@ -30,7 +30,7 @@ COLORS, DASHES = 6, ("-", (0, (5, 2)), (0, (1, 1.5)), (0, (6, 2, 1, 2)))
 INK, GRID = "#010101", "#020202"
 _SERIES = "#0300{:02x}"
 _REFERENCE = re.compile(r"^#(\S+)$|url\(#([^)]+)\)")
-_STYLE = {
+_STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",
     "svg.hashsalt": "report",
     "text.parse_math": False,
@@ -119,12 +119,13 @@ class Drawing:
                     axis.plot(thin_x, thin_y, color=style["color"], linewidth=0.8, alpha=0.45)
                 if line.band is not None:
                     axis.fill_between(line.x, *line.band, color=style["color"], alpha=0.2, linewidth=0)
-                marker = {"marker": "o", "markersize": 4} if len(line.x) == 1 else {}
                 if line.steps:
                     axis.stairs(line.y, line.x, linewidth=1.6, **style)
                     axis.stairs(line.y, line.x, fill=True, alpha=0.15, color=style["color"])
                 else:
-                    axis.plot(line.x, line.y, linewidth=2, **style, **marker)
+                    axis.plot(
+                        line.x, line.y, linewidth=2, marker="o" if len(line.x) == 1 else None, markersize=4, **style
+                    )
             _scale(axis, "x", x)
             _scale(axis, "y", y)
         return self._chart(figure, text)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
 from surgical_marl.evaluation.interval import interval
 from surgical_marl.evaluation.metrics import HOLD, STAGE, THRESHOLDS_MM, Metric, success
-from surgical_marl.report.charts import NUMBER, SHARE, Chart, Drawing, Line, Scale, Text, percent, plain
+from surgical_marl.report.charts import SHARE, Chart, Drawing, Line, Scale, Text, percent, plain
 from surgical_marl.report.groups import Group, stacked
 
 THRESHOLDS, BINS = 24, 24
@@ -83,7 +84,7 @@ def _threshold(drawing: Drawing, series: Sequence[Series], following: bool) -> C
         value = np.array([_mean(metric) for metric in metrics])
         bounds = np.array([interval(metric) or (np.nan, np.nan) for metric in metrics])
         lines.append(Line(one.number, grid, value, (bounds[:, 0], bounds[:, 1])))
-        columns.append([f"{percent(v)} ({percent(a)} to {percent(b)})" for v, (a, b) in zip(value, bounds, strict=True)])
+        columns.append([_cell(*pair) for pair in zip(value, bounds, strict=True)])
         at = ", ".join(f"{percent(value[grid == t][0])} within {t} mm" for t in THRESHOLDS_MM)
         sentences.append(f"{one.label}: {at}.")
     rows = [[plain(x), *cells] for x, *cells in zip(grid, *columns, strict=True)]
@@ -122,7 +123,7 @@ def _histogram(drawing: Drawing, series: Sequence[Series], kind: Histogram) -> C
     coarse = edges[:: (len(edges) - 1) // ROWS]
     rows = [
         [f"{plain(low)} to {plain(high)}", *(percent(column[i]) for column in columns)]
-        for i, (low, high) in enumerate(zip(coarse[:-1], coarse[1:], strict=True))
+        for i, (low, high) in enumerate(pairwise(coarse))
     ]
     text = Text(
         kind.title,
@@ -154,10 +155,7 @@ def _stages(drawing: Drawing, series: Sequence[Series], stages: Sequence[str]) -
         [interval(metric) or missing if np.isfinite(value) else missing for metric, value in zip(*pair, strict=True)]
         for pair in zip(metrics, values, strict=True)
     ])  # fmt: skip
-    cells = [
-        [f"{percent(v)} ({percent(b[0])} to {percent(b[1])})" for v, b in zip(*pair, strict=True)]
-        for pair in zip(values, bounds, strict=True)
-    ]
+    cells = [[_cell(*pair) for pair in zip(*row, strict=True)] for row in zip(values, bounds, strict=True)]
     words = [stage.replace("_", " ") for stage in stages]
     text = Text(
         "Stages of the task",
@@ -167,6 +165,10 @@ def _stages(drawing: Drawing, series: Sequence[Series], stages: Sequence[str]) -
         _legend(series),
     )
     return drawing.bars(text, words, values, bounds, SHARE)
+
+
+def _cell(value: float, bounds: np.ndarray) -> str:
+    return f"{percent(value)} ({percent(bounds[0])} to {percent(bounds[1])})"
 
 
 def _mean(metric: Metric) -> float:

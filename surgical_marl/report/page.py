@@ -113,7 +113,8 @@ def _evaluation(drawing: Drawing, groups: Sequence[Group]) -> list[Section]:
     first = next((run.result for run in every if run.result is not None), None)
     if first is None:
         return []
-    words = "{episodes} episodes of {goals} goals, difficulty {difficulty}, {control} control, {start} start".format(**first)
+    words = "{episodes} episodes of {goals} goals, difficulty {difficulty}, {control} control, {start} start"
+    words = words.format(**first)
     notes = [f"Without exploration noise: {words}; goal set {first['goal_set']:.12}."]
     if any(run.result is not None and run.result["goal_set"] != first["goal_set"] for run in every):
         notes.append("Not all runs were evaluated on the same goals, so that their numbers compare only roughly.")
@@ -134,7 +135,9 @@ def _training(drawing: Drawing, groups: Sequence[Group]) -> list[Section]:
         return []
     notes = ["Running means over a fiftieth of the training, in which actions are noisy."]
     if any(len(group.runs) > 1 for group in groups):
-        notes.append("A thick line is the mean over the seeds of a group, its band goes from the lowest to the highest.")
+        notes.append(
+            "A thick line is the mean over the seeds of a group, its band goes from the lowest to the highest."
+        )
     sections = [Section("training", "How training went", notes, charts)]
     terms, zero = training.reward_terms(drawing, groups)
     notes = [f"Always zero: {', '.join(zero)}."] if zero else []
@@ -159,10 +162,11 @@ def _commands(runs: Sequence[Run]) -> list[tuple[str, list[str], str]]:
     found = []
     for run in runs:
         commit = run.origin.get("commit", "")
+        checkout: list[str] = []
         if not commit:
-            note, checkout = "The commit of its code is not known.", []
+            note = "The commit of its code is not known."
         elif commit.endswith("-dirty"):
-            note, checkout = f"Its code had changes beside commit {commit.removesuffix('-dirty')}.", []
+            note = f"Its code had changes beside commit {commit.removesuffix('-dirty')}."
         else:
             note, checkout = "", [repeat.quote("git", "checkout", commit)]
         found.append((run.name, [*checkout, repeat.train_command(run), repeat.eval_command(run)], note))
@@ -170,7 +174,7 @@ def _commands(runs: Sequence[Run]) -> list[tuple[str, list[str], str]]:
 
 
 def _clips(groups: Sequence[Group]) -> list[Clip]:
-    found = []
+    found: list[Clip] = []
     for one in groups:
         run = next((run for run in one.runs if run.clip is not None), None)
         if run is None or run.clip is None:
@@ -188,8 +192,10 @@ def _clips(groups: Sequence[Group]) -> list[Clip]:
 
 def _clip(path: Path, label: str) -> Clip:
     if (size := path.stat().st_size) > CLIP_LIMIT:
-        most = f"the limit is {CLIP_LIMIT / 1e6:g} MB"
-        return Clip(label, None, f"{path.name} in the run's folder has {size / 1e6:.1f} MB and is not shown here: {most}.")
+        note = (
+            f"{path.name} in the run's folder has {size / 1e6:.1f} MB; more than {CLIP_LIMIT / 1e6:g} MB are not shown."
+        )
+        return Clip(label, None, note)
     return Clip(label, video_address(path), "")
 
 

@@ -15,7 +15,8 @@ from surgical_marl.report.groups import Group, differences, numbers
 from surgical_marl.report.run import Run
 
 ALSO = ("drop_rate", "peak_force_n", "min_distance_mm", "path_length_mm", "smoothness", "action_change",
-        "in_view_rate", "object_in_view_rate", "centre_error", "camera_travel_mm", "remote_center_error_mm")  # fmt: skip
+        "in_view_rate", "object_in_view_rate", "centre_error", "camera_travel_mm",
+        "remote_center_error_mm")  # fmt: skip
 """Metrics that a report shows beside those of a policy's card."""
 TAIL = 0.05
 """The share of the iterations at the end over which training's own figures are averaged."""
@@ -54,6 +55,8 @@ def runs(groups: Sequence[Group]) -> Table:
             rows.append([run.name, *([group.label] if len(groups) > 1 else []), *cells])
     if len(groups) > 1:
         head.insert(1, "group")
+    kept = [i for i in range(len(head)) if i == 0 or any(row[i] != "-" for row in rows)]
+    head, rows = [head[i] for i in kept], [[row[i] for i in kept] for row in rows]
     caption = f"Runs, with means over the last {TAIL:.0%} of training's iterations, where actions are noisy"
     return Table(caption, head, rows)
 
@@ -122,7 +125,8 @@ def results(groups: Sequence[Group]) -> Table | None:
     every = [run for group in groups for run in group.runs]
     if len(every) == 1 and every[0].result is not None:
         result = every[0].result
-        columns = {"all": _cells(result), **{agent: _cells(part) for agent, part in result["agents"].items()}}
+        agents = result["agents"] if len(result["agents"]) > 1 else {}
+        columns = {"all": _cells(result), **{agent: _cells(part) for agent, part in agents.items()}}
     else:
         columns = {}
         for group in groups:
@@ -145,7 +149,9 @@ def stages(groups: Sequence[Group]) -> Table | None:
         if run.result is not None and run.played is None and isinstance(run.result.get("stages"), dict)
     }
     names = dict.fromkeys(name for each in found.values() for name in each)
-    rows = [[name.replace("_", " "), *(number("stage_rate", each.get(name)) for each in found.values())] for name in names]
+    rows = [
+        [name.replace("_", " "), *(number("stage_rate", each.get(name)) for each in found.values())] for name in names
+    ]
     return Table("Stages of the task", ["stage", *found], rows) if rows else None
 
 

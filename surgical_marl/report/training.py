@@ -79,9 +79,7 @@ def _chart(drawing: Drawing, groups: Sequence[Group], name: str) -> Chart | None
     return drawing.lines(text, lines, NUMBER, scale, x_label)
 
 
-def _describe(
-    groups: Sequence[Group], curves: dict[int, Curve], write: Callable[[float], str], x_label: str
-) -> str:
+def _describe(groups: Sequence[Group], curves: dict[int, Curve], write: Callable[[float], str], x_label: str) -> str:
     sentences = []
     for number, found in curves.items():
         who = f"{groups[number].label}: " if len(groups) > 1 else ""
@@ -112,7 +110,10 @@ def _table(
 def _share_scale(name: str, values: np.ndarray) -> Scale:
     """Return a scale to 100 %, or to less for what should be small, and is."""
     most = float(values.max())
-    return SHARE if most > 0.2 or name == "success_rate" else Scale(percent, (-0.02 * max(1.1 * most, 0.01), max(1.1 * most, 0.01)))
+    if most > 0.2 or name == "success_rate":
+        return SHARE
+    high = max(1.1 * most, 0.01)
+    return Scale(percent, (-0.02 * high, high))
 
 
 def _log_scale(values: np.ndarray) -> Scale:

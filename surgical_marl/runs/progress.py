@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable
 from typing import Any, TextIO
 
 from tqdm import tqdm
@@ -26,7 +25,13 @@ def progress(total: int, unit: str, what: str = "", begun: int = 0, leave: bool 
         begun: how many are done already.
         leave: whether the bar stays when it is closed.
     """
-    options: dict[str, Any] = {"total": total, "unit": unit, "desc": f"{what}: " if what else None, "initial": begun, "leave": leave}
+    options: dict[str, Any] = {
+        "total": total,
+        "unit": unit,
+        "desc": f"{what}: " if what else None,
+        "initial": begun,
+        "leave": leave,
+    }
     if _has_widgets():
         from tqdm.auto import tqdm as widget
 
