@@ -35,8 +35,8 @@ def write_played(path: Path, played: Played) -> None:
 def read_played(path: Path) -> Played:
     """Read what `write_played` wrote, as float64. ValueError if the file is damaged or of another kind."""
     try:
-        with np.load(path, allow_pickle=False) as file:
-            found = {name: file[name] for name in file.files}
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+            found = {name: arrays[name] for name in arrays.files}
         kept = json.loads(str(found.pop("about")))
         agents = [str(agent) for agent in kept["agents"]]
         measures = {name: values.astype(float) for name, values in found.items()}

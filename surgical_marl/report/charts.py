@@ -81,7 +81,9 @@ class Line(NamedTuple):
 
 def plain(value: float) -> str:
     """Return a number with three digits that count; "-" if it is unknown."""
-    return "-" if not np.isfinite(value) else f"{value:z.3g}" if abs(value) < 1e4 else f"{value:,.0f}"
+    if not np.isfinite(value):
+        return "-"
+    return f"{value:,.0f}" if 1e4 <= abs(value) < 1e9 else f"{value:z.3g}"
 
 
 def percent(value: float) -> str:

@@ -192,10 +192,8 @@ def _clips(groups: Sequence[Group]) -> list[Clip]:
 
 def _clip(path: Path, label: str) -> Clip:
     if (size := path.stat().st_size) > CLIP_LIMIT:
-        note = (
-            f"{path.name} in the run's folder has {size / 1e6:.1f} MB; more than {CLIP_LIMIT / 1e6:g} MB are not shown."
-        )
-        return Clip(label, None, note)
+        most = f"more than {CLIP_LIMIT / 1e6:g} MB are not shown here"
+        return Clip(label, None, f"{path.name} in the run's folder has {size / 1e6:.1f} MB; {most}.")
     return Clip(label, video_address(path), "")
 
 
