@@ -14,7 +14,7 @@ import pytest
 import yaml
 
 import surgical_marl as sm
-from surgical_marl.evaluation.command import RESULT
+from surgical_marl.evaluation.command import FILM, RESULT
 from surgical_marl.evaluation.episodes import EPISODES, read_played, write_played
 from surgical_marl.evaluation.report import Evaluation
 from surgical_marl.report import judged, page
@@ -55,7 +55,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Page:
     """The report of two seeds of one setting and one of another, all evaluated."""
     root = tmp_path_factory.mktemp("runs")
     runs = [evaluate(make_run(root / f"s{seed}", seed=seed)) for seed in (0, 1)]
-    runs.append(evaluate(make_run(root / "other", num_envs=128), played(("psm_0",))))
+    runs.append(evaluate(make_run(root / "other", num_envs=128)))
     return Page(render([read_run(run) for run in runs]))
 
 
@@ -140,7 +140,6 @@ def test_what_is_missing_is_said(tmp_path: Path) -> None:
     assert begun.status == "Unfinished: no iteration is done yet." and "no iteration" in Page(render([begun])).text
     stopped = read_run(make_run(tmp_path / "stopped", rows=3))
     assert "3 of 6 iterations" in stopped.status and "--evaluate" in stopped.notes[0]
-    assert "3 of 6 iterations" in Page(render([stopped])).text
     (stopped.folder / DIVERGED).write_text("{}")
     (stopped.folder / CHECKPOINT).unlink()
     diverged = read_run(stopped.folder)
@@ -151,14 +150,14 @@ def test_what_is_missing_is_said(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("damage", ["", "{", "[]", '{"task": 1}', '"median_error_mm": "<b>"', '"agents": 3'])
 def test_a_damaged_evaluation_is_left_out(damage: str, tmp_path: Path) -> None:
-    run = evaluate(make_run(tmp_path / "run"))
+    run = evaluate(make_run(tmp_path / "run", rows=0))
     text = (run / RESULT).read_text()
     if damage.startswith('"'):
         text = json.dumps({**json.loads(text), **json.loads(f"{{{damage}}}")})
     (run / RESULT).write_text(text if damage.startswith('"') else damage)
     found = read_run(run)
     assert found.result is None and "left out" in found.notes[0] and RESULT in found.notes[0]
-    assert "How training went" in Page(render([found])).text
+    assert found.notes[0] in Page(render([found])).text
 
 
 def test_damaged_episodes_are_left_out(tmp_path: Path) -> None:
@@ -172,7 +171,8 @@ def test_damaged_episodes_are_left_out(tmp_path: Path) -> None:
 
 
 def test_a_large_clip_is_named_and_a_small_one_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    run = read_run(evaluate(make_run(tmp_path / "run"), clip=b"small"))
+    (make_run(tmp_path / "run", rows=0) / FILM).write_bytes(b"small")
+    run = read_run(tmp_path / "run")
     assert [video["src"] for video in Page(render([run])).of("video")] == ["data:video/mp4;base64,c21hbGw="]
     monkeypatch.setattr(page, "CLIP_LIMIT", 4)
     found = Page(render([run]))
@@ -187,7 +187,7 @@ def test_many_series_are_told_apart() -> None:
 
 
 def test_what_shows_itself_in_a_notebook(tmp_path: Path) -> None:
-    run = evaluate(make_run(tmp_path / "run"), played((HOSTILE,)))
+    run = evaluate(make_run(tmp_path / "run", rows=0), played((HOSTILE,)))
     report = sm.Report(run)
     (frame,) = Page(report._repr_html_()).of("iframe")
     assert frame["srcdoc"] == report.html and frame["sandbox"] == ""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -73,8 +74,14 @@ def played(agents: tuple[str, ...] = ("psm_0",), stages: tuple[str, ...] = (), s
 
 def evaluate(folder: Path, episodes: Played | None = None, *, iteration: int = 6, clip: bytes = b"\0" * 100) -> Path:
     """Give a run what the end of a training does: a result, its episodes, and a clip."""
-    episodes = episodes or played()
-    write_played(folder / EPISODES, episodes)
-    (folder / RESULT).write_text(json.dumps({**summarise([episodes]), "iteration": iteration}))
+    write_played(folder / EPISODES, episodes or played())
+    result = summarise([episodes]) if episodes else standard()
+    (folder / RESULT).write_text(json.dumps({**result, "iteration": iteration}))
     (folder / FILM).write_bytes(clip)
     return folder
+
+
+@cache
+def standard() -> dict[str, Any]:
+    """The result of `played()`."""
+    return summarise([played()])
