@@ -23,7 +23,7 @@ from surgical_marl.report.groups import curve, differences, group
 from surgical_marl.report.page import render
 from surgical_marl.report.run import read_run
 from surgical_marl.runs.folder import CHECKPOINT, CONFIG, DIVERGED, METRICS
-from tests.helpers.runs import evaluate, make_run, played
+from tests.helpers.run_folders import evaluate, make_run, played
 
 LOADS = ("src", "href", "xlink:href", "srcset", "data", "action", "poster", "background", "srcdoc")
 HOSTILE = "<img src=x onerror=alert(1)>"

@@ -15,7 +15,7 @@ from surgical_marl.report.repeat import train_command
 from surgical_marl.report.run import read_run
 from surgical_marl.runs.folder import CONFIG, read_settings
 from surgical_marl.runs.settings import Settings, load_config
-from tests.helpers.runs import evaluate, make_run
+from tests.helpers.run_folders import evaluate, make_run
 
 
 def test_a_report_goes_to_the_run_or_where_it_is_wanted(

@@ -1,87 +1,132 @@
-"""Run folders that nobody trained: config, metrics and evaluation as a training leaves them."""
+"""Training runs on fake environments, in this process or another, and what they left."""
 
 from __future__ import annotations
 
-import json
-from functools import cache
+import os
+import signal
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+import torch
 
-from surgical_marl.evaluation.command import FILM, RESULT
-from surgical_marl.evaluation.episodes import EPISODES, write_played
-from surgical_marl.evaluation.evaluate import Played, summarise
-from surgical_marl.runs.folder import CHECKPOINT, CONFIG, METRICS, write_metrics
-from surgical_marl.runs.settings import Settings, config_text
+from surgical_marl.learning import train
+from surgical_marl.runs.folder import read_checkpoint, read_metrics
+from surgical_marl.runs.settings import ConstraintSettings, NetworkSettings, PPOSettings, Settings
+from tests.helpers.fake_env import FakeEnv
 
-NOTES = {
-    "versions": {"python": "3.11.7", "torch": "2.12.0"},
-    "origin": {"device": "a GPU", "commit": "0123456789ab", "started": "2026-01-01T00:00:00+0000"},
+COUNTS, SIZES = {"psm": 2, "ecm": 1}, {"psm": 3, "ecm": 2}
+SMALL = Settings(
+    scene="psm",
+    num_envs=32,
+    iterations=4,
+    steps_per_iteration=8,
+    checkpoint_every=2,
+    device="cpu",
+    network=NetworkSettings(hidden=(16,)),
+    ppo=PPOSettings(epochs=2, mini_batches=2),
+)
+OPTIONS: list[dict[str, Any]] = [
+    {},
+    {"ppo": replace(SMALL.ppo, normalise_values=True)},
+    {"constraint": ConstraintSettings(cost="collision", limit=0.01)},
+    {"network": replace(SMALL.network, recurrent="gru")},
+]
+"""What an algorithm may have beside its networks."""
+ALL: dict[str, Any] = {
+    **OPTIONS[1],
+    **OPTIONS[2],
+    "network": replace(SMALL.network, recurrent="lstm"),
+    "team_reward": True,
 }
-COLUMNS = ("iteration", "env_steps", "seconds", "steps_per_s", "reward", "reward_distance", "reward_idle",
-           "tip_error_mm", "success_rate", "collision_rate", "entropy")  # fmt: skip
 
 
-def make_run(folder: Path, *, rows: int = 6, success: float = 0.5, **settings: Any) -> Path:
-    """A folder with config and metrics; `success` is that of all iterations."""
-    folder.mkdir(parents=True)
-    chosen = Settings(**{"task": "reach", "scene": "psm", "iterations": 6, "num_envs": 64, **settings})
-    (folder / CONFIG).write_text(config_text(chosen, NOTES))
-    (folder / CHECKPOINT).write_bytes(b"")
-    found = [
-        {
-            **dict.fromkeys(COLUMNS, 0.0),
-            "iteration": i,
-            "env_steps": 1000 * i,
-            "seconds": 2.0,
-            "steps_per_s": 500.0,
-            "reward": i / 10,
-            "reward_distance": -1.0 / i,
-            "tip_error_mm": 10.0 / i,
-            "success_rate": success,
-        }
-        for i in range(1, rows + 1)
-    ]
-    if rows:
-        write_metrics(folder, COLUMNS, found)
-    assert (folder / METRICS).is_file() == bool(rows)
-    return folder
+def fake_env(settings: Settings, num_envs: int | None = None) -> Any:
+    return FakeEnv(COUNTS, SIZES, settings.num_envs, max_steps=10)
 
 
-def played(agents: tuple[str, ...] = ("psm_0",), stages: tuple[str, ...] = (), seed: int = 0) -> Played:
-    """20 episodes whose errors are between 0.1 and 10 mm."""
-    rng = np.random.default_rng(seed)
-    shape = 20, len(agents)
-    error = 1e-3 * np.geomspace(0.1, 10, 20 * len(agents)).reshape(shape)
-    measures = {
-        **{
-            name: rng.random(shape) for name in ("distance", "center", "path", "time", "contact_force", "action_change")
-        },
-        **{f"stage_{name}": (rng.random(shape) < 0.5).astype(float) for name in stages},
-        "smoothness": -rng.random(shape),
-        "error": error,
-        "held": error,
-        "squared": error**2,
-        "success": (error < 2e-3).astype(float),
-        "collided": np.zeros(shape),
-        "reward_distance": -rng.random(shape),
-    }
-    about = {"task": "reach", "scene": "psm", "control": "position", "difficulty": "default", "goals": "held_out"}
-    about |= {"start": "home", "episodes": 20, "max_steps": 100, "control_dt": 0.02, "protocol": 2, "seed": 0}
-    return Played({**about, "goal_set": "0" * 64}, list(agents), measures, False, stages)
+def run(settings: Settings, out: Path, resume: bool = False) -> None:
+    """Train on fake environments; for another process, as it patches this one."""
+    train.make_env = fake_env
+    train.train(settings, out=out, resume=out if resume else None)
 
 
-def evaluate(folder: Path, episodes: Played | None = None, *, iteration: int = 6, clip: bytes = b"\0" * 100) -> Path:
-    """Give a run what the end of a training does: a result, its episodes, and a clip."""
-    write_played(folder / EPISODES, episodes or played())
-    result = summarise([episodes]) if episodes else standard()
-    (folder / RESULT).write_text(json.dumps({**result, "iteration": iteration}))
-    (folder / FILM).write_bytes(clip)
-    return folder
+def run_or_resume(settings: Settings, out: Path) -> None:
+    """As the command does it when it gets the same folder for both."""
+    run(settings, out, resume=(out / "config.yaml").exists())
 
 
-@cache
-def standard() -> dict[str, Any]:
-    """The result of `played()`."""
-    return summarise([played()])
+def run_until(settings: Settings, out: Path, moment: str) -> None:
+    """As `run_or_resume`, but the process kills itself at a moment of `MOMENTS`."""
+    MOMENTS[moment]()
+    run_or_resume(settings, out)
+
+
+def same_state(first: Path, second: Path) -> bool:
+    """Whether two runs have the same checkpoint, bit for bit, and the same metrics but for times."""
+    return _same(read_checkpoint(first), read_checkpoint(second)) and _metrics(first) == _metrics(second)
+
+
+def _same(first: Any, second: Any) -> bool:
+    if isinstance(first, torch.Tensor):
+        return torch.equal(first, second)
+    if isinstance(first, dict):
+        return first.keys() == second.keys() and all(_same(first[key], second[key]) for key in first)
+    if isinstance(first, list | tuple):
+        return len(first) == len(second) and all(map(_same, first, second))
+    return bool(first == second)
+
+
+def _metrics(run: Path) -> str:
+    return str([{k: v for k, v in row.items() if k not in ("seconds", "steps_per_s")} for row in read_metrics(run)])
+
+
+def _kill() -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def _at(owner: Any, name: str, kill: Callable[..., bool], after: bool = False) -> None:
+    """Kill the process when a function is called with certain arguments."""
+    original = getattr(owner, name)
+
+    def patched(*arguments: Any, **options: Any) -> Any:
+        dead = kill(*arguments)
+        if dead and not after:
+            _kill()
+        result = original(*arguments, **options)
+        if dead:
+            _kill()
+        return result
+
+    setattr(owner, name, patched)
+
+
+def _half_a_file(state: Any, path: Path) -> bool:
+    if "iteration" in state and state["iteration"] == 2:
+        Path(path).write_bytes(b"half of it")
+        return True
+    return False
+
+
+def _is(name: str) -> Callable[..., bool]:
+    return lambda source, target: Path(target).name == name and (name != "checkpoint.pt" or _iteration(source) == 2)
+
+
+def _iteration(checkpoint: Path) -> int:
+    return int(torch.load(checkpoint, weights_only=True)["iteration"])
+
+
+MOMENTS: dict[str, Callable[[], None]] = {
+    "before anything is written": lambda: _at(train, "claim_folder", lambda out: True),
+    "before the settings have their name": lambda: _at(os, "replace", _is("config.yaml")),
+    "before the first checkpoint": lambda: _at(train, "make_training", lambda settings: True),
+    "in the metrics": lambda: _at(os, "replace", _is("metrics.csv")),
+    "in a checkpoint": lambda: _at(torch, "save", _half_a_file),
+    "before a checkpoint has its name": lambda: _at(os, "replace", _is("checkpoint.pt")),
+    "after a checkpoint has its name": lambda: _at(os, "replace", _is("checkpoint.pt"), after=True),
+    "in an iteration": lambda: _at(train.Trainer, "_gather_values", lambda training: training.iteration == 2),
+    "after an iteration": lambda: _at(train.Log, "write", lambda log, row: row["iteration"] == 3, after=True),
+}
+
+LONG = replace(SMALL, iterations=1_000_000, checkpoint_every=3)
