@@ -17,7 +17,7 @@ import surgical_marl as sm
 from surgical_marl.evaluation.command import FILM, RESULT
 from surgical_marl.evaluation.episodes import EPISODES, read_played, write_played
 from surgical_marl.evaluation.report import Evaluation
-from surgical_marl.report import judged, page
+from surgical_marl.report import judged, page, training
 from surgical_marl.report.charts import SHARE, Drawing, Text
 from surgical_marl.report.groups import curve, differences, group
 from surgical_marl.report.page import render
@@ -117,6 +117,16 @@ def test_runs_that_differ_by_their_seed_are_one_group_with_a_band(tmp_path: Path
     assert found is not None and found.x[-1] == 4000 and found.single[0][0][-1] == 6000
     np.testing.assert_allclose([found.mean, found.low, found.high], np.outer([0.4, 0.2, 0.6], np.ones(len(found.x))))
     assert curve(groups[0], "no_such_column") is None
+
+
+def test_the_parts_of_an_iteration_have_curves_where_they_are_known(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "run")
+    assert [chart.title for chart in training.speed(Drawing(), group([read_run(run)]))] == [
+        "Environment steps a second"
+    ]
+    (run / METRICS).write_text((run / METRICS).read_text().replace("entropy", "seconds_rollout"))
+    titles = [chart.title for chart in training.speed(Drawing(), group([read_run(run)]))]
+    assert titles == ["Environment steps a second", "Seconds of an iteration", "Seconds rollout"]
 
 
 def test_numbers_beside_charts_are_those_of_the_episodes(tmp_path: Path) -> None:

@@ -106,6 +106,13 @@ def test_the_command_names_what_has_no_default_here(tmp_path: Path) -> None:
     assert words[:3] == ["surgical-marl", "train", "my task"] and "unheard_of=1.0e-05" in words
 
 
+def test_a_folder_that_is_called_like_a_policy_is_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    make_run(tmp_path / "reach-psm", rows=0)
+    assert "no iteration is done yet" in command.report_run(Path("reach-psm")).read_text()
+    assert (tmp_path / "reach-psm" / "report.html").is_file()
+
+
 def test_a_training_that_is_stopped_leaves_a_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def stopped(settings: Settings, *, out: Path, resume: Path | None) -> Path:
         make_run(out, rows=2)

@@ -281,18 +281,18 @@ def _train(arguments: argparse.Namespace) -> None:
 
     from surgical_marl.evaluation.command import judge
     from surgical_marl.learning.train import train
-    from surgical_marl.report.command import report
+    from surgical_marl.report.command import report_run
 
     try:
         run = train(settings, out=out, resume=resume)
     except (FloatingPointError, KeyboardInterrupt):
         if is_first() and has_begun(out):
             with contextlib.suppress(ValueError):  # what stopped the training says more
-                report([str(out)])
+                report_run(out)
         raise
     if is_first():
         judge(run)
-        report([str(run)])
+        report_run(run)
 
 
 def _run_folder(settings: Any) -> Path:

@@ -13,6 +13,9 @@ from surgical_marl.evaluation.evaluate import Played
 from surgical_marl.files import write_atomic
 
 EPISODES = "episodes.npz"
+MEASURES = ("error", "held", "squared", "distance", "center", "success", "collided", "time", "path", "smoothness",
+            "action_change")  # fmt: skip
+"""Measures of every task."""
 
 
 def write_played(path: Path, played: Played) -> None:
@@ -43,7 +46,7 @@ def read_played(path: Path) -> Played:
         shape = measures["error"].shape
         if len(shape) != 2 or shape[1] != len(agents) or any(values.shape != shape for values in measures.values()):
             raise ValueError(shape)
-        if not {"held", "distance", "collided", "success"} <= measures.keys():
+        if not {*MEASURES} <= measures.keys():
             raise ValueError(list(measures))
         stages = tuple(str(stage) for stage in kept["stages"])
         return Played(dict(kept["about"]), agents, measures, bool(kept["follows"]), stages)

@@ -43,6 +43,13 @@ def report(names: Sequence[str], out: Path | None = None, evaluate: bool = False
     return path
 
 
+def report_run(run: Path) -> Path:
+    """Write the report of a run folder into it, and return its path. ValueError if it cannot be written."""
+    _check(path := run / REPORT)
+    write(path, [read_run(run)])
+    return path
+
+
 def write(path: Path, runs: Sequence[Run]) -> None:
     """Write the report of some runs to a file. ValueError as in `report`."""
     page = render(runs).encode(errors="replace")  # a folder's name may hold bytes that are no text

@@ -57,7 +57,7 @@ class Run:
 
 
 def read_run(given: str | os.PathLike[str]) -> Run:
-    """Read a run folder or a shipped policy.
+    """Read a run folder, or a shipped policy by its name; a `Path` is always a folder.
 
     Settings that this version does not know are read like others, so that runs of older versions can be reported.
 
@@ -67,7 +67,7 @@ def read_run(given: str | os.PathLike[str]) -> Run:
     text = os.fspath(given)
     if Path(text).is_file():
         raise ValueError(f"{text} is a file, not a run: name the run's folder")
-    folder = find("policies", text)
+    folder = find("policies", text) if isinstance(given, str) or not Path(given).is_dir() else Path(given).resolve()
     config, versions, origin = _read_config(folder, text)
     columns, notes = _read_columns(folder), []
     shipped = holds_weights(folder)
