@@ -145,6 +145,15 @@ def test_numbers_beside_charts_are_those_of_the_episodes(tmp_path: Path) -> None
     np.testing.assert_allclose(columns.sum(0), 100, atol=0.6)
 
 
+def test_a_histogram_is_not_ruled_by_one_outlier(tmp_path: Path) -> None:
+    episodes = played(tuple(f"arm_{i}" for i in range(10)))
+    episodes.measures["contact_force"][0, 0] = 1000.0
+    found = judged.charts(Drawing(), group([read_run(evaluate(make_run(tmp_path / "run"), episodes))]))
+    (chart,) = [chart for chart in found if chart.title == "Peak contact force (N)"]
+    assert "arm_0: " in chart.description and "1e+03" in chart.description
+    assert chart.rows[-1][0].endswith(" or more") and chart.rows[-1][1] != "0.0%" and chart.rows[0][1] != "0.0%"
+
+
 def test_what_is_missing_is_said(tmp_path: Path) -> None:
     begun = read_run(make_run(tmp_path / "begun", rows=0))
     assert begun.status == "Unfinished: no iteration is done yet." and "no iteration" in Page(render([begun])).text

@@ -113,7 +113,7 @@ class Drawing:
 
     def lines(self, text: Text, lines: Sequence[Line], x: Scale, y: Scale, x_label: str) -> Chart:
         """Draw lines; `x_label` is not a name that a user chose."""
-        figure, axis = _axes(x_label, HEIGHT, left=0.14)
+        figure, axis = _axes(x_label, HEIGHT, left=0.17)
         with rc_context(_STYLE):
             for line in lines:
                 style: dict[str, Any] = {"color": series_color(line.series), "linestyle": dash(line.series)}

@@ -115,30 +115,37 @@ def _histogram(drawing: Drawing, series: Sequence[Series], kind: Histogram) -> C
     shown = [one for one in series if one.label in found]
     for one in shown:
         known, size = found[one.label]
-        share = np.histogram(known, edges)[0] / size
+        share = np.histogram(np.minimum(known, edges[-1]), edges)[0] / size
         lines.append(Line(one.number, edges, share, steps=True))
         columns.append(share.reshape(-1, len(share) // ROWS).sum(1))
-        quartiles = ", ".join(plain(value) for value in np.percentile(known, [5, 50, 95]))
-        sentences.append(f"{one.label}: {quartiles}; {percent(known.size / size)} have a value.")
+        spread = ", ".join(plain(value) for value in np.percentile(known, [5, 50, 95, 100]))
+        sentences.append(f"{one.label}: {spread}; {percent(known.size / size)} have a value.")
     coarse = edges[:: (len(edges) - 1) // ROWS]
     rows = [
         [f"{plain(low)} to {plain(high)}", *(percent(column[i]) for column in columns)]
         for i, (low, high) in enumerate(pairwise(coarse))
     ]
+    label = kind.label
+    if every.max() > edges[-1]:
+        label += "; last bin: or more"
+        rows[-1][0] = f"{plain(coarse[-2])} or more"
     text = Text(
         kind.title,
-        f"Share of episodes and arms by {kind.label}. 5th, 50th and 95th percentile of {' '.join(sentences)}",
+        f"Share of episodes and arms by {kind.label}. 5th, 50th and 95th percentile, and the largest: "
+        f"{' '.join(sentences)}",
         [kind.label, *(one.label for one in shown)],
         rows,
         _legend(shown),
     )
-    return drawing.lines(text, lines, Scale(plain, (edges[0], edges[-1]), log=log), Scale(percent), kind.label)
+    return drawing.lines(text, lines, Scale(plain, (edges[0], edges[-1]), log=log), Scale(percent), label)
 
 
 def _edges(values: np.ndarray, log: bool) -> np.ndarray:
     low, high = float(values.min()), float(values.max())
     if log:
         return np.geomspace(low, high * 1.0001, BINS + 1)
+    usual = float(np.percentile(values, 99))
+    high = usual if high > 3 * usual > 0 else high  # the last bin has what is beyond
     low = min(low, 0.0) if low < 0.3 * high else low
     return np.linspace(low, high if high > low else low + 1.0, BINS + 1)
 
