@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv
     from surgical_marl.interfaces.jax_env import jax_env
     from surgical_marl.interfaces.pettingzoo import parallel_env
+    from surgical_marl.report.notebook import Report, Video
     from surgical_marl.robots.arm import load_arm
     from surgical_marl.scenes.load import load_scene
     from surgical_marl.scenes.objects import load_object
@@ -30,6 +31,8 @@ __version__ = "0.1.0"
 
 _LAZY = {
     "BatchedEnv": "surgical_marl.envs.batch",
+    "Report": "surgical_marl.report.notebook",
+    "Video": "surgical_marl.report.notebook",
     "jax_env": "surgical_marl.interfaces.jax_env",
     "load_arm": "surgical_marl.robots.arm",
     "load_object": "surgical_marl.scenes.objects",
@@ -41,8 +44,10 @@ _LAZY = {
 
 __all__ = [
     "BatchedEnv",
+    "Report",
     "Task",
     "TipTask",
+    "Video",
     "jax_env",
     "list_algorithms",
     "list_arms",

@@ -120,6 +120,20 @@ def test_the_score_of_a_trial_is_that_of_its_last_step() -> None:
     assert found["score_time_s"].values[0].tolist() == [[10, 10], [30, 30]]
 
 
+def test_the_peak_force_is_the_largest_of_the_steps_of_an_episode() -> None:
+    lengths = [3, 5]
+    played = random_trajectory(0, lengths, 2)
+    force = np.array([[0, 1], [4, 1], [2, 2], [9, 2], [9, 3]], float)[..., None] * [1.0, 10.0]
+    found = metrics(
+        {
+            name: values[None]
+            for name, values in measure(played._replace(terms={"contact_force": force}), DT, False).items()
+        },
+        False,
+    )
+    assert found["peak_force_n"].values[0].tolist() == [[4, 40], [3, 30]]
+
+
 def test_what_an_episode_does_not_have_is_undefined() -> None:
     still = random_trajectory(0, [6, 1], 1)
     still.tip[...], still.error[...], still.distance[...], still.missed[...] = 0.01, 0.5, np.inf, True

@@ -125,6 +125,8 @@ for numbers in (found, *found["agents"].values()):
     assert numbers["stages"].keys() == {"half", "all"}
     assert 0 <= numbers["success_rate"] <= numbers["stages"]["all"] <= numbers["stages"]["half"] <= 1
 assert found["agents"].keys() == {"psm_0", "ecm_0"} and (out / "video.mp4").stat().st_size
+page = (out / "report.html").read_text()
+assert "salute in psm_watched" in page and "Finished: 2 iterations" in page and "Stages of the task" in page
 
 env = make_env(read_settings(out), 2)
 assert env.task.summary() == "Salute: every arm takes up a posture that it is told."

@@ -1,4 +1,4 @@
-"""The commands that measure policies: eval and crossplay."""
+"""The commands that measure and show policies: eval, crossplay and report."""
 
 from __future__ import annotations
 
@@ -40,6 +40,18 @@ def add_crossplay(commands: Any) -> None:
     parser.set_defaults(command=_crossplay, name="crossplay")
 
 
+def add_report(commands: Any) -> None:
+    """Add the command report."""
+    parser = commands.add_parser("report", help="write a page on runs: curves, evaluation, settings (docs/report.md)")
+    what = "run folders and shipped policies of one task; runs that differ by their seed alone are shown as one group"
+    parser.add_argument("runs", nargs="+", metavar="RUN", help=what)
+    where = "default: report.html in the run's folder, or here for several runs and for shipped policies"
+    parser.add_argument("--out", type=Path, metavar="FILE.html", help=where)
+    evaluate = "first play 200 episodes with each policy whose episodes are not kept"
+    parser.add_argument("--evaluate", action="store_true", help=evaluate)
+    parser.set_defaults(command=_report, name="report")
+
+
 def _add_options(parser: argparse.ArgumentParser) -> None:
     """Add the flags that say which episodes are played."""
     parser.add_argument("--task", help="of a policy that is not trained")
@@ -77,6 +89,17 @@ def _crossplay(arguments: argparse.Namespace) -> None:
     asked = {key: getattr(arguments, key) for key in (*OWN, *CHOSEN)}
     result = crossplay(arguments.teams, asked, arguments.episodes, arguments.seed)
     print(report(result, arguments.json, arguments.figure))
+
+
+def _report(arguments: argparse.Namespace) -> None:
+    _check_files(("--out", arguments.out, ".html"))
+    for run in arguments.runs:
+        if not Path(run).exists() and run not in list_policies():
+            raise unknown("run or policy", run, list_policies())
+
+    from surgical_marl.report.command import report
+
+    print(report(arguments.runs, arguments.out, arguments.evaluate))
 
 
 def _check(arguments: argparse.Namespace, policies: Sequence[str]) -> None:

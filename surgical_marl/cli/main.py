@@ -1,10 +1,11 @@
-"""The command `surgical-marl`: train, eval, crossplay, list, check, export, bench, doctor."""
+"""The command `surgical-marl`: train, eval, crossplay, report, list, check, export, bench, doctor."""
 
 from __future__ import annotations
 
 # Only light imports here, so that `list` and a mistyped command respond at once. torch and JAX are imported by the
 # commands that need them.
 import argparse
+import contextlib
 import os
 import sys
 import time
@@ -13,7 +14,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from surgical_marl.bench.workload import BENCHED, Workload
-from surgical_marl.cli.evaluating import add_crossplay, add_eval
+from surgical_marl.cli.evaluating import add_crossplay, add_eval, add_report
 from surgical_marl.cli.flags import add_flags, flagged, given, one_of, whole
 from surgical_marl.content import find, list_arms, list_objects, list_policies, list_scenes, unknown
 from surgical_marl.plugins.algorithms import list_algorithms
@@ -88,11 +89,13 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(prog="surgical-marl", description="Surgical robot arms that learn together.")
     parser.add_argument("--version", action="version", version=f"%(prog)s {_version()}")
-    commands = parser.add_subparsers(required=True, metavar="{train,eval,crossplay,list,check,export,bench,doctor}")
+    commands = parser.add_subparsers(
+        required=True, metavar="{train,eval,crossplay,report,list,check,export,bench,doctor}"
+    )
 
     train = commands.add_parser(
         "train",
-        help="train a policy, then evaluate it",
+        help="train a policy, evaluate it, and write a report",
         usage="%(prog)s TASK [--scene SCENE] [options] [key=value ...]\n"
         "       %(prog)s --resume DIR [options] [key=value ...]",
         epilog="key=value sets anything in configs/, such as ppo.learning_rate=3e-4",
@@ -108,6 +111,7 @@ def _parser() -> argparse.ArgumentParser:
 
     add_eval(commands)
     add_crossplay(commands)
+    add_report(commands)
 
     names = commands.add_parser("list", help="list tasks, scenes, arms, objects, algorithms and policies")
     names.add_argument("kind", nargs="?", type=one_of(tuple(_LISTS)), metavar="|".join(_LISTS))
@@ -277,10 +281,18 @@ def _train(arguments: argparse.Namespace) -> None:
 
     from surgical_marl.evaluation.command import judge
     from surgical_marl.learning.train import train
+    from surgical_marl.report.command import report_run
 
-    run = train(settings, out=out, resume=resume)
+    try:
+        run = train(settings, out=out, resume=resume)
+    except (FloatingPointError, KeyboardInterrupt):
+        if is_first() and has_begun(out):
+            with contextlib.suppress(ValueError):  # what stopped the training says more
+                report_run(out)
+        raise
     if is_first():
         judge(run)
+        report_run(run)
 
 
 def _run_folder(settings: Any) -> Path:

@@ -7,18 +7,25 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from surgical_marl.content import BASELINES, find
+from surgical_marl.evaluation.episodes import EPISODES, write_played
 from surgical_marl.evaluation.evaluate import MAX_BATCH, Played, difference, play, summarise
 from surgical_marl.evaluation.report import ABOUT, format_table, write_csv
 from surgical_marl.files import write_atomic
 from surgical_marl.policies.policy import load_policy
 from surgical_marl.policies.team import Team
 from surgical_marl.runs.environment import make_env
-from surgical_marl.runs.folder import read_settings
+from surgical_marl.runs.folder import read_metrics, read_settings
 from surgical_marl.runs.settings import Settings
 
+if TYPE_CHECKING:
+    from surgical_marl.envs.batch import BatchedEnv
+    from surgical_marl.policies.policy import Policy
+
+RESULT, FILM = "eval.json", "video.mp4"
+"""Files that `judge` adds to a run."""
 OWN = ("task", "scene", "control", "knowledge", "messages")
 CHOSEN = ("difficulty", "start", "goals")
 """Options that a trained policy determines, and options that can be chosen for any policy."""
@@ -46,8 +53,7 @@ def play_all(
     played = {}
     for policy in policies:
         acting = Team(env, find_policy(policy), partners or {})
-        print(f"evaluating {policy}: {episodes} episodes", file=sys.stderr)
-        run = play(env, acting, episodes, seed)
+        run = play(env, acting, episodes, seed, f"evaluating {policy}, {episodes} episodes")
         played[policy] = run._replace(about={**run.about, "partners": dict(partners)}) if partners else run
     return played
 
@@ -116,21 +122,28 @@ def report(
 def judge(run: Path) -> None:
     """Do what `surgical-marl train` does after training.
 
-    Evaluate the run on the standard goals, write and print the result, and film the policy.
+    Evaluate the run on the standard goals, write and print the result, keep the episodes, and film the policy.
     """
-    print("evaluating 200 episodes", file=sys.stderr)
-    env = make_env(read_settings(run, ["engine=auto", "device=auto", "goals=held_out"]), num_envs=200)
-    policy = load_policy(run, env)
-    result = summarise([play(env, policy, episodes=200, seed=0)])
+    env, policy, played = play_standard(run)
+    rows = read_metrics(run)
+    result = {**summarise([played]), **({"iteration": int(rows[-1]["iteration"])} if rows else {})}
     text = json.dumps(result, indent=2) + "\n"
-    write_atomic(run / "eval.json", lambda path: path.write_text(text))
+    write_played(run / EPISODES, played)
+    write_atomic(run / RESULT, lambda path: path.write_text(text))
     print(format_table(result))
     print(run, flush=True)
 
     from surgical_marl.view.record import record
 
     print("recording a video", file=sys.stderr)
-    record(env, policy, run / "video.mp4")
+    record(env, policy, run / FILM)
+
+
+def play_standard(run: Path) -> tuple[BatchedEnv, Policy, Played]:
+    """Play the standard goals with a run or a shipped policy; also return the environment and the policy."""
+    env = make_env(read_settings(run, ["engine=auto", "device=auto", "goals=held_out"]), num_envs=200)
+    policy = load_policy(run, env)
+    return env, policy, play(env, policy, 200, seed=0, show="evaluating 200 episodes")
 
 
 def read_result(path: Path) -> dict[str, Any]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -50,8 +49,8 @@ def crossplay(teams: Sequence[str], asked: Mapping[str, str | None], episodes: i
         partners = {} if role == "" or partner == team else {role: partner}
         key = team, tuple(partners.items())
         if key not in known:
-            print(f"playing {team}" + "".join(f", {role} is {who}" for role, who in partners.items()), file=sys.stderr)
-            known[key] = play(env, Team(env, find_policy(team), partners), episodes, seed)
+            who = f"playing {team}" + "".join(f", {role} is {other}" for role, other in partners.items())
+            known[key] = play(env, Team(env, find_policy(team), partners), episodes, seed, who)
         return known[key]
 
     roles = env.agents[1:] if len(env.agents) == 2 else env.agents  # of two, one is the other one's transpose

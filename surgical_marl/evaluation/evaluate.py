@@ -18,6 +18,7 @@ from surgical_marl.evaluation.interval import interval
 from surgical_marl.evaluation.metrics import (
     DROP,
     LAST,
+    PEAK,
     SEARCHING,
     STAGE,
     SUCCESS_MM,
@@ -29,7 +30,9 @@ from surgical_marl.evaluation.metrics import (
     measure,
     metrics,
 )
+from surgical_marl.evaluation.report import Evaluation
 from surgical_marl.policies.acting import forget
+from surgical_marl.runs.progress import progress
 
 if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv
@@ -39,7 +42,7 @@ MAX_BATCH = 1024
 ERRORS = ("tip_error", "goal_error")
 """Infos of how far a tool tip, or an object, is from its goal, m: the first that there is counts."""
 INFOS = ("success", "collision", "min_distance")
-KEPT = (*ERRORS, *INFOS, *LAST, *VIEWED, *TRAVEL, DROP, SEARCHING)
+KEPT = (*ERRORS, *INFOS, *LAST, *VIEWED, *TRAVEL, *PEAK, DROP, SEARCHING)
 """Names of infos that metrics are computed from, besides those that begin like `TERMS` and `STAGE`."""
 
 
@@ -62,7 +65,7 @@ def evaluate(
     policy: Callable[[Mapping[str, Any]], Mapping[str, Any]],
     episodes: int,
     seed: int,
-) -> dict[str, Any]:
+) -> Evaluation:
     """Run a policy for a number of episodes.
 
     Args:
@@ -73,7 +76,7 @@ def evaluate(
         seed: seed of the goals.
 
     Returns:
-        The object that `surgical-marl eval --json` prints for one run, see docs/evaluation.md.
+        The object that `surgical-marl eval --json` prints for one run, see docs/evaluation.md; a dict.
     """
     return summarise([play(env, policy, episodes, seed)])
 
@@ -83,29 +86,37 @@ def play(
     policy: Callable[[Mapping[str, Any]], Mapping[str, Any]],
     episodes: int,
     seed: int,
+    show: str = "",
 ) -> Played:
     """Play the episodes of `evaluate`, and return their measures without metrics.
+
+    If there is a text to `show`, it stands before a progress bar on stderr.
 
     The first episode of each environment counts, however long it takes, so that short episodes are not
     over-represented. More episodes than environments are played in blocks, each from its own seed.
     """
     if episodes < 1:
         raise ValueError(f"episodes must be 1 or more, not {episodes}")
-    blocks, goals = [], []
-    for block in range(math.ceil(episodes / env.num_envs)):
+    blocks, goals, count_blocks = [], [], math.ceil(episodes / env.num_envs)
+    bar = progress(count_blocks * env.max_steps, "step", show) if show else None
+    for block in range(count_blocks):
         count = min(env.num_envs, episodes - block * env.num_envs)
         observations, *_ = env.reset(episode_seed(seed, block))
         forget(policy)
         goals += read_goals(env, count)
-        trajectory = _first_episodes(env, policy, observations, count)
+        trajectory = _first_episodes(env, policy, observations, count, bar)
         blocks.append(measure(trajectory, env.control_dt, env.task.follows))
+        if bar is not None:
+            bar.update((block + 1) * env.max_steps - bar.n)  # episodes may be shorter
+    if bar is not None:
+        bar.close()
     about = describe_goals(env, episodes)
     measures = {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
     found = {**about, "seed": seed, "goal_set": goal_hash(about, goals)}
     return Played(found, list(env.agents), measures, env.task.follows, env.task.stages)
 
 
-def summarise(runs: Sequence[Played]) -> dict[str, Any]:
+def summarise(runs: Sequence[Played]) -> Evaluation:
     """Return the metrics of one run, or of the episodes of several runs together, over all agents and for each.
 
     ValueError if the runs did not play the same goals.
@@ -122,7 +133,7 @@ def summarise(runs: Sequence[Played]) -> dict[str, Any]:
     for numbers in agents.values():
         for name in [name for name in numbers if name.startswith("team_")]:
             del numbers[name], numbers["intervals"][name]
-    return {**first.about, **_numbers(metrics(measures, following), first.stages), "agents": agents}
+    return Evaluation({**first.about, **_numbers(metrics(measures, following), first.stages), "agents": agents})
 
 
 def difference(result: Mapping[str, Any], other: Mapping[str, Any], name: str) -> dict[str, float | None]:
@@ -152,7 +163,7 @@ def _numbers(found: Mapping[str, Metric], stages: Sequence[str]) -> dict[str, An
 
 
 def _first_episodes(
-    env: BatchedEnv, policy: Callable[..., Mapping[str, Any]], observations: Mapping[str, Any], count: int
+    env: BatchedEnv, policy: Callable[..., Mapping[str, Any]], observations: Mapping[str, Any], count: int, bar: Any
 ) -> Trajectory:
     """Play the first episodes of the first `count` environments, which have just been reset."""
     lengths = np.zeros(count, int)
@@ -169,6 +180,9 @@ def _first_episodes(
             name for info in told for name in info if name in KEPT or name.startswith((*TERMS, STAGE))
         )
         infos.append({name: np.stack([_numpy(info.get(name, unknown), count) for info in told], -1) for name in names})
+        if bar is not None:
+            bar.set_postfix_str(_figures(infos[-1]), refresh=False)
+            bar.update()
         ended = step.terminated | step.truncated
         forget(policy, ended)
         done = _numpy(ended, count)
@@ -185,6 +199,14 @@ def _first_episodes(
     tip, center = _kinematics(env, np.stack(starts))
     changes = np.stack([_changes(np.stack(own)) for own in zip(*acted, strict=True)], -1)
     return Trajectory(lengths, error, success > 0, missed, collision > 0, distance, changes, tip, center, series)
+
+
+def _figures(infos: Mapping[str, np.ndarray]) -> str:
+    """Return how a step's episodes stand: success, collisions and the median error, as far as they are known."""
+    errors = next((infos[name] for name in ERRORS if name in infos), np.zeros(0))
+    known = errors[np.isfinite(errors)]
+    error = f"error {1000 * np.median(known):.2f} mm, " if known.size else ""
+    return f"{error}success {np.mean(infos['success'] > 0):.0%}, collision {np.mean(infos['collision'] > 0):.0%}"
 
 
 def _changes(actions: np.ndarray) -> np.ndarray:

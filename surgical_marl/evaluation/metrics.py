@@ -37,6 +37,8 @@ SEARCHING = "searching"
 """Whether an endoscope may still look for what it is to show, in `infos` of tasks with such a search."""
 TRAVEL = {"camera_travel": ("camera_travel_mm", 1000.0)}
 """Infos of how far something moved in a step, whose sum counts, likewise."""
+PEAK = {"contact_force": ("peak_force_n", 1.0)}
+"""Infos whose largest value of all steps counts, likewise."""
 STILL = 1e-3
 """A tip that moved less than this, in m, has no smoothness, because its motion is noise."""
 
@@ -63,8 +65,8 @@ class Trajectory(NamedTuple):
     center: np.ndarray
     """[T, E, A], distance of the shaft from its remote center at the start of each step, m; NaN without one."""
     terms: Mapping[str, np.ndarray]
-    """Reward terms, costs, stages, `SEARCHING` and what `LAST`, `VIEWED` and `TRAVEL` have, of each step, by their
-    names in `infos`, [T, E, A]; NaN for an agent that has none."""
+    """Reward terms, costs, stages, `SEARCHING` and what `LAST`, `VIEWED`, `TRAVEL` and `PEAK` have, of each step, by
+    their names in `infos`, [T, E, A]; NaN for an agent that has none."""
 
 
 class Metric(NamedTuple):
@@ -91,7 +93,7 @@ def measure(trajectory: Trajectory, dt: float, following: bool) -> dict[str, np.
         `center`, `path` of the tip. Also `collided`; `time` from which on it is not `missed`, s, `smoothness`, and
         `action_change`, the root mean square in steps that begin at the goal, NaN where undefined; the mean of each of
         the `terms`, over the steps that count of those in `VIEWED`, NaN if there are none; at the last step of those in
-        `LAST`, over all steps together of `TRAVEL`.
+        `LAST`, over all steps together of `TRAVEL`, the largest of `PEAK`.
     """
     lengths, error = trajectory.lengths[:, None], trajectory.error
     step = np.arange(1, len(error) + 1)[:, None, None]
@@ -127,7 +129,10 @@ def measure(trajectory: Trajectory, dt: float, following: bool) -> dict[str, np.
 
 
 def _reduced(name: str, values: np.ndarray, where: np.ndarray, final: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    """Reduce steps: whether a stage was ever reached or there was a drop, last of `LAST`, sum of `TRAVEL`, else mean.
+    """Reduce steps to one number: their mean, unless the name asks for something else.
+
+    That is whether a stage was ever reached or there was a drop, the largest of `PEAK`, the last of `LAST`, or the sum
+    of `TRAVEL`.
 
     Args:
         where: [T, E, 1], the steps that count.
@@ -139,7 +144,7 @@ def _reduced(name: str, values: np.ndarray, where: np.ndarray, final: Callable[[
     if name in TRAVEL:
         return kept.sum(0)
     with np.errstate(invalid="ignore"):
-        return kept.max(0) if name.startswith((STAGE, DROP)) else kept.sum(0) / where.sum(0)
+        return kept.max(0) if name.startswith((STAGE, DROP, *PEAK)) else kept.sum(0) / where.sum(0)
 
 
 def metrics(measures: Mapping[str, np.ndarray], following: bool) -> dict[str, Metric]:
@@ -170,7 +175,7 @@ def metrics(measures: Mapping[str, np.ndarray], following: bool) -> dict[str, Me
         found["rmse_mm"] = Metric(1e6 * measures["squared"], lambda values: np.sqrt(values.mean(-1)))
     if DROP in measures:
         found["drop_rate"] = Metric(measures[DROP].max(-1, keepdims=True), _mean)
-    for name, (title, unit) in (LAST | VIEWED | TRAVEL).items():
+    for name, (title, unit) in (LAST | VIEWED | TRAVEL | PEAK).items():
         if name in measures:
             found[title] = Metric(unit * measures[name], _mean_of_known)
     return found | {

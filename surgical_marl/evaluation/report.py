@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import html
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,17 @@ ABOUT = (
 )
 
 
+class Evaluation(dict[str, Any]):
+    """What `evaluate` returns: a dict that a notebook shows as a table."""
+
+    def _repr_html_(self) -> str:
+        head, *rows = _rows(self, self["agents"])
+        cells = "".join(f"<th>{html.escape(cell)}</th>" for cell in head)
+        lines = "".join("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
+        caption = html.escape(_describe(self))
+        return f"<table><caption>{caption}</caption><thead><tr>{cells}</tr></thead><tbody>{lines}</tbody></table>"
+
+
 def format_table(result: Mapping[str, Any], others: Mapping[str, Mapping[str, Any]] | None = None) -> str:
     """Return what `evaluate` returned as plain text: one line for each metric, with its 95 % interval.
 
@@ -35,19 +47,28 @@ def format_table(result: Mapping[str, Any], others: Mapping[str, Mapping[str, An
         result: what `evaluate` returned.
         others: further columns to show beside it, metrics by title; if None, one column for each agent.
     """
-    columns = result["agents"] if others is None else others
+    rows = _rows(result, result["agents"] if others is None else others)
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ("  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]).rstrip() for row in rows)
+    return "\n".join([_describe(result), *lines])
+
+
+def _describe(result: Mapping[str, Any]) -> str:
+    """Return what was played, as a text."""
     words = "{task} in {scene}, {difficulty}, {control} control, {goals} goals, {start} start: {episodes} episodes"
     what = f"{words.format(**result)}, seed {result['seed']}"
     what += "".join(f", {agent} is {who}" for agent, who in result.get("partners", {}).items())
-    goals = f"goal set {result['goal_set']:.12} ({'standard' if is_standard(result) else 'not a standard one'})"
+    return f"{what}, goal set {result['goal_set']:.12} ({'standard' if is_standard(result) else 'not a standard one'})"
+
+
+def _rows(result: Mapping[str, Any], columns: Mapping[str, Mapping[str, Any]]) -> list[list[str]]:
+    """Return the head of a table and a row for each metric."""
     rows = [["", "all", "95 % interval", *columns]]
     for name, bounds in result["intervals"].items():
         span = "-" if bounds is None else " to ".join(number(name, bound) for bound in bounds)
         rows.append([title(name), number(name, result[name]), span])
         rows[-1] += [number(name, values.get(name)) for values in columns.values()]
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = ("  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]).rstrip() for row in rows)
-    return "\n".join([f"{what}, {goals}", *lines])
+    return rows
 
 
 def write_csv(path: Path, results: Sequence[Mapping[str, Any]]) -> None:
@@ -77,7 +98,7 @@ def _csv_row(result: Mapping[str, Any], agent: str | None) -> dict[str, Any]:
     return row
 
 
-UNITS = {"_mm": " (mm)", "_s": " (s)", "_deg": " (degrees)", "image_error": "image error (grey levels)"}
+UNITS = {"_mm": " (mm)", "_s": " (s)", "_deg": " (degrees)", "_n": " (N)", "image_error": "image error (grey levels)"}
 """Units of metrics, by the suffix of their names."""
 
 

@@ -19,13 +19,13 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 from torch import Tensor
-from tqdm import trange
 
 from surgical_marl.cache import cached_arrays
 from surgical_marl.engines.stepper import describe
 from surgical_marl.policies.layout import Layout
 from surgical_marl.policies.oracle import oracle
 from surgical_marl.runs.environment import make_env
+from surgical_marl.runs.progress import progress
 from surgical_marl.runs.settings import Settings
 
 if TYPE_CHECKING:
@@ -114,7 +114,8 @@ def _record(env: BatchedEnv) -> dict[str, np.ndarray]:
         rows[kind].append(_joined([parts[name] for name in shapes[kind]], at))
         places[kind].append(np.stack([at, np.full(len(at), step)]))
 
-    for step in trange(env.max_steps, desc="the oracle's episodes", unit="step", leave=False, disable=None):
+    bar = progress(env.max_steps, "step", "the oracle's episodes", leave=False)
+    for step in range(env.max_steps):
         actions = {agent: np.clip(action, -1.0, 1.0) for agent, action in policy(observations).items()}
         if step and step % EVERY == 0:
             keep("states", step, goes_on, {**env.carry(), **observations, "state": state})
@@ -125,6 +126,9 @@ def _record(env: BatchedEnv) -> dict[str, np.ndarray]:
         goes_on &= ~(result.terminated | result.truncated)
         success = np.all([result.infos[agent]["success"] for agent in env.agents], axis=0)
         solved = np.where((solved < 0) & success & goes_on, step, solved)
+        bar.set_postfix_str(f"{(solved >= 0).mean():.0%} solved", refresh=False)
+        bar.update()
+    bar.close()
     found = {}
     for kind, (numbers, steps) in ((kind, np.concatenate(places[kind], 1)) for kind in shapes):
         useful = np.flatnonzero((solved[numbers] >= 0) & (steps <= solved[numbers] + BEYOND))

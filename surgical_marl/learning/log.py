@@ -5,17 +5,15 @@ from __future__ import annotations
 import csv
 import math
 import os
-import sys
 from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
 from surgical_marl.learning.trainer import Report, Trainer
 from surgical_marl.runs.folder import METRICS, format_row
+from surgical_marl.runs.progress import progress
 
 
 class Reports:
@@ -51,9 +49,7 @@ class Log:
         board = SummaryWriter(str(out / "tensorboard"), purge_step=training.iteration + 1)
         self._board = self._files.enter_context(board)
         total, begun = training.settings.iterations, training.iteration
-        self._bar = self._files.enter_context(
-            tqdm(initial=begun, total=total, unit="it", file=sys.stderr, dynamic_ncols=True)
-        )
+        self._bar = self._files.enter_context(progress(total, "it", begun=begun))
 
     def __enter__(self) -> Log:
         return self

@@ -30,7 +30,7 @@ def draw_curve(run: Path, title: str) -> None:
         values = np.array([row[name] for row in rows])
         known = np.isfinite(values)
         axis.plot(steps[known], values[known], color=color, alpha=0.25, linewidth=1)
-        axis.plot(steps[known], _smooth(values[known]), color=color, linewidth=2)
+        axis.plot(steps[known], smooth(values[known]), color=color, linewidth=2)
         axis.set(title=label, xlabel="environment steps")
         axis.title.set_fontsize(10)
         axis.xaxis.set_major_formatter(EngFormatter(sep=""))
@@ -48,7 +48,7 @@ def draw_curve(run: Path, title: str) -> None:
     write_atomic(run / CURVE, lambda path: figure.savefig(path, format="png", dpi=150))
 
 
-def _smooth(values: np.ndarray) -> np.ndarray:
+def smooth(values: np.ndarray) -> np.ndarray:
     """Return the running mean over a fiftieth of the curve, with shorter windows at the ends."""
     half = len(values) // 100
     sums = np.concatenate([[0.0], np.cumsum(values)])

@@ -1,7 +1,8 @@
 """The files of a run folder, and how they are read and written.
 
-A run folder holds `config.yaml`, `checkpoint.pt`, `metrics.csv`, `curve.png` and `tensorboard/`. If there were
-several processes, `environments-*.pt` of the other ranks are beside the checkpoint. If training diverged, there is
+A run folder holds `config.yaml`, `checkpoint.pt`, `metrics.csv`, `curve.png` and `tensorboard/`. What is made of them
+at the end, `eval.json`, `episodes.npz`, `video.mp4` and `report.html`, is written elsewhere. If there were several
+processes, `environments-*.pt` of the other ranks are beside the checkpoint. If training diverged, there is
 also `diverged.json`.
 
 A shipped policy has safetensors instead of the checkpoint (`surgical_marl/evaluation/export.py`). Every write is
@@ -167,6 +168,8 @@ def read_metrics(run: Path) -> list[dict[str, float]]:
     rows: list[dict[str, float]] = []
     with (run / METRICS).open(newline="", errors="replace") as file, contextlib.suppress(ValueError):
         for row in csv.DictReader(line for line in file if line.endswith("\n")):
+            if None in row:  # cells without a column
+                break
             rows.append({key: float(cell or "nan") for key, cell in row.items()})
     return rows
 

@@ -1,0 +1,62 @@
+"""The commands that repeat a run."""
+
+from __future__ import annotations
+
+import shlex
+from typing import Any
+
+import yaml
+
+from surgical_marl.report.run import Run, flatten
+from surgical_marl.runs.folder import read_settings
+from surgical_marl.runs.settings import config_text, load_config
+
+
+def train_command(run: Run) -> str:
+    """Return the `surgical-marl train` that has exactly the settings of a run.
+
+    It names each setting that differs from the defaults of its task and scene, be it those for a CPU or for a GPU.
+    """
+    task, scene, settings = str(run.config["task"]), str(run.config["scene"]), _settings(run)
+    try:
+        level = [f"difficulty={settings['difficulty']}"]
+        both = [
+            _flat(config_text(load_config(task, scene, [*level, f"device={device}"]), {})) for device in ("cpu", "cuda")
+        ]
+    except (ValueError, KeyError):  # a task, or settings, that are not of this installation
+        both = []
+    command = ["surgical-marl", "train", task, "--scene", scene, "--seed", run.seed]
+    for name, value in settings.items():
+        usual = bool(both) and all(name in defaults and defaults[name] == value for defaults in both)
+        if name in ("device", "difficulty"):  # the defaults above are those of the run's own level, on two devices
+            usual = value in ("auto", "default")
+        if not usual and name not in ("task", "scene", "seed"):
+            command.append(f"{name}={_flow(value)}")
+    return shlex.join(command)
+
+
+def eval_command(run: Run) -> str:
+    """Return the command that repeats the evaluation."""
+    return shlex.join(["surgical-marl", "eval", run.given])
+
+
+def _settings(run: Run) -> dict[str, Any]:
+    """Return a run's settings by dotted name, with those that an older version did not write."""
+    try:
+        return _flat(config_text(read_settings(run.folder), {}))
+    except (ValueError, TypeError):
+        return dict(run.config)
+
+
+def _flat(text: str) -> dict[str, Any]:
+    return flatten(yaml.safe_load(text))
+
+
+def _flow(value: Any) -> str:
+    """Return a value as YAML on one line."""
+    return str(yaml.safe_dump(value, default_flow_style=True, width=10**9)).removesuffix("...\n").strip()
+
+
+def quote(*words: str) -> str:
+    """Return a command line of these words, as a shell reads it."""
+    return shlex.join(words)
