@@ -89,4 +89,4 @@ def test_an_object_is_handed_over_as_in_plain_mujoco() -> None:
     assert seen.holding[:, CHUNK - 1].all() and (seen.holding[:, -1] == [False, True]).all()
     assert off[:, :CHUNK].max() < NEAR, "while both hold it"
     assert np.median(off[:, : 4 * CHUNK].max(1)) < NEAR and off[:, : 4 * CHUNK].max() < 8e-4
-    assert off.max() < 1.5e-3
+    assert np.median(off.max(1)) < 2 * NEAR and off.max() < 2e-3
