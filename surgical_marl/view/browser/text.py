@@ -1,0 +1,40 @@
+"""Text of the page. Names may come from anybody's files: what goes into HTML is escaped here, in one place."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from surgical_marl.view.history import ERRORS
+from surgical_marl.view.session import Session
+
+_CELL = "padding:1px 8px 1px 0;white-space:nowrap"
+
+
+def status(session: Session) -> str:
+    """Return what the first environment is at, as HTML: its time, and errors, stages and contacts of all agents."""
+    env = session.env
+    head = f"<b>{html.escape(env.task_name)}</b> on <b>{html.escape(env.scene.name)}</b>, {html.escape(str(session.settings.difficulty))}"
+    step = int(np.asarray(env.steps)[0])
+    time = f"{step * env.control_dt:.2f} of {env.max_steps * env.control_dt:.0f} s, seed {session.seed}"
+    rows = "".join(_row(agent, own) for agent, own in session.infos.items())
+    return f'<div style="font-size:0.8em;padding:0 1em">{head}<br/>{time}<table>{rows}</table></div>'
+
+
+def summary(info: Mapping[str, Any], index: int = 0) -> list[str]:
+    """Return what an agent's infos of a step say in short: error, stages, and what went wrong."""
+    read = lambda name: float(np.asarray(info[name])[index])  # noqa: E731
+    words = [f"{1000 * read(name):.2f} mm" for name in ERRORS if name in info][:1]
+    done = [name.removeprefix("stage_") for name in info if name.startswith("stage_") and read(name)]
+    if done:
+        words.append("stages " + ", ".join(done))
+    words += [name for name in ("success", "holding", "collision", "drop") if name in info and read(name)]
+    return words
+
+
+def _row(agent: str, info: Mapping[str, Any]) -> str:
+    cells = [agent, ", ".join(summary(info)) or "-"]
+    return "<tr>" + "".join(f'<td style="{_CELL}">{html.escape(cell)}</td>' for cell in cells) + "</tr>"
