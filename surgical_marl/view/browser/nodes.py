@@ -21,7 +21,7 @@ RED, GREY, GOLD = np.array([226, 40, 40]), np.array([120, 130, 140]), np.array([
 PARTS = ("targets", "paths", "trails", "trocars", "contacts", "distance")
 """What can be hidden, beside arms and objects."""
 _TIP_RADIUS = 0.0025
-_FADED = np.array([235, 238, 242])
+_FADED = np.array([200, 205, 212])
 _NONE = np.zeros((0, 2, 3), np.float32)
 
 
@@ -53,11 +53,14 @@ class Nodes:
     def __init__(self, server: Any, session: Session) -> None:
         self._scene, self._session = server.scene, session
         env = session.env
-        self._offsets = offsets(env.num_envs, 1.3 * float(env.scene.model.stat.extent))
+        self.offsets = offsets(env.num_envs, 1.3 * float(env.scene.model.stat.extent))
         self._paths = Paths(env)
         self._shown = dict.fromkeys(PARTS, True)
         self._trailed = -1
+        """Where environments stand, [N, 3], m."""
         first = session.moment()
+        low = float(first.positions[..., 2].min()) - 0.1
+        self._scene.add_grid("/floor", 4.0, 4.0, position=(0, 0, low), cell_size=0.1, section_size=0.5, shadow_opacity=0.2)
         self._make_bodies(first)
         self._make_marks(first)
         self._make_lines()
@@ -73,7 +76,7 @@ class Nodes:
         """Show what there is to see now."""
         moment = self._session.moment()
         for body, handle in self._moving.items():
-            handle.batched_positions = (moment.positions[:, body] + self._offsets).astype(np.float32)
+            handle.batched_positions = (moment.positions[:, body] + self.offsets).astype(np.float32)
             handle.batched_wxyzs = moment.quaternions[:, body].astype(np.float32)
         self._tips.batched_positions = self._placed(moment.tips)
         if self._marks is not None:
@@ -93,7 +96,7 @@ class Nodes:
         tips, objects, held = self._session.trails()
         lines, colours = [_NONE], [np.zeros((0, 2, 3), np.uint8)]
         age = np.linspace(0.0, 1.0, len(tips))[1:, None, None]
-        for env, offset in enumerate(self._offsets):
+        for env, offset in enumerate(self.offsets):
             for arm in range(tips.shape[2]):
                 lines.append(segments(tips[:, env, arm] + offset))
                 colours.append(_fading(colour(arm), age))
@@ -105,7 +108,7 @@ class Nodes:
 
     def _placed(self, points: np.ndarray) -> np.ndarray:
         """Return points [N, m, 3] of all environments where they stand, [N * m, 3]."""
-        return (points + self._offsets[:, None]).reshape(-1, 3).astype(np.float32)
+        return (points + self.offsets[:, None]).reshape(-1, 3).astype(np.float32)
 
     def _make_bodies(self, moment: Moment) -> None:
         model = self._session.env.scene.model
@@ -114,10 +117,12 @@ class Nodes:
             glb = body_glb(model, body)
             if glb is None:
                 continue
+            moves = bool(model.body_weldid[body]) or model.body_mocapid[body] >= 0
             handle = self._scene.add_batched_glb(
-                f"/bodies/{body}", glb, moment.quaternions[:, body], moment.positions[:, body] + self._offsets, lod="off"
-            )
-            if model.body_weldid[body] or model.body_mocapid[body] >= 0:
+                f"/bodies/{body}", glb, moment.quaternions[:, body], moment.positions[:, body] + self.offsets, lod="off",
+                receive_shadow=not moves,
+            )  # fmt: skip
+            if moves:
                 self._moving[body] = handle
 
     def _make_marks(self, moment: Moment) -> None:
@@ -132,9 +137,10 @@ class Nodes:
             self._marks = self._balls("/targets", moment.marks, np.tile(own, (count, 1)), GOAL_RADIUS, 0.75)
         ring = trimesh.creation.torus(0.009, 0.0014, major_sections=32, minor_sections=10)
         self._trocars = []
-        for arm, mount in enumerate(env.scene.mounts.values()):
+        for arm, (agent, mount) in enumerate(env.scene.mounts.items()):
             if mount.arm.remote_center:
-                places = self._offsets + mount.position
+                self._trocars.append(self._scene.add_label(f"/names/{arm}", agent, position=mount.position + self.offsets[0]))
+                places = self.offsets + mount.position
                 wxyz = np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))
                 mesh = np.asarray(ring.vertices), np.asarray(ring.faces)
                 self._trocars.append(
@@ -178,7 +184,7 @@ class Nodes:
         }
 
     def _draw_distances(self, moment: Moment) -> None:
-        near = [(line, offset) for line, offset in zip(moment.nearest, self._offsets, strict=True) if line is not None]
+        near = [(line, offset) for line, offset in zip(moment.nearest, self.offsets, strict=True) if line is not None]
         if near:
             colours = np.array([[distance_colour(line.distance)] * 2 for line, _ in near])
             _set(self._lines, np.array([line.ends + offset for line, offset in near]), colours)
@@ -186,7 +192,7 @@ class Nodes:
     def _draw_contacts(self, moment: Moment) -> None:
         arrows = [
             (push.place + offset, push.place + offset + push.direction * min(0.05, 0.008 + 0.002 * push.force))
-            for pushes, offset in zip(moment.pushes, self._offsets, strict=True)
+            for pushes, offset in zip(moment.pushes, self.offsets, strict=True)
             for push in pushes
         ]
         if arrows or len(self._arrows.points):
@@ -195,9 +201,9 @@ class Nodes:
 
     def _draw_paths(self, paths: np.ndarray) -> None:
         arms = range(paths.shape[2])
-        lines = [segments(paths[env, :, arm] + offset) for env, offset in enumerate(self._offsets) for arm in arms]
+        lines = [segments(paths[env, :, arm] + offset) for env, offset in enumerate(self.offsets) for arm in arms]
         pieces = len(lines[0])
-        colours = [np.tile(colour(arm), (pieces, 2, 1)) for _ in self._offsets for arm in arms]
+        colours = [np.tile(colour(arm), (pieces, 2, 1)) for _ in self.offsets for arm in arms]
         points = np.concatenate(lines).astype(np.float32)
         if not np.array_equal(points, self._ways.points):
             _set(self._ways, points, np.concatenate(colours))

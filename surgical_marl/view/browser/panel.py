@@ -13,6 +13,7 @@ from surgical_marl.view.browser.text import status
 from surgical_marl.view.pace import Pace
 from surgical_marl.view.session import MOST_ENVS, Session
 
+GO, STEP, RESET = "Pause / go on", "One step", "Reset"
 SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "4")
 
 
@@ -31,32 +32,19 @@ class Panel:
 
     Args:
         server: of viser.
-        folder: where the menus go.
         session: what is looked at.
         pace: how time passes.
         ask: lets the thread that steps do something.
-        choose: looks at something else.
     """
 
-    def __init__(
-        self,
-        server: Any,
-        folder: Any,
-        session: Session,
-        pace: Pace,
-        ask: Callable[[Callable[[], None]], None],
-        choose: Callable[[Choice], None],
-    ) -> None:
-        self._gui, self._session, self._pace, self._ask, self._choose = server.gui, session, pace, ask, choose
+    def __init__(self, server: Any, session: Session, pace: Pace, ask: Callable[[Callable[[], None]], None]) -> None:
+        self._gui, self._session, self._pace, self._ask = server.gui, session, pace, ask
         self._make_time()
         self._status = self._gui.add_html(status(session))
-        with folder:
-            self._make_menus()
 
     def sync(self) -> None:
         """Show how things are."""
-        self._status.content = status(self._session)
-        self._pause.label = "Go on" if self._pace.paused else "Pause"
+        self._status.content = status(self._session, self._pace.paused)
         if self._seed.value != self._session.seed:
             self._seed.value = self._session.seed
 
@@ -73,8 +61,7 @@ class Panel:
 
     def _make_time(self) -> None:
         gui, pace = self._gui, self._pace
-        self._pause = gui.add_button("Pause", hint="key space")
-        step, reset = gui.add_button("One step", hint="key N"), gui.add_button("Reset", hint="key R")
+        buttons = gui.add_button_group("time", (GO, STEP, RESET), hint="keys: space, N, R")
         speed = gui.add_dropdown("speed", SPEEDS, initial_value=f"{pace.speed:g}")
         self._seed = gui.add_number("seed", self._session.seed, min=0, max=2**31 - 1, step=1)
 
@@ -88,17 +75,22 @@ class Panel:
         def begin() -> None:
             self._session.reset(int(self._seed.value))
 
-        for button, key, label, act in (
-            (self._pause, "space", "pause or go on", turn),
-            (step, "N", "one step", single),
-            (reset, "R", "reset", begin),
-        ):
-            button.on_click(self._then(act))
+        acts = {GO: turn, STEP: single, RESET: begin}
+        for (label, act), key in zip(acts.items(), ("space", "N", "R"), strict=True):
             gui.add_command(label, hotkey=key).on_trigger(self._then(act))
+        buttons.on_click(self._then(lambda: acts[buttons.value]()))
         speed.on_update(self._then(lambda: setattr(pace, "speed", float(speed.value))))
         self._seed.on_update(self._then(begin))
 
-    def _make_menus(self) -> None:
+    def add_menus(self, folder: Any, choose: Callable[[Choice], None]) -> None:
+        """Add the menus of what is looked at; `choose` looks at something else."""
+        with folder:
+            chosen, menus = self._make_menus()
+        for menu in menus:
+            menu.on_update(self._then(lambda: choose(chosen())))
+
+    def _make_menus(self) -> tuple[Callable[[], Choice], list[Any]]:
+        """Return what says what the menus say, and the menus."""
         env, gui = self._session.env, self._gui
         scene = self._session.settings.scene
         scenes = list(dict.fromkeys([*list_scenes(), scene]))
@@ -108,8 +100,7 @@ class Panel:
         level = gui.add_dropdown("difficulty", levels, initial_value=self._session.settings.difficulty)
         count = gui.add_dropdown("environments", list(map(str, range(1, MOST_ENVS + 1))), initial_value=str(env.num_envs))
         chosen = lambda: Choice(task.value, place.value, level.value, int(count.value))  # noqa: E731
-        for menu in (task, place, level, count):
-            menu.on_update(self._then(lambda: self._choose(chosen())))
+        return chosen, [task, place, level, count]
 
     def _then(self, act: Callable[[], None]) -> Callable[[Any], Any]:
         """Return a callback of viser that lets the stepping thread act, when it was a person who caused it."""

@@ -19,7 +19,7 @@ from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.runs.settings import Settings
 from surgical_marl.view.browser.arms import Arms
 from surgical_marl.view.browser.gate import close_server, open_server
-from surgical_marl.view.browser.nodes import Nodes, offsets
+from surgical_marl.view.browser.nodes import Nodes
 from surgical_marl.view.browser.panel import Choice, Panel
 from surgical_marl.view.browser.pictures import Pictures
 from surgical_marl.view.browser.plots import Plots
@@ -124,21 +124,14 @@ class Viewer:
         server.scene.reset()
         server.gui.reset()
         _light(server)
-        stat = session.env.scene.model.stat
-        camera = server.initial_camera
-        camera.look_at = 0.55 * np.asarray(stat.center)
-        camera.position = camera.look_at + stat.extent * session.env.num_envs**0.5 * np.array([0.35, -0.95, 0.45])
-        camera.fov = np.deg2rad(50)
+        _aim(server.initial_camera, session)
         self.pace = Pace(session.env.control_dt)
-        gui = server.gui
         self._nodes = Nodes(server, session)
-        tabs: dict[str, Any] = {}
-        panel = Panel(server, gui.add_folder("Scene"), session, self.pace, self.ask, self.choose)
-        group = gui.add_tab_group()
-        for name in ("Arms", "Plots", "Pictures", "Show"):
-            tabs[name] = group.add_tab(name)
-        offset = offsets(session.env.num_envs, 1.3 * float(stat.extent))[0]
-        self._arms = Arms(server, tabs["Arms"], session, self.ask, offset)
+        panel = Panel(server, session, self.pace, self.ask)
+        group = server.gui.add_tab_group()
+        tabs = {name: group.add_tab(name) for name in ("Arms", "Scene", "Plots", "Pictures", "Show")}
+        self._arms = Arms(server, tabs["Arms"], session, self.ask, self._nodes.offsets[0])
+        panel.add_menus(tabs["Scene"], self.choose)
         plots, pictures = Plots(server, tabs["Plots"]), Pictures(server, tabs["Pictures"], session)
         panel.add_parts(tabs["Show"], self._nodes)
 
@@ -172,6 +165,18 @@ def _settings(choice: Choice, old: Session) -> tuple[Settings, Any]:
         scene = task.default_scene or task.scenes[0]
     difficulty = choice.difficulty if choice.difficulty in task.levels else "default"
     return Settings(choice.task, scene, difficulty=difficulty, seed=old.seed), first_choice(choice.task, scene)
+
+
+def _aim(camera: Any, session: Session) -> None:
+    """Let a camera look at all tool tips from where no arm stands: from across the bases of the arms."""
+    tips = session.moment().tips.mean((0, 1))
+    stat, count = session.env.scene.model.stat, session.env.num_envs
+    away = (tips - stat.center) * [1, 1, 0]
+    length = float(np.linalg.norm(away))
+    away = away / length if length > 1e-3 else np.array([0.0, 1.0, 0.0])
+    camera.look_at = tips + [0.0, 0.0, 0.03 * stat.extent]
+    camera.position = camera.look_at + stat.extent * (0.42 * away + [0.0, 0.0, 0.26]) * (1 + 0.7 * (count - 1))
+    camera.fov = float(np.deg2rad(50))
 
 
 def _light(server: Any) -> None:
