@@ -90,7 +90,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(prog="surgical-marl", description="Surgical robot arms that learn together.")
     parser.add_argument("--version", action="version", version=f"%(prog)s {_version()}")
-    commands = parser.add_subparsers(required=True, metavar="{%s}" % ",".join(_COMMANDS))
+    commands = parser.add_subparsers(required=True, metavar=f"{{{','.join(_COMMANDS)}}}")
 
     train = commands.add_parser(
         "train",

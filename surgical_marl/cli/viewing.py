@@ -18,10 +18,10 @@ _OWN = ("control", "knowledge", "messages", "difficulty", "start", "goals")
 
 def add_view(commands: Any) -> None:
     """Add the command view."""
-    parser = commands.add_parser("view", help="a task in the browser, with a policy or a person at each arm (docs/viewer.md)")
+    parser = commands.add_parser("view", help="a task in the browser, policies or people at the arms (docs/viewer.md)")
     _add_what(parser)
-    parser.add_argument("--num-envs", type=whole(1, 4), default=1, metavar="N", help="environments side by side, 1 to 4")
-    parser.add_argument("--port", type=whole(0, 65535), default=8080, metavar="N", help="of the page; 0 for any free one")
+    parser.add_argument("--num-envs", type=whole(1, 4), default=1, metavar="N", help="environments side by side")
+    parser.add_argument("--port", type=whole(0, 65535), default=8080, metavar="N", help="of the page; 0 for any")
     parser.add_argument("--record", type=Path, metavar="DIR", help="keep what was done, for `surgical-marl replay`")
     parser.set_defaults(command=_view, name="view")
 

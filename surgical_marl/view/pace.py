@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 MOST = 20
-"""Steps at most at a time: who falls behind runs slower, and does not freeze the page."""
+"""Steps at most at a time: who falls behind runs slower."""
 
 
 class Pace:
@@ -25,6 +25,10 @@ class Pace:
     def step_once(self) -> None:
         """Let one step be due although time stands still."""
         self._single += 1
+
+    def forgive(self) -> None:
+        """Forget the steps that are due but were not done: they take longer than there is time."""
+        self._owed = 0.0
 
     def due(self, now: float) -> int:
         """Return how many steps to do at a time in s that never runs back."""

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from surgical_marl.runtime import jnp
 from surgical_marl.tasks.base.path_task import PathTask
 
 if TYPE_CHECKING:
@@ -33,6 +34,6 @@ class Paths:
         return np.stack([self._known[row] for row in rows])
 
     def _path(self, task: PathTask, row: int) -> np.ndarray:
-        own = np.asarray(task.along(np.int32(row), self._times), float)  # type: ignore[arg-type]
+        own: np.ndarray = np.asarray(task.along(jnp.int32(row), jnp.asarray(self._times)))
         placed = [own[:, arm] @ mount.rotation.T + mount.position for arm, mount in enumerate(self._mounts)]
         return np.stack(placed, 1)

@@ -1,9 +1,9 @@
 """Environments that are looked at while they run: state alone, no drawing, no browser.
 
-    session = Session(Settings(task="reach", scene="bimanual_psm"), "oracle")
-    session.step()
-    session.moment()                        # what there is to see
-    session.set_mover("psm_1", "you")
+session = Session(Settings(task="reach", scene="bimanual_psm"), "oracle")
+session.step()
+session.moment()                        # what there is to see
+session.set_mover("psm_1", "you")
 """
 
 from __future__ import annotations

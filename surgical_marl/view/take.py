@@ -64,16 +64,19 @@ class Take:
 
     def add(self, actions: Mapping[str, np.ndarray], step: BatchStep) -> None:
         """Note the actions of a step that the environment has just done, and what it led to."""
-        self._steps.append({f"actions/{agent}": np.array(own) for agent, own in actions.items()} | _after(self._env, step))
+        self._steps.append(
+            {f"actions/{agent}": np.array(own) for agent, own in actions.items()} | _after(self._env, step)
+        )
 
     def write(self, path: Path) -> Path:
         """Write the file, completely or not at all, and return its path."""
-        content = {f"{_START}{name}": value for name, value in self._start.items()}
+        content = {"about": np.array(json.dumps(self._about))}
+        content |= {f"{_START}{name}": value for name, value in self._start.items()}
         content |= {name: np.stack([step[name] for step in self._steps]) for name in self._steps[0]}
 
         def save(part: Path) -> None:
             with part.open("wb") as file:
-                np.savez_compressed(file, about=np.array(json.dumps(self._about)), **content)
+                np.savez_compressed(file, **content)  # type: ignore[arg-type]
 
         path.parent.mkdir(parents=True, exist_ok=True)
         write_atomic(path, save)

@@ -23,6 +23,8 @@ KEYS = {
     "pageup": (0, 0, STEP), "pagedown": (0, 0, -STEP),
 }  # fmt: skip
 JAW_KEY = "J"
+_DIGITS = 4
+"""Digits of a joint's position, rad or m, in a slider."""
 _QUIET = 0.5
 """Time in s after somebody used a control, in which the page does not move it."""
 
@@ -77,8 +79,11 @@ class Arms:
             async def _(_: Any) -> None:
                 self._ask(lambda: self._with_first(act))
 
+        def nudge(step: tuple[float, float, float]) -> Callable[[Hand], None]:
+            return lambda hand: hand.nudge(step)
+
         for key, step in KEYS.items():
-            bind(key, f"tool tip by {1000 * STEP:.0f} mm: {key.removeprefix('arrow')}", lambda hand, s=step: hand.nudge(s))
+            bind(key, f"tool tip by {1000 * STEP:.0f} mm: {key.removeprefix('arrow')}", nudge(step))
         bind(JAW_KEY, "open or close the jaw", _turn_jaw)
 
     def _with_first(self, act: Callable[[Hand], None]) -> None:
@@ -97,8 +102,8 @@ class Controls:
         lower, upper = hand.limits
         with folder:
             self._sliders = {
-                joint: self._slider(server, index, name, float(lower[index]), float(upper[index]))
-                for joint, (index, name) in enumerate(zip(range(len(hand.joints)), hand.joints, strict=True))
+                index: self._slider(server, index, name, float(lower[index]), float(upper[index]))
+                for index, name in enumerate(hand.joints)
                 if not hand.jaw[index]
             }
             self._jaw = self._jaw_box(server) if hand.jaw.any() else None
@@ -119,7 +124,7 @@ class Controls:
             return
         for index, slider in self._sliders.items():
             if abs(slider.value - self._hand.q[index]) > slider.step:
-                slider.value = float(self._hand.q[index])
+                slider.value = round(float(self._hand.q[index]), _DIGITS)
         pose = self._hand.tip()
         self._handle.position, self._handle.wxyz = pose[:3, 3] + self._offset, quaternion(pose[:3, :3])
 
@@ -134,8 +139,9 @@ class Controls:
         self._ask(act)
 
     def _slider(self, server: Any, index: int, name: str, lower: float, upper: float) -> Any:
-        value = float(np.clip(self._hand.q[index], lower, upper))
-        slider = server.gui.add_slider(name, min=lower, max=upper, step=(upper - lower) / 1000, initial_value=value)
+        value = round(float(np.clip(self._hand.q[index], lower, upper)), _DIGITS)
+        step = 10.0**-_DIGITS
+        slider = server.gui.add_slider(name, min=lower, max=upper, step=step, initial_value=value)
 
         @slider.on_update
         async def _(event: Any) -> None:

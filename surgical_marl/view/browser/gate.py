@@ -1,9 +1,10 @@
 """A web server that only who knows the address can use: on this machine alone, with a secret in the path.
 
-viser serves its page and a websocket on one port, by the public package websockets, and to everybody who can reach it.
-Here it gets a socket that is bound to 127.0.0.1, and websockets asks `_guarded` before it answers any request, be it for
-the page or for the websocket: the path has to begin with the secret. Other users of this machine, and pages of other
-sites in the same browser, do not know it. viser's page opens its websocket under its own address, secret included.
+viser serves its page and a websocket on one port, by the public package websockets, to everybody who can reach it.
+Here it gets a socket that is bound to 127.0.0.1, and websockets asks `_guarded` before it answers any request, be it
+for the page or for the websocket: the path has to begin with the secret. Other users of this machine, and pages of
+other sites in the same browser, do not know it. viser's page opens its websocket under its own address, secret
+included.
 
 viser takes no socket and no such question as arguments. So `websockets.asyncio.server.serve`, which viser calls when it
 starts, is replaced while it starts. If a later viser does not call it, there is an error and no server.
@@ -42,7 +43,9 @@ def open_server(port: int) -> tuple[Any, str]:
             server = viser.ViserServer(host=HOST, verbose=False)
         if not used:
             close_server(server)
-            raise RuntimeError("this version of viser starts its server in another way: no page is served without guard")
+            raise RuntimeError(
+                "this version of viser starts its server in another way: no page is served without guard"
+            )
     except BaseException:
         listener.close()
         raise
@@ -87,11 +90,11 @@ def _guarded(token: str, listener: socket.socket) -> Iterator[list[bool]]:
 
         return serve(handler, sock=listener, process_request=ask, **options)
 
-    module.serve = serve_guarded  # type: ignore[assignment,misc]
+    module.serve = serve_guarded  # type: ignore[assignment]
     try:
         yield used
     finally:
-        module.serve = serve  # type: ignore[misc]
+        module.serve = serve
 
 
 def unlocked(path: str, token: str) -> str | None:

@@ -60,7 +60,9 @@ class Nodes:
         """Where environments stand, [N, 3], m."""
         first = session.moment()
         low = float(first.positions[..., 2].min()) - 0.1
-        self._scene.add_grid("/floor", 4.0, 4.0, position=(0, 0, low), cell_size=0.1, section_size=0.5, shadow_opacity=0.2)
+        self._scene.add_grid(
+            "/floor", 4.0, 4.0, position=(0, 0, low), cell_size=0.1, section_size=0.5, shadow_opacity=0.2
+        )
         self._make_bodies(first)
         self._make_marks(first)
         self._make_lines()
@@ -118,10 +120,9 @@ class Nodes:
             if glb is None:
                 continue
             moves = bool(model.body_weldid[body]) or model.body_mocapid[body] >= 0
-            handle = self._scene.add_batched_glb(
-                f"/bodies/{body}", glb, moment.quaternions[:, body], moment.positions[:, body] + self.offsets, lod="off",
-                receive_shadow=not moves,
-            )  # fmt: skip
+            places = moment.quaternions[:, body], moment.positions[:, body] + self.offsets
+            # what moves throws shadows but shows none: shadows on its own sides flicker
+            handle = self._scene.add_batched_glb(f"/bodies/{body}", glb, *places, lod="off", receive_shadow=not moves)
             if moves:
                 self._moving[body] = handle
 
@@ -139,7 +140,9 @@ class Nodes:
         self._trocars = []
         for arm, (agent, mount) in enumerate(env.scene.mounts.items()):
             if mount.arm.remote_center:
-                self._trocars.append(self._scene.add_label(f"/names/{arm}", agent, position=mount.position + self.offsets[0]))
+                self._trocars.append(
+                    self._scene.add_label(f"/names/{arm}", agent, position=mount.position + self.offsets[0])
+                )
                 places = self.offsets + mount.position
                 wxyz = np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))
                 mesh = np.asarray(ring.vertices), np.asarray(ring.faces)

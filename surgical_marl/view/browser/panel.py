@@ -14,6 +14,8 @@ from surgical_marl.view.pace import Pace
 from surgical_marl.view.session import MOST_ENVS, Session
 
 GO, STEP, RESET = "Pause / go on", "One step", "Reset"
+LONGEST = 3600.0
+"""An episode at most, s."""
 SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "4")
 
 
@@ -25,6 +27,8 @@ class Choice:
     scene: str
     difficulty: str
     num_envs: int
+    max_steps: int
+    """Of an episode."""
 
 
 class Panel:
@@ -98,9 +102,18 @@ class Panel:
         task = gui.add_dropdown("task", list_tasks(), initial_value=env.task_name)
         place = gui.add_dropdown("scene", scenes, initial_value=scene)
         level = gui.add_dropdown("difficulty", levels, initial_value=self._session.settings.difficulty)
-        count = gui.add_dropdown("environments", list(map(str, range(1, MOST_ENVS + 1))), initial_value=str(env.num_envs))
-        chosen = lambda: Choice(task.value, place.value, level.value, int(count.value))  # noqa: E731
-        return chosen, [task, place, level, count]
+        count = gui.add_dropdown(
+            "environments", list(map(str, range(1, MOST_ENVS + 1))), initial_value=str(env.num_envs)
+        )
+        length = gui.add_number(
+            "seconds an episode", round(env.max_steps * env.control_dt, 3), min=env.control_dt, max=LONGEST, step=1.0
+        )
+
+        def chosen() -> Choice:
+            steps = max(1, round(float(length.value) / env.control_dt))
+            return Choice(task.value, place.value, level.value, int(count.value), steps)
+
+        return chosen, [task, place, level, count, length]
 
     def _then(self, act: Callable[[], None]) -> Callable[[Any], Any]:
         """Return a callback of viser that lets the stepping thread act, when it was a person who caused it."""

@@ -31,7 +31,9 @@ def curves(history: History) -> dict[str, list[Curve]]:
         "distance of arms, mm": [
             Curve(agent, own[i], 1000 * history.read(agent, "min_distance")) for i, agent in enumerate(agents)
         ],
-        "contact force, N": [Curve(agent, own[i], history.read(agent, "contact_force")) for i, agent in enumerate(agents)],
+        "contact force, N": [
+            Curve(agent, own[i], history.read(agent, "contact_force")) for i, agent in enumerate(agents)
+        ],
         "reward": [Curve(agent, own[i], history.read(agent, "reward")) for i, agent in enumerate(agents)],
     }
     for agent in agents:

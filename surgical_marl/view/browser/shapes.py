@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -17,7 +18,7 @@ _VISIBLE = 2
 _CREASE = 0.6
 """Angle of two faces in rad from which on their edge is sharp."""
 
-_Geom = mujoco.mjtGeom
+_Geom: Any = mujoco.mjtGeom
 
 
 def body_glb(model: mujoco.MjModel, body: int) -> bytes | None:
@@ -57,7 +58,7 @@ def _ellipsoid(size: np.ndarray) -> trimesh.Trimesh:
     return mesh
 
 
-_MADE: dict[_Geom, Callable[[np.ndarray], trimesh.Trimesh]] = {
+_MADE: dict[Any, Callable[[np.ndarray], trimesh.Trimesh]] = {
     _Geom.mjGEOM_SPHERE: lambda size: trimesh.creation.icosphere(subdivisions=3, radius=size[0]),
     _Geom.mjGEOM_CAPSULE: lambda size: trimesh.creation.capsule(2 * size[1], size[0], count=[20, 16]),
     _Geom.mjGEOM_ELLIPSOID: _ellipsoid,
@@ -69,7 +70,9 @@ _MADE: dict[_Geom, Callable[[np.ndarray], trimesh.Trimesh]] = {
 def _mesh(model: mujoco.MjModel, index: int) -> trimesh.Trimesh:
     first, count = model.mesh_vertadr[index], model.mesh_vertnum[index]
     begin, faces = model.mesh_faceadr[index], model.mesh_facenum[index]
-    return trimesh.Trimesh(model.mesh_vert[first : first + count], model.mesh_face[begin : begin + faces], process=False)
+    return trimesh.Trimesh(
+        model.mesh_vert[first : first + count], model.mesh_face[begin : begin + faces], process=False
+    )
 
 
 def _material(rgba: np.ndarray) -> PBRMaterial:

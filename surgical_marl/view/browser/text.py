@@ -17,10 +17,11 @@ _CELL = "padding:1px 8px 1px 0;white-space:nowrap"
 def status(session: Session, paused: bool = False) -> str:
     """Return what the first environment is at, as HTML: its time, and errors, stages and contacts of all agents."""
     env = session.env
-    head = f"<b>{html.escape(env.task_name)}</b> on <b>{html.escape(env.scene.name)}</b>, {html.escape(str(session.settings.difficulty))}"
-    step = int(np.asarray(env.steps)[0])
-    time = f"{step * env.control_dt:.2f} of {env.max_steps * env.control_dt:.0f} s, seed {session.seed}{', paused' if paused else ''}"
-    rows = "".join(_row(agent, own) for agent, own in session.infos.items())
+    names = [html.escape(name) for name in (env.task_name, env.scene.name, session.settings.difficulty)]
+    step, dt = int(np.asarray(env.steps)[0]), env.control_dt
+    time = f"{step * dt:.2f} of {env.max_steps * dt:.0f} s, seed {session.seed}{', paused' if paused else ''}"
+    rows = "".join(_row(agent, session.infos[agent]) for agent in env.agents if agent in session.infos)
+    head = f"<b>{names[0]}</b> on <b>{names[1]}</b>, {names[2]}"
     return f'<div style="font-size:0.8em;padding:0 1em 0.8em">{head}<br/>{time}<table>{rows}</table></div>'
 
 

@@ -28,6 +28,8 @@ from surgical_marl.view.session import Session, first_choice
 
 FPS = 30.0
 """Times a second that the scene is drawn."""
+STEPPING = 0.6 / FPS
+"""Time for steps between two drawings, s."""
 _SLOWER = {"trails": 3, "pictures": 4, "text": 6, "plots": 8}
 """Every how many drawings these are drawn."""
 
@@ -47,7 +49,12 @@ class Viewer:
     """
 
     def __init__(
-        self, settings: Settings, who: str | None = None, num_envs: int = 1, port: int = 8080, record: Path | None = None
+        self,
+        settings: Settings,
+        who: str | None = None,
+        num_envs: int = 1,
+        port: int = 8080,
+        record: Path | None = None,
     ) -> None:
         self._record = record
         self._further = () if who is None else (who,)
@@ -81,6 +88,9 @@ class Viewer:
             self._do(self._asked.get())
         for _ in range(self.pace.due(now)):
             self.session.step()
+            if time.monotonic() - now > STEPPING:
+                self.pace.forgive()  # the page stays smooth, and simulated time falls behind
+                break
         with self.server.atomic():
             self._nodes.draw()
             for name, every in _SLOWER.items():
@@ -148,9 +158,8 @@ class Viewer:
 
 
 def _choice(session: Session) -> Choice:
-    return Choice(
-        session.settings.task, session.settings.scene, session.settings.difficulty, session.env.num_envs
-    )
+    settings, env = session.settings, session.env
+    return Choice(settings.task, settings.scene, settings.difficulty, env.num_envs, env.max_steps)
 
 
 def _settings(choice: Choice, old: Session) -> tuple[Settings, Any]:
@@ -159,7 +168,8 @@ def _settings(choice: Choice, old: Session) -> tuple[Settings, Any]:
     A task that was just chosen brings a scene of its own if it is not meant for the old one.
     """
     if (choice.task, choice.scene) == (old.settings.task, old.settings.scene):
-        return replace(old.settings, difficulty=choice.difficulty, seed=old.seed), old.movers.who
+        settings = replace(old.settings, difficulty=choice.difficulty, max_steps=choice.max_steps, seed=old.seed)
+        return settings, old.movers.who
     task, scene = TASKS.load(choice.task), choice.scene
     if choice.task != old.settings.task and task.scenes and scene not in task.scenes:
         scene = task.default_scene or task.scenes[0]
@@ -174,8 +184,9 @@ def _aim(camera: Any, session: Session) -> None:
     away = (tips - stat.center) * [1, 1, 0]
     length = float(np.linalg.norm(away))
     away = away / length if length > 1e-3 else np.array([0.0, 1.0, 0.0])
-    camera.look_at = tips + [0.0, 0.0, 0.03 * stat.extent]
-    camera.position = camera.look_at + stat.extent * (0.42 * away + [0.0, 0.0, 0.26]) * (1 + 0.7 * (count - 1))
+    up = np.array([0.0, 0.0, stat.extent])
+    camera.look_at = tips + 0.03 * up
+    camera.position = camera.look_at + (0.42 * stat.extent * away + 0.26 * up) * (1 + 0.7 * (count - 1))
     camera.fov = float(np.deg2rad(50))
 
 
