@@ -1,4 +1,4 @@
-"""The command `surgical-marl`: train, eval, crossplay, view, replay, list, check, export, bench, doctor."""
+"""The command `surgical-marl`: train, eval, crossplay, play, view, replay, list, check, export, bench, doctor."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from typing import Any, NoReturn
 from surgical_marl.bench.workload import BENCHED, Workload
 from surgical_marl.cli.evaluating import add_crossplay, add_eval
 from surgical_marl.cli.flags import add_flags, flagged, given, one_of, whole
-from surgical_marl.cli.viewing import add_replay, add_view
+from surgical_marl.cli.viewing import add_play, add_replay, add_view
 from surgical_marl.content import find, list_arms, list_objects, list_policies, list_scenes, unknown
 from surgical_marl.plugins.algorithms import list_algorithms
 from surgical_marl.plugins.tasks import list_tasks
@@ -32,7 +32,7 @@ _LISTS = {
     "policies": list_policies,
 }
 
-_COMMANDS = ("train", "eval", "crossplay", "view", "replay", "list", "check", "export", "bench", "doctor")
+_COMMANDS = ("train", "eval", "crossplay", "play", "view", "replay", "list", "check", "export", "bench", "doctor")
 _CONTROL = choices("control")
 _TAKE_SETTINGS = ("train", "bench train", "bench solve")
 """Commands that take `key=value`."""
@@ -110,6 +110,7 @@ def _parser() -> argparse.ArgumentParser:
 
     add_eval(commands)
     add_crossplay(commands)
+    add_play(commands)
     add_view(commands)
     add_replay(commands)
 

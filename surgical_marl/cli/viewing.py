@@ -5,6 +5,7 @@ from __future__ import annotations
 # Only light imports here, as in main.py.
 import argparse
 import importlib.util
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,20 @@ def add_view(commands: Any) -> None:
     parser.set_defaults(command=_view, name="view")
 
 
+def add_play(commands: Any) -> None:
+    """Add the command play."""
+    parser = commands.add_parser("play", help="a film of a policy, from outside and from the endoscope")
+    _add_what(parser)
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="an .mp4 or a .gif")
+    parser.add_argument("--episodes", type=whole(1, 1000), default=1, metavar="N")
+    parser.add_argument("--grid", type=_grid, default=(1, 1), metavar="RxC", help="so many environments, such as 4x4")
+    parser.add_argument("--slow", type=_number, default=1.0, metavar="X", help="times slower than real time")
+    what = "a camera of the scene by name, or AZIMUTH,ELEVATION,DISTANCE in degrees and m about the tool tips"
+    parser.add_argument("--camera", metavar="CAMERA", help=what)
+    parser.add_argument("--plain", action="store_true", help="without words in the picture")
+    parser.set_defaults(command=_play, name="play")
+
+
 def add_replay(commands: Any) -> None:
     """Add the command replay."""
     parser = commands.add_parser("replay", help="step a recording of the viewer again, and compare the numbers")
@@ -37,7 +52,7 @@ def _add_what(parser: argparse.ArgumentParser) -> None:
     """Add the flags that say what is shown."""
     parser.add_argument("task", metavar="TASK", help=f"one of: {', '.join(list_tasks())}")
     parser.add_argument("--scene", help="a name (see `list scenes`) or a .yaml file")
-    what = f"a run folder, a policy's name, {', '.join(BASELINES)} (default: the policy that ships, or zero)"
+    what = f"a run folder, a policy's name, {', '.join(BASELINES)} (default: the policy that ships, or oracle)"
     parser.add_argument("--policy", metavar="RUN_OR_POLICY", help=what)
     add_flags(parser, Options, _OWN, default="the policy's own")
     parser.add_argument("--seed", type=whole(0, 2**31 - 1), default=0, metavar="S")
@@ -68,6 +83,36 @@ def _view(arguments: argparse.Namespace) -> None:
     viewer.run(end)
 
 
+def _play(arguments: argparse.Namespace) -> None:
+    settings, who = _settings(arguments)
+    if arguments.out.suffix not in (".mp4", ".gif") or not arguments.out.parent.is_dir():
+        raise ValueError(f"cannot write --out {arguments.out}: name an .mp4 or .gif file in a folder that exists")
+
+    from surgical_marl.runs.environment import make_env
+    from surgical_marl.view.film import Look, camera_of, film
+    from surgical_marl.view.movers import Movers, first
+
+    look = Look(arguments.grid, arguments.slow, words=not arguments.plain)
+    env = make_env(settings, look.grid[0] * look.grid[1], "numpy")
+    look = replace(look, camera=camera_of(arguments.camera, env))
+    movers = Movers(env, first(env) if who is None else who)
+    print(film(env, movers, arguments.out, look, arguments.episodes, arguments.seed))
+
+
+def _grid(text: str) -> tuple[int, int]:
+    rows, _, columns = text.partition("x")
+    if not (rows.isdecimal() and columns.isdecimal()):
+        raise argparse.ArgumentTypeError(f"must be rows and columns such as 4x4, not {text!r}")
+    return int(rows), int(columns)
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"must be a number, not {text!r}") from None
+
+
 def _replay(arguments: argparse.Namespace) -> int:
     if not arguments.file.is_file():
         raise ValueError(f"there is no file {arguments.file}")
@@ -86,7 +131,7 @@ def _replay(arguments: argparse.Namespace) -> int:
     return 1
 
 
-def _settings(arguments: argparse.Namespace) -> tuple[Any, str]:
+def _settings(arguments: argparse.Namespace) -> tuple[Any, str | None]:
     """Return the settings of what is shown, and who moves the arms; ValueError if it does not exist or fit together."""
     if arguments.task not in list_tasks():
         raise unknown("task", arguments.task, list_tasks())
@@ -102,13 +147,8 @@ def _settings(arguments: argparse.Namespace) -> tuple[Any, str]:
         raise unknown("run or policy", who, [*list_policies(), *BASELINES])
 
     from surgical_marl.evaluation.command import common_settings
-    from surgical_marl.view.session import first_choice
 
-    if who is None:
-        who = first_choice(arguments.task, arguments.scene)
     asked = {key: getattr(arguments, key) for key in ("task", "scene", *_OWN)}
-    settings = common_settings([who], {**asked, "goals": asked["goals"] or "training"})
-
-    from dataclasses import replace
+    settings = common_settings([who or "zero"], {**asked, "goals": asked["goals"] or "training"})
 
     return replace(settings, seed=arguments.seed), who

@@ -69,3 +69,14 @@ class History:
 def wanted(name: str) -> bool:
     """Return whether an info is remembered."""
     return name in (*ERRORS, "min_distance", "contact_force") or name.startswith(REWARD)
+
+
+def summary(info: Mapping[str, Any], index: int = 0) -> list[str]:
+    """Return what an agent's infos of a step say in short: error, stages, and what went wrong."""
+    read = lambda name: float(np.asarray(info[name])[index])  # noqa: E731
+    words = [f"{1000 * read(name):.2f} mm" for name in ERRORS if name in info][:1]
+    done = [name.removeprefix("stage_") for name in info if name.startswith("stage_") and read(name)]
+    if done:
+        words.append("stages " + ", ".join(done))
+    words += [name for name in ("success", "holding", "collision", "drop") if name in info and read(name)]
+    return words

@@ -16,12 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from surgical_marl.content import list_policies
 from surgical_marl.runs.environment import make_env
 from surgical_marl.runs.settings import Settings
 from surgical_marl.view.history import History
 from surgical_marl.view.moment import Moment, Observer
-from surgical_marl.view.movers import Movers, choices
+from surgical_marl.view.movers import Movers, choices, first
 from surgical_marl.view.take import MOST_STEPS, Take
 
 TRAIL = 100
@@ -37,7 +36,8 @@ class Session:
 
     Args:
         settings: of the environments; its seed is that of the first episodes.
-        who: moves all arms at first: a policy, a run, or a name of `movers.SIMPLE`; or agent -> who moves it.
+        who: moves all arms at first: a policy, a run, or a name of `movers.SIMPLE`; or agent -> who moves it; None
+            for the policy that ships for the task and the scene, or the oracle, or nobody.
         num_envs: how many environments, 1 to `MOST_ENVS`.
         record: a folder for takes; None to keep none.
         further: runs that may move arms, by their folders, beside the policies that ship.
@@ -49,7 +49,7 @@ class Session:
     def __init__(
         self,
         settings: Settings,
-        who: str | Mapping[str, str],
+        who: str | Mapping[str, str] | None = None,
         num_envs: int = 1,
         record: Path | None = None,
         further: tuple[str, ...] = (),
@@ -60,8 +60,10 @@ class Session:
         self.env = make_env(self.settings, num_envs, "numpy")
         self.seed = settings.seed
         self.observations: Any = self.env.reset(self.seed)[0]
-        self.movers = Movers(self.env, who)
-        self.choices = choices(self.env, (*further, *self.movers.who.values()))
+        self.choices = choices(self.env, further)
+        """Who can move the arms."""
+        self.movers = Movers(self.env, first(self.env) if who is None else who)
+        self.choices += [name for name in dict.fromkeys(self.movers.who.values()) if name not in self.choices]
         self.history = History(self.env.agents, self.env.control_dt)
         self.infos: dict[str, dict[str, Any]] = {}
         """Of the last step; empty after a reset."""
@@ -148,9 +150,3 @@ class Session:
             number = 1 + max((int(path.stem[5:]) for path in self._record.glob("take-[0-9]*.npz")), default=0)
             self._take.write(self._record / f"take-{number:04}.npz")
         self._take = Take(self.env, self.settings, self.seed, self.movers.who)
-
-
-def first_choice(task: str, scene: str) -> str:
-    """Return who moves the arms if nobody is named: the policy that ships for a task and scene, or nobody."""
-    name = f"{task}-{Path(scene).stem}"
-    return name if name in list_policies() else "zero"

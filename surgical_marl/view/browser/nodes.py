@@ -20,6 +20,8 @@ from surgical_marl.view.session import Session
 RED, GREY, GOLD = np.array([226, 40, 40]), np.array([120, 130, 140]), np.array([226, 168, 20])
 PARTS = ("targets", "paths", "trails", "trocars", "contacts", "distance")
 """What can be hidden, beside arms and objects."""
+ROOM = 0.35
+"""Between environments that stand side by side, m, beside what the frames of their bodies take."""
 _TIP_RADIUS = 0.0025
 _FADED = np.array([200, 205, 212])
 _NONE = np.zeros((0, 2, 3), np.float32)
@@ -53,12 +55,12 @@ class Nodes:
     def __init__(self, server: Any, session: Session) -> None:
         self._scene, self._session = server.scene, session
         env = session.env
-        self.offsets = offsets(env.num_envs, 1.3 * float(env.scene.model.stat.extent))
+        first = session.moment()
+        self.offsets = offsets(env.num_envs, ROOM + float(np.ptp(first.positions[..., 0])))
         self._paths = Paths(env)
         self._shown = dict.fromkeys(PARTS, True)
         self._trailed = -1
         """Where environments stand, [N, 3], m."""
-        first = session.moment()
         low = float(first.positions[..., 2].min()) - 0.1
         self._scene.add_grid(
             "/floor", 4.0, 4.0, position=(0, 0, low), cell_size=0.1, section_size=0.5, shadow_opacity=0.2

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from surgical_marl.view.history import ERRORS
+from surgical_marl.view.history import summary
 from surgical_marl.view.session import Session
 
 _CELL = "padding:1px 8px 1px 0;white-space:nowrap"
@@ -23,17 +23,6 @@ def status(session: Session, paused: bool = False) -> str:
     rows = "".join(_row(agent, session.infos[agent]) for agent in env.agents if agent in session.infos)
     head = f"<b>{names[0]}</b> on <b>{names[1]}</b>, {names[2]}"
     return f'<div style="font-size:0.8em;padding:0 1em 0.8em">{head}<br/>{time}<table>{rows}</table></div>'
-
-
-def summary(info: Mapping[str, Any], index: int = 0) -> list[str]:
-    """Return what an agent's infos of a step say in short: error, stages, and what went wrong."""
-    read = lambda name: float(np.asarray(info[name])[index])  # noqa: E731
-    words = [f"{1000 * read(name):.2f} mm" for name in ERRORS if name in info][:1]
-    done = [name.removeprefix("stage_") for name in info if name.startswith("stage_") and read(name)]
-    if done:
-        words.append("stages " + ", ".join(done))
-    words += [name for name in ("success", "holding", "collision", "drop") if name in info and read(name)]
-    return words
 
 
 def _row(agent: str, info: Mapping[str, Any]) -> str:

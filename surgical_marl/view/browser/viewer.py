@@ -24,7 +24,7 @@ from surgical_marl.view.browser.panel import Choice, Panel
 from surgical_marl.view.browser.pictures import Pictures
 from surgical_marl.view.browser.plots import Plots
 from surgical_marl.view.pace import Pace
-from surgical_marl.view.session import Session, first_choice
+from surgical_marl.view.session import Session
 
 FPS = 30.0
 """Times a second that the scene is drawn."""
@@ -39,7 +39,7 @@ class Viewer:
 
     Args:
         settings: of the environments.
-        who: moves all arms at first; None for the policy that ships, or nobody.
+        who: moves all arms at first, as in `Session`.
         num_envs: how many environments.
         port: of the page; 0 for any that is free.
         record: a folder for takes; None to keep none.
@@ -61,7 +61,6 @@ class Viewer:
         self._asked: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self.server, self.address = open_server(port)
         try:
-            who = first_choice(settings.task, settings.scene) if who is None else who
             self.session = Session(settings, who, num_envs, record, self._further)
             self._show()
         except BaseException:
@@ -174,7 +173,7 @@ def _settings(choice: Choice, old: Session) -> tuple[Settings, Any]:
     if choice.task != old.settings.task and task.scenes and scene not in task.scenes:
         scene = task.default_scene or task.scenes[0]
     difficulty = choice.difficulty if choice.difficulty in task.levels else "default"
-    return Settings(choice.task, scene, difficulty=difficulty, seed=old.seed), first_choice(choice.task, scene)
+    return Settings(choice.task, scene, difficulty=difficulty, seed=old.seed), None
 
 
 def _aim(camera: Any, session: Session) -> None:
