@@ -44,7 +44,7 @@ def open_server(port: int) -> tuple[Any, str]:
         if not used:
             close_server(server)
             raise RuntimeError(
-                "this version of viser starts its server in another way: no page is served without guard"
+                "this version of viser starts its server in another way: no page is served without a guard"
             )
     except BaseException:
         listener.close()
@@ -100,4 +100,4 @@ def _guarded(token: str, listener: socket.socket) -> Iterator[list[bool]]:
 def unlocked(path: str, token: str) -> str | None:
     """Return the path of a request without the token that it begins with; None if it begins otherwise."""
     given, _, rest = path.partition("?")[0].removeprefix("/").partition("/")
-    return f"/{rest}" if hmac.compare_digest(given.encode(), token.encode()) else None
+    return f"/{rest}" if hmac.compare_digest(given.encode(errors="surrogateescape"), token.encode()) else None
