@@ -165,18 +165,22 @@ def test_a_handle_is_dragged_with_the_mouse(running: Running) -> None:
     viewer, page = running.viewer, running.open()
     choose(page, "moved by", "you", 0)
     comes(lambda: "psm_0" in viewer.session.movers.hands, page)
-    page.wait_for_timeout(3000)
+    comes(lambda: running.viewer.server.get_clients(), page)
+    page.wait_for_timeout(5000)  # until the handle is drawn
     hand = viewer.session.movers.hands["psm_0"]
     pose = hand.tip()
-    axis = pose[:3, 2]
-    start, end = (pixel(viewer, pose[:3, 3] + far * axis) for far in (0.05, 0.075))
+    axis = pose[:3, 0]
+    start, end = (pixel(viewer, pose[:3, 3] + far * axis) for far in (0.045, 0.065))
     page.mouse.move(*start)
+    page.wait_for_timeout(700)  # a handle is grabbed where the mouse was seen above it
     page.mouse.down()
-    for share in np.linspace(0, 1, 8):
+    for share in np.linspace(0, 1, 6):
         page.mouse.move(*(start + share * (end - start)))
-        page.wait_for_timeout(60)
+        page.wait_for_timeout(200)
     page.mouse.up()
-    comes(lambda: (hand.tip()[:3, 3] - pose[:3, 3]) @ axis > 0.005, page)
+    comes(lambda: abs((hand.tip()[:3, 3] - pose[:3, 3]) @ axis - 0.020) < 0.002, page)
+    tip = lambda: viewer.session.moment().tips[0, 0]  # noqa: E731
+    comes(lambda: np.linalg.norm(tip() - hand.tip()[:3, 3]) < 0.001, page)
     assert not running.complaints
     page.close()
 
