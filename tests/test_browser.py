@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-pytest.importorskip("viser", reason="the viewer needs viser: pip install 'surgical-marl[view]'")
-api = pytest.importorskip("playwright.sync_api", reason="a browser is driven by playwright: pip install playwright")
-
 from surgical_marl.content import find
 from surgical_marl.robots.rotation import matrix_of
 from surgical_marl.runs.settings import Settings
 from surgical_marl.view.browser.viewer import Viewer
 from surgical_marl.view.take import replay
+
+pytest.importorskip("viser", reason="the viewer needs viser: pip install 'surgical-marl[view]'")
+api = pytest.importorskip("playwright.sync_api", reason="a browser is driven by playwright: pip install playwright")
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium on this machine")]
