@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,6 +16,7 @@ import pytest
 from surgical_marl.cli.main import main
 from surgical_marl.robots.rotation import turned
 from surgical_marl.runs.settings import Settings
+from surgical_marl.view.browser.gate import open_server
 from surgical_marl.view.browser.text import status
 from surgical_marl.view.hand import Hand
 from surgical_marl.view.history import History, summary
@@ -188,7 +190,13 @@ def test_a_file_that_is_no_take_is_refused(tmp_path: Path) -> None:
     np.savez(tmp_path / "other.npz", qpos=np.zeros(3))
     np.savez(tmp_path / "old.npz", qpos=np.zeros(3), about='{"layout": 0, "environment": {}, "engine": "fused", '
              '"device": "cpu", "num_envs": 1, "versions": {}}')  # fmt: skip
-    for name, sentence in (("text", "not a take"), ("other", "not a take"), ("old", "layout 0")):
+    options = json.dumps({"task": "reach", "scene": "psm"})
+    rest = '"engine": "fused", "device": "cpu", "num_envs": 1, "versions": {}}'
+    np.savez(tmp_path / "part.npz", qpos=np.zeros(3), about=f'{{"layout": 1, "environment": {options}, {rest}')
+    np.savez(tmp_path / "new.npz", qpos=np.zeros(3), about=f'{{"layout": 1, "environment": {{"x": 1}}, {rest}')
+    refused = {"text": "not a take", "other": "not a take", "old": "layout 0", "part": "lacks actions/psm_0",
+               "new": "does not know"}  # fmt: skip
+    for name, sentence in refused.items():
         with pytest.raises(ValueError, match=sentence):
             replay(tmp_path / f"{name}.npz")
 
@@ -231,6 +239,19 @@ def test_names_are_escaped(session: Session) -> None:
     assert "&lt;img" in status(session)
 
 
+def test_without_viser_a_sentence_says_what_to_install(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "viser", None)
+    assert main(VIEW) == 2
+    assert (
+        capsys.readouterr().err
+        == "surgical-marl: the viewer needs the package viser: pip install 'surgical-marl[view]'\n"
+    )
+    with pytest.raises(ValueError, match="pip install"):
+        open_server(0)
+
+
 VIEW = ["view", "reach", "--scene", "psm"]
 
 
@@ -246,7 +267,6 @@ VIEW = ["view", "reach", "--scene", "psm"]
         ([*VIEW, "--policy", "reach-star"], ["reach-star", "'star'", "not 'psm'"]),
         ([*VIEW, "--num-envs", "5"], ["--num-envs", "from 1 to 4"]),
         ([*VIEW, "--port", "70000"], ["--port", "'70000'"]),
-        ([*VIEW, "--record", "pyproject.toml"], ["pyproject.toml", "no folder"]),
         (["replay", "none.npz"], ["none.npz"]),
         (["replay", "pyproject.toml"], ["pyproject.toml", "not a take"]),
         (["play", "reach", "--scene", "psm"], ["--out"]),

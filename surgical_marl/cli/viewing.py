@@ -60,8 +60,6 @@ def _add_what(parser: argparse.ArgumentParser) -> None:
 
 def _view(arguments: argparse.Namespace) -> None:
     settings, who = _settings(arguments)
-    if arguments.record is not None and arguments.record.exists() and not arguments.record.is_dir():
-        raise ValueError(f"cannot record in {arguments.record}: it is no folder")
     if importlib.util.find_spec("viser") is None:  # said before anything is compiled
         from surgical_marl.view.browser.gate import NEEDED
 
@@ -72,8 +70,11 @@ def _view(arguments: argparse.Namespace) -> None:
 
     import torch
 
+    from surgical_marl.runs.folder import check_writable
     from surgical_marl.view.browser.viewer import Viewer
 
+    if arguments.record is not None:
+        check_writable(arguments.record)
     torch.set_num_threads(1)  # for a few environments, threads of torch wait for each other longer than they compute
     viewer = Viewer(settings, who, arguments.num_envs, arguments.port, arguments.record)
     print(viewer.address, flush=True)

@@ -102,8 +102,14 @@ def replay(path: Path) -> Replayed:
         ValueError: it is no take, or what it was recorded in can't be made here.
     """
     about, arrays = read_take(path)
-    settings = Settings(**about["environment"], engine=about["engine"], device=about["device"])
+    try:
+        settings = Settings(**about["environment"], engine=about["engine"], device=about["device"])
+    except TypeError:  # options of another version
+        raise ValueError(f"{path} was recorded in an environment that this version does not know") from None
     env = make_env(settings, about["num_envs"], "numpy")
+    needed = {"objects", "ended", *(f"{kind}/{agent}" for kind in ("actions", "rewards") for agent in env.agents)}
+    if missing := sorted(needed - arrays.keys()):
+        raise ValueError(f"{path} is no whole take: it lacks {', '.join(missing)}")
     env.set_carry({name.removeprefix(_START): value for name, value in arrays.items() if name.startswith(_START)})
     count, first, largest = len(arrays["qpos"]), None, 0.0
     for number in range(count):
