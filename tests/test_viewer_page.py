@@ -172,7 +172,7 @@ def test_distances_turn_red() -> None:
 
 
 def test_environments_stand_side_by_side() -> None:
-    assert offsets(3, 2.0)[:, 0].tolist() == [-2.0, 0.0, 2.0]
+    assert offsets(3, 2.0)[:, 0].tolist() == [2.0, 0.0, -2.0]
     assert not offsets(3, 2.0)[:, 1:].any()
 
 

@@ -20,7 +20,7 @@ from surgical_marl.view.session import Session
 RED, GREY, GOLD = np.array([226, 40, 40]), np.array([120, 130, 140]), np.array([226, 168, 20])
 PARTS = ("targets", "paths", "trails", "trocars", "contacts", "distance")
 """What can be hidden, beside arms and objects."""
-ROOM = 0.35
+ROOM = 0.7
 """Between environments that stand side by side, m, beside what the frames of their bodies take."""
 _TIP_RADIUS = 0.0025
 _FADED = np.array([200, 205, 212])
@@ -39,8 +39,12 @@ def distance_colour(distance: float) -> np.ndarray:
 
 
 def offsets(count: int, width: float) -> np.ndarray:
-    """Return where environments stand, [count, 3] in m: side by side, the row about the middle of the world."""
-    x = (np.arange(count) - (count - 1) / 2) * width
+    """Return where environments stand, [count, 3] in m: side by side about the middle of the world.
+
+    The first one is where x is largest: who looks at the arms from across their bases has it on the left, where no menu
+    is above it.
+    """
+    x = ((count - 1) / 2 - np.arange(count)) * width
     return np.stack([x, np.zeros(count), np.zeros(count)], 1)
 
 
@@ -123,8 +127,8 @@ class Nodes:
                 continue
             moves = bool(model.body_weldid[body]) or model.body_mocapid[body] >= 0
             places = moment.quaternions[:, body], moment.positions[:, body] + self.offsets
-            # what moves throws shadows but shows none: shadows on its own sides flicker
-            handle = self._scene.add_batched_glb(f"/bodies/{body}", glb, *places, lod="off", receive_shadow=not moves)
+            # Shadows of a body on its own sides flicker, so that only the ground of the scene shows any.
+            handle = self._scene.add_batched_glb(f"/bodies/{body}", glb, *places, lod="off", receive_shadow=body == 0)
             if moves:
                 self._moving[body] = handle
 
