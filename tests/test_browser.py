@@ -146,13 +146,13 @@ def test_a_person_and_a_policy_bring_two_arms_to_their_targets(running: Running,
     def error() -> np.ndarray:
         return viewer.session.moment().marks[0, 0] - viewer.session.movers.hands["psm_0"].tip()[:3, 3]
 
-    for _ in range(100):
+    page.evaluate("document.activeElement.blur()")  # a menu that has the focus keeps the keys
+    for _ in range(200):
         axis = int(np.argmax(np.abs(error())))
         if abs(error()[axis]) < 0.0011:
             break
-        before = error()
         page.keyboard.press(keys[axis][int(error()[axis] < 0)])
-        comes(lambda before=before: (error() != before).any(), page)
+        page.wait_for_timeout(250)  # a key that comes before the page listens is lost, and pressed again
     infos = lambda agent: float(viewer.session.infos[agent]["tip_error"][0])  # noqa: E731
     comes(lambda: infos("psm_0") < 0.003 and infos("psm_1") < 0.002, page)
     page.close()
