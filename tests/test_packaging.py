@@ -58,7 +58,7 @@ def test_an_editable_install_carries_no_copy(tmp_path: Path) -> None:
 def test_every_dependency_is_pinned() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extras = project["optional-dependencies"]
-    wanted = [*project["dependencies"], *extras["test"], *extras["docs"], *extras["tune"]]
+    wanted = [*project["dependencies"], *extras["test"], *extras["docs"], *extras["tune"], *extras["view"]]
     lines = (ROOT / "constraints.txt").read_text().splitlines()
     pins = {line.split("==")[0].lower() for line in lines if not line.startswith("#")}
     for requirement in wanted:

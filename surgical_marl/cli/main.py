@@ -1,4 +1,4 @@
-"""The command `surgical-marl`: train, eval, crossplay, report, list, check, export, bench, doctor."""
+"""The command `surgical-marl`."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from typing import Any, NoReturn
 from surgical_marl.bench.workload import BENCHED, Workload
 from surgical_marl.cli.evaluating import add_crossplay, add_eval, add_report
 from surgical_marl.cli.flags import add_flags, flagged, given, one_of, whole
+from surgical_marl.cli.viewing import add_play, add_replay, add_view
 from surgical_marl.content import find, list_arms, list_objects, list_policies, list_scenes, unknown
 from surgical_marl.plugins.algorithms import list_algorithms
 from surgical_marl.plugins.tasks import list_tasks
@@ -89,9 +90,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(prog="surgical-marl", description="Surgical robot arms that learn together.")
     parser.add_argument("--version", action="version", version=f"%(prog)s {_version()}")
-    commands = parser.add_subparsers(
-        required=True, metavar="{train,eval,crossplay,report,list,check,export,bench,doctor}"
-    )
+    commands = parser.add_subparsers(required=True)
 
     train = commands.add_parser(
         "train",
@@ -112,6 +111,9 @@ def _parser() -> argparse.ArgumentParser:
     add_eval(commands)
     add_crossplay(commands)
     add_report(commands)
+    add_play(commands)
+    add_view(commands)
+    add_replay(commands)
 
     names = commands.add_parser("list", help="list tasks, scenes, arms, objects, algorithms and policies")
     names.add_argument("kind", nargs="?", type=one_of(tuple(_LISTS)), metavar="|".join(_LISTS))

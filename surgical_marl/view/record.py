@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from surgical_marl.machine import cores
 from surgical_marl.policies.acting import forget
-from surgical_marl.view.render import Renderer, Sphere
+from surgical_marl.view.render import Renderer, Sphere, View
 from surgical_marl.view.video import write_video
 
 if TYPE_CHECKING:
@@ -96,17 +96,18 @@ class ScenePicture:
         self._env = env
         self._renderer = Renderer(env.scene.model, width, height)
 
-    def draw(self, pose: Pose | None = None) -> NDArray[np.uint8]:
+    def draw(self, pose: Pose | None = None, camera: str | View | None = None) -> NDArray[np.uint8]:
         """Return a picture [height, width, 3] of the environment.
 
-        It shows the environment as it was at `pose`, or as it is now if there is no `pose`.
+        It shows the environment as it was at `pose`, or as it is now if there is no `pose`. The `camera` is one of
+        `Renderer.render`.
         """
         pose = pose or self.pose()
         data = mujoco.MjData(model := self._env.scene.model)
         data.qpos[:], data.mocap_pos[:], data.mocap_quat[:] = pose.qpos, pose.origins, pose.quaternions
         mujoco.mj_kinematics(model, data)
         mujoco.mj_camlight(model, data)
-        return self._renderer.render(data, spheres=pose.balls)
+        return self._renderer.render(data, camera, pose.balls)
 
     def pose(self, index: int = 0) -> Pose:
         """Return the current pose of an environment, by its number in the batch."""

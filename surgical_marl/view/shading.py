@@ -41,11 +41,8 @@ class Look:
 
     @classmethod
     def of(cls, model: mujoco.MjModel) -> Look:
-        """Read a model's look; a geom's own rgba overrides its material's, as in MuJoCo."""
-        rgba = model.geom_rgba.copy()
-        painted = (model.geom_matid >= 0) & (rgba == _DEFAULT_RGBA).all(axis=1)
-        rgba[painted] = model.mat_rgba[model.geom_matid[painted]]
-        colour = rgba[:, :3].astype(float)
+        """Read a model's look."""
+        colour = visual_rgba(model)[:, :3].astype(float)
         plane = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
         # Greys are rendered as steel, which reflects the room; colours as plastic or tissue, which hardly do.
         saturation = np.ptp(colour, axis=1) / np.maximum(colour.max(axis=1), 1e-6)
@@ -97,6 +94,14 @@ class Look:
         far = np.clip(distance / self.extent / 4 - 0.5, 0.0, 1.0)
         mist = np.where(self.plane[geom], far * far * (3 - 2 * far), 0.0)[:, None]
         return colour + mist * (np.maximum(room, _HORIZON) - colour)
+
+
+def visual_rgba(model: mujoco.MjModel) -> NDArray[np.float32]:
+    """Return the colours of all geoms, [ngeom, 4]; a geom's own rgba overrides its material's, as in MuJoCo."""
+    rgba: NDArray[np.float32] = model.geom_rgba.copy()
+    painted = (model.geom_matid >= 0) & (rgba == _DEFAULT_RGBA).all(axis=1)
+    rgba[painted] = model.mat_rgba[model.geom_matid[painted]]
+    return rgba
 
 
 def _round_length(length: float) -> float:

@@ -1,0 +1,155 @@
+"""The commands that show: view, play and replay."""
+
+from __future__ import annotations
+
+# Only light imports here, as in main.py.
+import argparse
+import importlib.util
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from surgical_marl.cli.flags import add_flags, whole
+from surgical_marl.content import BASELINES, find, list_policies, list_scenes, unknown
+from surgical_marl.plugins.tasks import list_tasks
+from surgical_marl.tasks.base.options import Options
+
+_OWN = ("control", "knowledge", "messages", "difficulty", "start", "goals")
+
+
+def add_view(commands: Any) -> None:
+    """Add the command view."""
+    parser = commands.add_parser("view", help="a task in the browser, policies or people at the arms (docs/viewer.md)")
+    _add_what(parser)
+    parser.add_argument("--num-envs", type=whole(1, 4), default=1, metavar="N", help="environments side by side")
+    parser.add_argument("--port", type=whole(0, 65535), default=8080, metavar="N", help="of the page; 0 for any")
+    parser.add_argument("--record", type=Path, metavar="DIR", help="keep what was done, for `surgical-marl replay`")
+    parser.set_defaults(command=_view, name="view")
+
+
+def add_play(commands: Any) -> None:
+    """Add the command play."""
+    parser = commands.add_parser("play", help="a film of a policy, from outside and from the endoscope")
+    _add_what(parser)
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="an .mp4 or a .gif")
+    parser.add_argument("--episodes", type=whole(1, 1000), default=1, metavar="N")
+    parser.add_argument("--grid", type=_grid, default=(1, 1), metavar="RxC", help="so many environments, such as 4x4")
+    parser.add_argument("--slow", type=_number, default=1.0, metavar="X", help="times slower than real time")
+    what = "a camera of the scene by name, or AZIMUTH,ELEVATION,DISTANCE in degrees and m about the tool tips"
+    parser.add_argument("--camera", metavar="CAMERA", help=what)
+    parser.add_argument("--plain", action="store_true", help="without words in the picture")
+    parser.set_defaults(command=_play, name="play")
+
+
+def add_replay(commands: Any) -> None:
+    """Add the command replay."""
+    parser = commands.add_parser("replay", help="step a recording of the viewer again, and compare the numbers")
+    parser.add_argument("file", type=Path, metavar="FILE.npz", help="what `surgical-marl view --record` wrote")
+    parser.set_defaults(command=_replay, name="replay")
+
+
+def _add_what(parser: argparse.ArgumentParser) -> None:
+    """Add the flags that say what is shown."""
+    parser.add_argument("task", metavar="TASK", help=f"one of: {', '.join(list_tasks())}")
+    parser.add_argument("--scene", help="a name (see `list scenes`) or a .yaml file")
+    what = f"a run folder, a policy's name, {', '.join(BASELINES)} (default: the policy that ships, or oracle)"
+    parser.add_argument("--policy", metavar="RUN_OR_POLICY", help=what)
+    add_flags(parser, Options, _OWN, default="the policy's own")
+    parser.add_argument("--seed", type=whole(0, 2**31 - 1), default=0, metavar="S")
+
+
+def _view(arguments: argparse.Namespace) -> None:
+    settings, who = _settings(arguments)
+    if importlib.util.find_spec("viser") is None:  # said before anything is compiled
+        from surgical_marl.view.browser.gate import NEEDED
+
+        raise ValueError(NEEDED)
+
+    import signal
+    import threading
+
+    import torch
+
+    from surgical_marl.runs.folder import check_writable
+    from surgical_marl.view.browser.viewer import Viewer
+
+    if arguments.record is not None:
+        check_writable(arguments.record)
+    torch.set_num_threads(1)  # for a few environments, threads of torch wait for each other longer than they compute
+    viewer = Viewer(settings, who, arguments.num_envs, arguments.port, arguments.record)
+    print(viewer.address, flush=True)
+    end = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: end.set())
+    viewer.run(end)
+
+
+def _play(arguments: argparse.Namespace) -> None:
+    settings, who = _settings(arguments)
+    if arguments.out.suffix not in (".mp4", ".gif") or not arguments.out.parent.is_dir():
+        raise ValueError(f"cannot write --out {arguments.out}: name an .mp4 or .gif file in a folder that exists")
+
+    from surgical_marl.runs.environment import make_env
+    from surgical_marl.view.film import Look, camera_of, film
+    from surgical_marl.view.movers import Movers, first
+
+    look = Look(arguments.grid, arguments.slow, words=not arguments.plain)
+    env = make_env(settings, look.grid[0] * look.grid[1], "numpy")
+    look = replace(look, camera=camera_of(arguments.camera, env))
+    movers = Movers(env, first(env) if who is None else who)
+    print(film(env, movers, arguments.out, look, arguments.episodes, arguments.seed))
+
+
+def _grid(text: str) -> tuple[int, int]:
+    rows, _, columns = text.partition("x")
+    if not (rows.isdecimal() and columns.isdecimal()):
+        raise argparse.ArgumentTypeError(f"must be rows and columns such as 4x4, not {text!r}")
+    return int(rows), int(columns)
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"must be a number, not {text!r}") from None
+
+
+def _replay(arguments: argparse.Namespace) -> int:
+    if not arguments.file.is_file():
+        raise ValueError(f"there is no file {arguments.file}")
+
+    from surgical_marl.view.take import replay
+
+    found = replay(arguments.file)
+    if found.differs_at is None:
+        print(f"{arguments.file}: {found.steps} steps, the same numbers")
+        return 0
+    changed = f"; versions have changed: {', '.join(found.versions)}" if found.versions else ""
+    print(
+        f"{arguments.file}: {found.steps} steps, other numbers from step {found.differs_at} on, positions by up to "
+        f"{found.largest:.3g}{changed}"
+    )
+    return 1
+
+
+def _settings(arguments: argparse.Namespace) -> tuple[Any, str | None]:
+    """Return the settings of what is shown, and who moves the arms; ValueError if it does not exist or fit together."""
+    if arguments.task not in list_tasks():
+        raise unknown("task", arguments.task, list_tasks())
+    if arguments.scene is None:
+        from surgical_marl.plugins.tasks import TASKS
+
+        arguments.scene = TASKS.load(arguments.task).default_scene
+    if arguments.scene is None:
+        raise ValueError(f"{arguments.name} {arguments.task} needs --scene ({', '.join(list_scenes())})")
+    find("scenes", arguments.scene)
+    who = arguments.policy
+    if who is not None and who not in (*BASELINES, *list_policies()) and not Path(who).is_dir():
+        raise unknown("run or policy", who, [*list_policies(), *BASELINES])
+
+    from surgical_marl.evaluation.command import common_settings
+
+    asked = {key: getattr(arguments, key) for key in ("task", "scene", *_OWN)}
+    settings = common_settings([who or "zero"], {**asked, "goals": asked["goals"] or "training"})
+
+    return replace(settings, seed=arguments.seed), who

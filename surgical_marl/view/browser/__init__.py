@@ -1,0 +1,1 @@
+"""The viewer: an environment in a browser, by viser."""

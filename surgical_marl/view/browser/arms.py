@@ -1,0 +1,167 @@
+"""The menus of who moves each arm, and what a person moves an arm with: sliders, a handle at the tool tip, keys."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from surgical_marl.robots.rotation import matrix_of, quaternion
+from surgical_marl.view.hand import Hand
+from surgical_marl.view.movers import YOU
+from surgical_marl.view.session import Session
+
+Ask = Callable[[Callable[[], None]], None]
+"""Lets the thread that steps do something."""
+
+STEP = 0.002
+"""How far a key moves the tool tip, m."""
+KEYS = {
+    "arrowleft": (-STEP, 0, 0), "arrowright": (STEP, 0, 0), "arrowup": (0, STEP, 0), "arrowdown": (0, -STEP, 0),
+    "pageup": (0, 0, STEP), "pagedown": (0, 0, -STEP),
+}  # fmt: skip
+JAW_KEY = "J"
+_DIGITS = 4
+"""Digits of a joint's position, rad or m, in a slider."""
+_QUIET = 0.5
+"""Time in s after somebody used a control, in which the page does not move it."""
+
+
+class Arms:
+    """The part of the page that says who moves each arm."""
+
+    def __init__(self, server: Any, folder: Any, session: Session, ask: Ask, offset: np.ndarray) -> None:
+        self._server, self._session, self._ask, self._offset = server, session, ask, offset
+        self._menus: dict[str, Any] = {}
+        self._folders: dict[str, Any] = {}
+        self._controls: dict[str, Controls] = {}
+        with folder:
+            for agent in session.env.agents:
+                self._folders[agent] = server.gui.add_folder(agent)
+                with self._folders[agent]:
+                    self._menus[agent] = self._menu(agent)
+        self._keys()
+
+    def sync(self) -> None:
+        """Show who moves the arms and what a person wants, as the session has it."""
+        movers = self._session.movers
+        for agent, menu in self._menus.items():
+            if menu.value != movers.who[agent]:
+                menu.value = movers.who[agent]
+            if agent in self._controls and movers.who[agent] != YOU:
+                self._controls.pop(agent).remove()
+            elif agent in movers.hands and agent not in self._controls:
+                number = self._session.env.agents.index(agent)
+                hand, folder = movers.hands[agent], self._folders[agent]
+                self._controls[agent] = Controls(self._server, folder, hand, self._ask, number, self._offset)
+        for controls in self._controls.values():
+            controls.sync()
+
+    def _menu(self, agent: str) -> Any:
+        options = self._session.choices
+        menu = self._server.gui.add_dropdown("moved by", options, initial_value=self._session.movers.who[agent])
+
+        @menu.on_update
+        async def _(event: Any) -> None:
+            if event.client is not None:
+                self._ask(lambda: self._session.set_mover(agent, str(menu.value)))
+
+        return menu
+
+    def _keys(self) -> None:
+        """Let keys move the first arm that a person moves."""
+        gui = self._server.gui
+
+        def bind(key: str, label: str, act: Callable[[Hand], None]) -> None:
+            @gui.add_command(label, hotkey=key).on_trigger
+            async def _(_: Any) -> None:
+                self._ask(lambda: self._with_first(act))
+
+        def nudge(step: tuple[float, float, float]) -> Callable[[Hand], None]:
+            return lambda hand: hand.nudge(step)
+
+        for key, step in KEYS.items():
+            bind(key, f"tool tip by {1000 * STEP:.0f} mm: {key.removeprefix('arrow')}", nudge(step))
+        bind(JAW_KEY, "open or close the jaw", _turn_jaw)
+
+    def _with_first(self, act: Callable[[Hand], None]) -> None:
+        hand = next(iter(self._session.movers.hands.values()), None)
+        if hand is None:
+            raise ValueError(f"no arm is moved by {YOU!r}: choose it in the menu of an arm first")
+        act(hand)
+
+
+class Controls:
+    """What a person moves one arm with."""
+
+    def __init__(self, server: Any, folder: Any, hand: Hand, ask: Ask, number: int, offset: np.ndarray) -> None:
+        self._hand, self._ask, self._offset = hand, ask, offset
+        self._used = 0.0
+        lower, upper = hand.limits
+        with folder:
+            self._sliders = {
+                index: self._slider(server, index, name, float(lower[index]), float(upper[index]))
+                for index, name in enumerate(hand.joints)
+                if not hand.jaw[index]
+            }
+            self._jaw = self._jaw_box(server) if hand.jaw.any() else None
+        self._handle = server.scene.add_transform_controls(f"/handle/{number}", scale=0.06, depth_test=False)
+
+        @self._handle.on_update
+        async def _(event: Any) -> None:
+            position, turn = np.array(event.target.position), matrix_of(np.array(event.target.wxyz))
+            self._use(lambda: self._hand.reach(position - self._offset, turn))
+
+        self.sync()
+
+    def sync(self) -> None:
+        """Move all controls to what is wanted, unless somebody is using them."""
+        if self._jaw is not None and self._jaw.value != self._hand.jaw_open:
+            self._jaw.value = self._hand.jaw_open
+        if time.monotonic() - self._used < _QUIET:
+            return
+        for index, slider in self._sliders.items():
+            if abs(slider.value - self._hand.q[index]) > slider.step:
+                slider.value = round(float(self._hand.q[index]), _DIGITS)
+        pose = self._hand.tip()
+        self._handle.position, self._handle.wxyz = pose[:3, 3] + self._offset, quaternion(pose[:3, :3])
+
+    def remove(self) -> None:
+        """Take the controls off the page."""
+        for control in (*self._sliders.values(), self._jaw, self._handle):
+            if control is not None:
+                control.remove()
+
+    def _use(self, act: Callable[[], None]) -> None:
+        self._used = time.monotonic()
+        self._ask(act)
+
+    def _slider(self, server: Any, index: int, name: str, lower: float, upper: float) -> Any:
+        value = round(float(np.clip(self._hand.q[index], lower, upper)), _DIGITS)
+        step = 10.0**-_DIGITS
+        slider = server.gui.add_slider(name, min=lower, max=upper, step=step, initial_value=value)
+
+        @slider.on_update
+        async def _(event: Any) -> None:
+            if event.client is not None:
+                wanted = float(slider.value)
+                self._use(lambda: self._hand.set_joint(index, wanted))
+
+        return slider
+
+    def _jaw_box(self, server: Any) -> Any:
+        box = server.gui.add_checkbox("jaw open", initial_value=self._hand.jaw_open, hint=f"key {JAW_KEY}")
+
+        @box.on_update
+        async def _(event: Any) -> None:
+            if event.client is not None:
+                wanted = bool(box.value)
+                self._ask(lambda: setattr(self._hand, "jaw_open", wanted))
+
+        return box
+
+
+def _turn_jaw(hand: Hand) -> None:
+    hand.jaw_open = not hand.jaw_open

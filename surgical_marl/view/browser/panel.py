@@ -1,0 +1,125 @@
+"""The menus and buttons of the page."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from surgical_marl.content import list_scenes
+from surgical_marl.plugins.tasks import TASKS, list_tasks
+from surgical_marl.view.browser.nodes import PARTS, Nodes
+from surgical_marl.view.browser.text import status
+from surgical_marl.view.pace import Pace
+from surgical_marl.view.session import MOST_ENVS, Session
+
+GO, STEP, RESET = "Pause / go on", "One step", "Reset"
+LONGEST = 3600.0
+"""An episode at most, s."""
+SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "4")
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What the menus say is to be looked at."""
+
+    task: str
+    scene: str
+    difficulty: str
+    num_envs: int
+    max_steps: int
+    """Of an episode."""
+
+
+class Panel:
+    """The part of the page that says what is looked at, and how time passes.
+
+    Args:
+        server: of viser.
+        session: what is looked at.
+        pace: how time passes.
+        ask: lets the thread that steps do something.
+    """
+
+    def __init__(self, server: Any, session: Session, pace: Pace, ask: Callable[[Callable[[], None]], None]) -> None:
+        self._gui, self._session, self._pace, self._ask = server.gui, session, pace, ask
+        self._make_time()
+        self._status = self._gui.add_html(status(session))
+
+    def sync(self) -> None:
+        """Show how things are."""
+        self._status.content = status(self._session, self._pace.paused)
+        if self._seed.value != self._session.seed:
+            self._seed.value = self._session.seed
+
+    def add_parts(self, folder: Any, nodes: Nodes) -> None:
+        """Add a box for each part of the scene that can be hidden."""
+
+        def box(part: str) -> None:
+            handle = self._gui.add_checkbox(part, initial_value=True)
+            handle.on_update(self._then(lambda: nodes.show(part, bool(handle.value))))
+
+        with folder:
+            for part in PARTS:
+                box(part)
+
+    def _make_time(self) -> None:
+        gui, pace = self._gui, self._pace
+        buttons = gui.add_button_group("time", (GO, STEP, RESET), hint="keys: space, N, R")
+        speed = gui.add_dropdown("speed", SPEEDS, initial_value=f"{pace.speed:g}")
+        self._seed = gui.add_number("seed", self._session.seed, min=0, max=2**31 - 1, step=1)
+
+        def turn() -> None:
+            pace.paused = not pace.paused
+
+        def single() -> None:
+            pace.paused = True
+            pace.step_once()
+
+        def begin() -> None:
+            self._session.reset(int(self._seed.value))
+
+        acts = {GO: turn, STEP: single, RESET: begin}
+        for (label, act), key in zip(acts.items(), ("space", "N", "R"), strict=True):
+            gui.add_command(label, hotkey=key).on_trigger(self._then(act))
+        buttons.on_click(self._then(lambda: acts[buttons.value]()))
+        speed.on_update(self._then(lambda: setattr(pace, "speed", float(speed.value))))
+        self._seed.on_update(self._then(begin))
+
+    def add_menus(self, folder: Any, choose: Callable[[Choice], None]) -> None:
+        """Add the menus of what is looked at; `choose` looks at something else."""
+        with folder:
+            chosen, menus = self._make_menus()
+        for menu in menus:
+            menu.on_update(self._then(lambda: choose(chosen())))
+
+    def _make_menus(self) -> tuple[Callable[[], Choice], list[Any]]:
+        """Return what says what the menus say, and the menus."""
+        env, gui = self._session.env, self._gui
+        scene = self._session.settings.scene
+        scenes = list(dict.fromkeys([*list_scenes(), scene]))
+        levels = list(TASKS.load(env.task_name).levels)
+        task = gui.add_dropdown("task", list_tasks(), initial_value=env.task_name)
+        place = gui.add_dropdown("scene", scenes, initial_value=scene)
+        level = gui.add_dropdown("difficulty", levels, initial_value=self._session.settings.difficulty)
+        count = gui.add_dropdown(
+            "environments", list(map(str, range(1, MOST_ENVS + 1))), initial_value=str(env.num_envs)
+        )
+        length = gui.add_number(
+            "seconds an episode", round(env.max_steps * env.control_dt, 3), min=env.control_dt, max=LONGEST, step=1.0
+        )
+
+        def chosen() -> Choice:
+            steps = max(1, round(float(length.value) / env.control_dt))
+            return Choice(task.value, place.value, level.value, int(count.value), steps)
+
+        return chosen, [task, place, level, count, length]
+
+    def _then(self, act: Callable[[], None]) -> Callable[[Any], Any]:
+        """Return a callback of viser that lets the stepping thread act, when it was a person who caused it."""
+
+        async def callback(event: Any) -> None:
+            if event.client is not None:
+                self._ask(act)
+
+        return callback

@@ -1,0 +1,76 @@
+"""Live plots of one environment: error, distance, force, and every term of the reward."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from surgical_marl.view.browser.nodes import colour
+from surgical_marl.view.history import REWARD, History
+
+_TERMS = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#8c564b", "#e377c2", "#17becf", "#bcbd22", "#7f7f7f", "#ff7f0e")
+_HEIGHT = 150
+
+
+class Curve(NamedTuple):
+    """A line of a plot."""
+
+    label: str
+    colour: str
+    values: np.ndarray
+
+
+def curves(history: History) -> dict[str, list[Curve]]:
+    """Return the lines of each plot, by the plot's title; [T] each. A plot without a number is left out."""
+    agents = history.agents
+    own = [_css(colour(index)) for index in range(len(agents))]
+    plots = {
+        "error, mm": [Curve(agent, own[i], history.error(agent)[1]) for i, agent in enumerate(agents)],
+        "distance of arms, mm": [
+            Curve(agent, own[i], 1000 * history.read(agent, "min_distance")) for i, agent in enumerate(agents)
+        ],
+        "contact force, N": [
+            Curve(agent, own[i], history.read(agent, "contact_force")) for i, agent in enumerate(agents)
+        ],
+        "reward": [Curve(agent, own[i], history.read(agent, "reward")) for i, agent in enumerate(agents)],
+    }
+    for agent in agents:
+        terms = sorted(name for name in history.names(agent) if name.startswith(REWARD))
+        plots[f"terms of the reward of {agent}"] = [
+            Curve(term.removeprefix(REWARD), _TERMS[k % len(_TERMS)], history.read(agent, term))
+            for k, term in enumerate(terms)
+        ]
+    return {title: lines for title, lines in plots.items() if any(np.isfinite(line.values).any() for line in lines)}
+
+
+class Plots:
+    """The plots of a session on the page. They appear with the first numbers."""
+
+    def __init__(self, server: Any, folder: Any) -> None:
+        self._gui, self._folder = server.gui, folder
+        self._handles: dict[str, Any] = {}
+
+    def draw(self, history: History) -> None:
+        """Show the last steps."""
+        time = history.time
+        if len(time) < 2:
+            return
+        for title, lines in curves(history).items():
+            data = (time, *(np.nan_to_num(line.values, nan=0.0) for line in lines))
+            if title in self._handles:
+                self._handles[title].data = data
+            else:
+                self._handles[title] = self._make(title, data, lines)
+
+    def _make(self, title: str, data: tuple[np.ndarray, ...], lines: Sequence[Curve]) -> Any:
+        series = ({"label": "s"}, *({"label": line.label, "stroke": line.colour, "width": 1.5} for line in lines))
+        with self._folder:
+            return self._gui.add_uplot(
+                data, series, title=title, scales={"x": {"time": False}}, height=_HEIGHT, legend={"show": True}
+            )
+
+
+def _css(rgb: np.ndarray) -> str:
+    return "#" + "".join(f"{int(part):02x}" for part in rgb)

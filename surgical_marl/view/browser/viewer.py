@@ -1,0 +1,198 @@
+"""Runs `surgical-marl view`: one thread steps and draws, and does what the page asks it to.
+
+viser calls back in threads of its own. A callback changes nothing: it puts what is to be done into a queue.
+"""
+
+from __future__ import annotations
+
+import queue
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from threading import Event
+from typing import Any
+
+import numpy as np
+
+from surgical_marl.plugins.tasks import TASKS
+from surgical_marl.runs.settings import Settings
+from surgical_marl.view.browser.arms import Arms
+from surgical_marl.view.browser.gate import close_server, open_server
+from surgical_marl.view.browser.nodes import Nodes
+from surgical_marl.view.browser.panel import Choice, Panel
+from surgical_marl.view.browser.pictures import Pictures
+from surgical_marl.view.browser.plots import Plots
+from surgical_marl.view.pace import Pace
+from surgical_marl.view.session import Session
+
+FPS = 30.0
+"""Times a second that the scene is drawn."""
+STEPPING = 0.6 / FPS
+"""Time for steps between two drawings, s."""
+_SLOWER = {"trails": 3, "pictures": 4, "text": 6, "plots": 8}
+"""Every how many drawings these are drawn."""
+
+
+class Viewer:
+    """A session in a browser.
+
+    Args:
+        settings: of the environments.
+        who: moves all arms at first, as in `Session`.
+        num_envs: how many environments.
+        port: of the page; 0 for any that is free.
+        record: a folder for takes; None to keep none.
+
+    Raises:
+        ValueError: something is unknown, does not fit together, or the port is taken.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        who: str | None = None,
+        num_envs: int = 1,
+        port: int = 8080,
+        record: Path | None = None,
+    ) -> None:
+        self._record = record
+        self._further = () if who is None else (who,)
+        self._asked: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self.server, self.address = open_server(port)
+        try:
+            self.session = Session(settings, who, num_envs, record, self._further)
+            self._show()
+        except BaseException:
+            close_server(self.server)
+            raise
+        self.drawn = 0
+        """How many times the scene was drawn."""
+
+    def run(self, until: Event) -> None:
+        """Step and draw until an event is set; then write what was recorded, and stop the server."""
+        try:
+            due = time.monotonic()
+            while not until.is_set():
+                self.turn(time.monotonic())
+                due = max(due + 1 / FPS, time.monotonic())
+                until.wait(due - time.monotonic())
+        finally:
+            self.session.close()
+            close_server(self.server)
+
+    def turn(self, now: float) -> None:
+        """Do what was asked for, the steps that are due at a time in s, and draw."""
+        while not self._asked.empty():
+            self._do(self._asked.get())
+        for _ in range(self.pace.due(now)):
+            self.session.step()
+            if time.monotonic() - now > STEPPING:
+                self.pace.forgive()  # the page stays smooth, and simulated time falls behind
+                break
+        with self.server.atomic():
+            self._nodes.draw()
+            for name, every in _SLOWER.items():
+                if self.drawn % every == 0:
+                    self._slow[name]()
+        self.drawn += 1
+
+    def ask(self, act: Callable[[], None]) -> None:
+        """Let the thread that steps do something soon."""
+        self._asked.put(act)
+
+    def choose(self, choice: Choice) -> None:
+        """Look at something else. If that can't be done, everything stays as it is."""
+        old = self.session
+        if choice == _choice(old):
+            return
+        self._say("Preparing", f"{choice.task} on {choice.scene}", 5)
+        try:
+            settings, who = _settings(choice, old)
+            self.session = Session(settings, who, choice.num_envs, self._record, self._further)
+        except ValueError:
+            self._show()  # with menus that say what is looked at
+            raise
+        old.close()
+        self._show()
+
+    def _do(self, act: Callable[[], None]) -> None:
+        try:
+            act()
+        except ValueError as error:
+            self._say("Not possible", str(error), 10, color="red")
+            self._arms.sync()
+
+    def _say(self, title: str, text: str, seconds: float, **look: Any) -> None:
+        for client in self.server.get_clients().values():
+            client.add_notification(title, text, auto_close_seconds=seconds, **look)
+
+    def _show(self) -> None:
+        """Make the page anew for the session."""
+        server, session = self.server, self.session
+        server.scene.reset()
+        server.gui.reset()
+        _light(server)
+        _aim(server.initial_camera, session)
+        self.pace = Pace(session.env.control_dt)
+        self._nodes = Nodes(server, session)
+        panel = Panel(server, session, self.pace, self.ask)
+        group = server.gui.add_tab_group()
+        tabs = {name: group.add_tab(name) for name in ("Arms", "Scene", "Plots", "Pictures", "Show")}
+        self._arms = Arms(server, tabs["Arms"], session, self.ask, self._nodes.offsets[0])
+        panel.add_menus(tabs["Scene"], self.choose)
+        plots, pictures = Plots(server, tabs["Plots"]), Pictures(server, tabs["Pictures"], session)
+        panel.add_parts(tabs["Show"], self._nodes)
+
+        def text() -> None:
+            panel.sync()
+            self._arms.sync()
+
+        self._slow: dict[str, Callable[[], None]] = {
+            "trails": self._nodes.draw_trails,
+            "pictures": pictures.draw,
+            "text": text,
+            "plots": lambda: plots.draw(session.history),
+        }
+
+
+def _choice(session: Session) -> Choice:
+    settings, env = session.settings, session.env
+    return Choice(settings.task, settings.scene, settings.difficulty, env.num_envs, env.max_steps)
+
+
+def _settings(choice: Choice, old: Session) -> tuple[Settings, Any]:
+    """Return the settings of what is chosen, and who moves its arms.
+
+    A task that was just chosen brings a scene of its own if it is not meant for the old one.
+    """
+    if (choice.task, choice.scene) == (old.settings.task, old.settings.scene):
+        settings = replace(old.settings, difficulty=choice.difficulty, max_steps=choice.max_steps, seed=old.seed)
+        return settings, old.movers.who
+    task, scene = TASKS.load(choice.task), choice.scene
+    if choice.task != old.settings.task and task.scenes and scene not in task.scenes:
+        scene = task.default_scene or task.scenes[0]
+    difficulty = choice.difficulty if choice.difficulty in task.levels else "default"
+    return Settings(choice.task, scene, difficulty=difficulty, seed=old.seed), None
+
+
+def _aim(camera: Any, session: Session) -> None:
+    """Let a camera look at all tool tips from where no arm stands: from across the bases of the arms."""
+    tips = session.moment().tips.mean((0, 1))
+    stat, count = session.env.scene.model.stat, session.env.num_envs
+    away = (tips - stat.center) * [1, 1, 0]
+    length = float(np.linalg.norm(away))
+    away = away / length if length > 1e-3 else np.array([0.0, 1.0, 0.0])
+    up = np.array([0.0, 0.0, stat.extent])
+    camera.look_at = tips + 0.03 * up
+    camera.position = camera.look_at + (0.42 * stat.extent * away + 0.26 * up) * (1 + 0.7 * (count - 1))
+    camera.fov = float(np.deg2rad(50))
+
+
+def _light(server: Any) -> None:
+    """Light the scene like a room, without files from elsewhere."""
+    server.scene.set_up_direction("+z")
+    server.scene.configure_environment_map(None)
+    server.scene.configure_default_lights(enabled=True, cast_shadow=True)
+    server.scene.add_light_hemisphere("/room", sky_color=(235, 242, 255), ground_color=(150, 130, 120), intensity=1.2)
+    server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")

@@ -1,0 +1,185 @@
+"""Films of a policy for `surgical-marl play`: from outside and from the endoscope, with errors and stages in words.
+
+    env = make_env(settings, num_envs=16, arrays="numpy")
+    film(env, Movers(env, "oracle"), Path("sixteen.mp4"), Look(grid=(4, 4)))
+
+The environments of a grid play at the same time, and each frame holds all of them.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+from tqdm import tqdm
+
+from surgical_marl.content import unknown
+from surgical_marl.machine import cores
+from surgical_marl.view.history import summary
+from surgical_marl.view.moment import Observer
+from surgical_marl.view.record import FPS, Pose, ScenePicture
+from surgical_marl.view.render import View
+from surgical_marl.view.video import write_video
+
+if TYPE_CHECKING:
+    from surgical_marl.envs.batch import BatchedEnv
+    from surgical_marl.view.movers import Movers
+
+WIDTH, HEIGHT = 480, 360
+"""Pixels of the picture from outside, if there is one environment."""
+WALL = 1280
+"""Pixels along the width of a film of several environments, about."""
+MOST = 8
+"""Rows and columns of a grid at most."""
+
+Picture = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Look:
+    """How a film looks.
+
+    Attributes:
+        grid: rows and columns of environments.
+        slow: how many times slower than real time.
+        camera: a camera of the scene by name, or a free one; None for the scene's own view.
+        words: whether to write errors and stages into the pictures.
+
+    Raises:
+        ValueError: a grid or a slowness that can't be.
+    """
+
+    grid: tuple[int, int] = (1, 1)
+    slow: float = 1.0
+    camera: str | View | None = None
+    words: bool = True
+
+    def __post_init__(self) -> None:
+        if not all(1 <= side <= MOST for side in self.grid):
+            raise ValueError(f"a grid has 1 to {MOST} rows and columns, not {self.grid[0]}x{self.grid[1]}")
+        if not 0.1 <= self.slow <= 100:
+            raise ValueError(f"slow must be from 0.1 to 100, not {self.slow:g}")
+
+    @property
+    def tile(self) -> tuple[int, int]:
+        """Width and height of the picture of one environment, pixels."""
+        if self.grid == (1, 1):
+            return WIDTH, HEIGHT
+        width = WALL // self.grid[1] // 2 * 2
+        return width, width * HEIGHT // WIDTH // 2 * 2
+
+
+class Shot(NamedTuple):
+    """What a frame shows of one environment."""
+
+    pose: Pose
+    scope: Picture | None
+    """What the endoscope sees; None in a scene without one, and in a grid."""
+    words: list[str]
+
+
+def film(env: BatchedEnv, movers: Movers, path: Path, look: Look, episodes: int = 1, seed: int = 0) -> Path:
+    """Film the environments of `env`, as many as `look.grid` holds, and return the path of the film."""
+    every = max(1, round(1 / (FPS * look.slow * env.control_dt)))
+    count = -(-episodes * env.max_steps // every)
+    shown = tqdm(_frames(env, movers, look, every, episodes, seed), "frames", count, disable=None)
+    return write_video(path, shown, 1 / (every * env.control_dt * look.slow))
+
+
+def camera_of(text: str | None, env: BatchedEnv) -> str | View | None:
+    """Return the camera that a text names: one of the scene, or AZIMUTH,ELEVATION,DISTANCE about the tool tips.
+
+    Raises:
+        ValueError: it names none.
+    """
+    names = [env.scene.model.camera(index).name for index in range(env.scene.model.ncam)]
+    if text is None or text in names:
+        return text
+    try:
+        azimuth, elevation, distance = map(float, text.split(","))
+    except ValueError:
+        raise unknown("camera", text, [*names, "AZIMUTH,ELEVATION,DISTANCE"]) from None
+    env.reset(0)
+    middle = Observer(env.scene).look(env).tips[0].mean(0)
+    return View(middle, distance, azimuth, elevation)
+
+
+def wall(pictures: Iterable[Picture], columns: int) -> Picture:
+    """Return pictures of the same size as one, row by row."""
+    tiles = list(pictures)
+    rows = [np.concatenate(tiles[first : first + columns], 1) for first in range(0, len(tiles), columns)]
+    return np.concatenate(rows, 0)
+
+
+def written(picture: Picture, lines: list[str]) -> Picture:
+    """Return a picture with lines of text in its upper left corner, on a dark ground."""
+    if not lines:
+        return picture
+    size = max(10, len(picture) // 24)
+    image = Image.fromarray(picture)
+    draw = ImageDraw.Draw(image, "RGBA")
+    text, font = "\n".join(lines), ImageFont.load_default(size)
+    left, top, right, bottom = draw.multiline_textbbox((size // 2, size // 2), text, font=font)
+    draw.rectangle((left - 4, top - 4, right + 4, bottom + 4), fill=(0, 0, 0, 130))
+    draw.multiline_text((size // 2, size // 2), text, font=font, fill=(255, 255, 255, 255))
+    return np.asarray(image)
+
+
+def _frames(env: BatchedEnv, movers: Movers, look: Look, every: int, episodes: int, seed: int) -> Iterator[Picture]:
+    picture = ScenePicture(env, *look.tile)
+
+    def draw(shot: Shot) -> Picture:
+        seen = written(picture.draw(shot.pose, look.camera), shot.words)
+        return seen if shot.scope is None else np.concatenate([seen, shot.scope], 1)
+
+    most = cores()
+    drawn: deque[list[Future[Picture]]] = deque()
+    with ThreadPoolExecutor(most) as threads:  # a picture takes half a second of a core, without Python's lock
+        for shots in _shots(env, movers, look, picture, every, episodes, seed):
+            drawn.append([threads.submit(draw, shot) for shot in shots])
+            if len(drawn) > most:
+                yield _joined(drawn.popleft(), look)
+        while drawn:
+            yield _joined(drawn.popleft(), look)
+
+
+def _joined(tiles: list[Future[Picture]], look: Look) -> Picture:
+    return wall((tile.result() for tile in tiles), look.grid[1])
+
+
+def _shots(
+    env: BatchedEnv, movers: Movers, look: Look, picture: ScenePicture, every: int, episodes: int, seed: int
+) -> Iterator[list[Shot]]:
+    """Yield what each frame shows, while the environments play."""
+    scope = _scope(env) if look.grid == (1, 1) else lambda: None
+    observations, _, infos = env.reset(seed)
+    movers.begin(observations)
+    for step in range(episodes * env.max_steps):
+        if step % every == 0:
+            words = [_words(env, infos, index) if look.words else [] for index in range(env.num_envs)]
+            yield [Shot(picture.pose(index), scope(), words[index]) for index in range(env.num_envs)]
+        outcome = env.step(movers.actions(observations))
+        observations, infos = outcome.observations, outcome.infos
+        movers.begin(observations, np.asarray(outcome.terminated | outcome.truncated))
+
+
+def _words(env: BatchedEnv, infos: Any, index: int) -> list[str]:
+    time = float(np.asarray(env.steps)[index]) * env.control_dt
+    return [f"{time:.2f} s", *(f"{agent}  {', '.join(summary(infos[agent], index))}" for agent in env.agents)]
+
+
+def _scope(env: BatchedEnv) -> Callable[[], Picture | None]:
+    """Return what returns the endoscope's picture of the first environment, or None in a scene without one."""
+    if not any(mount.arm.camera is not None for mount in env.scene.mounts.values()):
+        return lambda: None
+    from surgical_marl.vision.endoscope import Endoscope
+
+    endoscope = Endoscope(env.scene, env.num_envs, width=HEIGHT, height=HEIGHT)
+    return lambda: np.asarray(endoscope.render(env.qpos, env.object_poses).rgb[0, 0])

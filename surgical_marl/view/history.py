@@ -1,0 +1,82 @@
+"""What happened lately in one environment, for plots: errors, distances, forces, terms of the reward."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+ERRORS = ("tip_error", "goal_error")
+"""Infos of how far a tool tip, or an object, is from its goal, m: the first that there is counts."""
+REWARD = "reward_"
+"""How infos of terms of the reward begin."""
+
+
+class History:
+    """The last steps of one environment.
+
+    Args:
+        agents: names of the agents.
+        dt: time of a step, s.
+        seconds: how long a step is remembered.
+    """
+
+    def __init__(self, agents: Sequence[str], dt: float, seconds: float = 10.0) -> None:
+        self.agents, self._dt = list(agents), dt
+        self._room = max(2, round(seconds / dt))
+        self._rows: dict[tuple[str, str], np.ndarray] = {}
+        self._count = 0
+
+    def add(self, infos: Mapping[str, Mapping[str, Any]], rewards: Mapping[str, Any], index: int = 0) -> None:
+        """Remember a step: infos and rewards of all agents, [N] each, of environment `index`."""
+        place = self._count % self._room
+        for agent in self.agents:
+            own = {name: float(np.asarray(value)[index]) for name, value in infos[agent].items() if wanted(name)}
+            own["reward"] = float(np.asarray(rewards[agent])[index])
+            for name, value in own.items():
+                row = self._rows.setdefault((agent, name), np.full(self._room, np.nan))
+                row[place] = value if np.isfinite(value) else np.nan
+        self._count += 1
+
+    def clear(self) -> None:
+        """Forget all steps."""
+        self._rows, self._count = {}, 0
+
+    @property
+    def time(self) -> np.ndarray:
+        """Times of the remembered steps, s before the last one, [T], 0 at the end."""
+        return np.arange(1 - min(self._count, self._room), 1) * self._dt
+
+    def names(self, agent: str) -> list[str]:
+        """Return the names of what is remembered of an agent."""
+        return [name for owner, name in self._rows if owner == agent]
+
+    def read(self, agent: str, name: str) -> np.ndarray:
+        """Return the remembered values, oldest first, [T]; NaN where there was none."""
+        kept = min(self._count, self._room)
+        row = self._rows.get((agent, name))
+        if row is None:
+            return np.full(kept, np.nan)
+        return np.roll(row, -(self._count % self._room))[-kept:] if self._count > self._room else row[:kept].copy()
+
+    def error(self, agent: str) -> tuple[str, np.ndarray]:
+        """Return the name of the agent's error and its values in mm, [T]; an empty name if it has none."""
+        name = next((name for name in ERRORS if (agent, name) in self._rows), "")
+        return name, 1000 * self.read(agent, name)
+
+
+def wanted(name: str) -> bool:
+    """Return whether an info is remembered."""
+    return name in (*ERRORS, "min_distance", "contact_force") or name.startswith(REWARD)
+
+
+def summary(info: Mapping[str, Any], index: int = 0) -> list[str]:
+    """Return what an agent's infos of a step say in short: error, stages, and what went wrong."""
+    read = lambda name: float(np.asarray(info[name])[index])  # noqa: E731
+    words = [f"{1000 * read(name):.2f} mm" for name in ERRORS if name in info][:1]
+    done = [name.removeprefix("stage_") for name in info if name.startswith("stage_") and read(name)]
+    if done:
+        words.append("stages " + ", ".join(done))
+    words += [name for name in ("success", "holding", "collision", "drop") if name in info and read(name)]
+    return words

@@ -1,0 +1,124 @@
+"""What there is to see of N environments at one moment, as numbers: no drawing, no browser.
+
+    moment = Observer(env.scene).look(env)
+    moment.nearest[0]                       # the shortest line between two arms of the first environment
+
+Places follow from joint positions and object poses by C MuJoCo's kinematics, so that they fit the pictures.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import mujoco
+import numpy as np
+
+if TYPE_CHECKING:
+    from surgical_marl.envs.batch import BatchedEnv
+    from surgical_marl.scenes.scene import Scene
+
+FAR = 10.0
+"""Distance in m beyond which two shapes need not be compared."""
+
+
+class Near(NamedTuple):
+    """The shortest line between two arms."""
+
+    distance: float
+    """m; below 0 where they overlap."""
+    ends: np.ndarray
+    """Its ends in the world, [2, 3], m."""
+
+
+class Push(NamedTuple):
+    """A contact of two shapes."""
+
+    place: np.ndarray
+    """In the world, [3], m."""
+    direction: np.ndarray
+    """Unit vector from the first shape to the second one, [3]."""
+    force: float
+    """Normal force, N."""
+
+
+class Moment(NamedTuple):
+    """N environments at one moment, each in its own world; lengths in m, quaternions w, x, y, z."""
+
+    positions: np.ndarray
+    """Of all bodies of the scene's model, [N, bodies, 3]."""
+    quaternions: np.ndarray
+    """[N, bodies, 4]"""
+    tips: np.ndarray
+    """Tool tips, [N, arms, 3]."""
+    objects: np.ndarray
+    """Origins of free objects, [N, k, 3]."""
+    held: np.ndarray
+    """Which arms hold which free objects, [N, k, arms] bool."""
+    marks: np.ndarray
+    """Places that the task marks as goals, [N, marks, 3]."""
+    nearest: list[Near | None]
+    """For each environment; None in a scene of one arm."""
+    pushes: list[list[Push]]
+    """Contacts of arms in the last step, for each environment."""
+
+
+class Observer:
+    """Finds what there is to see in environments of one scene."""
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene = scene
+        self._data = mujoco.MjData(scene.model)
+        names = scene.pairs
+        self._geoms = list(zip(scene.model.pair_geom1.tolist(), scene.model.pair_geom2.tolist(), strict=True))
+        self._between = [k for k, (one, other) in enumerate(names) if _owner(one) != _owner(other)]
+        self._sites = [scene.model.site(f"{agent}/tool_tip").id for agent in scene.agents]
+
+    def look(self, env: BatchedEnv, forces: Any = None) -> Moment:
+        """Return what there is to see now.
+
+        Args:
+            env: environments of the scene, with numpy arrays.
+            forces: normal forces of `scene.pairs` in the last step, [N, P], N; None where there was no such step.
+        """
+        qpos, poses, marks = env.qpos, env.object_poses, env.task.marks(env.goal)
+        count, bodies = len(qpos), self._scene.model.nbody
+        positions, quaternions = np.empty((count, bodies, 3)), np.empty((count, bodies, 4))
+        tips = np.empty((count, len(self._sites), 3))
+        nearest: list[Near | None] = []
+        pushes: list[list[Push]] = []
+        for row in range(count):
+            self._place(qpos[row], poses.origin[row], poses.quaternion[row])
+            positions[row], quaternions[row] = self._data.xpos, self._data.xquat
+            tips[row] = self._data.site_xpos[self._sites]
+            nearest.append(self._nearest())
+            pushes.append([] if forces is None else self._pushes(np.asarray(forces)[row]))
+        marks = np.asarray(marks, float) if marks.size else np.zeros((count, 0, 3))
+        return Moment(positions, quaternions, tips, poses.origin, env.held, marks, nearest, pushes)
+
+    def _place(self, qpos: np.ndarray, origins: np.ndarray, quaternions: np.ndarray) -> None:
+        data = self._data
+        data.qpos[:], data.mocap_pos[:], data.mocap_quat[:] = qpos, origins, quaternions
+        mujoco.mj_kinematics(self._scene.model, data)
+
+    def _nearest(self) -> Near | None:
+        lines = [self._line(k) for k in self._between]
+        return min(lines, key=lambda line: line.distance) if lines else None
+
+    def _line(self, pair: int) -> Near:
+        ends = np.zeros(6)
+        distance = mujoco.mj_geomDistance(self._scene.model, self._data, *self._geoms[pair], FAR, ends)
+        return Near(float(distance), ends.reshape(2, 3))
+
+    def _pushes(self, forces: np.ndarray) -> list[Push]:
+        found = []
+        for pair in np.flatnonzero(forces > 0):
+            start, end = self._line(int(pair)).ends
+            way = end - start
+            length = float(np.linalg.norm(way))
+            direction = way / length if length > 1e-9 else np.array([0.0, 0.0, 1.0])
+            found.append(Push((start + end) / 2, direction, float(forces[pair])))
+        return found
+
+
+def _owner(geom: str) -> str:
+    return geom.split("/")[0]

@@ -1,0 +1,158 @@
+"""What was done in the viewer, as a file that can be stepped again to the same numbers.
+
+`surgical-marl view --record DIR` writes takes, and `surgical-marl replay FILE` steps one again. A take is an npz file:
+
+    about               JSON text: layout, environment (its options), engine, device, num_envs, seed, movers, versions
+    start<path>         all that the first step depends on, as in "start.physics.qpos", [N, ...]
+    actions/<agent>     what each arm was commanded, [T, N, a] float32
+    rewards/<agent>     [T, N] float32
+    qpos                joint positions after each step, [T, N, nq] float32
+    objects             position and quaternion of free objects after each step, [T, N, k, 7] float32
+    ended               where an episode ended with the step, [T, N] bool
+
+`movers` lists [step, agent, who]: who moved an agent from this step on. A replay does not ask them: it has the actions.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from surgical_marl.files import write_atomic
+from surgical_marl.runs.environment import make_env
+from surgical_marl.runs.settings import Settings
+
+if TYPE_CHECKING:
+    from surgical_marl.envs.batch import BatchedEnv, BatchStep
+
+LAYOUT = 1
+MOST_STEPS = 10_000
+"""Steps of a take, so that its arrays stay small; the next take goes on from there."""
+_START = "start"
+_PACKAGES = ("surgical-marl", "jax", "warp-lang", "numpy")
+
+
+class Take:
+    """A recording that has begun where an environment now is, before its next step."""
+
+    def __init__(self, env: BatchedEnv, settings: Settings, seed: int, movers: Mapping[str, str]) -> None:
+        self._env, self._start = env, env.carry()
+        self._about: dict[str, Any] = {
+            "layout": LAYOUT,
+            "environment": settings.of_environment(),
+            "engine": env.engine.name,
+            "device": env.device,
+            "num_envs": env.num_envs,
+            "seed": seed,
+            "movers": [[0, agent, who] for agent, who in movers.items()],
+            "versions": {name: importlib.metadata.version(name) for name in _PACKAGES},
+        }
+        self._steps: list[dict[str, np.ndarray]] = []
+
+    def __len__(self) -> int:
+        return len(self._steps)
+
+    def moved_by(self, agent: str, who: str) -> None:
+        """Note who moves an arm from the next step on."""
+        self._about["movers"].append([len(self), agent, who])
+
+    def add(self, actions: Mapping[str, np.ndarray], step: BatchStep) -> None:
+        """Note the actions of a step that the environment has just done, and what it led to."""
+        self._steps.append(
+            {f"actions/{agent}": np.array(own) for agent, own in actions.items()} | _after(self._env, step)
+        )
+
+    def write(self, path: Path) -> Path:
+        """Write the file, completely or not at all, and return its path."""
+        content = {"about": np.array(json.dumps(self._about))}
+        content |= {f"{_START}{name}": value for name, value in self._start.items()}
+        content |= {name: np.stack([step[name] for step in self._steps]) for name in self._steps[0]}
+
+        def save(part: Path) -> None:
+            with part.open("wb") as file:
+                np.savez_compressed(file, **content)  # type: ignore[arg-type]
+
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomic(path, save)
+        return path
+
+
+class Replayed(NamedTuple):
+    """What came of stepping a take again."""
+
+    steps: int
+    differs_at: int | None
+    """The first step that led to other numbers, from 0; None if none did."""
+    largest: float
+    """The largest difference of a joint position, rad or m, or of an object's position, m."""
+    versions: list[str]
+    """Packages that have another version than when the take was recorded."""
+
+
+def replay(path: Path) -> Replayed:
+    """Step a take again, and compare all numbers bit by bit.
+
+    Raises:
+        ValueError: it is no take, or what it was recorded in can't be made here.
+    """
+    about, arrays = read_take(path)
+    try:
+        settings = Settings(**about["environment"], engine=about["engine"], device=about["device"])
+    except TypeError:  # options of another version
+        raise ValueError(f"{path} was recorded in an environment that this version does not know") from None
+    env = make_env(settings, about["num_envs"], "numpy")
+    needed = {"objects", "ended", *(f"{kind}/{agent}" for kind in ("actions", "rewards") for agent in env.agents)}
+    if missing := sorted(needed - arrays.keys()):
+        raise ValueError(f"{path} is no whole take: it lacks {', '.join(missing)}")
+    env.set_carry({name.removeprefix(_START): value for name, value in arrays.items() if name.startswith(_START)})
+    count, first, largest = len(arrays["qpos"]), None, 0.0
+    for number in range(count):
+        step = env.step({agent: arrays[f"actions/{agent}"][number] for agent in env.agents})
+        for name, value in _after(env, step).items():
+            wanted = arrays[name][number]
+            if not np.array_equal(wanted, value, equal_nan=True):
+                first = number if first is None else first
+                if name in ("qpos", "objects"):
+                    largest = max(largest, float(np.max(np.abs(wanted - value), initial=0.0)))
+    env.close()
+    changed = [
+        f"{name} {was} -> {now}"
+        for name, was in about["versions"].items()
+        if (now := importlib.metadata.version(name)) != was
+    ]
+    return Replayed(count, first, largest, changed)
+
+
+def read_take(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Return what `about` says, and all arrays by name; ValueError if the file is no take."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files if name != "about"}
+            about = json.loads(str(file["about"]))
+    except OSError as error:
+        raise ValueError(f"cannot read {path}: {error.strerror or 'it is no npz file'}") from None
+    except (ValueError, KeyError, TypeError, AttributeError, EOFError, zipfile.BadZipFile):
+        about, arrays = {}, {}
+    known = {"layout", "environment", "engine", "device", "num_envs", "versions"}
+    if not isinstance(about, dict) or not known <= about.keys() or "qpos" not in arrays:
+        raise ValueError(f"{path} is not a take that `surgical-marl view --record` wrote")
+    if about["layout"] != LAYOUT:
+        raise ValueError(f"{path} is a take of layout {about['layout']!r}: this version reads layout {LAYOUT}")
+    return about, arrays
+
+
+def _after(env: BatchedEnv, step: BatchStep) -> dict[str, np.ndarray]:
+    """Return the numbers of a step that a replay is compared in."""
+    poses = env.object_poses
+    return {
+        **{f"rewards/{agent}": np.array(reward, np.float32) for agent, reward in step.rewards.items()},
+        "qpos": np.array(env.qpos, np.float32),
+        "objects": np.concatenate([poses.origin, poses.quaternion], -1).astype(np.float32),
+        "ended": np.asarray(step.terminated | step.truncated),
+    }

@@ -1,0 +1,207 @@
+"""The viewer in a real browser: Debian's chromium without a window, driven by playwright."""
+
+from __future__ import annotations
+
+import shutil
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from surgical_marl.content import find
+from surgical_marl.robots.rotation import matrix_of
+from surgical_marl.runs.settings import Settings
+from surgical_marl.view.browser.viewer import Viewer
+from surgical_marl.view.take import replay
+
+pytest.importorskip("viser", reason="the viewer needs viser: pip install 'surgical-marl[view]'")
+api = pytest.importorskip("playwright.sync_api", reason="a browser is driven by playwright: pip install playwright")
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium on this machine")]
+SOFTWARE = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
+PATIENCE = 60.0
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with api.sync_playwright() as playwright:
+        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=SOFTWARE)
+        yield chromium
+        chromium.close()
+
+
+class Running:
+    """A viewer that runs in a thread, as the command does, and what pages of it complained about."""
+
+    def __init__(self, browser: Any, settings: Settings, who: str, record: Path | None = None) -> None:
+        self.viewer = Viewer(settings, who, port=0, record=record)
+        self.complaints: list[str] = []
+        self._browser, self._end = browser, threading.Event()
+        self._thread = threading.Thread(target=self.viewer.run, args=(self._end,))
+        self._thread.start()
+
+    def open(self) -> Any:
+        page = self._browser.new_page(viewport={"width": 1000, "height": 900})
+        page.on("console", lambda message: message.type == "error" and self.complaints.append(message.text))
+        page.on("pageerror", lambda error: self.complaints.append(str(error)))
+        page.on("request", self._ask)
+        page.set_default_timeout(1000 * PATIENCE)
+        page.goto(self.viewer.address)
+        page.get_by_role("tab", name="Scene").wait_for()
+        return page
+
+    def _ask(self, request: Any) -> None:
+        if not request.url.startswith((self.viewer.address, "data:", "blob:")):
+            self.complaints.append(f"it asks for {request.url}")
+
+    def close(self) -> None:
+        self._end.set()
+        self._thread.join()
+
+
+@pytest.fixture
+def running(browser: Any, tmp_path: Path) -> Iterator[Running]:
+    settings = Settings(task="reach", scene="bimanual_psm", seed=3, max_steps=100_000)
+    made = Running(browser, settings, "oracle", tmp_path)
+    yield made
+    made.close()
+
+
+def comes(true: Callable[[], Any], page: Any = None) -> None:
+    """Wait until something is true."""
+    end = time.monotonic() + PATIENCE
+    while not true():
+        assert time.monotonic() < end, "it never came true"
+        if page is None:
+            time.sleep(0.1)
+        else:
+            page.wait_for_timeout(100)
+
+
+def choose(page: Any, label: str, option: str, number: int = 0) -> None:
+    page.locator("input:visible").and_(page.get_by_label(label, exact=True)).nth(number).click()
+    page.get_by_role("option", name=option, exact=True).click()
+
+
+def test_the_controls_do_what_they_say(running: Running) -> None:
+    viewer, page = running.viewer, running.open()
+    page.get_by_role("button", name="Pause / go on").click()
+    comes(lambda: viewer.pace.paused, page)
+    steps = viewer.session.steps
+    page.get_by_role("button", name="One step").click()
+    comes(lambda: viewer.session.steps == steps + 1, page)
+    page.wait_for_timeout(500)
+    assert viewer.session.steps == steps + 1
+    page.get_by_role("button", name="Reset", exact=True).click()
+    comes(lambda: viewer.session.steps == 0, page)
+    page.keyboard.press("n")
+    comes(lambda: viewer.session.steps == 1, page)
+    choose(page, "speed", "0.25")
+    comes(lambda: viewer.pace.speed == 0.25, page)
+    page.get_by_label("seed", exact=True).fill("11")
+    page.keyboard.press("Enter")
+    comes(lambda: viewer.session.seed == 11, page)
+    choose(page, "moved by", "frozen", 1)
+    comes(lambda: viewer.session.movers.who == {"psm_0": "oracle", "psm_1": "frozen"}, page)
+    page.get_by_role("tab", name="Show").click()
+    page.get_by_label("targets", exact=True).click()
+    comes(lambda: not viewer._nodes._marks.visible, page)
+    page.get_by_role("tab", name="Plots").click()
+    page.get_by_text("error, mm").wait_for()
+    page.get_by_role("tab", name="Scene").click()
+    choose(page, "environments", "2")
+    comes(lambda: viewer.session.env.num_envs == 2, page)
+    assert viewer.session.movers.who["psm_1"] == "frozen"
+    assert not running.complaints
+    page.close()
+
+
+def test_a_closed_tab_ends_nothing_and_a_second_one_works(running: Running) -> None:
+    first, second = running.open(), running.open()
+    first.close()
+    steps = running.viewer.session.steps
+    comes(lambda: running.viewer.session.steps > steps, second)
+    second.get_by_role("button", name="Pause / go on").click()
+    comes(lambda: running.viewer.pace.paused, second)
+    second.close()
+    running.viewer.pace.paused = False
+    third = running.open()
+    steps = running.viewer.session.steps
+    comes(lambda: running.viewer.session.steps > steps, third)
+    assert not running.complaints
+    third.close()
+
+
+def test_a_person_and_a_policy_bring_two_arms_to_their_targets(running: Running, tmp_path: Path) -> None:
+    viewer, page = running.viewer, running.open()
+    choose(page, "moved by", "you", 0)
+    comes(lambda: "psm_0" in viewer.session.movers.hands, page)
+    keys = (("ArrowRight", "ArrowLeft"), ("ArrowUp", "ArrowDown"), ("PageUp", "PageDown"))
+
+    def error() -> np.ndarray:
+        return viewer.session.moment().marks[0, 0] - viewer.session.movers.hands["psm_0"].tip()[:3, 3]
+
+    page.evaluate("document.activeElement.blur()")  # a menu that has the focus keeps the keys
+    for _ in range(200):
+        axis = int(np.argmax(np.abs(error())))
+        if abs(error()[axis]) < 0.0011:
+            break
+        page.keyboard.press(keys[axis][int(error()[axis] < 0)])
+        page.wait_for_timeout(250)  # a key that comes before the page listens is lost, and pressed again
+    infos = lambda agent: float(viewer.session.infos[agent]["tip_error"][0])  # noqa: E731
+    comes(lambda: infos("psm_0") < 0.003 and infos("psm_1") < 0.002, page)
+    page.close()
+    running.close()
+    found = replay(tmp_path / "take-0001.npz")
+    assert found.steps > 100 and found.differs_at is None
+
+
+def test_a_handle_is_dragged_with_the_mouse(running: Running) -> None:
+    viewer, page = running.viewer, running.open()
+    choose(page, "moved by", "you", 0)
+    comes(lambda: "psm_0" in viewer.session.movers.hands, page)
+    comes(lambda: running.viewer.server.get_clients(), page)
+    page.wait_for_timeout(5000)  # until the handle is drawn
+    hand = viewer.session.movers.hands["psm_0"]
+    pose = hand.tip()
+    axis = pose[:3, 0]
+    start, end = (pixel(viewer, pose[:3, 3] + far * axis) for far in (0.045, 0.065))
+    page.mouse.move(*start)
+    page.wait_for_timeout(700)  # a handle is grabbed where the mouse was seen above it
+    page.mouse.down()
+    for share in np.linspace(0, 1, 6):
+        page.mouse.move(*(start + share * (end - start)))
+        page.wait_for_timeout(200)
+    page.mouse.up()
+    comes(lambda: abs((hand.tip()[:3, 3] - pose[:3, 3]) @ axis - 0.020) < 0.002, page)
+    tip = lambda: viewer.session.moment().tips[0, 0]  # noqa: E731
+    comes(lambda: np.linalg.norm(tip() - hand.tip()[:3, 3]) < 0.001, page)
+    assert not running.complaints
+    page.close()
+
+
+def test_hostile_names_stay_text(browser: Any, tmp_path: Path) -> None:
+    scene = tmp_path / "<img src=x onerror=window.hit=1>.yaml"
+    scene.write_text(find("scenes", "psm").read_text())
+    running = Running(browser, Settings(task="reach", scene=str(scene)), "zero")
+    page = running.open()
+    page.get_by_text("<img src=x onerror=window.hit=1>").first.wait_for()
+    assert page.evaluate("window.hit") is None
+    assert not running.complaints
+    page.close()
+    running.close()
+
+
+def pixel(viewer: Viewer, point: np.ndarray) -> np.ndarray:
+    """Where the page of the only tab shows a point, by its camera: x to the right, y down, z forward."""
+    (client,) = viewer.server.get_clients().values()
+    camera = client.camera
+    x, y, z = matrix_of(np.array(camera.wxyz)).T @ (point - camera.position)
+    half = camera.image_height / 2
+    scale = half / np.tan(camera.fov / 2)
+    return np.array([camera.image_width / 2 + scale * x / z, half + scale * y / z])

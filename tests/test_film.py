@@ -1,0 +1,74 @@
+"""Films of policies: what is in a frame, and how many there are."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import imageio.v3 as imageio
+import numpy as np
+import pytest
+
+from surgical_marl.envs.batch import BatchedEnv
+from surgical_marl.view.film import Look, camera_of, film, wall, written
+from surgical_marl.view.movers import Movers, first
+from surgical_marl.view.render import View
+
+
+def test_words_are_in_the_upper_left_corner_alone() -> None:
+    plain = np.full((240, 320, 3), 200, np.uint8)
+    changed = (written(plain, ["1.00 s", "psm_0  0.05 mm"]) != plain).any(-1)
+    assert changed[:120, :160].any()
+    assert not changed[120:].any() and not changed[:, 200:].any()
+    assert written(plain, []) is plain
+
+
+def test_a_wall_has_its_pictures_row_by_row() -> None:
+    tiles = [np.full((2, 3, 3), value, np.uint8) for value in range(6)]
+    found = wall(tiles, columns=3)
+    assert found.shape == (4, 9, 3)
+    assert found[::2, ::3, 0].tolist() == [[0, 1, 2], [3, 4, 5]]
+
+
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("surgical_marl.view.film.WIDTH", 120)
+    monkeypatch.setattr("surgical_marl.view.film.HEIGHT", 90)
+
+
+@pytest.mark.usefixtures("small")
+def test_a_film_is_as_long_as_its_episode_and_slow_ones_are_longer(tmp_path: Path) -> None:
+    env = BatchedEnv("reach", "psm", device="cpu", max_steps=4)
+    movers = Movers(env, "oracle")
+    frames = imageio.imread(film(env, movers, tmp_path / "film.gif", Look()))
+    assert frames.shape == (2, 90, 120, 3)  # 25 a second, of 50 steps a second
+    slow = film(env, movers, tmp_path / "slow.gif", Look(slow=4.0, camera=View(distance=0.5)))
+    assert len(imageio.imread(slow)) == 4
+    assert imageio.immeta(slow)["duration"] == 80  # ms: 4 steps of 20 ms take 320 ms
+    assert (frames[0] != frames[1]).any()
+
+
+@pytest.mark.usefixtures("small")
+def test_an_endoscope_is_beside_and_a_grid_has_every_environment(tmp_path: Path) -> None:
+    env = BatchedEnv("reach", "ecm", device="cpu", max_steps=2)
+    frames = imageio.imread(film(env, Movers(env, "zero"), tmp_path / "scope.gif", Look()), index=None)
+    assert frames.shape[-3:-1] == (90, 120 + 90)
+    many = BatchedEnv("reach", "psm", num_envs=8, device="cpu", max_steps=2)
+    look = Look(grid=(1, 8))
+    picture = imageio.imread(film(many, Movers(many, "zero"), tmp_path / "grid.gif", look), index=None)
+    width, height = look.tile
+    assert picture.shape[-3:-1] == (height, 8 * width)
+
+
+def test_cameras_have_names_or_angles() -> None:
+    env = BatchedEnv("reach", "psm", device="cpu")
+    assert camera_of(None, env) is None
+    assert camera_of("overview", env) == "overview"
+    free = camera_of("90,-20,0.4", env)
+    assert isinstance(free, View) and (free.azimuth, free.elevation, free.distance) == (90, -20, 0.4)
+    with pytest.raises(ValueError, match="unknown camera 'left'"):
+        camera_of("left", env)
+
+
+def test_the_policy_that_ships_comes_first() -> None:
+    assert first(BatchedEnv("reach", "psm", device="cpu")) == "reach-psm"
+    assert first(BatchedEnv("needle_pick", "psm_needle", device="cpu")) == "oracle"

@@ -1,0 +1,214 @@
+"""The viewer's page: who may open it, and what its controls do, without a browser."""
+
+from __future__ import annotations
+
+import http.client
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+
+pytest.importorskip("viser", reason="the viewer's page needs viser: pip install 'surgical-marl[view]'")
+
+import viser
+import websockets.asyncio.server
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+
+from surgical_marl.runs.settings import Settings
+from surgical_marl.scenes.load import load_scene
+from surgical_marl.view.browser.gate import close_server, open_server, unlocked
+from surgical_marl.view.browser.nodes import distance_colour, offsets, segments
+from surgical_marl.view.browser.panel import Choice
+from surgical_marl.view.browser.pictures import observed
+from surgical_marl.view.browser.plots import curves
+from surgical_marl.view.browser.shapes import geom_mesh
+from surgical_marl.view.browser.viewer import Viewer
+
+
+@pytest.fixture(scope="module")
+def address() -> Iterator[str]:
+    serve = websockets.asyncio.server.serve
+    server, found = open_server(0)
+    assert websockets.asyncio.server.serve is serve
+    yield found
+    close_server(server)
+
+
+def answer(address: str, path: str) -> int:
+    parts = urlsplit(address)
+    connection = http.client.HTTPConnection(str(parts.hostname), parts.port, timeout=10)
+    connection.request("GET", path)
+    return connection.getresponse().status
+
+
+def test_a_page_needs_its_secret(address: str) -> None:
+    secret = urlsplit(address).path
+    assert answer(address, secret) == 200
+    for path in ("/", "/index.html", secret[:-2] + "/", secret.upper(), "/x" + secret, f"/?{secret}", "/%00"):
+        assert answer(address, path) == 403, path
+
+
+def test_a_websocket_needs_its_secret(address: str) -> None:
+    protocol: Any = f"viser-v{viser.__version__}"
+    for path in ("/", "/wrong"):
+        with pytest.raises(InvalidStatus, match="403"):
+            connect(f"ws://{urlsplit(address).netloc}{path}", subprotocols=[protocol])
+    with connect(address.replace("http", "ws").rstrip("/"), subprotocols=[protocol]) as socket:
+        assert socket.recv(timeout=10)
+
+
+def test_addresses_are_random_and_local(address: str) -> None:
+    server, other = open_server(0)
+    close_server(server)
+    assert urlsplit(address).hostname == urlsplit(other).hostname == "127.0.0.1"
+    assert urlsplit(address).path != urlsplit(other).path
+    assert len(urlsplit(other).path) > 30
+
+
+def test_a_port_in_use_is_refused(address: str) -> None:
+    port = urlsplit(address).port
+    assert port
+    with pytest.raises(ValueError, match=f"cannot serve on port {port}.*--port"):
+        open_server(port)
+
+
+def test_a_viser_that_serves_in_another_way_is_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Other:
+        def __init__(self, **_: Any) -> None:
+            pass
+
+        def stop(self) -> None:
+            pass
+
+    monkeypatch.setattr(viser, "ViserServer", Other)
+    with pytest.raises(RuntimeError, match="without a guard"):
+        open_server(0)
+
+
+@pytest.mark.parametrize(
+    "path, inside",
+    [
+        ("/key", "/"),
+        ("/key/", "/"),
+        ("/key/a/b?x=/", "/a/b"),
+        ("/ke", None),
+        ("", None),
+        ("/keyy/", None),
+        ("/\udce9/", None),
+    ],
+)
+def test_the_secret_is_cut_off_a_path(path: str, inside: str | None) -> None:
+    assert unlocked(path, "key") == inside
+
+
+@pytest.fixture(scope="module")
+def viewer() -> Iterator[Viewer]:
+    made = Viewer(Settings(task="reach", scene="bimanual_psm", seed=3), "oracle", port=0)
+    yield made
+    made.session.close()
+    close_server(made.server)
+
+
+def turn(viewer: Viewer, times: int = 1) -> None:
+    for _ in range(times):
+        viewer.turn(time.monotonic())
+
+
+def test_what_is_drawn_is_where_it_is(viewer: Viewer) -> None:
+    viewer.pace.paused = True
+    for _ in range(10):
+        viewer.pace.step_once()
+        turn(viewer)
+    moment = viewer.session.moment()
+    nodes = viewer._nodes
+    for body, handle in nodes._moving.items():
+        np.testing.assert_allclose(handle.batched_positions, moment.positions[:, body], atol=1e-6)
+        np.testing.assert_allclose(handle.batched_wxyzs, moment.quaternions[:, body], atol=1e-6)
+    assert nodes._marks is not None
+    np.testing.assert_allclose(nodes._marks.batched_positions, moment.marks[0], atol=1e-6)
+    assert moment.nearest[0] is not None
+    np.testing.assert_allclose(nodes._lines.points[0], moment.nearest[0].ends, atol=1e-6)
+
+
+def test_what_can_not_be_done_changes_nothing(viewer: Viewer) -> None:
+    session, who = viewer.session, dict(viewer.session.movers.who)
+    viewer.ask(lambda: session.set_mover(session.env.agents[0], "nobody"))
+    viewer.ask(lambda: viewer.choose(Choice("reach", "bimanual_psm", "no such level", 1, 100)))
+    turn(viewer)
+    assert viewer.session is session and session.movers.who == who
+
+
+def test_other_environments_are_looked_at(viewer: Viewer) -> None:
+    agents = viewer.session.env.agents
+    viewer.ask(lambda: viewer.session.set_mover(agents[1], "frozen"))
+    viewer.ask(lambda: viewer.choose(Choice("reach", "bimanual_psm", "default", 3, 40)))
+    turn(viewer, 2)
+    env = viewer.session.env
+    assert (env.num_envs, env.max_steps, viewer.session.settings.difficulty) == (3, 40, "default")
+    assert viewer.session.movers.who == {agents[0]: "oracle", agents[1]: "frozen"}
+    assert viewer.session.seed == 3
+
+
+def test_every_visible_geom_has_a_surface_where_it_is() -> None:
+    model = load_scene("trimanual_psm_ecm_pegs").model
+    for geom in np.flatnonzero(model.geom_group <= 2):
+        mesh = geom_mesh(model, int(geom))
+        assert mesh is not None
+        half = model.geom_aabb[geom, 3:]
+        assert np.abs(mesh.vertices - model.geom_pos[geom]).max() <= np.linalg.norm(half) + 1e-6
+        assert mesh.is_watertight or len(mesh.faces) > 0
+
+
+def test_distances_turn_red() -> None:
+    assert distance_colour(0.0).tolist() == [226, 40, 40] == distance_colour(-0.01).tolist()
+    far, near = distance_colour(0.1), distance_colour(0.005)
+    assert near[0] > far[0] and near[1] < far[1]
+    assert (distance_colour(0.03) == far).all()
+
+
+def test_environments_stand_side_by_side() -> None:
+    assert offsets(3, 2.0)[:, 0].tolist() == [2.0, 0.0, -2.0]
+    assert not offsets(3, 2.0)[:, 1:].any()
+
+
+def test_a_line_through_points_has_one_piece_less() -> None:
+    points = np.arange(12.0).reshape(4, 3)
+    assert segments(points).shape == (3, 2, 3)
+    np.testing.assert_array_equal(segments(points)[1], points[1:3])
+
+
+def test_plots_show_what_happened(viewer: Viewer) -> None:
+    viewer.session.reset()
+    for _ in range(4):
+        viewer.session.step()
+    agent = viewer.session.env.agents[0]
+    plots = curves(viewer.session.history)
+    assert {"error, mm", "distance of arms, mm", "reward", f"terms of the reward of {agent}"} <= plots.keys()
+    (terms,) = (plots[title] for title in plots if title.endswith(f"of {agent}"))
+    assert plots["error, mm"][0].values[-1] == pytest.approx(1000 * viewer.session.infos[agent]["tip_error"][0])
+    total = np.sum([line.values for line in terms], axis=0)
+    np.testing.assert_allclose(total, plots["reward"][0].values, atol=1e-5)
+
+
+def test_pictures_that_agents_observe_are_shown() -> None:
+    depth = np.full((2, 4, 4, 1), 0.125, np.float32)
+    colours = np.arange(96, dtype=np.uint8).reshape(2, 4, 4, 3)
+    seen = observed(
+        {"ecm_0": {"proprioception": np.zeros((2, 3)), "depth": depth, "rgb": colours}, "psm_0": np.zeros(3)}
+    )
+    assert list(seen) == ["ecm_0 observes depth", "ecm_0 observes rgb"]
+    assert (seen["ecm_0 observes depth"] == 127).all() and seen["ecm_0 observes depth"].shape == (4, 4, 3)
+    np.testing.assert_array_equal(seen["ecm_0 observes rgb"], colours[0])
+
+
+def test_a_run_without_a_checkpoint_can_not_move_an_arm(viewer: Viewer, tmp_path: Path) -> None:
+    from surgical_marl.content import find
+
+    (tmp_path / "config.yaml").write_text((find("policies", "reach-bimanual_psm") / "config.yaml").read_text())
+    with pytest.raises(ValueError, match=r"it has no checkpoint\.pt"):
+        viewer.session.set_mover(viewer.session.env.agents[0], str(tmp_path))
