@@ -166,7 +166,10 @@ def test_pictures_are_terms_of_any_task(start: str) -> None:
         ({"observe": {"psm_0": []}}, "needs a term that is a vector"),
         ({"observe": {"psm_0": ["qpos", "qpos"]}}, "given 'qpos' twice"),
         ({"start": "anywhere"}, "start must be one of home, random, not 'anywhere'"),
-        ({"start": "random", "task": "track"}, r"unknown start of task 'track' 'random'.*choose from home"),
+        (
+            {"start": "random", "task": "match_image", "scene": "ecm"},
+            r"unknown start of task 'match_image' 'random'.*choose from home",
+        ),
         ({"goals": "new"}, "goals must be one of training, held_out, not 'new'"),
         ({"control": "psition"}, "control must be one of position, velocity, torque, not 'psition'"),
         ({"difficulty": "hrad"}, "unknown difficulty 'hrad', did you mean 'hard'"),

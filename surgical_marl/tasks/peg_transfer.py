@@ -10,7 +10,7 @@ Reward        the same for all arms, but for `clearance` and `collision`; weight
               if it is handed over `receive`, when both arms hold it (4), and `passed`, when the second one holds it
               alone (4); `over`, when it is held over its goal, clear of the pegs (4); `carry`, block to goal while the
               arm that places it holds it alone (20 / m). Then `precision`, exp(-error / 5 mm) while held (0.1);
-              `success` (0.5); `drop` (-2); `clearance` (0), `collision` (-2).
+              `success` (0.5); `drop` (-20); `clearance` (0), `collision` (-2).
 Success       the block stands on its goal peg, less than 2 mm above the plate, and no finger touches it.
 Termination   when the block, once lifted, is touched by no finger and is on no peg, or falls off the board; an episode
               is truncated after 600 control steps (12 s), if `easy` after 300.
@@ -109,7 +109,7 @@ class Task(ObjectTask):
     levels = {"easy": PegLevel(0.032, False), "default": PegLevel(1.0, True), "hard": PegLevel(1.0, True, True)}  # noqa: RUF012
     weights = {  # noqa: RUF012
         **ObjectTask.weights, "carry": 20.0, "receive": 4.0, "passed": 4.0, "over": 4.0, "success": 0.5,
-        "placed": 25.0, "clearance": 0.0,
+        "placed": 25.0, "drop": -20.0, "clearance": 0.0,
     }  # fmt: skip
     default_scene = "bimanual_psm_pegs"
     scenes = ("bimanual_psm_pegs", "trimanual_psm_ecm_pegs")

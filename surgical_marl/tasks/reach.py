@@ -24,7 +24,7 @@ Difficulty    standard deviation of the goals: easy 30 mm, default 50 mm (the pa
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -97,6 +97,10 @@ class Task(TipTask):
         postures, targets = self.tables.get("postures"), self.tables["targets"][row]
         goal = Goal(targets) if self.ways is None else RowGoal(targets, row)
         return Start(goal, None if postures is None else postures[row])
+
+    def goal_content(self, goal: Any) -> list[np.ndarray]:
+        """Return the targets, and where arms change places the row, which says also where they start."""
+        return [np.asarray(goal.targets)] if self.starts_at == "random" else super().goal_content(goal)
 
     def script(self) -> tuple[Step, ...]:
         """Return how arms go the ways that are known, all at the same pace.

@@ -18,10 +18,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
-from tqdm import tqdm
 
 from surgical_marl.content import unknown
 from surgical_marl.machine import cores
+from surgical_marl.runs.progress import progress
 from surgical_marl.view.history import summary
 from surgical_marl.view.moment import Observer
 from surgical_marl.view.record import FPS, Pose, ScenePicture
@@ -88,9 +88,17 @@ class Shot(NamedTuple):
 def film(env: BatchedEnv, movers: Movers, path: Path, look: Look, episodes: int = 1, seed: int = 0) -> Path:
     """Film the environments of `env`, as many as `look.grid` holds, and return the path of the film."""
     every = max(1, round(1 / (FPS * look.slow * env.control_dt)))
-    count = -(-episodes * env.max_steps // every)
-    shown = tqdm(_frames(env, movers, look, every, episodes, seed), "frames", count, disable=None)
-    return write_video(path, shown, 1 / (every * env.control_dt * look.slow))
+    bar = progress(-(-episodes * env.max_steps // every), "frame", "filming")
+
+    def shown() -> Iterator[Picture]:
+        for frame in _frames(env, movers, look, every, episodes, seed):
+            bar.update()
+            yield frame
+
+    try:
+        return write_video(path, shown(), 1 / (every * env.control_dt * look.slow))
+    finally:
+        bar.close()
 
 
 def camera_of(text: str | None, env: BatchedEnv) -> str | View | None:

@@ -61,10 +61,11 @@ class Nodes:
         env = session.env
         first = session.moment()
         self.offsets = offsets(env.num_envs, ROOM + float(np.ptp(first.positions[..., 0])))
+        """Where environments stand, [N, 3], m."""
         self._paths = Paths(env)
         self._shown = dict.fromkeys(PARTS, True)
         self._trailed = -1
-        """Where environments stand, [N, 3], m."""
+        """The step of the session up to which trails are drawn."""
         low = float(first.positions[..., 2].min()) - 0.1
         self._scene.add_grid(
             "/floor", 4.0, 4.0, position=(0, 0, low), cell_size=0.1, section_size=0.5, shadow_opacity=0.2
