@@ -118,8 +118,14 @@ def test_paths_that_do_not_fit_are_one_sentence() -> None:
         loops_and_lines(np.random.default_rng(0), 64, np.zeros(3), Level(0.02, 0.0, 0.1))
 
 
-@pytest.mark.parametrize("start", ["home", "random"])
-@pytest.mark.parametrize("draw", [walks, pytest.param(loops_and_lines, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("draw", "start"),
+    [
+        (walks, "random"),
+        *(pytest.param(draw, "home", marks=pytest.mark.slow) for draw in (walks, loops_and_lines)),
+        pytest.param(loops_and_lines, "random", marks=pytest.mark.slow),
+    ],
+)
 def test_arms_can_follow_their_paths_together(draw: object, start: str) -> None:
     """At ten times as many moments as were checked: in reach, within joint limits and speeds, and apart."""
     scene = load_scene("bimanual_psm")

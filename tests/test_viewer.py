@@ -63,7 +63,7 @@ def test_contacts_have_the_force_that_the_engine_says(session: Session) -> None:
 
 
 def test_a_path_passes_through_its_targets() -> None:
-    session = Session(Settings(task="follow_path", scene="bimanual_psm", seed=1), "zero")
+    session = Session(Settings(task="follow_path", scene="psm", seed=1, engine="mjx"), "zero")
     paths = Paths(session.env).read(session.env)
     assert paths is not None
     np.testing.assert_allclose(paths[:, 0], session.moment().marks, atol=1e-6)  # at the start, its first point
@@ -281,6 +281,7 @@ VIEW = ["view", "reach", "--scene", "psm"]
 def test_bad_input(argv: list[str], words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(argv) == 2
     out, err = capsys.readouterr()
-    assert not out and len(err.splitlines()) == 1
+    said = [line for line in err.splitlines() if not line.startswith("surgical-marl: compiling")]
+    assert not out and len(said) == 1
     for word in words:
-        assert word in err
+        assert word in said[0]
