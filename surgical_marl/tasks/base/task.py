@@ -81,6 +81,8 @@ class Task:
     levels: ClassVar[Mapping[str, Any]] = {"default": None}
     starts: ClassVar[tuple[str, ...]] = ("home",)
     """Allowed values of `Options.start`."""
+    starts_at: str = "home"
+    """The one of them that was chosen."""
     scenes: ClassVar[tuple[str, ...] | None] = None
     """Shipped scenes that it is meant for; None for all without objects. Others may do, too."""
     default_scene: ClassVar[str | None] = None
