@@ -8,8 +8,8 @@ Reward        per agent, each step, the terms and weights of `reach`.
 Success       tip within 2 mm of the reference point.
 Termination   none; an episode is truncated after 250 control steps (5 s), when the path is passed once.
 Randomisation cubic splines through random waypoints, half of them closed, sampled at equal arc length, from where the
-              tool tip is at the start. Each has its own speed, from half the greatest to the greatest, and turns by no more
-              than 4 rad/s. Paths are kept only if all arms can follow them together (`tasks/base/paths.py`). Arms
+              tool tip is at the start. Each has its own speed, from half the greatest to the greatest, and turns by no
+              more than 4 rad/s. Paths are kept only if all arms can follow them together (`tasks/base/paths.py`). Arms
               start at home, or with `start=random` with joints up to a quarter of their ranges from there.
 Difficulty    greatest speed, and distance from the start: easy 10 mm/s, 50 mm; default 20 mm/s, 50 mm; hard 30 mm/s,
               70 mm. Two arms' paths come within 20 mm of each other in no episode if easy, in a tenth by default, in

@@ -8,8 +8,8 @@ Success       tip within 2 mm of the target.
 Termination   none; an episode is truncated after 250 control steps (5 s).
 Randomisation targets rest at the tool tips at first. Then their velocities walk at random, as in the paper, but never
               faster than a greatest speed, and never further than a greatest distance from where they began. Walks are
-              kept only if all arms can follow them together (`surgical_marl/tasks/base/paths.py`). Arms start at home, or
-              with `start=random` with joints up to a quarter of their ranges from there.
+              kept only if all arms can follow them together (`surgical_marl/tasks/base/paths.py`). Arms start at home,
+              or with `start=random` with joints up to a quarter of their ranges from there.
 Difficulty    greatest speed and distance: easy 10 mm/s, 50 mm; default 20 mm/s, 50 mm; hard 30 mm/s, 70 mm. The ways of
               two arms' targets come within 20 mm of each other, at different times, in no episode if easy, in a tenth
               by default, in half if hard (where arms can meet at all).
