@@ -9,10 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
 
 from surgical_marl.learning.demonstrations import Demonstrations, _waits
-from surgical_marl.learning.imitation import RATE, imitate
+from surgical_marl.learning.imitation import RATE, ImitationLoss, imitate
 from surgical_marl.learning.trainer import Trainer
+from surgical_marl.policies.networks import MultiAgentActor, actor_config
 from surgical_marl.runs.environment import make_env
 from surgical_marl.runs.settings import ImitationSettings, NetworkSettings, OracleStatesSettings, Settings
 
@@ -119,6 +121,52 @@ def test_imitation_fits_the_actions_and_leaves_the_deviation(trainer: Trainer) -
         assert name not in deviation or torch.equal(weight, deviation[name])
 
 
+def test_the_loss_of_imitation_is_that_of_normal_distributions() -> None:
+    torch.manual_seed(0)
+    shown = TensorDict({"psm": torch.randn(1, 2, 5), "ecm": torch.randn(1, 1, 4)}, batch_size=[1])
+    config = actor_config(NetworkSettings(hidden=(8,), init_std=0.3))
+    actor = MultiAgentActor(shown, {"psm": 3, "ecm": 2}, **config)
+    pair: Any = SimpleNamespace(shown=shown, actions=torch.randn(1, 8))  # so that every draw is the same
+    loss = ImitationLoss(actor, pair, batch_size=4)
+    loss.weight.fill_(0.5)
+    with torch.no_grad():
+        mean = actor(shown)
+    normal = torch.distributions.Normal(mean, 0.3)
+    unlikely = (normal.log_prob(mean) - normal.log_prob(pair.actions))[0]
+    torch.testing.assert_close(loss(actor), 0.5 * unlikely.sum() / 3)
+    torch.testing.assert_close(loss(actor.alone("psm")), 0.5 * unlikely[:6].sum() / 2)
+    torch.testing.assert_close(loss(actor.alone("ecm")), 0.5 * unlikely[6:].sum())
+    loss(actor).backward()
+    learns = {name: weight.grad is not None for name, weight in actor.named_parameters()}
+    assert not any(learns[name] for name in learns if "distribution" in name)
+    assert all(learns[name] for name in learns if "distribution" not in name)
+
+
+@pytest.mark.parametrize("algo", ["mappo", "happo"])
+def test_imitation_goes_on_beside_learning_and_fades(trainer: Trainer, algo: str) -> None:
+    found = Demonstrations(SETTINGS, trainer.env.layout, "cpu")
+
+    def errors(weight: float) -> list[float]:
+        """Errors of the oracle's actions after each of four iterations."""
+        imitation = ImitationSettings(weight=weight, until=0.5, batch_size=1024)
+        settings = replace(SETTINGS, algo=algo, imitation=imitation, oracle_states=OracleStatesSettings())
+        settings = replace(settings, ppo=replace(settings.ppo, epochs=20))
+        learns, after = Trainer(settings, make_env(settings)), []
+        actor = learns.algorithm.actor
+        for _ in range(4):
+            learns.iterate()
+            shown = TensorDict(dict.fromkeys(actor.outputs, found.shown["psm"]), found.shown.batch_size)
+            with torch.no_grad():
+                after.append(float((actor(shown) - found.actions).square().mean()))
+            if learns.algorithm.imitation is not None:
+                after.append(float(learns.algorithm.imitation.weight))
+        return after
+
+    with_it, without = errors(10.0), errors(0.0)
+    assert with_it[1::2] == [10.0, 5.0, 0.0, 0.0]
+    assert with_it[2] < 0.7 * without[1]
+
+
 def test_the_critic_learns_alone_after_imitation() -> None:
     settings = replace(SETTINGS, imitation=ImitationSettings(steps=5, hold=2))
     trainer = Trainer(settings, make_env(settings))
@@ -158,13 +206,16 @@ def test_the_actors_first_steps_are_as_short_as_later_ones() -> None:
 
 
 def test_another_control_is_refused(trainer: Trainer) -> None:
-    with pytest.raises(ValueError, match=r"oracle_states.rate and imitation.steps must be 0 with control 'torque'"):
+    with pytest.raises(
+        ValueError, match=r"oracle_states.rate, imitation.steps and imitation.weight must be 0 with control 'torque'"
+    ):
         Demonstrations(replace(SETTINGS, control="torque"), trainer.env.layout, "cpu")
 
 
 def test_pictures_are_refused() -> None:
     seeing: Any = SimpleNamespace(pictures={"ecm": {"image": None}})
     with pytest.raises(
-        ValueError, match=r"oracle_states.rate and imitation.steps must be 0 where agents observe pictures"
+        ValueError,
+        match=r"oracle_states.rate, imitation.steps and imitation.weight must be 0 where agents observe pictures",
     ):
         Demonstrations(SETTINGS, seeing, "cpu")

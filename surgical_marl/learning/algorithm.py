@@ -8,7 +8,7 @@ one agent (A = 1) this is PPO, by the same code.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import torch
 from rsl_rl.algorithms import PPO
@@ -25,6 +25,9 @@ from surgical_marl.learning.values import ValueScale
 from surgical_marl.policies.layout import Grouping
 from surgical_marl.policies.networks import MultiAgentActor, MultiAgentModel, make_actor, make_model
 from surgical_marl.policies.recurrent import Memory
+
+if TYPE_CHECKING:
+    from surgical_marl.learning.imitation import ImitationLoss
 
 LOSSES = ("value_loss", "surrogate_loss", "entropy", "kl", "learning_rate")
 LEARNING_RATE_RANGE = (1e-5, 1e-2)  # rsl_rl's limits of the adaptive learning rate
@@ -56,6 +59,7 @@ class Algorithm(PPO):
         losses: `LOSSES` of the last update, `[5]`; always at the same place in memory.
         imitates: whether the actor has imitated demonstrations. Its observations are then normalised as those were:
             what it has learned would be lost if inputs were scaled anew, by what all environments see at the start.
+        imitation: a loss beside that of the networks that act, or None.
     """
 
     grouping: ClassVar[Grouping] = "type"
@@ -88,6 +92,7 @@ class Algorithm(PPO):
         self.optimizer = torch.optim.Adam(self.parameters(), lr=self._rate, fused=True, capturable=self._cuda)
         self.losses = torch.zeros(len(LOSSES), device=self.device)
         self.imitates = False
+        self.imitation: ImitationLoss | None = None
         # 0 while only the critic learns, 1 afterwards.
         self._acting = torch.ones((), device=self.device)
         # Sums over the mini-batches of an update, of all `LOSSES` but the learning rate.
@@ -142,8 +147,10 @@ class Algorithm(PPO):
         entropy = actor.output_entropy.mean()
         ratio = torch.exp(log_prob - batch.old_actions_log_prob)
         surrogate = -self.surrogate(ratio, batch.advantages).mean()
-        loss = self._acting * (surrogate - self.entropy_coef * entropy)
-        return loss, torch.stack([surrogate, entropy, divergence]).detach()
+        loss = surrogate - self.entropy_coef * entropy
+        if self.imitation is not None:
+            loss = loss + self.imitation(actor)
+        return self._acting * loss, torch.stack([surrogate, entropy, divergence]).detach()
 
     def surrogate(self, ratio: Tensor, advantages: Tensor) -> Tensor:
         """Return the surrogate objective of each action, `[..., A]`: here the clipped one of PPO.

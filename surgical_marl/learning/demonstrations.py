@@ -65,7 +65,7 @@ class Demonstrations:
     """
 
     def __init__(self, settings: Settings, layout: Layout, device: str) -> None:
-        neither = "oracle_states.rate and imitation.steps must be 0"
+        neither = "oracle_states.rate, imitation.steps and imitation.weight must be 0"
         if settings.control != "position":
             raise ValueError(f"{neither} with control {settings.control!r}: the oracle needs position")
         if any(layout.pictures.values()):

@@ -18,7 +18,7 @@ from surgical_marl.learning.constraint import METRICS
 from surgical_marl.learning.demonstrations import Demonstrations
 from surgical_marl.learning.episodes import ENDED, Episodes
 from surgical_marl.learning.graphs import Replayed
-from surgical_marl.learning.imitation import RATE, imitate
+from surgical_marl.learning.imitation import RATE, ImitationLoss, imitate
 from surgical_marl.plugins.algorithms import ALGORITHMS
 from surgical_marl.runs.settings import Settings
 
@@ -97,9 +97,13 @@ class Trainer:
         self._stop = torch.zeros(1, device=device)
         self._marks = torch.zeros(len(self._names["observations"]) + len(self._names["values"]), device=device)
         self._values = torch.zeros(sum(map(len, self._names.values())), device=device)
-        wanted = settings.oracle_states.rate > 0 or settings.imitation.steps > 0
+        imitation = settings.imitation
+        wanted = settings.oracle_states.rate > 0 or imitation.steps > 0 or imitation.weight > 0
         self._demonstrations = Demonstrations(settings, self.env.layout, device) if wanted else None
-        self.algorithm.imitates = settings.imitation.steps > 0
+        self.algorithm.imitates = imitation.steps > 0
+        if self._demonstrations is not None and imitation.weight > 0:
+            actor = self.algorithm.actor
+            self.algorithm.imitation = ImitationLoss(actor, self._demonstrations, imitation.batch_size)
         self._samples = settings.steps_per_iteration * env.num_envs * distributed.size()
         self._read = 0.0
         self.rollout = Replayed(self._rollout, enabled=self._cuda and self.env.capturable)
@@ -132,6 +136,8 @@ class Trainer:
     def _imitate(self) -> None:
         """Let the actor imitate the oracle before the first iteration, and then the critic learn first."""
         asked = self.settings.imitation
+        if self.algorithm.imitation is not None:
+            self.algorithm.imitation.weight.fill_(asked.weight * self._fading(asked.until))
         if self._demonstrations is None or not asked.steps:
             return
         if self.iteration == 0:
@@ -145,8 +151,7 @@ class Trainer:
     def _place(self) -> None:
         """Let some environments go on from states of the oracle, as the settings say."""
         asked, demonstrations = self.settings.oracle_states, self._demonstrations
-        fading = max(0.0, 1.0 - self.iteration / (asked.until * self.settings.iterations))
-        share = asked.rate * fading * self.settings.steps_per_iteration / self.env.max_episode_length
+        share = asked.rate * self._fading(asked.until) * self.settings.steps_per_iteration / self.env.max_episode_length
         count = round(min(share, 1.0) * self.env.num_envs)
         if demonstrations is None or not count:
             return
@@ -162,6 +167,10 @@ class Trainer:
         if self.algorithm.constraint is not None:
             self.algorithm.constraint.broken &= ~moved
         self.episodes.move(moved)
+
+    def _fading(self, until: float) -> float:
+        """Return 1 in the first iteration, and 0 after this share of all iterations."""
+        return max(0.0, 1.0 - self.iteration / (until * self.settings.iterations))
 
     def close(self) -> None:
         """Release the CUDA graphs."""

@@ -69,10 +69,12 @@ class OracleStatesSettings(Checked):
 
 @dataclass(frozen=True)
 class ImitationSettings(Checked):
-    """Imitation of the oracle's actions before the first iteration (see `learning/imitation.py`).
+    """Imitation of the oracle's actions, before the first iteration and beside learning (see `learning/imitation.py`).
 
-    steps: gradient steps; 0 for none. batch_size: pairs of observation and action in each of them. hold: iterations in
-    which only the critic learns then, because what it says before would spoil what was imitated.
+    steps: gradient steps before the first iteration; 0 for none. batch_size: pairs of observation and action in each of
+    them. hold: iterations in which only the critic learns then, because what it says before would spoil what was
+    imitated. weight: of the imitation's loss in the loss of every mini-batch after that, at first. until: the share of
+    the run's iterations by which that has fallen to nothing, in a straight line.
     """
 
     prefix: ClassVar[str] = "imitation."
@@ -80,6 +82,8 @@ class ImitationSettings(Checked):
     steps: int = number(0, 0, 1_000_000)
     batch_size: int = number(1024, 1, 1_000_000)
     hold: int = number(10, 0, 1_000_000)
+    weight: float = number(0.0, 0.0, 1000.0)
+    until: float = number(1.0, 0.001, 1.0)
 
 
 @dataclass(frozen=True)
@@ -141,11 +145,13 @@ class Settings(Options):
                 "ppo.mini_batches must be at most num_envs * steps_per_iteration "
                 f"= {samples}, not {self.ppo.mini_batches}"
             )
-        if self.network.recurrent != "none" and self.imitation.steps:
-            raise ValueError(
-                f"imitation.steps must be 0 with network.recurrent {self.network.recurrent!r}, "
-                f"not {self.imitation.steps}: single steps are imitated"
-            )
+        for name in ("steps", "weight"):
+            value = getattr(self.imitation, name)
+            if self.network.recurrent != "none" and value:
+                raise ValueError(
+                    f"imitation.{name} must be 0 with network.recurrent {self.network.recurrent!r}, "
+                    f"not {value}: single steps are imitated"
+                )
         if self.network.recurrent != "none" and self.ppo.mini_batches > self.num_envs:
             raise ValueError(
                 f"ppo.mini_batches must be at most num_envs = {self.num_envs} with network.recurrent, "
