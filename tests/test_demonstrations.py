@@ -22,6 +22,7 @@ SETTINGS = Settings(
     task="reach", scene="psm", num_envs=64, iterations=4, steps_per_iteration=4, device="cpu",
     oracle_states=OracleStatesSettings(rate=12.5, until=0.5), network=NetworkSettings(hidden=(8,)),
 )  # fmt: skip
+NEITHER = "oracle_states.rate, imitation.steps and imitation.weight must be 0 "
 
 
 @pytest.fixture(scope="module")

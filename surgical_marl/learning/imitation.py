@@ -69,7 +69,7 @@ class ImitationLoss:
         self._shown, self._batch_size = demonstrations.shown, batch_size
 
     def __call__(self, actor: MultiAgentActor) -> Tensor:
-        """Return the weighted loss `[]`: half the square of errors in standard deviations, summed over an agent's action.
+        """Return the weighted loss `[]`: half of squared errors, in standard deviations, summed over an agent's action.
 
         Args:
             actor: all networks, or those of some groups of agents.
