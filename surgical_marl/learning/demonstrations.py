@@ -128,6 +128,8 @@ def _record(env: BatchedEnv) -> dict[str, np.ndarray]:
         solved = np.where((solved < 0) & success & goes_on, step, solved)
         bar.set_postfix_str(f"{(solved >= 0).mean():.0%} solved", refresh=False)
         bar.update()
+        if not (goes_on & ((solved < 0) | (step < solved + BEYOND))).any():
+            break
     bar.close()
     found = {}
     for kind, (numbers, steps) in ((kind, np.concatenate(places[kind], 1)) for kind in shapes):
