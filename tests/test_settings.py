@@ -87,6 +87,22 @@ def test_a_difficulty_has_settings_of_its_own(reach: Callable[[str], None]) -> N
         asked("psm", "difficulty=hard")
 
 
+def test_a_start_has_settings_of_its_own(reach: Callable[[str], None]) -> None:
+    reach(
+        "num_envs: 8\nstarts: {random: {num_envs: 64, ppo: {gamma: 0.9}, cuda: {num_envs: 256}}}\n"
+        "scenes: {psm: {num_envs: 16, iterations: 3}}\n"
+    )
+
+    def asked(*overrides: str) -> tuple[int, int, float]:
+        settings = load_config("reach", "psm", ["device=cpu", *overrides])
+        return settings.num_envs, settings.iterations, settings.ppo.gamma
+
+    assert asked() == (16, 3, 0.99)
+    assert asked("start=random") == (64, 3, 0.9)
+    assert asked("start=random", "device=cuda") == (256, 3, 0.9)
+    assert asked("start=random", "num_envs=5") == (5, 3, 0.9)
+
+
 def test_the_shipped_settings_load() -> None:
     settings = load_config("reach", "bimanual_psm")
     assert settings.network == NetworkSettings()

@@ -100,8 +100,11 @@ class Demonstrations:
 def _record(env: BatchedEnv) -> dict[str, np.ndarray]:
     """Return `states` [STATES, columns] and `pairs` [n, columns] float32, with the columns that `_shapes` names.
 
-    Both are of episodes in which the oracle succeeded.
+    Both are of episodes in which the oracle succeeded: up to `BEYOND` steps later, and all of those whose targets move,
+    in which nobody waits.
     """
+    follows = env.task.follows
+    beyond = env.max_steps if follows else BEYOND
     policy, rng = oracle(env), np.random.default_rng(0)
     observations, state, _ = env.reset(seed=0)
     goes_on, solved = np.ones(env.num_envs, bool), np.full(env.num_envs, -1)
@@ -119,7 +122,7 @@ def _record(env: BatchedEnv) -> dict[str, np.ndarray]:
         actions = {agent: np.clip(action, -1.0, 1.0) for agent, action in policy(observations).items()}
         if step and step % EVERY == 0:
             keep("states", step, goes_on, {**env.carry(), **observations, "state": state})
-        moves = (solved >= 0) | ~_waits(env, actions, observations)
+        moves = follows | (solved >= 0) | ~_waits(env, actions, observations)
         keep("pairs", step, goes_on & moves, {**observations, **{f"action of {a}": x for a, x in actions.items()}})
         result = env.step(disturbance.added(actions))
         observations, state = result.observations, result.state
@@ -128,12 +131,12 @@ def _record(env: BatchedEnv) -> dict[str, np.ndarray]:
         solved = np.where((solved < 0) & success & goes_on, step, solved)
         bar.set_postfix_str(f"{(solved >= 0).mean():.0%} solved", refresh=False)
         bar.update()
-        if not (goes_on & ((solved < 0) | (step < solved + BEYOND))).any():
+        if not (goes_on & ((solved < 0) | (step < solved + beyond))).any():
             break
     bar.close()
     found = {}
     for kind, (numbers, steps) in ((kind, np.concatenate(places[kind], 1)) for kind in shapes):
-        useful = np.flatnonzero((solved[numbers] >= 0) & (steps <= solved[numbers] + BEYOND))
+        useful = np.flatnonzero((solved[numbers] >= 0) & (steps <= solved[numbers] + beyond))
         chosen = rng.choice(useful, STATES) if kind == "states" and len(useful) else useful
         found[kind] = np.concatenate(rows[kind])[chosen]
     return found
@@ -189,7 +192,7 @@ def _shapes(env: BatchedEnv) -> dict[str, dict[str, tuple[int, ...]]]:
 
 def _joined(parts: Sequence[np.ndarray], rows: np.ndarray) -> np.ndarray:
     """Return some rows of parts [N, ...] side by side, float32, which holds all whole numbers in them."""
-    return np.concatenate([part[rows].reshape(len(rows), -1) for part in parts], 1, dtype=np.float32)
+    return np.concatenate([part.reshape(len(part), -1)[rows] for part in parts], 1, dtype=np.float32)
 
 
 def _cut(rows: np.ndarray, shapes: Mapping[str, tuple[int, ...]]) -> Iterator[tuple[str, np.ndarray]]:

@@ -51,22 +51,19 @@ class ImitationLoss:
     """How unlikely the oracle's actions are, as a loss beside that of reinforcement learning.
 
     It keeps an actor from forgetting states that it seldom comes to (A. Rajeswaran et al., 2018, arXiv 1709.10087,
-    equation 3, with a weight that falls in a straight line). Standard deviations do not learn from it.
+    equation 3, with a weight that stays the same). Standard deviations do not learn from it.
 
     Args:
         actor: all networks that act.
         demonstrations: on the actor's device.
         batch_size: pairs of observation and action, drawn at each call.
-
-    Attributes:
-        weight: of the loss, `[]`, on the device.
+        weight: of the loss.
     """
 
-    def __init__(self, actor: MultiAgentActor, demonstrations: Demonstrations, batch_size: int) -> None:
-        self.weight = torch.zeros((), device=demonstrations.actions.device)
+    def __init__(self, actor: MultiAgentActor, demonstrations: Demonstrations, batch_size: int, weight: float) -> None:
         widths = [actor.counts[group] * width for group, width in actor.outputs.items()]
         self._actions = dict(zip(actor.outputs, demonstrations.actions.split(widths, -1), strict=True))
-        self._shown, self._batch_size = demonstrations.shown, batch_size
+        self._shown, self._batch_size, self._weight = demonstrations.shown, batch_size, weight
 
     def __call__(self, actor: MultiAgentActor) -> Tensor:
         """Return the weighted loss `[]`: half of squared errors, in standard deviations, summed over an agent's action.
@@ -74,9 +71,9 @@ class ImitationLoss:
         Args:
             actor: all networks, or those of some groups of agents.
         """
-        chosen = torch.randint(len(self._shown), (self._batch_size,), device=self.weight.device)
+        chosen = torch.randint(len(self._shown), (self._batch_size,), device=self._shown.device)
         actor.distribute(self._shown[chosen])
         mean, deviation = actor.output_distribution_params
         wanted = torch.cat([self._actions[group][chosen] for group in actor.outputs], -1)
         errors = ((wanted - mean) / deviation.detach()).square()
-        return self.weight * errors.sum(-1).mean() / (2 * sum(actor.counts.values()))
+        return self._weight * errors.sum(-1).mean() / (2 * sum(actor.counts.values()))

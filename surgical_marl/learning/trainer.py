@@ -102,8 +102,8 @@ class Trainer:
         self._demonstrations = Demonstrations(settings, self.env.layout, device) if wanted else None
         self.algorithm.imitates = imitation.steps > 0
         if self._demonstrations is not None and imitation.weight > 0:
-            actor = self.algorithm.actor
-            self.algorithm.imitation = ImitationLoss(actor, self._demonstrations, imitation.batch_size)
+            shown, batch_size, weight = self._demonstrations, imitation.batch_size, imitation.weight
+            self.algorithm.imitation = ImitationLoss(self.algorithm.actor, shown, batch_size, weight)
         self._samples = settings.steps_per_iteration * env.num_envs * distributed.size()
         self._read = 0.0
         self.rollout = Replayed(self._rollout, enabled=self._cuda and self.env.capturable)
@@ -136,8 +136,6 @@ class Trainer:
     def _imitate(self) -> None:
         """Let the actor imitate the oracle before the first iteration, and then the critic learn first."""
         asked = self.settings.imitation
-        if self.algorithm.imitation is not None:
-            self.algorithm.imitation.weight.fill_(asked.weight * self._fading(asked.until))
         if self._demonstrations is None or not asked.steps:
             return
         if self.iteration == 0:
@@ -151,7 +149,8 @@ class Trainer:
     def _place(self) -> None:
         """Let some environments go on from states of the oracle, as the settings say."""
         asked, demonstrations = self.settings.oracle_states, self._demonstrations
-        share = asked.rate * self._fading(asked.until) * self.settings.steps_per_iteration / self.env.max_episode_length
+        fading = max(0.0, 1.0 - self.iteration / (asked.until * self.settings.iterations))
+        share = asked.rate * fading * self.settings.steps_per_iteration / self.env.max_episode_length
         count = round(min(share, 1.0) * self.env.num_envs)
         if demonstrations is None or not count:
             return
@@ -167,10 +166,6 @@ class Trainer:
         if self.algorithm.constraint is not None:
             self.algorithm.constraint.broken &= ~moved
         self.episodes.move(moved)
-
-    def _fading(self, until: float) -> float:
-        """Return 1 in the first iteration, and 0 after this share of all iterations."""
-        return max(0.0, 1.0 - self.iteration / (until * self.settings.iterations))
 
     def close(self) -> None:
         """Release the CUDA graphs."""

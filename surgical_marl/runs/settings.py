@@ -73,8 +73,7 @@ class ImitationSettings(Checked):
 
     steps: gradient steps before the first iteration; 0 for none. batch_size: pairs of observation and action in each of
     them. hold: iterations in which only the critic learns then, because what it says before would spoil what was
-    imitated. weight: of the imitation's loss in the loss of every mini-batch after that, at first. until: the share of
-    the run's iterations by which that has fallen to nothing, in a straight line.
+    imitated. weight: of the imitation's loss in the loss of every mini-batch after that.
     """
 
     prefix: ClassVar[str] = "imitation."
@@ -83,7 +82,6 @@ class ImitationSettings(Checked):
     batch_size: int = number(1024, 1, 1_000_000)
     hold: int = number(10, 0, 1_000_000)
     weight: float = number(0.0, 0.0, 1000.0)
-    until: float = number(1.0, 0.001, 1.0)
 
 
 @dataclass(frozen=True)
@@ -167,9 +165,10 @@ def load_config(task: str, scene: str, overrides: Iterable[str] = ()) -> Setting
     1. the task's file
     2. the section of the difficulty under `difficulties` in that file
     3. the section of the scene under `scenes` in that file
-    4. the overrides
+    4. the section of where episodes start under `starts` in that file
+    5. the overrides
 
-    On a GPU each of the first three is followed by the section `cuda` in it.
+    On a GPU each of the first four is followed by the section `cuda` in it.
 
     Args:
         task: a name of `list_tasks()`. Its file is the one of that name in `configs/`, if there is one.
@@ -182,12 +181,15 @@ def load_config(task: str, scene: str, overrides: Iterable[str] = ()) -> Setting
     """
     TASKS.check(task)
     values, overrides = _read_task(task), list(overrides)
-    scenes, difficulties = (as_mapping(name, values.pop(name, None) or {}) for name in ("scenes", "difficulties"))
-    difficulty = str(_override(values, overrides).get("difficulty", "default"))
+    kinds = ("scenes", "difficulties", "starts")
+    scenes, difficulties, starts = (as_mapping(name, values.pop(name, None) or {}) for name in kinds)
+    asked = _override(values, overrides)
+    difficulty, start = str(asked.get("difficulty", "default")), str(asked.get("start", "home"))
     parts = {
         "": values,
         f"difficulties.{difficulty}": difficulties.get(difficulty) or {},
         f"scenes.{scene}": scenes.get(scene) or {},
+        f"starts.{start}": starts.get(start) or {},
     }
     layers, on_gpu = [], []
     for name, part in parts.items():
