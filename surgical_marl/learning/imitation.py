@@ -64,6 +64,7 @@ class ImitationLoss:
         widths = [actor.counts[group] * width for group, width in actor.outputs.items()]
         self._actions = dict(zip(actor.outputs, demonstrations.actions.split(widths, -1), strict=True))
         self._shown, self._batch_size, self._weight = demonstrations.shown, batch_size, weight
+        self._device = demonstrations.actions.device
 
     def __call__(self, actor: MultiAgentActor) -> Tensor:
         """Return the weighted loss `[]`: half of squared errors, in standard deviations, summed over an agent's action.
@@ -71,7 +72,7 @@ class ImitationLoss:
         Args:
             actor: all networks, or those of some groups of agents.
         """
-        chosen = torch.randint(len(self._shown), (self._batch_size,), device=self._shown.device)
+        chosen = torch.randint(len(self._shown), (self._batch_size,), device=self._device)
         actor.distribute(self._shown[chosen])
         mean, deviation = actor.output_distribution_params
         wanted = torch.cat([self._actions[group][chosen] for group in actor.outputs], -1)
