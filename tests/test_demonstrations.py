@@ -87,7 +87,10 @@ def test_waiting_is_not_shown(trainer: Trainer) -> None:
     actions = np.zeros((4, 7), np.float32)
     actions[:, -1] = [-1.0, 1.0, -1.0, -1.0]
     actions[2, 0] = 0.5
-    assert _waits(env, {"psm_0": actions}, observations).tolist() == [True, False, False, True]
+    opens = {"psm_0": np.ones((4, 7), np.float32)}
+    assert _waits(env, {"psm_0": actions}, {"psm_0": actions}, observations).tolist() == [True, False, False, True]
+    closes = {"psm_0": -opens["psm_0"]}  # a jaw that opens after it closed is kept where it is
+    assert _waits(env, {"psm_0": actions}, closes, observations).tolist() == [True, True, False, True]
 
 
 def test_what_is_shown_leads_to_the_target(trainer: Trainer) -> None:

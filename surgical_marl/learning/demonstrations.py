@@ -109,6 +109,7 @@ def _record(env: BatchedEnv) -> dict[str, np.ndarray]:
     observations, state, _ = env.reset(seed=0)
     goes_on, solved = np.ones(env.num_envs, bool), np.full(env.num_envs, -1)
     disturbance, shapes = _Disturbance(env, rng), _shapes(env)
+    before: Mapping[str, np.ndarray] = {}
     rows: dict[str, list[np.ndarray]] = {kind: [] for kind in shapes}
     places: dict[str, list[np.ndarray]] = {kind: [] for kind in shapes}
 
@@ -122,9 +123,9 @@ def _record(env: BatchedEnv) -> dict[str, np.ndarray]:
         actions = {agent: np.clip(action, -1.0, 1.0) for agent, action in policy(observations).items()}
         if step and step % EVERY == 0:
             keep("states", step, goes_on, {**env.carry(), **observations, "state": state})
-        moves = follows | (solved >= 0) | ~_waits(env, actions, observations)
+        moves = follows | (solved >= 0) | ~_waits(env, actions, before or actions, observations)
         keep("pairs", step, goes_on & moves, {**observations, **{f"action of {a}": x for a, x in actions.items()}})
-        result = env.step(disturbance.added(actions))
+        result, before = env.step(disturbance.added(actions)), actions
         observations, state = result.observations, result.state
         goes_on &= ~(result.terminated | result.truncated)
         success = np.all([result.infos[agent]["success"] for agent in env.agents], axis=0)
@@ -161,10 +162,23 @@ class _Disturbance:
         return found
 
 
-def _waits(env: BatchedEnv, actions: Mapping[str, np.ndarray], observations: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return whether the oracle waits, [N]: no joint moves, and jaws are commanded to where they are commanded already.
+def _waits(
+    env: BatchedEnv,
+    actions: Mapping[str, np.ndarray],
+    before: Mapping[str, np.ndarray],
+    observations: Mapping[str, np.ndarray],
+) -> np.ndarray:
+    """Return whether the oracle waits, [N]: no joint moves, and no jaw does.
 
-    Imitated, such a pair would have an arm wait forever, because what it observes does not change.
+    A jaw does not move at the end of its way. Neither does it where the oracle keeps it half open, by opening and
+    closing it in turn. Imitated, a pair of waiting would have an arm wait forever, because what it observes does not
+    change.
+
+    Args:
+        env: the environments.
+        actions: of the oracle, [N, n] by agent.
+        before: its actions in the step before.
+        observations: [N, d] by agent.
     """
     waits = np.ones(env.num_envs, bool)
     for agent, whole in actions.items():
@@ -175,7 +189,8 @@ def _waits(env: BatchedEnv, actions: Mapping[str, np.ndarray], observations: Map
             own = env.restated({agent: observations[agent]}, "si")[agent]
             command = own[:, env.observation_terms(agent)["command"]][:, jaw]
             ends = np.where(action[:, jaw] > 0, arm.jaw.open, arm.jaw.closed)
-            waits &= (np.abs(ends - command) < 1e-3).all(-1)
+            turns = (action[:, jaw] > 0) != (before[agent][:, : len(jaw)][:, jaw] > 0)
+            waits &= ((np.abs(ends - command) < 1e-3) | turns).all(-1)
     return waits
 
 
