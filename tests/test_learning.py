@@ -55,7 +55,15 @@ def weights(run: Path) -> dict[str, torch.Tensor]:
 
 
 def without_time(rows: list[dict[str, float]]) -> str:
-    return str([{k: v for k, v in row.items() if k not in ("seconds", "steps_per_s")} for row in rows])
+    return str([{k: v for k, v in row.items() if not k.startswith(("seconds", "steps_per_s"))} for row in rows])
+
+
+def test_an_iterations_time_is_split(tmp_path: Path, fakes: list[Any]) -> None:
+    train.train(replace(SMALL, iterations=2), out=tmp_path / "run")
+    for row in read_metrics(tmp_path / "run"):
+        assert row["seconds_rollout"] > 0
+        assert row["seconds_update"] > 0
+        assert row["seconds_rollout"] + row["seconds_update"] <= row["seconds"]
 
 
 @pytest.mark.parametrize("algo", list_algorithms())

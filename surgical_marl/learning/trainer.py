@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
@@ -19,6 +20,7 @@ from surgical_marl.learning.demonstrations import Demonstrations
 from surgical_marl.learning.episodes import ENDED, Episodes
 from surgical_marl.learning.graphs import Replayed
 from surgical_marl.learning.imitation import RATE, ImitationLoss, imitate
+from surgical_marl.learning.stopwatch import Mark, mark, seconds_between
 from surgical_marl.plugins.algorithms import ALGORITHMS
 from surgical_marl.runs.settings import Settings
 
@@ -28,6 +30,10 @@ if TYPE_CHECKING:
 
 OWN = ("env", "collided", "random", "random_cuda")
 """Parts of `Trainer.state` that belong to one process alone: of its environments, and its random numbers."""
+
+
+PARTS = ("seconds_rollout", "seconds_update")
+"""Columns of metrics with the parts of an iteration."""
 
 
 class Report(NamedTuple):
@@ -40,6 +46,8 @@ class Report(NamedTuple):
     """On the host: once `arrived`."""
     arrived: torch.cuda.Event | None
     """None where nothing has to arrive."""
+    marks: Sequence[Mark]
+    """Before the rollout, between it and the update, and after both."""
 
 
 class Trainer:
@@ -121,17 +129,20 @@ class Trainer:
         started = time.perf_counter()
         self._imitate()
         self._place()
+        marks = [mark(self._cuda)]
         self.rollout()
+        marks.append(mark(self._cuda))
         self._stop.fill_(self.stop_wanted)
         self.update()
+        marks.append(mark(self._cuda))
         self.iteration += 1
         self.env_steps += self._samples
         if not self._cuda:
-            return Report(self.iteration, self.env_steps, started, self._values.clone(), None)
+            return Report(self.iteration, self.env_steps, started, self._values.clone(), None, marks)
         host = torch.empty(self._values.shape, pin_memory=True).copy_(self._values, non_blocking=True)
         arrived = torch.cuda.Event()
         arrived.record()
-        return Report(self.iteration, self.env_steps, started, host, arrived)
+        return Report(self.iteration, self.env_steps, started, host, arrived, marks)
 
     def _imitate(self) -> None:
         """Let the actor imitate the oracle before the first iteration, and then the critic learn first."""
@@ -177,7 +188,7 @@ class Trainer:
     def columns(self) -> tuple[str, ...]:
         """Names of what `row` returns."""
         return (
-            *("iteration", "env_steps", "seconds", "steps_per_s"),
+            *("iteration", "env_steps", "seconds", *PARTS, "steps_per_s"),
             *("reward", *self.env.reward_terms),
             *("episodes", "tip_error_mm", "success_rate", "collision_rate"),
             *self._bounded,
@@ -204,12 +215,14 @@ class Trainer:
         self._read = now
         ended, steps = sums["episodes"], self.settings.steps_per_iteration * distributed.size()
         share = 1 / ended["episodes"] if ended["episodes"] else math.nan
+        parts = [seconds_between(*marks) for marks in pairwise(report.marks)]
         row = {
             **ended,
             **means,
             "iteration": report.iteration,
             "env_steps": report.env_steps,
             "seconds": seconds,
+            **dict(zip(PARTS, parts, strict=True)),
             "steps_per_s": self._samples / seconds,
             **{name: value / steps for name, value in sums["rewards"].items()},
             "tip_error_mm": 1000 * ended["error"] * share,

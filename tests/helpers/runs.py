@@ -79,7 +79,9 @@ def _same(first: Any, second: Any) -> bool:
 
 
 def _metrics(run: Path) -> str:
-    return str([{k: v for k, v in row.items() if k not in ("seconds", "steps_per_s")} for row in read_metrics(run)])
+    return str(
+        [{k: v for k, v in row.items() if not k.startswith(("seconds", "steps_per_s"))} for row in read_metrics(run)]
+    )
 
 
 def _kill() -> None:
