@@ -27,13 +27,13 @@ from typing import NamedTuple
 
 from surgical_marl.content import content_dir, unknown
 from surgical_marl.plugins.tasks import list_tasks, scenes_for
-from surgical_marl.runs.settings import own_levels
+from surgical_marl.runs.settings import own_sections
 from surgical_marl.runtime import defer_compiler
 
 PLACES = {
     f"{task}-{scene}{end}": (task, scene, level)
     for task in list_tasks()
-    for levels in [(("", "default"), *((f"-{level}", level) for level in own_levels(task)))]
+    for levels in [(("", "default"), *((f"-{level}", level) for level in own_sections(task, "difficulties")))]
     for scene in scenes_for(task)
     for end, level in levels
 }
@@ -103,7 +103,10 @@ def _jobs(name: str, arguments: argparse.Namespace, overrides: Sequence[str]) ->
         return []
     runs = {seed: folder / f"seed{seed}" for seed in arguments.seeds}
     task, scene, difficulty = PLACES[name]
-    own = [*([f"difficulty={difficulty}"] if difficulty != "default" else []), *overrides]
+    at_level = [] if difficulty == "default" else [f"difficulty={difficulty}"]
+    # A policy that is ready for more starts is of more use.
+    anywhere = [] if at_level else [f"start={start}" for start in own_sections(task, "starts")]
+    own = [*at_level, *anywhere, *overrides]
     trainings = [
         Job(name, path.name, train, (task, scene, path, [f"seed={seed}", *own]), folder / f"{path.name}.log")
         for seed, path in runs.items()

@@ -41,7 +41,8 @@ def test_every_task_and_scene_has_a_policy_and_those_that_ship_are_left_alone(sc
     assert known <= script.PLACES.keys()
     arguments = argparse.Namespace(out=tmp_path, runs=tmp_path / "runs", seeds=[0, 3])
     first, second, last = script._jobs("track-psm", arguments, ["num_envs=64"])
-    assert first.arguments == ("track", "psm", tmp_path / "runs" / "track-psm" / "seed0", ["seed=0", "num_envs=64"])
+    asked = ["seed=0", "start=random", "num_envs=64"]
+    assert first.arguments == ("track", "psm", tmp_path / "runs" / "track-psm" / "seed0", asked)
     assert second.what == "seed3" and not second.needs
     (crossing, *_) = script._jobs("reach-bimanual_psm-crossing", arguments, [])
     assert crossing.arguments[3] == ["seed=0", "difficulty=crossing"]

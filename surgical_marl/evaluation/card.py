@@ -157,7 +157,8 @@ def _how_trained(folder: Path, settings: Settings) -> str:
     last, notes = _training(folder), read_origin(folder)
     device, commit, started = (notes["origin"].get(key) or "unknown" for key in ("device", "commit", "started"))
     level = "" if settings.difficulty == "default" else f" --difficulty {settings.difficulty}"
-    command = f"surgical-marl train {settings.task} --scene {settings.scene}{level} --seed {settings.seed}"
+    start = "" if settings.start == "home" else f" --start {settings.start}"
+    command = f"surgical-marl train {settings.task} --scene {settings.scene}{level}{start} --seed {settings.seed}"
     steps = f"{last['env_steps']:,.0f} environment steps in {last['seconds']:,.0f} s of rollouts and updates"
     iterations = f"{last['iteration']:,.0f}"
     if last["iteration"] < settings.iterations:
@@ -181,9 +182,10 @@ def _imitation(settings: Settings, iterations: float) -> str:
     if not asked.steps:
         return ""
     alone = "all" if asked.hold >= iterations else f"the first {asked.hold:,}"
+    beside = f" Imitation went on beside learning, with weight {asked.weight:g}." if asked.weight else ""
     return (
         f"- Imitation of {settings.oracle_episodes:,} episodes of the oracle first, {asked.steps:,} steps of "
-        f"{asked.batch_size:,} pairs. In {alone} iterations only the critic learned then.\n"
+        f"{asked.batch_size:,} pairs. In {alone} iterations only the critic learned then.{beside}\n"
     )
 
 

@@ -205,9 +205,9 @@ def load_config(task: str, scene: str, overrides: Iterable[str] = ()) -> Setting
     return settings
 
 
-def own_levels(task: str) -> list[str]:
-    """Return the levels of difficulty for which a task's file has settings of their own."""
-    return list(as_mapping("difficulties", _read_task(task).get("difficulties") or {}))
+def own_sections(task: str, kind: str) -> list[str]:
+    """Return the names for which a task's file has settings of their own, of the kind "difficulties" or "starts"."""
+    return list(as_mapping(kind, _read_task(task).get(kind) or {}))
 
 
 def read_config(path: Path, overrides: Iterable[str] = ()) -> Settings:
