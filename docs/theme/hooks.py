@@ -47,7 +47,8 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
             return text
         link = posixpath.relpath(found, posixpath.dirname(here) or ".")
         if link.endswith(".mp4"):
-            return f'<video src="{link}" title="{text}" controls loop muted playsinline preload="metadata"></video>'
+            title = text.replace("`", "")
+            return f'<video src="{link}" title="{title}" controls loop muted playsinline preload="metadata"></video>'
         return f"{mark}[{text}]({link}{hash_}{anchor})"
 
     return LINK.sub(site_link, markdown)

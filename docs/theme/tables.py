@@ -2,8 +2,8 @@
 
     python docs/theme/tables.py
 
-A table stands between `<!-- table: NAME -->` and `<!-- end of table -->`. A picture in docs/gallery/<kind>/<name>.png is
-shown in the row of its arm, object, scene or task. `tests/test_docs_tables.py` holds the pages to the content.
+A table stands between `<!-- table: NAME -->` and `<!-- end of table -->`. A picture in docs/gallery/<kind>/<name>.png
+is shown in the row of its arm, object, scene or task. `tests/test_site.py` holds the pages to the content.
 """
 
 from __future__ import annotations
