@@ -5,16 +5,14 @@ if (location.protocol === "file:") {
       super()
       const frame = document.createElement("iframe")
       frame.hidden = true
-      frame.srcdoc = `<script>postMessage = data => parent.postMessage(data, "*")</script><script src="${url}"></script>`
-      this.frame = new Promise(ready => frame.addEventListener("load", () => ready(frame.contentWindow)))
-      addEventListener("message", event => {
-        if (event.source === frame.contentWindow) this.dispatchEvent(new MessageEvent("message", { data: event.data }))
-      })
+      frame.srcdoc = `<script>postMessage = data => frameElement.answer(data)</script><script src="${url}"></script>`
+      frame.answer = data => this.dispatchEvent(new MessageEvent("message", { data }))
+      this.ready = new Promise(done => frame.addEventListener("load", () => done(frame.contentWindow)))
       document.body.append(frame)
     }
 
     postMessage(data) {
-      this.frame.then(frame => frame.postMessage(data, "*"))
+      this.ready.then(frame => frame.dispatchEvent(new MessageEvent("message", { data })))
     }
   }
 }
