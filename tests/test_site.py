@@ -73,6 +73,16 @@ def test_the_reference_describes_every_public_name() -> None:
         assert getattr(importlib.import_module(module), last).__doc__, name
 
 
+def test_the_readmes_speeds_are_those_of_the_benchmarks() -> None:
+    """Other tables are of policies: their cards."""
+    _, _, rest = (ROOT / "README.md").read_text(encoding="utf-8").partition("## Speed")
+    rows = [row for row in rest.partition("##")[0].splitlines() if row.startswith("|")][2:]
+    figures = [figure for row in rows for figure in re.findall(r"\d[\d,.]*\d", row.split("|")[4])]
+    measured = (ROOT / "docs" / "benchmarks.md").read_text(encoding="utf-8")
+    assert len(figures) >= len(rows) > 5
+    assert not [figure for figure in figures if figure not in measured]
+
+
 def test_every_algorithm_has_its_place_in_the_page() -> None:
     text = (ROOT / "docs" / "algorithms.md").read_text(encoding="utf-8")
     shipped = [path.stem for path in (ROOT / "surgical_marl" / "learning" / "algorithms").glob("[!_]*.py")]
