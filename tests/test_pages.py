@@ -58,21 +58,23 @@ def held(scene: str) -> set[str]:
     return {placement.object.name for placement in load_scene(scene).objects.values()}
 
 
-def make_env(task: str, scene: str, **options: Any) -> Any:
-    """Return an environment if it is quick to make and nobody has to compile one for it; else only check it."""
-    chosen = {key: value for key, value in options.items() if value is not None}
-    if (task, scene) in QUICK and set(chosen) <= {"goals"}:
-        return Env(task, scene, **options)
+def no_env(task: str, scene: str, **options: Any) -> None:
     check_env(task, scene, **options)
     raise Ready
 
 
-def ready(*arguments: Any, **options: Any) -> None:
-    for each in (*arguments, options):
+def quick_env(task: str, scene: str, **options: Any) -> Any:
+    """Return an environment if it is quick to make and nobody has to compile one for it; else only check it."""
+    chosen = {key: value for key, value in options.items() if value is not None}
+    if (task, scene) in QUICK and set(chosen) <= {"goals"}:
+        return Env(task, scene, **options)
+    return no_env(task, scene, **options)
+
+
+def no_work(*arguments: Any, **_: Any) -> None:
+    for each in arguments:
         if isinstance(each, Options):
             check_env(**each.of_environment())
-        elif isinstance(each, dict) and "task" in each:
-            check_env(**each)
     raise Ready
 
 
@@ -114,6 +116,59 @@ def install(settings: dict[str, Any], names: dict[str, Any]) -> None:
             registry._registered[name] = names[where.partition(":")[2]]
 
 
+PAGE = """
+Type `make test`, or `surgical-marl list
+tasks`; `other` is no command. Save this as `my.yaml` beside `arms`:
+
+```yaml
+a: 1
+```
+
+- In a list:
+
+    ```sh
+    surgical-marl train reach \\
+        --scene psm   # two lines
+    ```
+"""
+
+
+def test_all_of_a_page_is_found() -> None:
+    found = list(pieces(PAGE))
+    assert [piece[:2] for piece in found[:3]] == [
+        ("inline", "make test"), ("inline", "surgical-marl list tasks"), ("file", "a: 1\n")]  # fmt: skip
+    assert found[2].name == "my.yaml" and found[3].kind == "yaml" and found[4].kind == "sh"
+    assert list(commands(found[4].text)) == [("surgical-marl train reach --scene psm".split(), "two lines")]
+    assert free_names("import a.b\nfor i in range(3):\n    c = a(i, d)\n") == {"d"}
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "surgical-marl train reech --scene psm",
+        "surgical-marl train reach",
+        "surgical-marl train reach --scene psm ppo.lerning_rate=1e-3",
+        "surgical-marl train reach --scene psm --difficulty odd",
+        "surgical-marl train needle_pick --scene psm",
+        "surgical-marl eval reach-psmm",
+        "surgical-marl bench sim --scene psm --speed",
+        "python -m surgical_marl.studies.grasping --legs 3",
+        "python policies/train_all.py --evalute",
+        "python -m surgical_marl.studies.nothing",
+        "torchrun --processes 4 -m surgical_marl train reach --scene psm",
+        "torchrun --nproc-per-node 4 -m surgical_marl train reach --scene psmm",
+        "make trian",
+        "make train ARGS='--sed 1'",
+        "pip install -e '.[nothing]'",
+        "pytest tests/test_nothing.py",
+        "conda install surgical-marl",
+    ],
+)
+def test_a_wrong_command_is_found(command: str, page_folder: Path) -> None:
+    with pytest.raises((AssertionError, ValueError, OSError, SystemExit, ImportError)):
+        check_command(shlex.split(command))
+
+
 def run_python(code: str, names: dict[str, Any]) -> None:
     """Run a program of a page, up to an environment that is not quick to make.
 
@@ -124,8 +179,8 @@ def run_python(code: str, names: dict[str, Any]) -> None:
         return
     lay_out(re.findall(r'"(runs/[^"]+)"', code))
     with pytest.MonkeyPatch.context() as patch, suppress(Ready):
-        patch.setattr("surgical_marl.envs.batch.Env", make_env)
-        patch.setattr("surgical_marl.interfaces.jax_env.Env", ready)
+        patch.setattr("surgical_marl.envs.batch.Env", quick_env)
+        patch.setattr("surgical_marl.interfaces.jax_env.Env", no_env)
         exec(program, names)
 
 
@@ -139,7 +194,7 @@ def check_command(words: list[str], is_mention: bool = False) -> None:
 
 
 BENCHES = (f"bench.{kind}.run" for kind in ("report", "learning", "solve", "face", "render"))
-WORK = ("envs.batch.Env", "cli.doctor.report", "evaluation.export.export_policy", "report.command.report",
+WORK = ("cli.doctor.report", "evaluation.export.export_policy", "report.command.report",
         "view.take.replay", *BENCHES)  # fmt: skip
 """Where the work of commands begins."""
 
@@ -149,7 +204,8 @@ def check_surgical_marl(argv: list[str]) -> None:
     lay_out(argv)
     with pytest.MonkeyPatch.context() as patch, suppress(Ready):
         for work in WORK:
-            patch.setattr(f"surgical_marl.{work}", ready)
+            patch.setattr(f"surgical_marl.{work}", no_work)
+        patch.setattr("surgical_marl.envs.batch.Env", no_env)
         patch.setattr("surgical_marl.bench.command._no_caches", nullcontext)  # it would outlast the command
         assert cli.main(argv) == 0, argv
     shutil.rmtree("runs", ignore_errors=True)
