@@ -138,7 +138,7 @@ def test_all_of_a_page_is_found() -> None:
     assert [piece[:2] for piece in found[:3]] == [
         ("inline", "make test"), ("inline", "surgical-marl list tasks"), ("file", "a: 1\n")]  # fmt: skip
     assert found[2].name == "my.yaml" and found[3].kind == "yaml" and found[4].kind == "sh"
-    assert list(commands(found[4].text)) == [("surgical-marl train reach --scene psm".split(), "two lines")]
+    assert list(commands(found[4].text)) == [(["surgical-marl", "train", "reach", "--scene", "psm"], "two lines")]
     assert free_names("import a.b\nfor i in range(3):\n    c = a(i, d)\n") == {"d"}
 
 
