@@ -15,7 +15,7 @@ from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).parents[2]
 CARDS = ("arms/*/README.md", "policies/README.md", "policies/*/README.md", "CHANGELOG.md")
-SHOWN = (".png", ".mp4", ".gif")
+SHOWN = (".png", ".webp", ".gif", ".mp4")
 """What the folder of a card holds for the eye."""
 LINK = re.compile(r"^```.*?^```|(!?)\[([^\]]*)\]\(([^)\s]+)\)|`[^`\n]+`", re.DOTALL | re.MULTILINE)
 """A link, or code, in which nothing is a link; whichever begins first."""

@@ -2,7 +2,7 @@
 
     python docs/theme/tables.py
 
-A table stands between `<!-- table: NAME -->` and `<!-- end of table -->`. A picture in docs/gallery/<kind>/<name>.png
+A table stands between `<!-- table: NAME -->` and `<!-- end of table -->`. A picture docs/images/<kind>/<name>.webp
 is shown in the row of its arm, object, scene or task. `tests/test_site.py` holds the pages to the content.
 """
 
@@ -120,7 +120,7 @@ def table(head: list[str], rows: Iterator[list[str]]) -> str:
 
 def shown(kind: str, name: str) -> str:
     """Return the picture of a piece of content, as Markdown for a page in docs/; nothing if there is none."""
-    path = f"gallery/{kind}/{name}.png"
+    path = f"images/{kind}/{name}.webp"
     return f"![{name}]({path})" if (DOCS / path).is_file() else ""
 
 
