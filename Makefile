@@ -23,8 +23,9 @@ train: $(READY)
 test: $(READY)
 	$(BIN)/pytest -n 2 --dist worksteal $(ARGS)
 
+# Not --quiet: it would also hide the warnings that --strict counts.
 docs: $(SITE_READY)
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 lint: $(READY)
 	$(BIN)/ruff check .

@@ -42,9 +42,10 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
         path, hash_, anchor = (target or "").partition("#")
         if not path or ":" in target:  # code, a heading of this page, or another site
             return match[0]
-        found = in_site(posixpath.normpath(posixpath.join(posixpath.dirname(source), path)), files)
-        if found is None:
-            return text
+        repository = posixpath.normpath(posixpath.join(posixpath.dirname(source), path))
+        found = in_site(repository, files)
+        if found is None:  # source code; or a mistake, which mkdocs finds
+            return text if (ROOT / repository).exists() else match[0]
         link = posixpath.relpath(found, posixpath.dirname(here) or ".")
         if link.endswith(".mp4"):
             title = text.replace("`", "")
@@ -60,6 +61,4 @@ def in_site(path: str, files: Files) -> str | None:
     for candidate in (uri, posixpath.join(uri, "README.md"), posixpath.join(uri, "index.md")):
         if files.get_file_from_path(candidate) is not None:
             return candidate
-    if not (ROOT / path).exists():
-        raise ValueError(f"a page links to {path}, which does not exist")
     return None
