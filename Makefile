@@ -1,15 +1,17 @@
 # make train   set up .venv, train two PSM arms to reach, then evaluate     (ARGS="--seed 1")
 # make test    set up .venv, run the tests                                  (ARGS="-k cli")
+# make docs    set up .venv, write the site of the documentation into site/ (open site/index.html)
 # make lint    style       make typecheck    types       make clean    remove what was built
 
 PYTHON ?= $(firstword $(shell command -v python3.11 python3 python))
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+SITE_READY := $(VENV)/.ready-for-docs
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help train test lint typecheck clean
+.PHONY: help train test docs lint typecheck clean
 
 help:
 	@sed -n 's/^# make/make/p' Makefile
@@ -21,6 +23,10 @@ train: $(READY)
 test: $(READY)
 	$(BIN)/pytest -n 2 --dist worksteal $(ARGS)
 
+# Not --quiet: it would also hide the warnings that --strict counts.
+docs: $(SITE_READY)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
 lint: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -29,7 +35,7 @@ typecheck: $(READY)
 	$(BIN)/mypy
 
 clean:
-	rm -rf $(VENV) build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) build dist site *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # The stamp is newer than what defines the environment, so a second call starts at once.
@@ -39,4 +45,9 @@ $(READY): pyproject.toml constraints.txt
 	  "surgical-marl: $$($(PYTHON) --version) is too old, name Python 3.11 or newer: make PYTHON=python3.11" >&2; exit 2; }
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --no-input --quiet --progress-bar off -c constraints.txt -e '.[test]'
+	@touch $@
+
+# What the site is made of, which nothing else needs.
+$(SITE_READY): $(READY)
+	$(BIN)/python -m pip install --no-input --quiet --progress-bar off -c constraints.txt -e '.[docs]'
 	@touch $@

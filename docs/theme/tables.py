@@ -1,0 +1,141 @@
+"""Writes the tables of content into the pages: what there is stands in the content itself, and in no list kept by hand.
+
+    python docs/theme/tables.py
+
+A table stands between `<!-- table: NAME -->` and `<!-- end of table -->`. A picture docs/images/<kind>/<name>.webp
+is shown in the row of its arm, object, scene or task. `tests/test_site.py` holds the pages to the content.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+
+from surgical_marl import list_arms, list_objects, list_policies, list_scenes, list_tasks
+from surgical_marl.plugins.tasks import TASKS, scenes_for
+from surgical_marl.robots.arm import load_arm
+from surgical_marl.scenes.load import load_scene
+from surgical_marl.scenes.objects import load_object
+
+DOCS = Path(__file__).resolve().parents[1]
+MARKED = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end of table -->)", re.DOTALL)
+
+
+def main() -> None:
+    """Write all tables of all pages."""
+    for page in pages():
+        page.write_text(written(page.read_text(encoding="utf-8")), encoding="utf-8")
+
+
+def pages() -> list[Path]:
+    """Return the pages that have tables of content."""
+    return [path for path in sorted(DOCS.rglob("*.md")) if MARKED.search(path.read_text(encoding="utf-8"))]
+
+
+def written(text: str) -> str:
+    """Return a page with the tables that it should have."""
+    return MARKED.sub(lambda match: f"{match[1]}{TABLES[match[2]]()}\n{match[3]}", text)
+
+
+def arms() -> str:
+    def rows() -> Iterator[list[str]]:
+        for name in list_arms():
+            arm = load_arm(name)
+            picture = shown("arms", name) or f"![{name}](../arms/{name}/preview.png)"
+            yield [
+                f"[`{name}`](../arms/{name}/README.md)",
+                picture,
+                arm.description,
+                words(j.name for j in arm.actuated),
+            ]
+
+    return table(["arm", "picture", "what it is", "joints, one number of an action each"], rows())
+
+
+def objects() -> str:
+    def rows() -> Iterator[list[str]]:
+        for name in list_objects():
+            item = load_object(name)
+            mass = f"{1000 * item.mass:.3g} g" if item.free else "fixed"
+            yield [
+                f"`{name}`",
+                shown("objects", name),
+                item.description,
+                mass,
+                str(len(item.shapes)),
+                sites(item.sites),
+            ]
+
+    return table(["object", "picture", "what it is", "mass", "shapes", "named places"], rows())
+
+
+def scenes() -> str:
+    def rows() -> Iterator[list[str]]:
+        for name in list_scenes():
+            scene = load_scene(name)
+            held = words(f"{key} (`{place.object.name}`)" for key, place in scene.objects.items()) or "-"
+            tasks = words(f"`{task}`" for task in list_tasks() if name in scenes_for(task)) or "-"
+            agents = words(f"`{agent}`" for agent in scene.agents)
+            yield [f"`{name}`", shown("scenes", name), scene.description, agents, held, tasks]
+
+    return table(["scene", "picture", "what stands there", "agents", "objects", "tasks meant for it"], rows())
+
+
+def tasks() -> str:
+    def rows() -> Iterator[list[str]]:
+        for name in list_tasks():
+            task = TASKS.load(name)
+            _, _, what = task.summary().partition(": ")
+            where = "all without objects" if task.scenes is None else words(f"`{scene}`" for scene in task.scenes)
+            levels = words(f"`{level}`" for level in task.levels)
+            policies = sum(policy.startswith(f"{name}-") for policy in list_policies())
+            yield [f"`{name}`", shown("tasks", name), what.rstrip("."), where, levels, str(policies)]
+
+    return table(["task", "picture", "what is to be done", "scenes", "difficulty", "policies that ship"], rows())
+
+
+def examples() -> str:
+    def rows() -> Iterator[list[str]]:
+        for path in sorted((DOCS / "examples").glob("*.py")):
+            what = (ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or "").partition("\n")[0]
+            yield [f"[{path.name}]({path.name})", what]
+
+    return table(["program", "what it is"], rows())
+
+
+TABLES: dict[str, Callable[[], str]] = {
+    function.__name__: function for function in (arms, objects, scenes, tasks, examples)
+}
+
+
+def table(head: list[str], rows: Iterator[list[str]]) -> str:
+    """Return a table in Markdown, without the columns that are empty in all rows."""
+    found = list(rows)
+    full = [column for column in range(len(head)) if any(row[column] for row in found)]
+    lines = [head, ["---"] * len(head), *found]
+    return "\n".join(f"| {' | '.join(line[column] for column in full)} |" for line in lines)
+
+
+def shown(kind: str, name: str) -> str:
+    """Return the picture of a piece of content, as Markdown for a page in docs/; nothing if there is none."""
+    path = f"images/{kind}/{name}.webp"
+    return f"![{name}]({path})" if (DOCS / path).is_file() else ""
+
+
+def words(names: Iterable[str]) -> str:
+    return ", ".join(names)
+
+
+def sites(names: Iterable[str]) -> str:
+    """Return the names of sites, those that only differ by a number as first to last."""
+    families: dict[str, list[str]] = {}
+    for name in names:
+        families.setdefault(re.sub(r"_\d+$", "", name), []).append(name)
+    ranges = (f"`{group[0]}`" + (f" to `{group[-1]}`" if len(group) > 1 else "") for group in families.values())
+    return words(ranges) or "-"
+
+
+if __name__ == "__main__":
+    main()
