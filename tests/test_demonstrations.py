@@ -11,12 +11,14 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from surgical_marl.learning.demonstrations import Demonstrations, _record, _waits
+from surgical_marl.learning.demonstrations import Demonstrations, _jaws_rest, _record
 from surgical_marl.learning.imitation import RATE, ImitationLoss, imitate
 from surgical_marl.learning.trainer import Trainer
 from surgical_marl.policies.networks import MultiAgentActor, actor_config
+from surgical_marl.policies.scripted import Scripted
 from surgical_marl.runs.environment import make_env
 from surgical_marl.runs.settings import ImitationSettings, NetworkSettings, OracleStatesSettings, Settings
+from surgical_marl.tasks.base.script import Step, Wish
 
 SETTINGS = Settings(
     task="reach", scene="psm", num_envs=64, iterations=4, steps_per_iteration=4, device="cpu",
@@ -81,16 +83,37 @@ def test_training_with_them_goes_on_bit_for_bit(trainer: Trainer) -> None:
     assert torch.equal(*ends)
 
 
-def test_waiting_is_not_shown(trainer: Trainer) -> None:
-    env = make_env(SETTINGS, 4, "numpy")
-    observations, *_ = env.reset(seed=0)  # at home, with closed jaws
-    actions = np.zeros((4, 7), np.float32)
-    actions[:, -1] = [-1.0, 1.0, -1.0, -1.0]
-    actions[2, 0] = 0.5
-    opens = {"psm_0": np.ones((4, 7), np.float32)}
-    assert _waits(env, {"psm_0": actions}, {"psm_0": actions}, observations).tolist() == [True, False, False, True]
-    closes = {"psm_0": -opens["psm_0"]}  # a jaw that opens after it closed is kept where it is
-    assert _waits(env, {"psm_0": actions}, closes, observations).tolist() == [True, True, False, True]
+def test_a_jaw_rests_at_its_ends_and_where_it_is_kept_half_open(trainer: Trainer) -> None:
+    env = make_env(SETTINGS, 2, "numpy")
+    observations, *_ = env.reset(seed=0)  # with closed jaws
+    closes = {"psm_0": np.full((2, 7), -1.0, np.float32)}
+    changes = {"psm_0": np.array([[0.5] * 6 + [1.0], [0.5] * 6 + [-1.0]], np.float32)}
+    opens = {"psm_0": np.full((2, 7), 1.0, np.float32)}
+    assert _jaws_rest(env, changes, opens, observations).tolist() == [False, True]
+    assert _jaws_rest(env, changes, closes, observations).tolist() == [True, True]
+    result = env.step(opens)
+    assert _jaws_rest(env, changes, changes, result.observations).tolist() == [False, False]
+
+
+def test_waiting_is_not_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A script that goes somewhere in a few steps, waits a second, and goes on."""
+    env = make_env(SETTINGS, 2, "numpy")
+    home = env.scene.mounts["psm_0"].arm.home
+    there = np.where(np.arange(7) < 6, 0.9, 1.0) * home
+    script = [
+        Step(lambda seen: {"psm_0": Wish(joints=np.tile(there, (len(seen.tools["psm_0"]), 1)))}, wait=0.5),
+        Step(lambda seen: {"psm_0": Wish(joints=np.tile(home, (len(seen.tools["psm_0"]), 1)))}),
+    ]
+    policy = Scripted(env, script, env.agents)
+    observations, *_ = env.reset(seed=0)
+    moved, waited = [], []
+    for _ in range(40):
+        actions = policy(observations)
+        moved.append(np.abs(actions["psm_0"][:, :6]).max(-1) > 1e-3)
+        waited.append(policy.waits.copy())
+        observations = env.step(actions).observations
+    assert (np.array(moved)[:36] != np.array(waited)[:36]).all()
+    assert 25 <= np.array(waited)[:, 0].sum() < 36
 
 
 def test_what_is_shown_leads_to_the_target(trainer: Trainer) -> None:

@@ -42,8 +42,6 @@ OWN = (".key", ".episode")
 DISTURBED, LASTS = 0.1, 0.8
 """Standard deviation of what is added to the actions of all joints but jaws, and how much of it lasts to the next step.
 With 0.3 an arm that holds a needle misses most handovers."""
-WAITING = 0.25
-"""Below this all joints wait for time to pass, or come back from a disturbance."""
 
 
 class Demonstrations:
@@ -123,7 +121,8 @@ def _record(env: BatchedEnv) -> dict[str, np.ndarray]:
         actions = {agent: np.clip(action, -1.0, 1.0) for agent, action in policy(observations).items()}
         if step and step % EVERY == 0:
             keep("states", step, goes_on, {**env.carry(), **observations, "state": state})
-        moves = follows | (solved >= 0) | ~_waits(env, actions, before or actions, observations)
+        # Imitated, a pair of waiting would have an arm wait forever, because what it observes does not change.
+        moves = follows | (solved >= 0) | ~(policy.waits & _jaws_rest(env, actions, before or actions, observations))
         keep("pairs", step, goes_on & moves, {**observations, **{f"action of {a}": x for a, x in actions.items()}})
         result, before = env.step(disturbance.added(actions)), actions
         observations, state = result.observations, result.state
@@ -162,17 +161,15 @@ class _Disturbance:
         return found
 
 
-def _waits(
+def _jaws_rest(
     env: BatchedEnv,
     actions: Mapping[str, np.ndarray],
     before: Mapping[str, np.ndarray],
     observations: Mapping[str, np.ndarray],
 ) -> np.ndarray:
-    """Return whether the oracle waits, [N]: no joint moves, and no jaw does.
+    """Return whether no jaw moves, [N].
 
-    A jaw does not move at the end of its way. Neither does it where the oracle keeps it half open, by opening and
-    closing it in turn. Imitated, a pair of waiting would have an arm wait forever, because what it observes does not
-    change.
+    It does not at the end of its way, and where the oracle keeps it half open, by opening and closing it in turn.
 
     Args:
         env: the environments.
@@ -180,18 +177,17 @@ def _waits(
         before: its actions in the step before.
         observations: [N, d] by agent.
     """
-    waits = np.ones(env.num_envs, bool)
-    for agent, whole in actions.items():
+    rest = np.ones(env.num_envs, bool)
+    for agent, action in actions.items():
         arm = env.scene.mounts[agent].arm
-        jaw, action = arm.moves_jaw, whole[:, : len(arm.moves_jaw)]
-        waits &= (np.abs(action[:, ~jaw]) < WAITING).all(-1)
-        if arm.jaw is not None:
-            own = env.restated({agent: observations[agent]}, "si")[agent]
-            command = own[:, env.observation_terms(agent)["command"]][:, jaw]
-            ends = np.where(action[:, jaw] > 0, arm.jaw.open, arm.jaw.closed)
-            turns = (action[:, jaw] > 0) != (before[agent][:, : len(jaw)][:, jaw] > 0)
-            waits &= ((np.abs(ends - command) < 1e-3) | turns).all(-1)
-    return waits
+        if arm.jaw is None:
+            continue
+        jaw = np.flatnonzero(arm.moves_jaw)
+        own = env.restated({agent: observations[agent]}, "si")[agent]
+        command, opens = own[:, env.observation_terms(agent)["command"]][:, jaw], action[:, jaw] > 0
+        ends = np.where(opens, arm.jaw.open, arm.jaw.closed)
+        rest &= ((np.abs(ends - command) < 1e-3) | (opens != (before[agent][:, jaw] > 0))).all(-1)
+    return rest
 
 
 def _shapes(env: BatchedEnv) -> dict[str, dict[str, tuple[int, ...]]]:

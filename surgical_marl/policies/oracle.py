@@ -9,8 +9,8 @@ environment's goals.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -28,7 +28,18 @@ FIRST, STARTS = 20, 8
 """Its steps in the first of an episode, and from how many postures: from a random one alone it may end at a limit."""
 
 
-def oracle(env: BatchedEnv, agents: Sequence[str] | None = None) -> Callable[[Mapping[str, Any]], dict[str, Any]]:
+class Oracle(Protocol):
+    """A policy, and where it waits."""
+
+    waits: np.ndarray
+    """Whether its tools wait for time to pass in an environment, [N] bool."""
+
+    def __call__(self, observations: Mapping[str, Any]) -> dict[str, Any]:
+        """Return what agents do."""
+        ...
+
+
+def oracle(env: BatchedEnv, agents: Sequence[str] | None = None) -> Oracle:
     """Make the oracle of an environment with control "position", for all of its tasks.
 
     If the task has a script, the arms follow it. Otherwise joints follow straight lines in joint space, all arms at the
@@ -59,6 +70,7 @@ class _Oracle:
 
     def __init__(self, env: BatchedEnv, moved: Sequence[str]) -> None:
         self._env = env
+        self.waits = np.zeros(env.num_envs, bool)
         self._arms = {agent: _Guide(env, agent, index) for index, agent in enumerate(env.agents) if agent in moved}
 
     def __call__(self, observations: Mapping[str, Any]) -> dict[str, Any]:

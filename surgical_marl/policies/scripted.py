@@ -29,6 +29,9 @@ class Scripted:
         env: the environments, with control "position".
         steps: the script.
         agents: those that the policy moves, if others have another one.
+
+    Attributes:
+        waits: whether an environment's tools are where they should be and wait for the next step, [N] bool.
     """
 
     def __init__(self, env: BatchedEnv, steps: Sequence[Step], agents: Sequence[str]) -> None:
@@ -42,6 +45,9 @@ class Scripted:
         """Number of each environment's step."""
         self._left = np.zeros(env.num_envs, int)
         """Control steps until the next one is planned."""
+        self._pauses = np.array([round(step.wait / env.control_dt) for step in steps])
+        """How many of these each step waits."""
+        self.waits = np.zeros(env.num_envs, bool)
 
     def __call__(self, observations: Mapping[str, Any]) -> dict[str, Any]:
         env = self._env
@@ -54,6 +60,7 @@ class Scripted:
         if len(due) and self._led:
             self._plan(due, began[due])
         self._left -= 1
+        self.waits = self._left <= self._pauses[self._now]
         pace = np.array([step.pace for step in self._steps])[self._now]
         share = np.minimum(1.0, pace / np.maximum(self._furthest(), 1e-9))[:, None]
         ways = {agent: share * self._tools[agent].way() for agent in self._led} | self._attend()
@@ -93,7 +100,7 @@ class Scripted:
             for agent, wish in wishes.items():
                 self._tools[agent].send(due[rows], wish)
             furthest = self._furthest(due[rows])
-            self._left[due[rows]] = np.ceil(furthest / step.pace) + round(step.wait / self._env.control_dt) + 1
+            self._left[due[rows]] = np.ceil(furthest / step.pace) + self._pauses[number] + 1
 
     def _look(self, due: np.ndarray) -> Snapshot:
         env = self._env
