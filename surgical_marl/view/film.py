@@ -24,7 +24,7 @@ from surgical_marl.machine import cores
 from surgical_marl.runs.progress import progress
 from surgical_marl.view.history import summary
 from surgical_marl.view.moment import Observer
-from surgical_marl.view.record import FPS, Pose, ScenePicture
+from surgical_marl.view.record import FPS, HEIGHT, WIDTH, Pose, ScenePicture
 from surgical_marl.view.render import View
 from surgical_marl.view.video import write_video
 
@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv
     from surgical_marl.view.movers import Movers
 
-WIDTH, HEIGHT = 480, 360
-"""Pixels of the picture from outside, if there is one environment."""
 WALL = 1280
 """Pixels along the width of a film of several environments, about."""
 MOST = 8
@@ -149,7 +147,7 @@ def _frames(env: BatchedEnv, movers: Movers, look: Look, every: int, episodes: i
 
     most = cores()
     drawn: deque[list[Future[Picture]]] = deque()
-    with ThreadPoolExecutor(most) as threads:  # a picture takes half a second of a core, without Python's lock
+    with ThreadPoolExecutor(most) as threads:  # a picture takes a tenth of a second of a core, without Python's lock
         for shots in _shots(env, movers, look, picture, every, episodes, seed):
             drawn.append([threads.submit(draw, shot) for shot in shots])
             if len(drawn) > most:
