@@ -20,7 +20,7 @@ from surgical_marl.view.render import View
 
 Array = NDArray[np.float64]
 
-_AZIMUTHS, _ELEVATIONS = np.arange(0.0, 360.0, 15.0), (-25.0, -33.0, -42.0)
+_AZIMUTHS, _ELEVATIONS = range(0, 360, 15), (-25.0, -33.0, -42.0)
 _FOVY = 40.0
 _POSTURES = 6
 _NEAR = 0.15
@@ -50,8 +50,9 @@ def best_view(scene: Scene) -> View:
     low, high = points.min(0), points.max(0)
     middle, radius = (low + high) / 2, np.linalg.norm(high - low) / 2
     own = _own_camera(moments[0].data, middle)
-    distance = max(_ROOM * radius / np.tan(np.radians(_FOVY / 2)), _LEAST * float(np.linalg.norm(own)))
-    views = [View(middle, distance, azimuth, elevation, _FOVY) for elevation in _ELEVATIONS for azimuth in _AZIMUTHS]
+    distance = float(max(_ROOM * radius / np.tan(np.radians(_FOVY / 2)), _LEAST * np.linalg.norm(own)))
+    ways = [(azimuth, elevation) for elevation in _ELEVATIONS for azimuth in _AZIMUTHS]
+    views = [View(tuple(middle.tolist()), distance, *way, _FOVY) for way in ways]
     return max(views, key=lambda view: _score(scene, moments, view, own))
 
 

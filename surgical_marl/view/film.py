@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 
 WALL = 1280
 """Pixels along the width of a film of several environments, about."""
+SMALLEST, LARGEST = 16, 4096
+"""Pixels of a side of a picture."""
 MOST = 8
 """Rows and columns of a grid at most."""
 
@@ -47,27 +49,34 @@ class Look:
     Attributes:
         grid: rows and columns of environments.
         slow: how many times slower than real time.
-        camera: a camera of the scene by name, or a free one; None for the scene's own view.
+        camera: a camera of the scene by name, or a free one; None for the view in which the least is hidden.
         words: whether to write errors and stages into the pictures.
+        size: width and height of the picture of one environment, pixels; None for 480 and 360, and less in a grid.
 
     Raises:
-        ValueError: a grid or a slowness that can't be.
+        ValueError: a grid, a slowness or a size that can't be.
     """
 
     grid: tuple[int, int] = (1, 1)
     slow: float = 1.0
     camera: str | View | None = None
     words: bool = True
+    size: tuple[int, int] | None = None
 
     def __post_init__(self) -> None:
         if not all(1 <= side <= MOST for side in self.grid):
             raise ValueError(f"a grid has 1 to {MOST} rows and columns, not {self.grid[0]}x{self.grid[1]}")
         if not 0.1 <= self.slow <= 100:
             raise ValueError(f"slow must be from 0.1 to 100, not {self.slow:g}")
+        if self.size is not None and not all(SMALLEST <= side <= LARGEST for side in self.size):
+            width, height = self.size
+            raise ValueError(f"a film is {SMALLEST} to {LARGEST} pixels wide and high, not {width}x{height}")
 
     @property
     def tile(self) -> tuple[int, int]:
         """Width and height of the picture of one environment, pixels."""
+        if self.size is not None:
+            return self.size
         if self.grid == (1, 1):
             return WIDTH, HEIGHT
         width = WALL // self.grid[1] // 2 * 2
@@ -78,8 +87,6 @@ class Shot(NamedTuple):
     """What a frame shows of one environment."""
 
     pose: Pose
-    scope: Picture | None
-    """What the endoscope sees; None in a scene without one, and in a grid."""
     words: list[str]
 
 
@@ -139,11 +146,11 @@ def written(picture: Picture, lines: list[str]) -> Picture:
 
 
 def _frames(env: BatchedEnv, movers: Movers, look: Look, every: int, episodes: int, seed: int) -> Iterator[Picture]:
-    picture = ScenePicture(env, *look.tile)
+    picture, scope = ScenePicture(env, *look.tile), _scope(env, look)
 
     def draw(shot: Shot) -> Picture:
         seen = written(picture.draw(shot.pose, look.camera), shot.words)
-        return seen if shot.scope is None else np.concatenate([seen, shot.scope], 1)
+        return seen if scope is None else np.concatenate([seen, scope(shot.pose)], 1)
 
     most = cores()
     drawn: deque[list[Future[Picture]]] = deque()
@@ -164,13 +171,12 @@ def _shots(
     env: BatchedEnv, movers: Movers, look: Look, picture: ScenePicture, every: int, episodes: int, seed: int
 ) -> Iterator[list[Shot]]:
     """Yield what each frame shows, while the environments play."""
-    scope = _scope(env) if look.grid == (1, 1) else lambda: None
     observations, _, infos = env.reset(seed)
     movers.begin(observations)
     for step in range(episodes * env.max_steps):
         if step % every == 0:
             words = [_words(env, infos, index) if look.words else [] for index in range(env.num_envs)]
-            yield [Shot(picture.pose(index), scope(), words[index]) for index in range(env.num_envs)]
+            yield [Shot(picture.pose(index), words[index]) for index in range(env.num_envs)]
         outcome = env.step(movers.actions(observations))
         observations, infos = outcome.observations, outcome.infos
         movers.begin(observations, np.asarray(outcome.terminated | outcome.truncated))
@@ -181,11 +187,11 @@ def _words(env: BatchedEnv, infos: Any, index: int) -> list[str]:
     return [f"{time:.2f} s", *(f"{agent}  {', '.join(summary(infos[agent], index))}" for agent in env.agents)]
 
 
-def _scope(env: BatchedEnv) -> Callable[[], Picture | None]:
-    """Return what returns the endoscope's picture of the first environment, or None in a scene without one."""
-    if not any(mount.arm.camera is not None for mount in env.scene.mounts.values()):
-        return lambda: None
-    from surgical_marl.vision.endoscope import Endoscope
-
-    endoscope = Endoscope(env.scene, env.num_envs, width=HEIGHT, height=HEIGHT)
-    return lambda: np.asarray(endoscope.render(env.qpos, env.object_poses).rgb[0, 0])
+def _scope(env: BatchedEnv, look: Look) -> Callable[[Pose], Picture] | None:
+    """Return what draws the endoscope's view beside the picture; None in a scene without one, and in a grid."""
+    cameras = [agent for agent, mount in env.scene.mounts.items() if mount.arm.camera is not None]
+    if not cameras or look.grid != (1, 1):
+        return None
+    _, side = look.tile
+    picture = ScenePicture(env, side, side)
+    return lambda pose: picture.draw(pose, f"{cameras[0]}/left")
