@@ -1,5 +1,6 @@
 # make train   set up .venv, train two PSM arms to reach, then evaluate     (ARGS="--seed 1")
 # make test    set up .venv, run the tests                                  (ARGS="-k cli")
+# make gallery set up .venv, draw docs/gallery.md and its pictures again     (ARGS="--only psm reach")
 # make lint    style       make typecheck    types       make clean    remove what was built
 
 PYTHON ?= $(firstword $(shell command -v python3.11 python3 python))
@@ -9,7 +10,7 @@ READY := $(VENV)/.ready
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help train test lint typecheck clean
+.PHONY: help train test gallery lint typecheck clean
 
 help:
 	@sed -n 's/^# make/make/p' Makefile
@@ -20,6 +21,9 @@ train: $(READY)
 # Neighbours in a file share what they compile: a worker takes half of the tests, in order, and from the other when done.
 test: $(READY)
 	$(BIN)/pytest -n 2 --dist worksteal $(ARGS)
+
+gallery: $(READY)
+	$(BIN)/python -m surgical_marl.studies.gallery --results docs $(ARGS)
 
 lint: $(READY)
 	$(BIN)/ruff check .

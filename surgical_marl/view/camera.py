@@ -9,7 +9,8 @@ arms in several postures about home. The same scene always gives the same view.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -29,8 +30,12 @@ _AROUND = 0.03
 """How far from the point in front of an arm its targets are looked for, m."""
 _SLACK = 0.012
 """A point counts as seen if what a ray meets is at most so far in front of it, m: it may lie within a tool."""
-_ROOM, _LEAST = 1.35, 0.55
-"""Width of the picture over that of what matters; distance at least, over that of the scene's own camera."""
+_FILLED, _LEAST = 0.75, 0.5
+"""Part of the picture that what matters fills; distance at least, over that of the scene's own camera."""
+_TABLES = {"points": 3, "starts": 7}
+"""Tables of a task that hold places in the world, and how many numbers a row has."""
+_PLACES = 16
+"""Rows of a task's tables that are looked at, about."""
 _TURNED, _CLOSE = 0.25, 0.5
 """What it costs to look from the other side than the scene's own camera, and if something close by is all one sees."""
 _GROUPS = np.array([1, 1, 1, 0, 0, 0], np.uint8)
@@ -43,17 +48,43 @@ class _Moment(NamedTuple):
     points: Array
 
 
-def best_view(scene: Scene) -> View:
-    """Return the view of a scene in which the least is hidden."""
-    moments = _moments(scene)
+def best_view(scene: Scene, places: Array | None = None, aspect: float = 4 / 3) -> View:
+    """Return the view of a scene in which the least is hidden.
+
+    Args:
+        scene: what is looked at.
+        places: further points in the world that should be seen, [P, 3], m.
+        aspect: width over height of the picture.
+    """
+    moments = _moments(scene, np.zeros((0, 3)) if places is None else places)
     points = np.concatenate([moment.points for moment in moments])
-    low, high = points.min(0), points.max(0)
-    middle, radius = (low + high) / 2, np.linalg.norm(high - low) / 2
-    own = _own_camera(moments[0].data, middle)
-    distance = float(max(_ROOM * radius / np.tan(np.radians(_FOVY / 2)), _LEAST * np.linalg.norm(own)))
+    middle = (points.min(0) + points.max(0)) / 2
+    own = moments[0].data.camera("overview").xpos - middle
     ways = [(azimuth, elevation) for elevation in _ELEVATIONS for azimuth in _AZIMUTHS]
-    views = [View(tuple(middle.tolist()), distance, *way, _FOVY) for way in ways]
+    views = [_fitted(points, middle, _LEAST * float(np.linalg.norm(own)), aspect, *way) for way in ways]
     return max(views, key=lambda view: _score(scene, moments, view, own))
+
+
+def task_places(task: Any) -> Array:
+    """Return points in the world that episodes of a task are about, [P, 3], m: where objects begin and should be.
+
+    Goals of tool tips are near the points in front of the arms, which every view shows.
+    """
+    tables = {name.removeprefix("work_"): np.asarray(table) for name, table in task.tables.items()}
+    known = [tables[name] for name, width in _TABLES.items() if name in tables and tables[name].shape[1:] == (width,)]
+    found = [table[:: -(-len(table) // _PLACES), :3] for table in known]
+    extremes = [table[[*table[:, :3].argmin(0), *table[:, :3].argmax(0)], :3] for table in known]
+    return np.concatenate([np.zeros((0, 3)), *found, *extremes]).astype(float)
+
+
+def _fitted(points: Array, middle: Array, least: float, aspect: float, azimuth: float, elevation: float) -> View:
+    """Return a view in this direction from so far that it shows all points, and from `least` away or farther."""
+    view = View(tuple(middle.tolist()), least, azimuth, elevation, _FOVY)
+    _, axes = view.pose()
+    across, up, back = ((points - middle) @ axes).T
+    side = _FILLED * np.tan(np.radians(_FOVY / 2))
+    needed = back + np.maximum(np.abs(across) / aspect, np.abs(up)) / side
+    return replace(view, distance=max(least, float(needed.max())))
 
 
 def seen(model: mujoco.MjModel, data: mujoco.MjData, eye: Array, points: Array) -> NDArray[np.bool_]:
@@ -78,10 +109,10 @@ def _score(scene: Scene, moments: list[_Moment], view: View, own: Array) -> floa
     return float(np.mean(shares) - _CLOSE * close - _TURNED * turned)
 
 
-def _moments(scene: Scene) -> list[_Moment]:
+def _moments(scene: Scene, places: Array) -> list[_Moment]:
     """Return the arms at home and in postures about it, with tool tips, targets and objects."""
     rng, model = np.random.default_rng(0), scene.model
-    still = [model.body(name).pos for name in scene.free_objects]
+    still = [*places, *(model.body(name).pos for name in scene.free_objects)]
     for mount in scene.mounts.values():
         steps = _AROUND * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
         still += list(mount.position + (mount.workspace + steps) @ mount.rotation.T)
@@ -99,11 +130,6 @@ def _moments(scene: Scene) -> list[_Moment]:
         tips = [data.site(f"{agent}/tool_tip").xpos for agent in scene.agents]
         found.append(_Moment(data, np.array([*tips, *still])))
     return found
-
-
-def _own_camera(data: mujoco.MjData, middle: Array) -> Array:
-    """Return the way from what matters to the scene's own camera, m."""
-    return np.asarray(data.camera("overview").xpos - middle)
 
 
 def _hits(model: mujoco.MjModel, data: mujoco.MjData, eye: Array, rays: Array) -> Array:

@@ -52,6 +52,7 @@ class Look:
         camera: a camera of the scene by name, or a free one; None for the view in which the least is hidden.
         words: whether to write errors and stages into the pictures.
         size: width and height of the picture of one environment, pixels; None for 480 and 360, and less in a grid.
+        fps: pictures a second of the film, about.
 
     Raises:
         ValueError: a grid, a slowness or a size that can't be.
@@ -62,6 +63,7 @@ class Look:
     camera: str | View | None = None
     words: bool = True
     size: tuple[int, int] | None = None
+    fps: float = FPS
 
     def __post_init__(self) -> None:
         if not all(1 <= side <= MOST for side in self.grid):
@@ -92,11 +94,11 @@ class Shot(NamedTuple):
 
 def film(env: BatchedEnv, movers: Movers, path: Path, look: Look, episodes: int = 1, seed: int = 0) -> Path:
     """Film the environments of `env`, as many as `look.grid` holds, and return the path of the film."""
-    every = max(1, round(1 / (FPS * look.slow * env.control_dt)))
+    every = _every(env, look)
     bar = progress(-(-episodes * env.max_steps // every), "frame", "filming")
 
     def shown() -> Iterator[Picture]:
-        for frame in _frames(env, movers, look, every, episodes, seed):
+        for frame in pictures(env, movers, look, episodes, seed):
             bar.update()
             yield frame
 
@@ -104,6 +106,25 @@ def film(env: BatchedEnv, movers: Movers, path: Path, look: Look, episodes: int 
         return write_video(path, shown(), 1 / (every * env.control_dt * look.slow))
     finally:
         bar.close()
+
+
+def pictures(env: BatchedEnv, movers: Movers, look: Look, episodes: int = 1, seed: int = 0) -> Iterator[Picture]:
+    """Yield the pictures of a film, each of all environments."""
+    picture, scope = ScenePicture(env, *look.tile), _scope(env, look)
+
+    def draw(shot: Shot) -> Picture:
+        seen = written(picture.draw(shot.pose, look.camera), shot.words)
+        return seen if scope is None else np.concatenate([seen, scope(shot.pose)], 1)
+
+    most = cores()
+    drawn: deque[list[Future[Picture]]] = deque()
+    with ThreadPoolExecutor(most) as threads:  # a picture takes a tenth of a second of a core, without Python's lock
+        for shots in _shots(env, movers, look, picture, episodes, seed):
+            drawn.append([threads.submit(draw, shot) for shot in shots])
+            if len(drawn) > most:
+                yield _joined(drawn.popleft(), look)
+        while drawn:
+            yield _joined(drawn.popleft(), look)
 
 
 def camera_of(text: str | None, env: BatchedEnv) -> str | View | None:
@@ -145,32 +166,15 @@ def written(picture: Picture, lines: list[str]) -> Picture:
     return np.asarray(image)
 
 
-def _frames(env: BatchedEnv, movers: Movers, look: Look, every: int, episodes: int, seed: int) -> Iterator[Picture]:
-    picture, scope = ScenePicture(env, *look.tile), _scope(env, look)
-
-    def draw(shot: Shot) -> Picture:
-        seen = written(picture.draw(shot.pose, look.camera), shot.words)
-        return seen if scope is None else np.concatenate([seen, scope(shot.pose)], 1)
-
-    most = cores()
-    drawn: deque[list[Future[Picture]]] = deque()
-    with ThreadPoolExecutor(most) as threads:  # a picture takes a tenth of a second of a core, without Python's lock
-        for shots in _shots(env, movers, look, picture, every, episodes, seed):
-            drawn.append([threads.submit(draw, shot) for shot in shots])
-            if len(drawn) > most:
-                yield _joined(drawn.popleft(), look)
-        while drawn:
-            yield _joined(drawn.popleft(), look)
-
-
 def _joined(tiles: list[Future[Picture]], look: Look) -> Picture:
     return wall((tile.result() for tile in tiles), look.grid[1])
 
 
 def _shots(
-    env: BatchedEnv, movers: Movers, look: Look, picture: ScenePicture, every: int, episodes: int, seed: int
+    env: BatchedEnv, movers: Movers, look: Look, picture: ScenePicture, episodes: int, seed: int
 ) -> Iterator[list[Shot]]:
     """Yield what each frame shows, while the environments play."""
+    every = _every(env, look)
     observations, _, infos = env.reset(seed)
     movers.begin(observations)
     for step in range(episodes * env.max_steps):
@@ -180,6 +184,11 @@ def _shots(
         outcome = env.step(movers.actions(observations))
         observations, infos = outcome.observations, outcome.infos
         movers.begin(observations, np.asarray(outcome.terminated | outcome.truncated))
+
+
+def _every(env: BatchedEnv, look: Look) -> int:
+    """Return how many control steps there are from one picture to the next."""
+    return max(1, round(1 / (look.fps * look.slow * env.control_dt)))
 
 
 def _words(env: BatchedEnv, infos: Any, index: int) -> list[str]:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from surgical_marl.machine import cores
 from surgical_marl.policies.acting import forget
-from surgical_marl.view.camera import best_view
+from surgical_marl.view.camera import best_view, task_places
 from surgical_marl.view.colours import GOAL_RADIUS, goal_colour
 from surgical_marl.view.drawn import Sphere
 from surgical_marl.view.render import Renderer, View
@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 FPS = 25
 WIDTH, HEIGHT = 480, 360
 """Pixels of a picture unless asked otherwise."""
+LEAST = 3.0
+"""Radius of a goal's ball in the picture at least, pixels."""
 THROUGH = 0.45
 """Share of a goal's colour that is seen through what hides it."""
 
@@ -102,7 +104,7 @@ class ScenePicture:
     def __init__(self, env: BatchedEnv, width: int = WIDTH, height: int = HEIGHT) -> None:
         self._env, scene = env, env.scene
         self._renderer = Renderer(scene.model, width, height, stage(scene), paint(scene))
-        self._view = best_view(scene)
+        self._view = best_view(scene, task_places(env.task), width / height)
 
     def draw(self, pose: Pose | None = None, camera: str | View | None = None) -> NDArray[np.uint8]:
         """Return a picture [height, width, 3] of the environment.
@@ -115,7 +117,12 @@ class ScenePicture:
         data.qpos[:], data.mocap_pos[:], data.mocap_quat[:] = pose.qpos, pose.origins, pose.quaternions
         mujoco.mj_kinematics(model, data)
         mujoco.mj_camlight(model, data)
-        return self._renderer.render(data, camera or self._view, pose.balls, THROUGH)
+        camera = camera or self._view
+        balls = pose.balls
+        if isinstance(camera, View):  # from afar a goal is larger than it is, or it would be a dot
+            least = LEAST * 2 * np.tan(np.radians(camera.fovy / 2)) / self._renderer.height * camera.distance
+            balls = [(place, max(radius, least), rgba) for place, radius, rgba in balls]
+        return self._renderer.render(data, camera, balls, THROUGH)
 
     def pose(self, index: int = 0) -> Pose:
         """Return the current pose of an environment, by its number in the batch."""
