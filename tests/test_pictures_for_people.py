@@ -65,6 +65,14 @@ def test_shapes_cover_the_pixels_that_rays_of_mujoco_hit(kind: str) -> None:
     assert (covered == expected)[~edge].mean() > 0.998
 
 
+def test_an_eye_inside_a_shape_looks_out_of_it() -> None:
+    """As a scope that is drawn back looks out of its sleeve."""
+    ball = "<geom size='.05' pos='0 .5 0' rgba='1 0 0 1'/>"
+    model, data = posed(f"<worldbody>{ball}<geom type='cylinder' size='.2 .2' rgba='0 0 1 1'/></worldbody>")
+    seen = Renderer(model, 41, 31).render(data, View(lookat=(0, 0.1, 0), distance=0.1, elevation=0)).astype(int)
+    assert seen[15, 20, 0] > 2 * seen[15, 20, 2]
+
+
 def half_shadow(height: float) -> int:
     """Return over how many pixels a shadow ends, on the right of a board so high above a floor."""
     floor = "<geom type='plane' size='0 0 1' rgba='.8 .8 .8 1'/>"

@@ -100,7 +100,7 @@ def clip(task: str, path: Path) -> str:
     who, scene = player(task)
     settings = common_settings([who], {"task": task, "scene": scene, "goals": "training"})
     env = make_env(replace(settings, seed=0), 1, "numpy")
-    look = Look(size=SMALL, fps=FPS)
+    look = Look(size=SMALL, fps=FPS, words=False)
     shown = islice(pictures(env, Movers(env, who), look), round(FPS * SECONDS))
     write_video(path, shown, FPS)
     env.close()

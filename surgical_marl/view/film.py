@@ -159,11 +159,23 @@ def written(picture: Picture, lines: list[str]) -> Picture:
     size = max(10, len(picture) // 24)
     image = Image.fromarray(picture)
     draw = ImageDraw.Draw(image, "RGBA")
-    text, font = "\n".join(lines), ImageFont.load_default(size)
+    font = ImageFont.load_default(size)
+    text = "\n".join(part for line in lines for part in _wrapped(line, font, picture.shape[1] - size - 8))
     left, top, right, bottom = draw.multiline_textbbox((size // 2, size // 2), text, font=font)
     draw.rectangle((left - 4, top - 4, right + 4, bottom + 4), fill=(0, 0, 0, 130))
     draw.multiline_text((size // 2, size // 2), text, font=font, fill=(255, 255, 255, 255))
     return np.asarray(image)
+
+
+def _wrapped(line: str, font: Any, width: float) -> list[str]:
+    """Return a line as several, parted at commas where it would be wider than so many pixels."""
+    found: list[str] = []
+    for part in line.split(", "):
+        if found and font.getlength(f"{found[-1]}, {part}") <= width:
+            found[-1] += f", {part}"
+        else:
+            found.append(f"  {part}" if found else part)
+    return found
 
 
 def _joined(tiles: list[Future[Picture]], look: Look) -> Picture:

@@ -264,7 +264,7 @@ def meet(
         else:
             depths = span(kind, shapes[shape].size, p, v)
             if depths[0] <= depths[1]:
-                t = wp.where(depths[0] >= 0.0, depths[0], depths[1])
+                t = depths[0]  # below 0 if the eye is inside, as a scope's is in its sleeve: then it looks out
         if t >= 0.0 and t <= best * 1.000001:
             best, hit = t, shape
     normal, side = wp.vec3(0.0, 0.0, 1.0), int(0)
