@@ -1,6 +1,7 @@
 # make train   set up .venv, train two PSM arms to reach, then evaluate     (ARGS="--seed 1")
 # make test    set up .venv, run the tests                                  (ARGS="-k cli")
 # make docs    set up .venv, write the site of the documentation into site/ (open site/index.html)
+# make gallery set up .venv, draw docs/gallery.md and its pictures again     (ARGS="--only psm reach")
 # make lint    style       make typecheck    types       make clean    remove what was built
 
 PYTHON ?= $(firstword $(shell command -v python3.11 python3 python))
@@ -11,7 +12,7 @@ SITE_READY := $(VENV)/.ready-for-docs
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help train test docs lint typecheck clean
+.PHONY: help train test docs gallery lint typecheck clean
 
 help:
 	@sed -n 's/^# make/make/p' Makefile
@@ -26,6 +27,9 @@ test: $(READY)
 # Not --quiet: it would also hide the warnings that --strict counts.
 docs: $(SITE_READY)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
+gallery: $(READY)
+	$(BIN)/python -m surgical_marl.studies.gallery --results docs $(ARGS)
 
 lint: $(READY)
 	$(BIN)/ruff check .

@@ -283,6 +283,19 @@ def test_rendering_as_json_and_as_a_sentence(
     assert (one.stereo, two.stereo, two.width) == (False, True, 8)
 
 
+def test_pictures_for_people_as_json_and_as_a_sentence(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(render.clock, "race", lambda clocks, *_: {key: clock(1) for key, clock in clocks.items()})
+    argv = ["bench", "render", "--of", "scene", "--scene", "psm"]
+    assert main([*argv, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert list(found) == ["ms_per_picture", "width", "height", "shapes"]
+    assert found["ms_per_picture"] > 0 and (found["width"], found["height"]) == (480, 360) and found["shapes"] > 30
+    assert main(argv) == 0
+    assert "of one core a picture, 480 x 360 pixels" in capsys.readouterr().out
+
+
 def test_what_the_face_adds_as_json_and_as_a_sentence(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -312,6 +325,8 @@ def test_what_the_face_adds_as_json_and_as_a_sentence(
         (["sim", "--sweep", "--out", "a.pdf"], ["a.pdf", ".png"]),
         (["sim", "--sweep", "--out", "none/a.png"], ["none/a.png", "folder"]),
         (["render", "--scene", "psm"], ["'psm'", "no endoscope"]),
+        (["render", "--of", "room"], ["'room'", "endoscope", "scene"]),
+        (["render", "--of", "scene", "--device", "cpu"], ["--device"]),
         (["render", "--scene", "ecm", "--sweep"], ["'--sweep'", "bench render"]),
     ],
 )

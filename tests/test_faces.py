@@ -105,6 +105,8 @@ def test_without_a_display_a_window_is_one_sentence(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(matplotlib, "get_backend", lambda: "agg")
     with pytest.raises(ValueError, match="render_mode 'human' needs a display, and there is none: use"):
         sm.parallel_env("reach", scene="psm", render_mode="human")
+    with pytest.raises(ValueError, match=r"render_size \(0, 9\) must be width and height"):
+        sm.parallel_env("reach", scene="psm", render_mode="rgb_array", render_size=(0, 9))
     with pytest.raises(ValueError, match="unknown render_mode 'ansi'; the modes are None, 'human' and 'rgb_array'"):
         sm.parallel_env("reach", scene="psm", render_mode="ansi")
 

@@ -22,6 +22,16 @@ def test_words_are_in_the_upper_left_corner_alone() -> None:
     assert written(plain, []) is plain
 
 
+def test_long_lines_are_wrapped_at_commas() -> None:
+    plain = np.full((240, 320, 3), 200, np.uint8)
+    words = ", ".join(["psm_0  0.05 mm", *(f"stage_{number}" for number in range(12))])
+    changed = (written(plain, [words]) != plain).any(-1)
+    rows, columns = np.flatnonzero(changed.any(1)), np.flatnonzero(changed.any(0))
+    assert columns[-1] < 319 and columns[-1] > 200
+    one = np.flatnonzero((written(plain, ["psm_0"]) != plain).any((1, 2)))
+    assert len(rows) > 1.4 * len(one)
+
+
 def test_a_wall_has_its_pictures_row_by_row() -> None:
     tiles = [np.full((2, 3, 3), value, np.uint8) for value in range(6)]
     found = wall(tiles, columns=3)
@@ -52,6 +62,8 @@ def test_an_endoscope_is_beside_and_a_grid_has_every_environment(tmp_path: Path)
     env = BatchedEnv("reach", "ecm", device="cpu", max_steps=2)
     frames = imageio.imread(film(env, Movers(env, "zero"), tmp_path / "scope.gif", Look()), index=None)
     assert frames.shape[-3:-1] == (90, 120 + 90)
+    large = film(env, Movers(env, "zero"), tmp_path / "large.webp", Look(size=(64, 32)))
+    assert imageio.imread(large).shape == (32, 64 + 32, 3)
     many = BatchedEnv("reach", "psm", num_envs=8, device="cpu", max_steps=2)
     look = Look(grid=(1, 8))
     picture = imageio.imread(film(many, Movers(many, "zero"), tmp_path / "grid.gif", look), index=None)

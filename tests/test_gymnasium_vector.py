@@ -157,7 +157,7 @@ def test_one_seed_and_the_same_actions_are_the_same_numbers_through_every_face(s
 
 
 def test_attributes_are_those_of_each_environment() -> None:
-    envs = make(render_mode="rgb_array", autoreset_mode=AutoresetMode.NEXT_STEP)
+    envs = make(render_mode="rgb_array", render_size=(60, 40), autoreset_mode=AutoresetMode.NEXT_STEP)
     assert envs.metadata["autoreset_mode"] is envs.autoreset_mode is AutoresetMode.NEXT_STEP
     assert envs.spec.max_episode_steps == STEPS
     assert make(max_episode_steps=7).spec.max_episode_steps == 7
@@ -175,7 +175,7 @@ def test_attributes_are_those_of_each_environment() -> None:
         envs.get_attr("no_such_thing")
     frames = envs.render()
     assert isinstance(frames, tuple) and len(frames) == N and envs.call("render")[1].shape == frames[1].shape
-    assert frames[0].dtype == np.uint8 and not np.array_equal(frames[0], frames[1])
+    assert frames[0].shape == (40, 60, 3) and frames[0].dtype == np.uint8 and not np.array_equal(frames[0], frames[1])
     assert make().render() is None
 
 

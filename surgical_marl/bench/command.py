@@ -23,8 +23,13 @@ def run(arguments: Namespace) -> int:
     """
     find("scenes", arguments.scene)
     if arguments.kind == "render":
-        from surgical_marl.bench.render import run
+        from surgical_marl.bench.render import run, run_pictures
 
+        if arguments.what == "scene":
+            if arguments.num_envs or arguments.device:
+                raise ValueError("pictures of a scene are drawn one by one on a CPU: leave --num-envs and --device out")
+            print(run_pictures(arguments.scene, arguments.json))
+            return 0
         print(run(arguments.scene, arguments.num_envs, arguments.device or "auto", arguments.json))
         return 0
     if arguments.task not in list_tasks():

@@ -1,6 +1,7 @@
-"""Throughput of the endoscope's pictures.
+"""Throughput of the endoscope's pictures, and time of a picture for people.
 
 measure_rendering("ecm", num_envs=8192, device="cuda").frames_per_s
+measure_pictures("trimanual_psm_ecm").ms_per_picture
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ import json
 from dataclasses import asdict, dataclass
 from typing import Any
 
+import mujoco
 import numpy as np
 import torch
 
@@ -16,7 +18,12 @@ from surgical_marl.bench import clock
 from surgical_marl.runtime import has_cuda
 from surgical_marl.scenes.load import load_scene
 from surgical_marl.scenes.scene import Scene
+from surgical_marl.view.camera import best_view
+from surgical_marl.view.record import HEIGHT, WIDTH
+from surgical_marl.view.render import Renderer
+from surgical_marl.view.stage import paint, stage
 from surgical_marl.vision.endoscope import SIZE, Endoscope
+from surgical_marl.vision.raycaster import GROUPS
 
 NUM_ENVS = {"cpu": 64, "cuda": 8192}
 """Default number of environments on each device."""
@@ -67,6 +74,40 @@ def measure_rendering(
     timer = clock.cuda_clock(render, CYCLE) if where == "cuda" else clock.cpu_clock(render)
     took = clock.race({"render": timer}, seconds, repeats)["render"]
     return Rendering(count * len(endoscope.eyes) / took, count, where, **options)
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """The speed of pictures for people, as `env.render()` and `surgical-marl play` draw them."""
+
+    ms_per_picture: float
+    """Milliseconds of one core."""
+    width: int
+    height: int
+    shapes: int
+    """Visible shapes of the scene."""
+
+
+def measure_pictures(
+    scene: str, size: tuple[int, int] = (WIDTH, HEIGHT), seconds: float = clock.SECONDS, repeats: int = clock.REPEATS
+) -> Pictures:
+    """Draw a scene with its arms at home as `env.render()` does, on one core; compiling comes before."""
+    drawn = load_scene(scene)
+    data = mujoco.MjData(drawn.model)
+    data.qpos[:] = drawn.home
+    mujoco.mj_forward(drawn.model, data)
+    renderer, view = Renderer(drawn.model, *size, stage(drawn), paint(drawn)), best_view(drawn)
+    timer = clock.cpu_clock(lambda: renderer.render(data, view))
+    took = clock.race({"picture": timer}, seconds, repeats)["picture"]
+    return Pictures(1e3 * took, *size, int((drawn.model.geom_group < GROUPS).sum()))
+
+
+def run_pictures(scene: str, as_json: bool) -> str:
+    """All of `surgical-marl bench render --of scene`: a sentence, or JSON."""
+    found = measure_pictures(scene)
+    if as_json:
+        return json.dumps(asdict(found))
+    return f"{scene}: {found.ms_per_picture:.0f} ms of one core a picture, {found.width} x {found.height} pixels"
 
 
 def run(scene: str, num_envs: int | None, device: str, as_json: bool) -> str:

@@ -154,7 +154,11 @@ def _parser() -> argparse.ArgumentParser:
     learns.add_argument("--collisions", type=float, default=0.01, metavar="SHARE", help="of episodes, to stay below")
     learns.add_argument("--limit", type=float, default=600.0, metavar="SECONDS", help="then it is given up")
 
-    draws = kinds.add_parser("render", help="pictures/s of the endoscope")
+    draws = kinds.add_parser("render", help="pictures/s of the endoscope, or ms of a picture for people")
+    draws.add_argument(
+        "--of", dest="what", type=one_of(("endoscope", "scene")), default="endoscope", metavar="endoscope|scene",
+        help="what an endoscope shows agents, or what env.render() shows people",
+    )  # fmt: skip
     draws.add_argument("--scene", default="ecm", help="a scene with an endoscope, or a .yaml file")
     draws.add_argument("--num-envs", type=whole(1), metavar="N", help="default: 64 on a CPU, 8192 on a GPU")
     add_flags(draws, Settings, ("device",))

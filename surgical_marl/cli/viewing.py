@@ -31,12 +31,14 @@ def add_play(commands: Any) -> None:
     """Add the command play."""
     parser = commands.add_parser("play", help="a film of a policy, from outside and from the endoscope")
     _add_what(parser)
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="an .mp4 or a .gif")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="an .mp4, a .gif or a .webp")
     parser.add_argument("--episodes", type=whole(1, 1000), default=1, metavar="N")
     parser.add_argument("--grid", type=_grid, default=(1, 1), metavar="RxC", help="so many environments, such as 4x4")
     parser.add_argument("--slow", type=_number, default=1.0, metavar="X", help="times slower than real time")
     what = "a camera of the scene by name, or AZIMUTH,ELEVATION,DISTANCE in degrees and m about the tool tips"
     parser.add_argument("--camera", metavar="CAMERA", help=what)
+    what = "pixels of the picture of one environment (default: 480x360, and less in a grid)"
+    parser.add_argument("--size", type=_size, metavar="WxH", help=what)
     parser.add_argument("--plain", action="store_true", help="without words in the picture")
     parser.set_defaults(command=_play, name="play")
 
@@ -86,14 +88,16 @@ def _view(arguments: argparse.Namespace) -> None:
 
 def _play(arguments: argparse.Namespace) -> None:
     settings, who = _settings(arguments)
-    if arguments.out.suffix not in (".mp4", ".gif") or not arguments.out.parent.is_dir():
-        raise ValueError(f"cannot write --out {arguments.out}: name an .mp4 or .gif file in a folder that exists")
+    if arguments.out.suffix not in (".mp4", ".gif", ".webp") or not arguments.out.parent.is_dir():
+        raise ValueError(
+            f"cannot write --out {arguments.out}: name an .mp4, .gif or .webp file in a folder that exists"
+        )
 
     from surgical_marl.runs.environment import make_env
     from surgical_marl.view.film import Look, camera_of, film
     from surgical_marl.view.movers import Movers, first
 
-    look = Look(arguments.grid, arguments.slow, words=not arguments.plain)
+    look = Look(arguments.grid, arguments.slow, words=not arguments.plain, size=arguments.size)
     env = make_env(settings, look.grid[0] * look.grid[1], "numpy")
     look = replace(look, camera=camera_of(arguments.camera, env))
     movers = Movers(env, first(env) if who is None else who)
@@ -105,6 +109,13 @@ def _grid(text: str) -> tuple[int, int]:
     if not (rows.isdecimal() and columns.isdecimal()):
         raise argparse.ArgumentTypeError(f"must be rows and columns such as 4x4, not {text!r}")
     return int(rows), int(columns)
+
+
+def _size(text: str) -> tuple[int, int]:
+    width, _, height = text.partition("x")
+    if not (width.isdecimal() and height.isdecimal()):
+        raise argparse.ArgumentTypeError(f"must be width and height in pixels such as 640x480, not {text!r}")
+    return int(width), int(height)
 
 
 def _number(text: str) -> float:

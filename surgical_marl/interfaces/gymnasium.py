@@ -19,7 +19,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.interfaces.joint import JointAgent
-from surgical_marl.interfaces.rendering import Rendering, check_mode
+from surgical_marl.interfaces.rendering import Rendering, check_mode, check_size
 from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.policies.teammates import Teammate, Teammates
 
@@ -60,6 +60,7 @@ class SurgicalEnv(LimitInSpec, gymnasium.Env[Any, np.ndarray]):
         teammates: arm -> who moves it: a policy's name or run folder, "oracle", "zero", "random", "frozen", or a
             function from what the arm observes to its action. With `agent`, each other arm needs one.
         render_mode: "rgb_array" or None. For a window, "human" makes `gymnasium.make` add its own `HumanRendering`.
+        render_size: width and height of a picture, pixels; None for 480 and 360.
         options: further arguments of `surgical_marl.envs.batch.BatchedEnv`.
 
     Raises:
@@ -70,11 +71,13 @@ class SurgicalEnv(LimitInSpec, gymnasium.Env[Any, np.ndarray]):
 
     def __init__(
         self, task: str = "reach", scene: str | None = None, *, agent: str | None = None,
-        teammates: Mapping[str, Teammate] | None = None, render_mode: str | None = None, **options: Any,
+        teammates: Mapping[str, Teammate] | None = None, render_mode: str | None = None,
+        render_size: tuple[int, int] | None = None, **options: Any,
     ) -> None:  # fmt: skip
         if "num_envs" in options:
             raise ValueError(f"num_envs {options['num_envs']!r} is for many environments: use gymnasium.make_vec")
         check_mode(render_mode, RENDER_MODES)
+        check_size(render_size)
         options["max_steps"] = _limit_of_make() or options.get("max_steps")
         self.batch = make_batch(task, scene, 1, options)
         self.joint = JointAgent(self.batch, agent, list(teammates or ()), alone=True)
@@ -82,7 +85,7 @@ class SurgicalEnv(LimitInSpec, gymnasium.Env[Any, np.ndarray]):
         self.observation_space, self.action_space = self.joint.observation_space, self.joint.action_space
         self.metadata = {**self.metadata, "render_fps": round(1 / self.batch.control_dt)}
         self.render_mode = render_mode
-        self._rendering = Rendering(self.batch, render_mode)
+        self._rendering = Rendering(self.batch, render_mode, render_size)
         self._seen: dict[str, Any] = {}
         self._over = True
 

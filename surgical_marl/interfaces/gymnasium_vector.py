@@ -16,7 +16,7 @@ from gymnasium.vector.utils import batch_space
 
 from surgical_marl.interfaces.gymnasium import RENDER_MODES, LimitInSpec, make_batch
 from surgical_marl.interfaces.joint import JointAgent
-from surgical_marl.interfaces.rendering import check_mode
+from surgical_marl.interfaces.rendering import check_mode, check_size
 from surgical_marl.policies.teammates import Teammate, Teammates
 
 
@@ -33,6 +33,7 @@ class SurgicalVectorEnv(LimitInSpec, VectorEnv[Any, np.ndarray, Any]):
         autoreset_mode: when an environment whose episode is over starts the next one: in the same step, in the next
             step, or when `reset(options={"reset_mask": ...})` says so.
         render_mode: "rgb_array" or None.
+        render_size: width and height of a picture, pixels; None for 480 and 360.
         options: further arguments of `surgical_marl.envs.batch.BatchedEnv`.
 
     Raises:
@@ -44,9 +45,11 @@ class SurgicalVectorEnv(LimitInSpec, VectorEnv[Any, np.ndarray, Any]):
     def __init__(
         self, num_envs: int = 1, task: str = "reach", scene: str | None = None, *, agent: str | None = None,
         teammates: Mapping[str, Teammate] | None = None, max_episode_steps: int | None = None,
-        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP, render_mode: str | None = None, **options: Any,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP, render_mode: str | None = None,
+        render_size: tuple[int, int] | None = None, **options: Any,
     ) -> None:  # fmt: skip
         check_mode(render_mode, RENDER_MODES)
+        self._size = check_size(render_size)
         self.autoreset_mode = _mode(autoreset_mode)
         if max_episode_steps is not None:
             options["max_steps"] = max_episode_steps
@@ -130,7 +133,7 @@ class SurgicalVectorEnv(LimitInSpec, VectorEnv[Any, np.ndarray, Any]):
             return None
         from surgical_marl.view.record import ScenePicture
 
-        self._pictures = self._pictures or ScenePicture(self.batch)
+        self._pictures = self._pictures or ScenePicture(self.batch, *self._size)
         return tuple(self._pictures.draw(self._pictures.pose(index)) for index in range(self.num_envs))
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:

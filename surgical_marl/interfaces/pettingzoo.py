@@ -20,7 +20,7 @@ from gymnasium.utils.seeding import np_random
 from pettingzoo import ParallelEnv
 
 from surgical_marl.envs.actions import check_actions
-from surgical_marl.interfaces.rendering import MODES, Rendering, check_mode
+from surgical_marl.interfaces.rendering import MODES, Rendering, check_mode, check_size
 
 if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv, BatchStep
@@ -32,7 +32,13 @@ class _Face:
     Each is a `ParallelEnv` itself, not by way of this class: skrl looks at an environment's direct bases.
     """
 
-    def __init__(self, batch: BatchedEnv, render_mode: str | None, render_modes: list[str]) -> None:
+    def __init__(
+        self,
+        batch: BatchedEnv,
+        render_mode: str | None,
+        render_modes: list[str],
+        render_size: tuple[int, int] | None = None,
+    ) -> None:
         self.batch = batch
         self.metadata = {
             "name": f"{batch.task_name}_v0",
@@ -45,7 +51,7 @@ class _Face:
         self.action_spaces = batch.action_spaces
         self.state_space = batch.state_space
         self.max_cycles = batch.max_steps
-        self._rendering = Rendering(batch, render_mode)
+        self._rendering = Rendering(batch, render_mode, render_size)
         self._random: np.random.Generator | None = None
         self._state: Any = None
 
@@ -95,8 +101,10 @@ class _Face:
 class SurgicalParallelEnv(_Face, ParallelEnv[str, Any, Any]):
     """One environment, numpy in and out; `agents` is empty once the episode is over, until `reset`."""
 
-    def __init__(self, batch: BatchedEnv, render_mode: str | None = None) -> None:
-        super().__init__(batch, render_mode, list(MODES))
+    def __init__(
+        self, batch: BatchedEnv, render_mode: str | None = None, render_size: tuple[int, int] | None = None
+    ) -> None:
+        super().__init__(batch, render_mode, list(MODES), render_size)
         self.agents: list[str] = []
         self._shapes = {agent: space.shape for agent, space in batch.action_spaces.items()}
 
@@ -197,6 +205,7 @@ def parallel_env(
     max_cycles: int | None = None,
     arrays: str = "numpy",
     render_mode: str | None = None,
+    render_size: tuple[int, int] | None = None,
     **options: Any,
 ) -> SurgicalParallelEnv | SurgicalBatchedParallelEnv:
     """Make a PettingZoo parallel environment.
@@ -210,6 +219,7 @@ def parallel_env(
         max_cycles: PettingZoo's name for the option `max_steps`.
         arrays: with `num_envs`, the library of the arrays: "numpy", "torch" or "jax".
         render_mode: of one environment: None, "rgb_array" for pictures, or "human" for a window that follows.
+        render_size: width and height of a picture, pixels; None for 480 and 360.
         options: `control` ("position", "velocity" or "torque"), `difficulty` (a level of the task), `start` ("home" or
             "random"), `max_steps` (control steps until truncation), `decimation` (physics steps a control step),
             `reward` (weights of reward terms, as in {"collision": -5}), `knowledge` ("task", "all", "own" or "one": who
@@ -222,6 +232,7 @@ def parallel_env(
     from surgical_marl.envs.batch import BatchedEnv
 
     check_mode(render_mode)
+    check_size(render_size)
     if render_mode and num_envs is not None:
         raise ValueError(f"render_mode {render_mode!r} is for one environment: leave num_envs {num_envs} out")
     if num_envs is None and arrays != "numpy":
@@ -230,7 +241,9 @@ def parallel_env(
         options["max_steps"] = max_cycles
     count = 1 if num_envs is None else num_envs
     batch = BatchedEnv(task, scene, num_envs=count, engine=engine, device=device, arrays=arrays, **options)
-    return SurgicalParallelEnv(batch, render_mode) if num_envs is None else SurgicalBatchedParallelEnv(batch)
+    if num_envs is not None:
+        return SurgicalBatchedParallelEnv(batch)
+    return SurgicalParallelEnv(batch, render_mode, render_size)
 
 
 def aec_env(task: str = "reach", **kwargs: Any) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 import os
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -12,6 +13,10 @@ if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv
 
 MODES = ("human", "rgb_array")
+SIZE = (480, 360)
+"""Width and height of a picture unless asked otherwise, pixels."""
+MOST = 8192
+"""Pixels of a side at most."""
 
 
 def check_mode(mode: str | None, modes: Sequence[str] = MODES) -> None:
@@ -27,15 +32,32 @@ def check_mode(mode: str | None, modes: Sequence[str] = MODES) -> None:
             raise ValueError("render_mode 'human' needs a display, and there is none: use render_mode='rgb_array'")
 
 
+def check_size(size: Any) -> tuple[int, int]:
+    """Return width and height of pictures in pixels, `SIZE` for None; ValueError if they are no such numbers."""
+    try:
+        width, height = SIZE if size is None else size
+        good = 1 <= (width := operator.index(width)) <= MOST and 1 <= (height := operator.index(height)) <= MOST
+    except (TypeError, ValueError):
+        good = False
+    if not good:
+        raise ValueError(f"render_size {size!r} must be width and height of a picture, 1 to {MOST} pixels each")
+    return width, height
+
+
 class Rendering:
     """Pictures of the first environment of a batch, as `mode` says.
 
-    A copy has the same mode, and a window of its own.
+    A copy has the same mode and size, and a window of its own.
+
+    Args:
+        batch: environments.
+        mode: one of `MODES`, or None.
+        size: width and height, pixels; None for `SIZE`.
     """
 
-    def __init__(self, batch: BatchedEnv, mode: str | None) -> None:
+    def __init__(self, batch: BatchedEnv, mode: str | None, size: tuple[int, int] | None = None) -> None:
         check_mode(mode)
-        self.batch, self.mode = batch, mode
+        self.batch, self.mode, self.size = batch, mode, check_size(size)
         self._picture: Any = None
         self._window: Any = None
 
@@ -52,7 +74,7 @@ class Rendering:
             return None
         from surgical_marl.view.record import ScenePicture
 
-        self._picture = self._picture or ScenePicture(self.batch)
+        self._picture = self._picture or ScenePicture(self.batch, *self.size)
         drawn = self._picture.draw()
         if self.mode == "rgb_array":
             return drawn

@@ -24,7 +24,7 @@ from surgical_marl.machine import cores
 from surgical_marl.runs.progress import progress
 from surgical_marl.view.history import summary
 from surgical_marl.view.moment import Observer
-from surgical_marl.view.record import FPS, Pose, ScenePicture
+from surgical_marl.view.record import FPS, HEIGHT, WIDTH, Pose, ScenePicture
 from surgical_marl.view.render import View
 from surgical_marl.view.video import write_video
 
@@ -32,10 +32,10 @@ if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv
     from surgical_marl.view.movers import Movers
 
-WIDTH, HEIGHT = 480, 360
-"""Pixels of the picture from outside, if there is one environment."""
 WALL = 1280
 """Pixels along the width of a film of several environments, about."""
+SMALLEST, LARGEST = 16, 4096
+"""Pixels of a side of a picture."""
 MOST = 8
 """Rows and columns of a grid at most."""
 
@@ -49,27 +49,36 @@ class Look:
     Attributes:
         grid: rows and columns of environments.
         slow: how many times slower than real time.
-        camera: a camera of the scene by name, or a free one; None for the scene's own view.
+        camera: a camera of the scene by name, or a free one; None for the view in which the least is hidden.
         words: whether to write errors and stages into the pictures.
+        size: width and height of the picture of one environment, pixels; None for 480 and 360, and less in a grid.
+        fps: pictures a second of the film, about.
 
     Raises:
-        ValueError: a grid or a slowness that can't be.
+        ValueError: a grid, a slowness or a size that can't be.
     """
 
     grid: tuple[int, int] = (1, 1)
     slow: float = 1.0
     camera: str | View | None = None
     words: bool = True
+    size: tuple[int, int] | None = None
+    fps: float = FPS
 
     def __post_init__(self) -> None:
         if not all(1 <= side <= MOST for side in self.grid):
             raise ValueError(f"a grid has 1 to {MOST} rows and columns, not {self.grid[0]}x{self.grid[1]}")
         if not 0.1 <= self.slow <= 100:
             raise ValueError(f"slow must be from 0.1 to 100, not {self.slow:g}")
+        if self.size is not None and not all(SMALLEST <= side <= LARGEST for side in self.size):
+            width, height = self.size
+            raise ValueError(f"a film is {SMALLEST} to {LARGEST} pixels wide and high, not {width}x{height}")
 
     @property
     def tile(self) -> tuple[int, int]:
         """Width and height of the picture of one environment, pixels."""
+        if self.size is not None:
+            return self.size
         if self.grid == (1, 1):
             return WIDTH, HEIGHT
         width = WALL // self.grid[1] // 2 * 2
@@ -80,18 +89,16 @@ class Shot(NamedTuple):
     """What a frame shows of one environment."""
 
     pose: Pose
-    scope: Picture | None
-    """What the endoscope sees; None in a scene without one, and in a grid."""
     words: list[str]
 
 
 def film(env: BatchedEnv, movers: Movers, path: Path, look: Look, episodes: int = 1, seed: int = 0) -> Path:
     """Film the environments of `env`, as many as `look.grid` holds, and return the path of the film."""
-    every = max(1, round(1 / (FPS * look.slow * env.control_dt)))
+    every = _every(env, look)
     bar = progress(-(-episodes * env.max_steps // every), "frame", "filming")
 
     def shown() -> Iterator[Picture]:
-        for frame in _frames(env, movers, look, every, episodes, seed):
+        for frame in pictures(env, movers, look, episodes, seed):
             bar.update()
             yield frame
 
@@ -99,6 +106,25 @@ def film(env: BatchedEnv, movers: Movers, path: Path, look: Look, episodes: int 
         return write_video(path, shown(), 1 / (every * env.control_dt * look.slow))
     finally:
         bar.close()
+
+
+def pictures(env: BatchedEnv, movers: Movers, look: Look, episodes: int = 1, seed: int = 0) -> Iterator[Picture]:
+    """Yield the pictures of a film, each of all environments."""
+    picture, scope = ScenePicture(env, *look.tile), _scope(env, look)
+
+    def draw(shot: Shot) -> Picture:
+        seen = written(picture.draw(shot.pose, look.camera), shot.words)
+        return seen if scope is None else np.concatenate([seen, scope(shot.pose)], 1)
+
+    most = cores()
+    drawn: deque[list[Future[Picture]]] = deque()
+    with ThreadPoolExecutor(most) as threads:  # a picture takes a tenth of a second of a core, without Python's lock
+        for shots in _shots(env, movers, look, picture, episodes, seed):
+            drawn.append([threads.submit(draw, shot) for shot in shots])
+            if len(drawn) > most:
+                yield _joined(drawn.popleft(), look)
+        while drawn:
+            yield _joined(drawn.popleft(), look)
 
 
 def camera_of(text: str | None, env: BatchedEnv) -> str | View | None:
@@ -133,29 +159,23 @@ def written(picture: Picture, lines: list[str]) -> Picture:
     size = max(10, len(picture) // 24)
     image = Image.fromarray(picture)
     draw = ImageDraw.Draw(image, "RGBA")
-    text, font = "\n".join(lines), ImageFont.load_default(size)
+    font = ImageFont.load_default(size)
+    text = "\n".join(part for line in lines for part in _wrapped(line, font, picture.shape[1] - size - 8))
     left, top, right, bottom = draw.multiline_textbbox((size // 2, size // 2), text, font=font)
     draw.rectangle((left - 4, top - 4, right + 4, bottom + 4), fill=(0, 0, 0, 130))
     draw.multiline_text((size // 2, size // 2), text, font=font, fill=(255, 255, 255, 255))
     return np.asarray(image)
 
 
-def _frames(env: BatchedEnv, movers: Movers, look: Look, every: int, episodes: int, seed: int) -> Iterator[Picture]:
-    picture = ScenePicture(env, *look.tile)
-
-    def draw(shot: Shot) -> Picture:
-        seen = written(picture.draw(shot.pose, look.camera), shot.words)
-        return seen if shot.scope is None else np.concatenate([seen, shot.scope], 1)
-
-    most = cores()
-    drawn: deque[list[Future[Picture]]] = deque()
-    with ThreadPoolExecutor(most) as threads:  # a picture takes half a second of a core, without Python's lock
-        for shots in _shots(env, movers, look, picture, every, episodes, seed):
-            drawn.append([threads.submit(draw, shot) for shot in shots])
-            if len(drawn) > most:
-                yield _joined(drawn.popleft(), look)
-        while drawn:
-            yield _joined(drawn.popleft(), look)
+def _wrapped(line: str, font: Any, width: float) -> list[str]:
+    """Return a line as several, parted at commas where it would be wider than so many pixels."""
+    found: list[str] = []
+    for part in line.split(", "):
+        if found and font.getlength(f"{found[-1]}, {part}") <= width:
+            found[-1] += f", {part}"
+        else:
+            found.append(f"  {part}" if found else part)
+    return found
 
 
 def _joined(tiles: list[Future[Picture]], look: Look) -> Picture:
@@ -163,19 +183,24 @@ def _joined(tiles: list[Future[Picture]], look: Look) -> Picture:
 
 
 def _shots(
-    env: BatchedEnv, movers: Movers, look: Look, picture: ScenePicture, every: int, episodes: int, seed: int
+    env: BatchedEnv, movers: Movers, look: Look, picture: ScenePicture, episodes: int, seed: int
 ) -> Iterator[list[Shot]]:
     """Yield what each frame shows, while the environments play."""
-    scope = _scope(env) if look.grid == (1, 1) else lambda: None
+    every = _every(env, look)
     observations, _, infos = env.reset(seed)
     movers.begin(observations)
     for step in range(episodes * env.max_steps):
         if step % every == 0:
             words = [_words(env, infos, index) if look.words else [] for index in range(env.num_envs)]
-            yield [Shot(picture.pose(index), scope(), words[index]) for index in range(env.num_envs)]
+            yield [Shot(picture.pose(index), words[index]) for index in range(env.num_envs)]
         outcome = env.step(movers.actions(observations))
         observations, infos = outcome.observations, outcome.infos
         movers.begin(observations, np.asarray(outcome.terminated | outcome.truncated))
+
+
+def _every(env: BatchedEnv, look: Look) -> int:
+    """Return how many control steps there are from one picture to the next."""
+    return max(1, round(1 / (look.fps * look.slow * env.control_dt)))
 
 
 def _words(env: BatchedEnv, infos: Any, index: int) -> list[str]:
@@ -183,11 +208,11 @@ def _words(env: BatchedEnv, infos: Any, index: int) -> list[str]:
     return [f"{time:.2f} s", *(f"{agent}  {', '.join(summary(infos[agent], index))}" for agent in env.agents)]
 
 
-def _scope(env: BatchedEnv) -> Callable[[], Picture | None]:
-    """Return what returns the endoscope's picture of the first environment, or None in a scene without one."""
-    if not any(mount.arm.camera is not None for mount in env.scene.mounts.values()):
-        return lambda: None
-    from surgical_marl.vision.endoscope import Endoscope
-
-    endoscope = Endoscope(env.scene, env.num_envs, width=HEIGHT, height=HEIGHT)
-    return lambda: np.asarray(endoscope.render(env.qpos, env.object_poses).rgb[0, 0])
+def _scope(env: BatchedEnv, look: Look) -> Callable[[Pose], Picture] | None:
+    """Return what draws the endoscope's view beside the picture; None in a scene without one, and in a grid."""
+    cameras = [agent for agent, mount in env.scene.mounts.items() if mount.arm.camera is not None]
+    if not cameras or look.grid != (1, 1):
+        return None
+    _, side = look.tile
+    picture = ScenePicture(env, side, side)
+    return lambda pose: picture.draw(pose, f"{cameras[0]}/left")

@@ -14,16 +14,23 @@ from numpy.typing import NDArray
 
 from surgical_marl.machine import cores
 from surgical_marl.policies.acting import forget
-from surgical_marl.view.render import Renderer, Sphere, View
+from surgical_marl.view.camera import best_view, task_places
+from surgical_marl.view.colours import GOAL_RADIUS, goal_colour
+from surgical_marl.view.drawn import Sphere
+from surgical_marl.view.render import Renderer, View
+from surgical_marl.view.stage import paint, stage
 from surgical_marl.view.video import write_video
 
 if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv
 
 FPS = 25
-GOAL_RADIUS = 0.004
-"""Radius of a goal's ball in m, large enough to see a tip touch it."""
-COLOURS = ((0.10, 0.60, 0.42, 1.0), (0.95, 0.60, 0.10, 1.0), (0.35, 0.40, 0.90, 1.0))
+WIDTH, HEIGHT = 480, 360
+"""Pixels of a picture unless asked otherwise."""
+LEAST = 3.0
+"""Radius of a goal's ball in the picture at least, pixels."""
+THROUGH = 0.45
+"""Share of a goal's colour that is seen through what hides it."""
 
 
 def record(
@@ -46,7 +53,9 @@ def frames(
     """Yield pictures of the first environment, `FPS` of them for a second of simulated time."""
     picture, most = ScenePicture(env), cores()
     drawn: deque[Future[NDArray[np.uint8]]] = deque()
-    with ThreadPoolExecutor(most) as threads:  # a picture takes half a second of a core, without holding Python's lock
+    with ThreadPoolExecutor(
+        most
+    ) as threads:  # a picture takes a tenth of a second of a core, without holding Python's lock
         for pose in _poses(env, policy, picture, episodes, seed):
             drawn.append(threads.submit(picture.draw, pose))
             if len(drawn) > most:
@@ -92,22 +101,28 @@ class ScenePicture:
     Threads may draw at the same time.
     """
 
-    def __init__(self, env: BatchedEnv, width: int = 480, height: int = 360) -> None:
-        self._env = env
-        self._renderer = Renderer(env.scene.model, width, height)
+    def __init__(self, env: BatchedEnv, width: int = WIDTH, height: int = HEIGHT) -> None:
+        self._env, scene = env, env.scene
+        self._renderer = Renderer(scene.model, width, height, stage(scene), paint(scene))
+        self._view = best_view(scene, task_places(env.task), width / height)
 
     def draw(self, pose: Pose | None = None, camera: str | View | None = None) -> NDArray[np.uint8]:
         """Return a picture [height, width, 3] of the environment.
 
         It shows the environment as it was at `pose`, or as it is now if there is no `pose`. The `camera` is one of
-        `Renderer.render`.
+        `Renderer.render`; without one the least is hidden (`best_view`).
         """
         pose = pose or self.pose()
         data = mujoco.MjData(model := self._env.scene.model)
         data.qpos[:], data.mocap_pos[:], data.mocap_quat[:] = pose.qpos, pose.origins, pose.quaternions
         mujoco.mj_kinematics(model, data)
         mujoco.mj_camlight(model, data)
-        return self._renderer.render(data, camera, pose.balls)
+        camera = camera or self._view
+        balls = pose.balls
+        if isinstance(camera, View):  # from afar a goal is larger than it is, or it would be a dot
+            least = LEAST * 2 * np.tan(np.radians(camera.fovy / 2)) / self._renderer.height * camera.distance
+            balls = [(place, max(radius, least), rgba) for place, radius, rgba in balls]
+        return self._renderer.render(data, camera, balls, THROUGH)
 
     def pose(self, index: int = 0) -> Pose:
         """Return the current pose of an environment, by its number in the batch."""
@@ -115,6 +130,6 @@ class ScenePicture:
         env = self._env
         marks = env.task.marks(env.goal)
         for number, place in enumerate(marks[index] if marks.size else []):
-            balls.append((tuple(place), GOAL_RADIUS, COLOURS[number % len(COLOURS)]))
+            balls.append((tuple(place), GOAL_RADIUS, (*goal_colour(number, marks.shape[1], len(env.agents)), 1.0)))
         objects, own = env.object_poses, lambda values: np.array(values[index], float)
         return Pose(own(env.qpos), own(objects.origin), own(objects.quaternion), balls)

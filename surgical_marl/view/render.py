@@ -1,33 +1,42 @@
-"""Pictures of a MuJoCo model without OpenGL: C MuJoCo's ray caster and simple shading.
+"""Pictures of a MuJoCo model without OpenGL, by rays that a compiled kernel casts on one core.
 
     renderer = Renderer(model, width=480, height=360)
     image = renderer.render(data, camera=View(lookat=(0, 0, 0), distance=0.5))
 
-Rays go through the middle of each pixel first. Pixels that differ from a neighbour are then cast
-again with a grid of finer rays, so that edges are smooth and flat areas stay cheap.
+Rays go through the middle of each pixel first; four finer ones follow where neighbours show different things. A large
+lamp throws soft shadows, and what stands close together darkens each other. What an agent observes through a camera is
+drawn elsewhere, by `vision/endoscope.py`, and does not depend on how pictures for people look.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
+from types import MappingProxyType
+from typing import Any
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from surgical_marl.content import unknown
-from surgical_marl.view import shading
+from surgical_marl.view import painter, tracer
+from surgical_marl.view.drawn import Drawn, Extra, Sphere
 
 Array = NDArray[np.float64]
 
-# A sphere that is drawn but is no part of the model: position, radius, rgba.
-Sphere = tuple[Sequence[float], float, Sequence[float]]
-
-_VISIBLE_GROUPS = np.array([1, 1, 1, 0, 0, 0], np.uint8)
-_FAR = 1e10
-_EDGE = 0.03  # difference in colour, of 1, above which finer rays are cast
-_FINER = 3  # finer rays along each side of a pixel
+_LAMP = np.array([-0.7, 0.6, 1.6])
+"""From the middle of a model to the lamp, in its extents: to the viewer's right, towards the viewer, and up."""
+_LAMP_SIZE, _SKY_SIZE = 0.045, 0.55
+"""Radii over distance of the lamp, and of the part of the sky that things near by hide."""
+_FAR, _SKY_FAR = 1e6, 0.2
+"""Distance of what hides the sky at most, in extents of the model."""
+_LAMP_TILES, _SKY_TILES = 128, 96
+_LIT = 1.6
+"""How far from the model's middle shadows reach, in its extents."""
+_LAMP_MARGIN, _SKY_MARGIN = 0.02, 0.05
+"""How far a half shadow reaches beyond a shape, of the extent; what is farther is cut off."""
 
 
 @dataclass(frozen=True)
@@ -51,44 +60,75 @@ class View:
 
 
 class Renderer:
-    """Draws the visual geoms (groups 0 to 2) of one model, at one size."""
+    """Draws the visual geoms (groups 0 to 2) of one model, at one size. Threads may draw at the same time.
 
-    def __init__(self, model: mujoco.MjModel, width: int = 480, height: int = 360) -> None:
+    Args:
+        model: whose geoms are primitives or meshes.
+        width, height: of a picture, pixels.
+        stage: shapes besides those of the model, such as a table.
+        paint: geom -> rgb in place of its own.
+
+    Raises:
+        ValueError: a size without pixels.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        width: int = 480,
+        height: int = 360,
+        stage: Sequence[Extra] = (),
+        paint: Mapping[int, Sequence[float]] = MappingProxyType({}),
+    ) -> None:
         if width < 1 or height < 1:
             raise ValueError(f"a picture of {width} x {height} pixels has nothing to show: use 1 or more")
         self.model, self.width, self.height = model, width, height
-        self._look = shading.Look.of(model)
+        self._drawn = Drawn(model, stage, paint)
+        self._wp = tracer.wp
+        for module in (tracer, painter):  # here, so that threads need not wait for each other
+            self._wp.load_module(module, device="cpu")
 
     def render(
         self,
         data: mujoco.MjData,
         camera: str | View | None = None,
         spheres: Sequence[Sphere] = (),
+        through: float = 0.0,
     ) -> NDArray[np.uint8]:
         """Return a picture [height, width, 3] of the pose in `data`, after `mj_forward`.
 
-        `camera` is a camera of the model by name or a free `View`; without one the model's first
-        camera looks, or a free view of the whole model. `spheres` are drawn besides the model.
+        Args:
+            data: poses of the model's geoms and cameras.
+            camera: a camera of the model by name, or a free view. Without one the model's first camera looks, or a free
+                view of the whole model.
+            spheres: drawn besides the model.
+            through: share of a sphere's colour, from 0 to 1, that is seen through what hides it.
         """
-        origin, axes, fovy = self._camera(data, camera)
-        scale = 2 * np.tan(np.deg2rad(fovy) / 2) / self.height
+        place, axes, fovy = self._camera(data, camera)
+        wp, size = self._wp, (self.height, self.width)
+        pixel = 2 * np.tan(np.deg2rad(fovy) / 2) / self.height
+        world, (shapes, *patterns) = self._drawn.at(data, place, pixel, spheres, through)
+        lists = self._lists(shapes, self._eye(place, axes, pixel, self.width, self.height), self._lamps(axes))
+        coarse = tuple(-(-side // int(painter.COARSE)) for side in size)
+        depths, sides, orbs = (wp.empty(size, dtype=dtype, device="cpu") for dtype in (float, int, int))
+        normals, lights = (wp.empty(size, dtype=wp.vec3, device="cpu"), wp.zeros(coarse, dtype=wp.vec2, device="cpu"))
+        found, (grain, faces) = [depths, normals, sides], patterns
+        wp.launch(painter.cast, size, [world, shapes, *lists, faces, *found, orbs], device="cpu")
+        wp.launch(painter.light_up, coarse, [shapes, *lists, *found, lights], device="cpu")
+        picture = np.empty((*size, 3), np.uint8)
+        written = wp.array(picture, dtype=wp.vec3ub, copy=False, device="cpu")
+        inputs = [world, shapes, *lists, grain, faces, *found, orbs, lights, written]
+        wp.launch(painter.paint, size, inputs, device="cpu")
+        return picture
 
-        def colours(rows: Array, columns: Array) -> Array:
-            right = (columns - self.width / 2) * scale
-            up = (self.height / 2 - rows) * scale
-            rays = np.stack([right, up, np.full_like(up, -1.0)], axis=1) @ axes.T
-            rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-            return self._colours(data, origin, rays, spheres)
-
-        rows, columns = np.mgrid[: self.height, : self.width].reshape(2, -1) + 0.5
-        image = colours(rows, columns).reshape(self.height, self.width, 3)
-        edge = np.argwhere(_edges(image)) + 0.5
-        offsets = (np.arange(_FINER) + 0.5) / _FINER - 0.5
-        fine = edge[:, None] + np.stack(np.meshgrid(offsets, offsets), axis=-1).reshape(1, -1, 2)
-        if len(edge):
-            finer = colours(fine[..., 0].ravel(), fine[..., 1].ravel())
-            image[_edges(image)] = finer.reshape(len(edge), -1, 3).mean(axis=1)
-        return (image * 255 + 0.5).astype(np.uint8)
+    def lamp(self, axes: Array) -> Array:
+        """Return where the lamp is for a camera with these axes, m: above the viewer's left shoulder."""
+        right = np.array([*axes[:2, 0], 0.0])
+        length = np.linalg.norm(right)
+        right = right / length if length > 1e-3 else np.array([1.0, 0.0, 0.0])
+        level = np.stack([right, np.cross(right, [0.0, 0.0, 1.0]), [0.0, 0.0, 1.0]], axis=1)
+        place: Array = self.model.stat.center + self.model.stat.extent * (level @ _LAMP)
+        return place
 
     def _camera(self, data: mujoco.MjData, camera: str | View | None) -> tuple[Array, Array, float]:
         model = self.model
@@ -104,83 +144,45 @@ class Renderer:
         axes = data.cam_xmat[index].reshape(3, 3)
         return data.cam_xpos[index], axes, float(model.cam_fovy[index])
 
-    def _colours(self, data: mujoco.MjData, origin: Array, rays: Array, spheres: Sequence[Sphere]) -> Array:
-        """Return the colours [n, 3], from 0 to 1, of rays from one origin."""
-        distance, geom, normal = self._cast(data, origin, rays)
-        image = shading.background(rays)
-        hit = np.flatnonzero(geom >= 0)
-        if hit.size:
-            points = origin + distance[hit, None] * rays[hit]
-            base = self._look.base_colour(data, geom[hit], points)
-            light = self._light(data, points, spheres)
-            colour = self._look.shade(base, geom[hit], normal[hit], rays[hit], points, light)
-            image[hit] = self._look.fade(colour, image[hit], geom[hit], distance[hit])
-        away = [np.linalg.norm(np.asarray(centre) - origin) for centre, _, _ in spheres]
-        for index in np.argsort(away)[::-1]:
-            centre, radius, rgba = spheres[index]
-            near = _sphere_distance(origin, rays, np.asarray(centre, float), radius)
-            seen = np.flatnonzero(near < np.where(geom >= 0, distance, np.inf))
-            points = origin + near[seen, None] * rays[seen]
-            facing = (points - centre) / radius
-            base = np.broadcast_to(np.asarray(rgba[:3], float) ** shading.GAMMA, facing.shape)
-            none = np.full(len(seen), -1)
-            light = np.ones(len(seen))
-            colour = self._look.shade(base, none, facing, rays[seen], points, light)
-            image[seen] += rgba[3] * (colour - image[seen])
-        return np.clip(image, 0.0, 1.0) ** (1 / shading.GAMMA)
+    def _lamps(self, axes: Array) -> list[Any]:
+        """Return the lamp, and the sky as a lamp overhead."""
+        extent = self.model.stat.extent
+        sky = self.model.stat.center + np.array([0.0, 0.0, 6.0 * extent])
+        key, above = self._lamp(self.lamp(axes), _LAMP_TILES), self._lamp(sky, _SKY_TILES)
+        key.spread, key.far, key.margin = _LAMP_SIZE, _FAR, _LAMP_MARGIN * extent
+        above.spread, above.far, above.margin = _SKY_SIZE, _SKY_FAR * extent, _SKY_MARGIN * extent
+        return [key, above]
 
-    def _light(self, data: mujoco.MjData, points: Array, spheres: Sequence[Sphere]) -> Array:
-        """Return how much of the lamp each point sees. The lamp is a point, so one cast serves all."""
-        rays = points - self._look.lamp
-        length = np.linalg.norm(rays, axis=1)
-        rays /= length[:, None]
-        reached = length * (1 - 1e-4)
-        blocked, geom, _ = self._cast(data, self._look.lamp, rays)
-        light = np.where((geom >= 0) & (blocked < reached), 0.0, 1.0)
-        for centre, radius, rgba in spheres:
-            near = _sphere_distance(self._look.lamp, rays, np.asarray(centre, float), radius)
-            light *= np.where(near < reached, 1 - rgba[3], 1.0)
-        return light
+    def _lamp(self, place: Array, tiles: int) -> Any:
+        """Return a lamp that looks at the middle of the model."""
+        back = place - self.model.stat.center
+        distance = np.linalg.norm(back)
+        back = back / distance
+        right = np.cross([0.0, 1.0, 0.0], back)
+        right /= np.linalg.norm(right)
+        axes = np.stack([right, np.cross(back, right), back], axis=1)
+        pixels = tiles * int(tracer.TILE)
+        return self._eye(place, axes, 2 * _LIT * self.model.stat.extent / distance / pixels, pixels, pixels)
 
-    def _cast(self, data: mujoco.MjData, origin: Array, rays: Array) -> tuple[Array, NDArray[np.int32], Array]:
-        """Return distance, geom (-1: none) and the normal towards the viewer of each ray's first hit."""
-        count = len(rays)
-        geom = np.empty(count, np.int32)
-        distance, normal = np.empty(count), np.empty((count, 3))
-        mujoco.mj_multiRay(
-            m=self.model,
-            d=data,
-            pnt=origin,
-            vec=np.ascontiguousarray(rays).reshape(-1),
-            geomgroup=_VISIBLE_GROUPS,
-            flg_static=True,
-            bodyexclude=-1,
-            geomid=geom,
-            dist=distance,
-            normal=normal.reshape(-1),
-            nray=count,
-            cutoff=_FAR,
-        )
-        normal[np.einsum("ij,ij->i", normal, rays) > 0] *= -1
-        return distance, geom, normal
+    def _lists(self, shapes: Any, eye: Any, lamps: list[Any]) -> list[Any]:
+        """Return all eyes, and which shapes each tile of theirs may show, and how many they are."""
+        wp, eyes, drawn = self._wp, [eye, *lamps], shapes.numpy()
+        for one, after in pairwise(eyes):
+            after.first = one.first + one.columns * one.rows
+        tiles = eyes[-1].first + eyes[-1].columns * eyes[-1].rows
+        lists = [wp.array(eyes, dtype=tracer.Eye, device="cpu")]
+        lists.append(wp.empty((tiles, max(len(drawn), 1)), dtype=wp.uint16, device="cpu"))
+        lists.append(wp.zeros(tiles, dtype=int, device="cpu"))
+        # The largest first: they may hide all of the lamp. From below: if one is too high, so are all after it.
+        orders = [np.arange(self._drawn.count), np.argsort(-drawn["radius"]), np.argsort(drawn["bottom"])]
+        for number, order in enumerate(orders):
+            numbers = wp.array(order.astype(np.int32), dtype=int, device="cpu")
+            wp.launch(tracer.list_shapes, 1, [shapes, *lists, numbers, number], device="cpu")
+        return lists
 
-
-def _sphere_distance(origin: Array, rays: Array, centre: Array, radius: float) -> Array:
-    """Return the distance along unit rays to a sphere, infinite where they miss it."""
-    towards = centre - origin
-    along = rays @ towards
-    inside = radius**2 - (towards @ towards - along**2)
-    near = along - np.sqrt(np.maximum(inside, 0.0))
-    return np.where((inside > 0) & (near > 0), near, np.inf)
-
-
-def _edges(image: Array) -> NDArray[np.bool_]:
-    """Return which pixels differ from the one beside, above or below them."""
-    edge = np.zeros(image.shape[:2], bool)
-    across = np.abs(np.diff(image, axis=1)).max(axis=2) > _EDGE
-    down = np.abs(np.diff(image, axis=0)).max(axis=2) > _EDGE
-    edge[:, 1:] |= across
-    edge[:, :-1] |= across
-    edge[1:] |= down
-    edge[:-1] |= down
-    return edge
+    def _eye(self, place: Array, axes: Array, pixel: float, width: int, height: int) -> Any:
+        eye, tile, wp = tracer.Eye(), int(tracer.TILE), self._wp
+        eye.place, eye.axes = wp.vec3(*place), wp.mat33(*axes.ravel())
+        eye.tile, eye.columns, eye.rows = pixel * tile, -(-width // tile), -(-height // tile)
+        eye.left, eye.top = -pixel * width / 2, pixel * height / 2
+        return eye

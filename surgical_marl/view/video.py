@@ -1,4 +1,4 @@
-"""Videos of frames: an mp4, or a gif where ffmpeg cannot run."""
+"""Videos of frames: an mp4, or a gif where ffmpeg cannot run; an animated webp for pages."""
 
 from __future__ import annotations
 
@@ -12,6 +12,10 @@ from typing import Any
 import imageio.v2 as imageio
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
+
+QUALITY = 55
+"""Of a webp, from 0 to 100."""
 
 Frames = Iterable[NDArray[np.uint8]]
 
@@ -19,7 +23,7 @@ Frames = Iterable[NDArray[np.uint8]]
 def write_video(path: str | os.PathLike[str], frames: Frames, fps: float) -> Path:
     """Write frames [height, width, 3] as a video and return its path.
 
-    A path with `.gif` becomes a gif. Any other becomes an mp4, or a gif beside it where ffmpeg cannot run.
+    A path with `.gif` or `.webp` becomes that. Any other becomes an mp4, or a gif beside it where ffmpeg cannot run.
     The file is written completely or not at all.
     """
     if not fps > 0:
@@ -29,12 +33,13 @@ def write_video(path: str | os.PathLike[str], frames: Frames, fps: float) -> Pat
     first = next(frames, None)
     if first is None:
         raise ValueError(f"no frames to write to {str(path)!r}: a video needs 1 or more")
-    gif = path.suffix == ".gif" or not ffmpeg_runs()
-    path = path.with_suffix(".gif" if gif else ".mp4")
+    if path.suffix not in (".gif", ".webp"):
+        path = path.with_suffix(".mp4" if ffmpeg_runs() else ".gif")
+    write = {".gif": _write_gif, ".webp": _write_webp, ".mp4": _write_mp4}[path.suffix]
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
     try:
-        (_write_gif if gif else _write_mp4)(part, first.shape, itertools.chain([first], frames), fps)
+        write(part, first.shape, itertools.chain([first], frames), fps)
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)
@@ -58,6 +63,11 @@ def _write_gif(path: Path, shape: tuple[int, ...], frames: Frames, fps: float) -
     with imageio.get_writer(path, duration=max(20.0, 1000 / fps), loop=0) as writer:
         for frame in frames:
             writer.append_data(frame)
+
+
+def _write_webp(path: Path, shape: tuple[int, ...], frames: Frames, fps: float) -> None:
+    first, *rest = (Image.fromarray(frame) for frame in frames)
+    first.save(path, save_all=True, append_images=rest, duration=round(1000 / fps), loop=0, quality=QUALITY, method=4)
 
 
 def _write_mp4(path: Path, shape: tuple[int, ...], frames: Frames, fps: float) -> None:

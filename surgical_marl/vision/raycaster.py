@@ -54,10 +54,10 @@ class RayCaster:
         meshes = np.where(kinds == MESH, model.geom_dataid[geoms], -1)
         pictures, tiles = num_envs * len(cameras), -(-width // TILE) * -(-height // TILE)
         pixel = float(2 * np.tan(np.radians(model.cam_fovy[cameras[0]]) / 2) / height)
-        self._meshes = {mesh: _mesh(model, mesh) for mesh in set(meshes) - {-1}}  # handles keep no mesh alive
+        self._meshes = {mesh: warp_mesh(model, mesh) for mesh in set(meshes) - {-1}}  # handles keep no mesh alive
         self._handles = wp.array([self._meshes[m].id if m >= 0 else 0 for m in meshes], dtype=wp.uint64)
         self._first_faces = wp.array(np.append(model.mesh_faceadr, 0)[meshes], dtype=int)
-        self._normals = wp.array(_normals(model), dtype=wp.vec3)
+        self._normals = wp.array(corner_normals(model), dtype=wp.vec3)
         self._kinds, self._geoms, self._cameras = (wp.array(ids, dtype=int) for ids in (kinds, geoms, cameras))
         self._sizes = wp.array(_sizes(model, geoms), dtype=wp.vec3)
         self._colours = wp.array(model.geom_rgba[geoms, :3], dtype=wp.vec3)
@@ -112,14 +112,14 @@ def _sizes(model: mujoco.MjModel, geoms: np.ndarray) -> np.ndarray:
     return sizes
 
 
-def _mesh(model: mujoco.MjModel, mesh: int) -> Any:
+def warp_mesh(model: mujoco.MjModel, mesh: int) -> Any:
     start, first = model.mesh_vertadr[mesh], model.mesh_faceadr[mesh]
     points = model.mesh_vert[start : start + model.mesh_vertnum[mesh]]
     faces = model.mesh_face[first : first + model.mesh_facenum[mesh]]
     return wp.Mesh(wp.array(points, dtype=wp.vec3), wp.array(faces.ravel(), dtype=int))
 
 
-def _normals(model: mujoco.MjModel) -> np.ndarray:
+def corner_normals(model: mujoco.MjModel) -> np.ndarray:
     """At the corners of every face of all meshes, [faces, 3, 3]: the vertex's, or the face's where that is far off."""
     found = np.zeros((max(len(model.mesh_face), 1), 3, 3), np.float32)
     for mesh in range(model.nmesh):

@@ -12,9 +12,9 @@ import trimesh
 
 from surgical_marl.tasks.base.task import APPROACH
 from surgical_marl.view.browser.shapes import body_glb
+from surgical_marl.view.colours import AGENTS, GOAL_RADIUS
 from surgical_marl.view.moment import Moment
 from surgical_marl.view.paths import Paths
-from surgical_marl.view.record import COLOURS, GOAL_RADIUS
 from surgical_marl.view.session import Session
 
 RED, GREY, GOLD = np.array([226, 40, 40]), np.array([120, 130, 140]), np.array([226, 168, 20])
@@ -29,7 +29,7 @@ _NONE = np.zeros((0, 2, 3), np.float32)
 
 def colour(index: int) -> np.ndarray:
     """Return the colour of an agent by its number, [3], 0 to 255."""
-    return (255 * np.array(COLOURS[index % len(COLOURS)][:3])).astype(np.uint8)
+    return (255 * np.array(AGENTS[index % len(AGENTS)])).astype(np.uint8)
 
 
 def distance_colour(distance: float) -> np.ndarray:

@@ -11,7 +11,7 @@ import trimesh
 from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
-from surgical_marl.view.shading import visual_rgba
+from surgical_marl.view.colours import visual_rgba
 
 _VISIBLE = 2
 """The last group of visual geoms."""
@@ -76,7 +76,7 @@ def _mesh(model: mujoco.MjModel, index: int) -> trimesh.Trimesh:
 
 
 def _material(rgba: np.ndarray) -> PBRMaterial:
-    """Return steel for greys, and plastic or tissue for colours, as `shading.Look` has them."""
+    """Return steel for greys, and plastic or tissue for colours."""
     saturation = float(np.ptp(rgba[:3]) / max(rgba[:3].max(), 1e-6))
     steel = float(np.clip(1 - 4 * saturation, 0.0, 1.0) * (0.3 < rgba[:3].mean() < 0.8))
     return PBRMaterial(

@@ -1,0 +1,153 @@
+"""Where to look at a scene from: the direction in which arms and objects hide the least of what matters.
+
+    view = best_view(scene)
+    Renderer(scene.model).render(data, view)
+
+What matters are tool tips, the points that targets are drawn around, and objects. The directions are tried with the
+arms in several postures about home. The same scene always gives the same view.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from surgical_marl.scenes.scene import Scene
+from surgical_marl.view.render import View
+
+Array = NDArray[np.float64]
+
+_AZIMUTHS, _ELEVATIONS = range(0, 360, 15), (-25.0, -33.0, -42.0)
+_FOVY = 40.0
+_POSTURES = 6
+_NEAR = 0.15
+"""Part of every joint's range about home that postures are drawn from."""
+_AROUND = 0.03
+"""How far from the point in front of an arm its targets are looked for, m."""
+_SLACK = 0.012
+"""A point counts as seen if what a ray meets is at most so far in front of it, m: it may lie within a tool."""
+_FILLED, _LEAST = 0.75, 0.5
+"""Part of the picture that what matters fills; distance at least, over that of the scene's own camera."""
+_TABLES = {"points": 3, "starts": 7}
+"""Tables of a task that hold places in the world, and how many numbers a row has."""
+_PLACES = 16
+"""Rows of a task's tables that are looked at, about."""
+_TURNED, _CLOSE = 0.25, 0.5
+"""What it costs to look from the other side than the scene's own camera, and if something close by is all one sees."""
+_GROUPS = np.array([1, 1, 1, 0, 0, 0], np.uint8)
+
+
+class _Moment(NamedTuple):
+    """The arms in one posture, and the points that should be seen then, [P, 3]."""
+
+    data: mujoco.MjData
+    points: Array
+
+
+def best_view(scene: Scene, places: Array | None = None, aspect: float = 4 / 3) -> View:
+    """Return the view of a scene in which the least is hidden.
+
+    Args:
+        scene: what is looked at.
+        places: further points in the world that should be seen, [P, 3], m.
+        aspect: width over height of the picture.
+    """
+    moments = _moments(scene, np.zeros((0, 3)) if places is None else places)
+    points = np.concatenate([moment.points for moment in moments])
+    middle = (points.min(0) + points.max(0)) / 2
+    own = moments[0].data.camera("overview").xpos - middle
+    ways = [(azimuth, elevation) for elevation in _ELEVATIONS for azimuth in _AZIMUTHS]
+    views = [_fitted(points, middle, _LEAST * float(np.linalg.norm(own)), aspect, *way) for way in ways]
+    return max(views, key=lambda view: _score(scene, moments, view, own))
+
+
+def task_places(task: Any) -> Array:
+    """Return points in the world that episodes of a task are about, [P, 3], m: where objects begin and should be.
+
+    Goals of tool tips are near the points in front of the arms, which every view shows.
+    """
+    tables = {name.removeprefix("work_"): np.asarray(table) for name, table in task.tables.items()}
+    known = [tables[name] for name, width in _TABLES.items() if name in tables and tables[name].shape[1:] == (width,)]
+    found = [table[:: -(-len(table) // _PLACES), :3] for table in known]
+    extremes = [table[[*table[:, :3].argmin(0), *table[:, :3].argmax(0)], :3] for table in known]
+    return np.concatenate([np.zeros((0, 3)), *found, *extremes]).astype(float)
+
+
+def _fitted(points: Array, middle: Array, least: float, aspect: float, azimuth: float, elevation: float) -> View:
+    """Return a view in this direction from so far that it shows all points, and from `least` away or farther."""
+    view = View(tuple(middle.tolist()), least, azimuth, elevation, _FOVY)
+    _, axes = view.pose()
+    across, up, back = ((points - middle) @ axes).T
+    side = _FILLED * np.tan(np.radians(_FOVY / 2))
+    needed = back + np.maximum(np.abs(across) / aspect, np.abs(up)) / side
+    return replace(view, distance=max(least, float(needed.max())))
+
+
+def seen(model: mujoco.MjModel, data: mujoco.MjData, eye: Array, points: Array) -> NDArray[np.bool_]:
+    """Return which points [P, 3] nothing hides from a place."""
+    ways = points - eye
+    away = np.linalg.norm(ways, axis=1)
+    hit = _hits(model, data, eye, ways / away[:, None])
+    return (hit < 0) | (hit > away - _SLACK)
+
+
+def _score(scene: Scene, moments: list[_Moment], view: View, own: Array) -> float:
+    """Return how good a view is, 1 at most: the share of points that are seen, less what it costs otherwise."""
+    eye, axes = view.pose()
+    shares = [seen(scene.model, moment.data, eye, moment.points).mean() for moment in moments]
+    side = np.tan(np.radians(_FOVY / 2)) * np.linspace(-1, 1, 9)
+    rays = np.stack([*np.meshgrid(4 / 3 * side, side), np.full((9, 9), -1.0)], axis=-1).reshape(-1, 3)
+    rays = rays / np.linalg.norm(rays, axis=1, keepdims=True) @ axes.T
+    hit = _hits(scene.model, moments[0].data, eye, rays)
+    close = ((hit >= 0) & (hit < 0.6 * view.distance)).mean()
+    towards = (eye - np.asarray(view.lookat)) / view.distance
+    turned = (1 - towards @ own / np.linalg.norm(own)) / 2
+    return float(np.mean(shares) - _CLOSE * close - _TURNED * turned)
+
+
+def _moments(scene: Scene, places: Array) -> list[_Moment]:
+    """Return the arms at home and in postures about it, with tool tips, targets and objects."""
+    rng, model = np.random.default_rng(0), scene.model
+    still = [*places, *(model.body(name).pos for name in scene.free_objects)]
+    for mount in scene.mounts.values():
+        steps = _AROUND * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
+        still += list(mount.position + (mount.workspace + steps) @ mount.rotation.T)
+    found = []
+    for number in range(_POSTURES):
+        spread = _NEAR if number else 0.0
+        drawn = {
+            agent: mount.arm.home + spread * (rng.uniform(mount.arm.lower, mount.arm.upper) - mount.arm.home)
+            for agent, mount in scene.mounts.items()
+        }
+        data = mujoco.MjData(model)
+        data.qpos[:] = scene.full_qpos(drawn)
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_camlight(model, data)
+        tips = [data.site(f"{agent}/tool_tip").xpos for agent in scene.agents]
+        found.append(_Moment(data, np.array([*tips, *still])))
+    return found
+
+
+def _hits(model: mujoco.MjModel, data: mujoco.MjData, eye: Array, rays: Array) -> Array:
+    """Return the distances of what rays from a place meet first, -1 for nothing."""
+    count = len(rays)
+    geom, distance = np.empty(count, np.int32), np.empty(count)
+    mujoco.mj_multiRay(
+        m=model,
+        d=data,
+        pnt=eye,
+        vec=np.ascontiguousarray(rays).reshape(-1),
+        geomgroup=_GROUPS,
+        flg_static=True,
+        bodyexclude=-1,
+        geomid=geom,
+        dist=distance,
+        normal=None,
+        nray=count,
+        cutoff=1e10,
+    )
+    return np.where(geom >= 0, distance, -1.0)

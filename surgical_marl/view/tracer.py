@@ -1,0 +1,284 @@
+"""Rays among the shapes of a picture: what they meet, and what stands between a point and a lamp.
+
+`list_shapes` lists for every tile of a camera's or a lamp's picture the shapes that some of its rays may meet; rays
+then test only those. The kernels run on a CPU, one picture a thread of the caller.
+"""
+
+# Kernels are Warp's language, which only looks like Python. Annotations are read as they are, without a
+# `from __future__`; a number that a loop or a branch changes is told its type.
+# ruff: noqa: UP018, RUF046, SIM109
+# mypy: ignore-errors
+from surgical_marl.runtime import prepare_warp
+from surgical_marl.view.lighting import hidden, ramp
+from surgical_marl.vision.rays import BOX, CYLINDER, FAR, MESH, outwards, reach, span
+
+wp = prepare_warp()
+wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "fast_math": True})
+
+TILE = wp.constant(8)
+"""Pixels along each side of a tile."""
+HALF_OPEN = wp.constant(0.7)
+"""Share of the sky that counts as seen from surfaces that look down."""
+SIDES = wp.constant(4)
+"""Sides of a shape that edges are smoothed between, at most."""
+DARK = wp.constant(0.004)
+"""Share of a lamp that counts as nothing."""
+PLANE = wp.constant(5)
+"""Kind of a shape, besides those of `vision/rays.py`: all below z = 0 in its frame."""
+
+
+@wp.struct
+class Eye:
+    """A camera, or a lamp that asks which shapes stand between it and a point."""
+
+    place: wp.vec3
+    axes: wp.mat33
+    """Right, up and back as columns."""
+    tile: wp.float32
+    """Width of a tile at distance 1."""
+    columns: wp.int32
+    rows: wp.int32
+    left: wp.float32
+    """Where the picture's left edge is at distance 1."""
+    top: wp.float32
+    spread: wp.float32
+    """Radius of a lamp over its distance; 0 for a camera."""
+    far: wp.float32
+    """Height above a point from which on nothing throws a shadow there, m; shadows grow weaker until there."""
+    margin: wp.float32
+    """How much larger shapes count, m: so far a half shadow may reach beyond them."""
+    first: wp.int32
+    """Row of the lists of shapes that belongs to its first tile."""
+
+
+@wp.struct
+class Shape:
+    """A shape of a picture."""
+
+    kind: wp.int32
+    """One of `vision/rays.py`, or `PLANE`."""
+    size: wp.vec3
+    radius: wp.float32
+    """Of a ball about the shape's origin that holds it."""
+    place: wp.vec3
+    bottom: wp.float32
+    """Height of its lowest point, or less, m."""
+    top: wp.float32
+    """Height of its highest point, or more, m."""
+    back: wp.mat33
+    """From the world's frame to the shape's."""
+    shadow_kind: wp.int32
+    """What stands for the shape where it throws a shadow; -1 if it throws none."""
+    shadow_size: wp.vec3
+    breadth: wp.vec2
+    """Half width and half length as seen from the side."""
+    colour: wp.vec3
+    alpha: wp.float32
+    gloss: wp.vec3
+    pattern: wp.int32
+    mesh: wp.uint64
+    first_face: wp.int32
+
+
+@wp.struct
+class World:
+    """What is the same for all shapes of a picture."""
+
+    balls: wp.int32
+    """Number of the first ball that is no part of the model; balls come last, the farthest first."""
+    through: wp.float32
+    """Share of a ball's colour that is seen through what hides it."""
+    fade: wp.float32
+    """Distance at which planes have faded, m."""
+
+
+@wp.func
+def meets(eye: Eye, shapes: wp.array[Shape], shape: int, n: wp.vec3):
+    """Return whether a shape reaches beyond a plane through the eye; n is normal to it, in the eye's frame."""
+    if shapes[shape].kind == PLANE:
+        return True
+    local = shapes[shape].back @ (eye.axes @ n)
+    away = wp.dot(local, shapes[shape].back @ (eye.place - shapes[shape].place))
+    return reach(shapes[shape].kind, shapes[shape].size, local) + eye.margin * wp.length(n) >= away
+
+
+@wp.kernel
+def list_shapes(
+    shapes: wp.array[Shape],
+    eyes: wp.array[Eye],
+    listed: wp.array2d[wp.uint16],
+    counts: wp.array[int],
+    order: wp.array[int],
+    number: int,
+):
+    """List shapes for every tile of an eye; one thread does all, so that all lists are in the same order.
+
+    Args:
+        order: numbers of the shapes to list, in this order.
+        listed, counts: shapes that rays through a tile may meet [tiles, shapes], and how many they are [tiles].
+        number: of the eye. A lamp lists what throws shadows.
+    """
+    eye = eyes[number]
+    for place in range(order.shape[0]):
+        shape = order[place]
+        at = wp.transpose(eye.axes) @ (shapes[shape].place - eye.place)
+        radius = shapes[shape].radius + eye.margin
+        near, far = -at[2] - radius, -at[2] + radius
+        first_column, last_column, first_row, last_row = int(0), int(eye.columns) - 1, int(0), int(eye.rows) - 1
+        if near > 1e-3:
+            left = (at[0] - radius) / wp.where(at[0] < radius, near, far)
+            right = (at[0] + radius) / wp.where(at[0] > -radius, near, far)
+            low = (at[1] - radius) / wp.where(at[1] < radius, near, far)
+            high = (at[1] + radius) / wp.where(at[1] > -radius, near, far)
+            first_column = wp.max(int(wp.floor((left - eye.left) / eye.tile)), 0)
+            last_column = wp.min(int(wp.floor((right - eye.left) / eye.tile)), eye.columns - 1)
+            first_row = wp.max(int(wp.floor((eye.top - high) / eye.tile)), 0)
+            last_row = wp.min(int(wp.floor((eye.top - low) / eye.tile)), eye.rows - 1)
+        if far <= 0.0 or (eye.spread > 0.0 and shapes[shape].shadow_kind < 0):
+            last_row = -1
+        for row in range(first_row, last_row + 1):
+            top = eye.top - float(row) * eye.tile
+            seen = meets(eye, shapes, shape, wp.vec3(0.0, 1.0, top - eye.tile))
+            if seen and meets(eye, shapes, shape, wp.vec3(0.0, -1.0, -top)):
+                for column in range(first_column, last_column + 1):
+                    edge = eye.left + float(column) * eye.tile
+                    seen = meets(eye, shapes, shape, wp.vec3(1.0, 0.0, edge))
+                    if seen and meets(eye, shapes, shape, wp.vec3(-1.0, 0.0, -edge - eye.tile)):
+                        tile = eye.first + row * eye.columns + column
+                        listed[tile, counts[tile]] = wp.uint16(shape)
+                        counts[tile] += 1
+
+
+@wp.func
+def lit(
+    shapes: wp.array[Shape],
+    lamp: Eye,
+    listed: wp.array2d[wp.uint16],
+    counts: wp.array[int],
+    point: wp.vec3,
+    own: int,
+    joint: float,
+):
+    """Return the share of a lamp that a point of a shape sees.
+
+    Args:
+        joint: 0 if shapes that hide the same part of the lamp count once, 1 if each of them counts.
+    """
+    at = wp.transpose(lamp.axes) @ (point - lamp.place)
+    if at[2] >= -1e-6:
+        return 1.0
+    column = int(wp.floor((-at[0] / at[2] - lamp.left) / lamp.tile))
+    row = int(wp.floor((lamp.top + at[1] / at[2]) / lamp.tile))
+    if column < 0 or row < 0 or column >= lamp.columns or row >= lamp.rows:
+        return 1.0
+    way = lamp.place - point
+    distance = wp.length(way)
+    way = way / distance
+    light, each = float(1.0), float(1.0)
+    tile = lamp.first + row * lamp.columns + column
+    for i in range(counts[tile]):
+        shape = int(listed[tile, i])
+        if shapes[shape].bottom > point[2] + lamp.far or light + joint * (each - light) < DARK:
+            break
+        towards = shapes[shape].place - point
+        along = wp.dot(towards, way)
+        radius = shapes[shape].radius
+        wide = radius + lamp.spread * wp.max(along + radius, 0.0)
+        near = (
+            shapes[shape].top > point[2]
+            and along > -radius
+            and along - radius < lamp.far
+            and wp.dot(towards, towards) - along * along < wide * wide
+        )
+        if near and (shape != own or shapes[shape].kind == MESH):
+            cover = float(0.0)
+            p, v = -(shapes[shape].back @ towards), shapes[shape].back @ way
+            if shapes[shape].kind == MESH:
+                query = wp.mesh_query_ray(shapes[shape].mesh, p, v, distance)
+                if query.result:
+                    cover = 1.0
+            else:
+                cover = hidden(
+                    shapes[shape].shadow_kind, shapes[shape].shadow_size, shapes[shape].breadth, p, v, lamp.spread
+                )
+            cover = cover * shapes[shape].alpha * (1.0 - ramp(0.0, 1.0, (along - radius) / lamp.far))
+            light = wp.min(light, 1.0 - cover)
+            each = each * (1.0 - cover)
+    return light + joint * (each - light)
+
+
+@wp.func
+def lamps(
+    shapes: wp.array[Shape],
+    eyes: wp.array[Eye],
+    listed: wp.array2d[wp.uint16],
+    counts: wp.array[int],
+    shape: int,
+    point: wp.vec3,
+    normal: wp.vec3,
+):
+    """Return the shares of the lamp and of the sky that a point of a shape sees."""
+    raised = point + 2e-5 * normal
+    light, open = float(0.0), float(HALF_OPEN)
+    if wp.dot(normal, eyes[1].place - point) > -0.2 * wp.length(eyes[1].place - point):
+        light = lit(shapes, eyes[1], listed, counts, raised, shape, 0.0)
+    upwards = ramp(-0.3, 0.2, normal[2])
+    if upwards > 0.0:
+        open += upwards * (lit(shapes, eyes[2], listed, counts, raised, shape, 1.0) - open)
+    return wp.vec2(light, open)
+
+
+@wp.func
+def ray_of(eye: Eye, column: float, row: float):
+    """Return the unit vector through a place of the picture."""
+    x, y = eye.left + column * eye.tile / float(TILE), eye.top - row * eye.tile / float(TILE)
+    return wp.normalize(eye.axes @ wp.vec3(x, y, -1.0))
+
+
+@wp.func
+def meet(
+    shapes: wp.array[Shape],
+    eye: Eye,
+    listed: wp.array2d[wp.uint16],
+    counts: wp.array[int],
+    face_normals: wp.array2d[wp.vec3],
+    column: float,
+    row: float,
+):
+    """Return how far a ray goes, the normal of what it meets, and the side of which shape that is; 0 for nothing."""
+    ray = ray_of(eye, column, row)
+    tile = int(row) // TILE * eye.columns + int(column) // TILE
+    best, hit, face = float(FAR), int(-1), int(-1)
+    u, w = float(0.0), float(0.0)
+    for i in range(counts[tile]):
+        shape = int(listed[tile, i])
+        back, kind = shapes[shape].back, shapes[shape].kind
+        p, v = back @ (eye.place - shapes[shape].place), back @ ray
+        t = float(-1.0)
+        if kind == MESH:
+            query = wp.mesh_query_ray(shapes[shape].mesh, p, v, best)
+            if query.result:
+                t, u, w, face = float(query.t), float(query.u), float(query.v), int(query.face)
+        elif kind == PLANE:
+            t = -p[2] / wp.where(wp.abs(v[2]) > 1e-9, v[2], 1e-9)
+        else:
+            depths = span(kind, shapes[shape].size, p, v)
+            if depths[0] <= depths[1]:
+                t = depths[0]  # below 0 if the eye is inside, as a scope's is in its sleeve: then it looks out
+        if t >= 0.0 and t <= best * 1.000001:
+            best, hit = t, shape
+    normal, side = wp.vec3(0.0, 0.0, 1.0), int(0)
+    if hit >= 0:
+        turn, made = shapes[hit].back, shapes[hit].kind
+        if made == MESH:
+            f = shapes[hit].first_face + face
+            normal = u * face_normals[f, 0] + w * face_normals[f, 1] + (1.0 - u - w) * face_normals[f, 2]
+        elif made != PLANE:
+            normal = outwards(made, shapes[hit].size, turn @ (eye.place + best * ray - shapes[hit].place))
+            if made == BOX or made == CYLINDER:
+                side = wp.where(normal[2] != 0.0, 1, wp.where(normal[1] != 0.0, 2, 3))
+        normal = wp.normalize(wp.transpose(turn) @ normal)
+        if wp.dot(normal, ray) > 0.0:
+            normal = -normal
+        side += SIDES * (hit + 1)
+    return best, normal, side
