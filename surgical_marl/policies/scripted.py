@@ -100,7 +100,7 @@ class Scripted:
             for agent, wish in wishes.items():
                 self._tools[agent].send(due[rows], wish)
             furthest = self._furthest(due[rows])
-            self._left[due[rows]] = np.ceil(furthest / step.pace) + self._pauses[number] + 1
+            self._left[due[rows]] = np.ceil(furthest / step.pace - 1e-6) + self._pauses[number] + 1
 
     def _look(self, due: np.ndarray) -> Snapshot:
         env = self._env
