@@ -9,7 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from surgical_marl.robots.description import Link, Robot, Shape, Vector
-from surgical_marl.robots.safe_xml import parse_xml, read_bytes, shown, write_xml
+from surgical_marl.robots.safe_xml import parse_xml, write_xml
+from surgical_marl.untrusted.files import read_bytes
+from surgical_marl.untrusted.values import shown
 
 KINDS = (".stl", ".obj", ".dae")
 MAX_MESH = 50_000_000

@@ -31,6 +31,7 @@ import yaml
 
 from surgical_marl.files import write_atomic
 from surgical_marl.runs.settings import Settings, config_text, read_config
+from surgical_marl.untrusted.files import is_file
 
 CONFIG, CHECKPOINT, METRICS, CURVE = "config.yaml", "checkpoint.pt", "metrics.csv", "curve.png"
 DIVERGED = "diverged.json"
@@ -82,7 +83,7 @@ def read_origin(run: Path) -> dict[str, dict[str, str | None]]:
 
 def has_begun(run: Path) -> bool:
     """Return whether a folder holds a run; a run has its settings from the start."""
-    return (run / CONFIG).is_file()
+    return is_file(run / CONFIG)
 
 
 def read_settings(run: str | Path, overrides: Iterable[str] = ()) -> Settings:
@@ -91,7 +92,7 @@ def read_settings(run: str | Path, overrides: Iterable[str] = ()) -> Settings:
     ValueError if it is not a run folder.
     """
     path = Path(run) / CONFIG
-    if not path.is_file():
+    if not is_file(path):
         raise ValueError(f"{run} is not a run folder: it has no {CONFIG}")
     return read_config(path, overrides)
 
