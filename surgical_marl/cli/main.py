@@ -289,6 +289,7 @@ def _train(arguments: argparse.Namespace) -> None:
     from surgical_marl.evaluation.command import judge
     from surgical_marl.learning.train import train
     from surgical_marl.report.command import report_run
+    from surgical_marl.runs.lock import owned
 
     try:
         run = train(settings, out=out, resume=resume)
@@ -298,8 +299,9 @@ def _train(arguments: argparse.Namespace) -> None:
                 report_run(out)
         raise
     if is_first():
-        judge(run)
-        report_run(run)
+        with owned(run):
+            judge(run)
+            report_run(run)
 
 
 def _run_folder(settings: Any) -> Path:

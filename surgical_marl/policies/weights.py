@@ -11,6 +11,7 @@ from safetensors.torch import save
 
 from surgical_marl.files import write_atomic
 from surgical_marl.runs.folder import WEIGHTS
+from surgical_marl.untrusted.arrays import check_safetensors
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -33,11 +34,16 @@ def write_weights(folder: Path, actor: MultiAgentActor) -> None:
 def read_weights(folder: Path) -> tuple[dict[str, list[int]], dict[str, Tensor]]:
     """Read the widths of each type of arm (see `WIDTHS`) and the state of a `MultiAgentActor`, on the CPU.
 
-    ValueError if a file is truncated, a pickle, or anything else that `write_weights` did not write.
+    ValueError if a file is truncated, a pickle, a link out of the folder, or anything else that `write_weights` did
+    not write.
     """
     groups: dict[str, list[int]] = {}
     state: dict[str, Tensor] = {}
     for path in sorted(folder.glob(f"[!.]*{WEIGHTS}")):
+        try:
+            check_safetensors(path, within=folder)
+        except ValueError as error:
+            raise ValueError(f"{error}: restore it from a copy") from None
         try:
             with safe_open(path, framework="pt", device="cpu") as file:
                 groups[path.stem] = [int(file.metadata()[key]) for key in WIDTHS]

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from surgical_marl.content import find
 from surgical_marl.evaluation.card import CLIP, EVALUATION
@@ -19,6 +18,7 @@ from surgical_marl.evaluation.episodes import EPISODES, read_played
 from surgical_marl.evaluation.evaluate import Played
 from surgical_marl.runs.folder import CHECKPOINT, CONFIG, DIVERGED, METRICS, holds_weights, read_metrics
 from surgical_marl.untrusted.files import is_file, is_folder
+from surgical_marl.yaml_file import load_yaml
 
 NOTES = ("versions", "origin")
 """Sections of a run's config that are no settings."""
@@ -115,9 +115,9 @@ def _read_config(folder: Path, given: str) -> tuple[dict[str, Any], dict[str, st
     if not is_file(path):
         raise ValueError(f"{given} is not a run folder: it has no {CONFIG}")
     try:
-        values = yaml.safe_load(path.read_text())
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError, OSError) as error:
-        raise ValueError(f"{path} cannot be read: {' '.join(str(error).split())}") from None
+        values = load_yaml(path)
+    except ValueError as error:
+        raise ValueError(f"{path} cannot be read: {str(error).removeprefix(f'{path} cannot be read: ')}") from None
     if not isinstance(values, dict):
         raise ValueError(f"{path} holds no settings")
     for name in ("task", "scene"):

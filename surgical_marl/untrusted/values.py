@@ -31,7 +31,7 @@ def as_number(value: Any, words: bool = False) -> float:
     try:
         return float(value)
     except OverflowError:
-        return math.inf if value > 0 else -math.inf
+        return math.inf if value > 0 else -math.inf  # type: ignore[operator]
     except ValueError:
         return math.nan
 
