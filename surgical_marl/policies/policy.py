@@ -122,8 +122,18 @@ def _read(folder: Path) -> tuple[dict[str, list[int]], dict[str, Tensor]]:
     if holds_weights(folder) and not (folder / CHECKPOINT).is_file():
         return read_weights(folder)
     checkpoint = read_checkpoint(folder)
-    groups = {name: list(widths) for name, widths in checkpoint["groups"].items()}
-    return groups, checkpoint["algorithm"]["actor_state_dict"]
+    try:
+        groups = {str(name): [int(width) for width in widths] for name, widths in checkpoint["groups"].items()}
+        state = dict(checkpoint["algorithm"]["actor_state_dict"])
+        good = all(isinstance(key, str) and isinstance(value, Tensor) for key, value in state.items())
+        good = good and all(len(widths) == 3 for widths in groups.values())
+    except (KeyError, TypeError, ValueError, AttributeError):
+        good = False
+    if not good:
+        raise ValueError(
+            f"{folder / CHECKPOINT} is damaged, or not a checkpoint of this program: restore it from a copy"
+        )
+    return groups, state
 
 
 def _samples(env: BatchedEnv, layout: Layout) -> TensorDict:
