@@ -36,7 +36,8 @@ LIMIT = '<limit lower="-1" upper="1" velocity="1" effort="1"/>'
 DAE = """<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1"><library_geometries>
 <geometry id="g"><mesh><source id="s"><float_array id="a" count="12">0 0 0 1 0 0 0 1 0 0 0 1</float_array>
 <technique_common><accessor source="#a" count="4" stride="3"><param name="X" type="float"/>
-<param name="Y" type="float"/><param name="Z" type="float"/></accessor></technique_common></source><vertices id="v"><input semantic="POSITION"
+<param name="Y" type="float"/><param name="Z" type="float"/></accessor></technique_common></source>
+<vertices id="v"><input semantic="POSITION"
 source="#s"/></vertices><triangles count="{count}"><input semantic="VERTEX" source="#v" offset="0"/><p>{indices}</p>
 </triangles></mesh></geometry></library_geometries><library_visual_scenes><visual_scene id="w"><node id="n">
 <instance_geometry url="#g"/></node></visual_scene></library_visual_scenes>
