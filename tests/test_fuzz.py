@@ -39,8 +39,8 @@ from surgical_marl.yaml_file import parse_yaml
 from tests.test_untrusted import OBJECT
 from tests.test_urdf import URDF, YAML
 
-COUNT = int(os.environ.get("FUZZ", 25))
-fuzz = settings(max_examples=COUNT, deadline=None, derandomize=COUNT <= 25, suppress_health_check=list(HealthCheck))
+COUNT = int(os.environ.get("FUZZ", 15))
+fuzz = settings(max_examples=COUNT, deadline=None, derandomize=COUNT <= 15, suppress_health_check=list(HealthCheck))
 
 SIMPLE = URDF.replace('<mesh filename="part.stl"/>', '<sphere radius="0.05"/>')
 SCENE = """arms: {two_0: {arm: two, position: [0, 0, 0], turn: 10, tilt: [0, 0, 0], workspace: [0, 0, 0.5]}}

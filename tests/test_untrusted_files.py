@@ -52,22 +52,22 @@ def header(length: int, about: bytes = b"{}") -> bytes:
 
 
 @pytest.mark.parametrize(
-    ("data", "words"),
+    "data",
     [
-        (b"", "has a header of 0 bytes"),
-        (header(2**40), "has a header of 1,099,511,627,776 bytes"),
-        (header(2**64 - 1), "has a header of"),
-        (header(4, b"[{]}"), "is not JSON"),
-        (header(100_000, b"[" * 100_000), "is not JSON"),
-        (header(2, b"[]"), "is no mapping"),
-        (header(2), "is damaged, or not the weights"),
-        (header(len(many := json.dumps({str(k): 0 for k in range(10_001)}).encode()), many), "10,001 tensors"),
-        (pickle.dumps({}), "has a header of"),
+        b"",
+        header(2**40),
+        header(2**64 - 1),
+        header(4, b"[{]}"),
+        header(100_000, b"[" * 100_000),
+        header(2, b"[]"),
+        header(2),
+        header(len(many := json.dumps({str(k): 0 for k in range(10_001)}).encode()), many),
+        pickle.dumps({}),
     ],
 )
-def test_weights(policy: Path, data: bytes, words: str) -> None:
+def test_weights(policy: Path, data: bytes) -> None:
     (policy / "psm.safetensors").write_bytes(data)
-    assert words in refused(lambda: read_weights(policy))
+    assert "psm.safetensors is damaged, or not the weights" in refused(lambda: read_weights(policy))
 
 
 def test_weights_stay_in_their_folder(policy: Path) -> None:

@@ -11,7 +11,8 @@ from safetensors.torch import save
 
 from surgical_marl.files import write_atomic
 from surgical_marl.runs.folder import WEIGHTS
-from surgical_marl.untrusted.arrays import check_safetensors
+from surgical_marl.untrusted.arrays import MAX_WEIGHTS, check_safetensors
+from surgical_marl.untrusted.files import check_file
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -40,11 +41,9 @@ def read_weights(folder: Path) -> tuple[dict[str, list[int]], dict[str, Tensor]]
     groups: dict[str, list[int]] = {}
     state: dict[str, Tensor] = {}
     for path in sorted(folder.glob(f"[!.]*{WEIGHTS}")):
+        check_file(path, MAX_WEIGHTS, within=folder)
         try:
-            check_safetensors(path, within=folder)
-        except ValueError as error:
-            raise ValueError(f"{error}: restore it from a copy") from None
-        try:
+            check_safetensors(path)
             with safe_open(path, framework="pt", device="cpu") as file:
                 groups[path.stem] = [int(file.metadata()[key]) for key in WIDTHS]
                 state |= {f"models.{path.stem}.{key}": file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
