@@ -15,6 +15,9 @@ from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
 
+from surgical_marl.untrusted.files import is_file, is_folder, user_path
+from surgical_marl.untrusted.values import listed, shown
+
 KINDS = ("arms", "scenes", "objects", "configs", "policies")
 BASELINES = ("zero", "random", "oracle")
 """Policies that need no learning. They have no task and scene of their own."""
@@ -75,17 +78,18 @@ def find(kind: str, name_or_path: str | os.PathLike[str]) -> Path:
             where = " and ".join(str(path) for path in places[text])
             raise ValueError(f"the {_NOUNS[kind]} {text!r} is in {where}: name the one that is meant by its path")
         return places[text][0]
-    path = Path(text).expanduser()
-    if text and (path.is_file() if kind in _SUFFIX else path.is_dir()):
+    path = user_path(text)
+    if text and (is_file(path) if kind in _SUFFIX else is_folder(path)):
         return path.resolve()
     raise unknown(_NOUNS[kind], text, list(places))
 
 
 def unknown(noun: str, value: object, good: Sequence[str]) -> ValueError:
     """Return the error for a name that does not exist: it names the value, the nearest good one and all good ones."""
-    near = difflib.get_close_matches(str(value), good, n=1)
-    hint = f", did you mean {near[0]!r}" if near else ", and no such file" if str(value).endswith(".yaml") else ""
-    return ValueError(f"unknown {noun} {str(value)!r}{hint} (choose from {', '.join(good) or 'none'})")
+    text = value if isinstance(value, str) else shown(value)
+    near = difflib.get_close_matches(text[:100], good, n=1)
+    hint = f", did you mean {near[0]!r}" if near else ", and no such file" if text.endswith(".yaml") else ""
+    return ValueError(f"unknown {noun} {shown(text)}{hint} (choose from {listed(good) or 'none'})")
 
 
 def _names(kind: str) -> list[str]:

@@ -302,7 +302,7 @@ def test_folders_that_cannot_be_used(tmp_path: Path, fakes: list[Any]) -> None:
     for text, message in (
         (b"", "config.yaml has no task"),
         (whole.replace("scene: psm\n", "").encode(), "config.yaml has no scene"),
-        (b"\xdf\xff", "config.yaml is not valid YAML"),
+        (b"\xdf\xff", "config.yaml cannot be read: it is no text in UTF-8"),
     ):
         (run / CONFIG).write_bytes(text)
         with pytest.raises(ValueError, match=message):

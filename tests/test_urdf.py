@@ -191,7 +191,7 @@ YAML_BOMB = "\n".join(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]" for i in
         (f"a0: &a0 ha\n{YAML_BOMB}\ntool_tip: *a11\n", "an alias"),
         ("[" * 2000, "not valid YAML"),
         ("tool_tip: !!python/name:os.system", "not valid YAML"),
-        ("tool_tip: 2001-99-99", "not valid YAML"),
+        ("tool_tip: !!timestamp 2001-99-99", "not valid YAML"),
     ],
 )
 def test_a_yaml_bomb_is_refused(folder: Path, text: str, words: str) -> None:

@@ -14,6 +14,7 @@ from surgical_marl.bench.workload import NUM_ENVS, Workload
 from surgical_marl.content import find, unknown
 from surgical_marl.plugins.tasks import list_tasks
 from surgical_marl.runs.settings import Settings
+from surgical_marl.untrusted.files import is_folder
 
 
 def run(arguments: Namespace) -> int:
@@ -43,7 +44,7 @@ def _sim(arguments: Namespace) -> int:
         raise ValueError(f"--sweep takes every number of environments: leave --num-envs {arguments.num_envs} out")
     if arguments.out and not arguments.sweep:
         raise ValueError(f"--out {arguments.out} is for the picture of a sweep: add --sweep")
-    if arguments.out and not (arguments.out.suffix == ".png" and arguments.out.parent.is_dir()):
+    if arguments.out and not (arguments.out.suffix == ".png" and is_folder(arguments.out.parent)):
         raise ValueError(f"cannot write {arguments.out}: name a .png file in a folder that exists")
     if arguments.engine == "mujoco" and arguments.device == "cuda":
         raise ValueError("engine 'mujoco' has no device 'cuda': it runs on a CPU")

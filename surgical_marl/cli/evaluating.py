@@ -12,6 +12,7 @@ from surgical_marl.cli.flags import add_flags, whole
 from surgical_marl.content import BASELINES, PARTNERS, find, list_policies, list_scenes, unknown
 from surgical_marl.plugins.tasks import list_tasks
 from surgical_marl.tasks.base.options import Options
+from surgical_marl.untrusted.files import is_file, is_folder
 
 
 def add_eval(commands: Any) -> None:
@@ -94,7 +95,7 @@ def _crossplay(arguments: argparse.Namespace) -> None:
 def _report(arguments: argparse.Namespace) -> None:
     _check_files(("--out", arguments.out, ".html"))
     for run in arguments.runs:
-        if not Path(run).exists() and run not in list_policies():
+        if not (is_file(run) or is_folder(run)) and run not in list_policies():
             raise unknown("run or policy", run, list_policies())
 
     from surgical_marl.report.command import report
@@ -113,7 +114,7 @@ def _check(arguments: argparse.Namespace, policies: Sequence[str]) -> None:
     if arguments.scene is not None:
         find("scenes", arguments.scene)
     for policy in trained:
-        if not Path(policy).is_dir() and policy not in list_policies():
+        if not is_folder(policy) and policy not in list_policies():
             raise unknown("run or policy", policy, [*list_policies(), *BASELINES])
 
 
@@ -126,7 +127,7 @@ def _partners(given: Sequence[str]) -> dict[str, str]:
             raise ValueError(f"--partner must be ROLE=POLICY such as psm_0=frozen, not {text!r}")
         if role in found:
             raise ValueError(f"--partner names {role!r} twice")
-        if policy not in PARTNERS and not Path(policy).is_dir() and policy not in list_policies():
+        if policy not in PARTNERS and not is_folder(policy) and policy not in list_policies():
             raise unknown("partner", policy, [*list_policies(), *PARTNERS])
         found[role] = policy
     return found
@@ -134,5 +135,5 @@ def _partners(given: Sequence[str]) -> dict[str, str]:
 
 def _check_files(*files: tuple[str, Path | None, str]) -> None:
     for flag, path, suffix in files:
-        if path and not (path.suffix == suffix and path.parent.is_dir()):
+        if path and not (path.suffix == suffix and is_folder(path.parent)):
             raise ValueError(f"cannot write {flag} {path}: name a {suffix} file in a folder that exists")

@@ -23,6 +23,7 @@ from surgical_marl.plugins.tasks import list_tasks
 from surgical_marl.runs.settings import Settings
 from surgical_marl.runtime import defer_compiler
 from surgical_marl.tasks.base.options import choices
+from surgical_marl.untrusted.values import shown
 
 _LISTS = {
     "tasks": list_tasks,
@@ -62,6 +63,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         # The reader (`| head`) is gone. Redirect stdout, so that Python's exit reports no error.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except OSError as error:  # a full disk, a folder that is read-only, a name that no file can have
+        about = f"{shown(str(error.filename))}: " if error.filename is not None else ""
+        print(f"surgical-marl: {about}{error.strerror or error}", file=sys.stderr)
+        return 2
     return code
 
 
@@ -288,6 +293,7 @@ def _train(arguments: argparse.Namespace) -> None:
     from surgical_marl.evaluation.command import judge
     from surgical_marl.learning.train import train
     from surgical_marl.report.command import report_run
+    from surgical_marl.runs.lock import owned
 
     try:
         run = train(settings, out=out, resume=resume)
@@ -297,8 +303,9 @@ def _train(arguments: argparse.Namespace) -> None:
                 report_run(out)
         raise
     if is_first():
-        judge(run)
-        report_run(run)
+        with owned(run):
+            judge(run)
+            report_run(run)
 
 
 def _run_folder(settings: Any) -> Path:

@@ -13,6 +13,7 @@ from surgical_marl.cli.flags import add_flags, whole
 from surgical_marl.content import BASELINES, find, list_policies, list_scenes, unknown
 from surgical_marl.plugins.tasks import list_tasks
 from surgical_marl.tasks.base.options import Options
+from surgical_marl.untrusted.files import is_file, is_folder
 
 _OWN = ("control", "knowledge", "messages", "difficulty", "start", "goals")
 
@@ -88,7 +89,7 @@ def _view(arguments: argparse.Namespace) -> None:
 
 def _play(arguments: argparse.Namespace) -> None:
     settings, who = _settings(arguments)
-    if arguments.out.suffix not in (".mp4", ".gif", ".webp") or not arguments.out.parent.is_dir():
+    if arguments.out.suffix not in (".mp4", ".gif", ".webp") or not is_folder(arguments.out.parent):
         raise ValueError(
             f"cannot write --out {arguments.out}: name an .mp4, .gif or .webp file in a folder that exists"
         )
@@ -126,7 +127,7 @@ def _number(text: str) -> float:
 
 
 def _replay(arguments: argparse.Namespace) -> int:
-    if not arguments.file.is_file():
+    if not is_file(arguments.file):
         raise ValueError(f"there is no file {arguments.file}")
 
     from surgical_marl.view.take import replay
@@ -155,7 +156,7 @@ def _settings(arguments: argparse.Namespace) -> tuple[Any, str | None]:
         raise ValueError(f"{arguments.name} {arguments.task} needs --scene ({', '.join(list_scenes())})")
     find("scenes", arguments.scene)
     who = arguments.policy
-    if who is not None and who not in (*BASELINES, *list_policies()) and not Path(who).is_dir():
+    if who is not None and who not in (*BASELINES, *list_policies()) and not is_folder(who):
         raise unknown("run or policy", who, [*list_policies(), *BASELINES])
 
     from surgical_marl.evaluation.command import common_settings

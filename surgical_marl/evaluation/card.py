@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import operator
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -17,6 +16,7 @@ from surgical_marl.policies.weights import read_weights
 from surgical_marl.runs.folder import CURVE, read_metrics, read_origin, read_settings
 from surgical_marl.runs.settings import Settings
 from surgical_marl.scenes.load import load_scene
+from surgical_marl.untrusted.files import read_json
 
 CARD, CLIP, EVALUATION = "README.md", "clip.mp4", "evaluation.json"
 SHOWN = ("median_error_mm", "p95_error_mm", "rmse_mm", "success_1mm", "success_2mm", "success_5mm", "team_success_2mm",
@@ -63,7 +63,7 @@ def table() -> str:
 
 
 def _row(folder: Path) -> tuple[str, ...]:
-    result = json.loads((folder / EVALUATION).read_text())
+    result = read_json(folder / EVALUATION)
     also = result.get("also", {})
     seen, elsewhere = also.get("training goals"), also.get("random starts", {})
     last, origin = _training(folder), read_origin(folder)["origin"]
@@ -89,7 +89,7 @@ def card(folder: Path, name: str) -> str:
         name: of the policy. It is not taken from the folder, which has another name while it is being written.
     """
     settings = read_settings(folder)
-    result = json.loads((folder / EVALUATION).read_text())
+    result = read_json(folder / EVALUATION)
     parts = [_what(settings, name, folder), _how_well(result, name), _how_trained(folder, settings)]
     return "\n".join([*parts, _limits(result, settings), _files(folder)])
 

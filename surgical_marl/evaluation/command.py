@@ -19,6 +19,7 @@ from surgical_marl.policies.team import Team
 from surgical_marl.runs.environment import make_env
 from surgical_marl.runs.folder import read_metrics, read_settings
 from surgical_marl.runs.settings import Settings
+from surgical_marl.untrusted.files import MAX_JSON, check_file, read_json
 
 if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv
@@ -154,11 +155,13 @@ def read_result(path: Path) -> dict[str, Any]:
     ValueError if the file is no such result.
     """
     try:
-        result = json.loads(path.read_text())
+        check_file(path, MAX_JSON)
+    except ValueError as error:
+        raise ValueError(f"cannot read {path}: {error}") from None
+    try:
+        result = read_json(path)
         result = result.get("aggregate", result)
         known = {*ABOUT, "intervals"} - {"policy"} <= result.keys()
-    except OSError as error:
-        raise ValueError(f"cannot read {path}: {error.strerror}") from None
     except (ValueError, AttributeError):
         known = False
     if not known:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ import numpy as np
 
 from surgical_marl.evaluation.evaluate import Played
 from surgical_marl.files import write_atomic
+from surgical_marl.untrusted.arrays import read_npz
 
 EPISODES = "episodes.npz"
 MEASURES = ("error", "held", "squared", "distance", "center", "success", "collided", "time", "path", "smoothness",
@@ -38,8 +38,7 @@ def write_played(path: Path, played: Played) -> None:
 def read_played(path: Path) -> Played:
     """Read what `write_played` wrote, as float64. ValueError if the file is damaged or of another kind."""
     try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
-            found = {name: arrays[name] for name in arrays.files}
+        found = read_npz(path)
         kept = json.loads(str(found.pop("about")))
         agents = [str(agent) for agent in kept["agents"]]
         measures = {name: values.astype(float) for name, values in found.items()}
@@ -50,5 +49,5 @@ def read_played(path: Path) -> Played:
             raise ValueError(list(measures))
         stages = tuple(str(stage) for stage in kept["stages"])
         return Played(dict(kept["about"]), agents, measures, bool(kept["follows"]), stages)
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         raise ValueError(f"{path} is damaged, or not the episodes of an evaluation: evaluate the run again") from None

@@ -5,9 +5,10 @@ from __future__ import annotations
 import csv
 import math
 import os
+import threading
 from collections import deque
-from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +46,7 @@ class Log:
 
         self._columns = training.columns
         self._files = ExitStack()
+        self._files.enter_context(_quiet_threads())
         self._csv = self._files.enter_context((out / METRICS).open("a", newline=""))
         board = SummaryWriter(str(out / "tensorboard"), purge_step=training.iteration + 1)
         self._board = self._files.enter_context(board)
@@ -70,6 +72,22 @@ class Log:
     def keep(self) -> None:
         """Flush to disk, so that what was written survives a power loss."""
         os.fsync(self._csv.fileno())
+
+
+@contextmanager
+def _quiet_threads() -> Iterator[None]:
+    """Print no traceback where tensorboard's thread cannot write: the next call of its writer raises that error."""
+    usual = threading.excepthook
+
+    def report(arguments: threading.ExceptHookArgs) -> None:
+        if not issubclass(arguments.exc_type, OSError):
+            usual(arguments)
+
+    threading.excepthook = report
+    try:
+        yield
+    finally:
+        threading.excepthook = usual
 
 
 def _describe(row: Mapping[str, float]) -> str:

@@ -41,6 +41,7 @@ from surgical_marl.runs.folder import (
     write_environments,
     write_metrics,
 )
+from surgical_marl.runs.lock import LOCK, owned
 from surgical_marl.runs.settings import Settings
 
 if TYPE_CHECKING:
@@ -81,32 +82,35 @@ def train(settings: Settings, *, out: Path, resume: Path | None = None) -> Path:
         resume: the run folder to continue from its checkpoint, or from the start if it has none yet.
 
     Raises:
-        ValueError: the folder cannot be used, the settings do not fit the run to resume, or so many environments do not
-            fit into memory.
+        ValueError: the folder cannot be used or written, another process trains in it, the settings do not fit the run
+            to resume, or so many environments do not fit into memory.
         FloatingPointError: training produced NaN; the last good checkpoint is kept, and `diverged.json` says where.
         KeyboardInterrupt, SystemExit: after Ctrl-C or SIGTERM, when the checkpoint is written.
     """
     with distributed.joined(settings.device), ExitStack() as closing:
         out = Path(distributed.agreed(str(out)))  # its name may hold the time
+        if distributed.rank() == 0 and _same(out, resume):
+            closing.enter_context(owned(out))  # before it is read
         state = None if resume is None else _read_resumed(settings, Path(resume), _same(out, resume))
         if state is not None and state["iteration"] == settings.iterations:
             _say(f"the run in {out} has its {settings.iterations} iterations: to go on, ask for more")
             return out
         rows = read_metrics(Path(resume)) if resume is not None and state is not None else []
-        with _claimed(out, resume, settings):
+        with _storing(out), _claimed(out, resume, settings, closing):
             training = make_training(settings)
             closing.callback(training.close)
             if state is not None:
                 training.set_state(state)
-        if distributed.rank() == 0:
-            write_metrics(
-                out, training.columns, [row for row in rows if row.get("iteration", math.inf) <= training.iteration]
-            )
-        _save(training, out)
-        if distributed.rank() == 0 and resume is not None:
-            write_config(out, settings)
-        with in_memory(settings.num_envs):
-            _run(training, out)
+        with _storing(out):
+            if distributed.rank() == 0:
+                write_metrics(
+                    out, training.columns, [row for row in rows if row.get("iteration", math.inf) <= training.iteration]
+                )
+            _save(training, out)
+            if distributed.rank() == 0 and resume is not None:
+                write_config(out, settings)
+            with in_memory(settings.num_envs):
+                _run(training, out)
     return out
 
 
@@ -120,11 +124,23 @@ def finish(settings: Settings, run: Path) -> None:
 
 
 @contextmanager
-def _claimed(out: Path, resume: Path | None, settings: Settings) -> Iterator[None]:
+def _storing(out: Path) -> Iterator[None]:
+    """Turn a full disk, and whatever else keeps files from being written, into an error of one sentence."""
+    try:
+        yield
+    except OSError as error:
+        raise ValueError(
+            f"cannot write {error.filename or f'to {out}'}: {error.strerror or error}; what was saved before stays, "
+            f"and --resume {out} goes on from there"
+        ) from None
+
+
+@contextmanager
+def _claimed(out: Path, resume: Path | None, settings: Settings, closing: ExitStack) -> Iterator[None]:
     """Prepare the run folder, and clean it up if the run is refused while it is made in memory.
 
     A new run has its settings in the folder from the start, so that it can be resumed whenever it is killed. If a new
-    run is refused, its folder is removed.
+    run is refused, its folder is removed. `closing` gets the lock of the folder.
     """
     if distributed.rank() > 0:
         yield
@@ -135,6 +151,7 @@ def _claimed(out: Path, resume: Path | None, settings: Settings) -> Iterator[Non
         (out / DIVERGED).unlink(missing_ok=True)
     else:
         claim_folder(out)
+        closing.enter_context(owned(out))
         if resume is None:
             write_config(out, settings)
     remove_temporaries(out)
@@ -143,6 +160,7 @@ def _claimed(out: Path, resume: Path | None, settings: Settings) -> Iterator[Non
     except ValueError:
         if resume is None:
             (out / CONFIG).unlink()
+        (out / LOCK).unlink(missing_ok=True)
         if new:
             out.rmdir()
         raise

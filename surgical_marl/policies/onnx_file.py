@@ -27,6 +27,8 @@ from torch import Tensor, nn
 
 from surgical_marl.files import write_atomic
 from surgical_marl.policies.layout import stack_pictures
+from surgical_marl.untrusted.arrays import MAX_WEIGHTS
+from surgical_marl.untrusted.files import read_bytes
 
 SUFFIX = ".onnx"
 OPSET = 20
@@ -95,7 +97,7 @@ def read_pictures(path: Path) -> dict[str, str]:
     import onnx
 
     found = {}
-    for each in onnx.load(path, load_external_data=False).graph.input:
+    for each in onnx.load_model_from_string(read_bytes(path, MAX_WEIGHTS)).graph.input:
         tensor = each.type.tensor_type
         if len(tensor.shape.dim) == 4:
             sizes = ", ".join(["N", *(str(size.dim_value) for size in tensor.shape.dim[1:])])

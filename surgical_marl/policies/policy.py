@@ -26,6 +26,8 @@ from surgical_marl.policies.recurrent import cleared
 from surgical_marl.policies.weights import read_weights
 from surgical_marl.runs.folder import CHECKPOINT, CONFIG, holds_weights, read_checkpoint, read_settings
 from surgical_marl.runs.settings import Settings
+from surgical_marl.untrusted.files import is_file
+from surgical_marl.untrusted.values import shown
 
 if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv
@@ -105,12 +107,14 @@ def find_run(run: str | Path) -> Path:
 
     ValueError if there is none.
     """
-    if (Path(run) / CONFIG).is_file():
+    if is_file(Path(run) / CONFIG):
         return Path(run)
     if str(run) in list_policies():
         return find("policies", str(run))
     shipped = ", ".join(list_policies()) or "none yet"
-    raise ValueError(f"{str(run)!r} is not a run folder, nor zero, random, oracle or a policy that ships ({shipped})")
+    raise ValueError(
+        f"{shown(str(run))} is not a run folder, nor zero, random, oracle or a policy that ships ({shipped})"
+    )
 
 
 def _read(folder: Path) -> tuple[dict[str, list[int]], dict[str, Tensor]]:
@@ -118,8 +122,18 @@ def _read(folder: Path) -> tuple[dict[str, list[int]], dict[str, Tensor]]:
     if holds_weights(folder) and not (folder / CHECKPOINT).is_file():
         return read_weights(folder)
     checkpoint = read_checkpoint(folder)
-    groups = {name: list(widths) for name, widths in checkpoint["groups"].items()}
-    return groups, checkpoint["algorithm"]["actor_state_dict"]
+    try:
+        groups = {str(name): [int(width) for width in widths] for name, widths in checkpoint["groups"].items()}
+        state = dict(checkpoint["algorithm"]["actor_state_dict"])
+        good = all(isinstance(key, str) and isinstance(value, Tensor) for key, value in state.items())
+        good = good and all(len(widths) == 3 for widths in groups.values())
+    except (KeyError, TypeError, ValueError, AttributeError):
+        good = False
+    if not good:
+        raise ValueError(
+            f"{folder / CHECKPOINT} is damaged, or not a checkpoint of this program: restore it from a copy"
+        )
+    return groups, state
 
 
 def _samples(env: BatchedEnv, layout: Layout) -> TensorDict:

@@ -11,6 +11,8 @@ from safetensors.torch import save
 
 from surgical_marl.files import write_atomic
 from surgical_marl.runs.folder import WEIGHTS
+from surgical_marl.untrusted.arrays import MAX_WEIGHTS, check_safetensors
+from surgical_marl.untrusted.files import check_file
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -33,12 +35,15 @@ def write_weights(folder: Path, actor: MultiAgentActor) -> None:
 def read_weights(folder: Path) -> tuple[dict[str, list[int]], dict[str, Tensor]]:
     """Read the widths of each type of arm (see `WIDTHS`) and the state of a `MultiAgentActor`, on the CPU.
 
-    ValueError if a file is truncated, a pickle, or anything else that `write_weights` did not write.
+    ValueError if a file is truncated, a pickle, a link out of the folder, or anything else that `write_weights` did
+    not write.
     """
     groups: dict[str, list[int]] = {}
     state: dict[str, Tensor] = {}
     for path in sorted(folder.glob(f"[!.]*{WEIGHTS}")):
+        check_file(path, MAX_WEIGHTS, within=folder)
         try:
+            check_safetensors(path)
             with safe_open(path, framework="pt", device="cpu") as file:
                 groups[path.stem] = [int(file.metadata()[key]) for key in WIDTHS]
                 state |= {f"models.{path.stem}.{key}": file.get_tensor(key) for key in file.keys()}  # noqa: SIM118

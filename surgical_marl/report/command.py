@@ -14,6 +14,7 @@ from surgical_marl.files import write_atomic
 from surgical_marl.report.page import GENERATOR, render
 from surgical_marl.report.run import Run, read_run
 from surgical_marl.runs.folder import CHECKPOINT, holds_weights
+from surgical_marl.untrusted.files import is_folder
 
 REPORT = "report.html"
 
@@ -60,7 +61,7 @@ def write(path: Path, runs: Sequence[Run]) -> None:
 
 
 def _check(path: Path) -> None:
-    if path.is_dir() or not path.parent.is_dir():
+    if is_folder(path) or not is_folder(path.parent):
         raise ValueError(f"cannot write {path}: name a .html file in a folder that exists")
     if path.is_file():
         with path.open(errors="replace") as file:

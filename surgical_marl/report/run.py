@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from surgical_marl.content import find
 from surgical_marl.evaluation.card import CLIP, EVALUATION
@@ -18,6 +17,8 @@ from surgical_marl.evaluation.command import FILM, RESULT, read_result
 from surgical_marl.evaluation.episodes import EPISODES, read_played
 from surgical_marl.evaluation.evaluate import Played
 from surgical_marl.runs.folder import CHECKPOINT, CONFIG, DIVERGED, METRICS, holds_weights, read_metrics
+from surgical_marl.untrusted.files import is_file, is_folder
+from surgical_marl.yaml_file import load_yaml
 
 NOTES = ("versions", "origin")
 """Sections of a run's config that are no settings."""
@@ -65,9 +66,9 @@ def read_run(given: str | os.PathLike[str]) -> Run:
         ValueError: there is no such folder, it holds no run, or its config cannot be read.
     """
     text = os.fspath(given)
-    if Path(text).is_file():
+    if is_file(text):
         raise ValueError(f"{text} is a file, not a run: name the run's folder")
-    folder = find("policies", text) if isinstance(given, str) or not Path(given).is_dir() else Path(given).resolve()
+    folder = find("policies", text) if isinstance(given, str) or not is_folder(given) else Path(given).resolve()
     config, versions, origin = _read_config(folder, text)
     columns, notes = _read_columns(folder), []
     shipped = holds_weights(folder)
@@ -111,12 +112,12 @@ def flatten(values: Mapping[Any, Any], prefix: str = "") -> dict[str, Any]:
 
 def _read_config(folder: Path, given: str) -> tuple[dict[str, Any], dict[str, str], dict[str, str]]:
     path = folder / CONFIG
-    if not path.is_file():
+    if not is_file(path):
         raise ValueError(f"{given} is not a run folder: it has no {CONFIG}")
     try:
-        values = yaml.safe_load(path.read_text())
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError, OSError) as error:
-        raise ValueError(f"{path} cannot be read: {' '.join(str(error).split())}") from None
+        values = load_yaml(path)
+    except ValueError as error:
+        raise ValueError(f"{path} cannot be read: {str(error).removeprefix(f'{path} cannot be read: ')}") from None
     if not isinstance(values, dict):
         raise ValueError(f"{path} holds no settings")
     for name in ("task", "scene"):

@@ -22,9 +22,10 @@ from surgical_marl.robots.drives import Cable, Drive, read_cables, read_drives
 from surgical_marl.robots.jaw import Jaw, read_jaw
 from surgical_marl.robots.mesh import MAX_MESH, mesh_files, resolve_meshes
 from surgical_marl.robots.reach import Box, box_of
-from surgical_marl.robots.safe_xml import read_bytes
 from surgical_marl.robots.urdf import Faults, read_urdf
 from surgical_marl.robots.urdf_faults import robot_faults
+from surgical_marl.untrusted.files import is_file, read_bytes
+from surgical_marl.untrusted.values import listed, shown
 from surgical_marl.yaml_file import build, check_keys, read_yaml
 
 CONTROL_MODES = ("position", "velocity", "torque")
@@ -256,9 +257,9 @@ def load_arm(name: str | Path) -> Arm:
     named |= {f"jaw pad {number}": pad.link for number, pad in enumerate(jaw.pads if jaw else ())}
     for key, link in named.items():
         if link not in links and (key == "tool_tip" or link is not None):
-            faults.append(f"{where}: {key} {link!r} is not a link of the URDF ({', '.join(links)})")
+            faults.append(f"{where}: {key} {shown(link)} is not a link of the URDF ({listed(links)})")
     if jaw is not None and jaw.joint not in leaders:
-        faults.append(f"{where}: jaw joint {jaw.joint!r} is not one of {', '.join(leaders)}")
+        faults.append(f"{where}: jaw joint {shown(jaw.joint)} is not one of {listed(leaders)}")
     if not leaders:
         faults.append(f"{path}: no joint moves; an arm needs one that is revolute or prismatic")
     if faults:
@@ -279,10 +280,16 @@ def load_arm(name: str | Path) -> Arm:
 
 def _urdf_path(folder: Path, name: Any) -> Path:
     if not isinstance(name, str) or not name:
-        raise ValueError(f"{folder / 'arm.yaml'}: urdf must name the URDF file in the folder, not {name!r}")
+        raise ValueError(f"{folder / 'arm.yaml'}: urdf must name the URDF file in the folder, not {shown(name)}")
     path = folder / name
-    if not path.resolve().is_relative_to(folder.resolve()):
-        raise ValueError(f"{folder / 'arm.yaml'}: urdf {name!r} leaves the arm's folder; copy it into the folder")
+    try:
+        inside = path.resolve().is_relative_to(folder.resolve())
+    except (OSError, RuntimeError, ValueError):  # an impossible file name, or a cycle of links
+        raise ValueError(f"{folder / 'arm.yaml'}: urdf {shown(name)} is not a name that a file can have") from None
+    if not inside:
+        raise ValueError(f"{folder / 'arm.yaml'}: urdf {shown(name)} leaves the arm's folder; copy it into the folder")
+    if not is_file(path):
+        raise ValueError(f"{folder / 'arm.yaml'}: there is no URDF file {shown(name)} in the folder")
     return path
 
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from surgical_marl.untrusted.values import LARGEST, as_number, check_count, listed, shown
 from surgical_marl.yaml_file import build, check_keys
 
 
@@ -73,18 +73,22 @@ def read_cables(cables: Any, joints: list[str], where: Path, keep: Callable[...,
     `keep` calls each reader and collects what is wrong. Only a `cables` that is not a list raises ValueError at once.
     """
     if not isinstance(cables, list):
-        raise ValueError(f"{where}: cables must be a list, not {cables!r}")
+        raise ValueError(f"{where}: cables must be a list, not {shown(cables)}")
+    check_count(len(cables), len(joints) ** 2, "cables", where)
     return tuple(keep(_cable, cable, joints, f"{where}, cable {number}") for number, cable in enumerate(cables))
 
 
 def _cable(mapping: Any, joints: list[str], where: str) -> Cable:
     cable: Cable = build(Cable, mapping, where)
     if not isinstance(cable.joints, dict) or len(cable.joints) < 2:
-        raise ValueError(f"{where}: joints must map two joints or more to coefficients, not {cable.joints!r}")
+        raise ValueError(f"{where}: joints must map two joints or more to coefficients, not {shown(cable.joints)}")
     for name, value in cable.joints.items():
         if name not in joints:  # a jaw is under position control in every mode, so no cable may drive it
-            raise ValueError(f"{where}: joint {name!r} is not one of {', '.join(joints)}")
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or value == 0:
-            raise ValueError(f"{where}: the coefficient of {name!r} must be a finite number but 0, not {value!r}")
+            raise ValueError(f"{where}: joint {shown(name)} is not one of {listed(joints)}")
+        if not 0 < abs(as_number(value)) <= LARGEST:
+            raise ValueError(
+                f"{where}: the coefficient of {name!r} must be a finite number but 0, not {shown(value)}, and at most "
+                f"{LARGEST:g} in size"
+            )
     _check_signs(cable, "effort", where)
     return cable

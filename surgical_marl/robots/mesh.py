@@ -3,17 +3,28 @@
 from __future__ import annotations
 
 import io
+import re
 from dataclasses import replace
 from pathlib import Path
+from xml.etree.ElementTree import Element
 
 import numpy as np
 
 from surgical_marl.robots.description import Link, Robot, Shape, Vector
-from surgical_marl.robots.safe_xml import parse_xml, read_bytes, shown, write_xml
+from surgical_marl.robots.safe_xml import parse_xml, write_xml
+from surgical_marl.untrusted.files import MB, check_file, read_bytes
+from surgical_marl.untrusted.values import LARGEST, LONGEST, check_count, shown
 
 KINDS = (".stl", ".obj", ".dae")
-MAX_MESH = 50_000_000
-"""Bytes; more is a mistake or an attack."""
+MAX_MESH = 25 * MB
+"""Bytes of a file."""
+MAX_TEXT = 10 * MB
+"""Bytes of an OBJ or DAE file. To read one takes up to eighty times as much memory."""
+MAX_ALL, TEXT_COST = 60 * MB, 3
+"""Bytes of the meshes of all shapes of an arm, each of an OBJ or DAE file counted three times: some seconds to read."""
+MAX_BLOCKS = 500
+"""Groups, objects and materials of an OBJ file, solids of an STL file in text, and geometries of a scene in a DAE file:
+each becomes a mesh of its own at first."""
 
 
 def resolve_meshes(robot: Robot, path: Path, folder: Path) -> tuple[Robot, list[str]]:
@@ -46,7 +57,32 @@ def resolve_meshes(robot: Robot, path: Path, folder: Path) -> tuple[Robot, list[
         visuals, collisions = (tuple(resolved(link.name, s) for s in of) for of in (link.visuals, link.collisions))
         return replace(link, visuals=visuals, collisions=collisions)
 
-    return replace(robot, links=tuple(map(whole, robot.links))), list(faults)
+    found = replace(robot, links=tuple(map(whole, robot.links)))
+    return found, list(faults) or _size_faults(found, path, folder)
+
+
+def _size_faults(robot: Robot, path: Path, folder: Path) -> list[str]:
+    """Return a sentence if all meshes together are too large."""
+    shapes = (shape for link in robot.links for shape in (*link.visuals, *link.collisions))
+    sizes: dict[str, int] = {}
+    total = 0
+    for shape in shapes:
+        if shape.mesh is not None:
+            if shape.mesh not in sizes:
+                try:
+                    sizes[shape.mesh] = _cost(folder / shape.mesh)
+                except ValueError as error:
+                    return [str(error)]
+            total += sizes[shape.mesh]
+    if total <= MAX_ALL:
+        return []
+    return [f"{path} has meshes of {total / MB:,.0f} MB (OBJ and DAE count {TEXT_COST} times); at most "
+            f"{MAX_ALL / MB:g} MB are read"]  # fmt: skip
+
+
+def _cost(file: Path) -> int:
+    text = file.suffix.lower() != ".stl"
+    return check_file(file, MAX_TEXT if text else MAX_MESH) * (TEXT_COST if text else 1)
 
 
 def mesh_files(robot: Robot) -> list[str]:
@@ -64,15 +100,26 @@ def read_mesh(path: Path, scale: Vector | None = None) -> tuple[np.ndarray, np.n
     import trimesh
 
     kind = path.suffix.lower().removeprefix(".")
-    data = read_bytes(path, MAX_MESH)
+    data = read_bytes(path, MAX_MESH if kind == "stl" else MAX_TEXT)
     if kind == "dae":
-        data = write_xml(parse_xml(data, path, "mesh").root)
+        root = parse_xml(data, path, "mesh").root
+        try:
+            shown_parts = _geometries(root)
+        except (ValueError, RecursionError) as error:
+            raise ValueError(f"{path} is not a mesh that can be read: {error}") from None
+        check_count(shown_parts, MAX_BLOCKS, "geometries", path)
+        data = write_xml(root)
+    else:
+        words = rb"solid" if kind == "stl" else rb"(?:g|o|usemtl|usemap)"
+        blocks = len(re.findall(rb"^[ \t]*" + words + rb"\b", data, re.M | re.I)) if _is_text(data, kind) else 0
+        check_count(blocks, MAX_BLOCKS, "groups", path)
     try:
         # From memory and without a resolver, so that files that the mesh refers to are not opened.
         scene = trimesh.load_scene(io.BytesIO(data), file_type=kind, skip_materials=True, process=False)
         mesh = scene.to_mesh()
         finite = bool(np.isfinite(mesh.vertices).all())
-        mesh.merge_vertices()  # an STL repeats a vertex for each of its triangles
+        if finite and np.abs(mesh.vertices).max(initial=0) <= LARGEST:
+            mesh.merge_vertices()  # an STL repeats a vertex for each of its triangles
         if kind == "dae":  # only this format of the three declares a unit
             unit, _, _ = str(scene.units).rpartition(" * ")  # "meters" or "0.001 * meters"
             mesh.apply_scale(float(unit or 1))
@@ -83,9 +130,54 @@ def read_mesh(path: Path, scale: Vector | None = None) -> tuple[np.ndarray, np.n
         raise ValueError(f"{path} is not a mesh that can be read: {' '.join(str(error).split())}") from None
     if not finite:
         raise ValueError(f"{path} has vertices that are not finite numbers")
+    if vertices.size and not np.abs(vertices).max() <= LONGEST:
+        raise ValueError(
+            f"{path} has vertices up to {np.abs(vertices).max():g} m away, more than {LONGEST:g} m: give it a scale"
+        )
     if len(vertices) < 4 or not len(faces):
         raise ValueError(f"{path} is not a mesh that can be read: it holds no surface")
     return vertices, faces
+
+
+def _is_text(data: bytes, kind: str) -> bool:
+    """Return whether a file is not an STL in binary, whose size follows from its number of triangles."""
+    return kind != "stl" or len(data) != 84 + 50 * int.from_bytes(data[80:84], "little")
+
+
+def _geometries(root: Element) -> int:
+    """Return how many geometries the scenes of a COLLADA document show, where nodes may stand for other nodes.
+
+    ValueError if a node stands for itself.
+    """
+    nodes = {f"#{node.get('id')}": node for node in root.iter() if _tag(node) == "node"}
+    known: dict[str, int] = {}
+    under_way: set[str] = set()
+
+    def count(element: Element) -> int:
+        total = 0
+        for part in element:
+            if _tag(part) in ("instance_geometry", "instance_controller"):
+                total += 1
+            elif _tag(part) == "instance_node":
+                total += named(part.get("url", ""))
+            else:
+                total += count(part)
+        return total
+
+    def named(url: str) -> int:
+        if url in under_way:
+            raise ValueError(f"the node {shown(url)} stands for itself")
+        if url not in known and url in nodes:
+            under_way.add(url)
+            known[url] = count(nodes[url])
+            under_way.discard(url)
+        return known.get(url, 0)
+
+    return sum(count(scene) for scene in root.iter() if _tag(scene) == "visual_scene")
+
+
+def _tag(element: Element) -> str:
+    return str(element.tag).rpartition("}")[2]
 
 
 def _mesh_path(filename: str, start: Path, folder: Path) -> str:

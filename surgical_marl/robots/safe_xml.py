@@ -8,6 +8,8 @@ from xml.etree.ElementTree import Element, TreeBuilder, tostring
 
 MAX_DEPTH = 256
 """Greatest depth of nested elements; libxml2 has the same limit."""
+MAX_ELEMENTS = 50_000
+"""Elements of a document; each takes a thousand bytes."""
 
 
 class Document(NamedTuple):
@@ -52,23 +54,6 @@ def write_xml(root: Element) -> bytes:
     return tostring(root)
 
 
-def read_bytes(path: Path, most: int) -> bytes:
-    """Return the content of a file; ValueError if it can't be read or holds more than `most` bytes."""
-    try:
-        with path.open("rb") as file:
-            data = file.read(most + 1)
-    except OSError as error:
-        raise ValueError(f"{path} cannot be read: {error.strerror}") from None
-    if len(data) > most:
-        raise ValueError(f"{path} is larger than {most // 1_000_000} MB, the most that is read")
-    return data
-
-
-def shown(text: str) -> str:
-    """Return a text in quotes, cut if it is long."""
-    return repr(text if len(text) <= 80 else text[:77] + "...")
-
-
 class _Lines(TreeBuilder):
     """Builds a tree of limited depth and keeps the line of each element."""
 
@@ -84,6 +69,8 @@ class _Lines(TreeBuilder):
         self._depth += 1
         if self._depth > MAX_DEPTH:
             raise ValueError(f"elements are nested deeper than {MAX_DEPTH}: line {line}")
+        if len(self.lines) == MAX_ELEMENTS:
+            raise ValueError(f"more than {MAX_ELEMENTS:,} elements are not read: line {line}")
         element = super().start(tag, attributes)
         self.lines[element] = line
         return element

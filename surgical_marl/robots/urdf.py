@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterable, Mapping
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,8 +30,9 @@ from surgical_marl.robots.description import (
     from_json,
     to_json,
 )
-from surgical_marl.robots.safe_xml import parse_xml, read_bytes, write_xml
-from surgical_marl.robots.urdf_faults import xml_faults
+from surgical_marl.robots.safe_xml import parse_xml, write_xml
+from surgical_marl.robots.urdf_faults import MAX_FAULTS, xml_faults
+from surgical_marl.untrusted.files import is_file, read_bytes
 
 if TYPE_CHECKING:
     from yourdfpy import urdf as yourdf
@@ -61,7 +63,7 @@ def read_urdf(path: Path) -> Robot:
         ValueError: not there, too large, no XML, a DOCTYPE (so entities never expand), or a tag that lacks something or
             has an invalid number. If more than one thing is wrong, the error is a `Faults`.
     """
-    if not path.is_file():
+    if not is_file(path):
         raise ValueError(f"there is no URDF file {path}")
     data = read_bytes(path, MAX_URDF)
 
@@ -73,7 +75,7 @@ def read_urdf(path: Path) -> Robot:
 
 def _parse(data: bytes, path: Path) -> Robot:
     document = parse_xml(data, path, "URDF")
-    if faults := list(xml_faults(document, path)):
+    if faults := list(islice(xml_faults(document, path), MAX_FAULTS)):
         raise Faults(faults)
     import yourdfpy
 

@@ -2,26 +2,45 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from surgical_marl.robots.description import MOVING, SHAPES, Robot
-from surgical_marl.robots.safe_xml import Document, shown
+from surgical_marl.robots.safe_xml import Document
+from surgical_marl.untrusted.values import LARGEST, LONGEST, SHORTEST, as_number, listed, shown
 
 LEAST = 1e-15
 """MuJoCo treats masses (kg) and moments of inertia (kg m2) up to this value as zero."""
 
-_ANY, _NOT_NEGATIVE, _POSITIVE = "finite", "finite and not negative", "finite and above 0"
+MAX_PARTS = {"link": 200, "joint": 200, "collision": 200, "visual": 1000, "material": 1000}
+"""How many tags of each kind are read."""
+MAX_TEXT = 1000
+"""Characters of an attribute."""
+MAX_FAULTS = 100
+"""Sentences about one file."""
+
+
+class _Kind(NamedTuple):
+    """What a number must be: in words, and its least and greatest value."""
+
+    words: str
+    least: float
+    most: float
+
+
+_ANY, _PLACE = _Kind("finite", -LARGEST, LARGEST), _Kind("finite", -LONGEST, LONGEST)
+_NOT_NEGATIVE, _SIDE = _Kind("finite and not negative", 0.0, LARGEST), _Kind("finite and above 0", SHORTEST, LONGEST)
 # Numbers of a URDF by tag and attribute: how many there must be, and of what kind.
-_NUMBERS: dict[tuple[str, str], tuple[tuple[int, ...], str]] = {
-    **dict.fromkeys([("origin", "xyz"), ("origin", "rpy"), ("axis", "xyz")], ((3,), _ANY)),
+_NUMBERS: dict[tuple[str, str], tuple[tuple[int, ...], _Kind]] = {
+    **dict.fromkeys([("origin", "xyz"), ("origin", "rpy")], ((3,), _PLACE)),
+    ("axis", "xyz"): ((3,), _Kind("finite and not all 0", -LONGEST, LONGEST)),
     **dict.fromkeys([("inertia", key) for key in ("ixx", "iyy", "izz")], ((1,), _NOT_NEGATIVE)),
     **dict.fromkeys([("inertia", key) for key in ("ixy", "ixz", "iyz")], ((1,), _ANY)),
-    **dict.fromkeys([("cylinder", "radius"), ("cylinder", "length"), ("sphere", "radius")], ((1,), _POSITIVE)),
+    **dict.fromkeys([("cylinder", "radius"), ("cylinder", "length"), ("sphere", "radius")], ((1,), _SIDE)),
     **dict.fromkeys([("limit", "lower"), ("limit", "upper")], ((1,), _ANY)),
     **dict.fromkeys([("limit", "velocity"), ("limit", "effort"), ("mass", "value")], ((1,), _NOT_NEGATIVE)),
     **dict.fromkeys([("dynamics", "damping"), ("dynamics", "friction")], ((1,), _NOT_NEGATIVE)),
@@ -32,7 +51,7 @@ _NUMBERS: dict[tuple[str, str], tuple[tuple[int, ...], str]] = {
         + [("safety_controller", f"k_{of}") for of in ("position", "velocity")],
         ((1,), _ANY),
     ),
-    ("box", "size"): ((3,), _POSITIVE),
+    ("box", "size"): ((3,), _SIDE),
     ("mesh", "scale"): ((1, 3), _ANY),
     ("color", "rgba"): ((4,), _NOT_NEGATIVE),
 }
@@ -58,7 +77,12 @@ def xml_faults(document: Document, path: Path) -> Iterator[str]:
     """
     root = document.root
     if root.tag != "robot" or not root.get("name"):
-        yield f"{path} is not a URDF: its root must be <robot name=...>, not <{root.tag}>"
+        yield f"{path} is not a URDF: its root must be <robot name=...>, not <{root.tag[:80]}>"
+        return
+    counts = Counter(element.tag for element in root.iter())
+    if many := [f"{counts[tag]:,} {tag}s" for tag, most in MAX_PARTS.items() if counts[tag] > most]:
+        limits = listed(f"{most:,} {tag}s" for tag, most in MAX_PARTS.items())
+        yield f"{path} has {' and '.join(many)}; at most {limits} are read"
         return
     for part in root:
         if part.tag not in ("link", "joint", "material"):
@@ -74,7 +98,9 @@ def xml_faults(document: Document, path: Path) -> Iterator[str]:
             if element.tag == "geometry" and (not len(element) or element[0].tag not in SHAPES):
                 yield f"{where}: <geometry> of link {part.get('name')!r} needs one of {', '.join(SHAPES)}"
             for key, text in element.attrib.items():
-                if (fault := _number_fault(element.tag, key, text)) is not None:
+                if len(text) > MAX_TEXT:
+                    yield f"{where}: {shown(key)} has {len(text):,} characters; at most {MAX_TEXT:,} are read"
+                elif (fault := _number_fault(element.tag, key, text)) is not None:
                     yield f"{where}: {fault}"
 
 
@@ -82,19 +108,15 @@ def _number_fault(tag: str, key: str, text: str) -> str | None:
     if (tag, key) not in _NUMBERS:
         return None
     counts, kind = _NUMBERS[tag, key]
-    try:
-        numbers = [float(word) for word in text.split()]
-    except ValueError:
-        numbers = []
-    good = len(numbers) in counts and all(map(math.isfinite, numbers))
-    if kind == _NOT_NEGATIVE:
-        good = good and min(numbers) >= 0
-    if kind == _POSITIVE:
-        good = good and min(numbers) > 0
-    if tag == "axis":
-        good, kind = good and any(numbers), "finite and not all 0"
+    numbers = [as_number(word, words=True) for word in text.split()]
+    good = len(numbers) in counts and all(kind.least <= number <= kind.most for number in numbers)
+    if good and (tag != "axis" or max(map(abs, numbers)) >= SHORTEST):
+        return None
     much = " or ".join(map(str, counts))
-    return None if good else f"{key}={shown(text)} of <{tag}> must be {much} number{'s' * (much != '1')}, {kind}"
+    return (
+        f"{key}={shown(text)} of <{tag}> must be {much} number{'s' * (much != '1')}, {kind.words}, "
+        f"from {kind.least:g} to {kind.most:g}"
+    )
 
 
 def _tree_faults(robot: Robot) -> Iterator[str]:
@@ -116,7 +138,7 @@ def _tree_faults(robot: Robot) -> Iterator[str]:
     if not links:
         yield "it has no links"
     if len(roots) > 1:
-        yield f"the links {', '.join(map(repr, roots))} have no parent; a tree has one root"
+        yield f"the links {listed(map(repr, roots))} have no parent; a tree has one root"
     if (looped := _looped(parents)) is not None:
         yield f"link {looped!r} is its own ancestor; links must form a tree"
 

@@ -1,9 +1,9 @@
 """The files of a run folder, and how they are read and written.
 
-A run folder holds `config.yaml`, `checkpoint.pt`, `metrics.csv`, `curve.png` and `tensorboard/`. What is made of them
-at the end, `eval.json`, `episodes.npz`, `video.mp4` and `report.html`, is written elsewhere. If there were several
-processes, `environments-*.pt` of the other ranks are beside the checkpoint. If training diverged, there is
-also `diverged.json`.
+A run folder holds `config.yaml`, `checkpoint.pt`, `metrics.csv`, `curve.png`, `tensorboard/` and `train.lock`
+(`surgical_marl/runs/lock.py`). What is made of them at the end, `eval.json`, `episodes.npz`, `video.mp4` and
+`report.html`, is written elsewhere. If there were several processes, `environments-*.pt` of the other ranks are beside
+the checkpoint. If training diverged, there is also `diverged.json`.
 
 A shipped policy has safetensors instead of the checkpoint (`surgical_marl/evaluation/export.py`). Every write is
 atomic, except that `metrics.csv` grows by rows.
@@ -22,20 +22,24 @@ import subprocess
 import tempfile
 import time
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, cast
 
 import torch
-import yaml
 
 from surgical_marl.files import write_atomic
 from surgical_marl.runs.settings import Settings, config_text, read_config
+from surgical_marl.untrusted.arrays import check_checkpoint
+from surgical_marl.untrusted.files import MB, check_file, is_file
+from surgical_marl.yaml_file import read_yaml
 
 CONFIG, CHECKPOINT, METRICS, CURVE = "config.yaml", "checkpoint.pt", "metrics.csv", "curve.png"
 DIVERGED = "diverged.json"
 WEIGHTS = ".safetensors"
 """Suffix of the weight files of a shipped policy."""
+MAX_METRICS = 100 * MB
+"""Bytes of `metrics.csv`, a quarter of a million iterations."""
 PACKAGES = ("surgical-marl", "torch", "rsl-rl-lib", "jax", "mujoco", "mujoco-mjx", "numpy")
 
 
@@ -76,13 +80,13 @@ def write_config(run: Path, settings: Settings) -> None:
 
 def read_origin(run: Path) -> dict[str, dict[str, str | None]]:
     """Return the `versions` and `origin` that `write_config` noted beside the settings; empty if a run has none."""
-    notes = yaml.safe_load((run / CONFIG).read_text())
-    return {name: notes.get(name) or {} for name in ("versions", "origin")}
+    notes = {name: values.get(name) for values in [read_yaml(run / CONFIG)] for name in ("versions", "origin")}
+    return {name: dict(found) if isinstance(found, dict) else {} for name, found in notes.items()}
 
 
 def has_begun(run: Path) -> bool:
     """Return whether a folder holds a run; a run has its settings from the start."""
-    return (run / CONFIG).is_file()
+    return is_file(run / CONFIG)
 
 
 def read_settings(run: str | Path, overrides: Iterable[str] = ()) -> Settings:
@@ -91,14 +95,45 @@ def read_settings(run: str | Path, overrides: Iterable[str] = ()) -> Settings:
     ValueError if it is not a run folder.
     """
     path = Path(run) / CONFIG
-    if not path.is_file():
+    if not is_file(path):
         raise ValueError(f"{run} is not a run folder: it has no {CONFIG}")
     return read_config(path, overrides)
 
 
 def write_checkpoint(run: Path, checkpoint: Mapping[str, Any]) -> None:
     """Replace the checkpoint of a run."""
-    write_atomic(run / CHECKPOINT, lambda path: torch.save(dict(checkpoint), path))
+    write_atomic(run / CHECKPOINT, lambda path: _save(dict(checkpoint), path))
+
+
+def _save(content: dict[str, Any], path: Path) -> None:
+    """Let torch write a file. OSError if that fails, for which torch itself has errors of other kinds."""
+    with path.open("wb") as file:
+        kept = _FirstError(file)
+        torch.save(content, cast(BinaryIO, kept))
+        if kept.error is not None:
+            raise kept.error
+
+
+class _FirstError:
+    """A file that keeps its first error, and takes everything after that without writing it."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        self.error: OSError | None = None
+
+    def write(self, data: Any) -> int:
+        self._try(self._file.write, data)
+        return len(data)
+
+    def flush(self) -> None:
+        self._try(self._file.flush)
+
+    def _try(self, call: Callable[..., object], *arguments: Any) -> None:
+        if self.error is None:
+            try:
+                call(*arguments)
+            except OSError as error:
+                self.error = error
 
 
 def holds_weights(folder: Path) -> bool:
@@ -114,6 +149,7 @@ def read_checkpoint(run: str | Path) -> dict[str, Any]:
     if not path.is_file():
         raise ValueError(f"{run} is not a run folder: it has no {CHECKPOINT}")
     try:
+        check_checkpoint(path)
         with warnings.catch_warnings(action="ignore"):  # torch's error for a file of another format
             checkpoint = torch.load(path, map_location="cpu", weights_only=True)
     except Exception:  # torch.load raises many types of errors for a damaged file
@@ -125,13 +161,15 @@ def read_checkpoint(run: str | Path) -> dict[str, Any]:
 
 def write_environments(run: Path, iteration: int, rank: int, processes: int, state: Mapping[str, Any]) -> None:
     """Write the part of an iteration's checkpoint that belongs to one further process."""
-    write_atomic(_environments(run, iteration, rank, processes), lambda path: torch.save(dict(state), path))
+    write_atomic(_environments(run, iteration, rank, processes), lambda path: _save(dict(state), path))
 
 
 def read_environments(run: Path, iteration: int, rank: int, processes: int) -> dict[str, Any] | None:
     """Read what `write_environments` wrote, on the CPU; None if it is not there or damaged."""
+    path = _environments(run, iteration, rank, processes)
     try:
-        state = torch.load(_environments(run, iteration, rank, processes), map_location="cpu", weights_only=True)
+        check_checkpoint(path)
+        state = torch.load(path, map_location="cpu", weights_only=True)
     except Exception:  # as in `read_checkpoint`
         return None
     return state if isinstance(state, dict) else None
@@ -162,11 +200,14 @@ def read_metrics(run: Path) -> list[dict[str, float]]:
     """Read the rows of `metrics.csv`. An empty cell is NaN.
 
     If there is no file, there are no rows. A row that was cut short is left out, and so are the rows after it.
+
+    ValueError if the file is too large.
     """
-    if not (run / METRICS).is_file():
+    if not is_file(run / METRICS):
         return []
+    check_file(run / METRICS, MAX_METRICS)
     rows: list[dict[str, float]] = []
-    with (run / METRICS).open(newline="", errors="replace") as file, contextlib.suppress(ValueError):
+    with (run / METRICS).open(newline="", errors="replace") as file, contextlib.suppress(ValueError, csv.Error):
         for row in csv.DictReader(line for line in file if line.endswith("\n")):
             if None in row:  # cells without a column
                 break

@@ -6,6 +6,7 @@ import difflib
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from functools import reduce
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, ClassVar, Literal, get_type_hints
 
@@ -17,6 +18,11 @@ from surgical_marl.plugins.algorithms import ALGORITHMS
 from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.runtime import has_cuda
 from surgical_marl.tasks.base.options import Checked, Options, as_mapping, choice, number
+from surgical_marl.untrusted.values import shown
+from surgical_marl.yaml_file import load_yaml, parse_yaml
+
+MAX_LAYERS, MAX_WEIGHTS = 32, 50_000_000
+"""Layers of a network, and weights between them: 200 MB, and four times that to learn with."""
 
 
 @dataclass(frozen=True)
@@ -102,10 +108,22 @@ class NetworkSettings(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if len(self.hidden) > MAX_LAYERS:
+            raise ValueError(f"network.hidden must have at most {MAX_LAYERS} layers, not {len(self.hidden):,}")
+        weights = sum(one * other for one, other in pairwise(self.hidden)) + self._cell_weights()
+        if weights > MAX_WEIGHTS:
+            raise ValueError(
+                f"network.hidden {shown(list(self.hidden))} has {weights:,} weights between its layers; at most "
+                f"{MAX_WEIGHTS:,} are made"
+            )
         if self.attention and self.recurrent != "none":
             raise ValueError(
                 f"network.attention must be 0 with network.recurrent {self.recurrent!r}, not {self.attention}"
             )
+
+    def _cell_weights(self) -> int:
+        """Return how many weights of a recurrent cell there are between its own units."""
+        return {"none": 0, "gru": 3, "lstm": 4}[self.recurrent] * self.hidden[0] ** 2
 
 
 @dataclass(frozen=True)
@@ -236,21 +254,17 @@ def _read_task(task: str) -> dict[str, Any]:
 
 
 def _read_yaml(path: Path) -> dict[str, Any]:
-    try:
-        values = yaml.safe_load(path.read_text())
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} is not valid YAML: {' '.join(str(error).split())}") from None
-    return dict(as_mapping(str(path), values or {}))
+    return dict(as_mapping(str(path), load_yaml(path) or {}))
 
 
 def _override(values: dict[str, Any], overrides: Iterable[str]) -> dict[str, Any]:
     for text in overrides:
         key, equals, value = text.partition("=")
         if not equals or not key:
-            raise ValueError(f"{text!r} is not an override of the form key=value, such as num_envs=512")
+            raise ValueError(f"{shown(text)} is not an override of the form key=value, such as num_envs=512")
         try:
-            nested: Any = yaml.safe_load(value)
-        except yaml.YAMLError:
+            nested: Any = parse_yaml(value)
+        except ValueError:
             nested = value
         for part in reversed(key.split(".")):
             nested = {part: nested}
@@ -279,7 +293,7 @@ def _reject_unknown(values: Mapping[str, Any], without: tuple[str, ...] = ()) ->
         names = [f"{key}.{inner}" for inner in as_mapping(key, value)] if key in sections else [str(key)]
         for name in names:
             if name not in known:
-                raise ValueError(f"unknown setting {name!r}; {_suggestion(name, known)}")
+                raise ValueError(f"unknown setting {shown(name)}; {_suggestion(name[:100], known)}")
 
 
 def _suggestion(name: str, known: list[str]) -> str:

@@ -29,6 +29,7 @@ from surgical_marl.scenes.load import load_scene
 from surgical_marl.scenes.objects import load_object
 from surgical_marl.scenes.scene import Scene
 from surgical_marl.scenes.timing import TIMESTEP
+from surgical_marl.untrusted.files import is_file, is_folder, user_path
 from surgical_marl.yaml_file import read_yaml
 
 REACH = 0.001
@@ -89,12 +90,14 @@ def _find(source: str | Path) -> dict[str, Path]:
     found = {kind: find(kind, text) for kind, names in named.items() if text in names}
     if found:
         return found
-    path = Path(text).expanduser().resolve()  # so that `./psm` is not taken for the shipped psm further down
-    if text and path.name == "arm.yaml" and path.is_file():
+    path = user_path(text)
+    if text and (is_file(path) or is_folder(path)):
+        path = path.resolve()  # so that `./psm` is not taken for the shipped psm further down
+    if text and path.name == "arm.yaml" and is_file(path):
         path = path.parent
-    if text and path.is_dir():
+    if text and is_folder(path):
         return {"arms": path}
-    if text and path.is_file():
+    if text and is_file(path):
         return {"objects" if _is_object(path) else "scenes": path}
     raise unknown("arm, scene or object", text, list(dict.fromkeys(chain(*named.values()))))
 

@@ -27,7 +27,12 @@ from surgical_marl.scenes.placing import add_objects, read_placements
 from surgical_marl.scenes.randomisation import read_randomisation
 from surgical_marl.scenes.scene import Mount, Scene
 from surgical_marl.scenes.surroundings import add_surroundings, add_tissue
+from surgical_marl.untrusted.files import is_file
+from surgical_marl.untrusted.values import check_count, shown
 from surgical_marl.yaml_file import check_keys, read_mapping, read_vector, read_yaml
+
+MAX_ARMS, MAX_TISSUE = 32, 200
+"""Arms and pieces of tissue of a scene."""
 
 
 def load_scene(name: str | Path, control: str = "position") -> Scene:
@@ -42,6 +47,9 @@ def load_scene(name: str | Path, control: str = "position") -> Scene:
     arms = settings.get("arms")
     if not isinstance(arms, dict) or not arms:
         raise ValueError(f"{path}: arms must map agent names such as psm_0 to arms")
+    check_count(len(arms), MAX_ARMS, "arms", path)
+    tissue = read_mapping(settings.get("tissue"), f"{path}, tissue")
+    check_count(len(tissue), MAX_TISSUE, "pieces of tissue", path)
     load = cache(load_arm)  # two agents may be the same arm
     mounts = {agent: _read_mount(agent, mount, path, load) for agent, mount in arms.items()}
     objects = read_placements(settings.get("objects"), mounts, path)
@@ -54,8 +62,8 @@ def load_scene(name: str | Path, control: str = "position") -> Scene:
     def compute() -> mujoco.MjModel:
         spec = build_scene(path.stem, mounts, control, randomisation, pads=bool(objects))
         add_surroundings(spec, mounts, settings.get("view"), path)
-        for piece, what in read_mapping(settings.get("tissue"), f"{path}, tissue").items():
-            add_tissue(spec, f"tissue/{piece}", what, f"{path}, tissue {piece!r}")
+        for piece, what in tissue.items():
+            add_tissue(spec, f"tissue/{piece}", what, f"{path}, tissue {shown(piece)}")
         add_objects(spec, objects)
         bare = scene(model=compile_scene(spec))
         for one, other in contact_pairs(bare):
@@ -71,13 +79,13 @@ def load_scene(name: str | Path, control: str = "position") -> Scene:
 
 
 def _read_mount(agent: str, settings: Any, path: Path, load: Callable[[str | Path], Arm]) -> Mount:
-    where = f"{path}, agent {agent!r}"
+    where = f"{path}, agent {shown(agent)}"
     if not isinstance(settings, dict) or "arm" not in settings:
         raise ValueError(f"{where}: must be a mapping that names its arm")
     check_keys(settings, ("arm", "position", "turn", "tilt", "workspace"), where)
     source = str(settings["arm"])
     local = path.parent / source  # a user's own arm may be named relative to the scene file
-    arm = load(local if (local / "arm.yaml").is_file() else source)
+    arm = load(local if is_file(local / "arm.yaml") else source)
     if not re.fullmatch(re.escape(arm.name) + r"_\d+", str(agent)):
         raise ValueError(f"{where}: an agent of arm {arm.name!r} is called {arm.name}_0, {arm.name}_1 and so on")
     vectors = {key: read_vector(settings.get(key, [0.0, 0.0, 0.0]), f"{where}, {key}") for key in

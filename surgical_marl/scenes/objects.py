@@ -22,9 +22,13 @@ from surgical_marl.robots.rotation import matrix_of, quaternion, turned
 from surgical_marl.scenes.poses import Pose
 from surgical_marl.scenes.shapes import Shape as Shape
 from surgical_marl.scenes.shapes import read_colour, read_number, read_shapes
+from surgical_marl.untrusted.values import check_count, shown
 from surgical_marl.yaml_file import check_keys, read_mapping, read_vector, read_yaml
 
 KEYS = ("description", "free", "mass", "density", "friction", "stiffness", "colour", "shapes", "sites")
+MAX_SITES = 100
+HEAVIEST, LIGHTEST = 1e6, 1e-12
+"""Masses of a free object, kg."""
 GREY = (0.7, 0.7, 0.72)
 """The colour of an object that has none."""
 GEOMS = {
@@ -131,10 +135,18 @@ def load_object(name: str | Path, colour: Any = None) -> Object:
     check_keys(settings, KEYS, path)
     free = settings.get("free")
     if not isinstance(free, bool):
-        raise ValueError(f"{path}: free must be true, for an object that moves, or false, not {free!r}")
+        raise ValueError(f"{path}: free must be true, for an object that moves, or false, not {shown(free)}")
     painted = read_colour(colour, where, read_colour(settings.get("colour"), where, np.array(GREY)))
     shapes = read_shapes(settings.get("shapes"), painted, where)
-    mass, center, inertia = _inertia(shapes, _density(settings, free, shapes, where), free)
+    density = _density(settings, free, shapes, where)
+    try:
+        mass, center, inertia = _inertia(shapes, density, free)
+    except (ValueError, mujoco.FatalError) as error:
+        raise ValueError(
+            f"{where}: its shapes are too small or too far apart: {' '.join(str(error).split())}"
+        ) from None
+    if free and not LIGHTEST <= mass <= HEAVIEST:
+        raise ValueError(f"{where}: a free object must weigh from {LIGHTEST:g} to {HEAVIEST:g} kg, not {mass:g}")
     friction = read_mapping(settings.get("friction"), f"{where}, friction")
     check_keys(friction, ("sliding", "torsion"), f"{where}, friction")
     sliding, torsion = (read_number(friction.get(key), f"{where}: {key} friction") for key in ("sliding", "torsion"))
@@ -192,8 +204,10 @@ def add_shape(body: Any, shape: Shape, **rest: Any) -> None:
 
 def _sites(settings: Any, where: str) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     sites = {}
-    for name, place in read_mapping(settings, f"{where}, sites").items():
-        at = f"{where}, site {name!r}"
+    given = read_mapping(settings, f"{where}, sites")
+    check_count(len(given), MAX_SITES, "sites", where)
+    for name, place in given.items():
+        at = f"{where}, site {shown(name)}"
         place = read_mapping(place, at)
         check_keys(place, ("position", "tilt"), at)
         position, tilt = (read_vector(place.get(key, [0, 0, 0]), f"{at}, {key}") for key in ("position", "tilt"))

@@ -13,7 +13,12 @@ from surgical_marl.content import find, list_scenes
 from surgical_marl.robots.rotation import quaternion, turned
 from surgical_marl.scenes.objects import Placement, add_shape, load_object
 from surgical_marl.scenes.surroundings import STILL
+from surgical_marl.untrusted.files import is_file
+from surgical_marl.untrusted.values import check_count, shown
 from surgical_marl.yaml_file import check_keys, read_mapping, read_vector, read_yaml
+
+MAX_OBJECTS = 50
+"""Objects of a scene."""
 
 
 def scenes_without_objects() -> list[str]:
@@ -28,8 +33,10 @@ def read_placements(settings: Any, agents: Iterable[str], path: Path) -> dict[st
         ValueError: a name that is also an agent's, an unknown object or key, or a bad number.
     """
     found = {}
-    for name, place in read_mapping(settings, f"{path}, objects").items():
-        where = f"{path}, object {name!r}"
+    given = read_mapping(settings, f"{path}, objects")
+    check_count(len(given), MAX_OBJECTS, "objects", path)
+    for name, place in given.items():
+        where = f"{path}, object {shown(name)}"
         if not re.fullmatch(r"[A-Za-z_]\w*", str(name)):
             raise ValueError(f"{where}: a name in a scene is of letters, digits and underscores")
         if name in agents or name == "world":
@@ -44,7 +51,7 @@ def _read_placement(settings: Any, where: str, folder: Path) -> Placement:
     check_keys(settings, ("object", "position", "tilt", "colour"), where)
     source = str(settings["object"])
     local = folder / source  # a user's own object may be named relative to the scene file
-    item = load_object(local if local.is_file() else source, settings.get("colour"))
+    item = load_object(local if is_file(local) else source, settings.get("colour"))
     position, tilt = (read_vector(settings.get(key, [0, 0, 0]), f"{where}, {key}") for key in ("position", "tilt"))
     return Placement(item, position, turned(tilt))
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from surgical_marl.untrusted.values import shown
 from surgical_marl.yaml_file import build
 
 SHARES = "stiffness", "damping", "friction", "object_size", "object_mass", "object_friction"
@@ -60,13 +61,12 @@ def read_randomisation(settings: Any, path: Path) -> Randomisation:
     """
     where = f"{path}, randomisation"
     found: Randomisation = build(Randomisation, {} if settings is None else settings, where)
+    late = found.latency
+    if isinstance(late, bool) or not isinstance(late, int) or not 0 <= late <= 50:
+        raise ValueError(f"{where}: latency must be a whole number of control steps from 0 to 50, not {shown(late)}")
     for item in fields(found):
         value, relative = getattr(found, item.name), item.name in SHARES
         if value < 0 or (relative and value >= 1):
             good = "from 0 to less than 1" if relative else "0 or more"
             raise ValueError(f"{where}: {item.name} must be {good}, not {value:g}")
-    if isinstance(found.latency, bool) or not isinstance(found.latency, int) or found.latency > 50:
-        raise ValueError(
-            f"{where}: latency must be a whole number of control steps from 0 to 50, not {found.latency!r}"
-        )
     return found

@@ -25,8 +25,8 @@ BOXES = 400_000
 """Boxes of the longest search. Pairs of the shipped scenes take up to 313,000, one or two seconds."""
 WALKERS, STEPS = 32, 40
 """How many of the nearest postures of a search a descent starts from, and how many steps it takes."""
-HALVINGS = 8
-"""How often a geom's range is halved to find the ball in which the geom stays."""
+HALVINGS, FEW_HALVINGS, MANY = 8, 4, 16
+"""How often a geom's range is halved to find the ball in which the geom stays, and how often if it has many joints."""
 
 
 @dataclass(frozen=True)
@@ -205,7 +205,7 @@ def ball(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, float]:
     """Return centre [3] and radius, m, of a ball in the world that a geom stays in within the joint limits."""
     limb = Limb(model, geom)
     boxes = limb.limits()
-    for _ in range(HALVINGS if limb.joints else 0):
+    for _ in range(min(len(limb.joints), 1) * (HALVINGS if len(limb.joints) <= MANY else FEW_HALVINGS)):
         speeds = limb.place(boxes[:, 0])[1]
         boxes = _halved(boxes, limb.moves(speeds, boxes[:, 1])[0].argmax(1))
     capsule, speeds = limb.place(boxes[:, 0])
@@ -251,6 +251,11 @@ def _carriers(model: mujoco.MjModel, geom: int, root: int = 0) -> list[int]:
     while bodies[-1] not in (0, root):
         bodies.append(int(model.body_parentid[bodies[-1]]))
     return bodies[-2::-1]
+
+
+def joints_to(model: mujoco.MjModel, geom: int) -> int:
+    """Return how many joints there are between the world and a geom."""
+    return sum(int(model.body_jntnum[body]) for body in _carriers(model, geom))
 
 
 def _last_common(one: list[int], other: list[int]) -> int:

@@ -16,7 +16,11 @@ import numpy as np
 
 from surgical_marl.content import unknown
 from surgical_marl.robots.rotation import matrix_of, turned
+from surgical_marl.untrusted.values import LARGEST, LEAST, LONGEST, SHORTEST, as_number, check_count, shown
 from surgical_marl.yaml_file import check_keys, read_mapping, read_vector
+
+MAX_SHAPES = 400
+"""Shapes of an object, each capsule of an arc counted."""
 
 
 @dataclass(frozen=True)
@@ -49,15 +53,21 @@ def read_shapes(settings: Any, colour: np.ndarray, where: str) -> tuple[Shape, .
         ValueError: an unknown kind or key, or a bad number.
     """
     if not isinstance(settings, list) or not settings:
-        raise ValueError(f"{where}: shapes must be a list of one shape or more ({', '.join(_READERS)}), not {settings}")
+        raise ValueError(
+            f"{where}: shapes must be a list of one shape or more ({', '.join(_READERS)}), not {shown(settings)}"
+        )
+    check_count(len(settings), MAX_SHAPES, "shapes", where)
     shapes: list[Shape] = []
     for number, entry in enumerate(settings):
         if not isinstance(entry, dict) or len(entry) != 1:
-            raise ValueError(f"{where}, shape {number}: {entry!r} must map one of {', '.join(_READERS)} to its sizes")
+            raise ValueError(
+                f"{where}, shape {number}: {shown(entry)} must map one of {', '.join(_READERS)} to its sizes"
+            )
         ((kind, values),) = entry.items()
         if kind not in _READERS:
             raise unknown(f"shape in {where}:", kind, list(_READERS))
         shapes += _READERS[kind](_Reader(values, colour, f"{where}, shape {number}, {kind}"))
+    check_count(len(shapes), MAX_SHAPES, "shapes", where)
     return tuple(shapes)
 
 
@@ -72,7 +82,7 @@ class _Reader:
         check_keys(self.values, (*keys, "colour"), self.where)
 
     def above(self, key: str) -> float:
-        return read_number(self.values.get(key), f"{self.where}, {key}", above=0.0)
+        return read_number(self.values.get(key), f"{self.where}, {key}", above=0.0, least=SHORTEST, most=LONGEST)
 
     def vector(self, key: str, default: Any = None) -> np.ndarray:
         return read_vector(self.values.get(key, default), f"{self.where}, {key}")
@@ -103,8 +113,7 @@ def _capsule(reader: _Reader) -> list[Shape]:
 def _box(reader: _Reader) -> list[Shape]:
     reader.check("size", "position", "tilt")
     size = reader.vector("size")
-    if not (size > 0).all():
-        raise ValueError(f"{reader.where}: size {size.tolist()} must be above 0")
+    check_size(size, reader.where)
     return [reader.shape("box", size / 2, *reader.place(), volume=float(np.prod(size)))]
 
 
@@ -122,7 +131,7 @@ def _arc(reader: _Reader) -> list[Shape]:
     radius, wire, degrees = (reader.above(key) for key in ("radius", "wire", "degrees"))
     segments = reader.values.get("segments")
     if isinstance(segments, bool) or not isinstance(segments, int) or not 1 <= segments <= 360:
-        raise ValueError(f"{reader.where}: segments must be a whole number from 1 to 360, not {segments!r}")
+        raise ValueError(f"{reader.where}: segments must be a whole number from 1 to 360, not {shown(segments)}")
     if degrees > 360 or wire / 2 >= radius or degrees / segments >= 180:
         raise ValueError(
             f"{reader.where}: degrees must be up to 360 and below 180 a segment, and the wire thinner than the arc"
@@ -154,16 +163,28 @@ _READERS: dict[str, Callable[[_Reader], list[Shape]]] = {
 }
 
 
-def read_number(value: Any, where: str, above: float | None = None) -> float:
-    """Return a finite number: above `above` if it is given, otherwise 0 or more; raise ValueError for another value."""
-    try:
-        number = math.nan if isinstance(value, bool) else float(value)  # YAML takes 1e5 for a word
-    except (TypeError, ValueError):
-        number = math.nan
-    if not math.isfinite(number) or number < 0 or (above is not None and number <= above):
-        raise ValueError(f"{where} must be a finite number {'0 or more' if above is None else f'above {above:g}'}, "
-                         f"not {value!r}")  # fmt: skip
+def read_number(
+    value: Any, where: str, above: float | None = None, least: float = LEAST, most: float = LARGEST
+) -> float:
+    """Return a number up to `most`; raise ValueError for another value.
+
+    It is 0 or more, or `least` at least and above `above` if that is given.
+    """
+    number = as_number(value, words=True)
+    good = 0 <= number <= most and (above is None or (number > above and number >= least))
+    if not good:
+        limits = "0 or more" if above is None else f"above {above:g}"
+        if math.isfinite(number) and number > 0:
+            limits = f"from {0.0 if above is None else least:g} to {most:g}"
+        raise ValueError(f"{where} must be a finite number {limits}, not {shown(value)}")
     return number
+
+
+def check_size(size: np.ndarray, where: str) -> None:
+    """Raise ValueError if a side is not above 0, or too short to be computed with."""
+    if not (size >= SHORTEST).all():
+        least = "above 0" if (size <= 0).any() else f"{SHORTEST:g} m or more"
+        raise ValueError(f"{where}: size {size.tolist()} must be {least}")
 
 
 def read_colour(value: Any, where: str, default: np.ndarray) -> np.ndarray:

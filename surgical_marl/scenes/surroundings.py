@@ -10,6 +10,8 @@ import numpy as np
 
 from surgical_marl.robots.rotation import quaternion, turned
 from surgical_marl.scenes.scene import Mount
+from surgical_marl.scenes.shapes import check_size
+from surgical_marl.untrusted.values import shown
 from surgical_marl.yaml_file import check_keys, read_mapping, read_vector
 
 STILL = {"contype": 0, "conaffinity": 0, "group": 1}
@@ -53,13 +55,15 @@ def add_tissue(spec: mujoco.MjSpec, name: str, settings: Any, where: str) -> Non
     """Add a coloured piece of tissue for an endoscope to look at. It is fixed in the world."""
     settings = read_mapping(settings, where)
     check_keys(settings, ("shape", "size", "position", "tilt", "colour"), where)
-    if settings.get("shape") not in TISSUE_SHAPES:
-        raise ValueError(f"{where}: shape {settings.get('shape')!r} must be one of {', '.join(TISSUE_SHAPES)}")
-    kind, lengths, words = TISSUE_SHAPES[settings["shape"]]
+    shape = settings.get("shape")
+    if not isinstance(shape, str) or shape not in TISSUE_SHAPES:
+        raise ValueError(f"{where}: shape {shown(shape)} must be one of {', '.join(TISSUE_SHAPES)}")
+    kind, lengths, words = TISSUE_SHAPES[shape]
     size = read_vector(settings.get("size"), f"{where}, size", lengths, f"{words} in m")
     colour = read_vector(settings.get("colour"), f"{where}, colour")
-    if not (size > 0).all() or not ((colour >= 0) & (colour <= 1)).all():
-        raise ValueError(f"{where}: size {size.tolist()} must be above 0, and colour {colour.tolist()} from 0 to 1")
+    check_size(size, where)
+    if not ((colour >= 0) & (colour <= 1)).all():
+        raise ValueError(f"{where}: colour {colour.tolist()} must be from 0 to 1")
     position, tilt = (read_vector(settings.get(key, [0, 0, 0]), f"{where}, {key}") for key in ("position", "tilt"))
     quat = quaternion(turned(tilt))
     spec.worldbody.add_geom(

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import importlib.metadata
 import json
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -27,6 +26,7 @@ import numpy as np
 from surgical_marl.files import write_atomic
 from surgical_marl.runs.environment import make_env
 from surgical_marl.runs.settings import Settings
+from surgical_marl.untrusted.arrays import read_npz
 
 if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv, BatchStep
@@ -132,12 +132,9 @@ def replay(path: Path) -> Replayed:
 def read_take(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Return what `about` says, and all arrays by name; ValueError if the file is no take."""
     try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files if name != "about"}
-            about = json.loads(str(file["about"]))
-    except OSError as error:
-        raise ValueError(f"cannot read {path}: {error.strerror or 'it is no npz file'}") from None
-    except (ValueError, KeyError, TypeError, AttributeError, EOFError, zipfile.BadZipFile):
+        arrays = read_npz(path)
+        about = json.loads(str(arrays.pop("about")))
+    except (ValueError, KeyError, RecursionError):
         about, arrays = {}, {}
     known = {"layout", "environment", "engine", "device", "num_envs", "versions"}
     if not isinstance(about, dict) or not known <= about.keys() or "qpos" not in arrays:

@@ -96,4 +96,4 @@ def _write_mp4(path: Path, shape: tuple[int, ...], frames: Frames, fps: float) -
             raise
         complaint = ffmpeg.stderr.read().decode(errors="replace")
     if ffmpeg.returncode:
-        raise RuntimeError(f"ffmpeg could not write {str(path)!r}: {' '.join(complaint.split())}")
+        raise OSError(f"ffmpeg could not write {str(path)!r}: {' '.join(complaint.split())}")

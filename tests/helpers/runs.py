@@ -104,9 +104,10 @@ def _at(owner: Any, name: str, kill: Callable[..., bool], after: bool = False) -
     setattr(owner, name, patched)
 
 
-def _half_a_file(state: Any, path: Path) -> bool:
+def _half_a_file(state: Any, file: Any) -> bool:
     if "iteration" in state and state["iteration"] == 2:
-        Path(path).write_bytes(b"half of it")
+        file.write(b"half of it")
+        file.flush()
         return True
     return False
 

@@ -16,6 +16,10 @@ from dataclasses import dataclass, field, fields
 from typing import Any, ClassVar, Literal, Union, get_args, get_origin, get_type_hints
 
 from surgical_marl.scenes.timing import DECIMATION
+from surgical_marl.untrusted.values import as_number, check_count, shown
+
+MOST_PARTS = 100
+"""Parts of a setting that is a list or a mapping."""
 
 
 def number(default: Any, low: float, high: float, text: str = "") -> Any:
@@ -125,20 +129,23 @@ def check(name: str, value: Any, kind: Any, metadata: Mapping[str, Any]) -> Any:
         kind = get_args(kind)[0]
     if get_origin(kind) is Literal:
         if value not in get_args(kind):
-            raise ValueError(f"{name} must be one of {', '.join(get_args(kind))}, not {value!r}")
+            raise ValueError(f"{name} must be one of {', '.join(get_args(kind))}, not {shown(value)}")
         return value
     if get_origin(kind) in (dict, Mapping):
         inner = get_args(kind)[1]
         given = as_mapping(name, {} if value is None else value)
+        check_count(len(given), MOST_PARTS, "names", name)
         bounds = {"range": (-1e6, 1e6)} if inner is float else {}
-        return {str(key): check(f"{name}.{key}", item, inner, bounds) for key, item in given.items()}
+        return {str(key): check(f"{name}.{str(key)[:80]}", item, inner, bounds) for key, item in given.items()}
     if get_origin(kind) is Sequence:
         if not isinstance(value, (list, tuple)) or not all(isinstance(part, str) for part in value):
-            raise ValueError(f"{name} must be a list of names such as [qpos, tool_tip], not {value!r}")
+            raise ValueError(f"{name} must be a list of names such as [qpos, tool_tip], not {shown(value)}")
+        check_count(len(value), MOST_PARTS, "names", name)
         return tuple(value)
     if get_origin(kind) is tuple:
         if not isinstance(value, (list, tuple)) or not value:
-            raise ValueError(f"{name} must be a list of whole numbers such as [256, 128, 64], not {value!r}")
+            raise ValueError(f"{name} must be a list of whole numbers such as [256, 128, 64], not {shown(value)}")
+        check_count(len(value), MOST_PARTS, "numbers", name)
         return tuple(check(name, part, int, metadata) for part in value)
     if kind is int and isinstance(value, numbers.Integral) and not isinstance(value, bool):
         value = int(value)  # numpy's whole numbers too
@@ -148,24 +155,19 @@ def check(name: str, value: Any, kind: Any, metadata: Mapping[str, Any]) -> Any:
     if good and limits is not None:
         good = limits[0] <= value <= limits[1]
     if not good:
-        raise ValueError(f"{name} must be {_describe(kind, limits)}, not {value!r}")
+        raise ValueError(f"{name} must be {_describe(kind, limits)}, not {shown(value)}")
     return value
 
 
 def as_mapping(name: str, value: Any) -> Mapping[str, Any]:
     """Return a value that must be a mapping; ValueError if it is none."""
     if not isinstance(value, Mapping):
-        raise ValueError(f"{name} must be a mapping of settings, not {value!r}")
+        raise ValueError(f"{name} must be a mapping of settings, not {shown(value)}")
     return value
 
 
 def _as_float(value: Any) -> Any:
-    if isinstance(value, bool) or not isinstance(value, (numbers.Real, str)):
-        return value
-    try:
-        number = float(value)
-    except ValueError:
-        return value
+    number = as_number(value, words=True)
     return number if math.isfinite(number) else value
 
 
