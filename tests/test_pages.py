@@ -14,7 +14,7 @@ import shutil
 import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext, suppress
-from itertools import pairwise
+from itertools import dropwhile, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -186,7 +186,7 @@ def run_python(code: str, names: dict[str, Any]) -> None:
 
 def check_command(words: list[str], is_mention: bool = False) -> None:
     """Raise AssertionError unless a command can be typed as it stands, or is nothing but a command's name."""
-    program, *rest = words
+    program, *rest = dropwhile(re.compile("[A-Z_]+=").match, words)  # without variables of the environment
     name = " ".join(rest).removeprefix("-m surgical_marl ")
     if not (is_mention and (not rest or name in COMMANDS)):
         assert program in CHECKS, f"no test knows the program {program!r}"
