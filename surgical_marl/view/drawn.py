@@ -15,8 +15,8 @@ from surgical_marl.view.colours import visual_rgba
 from surgical_marl.view.lighting import GLOW, GRAIN
 from surgical_marl.view.shading import GAMMA, PLASTIC, Material, material, materials
 from surgical_marl.view.tracer import PLANE, Shape, World, wp
-from surgical_marl.vision.raycaster import corner_normals, warp_mesh
-from surgical_marl.vision.rays import BOX, CAPSULE, CYLINDER, ELLIPSOID, FAR, MESH
+from surgical_marl.vision.raycaster import GROUPS, KINDS, corner_normals, warp_mesh
+from surgical_marl.vision.rays import CAPSULE, CYLINDER, ELLIPSOID, FAR, MESH
 
 Array = NDArray[np.float64]
 
@@ -26,17 +26,7 @@ Sphere = tuple[Sequence[float], float, Sequence[float]]
 _LAYOUT: Any = Shape.numpy_dtype()  # type: ignore[attr-defined]  # a struct of Warp
 _LINE = 0.6
 """Radius of a capsule in the picture at least, pixels."""
-_GROUPS = 3
-"""Geoms of the groups below this one are drawn."""
-_KINDS = {
-    mujoco.mjtGeom.mjGEOM_PLANE: PLANE,
-    mujoco.mjtGeom.mjGEOM_SPHERE: ELLIPSOID,
-    mujoco.mjtGeom.mjGEOM_ELLIPSOID: ELLIPSOID,
-    mujoco.mjtGeom.mjGEOM_CAPSULE: CAPSULE,
-    mujoco.mjtGeom.mjGEOM_CYLINDER: CYLINDER,
-    mujoco.mjtGeom.mjGEOM_BOX: BOX,
-    mujoco.mjtGeom.mjGEOM_MESH: MESH,
-}
+_KINDS = {mujoco.mjtGeom.mjGEOM_PLANE: PLANE, **KINDS}
 
 
 class Extra(NamedTuple):
@@ -69,7 +59,7 @@ class Drawn:
         stage: Sequence[Extra] = (),
         paint: Mapping[int, Sequence[float]] = MappingProxyType({}),
     ) -> None:
-        seen = (model.geom_group < _GROUPS) & (visual_rgba(model)[:, 3] > 0)
+        seen = (model.geom_group < GROUPS) & (visual_rgba(model)[:, 3] > 0)
         known = np.array([mujoco.mjtGeom(kind) in _KINDS for kind in model.geom_type], bool)
         self._geoms = geoms = np.flatnonzero(seen & known)
         kinds = [int(_KINDS[mujoco.mjtGeom(kind)]) for kind in model.geom_type[geoms]]

@@ -19,7 +19,7 @@ BLOCK = 128
 """Threads in a CUDA block."""
 SMOOTH = 0.8
 """A mesh looks smooth where its faces' directions differ by less than this cosine, as in MuJoCo."""
-_KINDS = {
+KINDS = {
     mujoco.mjtGeom.mjGEOM_SPHERE: ELLIPSOID,
     mujoco.mjtGeom.mjGEOM_ELLIPSOID: ELLIPSOID,
     mujoco.mjtGeom.mjGEOM_CAPSULE: CAPSULE,
@@ -50,7 +50,7 @@ class RayCaster:
         background: Sequence[float],
     ) -> None:
         geoms = np.flatnonzero((model.geom_group < GROUPS) & (model.geom_rgba[:, 3] > 0))
-        kinds = np.array([_KINDS[mujoco.mjtGeom(kind)] for kind in model.geom_type[geoms]], np.int32)
+        kinds = np.array([KINDS[mujoco.mjtGeom(kind)] for kind in model.geom_type[geoms]], np.int32)
         meshes = np.where(kinds == MESH, model.geom_dataid[geoms], -1)
         pictures, tiles = num_envs * len(cameras), -(-width // TILE) * -(-height // TILE)
         pixel = float(2 * np.tan(np.radians(model.cam_fovy[cameras[0]]) / 2) / height)
