@@ -49,7 +49,7 @@ from surgical_marl.tasks.base.grips import (
 )
 from surgical_marl.tasks.base.lying import lying
 from surgical_marl.tasks.base.object_task import FAR, NEAR, Best, Now, ObjectTask, known
-from surgical_marl.tasks.base.script import Snapshot, Step, Wish
+from surgical_marl.tasks.base.script import EARLY, Snapshot, Step, Wish
 from surgical_marl.tasks.base.task import Start
 from surgical_marl.tasks.base.terms import Picture, Term
 from surgical_marl.tasks.base.workspace import choose
@@ -238,13 +238,13 @@ class Task(ObjectTask):
 
         return (
             Step(lambda seen: grip(seen, -ABOVE)),
-            Step(lambda seen: grip(seen, PRESS), wait=0.1, pace=0.3),
-            Step(lambda seen: {giver: Wish()}, wait=0.4, good=holds(giver)),
+            Step(lambda seen: grip(seen, PRESS), wait=EARLY, pace=0.3),
+            Step(lambda seen: {giver: Wish()}, wait=0.4, pace=0.3, good=holds(giver)),
             Step(raised, wait=0.1, pace=0.3, good=holds(giver)),
             Step(offer, wait=0.3, pace=0.6, good=offered, back=4),
             Step(lambda seen: take(seen, BACK), wait=0.1),
-            Step(lambda seen: take(seen, -DEEP), wait=0.1, pace=0.3),
-            Step(lambda seen: {taker: Wish()}, wait=0.4, good=holds(taker), back=4),
+            Step(lambda seen: take(seen, -DEEP), wait=EARLY, pace=0.3),
+            Step(lambda seen: {taker: Wish()}, wait=0.4, pace=0.3, good=holds(taker), back=4),
             Step(lambda seen: {giver: Wish(opens=True)}, wait=0.3),
             Step(leave, wait=0.1, pace=0.5),
             Step(lambda seen: present(seen, RAISE), pace=0.8),

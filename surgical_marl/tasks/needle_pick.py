@@ -45,7 +45,7 @@ from surgical_marl.tasks.base.grips import (
 )
 from surgical_marl.tasks.base.lying import lying
 from surgical_marl.tasks.base.object_task import NEAR, ObjectGoal, ObjectTask
-from surgical_marl.tasks.base.script import Snapshot, Step, Wish
+from surgical_marl.tasks.base.script import EARLY, Snapshot, Step, Wish
 from surgical_marl.tasks.base.task import Start
 from surgical_marl.tasks.base.workspace import choose
 
@@ -139,8 +139,8 @@ class Task(ObjectTask):
 
         return (
             Step(lambda seen: grip(seen, -ABOVE)),
-            Step(lambda seen: grip(seen, PRESS), wait=0.1, pace=0.3),
-            Step(lambda seen: {agent: Wish()}, wait=0.4, good=holds),
+            Step(lambda seen: grip(seen, PRESS), wait=EARLY, pace=0.3),
+            Step(lambda seen: {agent: Wish()}, wait=0.4, pace=0.3, good=holds),
             Step(raised, wait=0.1, pace=0.3, good=holds),
             Step(present, wait=0.3, pace=0.6),
         )

@@ -10,7 +10,7 @@ import numpy as np
 
 from surgical_marl.tasks.base.blocks import gripping, upright
 from surgical_marl.tasks.base.grips import joints_at, moved, tool_of
-from surgical_marl.tasks.base.script import Snapshot, Step, Wish
+from surgical_marl.tasks.base.script import EARLY, Snapshot, Step, Wish
 
 if TYPE_CHECKING:
     from surgical_marl.scenes.scene import Mount, Scene
@@ -117,7 +117,7 @@ class Transfer:
         return (
             Step(lambda seen: {agent: self._as_from_home(agent, grip(seen, -OVER)[agent])}, wait=0.1),
             Step(lambda seen: grip(seen, PAST), wait=0.1, pace=0.3),
-            Step(lambda seen: {agent: Wish()}, wait=0.3, good=holds, back=first),
+            Step(lambda seen: {agent: Wish()}, wait=0.4, pace=0.3, good=holds, back=first),
             Step(lambda seen: _shifted(seen, agent, [0, 0, RAISE / 2]), pace=0.3, good=holds, back=first),
             Step(lambda seen: _shifted(seen, agent, [0, 0, RAISE / 2]), wait=0.1, pace=0.4),
         )
@@ -150,8 +150,8 @@ class Transfer:
             Step(lambda seen: offer(seen, [0.0, 0.0, 0.01] - AWAY * across), pace=0.6),
             Step(lambda seen: offer(seen, [0.0, 0.0, 0.0]), wait=0.2, pace=0.5),
             Step(lambda seen: take(seen, -OVER), wait=0.1, pace=0.6),
-            Step(lambda seen: take(seen, PAST), wait=0.1, pace=0.3),
-            Step(lambda seen: {taker: Wish()}, wait=0.3, good=self._holds(taker), back=again),
+            Step(lambda seen: take(seen, PAST), wait=EARLY, pace=0.3),
+            Step(lambda seen: {taker: Wish()}, wait=0.4, pace=0.3, good=self._holds(taker), back=again),
             Step(lambda seen: {giver: Wish(opens=WIDE)}, wait=0.2),
             Step(lambda seen: _shifted(seen, giver, [0, 0, RAISE / 2], WIDE), pace=0.3),
             Step(lambda seen: _shifted(seen, giver, -AWAY * across, WIDE), pace=0.6),

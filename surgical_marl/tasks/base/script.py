@@ -11,6 +11,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+EARLY = -0.06
+"""When a jaw begins to close, as a step's `wait`, s: its tool is still 1 to 3 mm from the end of its way then.
+
+If it closed at the end, an actor that imitates the script would stop a little before that, with an open jaw.
+"""
+
 
 class Snapshot(NamedTuple):
     """n environments as they are now, in the world; SI units."""
@@ -44,7 +50,7 @@ class Step(NamedTuple):
     plan: Callable[[Snapshot], Mapping[str, Wish]]
     """Return what each agent should do. Agents that are not named stay, with the jaw as it is."""
     wait: float = 0.0
-    """Time after all agents have arrived, s."""
+    """Time after all agents have arrived, s. Below 0 the next step begins while they are still on their way."""
     pace: float = 1.0
     """Speed, as a share of the joints' own."""
     good: Callable[[Snapshot], np.ndarray] | None = None
