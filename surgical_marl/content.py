@@ -63,8 +63,13 @@ def list_policies() -> list[str]:
     return _names("policies")
 
 
-def find(kind: str, name_or_path: str | os.PathLike[str]) -> Path:
+def find(kind: str, name_or_path: str | os.PathLike[str], where: str = "") -> Path:
     """Return the file or folder of content by its name, or of a user's own by its path.
+
+    Args:
+        kind: one of the folders of content, such as "arms".
+        name_or_path: what to find.
+        where: the place in a file that names it, for the error.
 
     Raises:
         ValueError: nothing has that name or is at that path, or two packages have something of that name.
@@ -78,14 +83,17 @@ def find(kind: str, name_or_path: str | os.PathLike[str]) -> Path:
     path = Path(text).expanduser()
     if text and (path.is_file() if kind in _SUFFIX else path.is_dir()):
         return path.resolve()
-    raise unknown(_NOUNS[kind], text, list(places))
+    error = unknown(_NOUNS[kind], text, list(places))
+    raise ValueError(f"{where}: {error}") if where else error
 
 
 def unknown(noun: str, value: object, good: Sequence[str]) -> ValueError:
     """Return the error for a name that does not exist: it names the value, the nearest good one and all good ones."""
     near = difflib.get_close_matches(str(value), good, n=1)
-    hint = f", did you mean {near[0]!r}" if near else ", and no such file" if str(value).endswith(".yaml") else ""
-    return ValueError(f"unknown {noun} {str(value)!r}{hint} (choose from {', '.join(good) or 'none'})")
+    text = str(value)
+    missing = ", and no such file" if text.endswith(".yaml") else ", and no such folder" if "/" in text else ""
+    hint = f", did you mean {near[0]!r}" if near else missing
+    return ValueError(f"unknown {noun} {text!r}{hint} (choose from {', '.join(good) or 'none'})")
 
 
 def _names(kind: str) -> list[str]:
