@@ -66,8 +66,13 @@ def list_policies() -> list[str]:
     return _names("policies")
 
 
-def find(kind: str, name_or_path: str | os.PathLike[str]) -> Path:
+def find(kind: str, name_or_path: str | os.PathLike[str], where: str = "") -> Path:
     """Return the file or folder of content by its name, or of a user's own by its path.
+
+    Args:
+        kind: one of the folders of content, such as "arms".
+        name_or_path: what to find.
+        where: the place in a file that names it, for the error.
 
     Raises:
         ValueError: nothing has that name or is at that path, or two packages have something of that name.
@@ -81,14 +86,16 @@ def find(kind: str, name_or_path: str | os.PathLike[str]) -> Path:
     path = user_path(text)
     if text and (is_file(path) if kind in _SUFFIX else is_folder(path)):
         return path.resolve()
-    raise unknown(_NOUNS[kind], text, list(places))
+    error = unknown(_NOUNS[kind], text, list(places))
+    raise ValueError(f"{where}: {error}") if where else error
 
 
 def unknown(noun: str, value: object, good: Sequence[str]) -> ValueError:
     """Return the error for a name that does not exist: it names the value, the nearest good one and all good ones."""
     text = value if isinstance(value, str) else shown(value)
     near = difflib.get_close_matches(text[:100], good, n=1)
-    hint = f", did you mean {near[0]!r}" if near else ", and no such file" if text.endswith(".yaml") else ""
+    missing = ", and no such file" if text.endswith(".yaml") else ", and no such folder" if "/" in text else ""
+    hint = f", did you mean {near[0]!r}" if near else missing
     return ValueError(f"unknown {noun} {shown(text)}{hint} (choose from {listed(good) or 'none'})")
 
 

@@ -37,7 +37,7 @@ TRAIN = ["train", "reach", "--scene", "psm"]
 @pytest.mark.parametrize(
     "argv, words",
     [
-        ([], ["required"]),
+        ([], ["required", "surgical-marl --help"]),
         (["trian"], ["'trian'", "train", "eval", "list", "doctor"]),
         (["list", "sceens"], ["'sceens'", "did you mean 'scenes'"]),
         (["list", "--all"], ["'--all'"]),
@@ -73,6 +73,7 @@ TRAIN = ["train", "reach", "--scene", "psm"]
         (["export", "scene", "psm", "--out", "no/such/psm.xml"], ["cannot write no/such/psm.xml"]),
         (["eval"], ["RUN_OR_POLICY"]),
         (["eval", "no_such_run"], ["'no_such_run'"]),
+        (["eval", "runs/none"], ["'runs/none', and no such folder"]),
         (["eval", "."], ["config.yaml"]),
         (["eval", ".", "--episodes", "0"], ["--episodes", "'0'"]),
         (["eval", ".", "--episodes", "1000001"], ["--episodes", "from 1 to 1000000", "'1000001'"]),

@@ -90,7 +90,7 @@ def test_a_scene_of_ones_own_is_a_file_anywhere(tmp_path: Path) -> None:
         ("arms: 3", "must map agent names"),
         ("arms: {}", "must map agent names"),
         ("arms: {psm_0: {arm: psm}}\nfriction: 1", "'friction'"),
-        ("arms: {psm_0: {arm: psn}}", "unknown arm 'psn', did you mean 'psm'"),
+        ("arms: {psm_0: {arm: psn}}", "agent 'psm_0': unknown arm 'psn', did you mean 'psm'"),
         ("arms: {psm_0: {position: [0, 0, 0]}}", "names its arm"),
         ("arms: {psm_0: {arm: psm, positon: [0, 0, 0]}}", "'positon'"),
         ("arms: {psm_0: {arm: psm, position: [0, 0]}}", "three finite numbers"),

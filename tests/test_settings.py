@@ -115,6 +115,8 @@ def test_the_shipped_settings_load() -> None:
         ("num_env=3", r"unknown setting 'num_env'; did you mean 'num_envs'\?"),
         ("learning_rate=3", r"unknown setting 'learning_rate'; did you mean 'ppo.learning_rate'\?"),
         ("ppo.gama=1", r"did you mean 'ppo.gamma'\?"),
+        ("ppo.lr=1", r"unknown setting 'ppo.lr'; the settings of ppo are: ppo.learning_rate, "),
+        ("ppo.num_envs=1", r"did you mean 'num_envs'\?"),
         ("scene=psm", "unknown setting 'scene'"),
         ("zzz=1", "the settings are: control"),
         ("num_envs", "not an override of the form key=value"),

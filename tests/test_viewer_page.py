@@ -19,6 +19,7 @@ import websockets.asyncio.server
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
+from surgical_marl.cli.main import main
 from surgical_marl.runs.settings import Settings
 from surgical_marl.scenes.load import load_scene
 from surgical_marl.view.browser.gate import close_server, open_server, unlocked
@@ -70,11 +71,16 @@ def test_addresses_are_random_and_local(address: str) -> None:
     assert len(urlsplit(other).path) > 30
 
 
-def test_a_port_in_use_is_refused(address: str) -> None:
+def test_a_port_in_use_is_refused(
+    address: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     port = urlsplit(address).port
     assert port
     with pytest.raises(ValueError, match=f"cannot serve on port {port}.*--port"):
         open_server(port)
+    monkeypatch.setattr("surgical_marl.view.browser.viewer.Viewer", None)  # the command says so before it makes one
+    assert main(["view", "reach", "--scene", "psm", "--port", str(port)]) == 2
+    assert f"cannot serve on port {port}" in capsys.readouterr().err
 
 
 def test_a_viser_that_serves_in_another_way_is_not_used(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -77,7 +77,7 @@ class _Parser(argparse.ArgumentParser):
         super().__init__(allow_abbrev=False, **options)
 
     def error(self, message: str) -> NoReturn:
-        raise ValueError(message)
+        raise ValueError(f"{message}; see {self.prog} --help")
 
 
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
@@ -95,7 +95,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(prog="surgical-marl", description="Surgical robot arms that learn together.")
     parser.add_argument("--version", action="version", version=f"%(prog)s {_version()}")
-    commands = parser.add_subparsers(required=True)
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
     train = commands.add_parser(
         "train",
@@ -105,7 +105,9 @@ def _parser() -> argparse.ArgumentParser:
         epilog="key=value sets anything in configs/, such as ppo.learning_rate=3e-4",
     )
     train.add_argument("task", nargs="?", metavar="TASK", help=f"one of: {', '.join(list_tasks())}")
-    train.add_argument("--scene", help="a name (see `list scenes`) or a .yaml file")
+    train.add_argument(
+        "--scene", help="a name (see `list scenes`) or a .yaml file (default: the task's own, if it has one)"
+    )
     add_flags(train, Settings)
     train.add_argument("--out", type=Path, metavar="DIR", help="run folder (default: runs/...)")
     train.add_argument(

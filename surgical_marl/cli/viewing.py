@@ -54,7 +54,9 @@ def add_replay(commands: Any) -> None:
 def _add_what(parser: argparse.ArgumentParser) -> None:
     """Add the flags that say what is shown."""
     parser.add_argument("task", metavar="TASK", help=f"one of: {', '.join(list_tasks())}")
-    parser.add_argument("--scene", help="a name (see `list scenes`) or a .yaml file")
+    parser.add_argument(
+        "--scene", help="a name (see `list scenes`) or a .yaml file (default: the task's own, if it has one)"
+    )
     what = f"a run folder, a policy's name, {', '.join(BASELINES)} (default: the policy that ships, or oracle)"
     parser.add_argument("--policy", metavar="RUN_OR_POLICY", help=what)
     add_flags(parser, Options, _OWN, default="the policy's own")
@@ -63,10 +65,11 @@ def _add_what(parser: argparse.ArgumentParser) -> None:
 
 def _view(arguments: argparse.Namespace) -> None:
     settings, who = _settings(arguments)
-    if importlib.util.find_spec("viser") is None:  # said before anything is compiled
-        from surgical_marl.view.browser.gate import NEEDED
+    from surgical_marl.view.browser.gate import NEEDED, check_port
 
+    if importlib.util.find_spec("viser") is None:  # this and the port are looked at before anything is compiled
         raise ValueError(NEEDED)
+    check_port(arguments.port)
 
     import signal
     import threading

@@ -38,7 +38,8 @@ def progress(total: int, unit: str, what: str = "", begun: int = 0, leave: bool 
         return widget(**options)
     if sys.stderr.isatty():
         return tqdm(**options, file=sys.stderr, dynamic_ncols=True)
-    lines = {"file": _Lines(sys.stderr), "mininterval": EVERY, "bar_format": _LINE}
+    # tqdm's monitor would write a line after maxinterval, by default 10 s, even where nothing is new.
+    lines = {"file": _Lines(sys.stderr), "mininterval": EVERY, "maxinterval": EVERY, "bar_format": _LINE}
     return tqdm(**{**options, **lines, "leave": True})
 
 

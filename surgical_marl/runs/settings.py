@@ -297,12 +297,17 @@ def _reject_unknown(values: Mapping[str, Any], without: tuple[str, ...] = ()) ->
 
 
 def _suggestion(name: str, known: list[str]) -> str:
-    # People often leave the section of a setting out, so compare the last parts as well.
-    last = {key.rpartition(".")[2]: key for key in known}
-    near = difflib.get_close_matches(name, known, 1) or [
-        last[match] for match in difflib.get_close_matches(name.rpartition(".")[2], list(last), 1)
-    ]
-    return f"did you mean {near[0]!r}?" if near else f"the settings are: {', '.join(known)}"
+    # People leave the section of a setting out or give another one, so compare the last parts as well. Within a section
+    # compare them first: `ppo.` alone makes ppo.lr resemble ppo.lam.
+    section, _, last = name.rpartition(".")
+    within = [key for key in known if section and key.startswith(f"{section}.")]
+    for among in (within, known):
+        lasts = {key.rpartition(".")[2]: key for key in among}
+        near = difflib.get_close_matches(name, [] if within else among, 1)
+        near = near or [lasts[match] for match in difflib.get_close_matches(last, list(lasts), 1)]
+        if near:
+            return f"did you mean {near[0]!r}?"
+    return f"the settings{f' of {section}' * bool(within)} are: {', '.join(within or known)}"
 
 
 def _build(values: Mapping[str, Any]) -> Settings:

@@ -85,7 +85,7 @@ def _read_mount(agent: str, settings: Any, path: Path, load: Callable[[str | Pat
     check_keys(settings, ("arm", "position", "turn", "tilt", "workspace"), where)
     source = str(settings["arm"])
     local = path.parent / source  # a user's own arm may be named relative to the scene file
-    arm = load(local if is_file(local / "arm.yaml") else source)
+    arm = load(local if is_file(local / "arm.yaml") else find("arms", source, where))
     if not re.fullmatch(re.escape(arm.name) + r"_\d+", str(agent)):
         raise ValueError(f"{where}: an agent of arm {arm.name!r} is called {arm.name}_0, {arm.name}_1 and so on")
     vectors = {key: read_vector(settings.get(key, [0.0, 0.0, 0.0]), f"{where}, {key}") for key in

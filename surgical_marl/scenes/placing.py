@@ -51,7 +51,7 @@ def _read_placement(settings: Any, where: str, folder: Path) -> Placement:
     check_keys(settings, ("object", "position", "tilt", "colour"), where)
     source = str(settings["object"])
     local = folder / source  # a user's own object may be named relative to the scene file
-    item = load_object(local if is_file(local) else source, settings.get("colour"))
+    item = load_object(local if is_file(local) else find("objects", source, where), settings.get("colour"))
     position, tilt = (read_vector(settings.get(key, [0, 0, 0]), f"{where}, {key}") for key in ("position", "tilt"))
     return Placement(item, position, turned(tilt))
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -100,14 +100,14 @@ class ObjectTask(Task):
 
     def __init__(self, scene: Scene, options: Options) -> None:
         super().__init__(scene, options)
-        self.object = find_object(scene, options.task, (self.point,))
+        self.object = find_object(scene, options.task, (self.point,), self.scenes or ())
         self.called = self.object
         """What the terms about it begin with that agents observe."""
         holders = [agent for agent, mount in scene.mounts.items() if mount.arm.jaw and len(mount.arm.jaw.pads) == 2]
         if len(holders) != self.hands:
             raise ValueError(
                 f"{options.task} needs a scene with {self.hands} arm{'s' * (self.hands > 1)} whose jaws have pads; "
-                f"{scene.name!r} has {len(holders)}"
+                f"{scene.name!r} has {len(holders)}{_such_as(self.scenes or ())}"
             )
         self.picker, self.presenter = holders[0], holders[-1]
         """The arm that picks the object up, and the one that brings it to the goal: the same if there is one."""
@@ -316,18 +316,22 @@ class ObjectTask(Task):
         return [np.asarray(self.tables[name], float)[goal.row] for name in names]
 
 
-def find_object(scene: Scene, task: str, sites: tuple[str, ...]) -> str:
+def find_object(scene: Scene, task: str, sites: tuple[str, ...], meant: Sequence[str] = ()) -> str:
     """Return the name of the first free object of a scene that has these sites and bars to grip.
 
-    ValueError if there is none.
+    ValueError, which names the scenes that the task is meant for, if there is none.
     """
     for name, place in scene.free_objects.items():
         if set(sites) <= set(place.object.sites) and any(shape.kind == "capsule" for shape in place.object.shapes):
             return name
     raise ValueError(
         f"{task} needs a scene with a free object that has bars to grip and the "
-        f"site{'s' * (len(sites) > 1)} {' and '.join(sites)}; {scene.name!r} has none"
+        f"site{'s' * (len(sites) > 1)} {' and '.join(sites)}; {scene.name!r} has none{_such_as(meant)}"
     )
+
+
+def _such_as(scenes: Sequence[str]) -> str:
+    return f" (choose from {', '.join(scenes)}, or a file)" if scenes else ""
 
 
 def _any(of: dict[str, Array]) -> Array:

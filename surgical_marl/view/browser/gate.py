@@ -52,6 +52,11 @@ def open_server(port: int) -> tuple[Any, str]:
     return server, f"http://{HOST}:{listener.getsockname()[1]}/{token}/"
 
 
+def check_port(port: int) -> None:
+    """Raise ValueError if a port is taken."""
+    _bind(port).close()
+
+
 def close_server(server: Any) -> None:
     """Stop a server of viser, without a word."""
     with contextlib.redirect_stdout(io.StringIO()):
