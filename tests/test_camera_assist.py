@@ -250,7 +250,7 @@ def test_the_camera_succeeds_only_with_the_tools_and_a_view_of_them() -> None:
     assert succeeds(world(q, {**places, "psm_1": places["psm_1"] + 0.005})) == [True, False, False]
 
 
-@pytest.mark.parametrize("difficulty", ["easy", "default", "hard"])
+@pytest.mark.parametrize("difficulty", ["easy", "default", pytest.param("hard", marks=pytest.mark.slow)])
 def test_endoscopes_start_anywhere_clear_of_tools_and_mostly_without_a_view(difficulty: str) -> None:
     known, scene = env(difficulty), env(difficulty).scene
     postures = np.asarray(known.task.tables["postures"], float)

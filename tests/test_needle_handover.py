@@ -37,7 +37,7 @@ def env(difficulty: str = "default") -> Env:
     return Env(TASK, SCENE, difficulty=difficulty)
 
 
-@pytest.mark.parametrize("difficulty", ["default", "hard"])
+@pytest.mark.parametrize("difficulty", ["default", pytest.param("hard", marks=pytest.mark.slow)])
 def test_starts_and_goals_are_out_of_the_other_arms_reach(difficulty: str) -> None:
     """Against the tips of many postures with the insertion at its limit, and the wrist in the middle."""
     task: Any = env(difficulty).task

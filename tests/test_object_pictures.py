@@ -47,7 +47,7 @@ def env(tmp_path_factory: pytest.TempPathFactory) -> BatchedEnv:
     for name, shape in SHAPES.items():
         path.with_name(f"{name}.yaml").write_text(OBJECT % f"{{{shape}}}")
     terms = ["qpos", "image", "ecm_0/depth"]
-    return BatchedEnv("reach", str(path), num_envs=ENVS, max_steps=STEPS, observe={"ecm_0": terms})
+    return BatchedEnv("reach", str(path), num_envs=ENVS, max_steps=STEPS, observe={"ecm_0": terms}, engine="mjx")
 
 
 @pytest.mark.parametrize("each", [(), (5,)], ids=["the same size", "sizes of their own"])
