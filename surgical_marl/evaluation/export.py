@@ -25,6 +25,7 @@ from surgical_marl.runs.curve import draw_curve
 from surgical_marl.runs.environment import make_env
 from surgical_marl.runs.folder import CONFIG, METRICS, read_settings
 from surgical_marl.runs.settings import Settings
+from surgical_marl.untrusted.files import read_json
 from surgical_marl.view.record import record
 
 EPISODES, SEED = 200, 0
@@ -91,7 +92,7 @@ def evaluate_again(folder: Path) -> None:
     Runs of its other training seeds are not available. Their old results stay, with the protocol of that time.
     """
     path = folder / EVALUATION
-    before = json.loads(path.read_text())
+    before = read_json(path)
     (played,) = play_all([str(folder)], {}, EPISODES, SEED).values()
     found = {"policy": folder.name, **summarise([played]), "seeds": before["seeds"], "also": _also(str(folder))}
     write_atomic(path, lambda part: part.write_text(json.dumps(found, indent=1) + "\n"))
