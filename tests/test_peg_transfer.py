@@ -21,13 +21,16 @@ from surgical_marl.policies.policy import load_policy, zero_policy
 from surgical_marl.scenes.object_contacts import RESTING, distances
 from surgical_marl.scenes.poses import Pose
 from surgical_marl.tasks.base.blocks import find_pegs, gripping, upright
+from surgical_marl.tasks.base.grips import tool_of
 from surgical_marl.tasks.base.object_task import Best
-from surgical_marl.tasks.base.peg_script import ABOVE_WALL
+from surgical_marl.tasks.base.peg_script import ABOVE_WALL, PAST
 from surgical_marl.tasks.base.world import World
 from surgical_marl.tasks.peg_transfer import CLEAR, SHIFT, PegGoal, Team
 
 TASK, SCENE = "peg_transfer", "bimanual_psm_pegs"
 ROW = 5
+TURN = upright(np.array([[0.01, 0.02, 0.03]]), np.array([75.0]))[0]
+"""A jaw that holds a block goes and turns like this."""
 
 
 @cache
@@ -98,6 +101,33 @@ def world(height: float, shift: float, held: tuple[bool, bool], touched: tuple[b
     goal = PegGoal(np.int32(ROW), best, Team(*map(np.float32, (0.0, 0.0, 0.0))))  # type: ignore[arg-type]
     body: Any = ObjectView(block[:3, 3], block[:3, :3], np.zeros(6))  # type: ignore[arg-type]
     return World(arms, goal, objects={task.object: body})
+
+
+def test_the_grip_that_is_observed_is_the_one_that_turns_the_tool_least() -> None:
+    """At home that of the oracle; and it stays the same one on the way there, and as the block is lifted and turned."""
+    task: Any = env().task
+    way = task._transfers[0]
+    mount, here = task.scene.mounts[way.giver], world(0.0, 0.0, NO, NO)
+    read = {name: task.terms(way.giver)[name].read for name in ("to_grasp", "grasp_axis")}
+
+    def seen(tool: np.ndarray, block: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The place in the world that `to_grasp` leads to, and `grasp_axis` in the world."""
+        tip, axes = (tool[:3, 3] - mount.position) @ mount.rotation, mount.rotation.T @ tool[:3, :3]
+        arms = {way.giver: SimpleNamespace(tool_tip=tip, tool_axes=axes)}
+        body: Any = ObjectView(block[:3, 3], block[:3, :3], np.zeros(6))  # type: ignore[arg-type]
+        place, axis = (read[name](World(arms, here.goal, objects={task.object: body})) for name in read)
+        return tool[:3, 3] + mount.rotation @ np.asarray(place), mount.rotation @ np.asarray(axis)
+
+    home = tool_of(mount, mount.arm.home)
+    blocks = upright(np.tile([-0.03, 0.0, 0.02], (24, 1)), np.linspace(-180, 180, 24, endpoint=False) + 3.0)
+    grips = gripping(mount, blocks, way.sites[way.aligned(blocks)], PAST)
+    for block, grip, number in zip(blocks, grips, way.aligned(blocks), strict=True):
+        bar = block[:3, 3] + block[:3, :3] @ way.sites[number]
+        for tool, body in ((home, block), (grip, block), (TURN @ grip, TURN @ block)):
+            place, axis = seen(tool, body)
+            turn = body @ np.linalg.inv(block)
+            np.testing.assert_allclose(place, turn[:3, :3] @ bar + turn[:3, 3], atol=1e-6)
+            np.testing.assert_allclose(axis, turn[:3, :3] @ grip[:3, 0], atol=1e-5)
 
 
 NO, SECOND, BOTH = (False, False), (False, True), (True, True)

@@ -162,10 +162,10 @@ class Simulator:
             return step(*state), None
 
         (physics, touch), _ = jax.lax.scan(substep, (physics, self.untouched), None, length=self.decimation)
-        tips, distance = self._look(physics.qpos)
+        tools, distance = self._look(physics.qpos)
         contacts = Contacts(distance, jnp.maximum(touch.penetration, -distance), touch.force, touch.overflow)
         handled = touch.handled if self._objects else None
-        return physics, contacts, self._view(jnp, physics, tips, contacts, handled)
+        return physics, contacts, self._view(jnp, physics, tools, contacts, handled)
 
     @property
     def untouched(self) -> Touch:
@@ -214,23 +214,23 @@ class Simulator:
 
     def look(self, physics: Physics) -> tuple[Contacts, dict[str, ArmView]]:
         """Return contacts and views of arms at rest, without penetrations and forces."""
-        tips, distance = self._look(physics.qpos)
+        tools, distance = self._look(physics.qpos)
         contacts = Contacts(distance, jnp.maximum(-distance, 0.0), jnp.zeros_like(distance), jnp.int32(0))
-        return contacts, self._view(jnp, physics, tips, contacts)
+        return contacts, self._view(jnp, physics, tools, contacts)
 
     def view(self, physics: Physics, contacts: Contacts) -> dict[str, ArmView]:
         """Return what tasks see at a posture.
 
         Distances are computed anew. Penetrations and forces are those in `contacts`, from the step before.
         """
-        tips, distance = self._look(physics.qpos)
-        return self._view(jnp, physics, tips, contacts._replace(distance=distance))
+        tools, distance = self._look(physics.qpos)
+        return self._view(jnp, physics, tools, contacts._replace(distance=distance))
 
-    def _look(self, qpos: Array) -> tuple[Array, Array]:
-        """Return tool tips [arms, 3] in the world and the distance of every pair, at a posture."""
+    def _look(self, qpos: Array) -> tuple[tuple[Array, Array], Array]:
+        """Return tool tips [arms, 3] and their axes [arms, 3, 3] in the world, and the distance of every pair."""
         data = self._together.pose(qpos)
-        tips = data.site_xpos[np.array(list(self._sites.values()))]
-        return tips, self._pairs.distance(data.geom_xpos, data.geom_xmat)
+        sites = np.array(list(self._sites.values()))
+        return (data.site_xpos[sites], data.site_xmat[sites]), self._pairs.distance(data.geom_xpos, data.geom_xmat)
 
     def _step(self, physics: Physics, touch: Touch) -> tuple[Physics, Touch]:
         """Return the state after one physics step, and the hardest touch up to the start of that step.
@@ -267,18 +267,19 @@ class Simulator:
         return dynamics.moved(physics, forces, qacc), hardest
 
     def _view(
-        self, xp: Any, physics: Physics, tips: Any, contacts: Contacts, handled: Any = None
+        self, xp: Any, physics: Physics, tools: tuple[Any, Any], contacts: Contacts, handled: Any = None
     ) -> dict[str, ArmView]:
         """Return the views, computed with the array library `xp`.
 
         Args:
             xp: numpy or JAX's.
             physics: the state.
-            tips: tool tips in the world, [arms, 3].
+            tools: tool tips in the world, [arms, 3], and their axes, [arms, 3, 3].
             contacts: of arms with each other.
             handled: as in `Touch`, [2, arms]; None without any objects.
         """
         views = {}
+        tips, axes = tools
         most = np.zeros((2, len(self.scene.agents)), np.float32) if handled is None else handled
         for i, agent in enumerate(self.scene.agents):
             mount, touching = self.scene.mounts[agent], self._touching[agent]
@@ -292,6 +293,7 @@ class Simulator:
                 qvel=physics.qvel[self._joints[agent]],  # each position has one velocity, so the indices agree
                 command=physics.ctrl[self._actuators[agent]],
                 tool_tip=(tips[i] - mount.position.astype(tips.dtype)) @ mount.rotation.astype(tips.dtype),
+                tool_axes=mount.rotation.T.astype(tips.dtype) @ axes[i],
                 nearest_tip=nearest @ mount.rotation.astype(tips.dtype),
                 min_distance=contacts.distance[near].min(initial=np.inf),
                 collision=contacts.penetration[touching].max(initial=0.0) > 0,
@@ -354,7 +356,8 @@ class Simulator:
         contacts: Any = Contacts(distance, np.maximum(-distance, 0.0), 0.0 * distance, np.int32(0))  # type: ignore[arg-type]
         objects = self._objects.start(self.scene, {}) if self._objects else ()
         physics: Any = Physics(self.scene.home, still, still, self._holding(self.scene.home), objects)  # type: ignore[arg-type]
-        views = self._view(np, physics, data.site_xpos[list(self._sites.values())], contacts)
+        sites = list(self._sites.values())
+        views = self._view(np, physics, (data.site_xpos[sites], data.site_xmat[sites].reshape(-1, 3, 3)), contacts)
         kinds = {"b": jnp.bool_, "i": jnp.int32}
         single = lambda x: jnp.asarray(x, kinds.get(x.dtype.kind, jnp.float32))  # noqa: E731
         # one by one: JAX would sort the agents by name

@@ -74,6 +74,8 @@ class ArmView(NamedTuple):
     """Position targets (or the last velocity or torque command), [n]."""
     tool_tip: Array
     """[3]"""
+    tool_axes: Array
+    """Axes of the tool's frame, columns, [3, 3]: a jaw closes along y and points along z."""
     nearest_tip: Array
     """From this tool tip to that of the nearest other arm, [3]; zero if there is none."""
     min_distance: Array
