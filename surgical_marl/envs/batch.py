@@ -289,16 +289,21 @@ class BatchedEnv:
                 begun, or the environment is closed. Nothing has changed then.
         """
         engine = self.engine
-        if not self._started:
-            raise ValueError("step before reset: call reset() first")
-        checked = check_actions(actions, self._action_shapes)
-        engine.step(checked, None if self._sight is None else self._sight.sense)
-        self._fresh[:] = False
+        self.step_raw(actions)
         faults = engine.end_faulty(self.max_steps, self.arrays)
         found = engine.outcome(self.arrays)
         if self._sight is not None:
             self._sight.show(found)
         return BatchStep(**{**found, "contacts": Contacts(**found["contacts"])}, faults=faults)
+
+    def step_raw(self, actions: dict[str, Any]) -> None:
+        """Do the first half of `step`: what is not finite stays as it is in the engine, and no episode ends by it."""
+        engine = self.engine
+        if not self._started:
+            raise ValueError("step before reset: call reset() first")
+        checked = check_actions(actions, self._action_shapes)
+        engine.step(checked, None if self._sight is None else self._sight.sense)
+        self._fresh[:] = False
 
     @property
     def qpos(self) -> np.ndarray:
