@@ -348,6 +348,10 @@ class BatchedEnv:
         self._part(".steps", "numpy")
         return {name: np.array(self.engine.read(name, "numpy")) for name in self.engine.carry_shapes}
 
+    def carry_tensors(self) -> dict[str, Any]:
+        """All that the next step depends on, as torch tensors on the device; nothing waits for it."""
+        return {name: self.engine.read(name, "torch") for name in self.engine.carry_shapes}
+
     def set_carry(self, carry: dict[str, Any], mask: np.ndarray | None = None) -> None:
         """Go on from what `carry()` returned, in all environments or in those of a mask [N].
 
