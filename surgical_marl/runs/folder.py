@@ -3,7 +3,8 @@
 A run folder holds `config.yaml`, `checkpoint.pt`, `metrics.csv`, `curve.png`, `tensorboard/` and `train.lock`
 (`surgical_marl/runs/lock.py`). What is made of them at the end, `eval.json`, `episodes.npz`, `video.mp4` and
 `report.html`, is written elsewhere. If there were several processes, `environments-*.pt` of the other ranks are beside
-the checkpoint. If training diverged, there is also `diverged.json`.
+the checkpoint. If training diverged, there is also `diverged.json`; if environments became NaN, `fault-*.npz`
+(`surgical_marl/runs/fault.py`).
 
 A shipped policy has safetensors instead of the checkpoint (`surgical_marl/evaluation/export.py`). Every write is
 atomic, except that `metrics.csv` grows by rows.

@@ -261,7 +261,7 @@ def _looks(task: str) -> bool:
     return bool(getattr(TASKS.load(task), "senses", ()))
 
 
-def main() -> None:
+def main(argv: Sequence[str] | None = None) -> None:
     """Step all cases, and print a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--steps", type=int, default=10_000_000, help="of all environments of all cases together")
@@ -270,7 +270,7 @@ def main() -> None:
     parser.add_argument("--only", nargs="*", metavar="SCENE", help="these scenes alone")
     parser.add_argument("--plain", action="store_true", help="scenes as they ship alone")
     parser.add_argument("--cost", action="store_true", help="say what the check of every step takes instead")
-    arguments = parser.parse_args()
+    arguments = parser.parse_args(argv)
     if arguments.cost:
         cost()
         return
