@@ -192,9 +192,9 @@ def test_episodes_are_counted_once_each(tmp_path: Path, fakes: list[Any]) -> Non
         }
 
     none, reward = flags([False] * 3), flags([1.0, 2.0, 3.0])
-    episodes.add(reward, none, infos(float("nan"), [True, False, False]))
-    episodes.add(reward, flags([True, True, False]), infos(0.25, [False, False, True]))
-    episodes.add(reward, flags([True, False, False]), infos(0.5, [False, False, False]))
+    episodes.add(reward, none, infos(float("nan"), [True, False, False]), flags([False] * 3))
+    episodes.add(reward, flags([True, True, False]), infos(0.25, [False, False, True]), flags([False] * 3))
+    episodes.add(reward, flags([True, False, False]), infos(0.5, [False, False, False]), flags([False, True, True]))
     # Ended: environment 0 (mean error 0.5, both succeed, collided before), 1 (0.5, half of them),
     # and 0 again (1.0, both, no collision). Two agents share a term of mean 4 that one of them has.
     assert episodes.take().tolist() == [3.0, 2.0, 2.5, 1.0, 6.0, 6.0]
@@ -233,7 +233,8 @@ def test_nan_stops_and_keeps_the_last_checkpoint(
     found = json.loads((tmp_path / "run" / "diverged.json").read_text())
     assert found["iteration"] == 4 and found["last_checkpoint"] == 2 and found["learning_rate"] > 0
     assert found["not_finite"]["observations"] == ["psm[0]", "state[0]"]
-    assert {"rewards", "values", "weights"} <= found["not_finite"].keys()
+    assert {"actions", "values", "gradients", "weights"} <= found["not_finite"].keys()
+    assert found["not_finite"]["gradients"] == ["actor in mini-batch 1", "critic in mini-batch 1"]
     monkeypatch.undo()
     monkeypatch.setattr(train, "make_env", lambda settings: FakeEnv(COUNTS, SIZES, settings.num_envs, max_steps=10))
     train.train(SMALL, out=tmp_path / "run", resume=tmp_path / "run")

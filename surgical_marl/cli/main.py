@@ -102,7 +102,10 @@ def _parser() -> argparse.ArgumentParser:
         help="train a policy, evaluate it, and write a report",
         usage="%(prog)s TASK [--scene SCENE] [options] [key=value ...]\n"
         "       %(prog)s --resume DIR [options] [key=value ...]",
-        epilog="key=value sets anything in configs/, such as ppo.learning_rate=3e-4",
+        epilog="key=value sets anything in configs/, such as ppo.learning_rate=3e-4. An environment that becomes NaN "
+        "or infinite begins anew, is counted in metrics.csv and kept as fault-*.npz for `surgical-marl replay`. "
+        "Training stops if more than 10 of them, and more than 1 in 10,000 steps, do so in an iteration, or if an "
+        "action, value, gradient, loss or weight is not finite.",
     )
     train.add_argument("task", nargs="?", metavar="TASK", help=f"one of: {', '.join(list_tasks())}")
     train.add_argument(

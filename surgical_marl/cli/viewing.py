@@ -46,8 +46,9 @@ def add_play(commands: Any) -> None:
 
 def add_replay(commands: Any) -> None:
     """Add the command replay."""
-    parser = commands.add_parser("replay", help="step a recording of the viewer again, and compare the numbers")
-    parser.add_argument("file", type=Path, metavar="FILE.npz", help="what `surgical-marl view --record` wrote")
+    parser = commands.add_parser("replay", help="step a recording of the viewer, or towards a fault, again")
+    what = "what `surgical-marl view --record` wrote, or a fault-*.npz of a run folder: where numbers became NaN"
+    parser.add_argument("file", type=Path, metavar="FILE.npz", help=what)
     parser.set_defaults(command=_replay, name="replay")
 
 
@@ -133,8 +134,11 @@ def _replay(arguments: argparse.Namespace) -> int:
     if not is_file(arguments.file):
         raise ValueError(f"there is no file {arguments.file}")
 
+    from surgical_marl.runs.fault import read_fault
     from surgical_marl.view.take import replay
 
+    if (fault := read_fault(arguments.file)) is not None:
+        return _reproduce(arguments.file, *fault)
     found = replay(arguments.file)
     if found.differs_at is None:
         print(f"{arguments.file}: {found.steps} steps, the same numbers")
@@ -144,6 +148,21 @@ def _replay(arguments: argparse.Namespace) -> int:
         f"{arguments.file}: {found.steps} steps, other numbers from step {found.differs_at} on, positions by up to "
         f"{found.largest:.3g}{changed}"
     )
+    return 1
+
+
+def _reproduce(file: Path, about: Any, arrays: Any) -> int:
+    """Step towards a fault again, and print where it is; return 1 if it does not come again."""
+    from surgical_marl.runs.fault import reproduce
+
+    found = reproduce(file, about, arrays)
+    print(f"{file}: {found.told}")
+    if found.at is not None:
+        print(f"not finite after step {found.at + 1} of {found.steps}, on {found.device}:")
+        print("\n".join(f"  {place}" for place in found.places))
+        return 0
+    changed = f"; versions have changed: {', '.join(found.versions)}" if found.versions else ""
+    print(f"all numbers stay finite in {found.steps} steps, on {found.device} (found on {about['device']}){changed}")
     return 1
 
 

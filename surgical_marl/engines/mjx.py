@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from surgical_marl.engines.faults import FINE, NEXT, checked, is_reward, places
 from surgical_marl.engines.stepper import MOST_KEPT, Stepper, announce, representative
 from surgical_marl.machine import cores
 from surgical_marl.runtime import no_collection
@@ -65,6 +66,37 @@ def _join(*parts: Any) -> Any:
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
 
 
+@jax.jit
+def _end_faulty(state: Any, leaving: Array, limit: int) -> tuple[Any, Array, Array]:
+    """Return the state with faulty episodes ended, where the next step ends one, [N] bool, and the codes of faults."""
+    count, results = len(leaving), {name: value for name, value in state._asdict().items() if name != "carry"}
+    bad_in = lambda leaf: ~jnp.isfinite(leaf).reshape(count, -1)  # noqa: E731
+    carry = [bad_in(leaf) for leaf in _floats(state.carry).values()]
+    found = {name: bad_in(leaf) for name, leaf in checked(results)}
+    bad = jnp.concatenate([*carry, *found.values()], 1)
+    broken = jnp.concatenate(carry + [own for name, own in found.items() if name.partition(".")[0] in NEXT], 1).any(1)
+    faulty = bad.any(1)
+
+    def clean(name: str, tree: Any) -> Any:
+        if isinstance(tree, dict):
+            return {key: clean(f"{name}.{key}", child) for key, child in tree.items()}
+        if name not in found:
+            return tree
+        zero = found[name].reshape(tree.shape)
+        return jnp.where(faulty if is_reward(name) else zero, 0.0, tree)
+
+    cleaned = {name: clean(name, results[name]) for name in {name.partition(".")[0] for name in found}}
+    steps = jnp.where(broken, jnp.int32(limit), state.carry.steps)
+    state = state._replace(
+        **cleaned,
+        carry=state.carry._replace(steps=steps),
+        terminated=state.terminated | faulty,
+        truncated=state.truncated & ~faulty,
+    )
+    codes = jnp.where(faulty & ~(leaving & ~broken), bad.argmax(1), FINE)
+    return state, broken, codes.astype(jnp.int32)
+
+
 class MjxEngine:
     """`num_envs` copies of an environment; every array gains a leading axis of that length."""
 
@@ -83,6 +115,7 @@ class MjxEngine:
         self._state: Any = None
         self._moved: Any = None
         self._stepped = False
+        self._leaving: Any = np.zeros(num_envs, bool)
         self._tree = jax.tree.structure(self._functions.carry)
         self.carry_shapes = {name: leaf.shape for name, leaf in _paths(self._functions.carry).items()}
 
@@ -140,6 +173,22 @@ class MjxEngine:
                 found = _join(*first, *rest)
         self._functions.traced.add(name)
         return found
+
+    @property
+    def fault_places(self) -> list[str]:
+        """Names of the places where a fault can be, by code (see `surgical_marl/engines/faults.py`)."""
+        results = {name: value for name, value in self._state._asdict().items() if name != "carry"}
+        leaves = _floats(self._state.carry) | dict(checked(results))
+        return [place for name, leaf in leaves.items() for place in places(name, leaf.shape[1:])]
+
+    def end_faulty(self, limit: int, library: str) -> Any:
+        """End the episode of every environment that the last step left NaN or infinite, as `FusedEngine` does it."""
+        self._state, self._leaving, codes = _end_faulty(self._state, self._leaving, limit)
+        return self._present(codes, library)
+
+    def expect_end(self, leaving: np.ndarray) -> None:
+        """Take note of the environments, [N] bool, whose next step ends an episode because of an older fault."""
+        self._leaving = jax.device_put(leaving, self._on)
 
     def outcome(self, library: str) -> dict[str, Any]:
         """Return what the last step or reset led to: fields of the environment's `State` as dicts.
@@ -210,3 +259,8 @@ def find_device(device: str) -> Any:
 def _paths(tree: Any) -> dict[str, Any]:
     """Leaves of a tree by their path, as in ".physics.qpos"."""
     return {jax.tree_util.keystr(path): leaf for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]}
+
+
+def _floats(tree: Any) -> dict[str, Any]:
+    """Leaves of a tree that hold real numbers, by their path."""
+    return {name: leaf for name, leaf in _paths(tree).items() if jnp.issubdtype(leaf.dtype, jnp.floating)}

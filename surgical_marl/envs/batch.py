@@ -23,6 +23,7 @@ from surgical_marl.engines.choose import ENGINES, make_engine
 from surgical_marl.engines.fused.threefry import episode_keys
 from surgical_marl.envs.actions import check_actions
 from surgical_marl.envs.env import Env
+from surgical_marl.envs.fault_place import FaultPlace, fault_place
 from surgical_marl.envs.free_objects import FreeObjects
 from surgical_marl.envs.observations import each, with_vector
 from surgical_marl.physics.views import Contacts
@@ -58,6 +59,11 @@ class BatchStep(NamedTuple):
     (m); of this step's episode."""
     contacts: Contacts
     """Distance and penetration (m) and force (N) of every pair in `scene.pairs`, [N, P] each; likewise."""
+    faults: Any
+    """[N] int32: where a number was NaN or infinite, the code of the first one, which `fault_place` names; else -1.
+
+    Such an episode is terminated, its reward is 0, and observations that were not finite are 0 too. If its state was at
+    fault, the next step begins a new episode, whatever the action."""
 
 
 class BatchedEnv:
@@ -224,6 +230,7 @@ class BatchedEnv:
                 engine.restart()
             else:
                 engine.reset(secrets.randbits(63) if whole is None else whole, first)
+            engine.expect_end(np.zeros(self.num_envs, bool))
         else:
             mask = np.ones(self.num_envs, bool) if mask is None else np.asarray(mask)
             self._begin(seed, first, mask)
@@ -254,6 +261,7 @@ class BatchedEnv:
         self.engine.write(".episode", np.where(seeded, -1, self.engine.read(".episode", "numpy")))
         self.engine.write(".steps", (seeded | ~begun).astype(np.int32))
         self.engine.restart()
+        self.engine.expect_end(np.zeros(self.num_envs, bool))
         if before is not None:
             self.set_carry(before, ~mask)
 
@@ -281,15 +289,21 @@ class BatchedEnv:
                 begun, or the environment is closed. Nothing has changed then.
         """
         engine = self.engine
+        self.step_raw(actions)
+        faults = engine.end_faulty(self.max_steps, self.arrays)
+        found = engine.outcome(self.arrays)
+        if self._sight is not None:
+            self._sight.show(found)
+        return BatchStep(**{**found, "contacts": Contacts(**found["contacts"])}, faults=faults)
+
+    def step_raw(self, actions: dict[str, Any]) -> None:
+        """Do the first half of `step`: what is not finite stays as it is in the engine, and no episode ends by it."""
+        engine = self.engine
         if not self._started:
             raise ValueError("step before reset: call reset() first")
         checked = check_actions(actions, self._action_shapes)
         engine.step(checked, None if self._sight is None else self._sight.sense)
         self._fresh[:] = False
-        found = engine.outcome(self.arrays)
-        if self._sight is not None:
-            self._sight.show(found)
-        return BatchStep(**{**found, "contacts": Contacts(**found["contacts"])})
 
     @property
     def qpos(self) -> np.ndarray:
@@ -334,6 +348,10 @@ class BatchedEnv:
         self._part(".steps", "numpy")
         return {name: np.array(self.engine.read(name, "numpy")) for name in self.engine.carry_shapes}
 
+    def carry_tensors(self) -> dict[str, Any]:
+        """All that the next step depends on, as torch tensors on the device; nothing waits for it."""
+        return {name: self.engine.read(name, "torch") for name in self.engine.carry_shapes}
+
     def set_carry(self, carry: dict[str, Any], mask: np.ndarray | None = None) -> None:
         """Go on from what `carry()` returned, in all environments or in those of a mask [N].
 
@@ -353,7 +371,12 @@ class BatchedEnv:
                 own = mask.reshape(-1, *[1] * (value.ndim - 1))
                 value = np.where(own, value, self.engine.read(name, "numpy"))
             self.engine.write(name, value)
+        self.engine.expect_end(np.asarray(self.engine.read(".steps", "numpy")) >= self.max_steps)
         self._started = True
+
+    def fault_place(self, code: int) -> FaultPlace:
+        """Return what the code of a fault stands for."""
+        return fault_place(self.env, self.engine.fault_places[code])
 
     def _part(self, name: str, library: str) -> Any:
         engine = self.engine

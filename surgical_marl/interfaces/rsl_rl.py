@@ -67,21 +67,22 @@ class RslRlVecEnv(VecEnv):
         """One control step of all environments.
 
         Args:
-            actions: `[N, sum]`, clipped to [-1, 1], in the order of `layout.agents`.
+            actions: `[N, sum]`, clipped to [-1, 1], in the order of `layout.agents`; NaN is 0.
 
         Returns:
             Observations after auto-reset; the mean reward over agents `[N]`; done flags `[N]`
             (bool); and extras: "agent_rewards" `[N, A]`, "time_outs" `[N]` (bool, truncated and not
-            terminated), "final_obs" (the observations of the finished step, before auto-reset) and
-            "infos" of the environment.
+            terminated), "final_obs" (the observations of the finished step, before auto-reset), "faults"
+            `[N]` (int32, -1 where all is finite) and "infos" of the environment.
         """
-        step = self.env.step(self.layout.split(actions.clamp(-1.0, 1.0)))
+        step = self.env.step(self.layout.split(bounded(actions)))
         self._observations = self._group(step.observations, step.state)
         rewards = self.layout.rewards(step.rewards)
         extras = {
             "agent_rewards": rewards,
             "time_outs": step.truncated & ~step.terminated,
             "final_obs": self._group(step.final_observations, step.final_state),
+            "faults": step.faults,
             "infos": step.infos,
         }
         return self._observations, rewards.mean(-1), step.terminated | step.truncated, extras
@@ -101,6 +102,24 @@ class RslRlVecEnv(VecEnv):
         groups = {name: value.to(self.device) for name, value in carry["observations"].items()}
         self._observations = TensorDict(groups, batch_size=[self.num_envs])
 
+    def packed_carry(self) -> Tensor:
+        """Return all that the next step depends on as one tensor, `[N, S]` float32; nothing waits for the device.
+
+        Whole numbers are there by their bits.
+        """
+        parts = [tensor.reshape(self.num_envs, -1) for tensor in self.env.carry_tensors().values()]
+        return torch.cat([part if part.dtype == torch.float32 else _bits(part) for part in parts], -1)
+
+    def unpacked_carry(self, packed: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the parts of the carry of one environment, `[1, ...]` each, from its row of `packed_carry`, `[S]`."""
+        found, first = {}, 0
+        for name, like in self.env.carry().items():
+            size = like[0].size
+            row = packed[first : first + size]
+            row = row.astype(like.dtype) if like.dtype.itemsize < 4 else row.view(like.dtype)
+            found[name], first = row.reshape(1, *like.shape[1:]), first + size
+        return found
+
     def place(self, chosen: Tensor, carry: Mapping[str, Tensor]) -> None:
         """Let the environments `chosen` [n] go on from other states.
 
@@ -116,6 +135,16 @@ class RslRlVecEnv(VecEnv):
     def _group(self, observations: Mapping[str, Any], state: Any) -> TensorDict:
         groups = {**self.layout.stack(observations), "state": state.clone()}
         return TensorDict(groups, batch_size=[self.num_envs])
+
+
+def bounded(actions: Tensor) -> Tensor:
+    """Return actions as environments take them: within [-1, 1], and 0 for NaN."""
+    return actions.nan_to_num(0.0).clamp(-1.0, 1.0)
+
+
+def _bits(tensor: Tensor) -> Tensor:
+    """Return numbers of four bytes by their bits, and those of fewer bytes, such as bool, by their values."""
+    return tensor.contiguous().view(torch.float32) if tensor.element_size() == 4 else tensor.float()
 
 
 def _tensor(value: Any) -> Tensor:

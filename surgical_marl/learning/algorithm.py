@@ -57,6 +57,8 @@ class Algorithm(PPO):
             all arms (see `surgical_marl.policies.layout.Layout`).
         central_critic: whether the critic sees the whole state, instead of what each agent sees.
         losses: `LOSSES` of the last update, `[5]`; always at the same place in memory.
+        gradients: sums of the gradient norms of actor and critic in the last update, `[2]`, likewise.
+        before: mini-batches of it before the first gradient that was not finite, `[2]`, likewise.
         imitates: whether the actor has imitated demonstrations. Its observations are then normalised as those were:
             what it has learned would be lost if inputs were scaled anew, by what all environments see at the start.
         imitation: a loss beside that of the networks that act, or None.
@@ -95,6 +97,11 @@ class Algorithm(PPO):
         self.imitation: ImitationLoss | None = None
         # 0 while only the critic learns, 1 afterwards.
         self._acting = torch.ones((), device=self.device)
+        # Norms of the gradients of actor and critic, summed over an update: not finite if one was not. And the number
+        # of mini-batches before the first such one.
+        self.gradients = torch.zeros(2, device=self.device)
+        self.before = torch.zeros(2, device=self.device)
+        self._norms, self._good = torch.zeros_like(self.gradients), torch.zeros_like(self.before)
         # Sums over the mini-batches of an update, of all `LOSSES` but the learning rate.
         self._sums = torch.zeros(len(LOSSES) - 1, device=self.device)
 
@@ -258,8 +265,10 @@ class Algorithm(PPO):
         divergence = distributed.average_gradients(self.parameters(), divergence)
         if self.schedule == "adaptive":
             self._adapt_rate(divergence)
-        for model in (self.actor, self.critic):
-            nn.utils.clip_grad_norm_(model.parameters(), self.max_grad_norm)
+        models = (self.actor, self.critic)
+        norms = [nn.utils.clip_grad_norm_(model.parameters(), self.max_grad_norm) for model in models]
+        self._norms += torch.stack(norms)
+        self._good += self._norms.isfinite()
         self.optimizer.step()
 
     def conclude(self) -> None:
@@ -271,6 +280,9 @@ class Algorithm(PPO):
         count = self.num_mini_batches * self.num_learning_epochs
         self.losses.copy_(torch.cat([self._sums / count, self._rate[None]]))
         self._sums.zero_()
+        for kept, own in ((self.gradients, self._norms), (self.before, self._good)):
+            kept.copy_(own)
+            own.zero_()
 
     def parameters(self) -> list[nn.Parameter]:
         """Return all that the optimiser changes."""

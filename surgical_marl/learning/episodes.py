@@ -34,8 +34,11 @@ class Episodes:
         self.moved = torch.zeros_like(self.collided)
         self._totals = torch.zeros(len(ENDED) + len(self.terms), device=device)
 
-    def add(self, rewards: Tensor, dones: Tensor, infos: Mapping[str, Mapping[str, Tensor]]) -> None:
-        """Count one step: rewards `[N]`, dones `[N]`, and the infos of each agent."""
+    def add(self, rewards: Tensor, dones: Tensor, infos: Mapping[str, Mapping[str, Tensor]], faulty: Tensor) -> None:
+        """Count one step: rewards `[N]`, dones `[N]`, the infos of each agent, and where numbers are not finite `[N]`.
+
+        An episode that ends by such a fault does not count, nor what is left of it in the next step.
+        """
         success, collision = (torch.stack([infos[agent][name] for agent in self.agents]) for name in KNOWN)
         errors = [infos[agent]["tip_error"] for agent in self.agents if "tip_error" in infos[agent]]
         error = torch.stack(errors) if errors else torch.full_like(rewards, math.nan)[None]
@@ -50,10 +53,11 @@ class Episodes:
                 self.collided.float(),
             ]
         )
-        sums = torch.where(dones & ~self.moved, ended, 0.0).sum(-1)
+        sums = torch.where(dones & ~self.moved & ~faulty, ended, 0.0).sum(-1)
         self._totals += torch.cat([sums, rewards.mean()[None], self._mean_terms(infos, rewards)])
         self.collided &= ~dones
         self.moved &= ~dones
+        self.moved |= faulty
 
     def move(self, moved: Tensor) -> None:
         """Note which environments, `[N]` bool, go on from another state now."""

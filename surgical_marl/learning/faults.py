@@ -4,14 +4,43 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-KINDS = ("observations", "rewards", "values", "losses", "weights")
+KINDS = ("environments", "observations", "rewards", "actions", "values", "gradients", "losses", "weights", "checkpoint")
 """Kinds of values that can be at fault, in the order in which a fault spreads."""
+
+
+MOST, SHARE = 10, 1e-4
+"""Training stops if, in an iteration, more environments than both of these are at fault: this many, and this share of
+all steps of environments."""
+
+
+class Fault(NamedTuple):
+    """The first environment of an iteration that was not finite."""
+
+    iteration: int
+    total: int
+    """Of faults in this iteration, in this process."""
+    step: int
+    """In the rollout, from 0."""
+    number: int
+    """Of the environment, among those of this process."""
+    code: int
+    """See `BatchedEnv.fault_place`."""
+    start: dict[str, np.ndarray]
+    """Its carry when the rollout began, [1, ...]."""
+    actions: np.ndarray
+    """Its actions up to that step, [T, sum]."""
+
+
+def too_many(count: float, steps: int) -> bool:
+    """Return whether so many faults in so many steps of environments stop a training."""
+    return count > max(MOST, SHARE * steps)
 
 
 class Diverged(FloatingPointError):
@@ -27,10 +56,10 @@ class Diverged(FloatingPointError):
         self.iteration, self.found, self.learning_rate = iteration, dict(found), learning_rate
         kind = next(kind for kind in KINDS if kind in found)
         names = ", ".join(found[kind][:3]) + (f" and {len(found[kind]) - 3} more" if len(found[kind]) > 3 else "")
-        super().__init__(
-            f"{kind} became NaN or infinite in iteration {iteration} ({names}): "
-            f"resume the last checkpoint with a lower ppo.learning_rate than {learning_rate:g}"
-        )
+        advice = f"resume the last checkpoint with a lower ppo.learning_rate than {learning_rate:g}"
+        if kind == "environments":
+            advice = "`surgical-marl replay` of a fault-*.npz in the run folder shows where"
+        super().__init__(f"{kind} became NaN or infinite in iteration {iteration} ({names}): {advice}")
 
     @property
     def summary(self) -> dict[str, Any]:
@@ -41,8 +70,8 @@ class Diverged(FloatingPointError):
 
 def find(values: Mapping[str, Mapping[str, float]]) -> dict[str, list[str]]:
     """Names of what is not finite of each kind; kinds that are fine are left out."""
-    bad = {kind: [name for name, value in values[kind].items() if not math.isfinite(value)] for kind in KINDS}
-    return {kind: names for kind, names in bad.items() if names}
+    bad = {kind: [name for name, value in named.items() if not math.isfinite(value)] for kind, named in values.items()}
+    return {kind: bad[kind] for kind in KINDS if bad.get(kind)}
 
 
 def column_names(observations: TensorDict) -> list[str]:

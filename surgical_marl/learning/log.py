@@ -12,6 +12,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
+from surgical_marl.learning.faults import Fault
 from surgical_marl.learning.trainer import Report, Trainer
 from surgical_marl.runs.folder import METRICS, format_row
 from surgical_marl.runs.progress import progress
@@ -20,8 +21,11 @@ from surgical_marl.runs.progress import progress
 class Reports:
     """Reads an iteration's report when the next one is under way, so that a GPU is never idle."""
 
-    def __init__(self, training: Trainer, write: Callable[[dict[str, float]], None]) -> None:
-        self._training, self._write, self._waiting = training, write, deque[Report]()
+    def __init__(
+        self, training: Trainer, write: Callable[[dict[str, float]], None], keep: Callable[[Fault], None]
+    ) -> None:
+        self._training, self._write, self._keep = training, write, keep
+        self._waiting = deque[Report]()
         self._lag = 1 if training.env.device == "cuda" else 0
 
     def add(self, report: Report) -> None:
@@ -35,7 +39,10 @@ class Reports:
 
     def _read(self, left: int) -> None:
         while len(self._waiting) > left:
-            self._write(self._training.row(self._waiting.popleft()))
+            report = self._waiting.popleft()
+            if (fault := self._training.fault(report)) is not None:
+                self._keep(fault)
+            self._write(self._training.row(report))
 
 
 class Log:

@@ -13,15 +13,17 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
+import torch
 from tqdm import tqdm
 
 from surgical_marl.files import remove_temporaries
 from surgical_marl.learning import distributed
-from surgical_marl.learning.faults import Diverged
+from surgical_marl.learning.faults import Diverged, Fault
 from surgical_marl.learning.log import Log, Reports
 from surgical_marl.learning.room import check_room, in_memory
 from surgical_marl.learning.trainer import OWN, Trainer
 from surgical_marl.runs.environment import make_env
+from surgical_marl.runs.fault import write_fault
 from surgical_marl.runs.folder import (
     CHECKPOINT,
     CONFIG,
@@ -30,6 +32,7 @@ from surgical_marl.runs.folder import (
     claim_folder,
     has_begun,
     holds_weights,
+    not_finite,
     read_checkpoint,
     read_environments,
     read_metrics,
@@ -61,6 +64,10 @@ CHANGEABLE = {
 }
 # Except these, which determine the content of a checkpoint.
 FIXED = {"ppo.normalise_values", "constraint.cost"}
+
+
+MOST_FAULTS = 10
+"""Files of faults in a run folder."""
 
 
 def make_training(settings: Settings) -> Trainer:
@@ -176,6 +183,8 @@ def _save(training: Trainer, out: Path) -> None:
     The other processes write before rank 0, because the file of rank 0 stands for a complete checkpoint.
     """
     state, rank = training.state(), distributed.rank()
+    if bad := not_finite(state["algorithm"]):
+        raise Diverged(training.iteration, {"checkpoint": bad}, math.nan)
     iteration, processes = training.iteration, distributed.size()
     if rank > 0:
         write_environments(out, iteration, rank, processes, {name: state[name] for name in OWN})
@@ -189,7 +198,8 @@ def _run(training: Trainer, out: Path) -> None:
     settings = training.settings
     with _signals(training) as received, ExitStack() as files:
         log = files.enter_context(Log(training, out)) if distributed.rank() == 0 else None
-        reports = Reports(training, log.write if log else lambda row: None)
+        keep = lambda fault: _keep_fault(training, out, fault)  # noqa: E731
+        reports = Reports(training, log.write if log else lambda row: None, keep)
         done = False
         try:
             while not done:
@@ -212,6 +222,21 @@ def _run(training: Trainer, out: Path) -> None:
     if training.stopping:
         number = received[0] if received else signal.SIGTERM
         raise KeyboardInterrupt if number == signal.SIGINT else SystemExit(128 + number)
+
+
+def _keep_fault(training: Trainer, out: Path, fault: Fault) -> None:
+    """Say on stderr what was at fault, and write what reproduces it, for the first faults of a run."""
+    env, rank, seed = training.env.env, distributed.rank(), training.settings.seed
+    place, index = str(env.fault_place(fault.code)), rank * env.num_envs + fault.number
+    said = f"{place} became NaN or infinite in iteration {fault.iteration}, environment {index}, seed {seed}"
+    path = out / (f"fault-{fault.iteration}.npz" if rank == 0 else f"fault-{fault.iteration}-{rank}.npz")
+    if path.exists() or len(list(out.glob("fault-*.npz"))) < MOST_FAULTS:
+        actions = training.env.layout.split(torch.from_numpy(fault.actions[:, None]))
+        told = {"seed": seed, "index": index, "place": place, "iteration": fault.iteration}
+        numbers = {agent: own.numpy() for agent, own in actions.items()}
+        write_fault(path, env, training.settings, fault.start, numbers, **told)
+        said += f": surgical-marl replay {path} shows it"
+    tqdm.write(f"surgical-marl: {said}; {fault.total:,} such episodes have ended", file=sys.stderr)
 
 
 def _read_resumed(settings: Settings, run: Path, goes_on: bool) -> dict[str, Any] | None:

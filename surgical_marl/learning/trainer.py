@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor
 
-from surgical_marl.interfaces.rsl_rl import RslRlVecEnv
+from surgical_marl.interfaces.rsl_rl import RslRlVecEnv, bounded
 from surgical_marl.learning import distributed, faults
 from surgical_marl.learning.algorithm import LOSSES, Algorithm
 from surgical_marl.learning.configuration import rsl_rl_config
@@ -43,7 +43,7 @@ class Report(NamedTuple):
     env_steps: int
     started: float
     values: Tensor
-    """On the host: once `arrived`."""
+    """On the host: once `arrived`. The first numbers are those that `row` reads, and the others the first fault."""
     arrived: torch.cuda.Event | None
     """None where nothing has to arrive."""
     marks: Sequence[Mark]
@@ -95,16 +95,29 @@ class Trainer:
             "rewards": [ENDED[-1], *terms],
             "losses": [*LOSSES, *self._bounded, "action_std"],
             "stop": ["stop"],
+            "faults": ["faults"],
+            "before": ["actor", "critic"],
+            "gradients": ["actor", "critic"],
             "observations": faults.column_names(self._observations),
             "values": ["values", "returns"],
+            "actions": self.env.layout.agents,
             "weights": [name for name, _ in self._weights()],
         }
         # All environments start together: let the first episodes end at different times.
         steps = torch.randint(0, max(env.max_steps, 1), (env.num_envs,))
         self.env.episode_length_buf = steps.to(device)
         self._stop = torch.zeros(1, device=device)
-        self._marks = torch.zeros(len(self._names["observations"]) + len(self._names["values"]), device=device)
-        self._values = torch.zeros(sum(map(len, self._names.values())), device=device)
+        marked = sum(len(self._names[kind]) for kind in ("observations", "values", "actions"))
+        self._marks = torch.zeros(marked, device=device)
+        # Codes of faults in each step of a rollout, the carry before it, and the number of each of its steps.
+        shape = settings.steps_per_iteration, env.num_envs
+        self._faults = torch.full(shape, -1, dtype=torch.int32, device=device)
+        self._before = self.env.packed_carry()
+        self._order = torch.arange(self._faults.numel(), device=device)
+        width = 4 + self._before.shape[-1] + shape[0] * self.env.num_actions
+        self._count = sum(map(len, self._names.values()))
+        self._report = torch.zeros(self._count + width, device=device)
+        self._values, self._fault = self._report[: self._count], self._report[self._count :]
         imitation = settings.imitation
         wanted = settings.oracle_states.rate > 0 or imitation.steps > 0 or imitation.weight > 0
         self._demonstrations = Demonstrations(settings, self.env.layout, device) if wanted else None
@@ -138,8 +151,8 @@ class Trainer:
         self.iteration += 1
         self.env_steps += self._samples
         if not self._cuda:
-            return Report(self.iteration, self.env_steps, started, self._values.clone(), None, marks)
-        host = torch.empty(self._values.shape, pin_memory=True).copy_(self._values, non_blocking=True)
+            return Report(self.iteration, self.env_steps, started, self._report.clone(), None, marks)
+        host = torch.empty(self._report.shape, pin_memory=True).copy_(self._report, non_blocking=True)
         arrived = torch.cuda.Event()
         arrived.record()
         return Report(self.iteration, self.env_steps, started, host, arrived, marks)
@@ -190,11 +203,24 @@ class Trainer:
         return (
             *("iteration", "env_steps", "seconds", *PARTS, "steps_per_s"),
             *("reward", *self.env.reward_terms),
-            *("episodes", "tip_error_mm", "success_rate", "collision_rate"),
+            *("episodes", "tip_error_mm", "success_rate", "collision_rate", "faults"),
             *self._bounded,
             *LOSSES,
             "action_std",
         )
+
+    def fault(self, report: Report) -> faults.Fault | None:
+        """Return the first fault of an iteration in this process; this waits until the iteration is done."""
+        if report.arrived is not None:
+            report.arrived.synchronize()
+        found = report.values[self._count :].numpy()
+        count, step, index, code = (int(value) for value in found[:4])
+        if not count:
+            return None
+        end = 4 + self._before.shape[-1]
+        actions = found[end:].reshape(-1, self.env.num_actions)[: step + 1]
+        start = self.env.unpacked_carry(found[4:end])
+        return faults.Fault(report.iteration, count, step, index, code, start, actions)
 
     def row(self, report: Report) -> dict[str, float]:
         """Return the metrics of an iteration (see `columns`); this waits until the iteration is done.
@@ -203,9 +229,15 @@ class Trainer:
         """
         if report.arrived is not None:
             report.arrived.synchronize()
-        values = iter(report.values.tolist())
+        values = iter(report.values[: self._count].tolist())
         sums = {kind: {name: next(values) for name in names} for kind, names in self._names.items()}
         means = {name: value / distributed.size() for name, value in sums["losses"].items()}
+        count = int(sums["faults"]["faults"])
+        many = faults.too_many(count, self._samples)
+        sums["environments"] = {f"{count:,} of {self._samples:,} steps": math.nan if many else 0.0}
+        done = {name: int(value) // distributed.size() for name, value in sums["before"].items()}
+        norms = sums["gradients"].items()
+        sums["gradients"] = {f"{name} in mini-batch {done[name] + 1}": value for name, value in norms}
         if found := faults.find(sums):
             raise faults.Diverged(report.iteration, found, means["learning_rate"])
         self.stopping = bool(sums["stop"]["stop"])
@@ -228,6 +260,7 @@ class Trainer:
             "tip_error_mm": 1000 * ended["error"] * share,
             "success_rate": ended["success"] * share,
             "collision_rate": ended["collision"] * share,
+            "faults": count,
         }
         return {name: row[name] for name in self.columns}
 
@@ -237,17 +270,30 @@ class Trainer:
         algorithm.storage.clear()
         with torch.inference_mode():
             observations = self._observations
-            for _ in range(self.settings.steps_per_iteration):
+            self._before.copy_(self.env.packed_carry())
+            for step in range(self.settings.steps_per_iteration):
                 actions = algorithm.act(observations)
                 observations, rewards, dones, extras = self.env.step(actions)
                 algorithm.process_env_step(observations, rewards, dones, extras)
-                self.episodes.add(rewards, dones, extras["infos"])
+                self.episodes.add(rewards, dones, extras["infos"], extras["faults"] >= 0)
+                self._faults[step].copy_(extras["faults"])
             algorithm.compute_returns(observations)
             for name, kept in self._observations.items():
                 kept.copy_(observations[name])
             stored = algorithm.storage
             columns = faults.mark_columns(stored.observations, observations)
-            self._marks.copy_(torch.cat([columns, faults.mark([stored.values, stored.returns])]))
+            moves = self.env.layout.split(stored.actions).values()
+            self._marks.copy_(torch.cat([columns, faults.mark([stored.values, stored.returns, *moves])]))
+            self._note_fault()
+
+    def _note_fault(self) -> None:
+        """Note how many faults the rollout had, and of the first one all that reproduces it."""
+        bad, last = self._faults.flatten() >= 0, self._order.numel() - 1
+        first = torch.where(bad, self._order, last).min()
+        step, index = first // self.env.num_envs, (first % self.env.num_envs)[None]
+        numbers = torch.stack([bad.sum(), step, index[0], self._faults.flatten()[first[None]][0]])
+        actions = bounded(self.algorithm.storage.actions.index_select(1, index))
+        self._fault.copy_(torch.cat([numbers.float(), self._before.index_select(0, index)[0], actions.flatten()]))
 
     def _gather_values(self) -> None:
         """Put together what `row` reads."""
@@ -256,7 +302,8 @@ class Trainer:
         parts = [self.episodes.take(), self.algorithm.losses]
         if self.algorithm.constraint is not None:
             parts.append(self.algorithm.constraint.metrics())
-        self._values.copy_(torch.cat([*parts, std[None], self._stop, self._marks, weights]))
+        learning = [self.algorithm.before, self.algorithm.gradients]
+        self._values.copy_(torch.cat([*parts, std[None], self._stop, self._fault[:1], *learning, self._marks, weights]))
         distributed.total(self._values)
 
     def _weights(self) -> list[tuple[str, Tensor]]:

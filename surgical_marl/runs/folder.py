@@ -3,7 +3,8 @@
 A run folder holds `config.yaml`, `checkpoint.pt`, `metrics.csv`, `curve.png`, `tensorboard/` and `train.lock`
 (`surgical_marl/runs/lock.py`). What is made of them at the end, `eval.json`, `episodes.npz`, `video.mp4` and
 `report.html`, is written elsewhere. If there were several processes, `environments-*.pt` of the other ranks are beside
-the checkpoint. If training diverged, there is also `diverged.json`.
+the checkpoint. If training diverged, there is also `diverged.json`; if environments became NaN, `fault-*.npz`
+(`surgical_marl/runs/fault.py`).
 
 A shipped policy has safetensors instead of the checkpoint (`surgical_marl/evaluation/export.py`). Every write is
 atomic, except that `metrics.csv` grows by rows.
@@ -32,6 +33,7 @@ from surgical_marl.files import write_atomic
 from surgical_marl.runs.settings import Settings, config_text, read_config
 from surgical_marl.untrusted.arrays import check_checkpoint
 from surgical_marl.untrusted.files import MB, check_file, is_file
+from surgical_marl.untrusted.values import listed
 from surgical_marl.yaml_file import read_yaml
 
 CONFIG, CHECKPOINT, METRICS, CURVE = "config.yaml", "checkpoint.pt", "metrics.csv", "curve.png"
@@ -156,7 +158,19 @@ def read_checkpoint(run: str | Path) -> dict[str, Any]:
         checkpoint = None
     if not isinstance(checkpoint, dict) or not {"iteration", "groups", "algorithm"} <= checkpoint.keys():
         raise ValueError(f"{path} is damaged, or not a checkpoint of this program: restore it from a copy")
+    if bad := not_finite(checkpoint["algorithm"]):
+        raise ValueError(f"{path} holds numbers that are not finite ({listed(bad, 3)}): restore it from a copy")
     return checkpoint
+
+
+def not_finite(tree: Any, name: str = "") -> list[str]:
+    """Return the names of tensors in dicts and lists in which a number is NaN or infinite."""
+    if isinstance(tree, torch.Tensor):
+        return [] if not tree.is_floating_point() or bool(tree.isfinite().all()) else [name]
+    if not isinstance(tree, (Mapping, list, tuple)):
+        return []
+    parts = tree.items() if isinstance(tree, Mapping) else enumerate(tree)
+    return [bad for key, part in parts for bad in not_finite(part, f"{name}.{key}" if name else str(key))]
 
 
 def write_environments(run: Path, iteration: int, rank: int, processes: int, state: Mapping[str, Any]) -> None:

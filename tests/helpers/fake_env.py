@@ -101,6 +101,7 @@ class FakeEnv:
             final_observations=final_observations,
             final_state=final_state,
             infos=infos,
+            faults=torch.full((self.num_envs,), -1, dtype=torch.int32),
         )
 
     def _info(self, agent: str) -> dict[str, Tensor]:
@@ -131,6 +132,9 @@ class FakeEnv:
         state = {"steps": self.steps.copy(), "generator": self.generator.get_state().numpy()}
         state |= {f"where/{agent}": where.numpy() for agent, where in self.where.items()}
         return state
+
+    def carry_tensors(self) -> dict[str, Tensor]:
+        return {f"where/{agent}": where.clone() for agent, where in self.where.items()}
 
     def set_carry(self, carry: dict[str, np.ndarray]) -> None:
         self.steps = carry["steps"].copy()

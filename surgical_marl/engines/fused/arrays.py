@@ -48,12 +48,12 @@ class Arrays(ABC):
                 f"{room // (2 * each)} fit"
             )
         self._buffers = {name: self._zeros(max(source.sizes[name], 1), stride, dtype) for name, dtype in _TYPES.items()}
-        self.order, self.work = self._constant(np.arange(stride, dtype=np.int32)), self._zeros(1, stride, np.int32)[0]
-        constants = [self._constant(table) for table in tables.values()]
+        self.order, self.work = self.constant(np.arange(stride, dtype=np.int32)), self._zeros(1, stride, np.int32)[0]
+        constants = [self.constant(table) for table in tables.values()]
         self.all = [
-            *(self._warp(buffer) for buffer in self._buffers.values()),
-            *(self._warp(constant) for constant in constants),
-            *(self._warp(array) for array in (self.order, self.work)),
+            *(self.warp(buffer) for buffer in self._buffers.values()),
+            *(self.warp(constant) for constant in constants),
+            *(self.warp(array) for array in (self.order, self.work)),
         ]
 
     @abstractmethod
@@ -69,6 +69,10 @@ class Arrays(ABC):
         """Return the leaves of a dict of dicts, of results. Later steps leave them as they are."""
 
     @abstractmethod
+    def presented(self, array: Any, library: str) -> Any:
+        """Return an array [N] of the device as one of another library."""
+
+    @abstractmethod
     def renew(self) -> None:
         """Make room for results, before a kernel is launched."""
 
@@ -76,10 +80,20 @@ class Arrays(ABC):
     def _zeros(self, fields: int, stride: int, dtype: Any) -> Any: ...
 
     @abstractmethod
-    def _constant(self, table: np.ndarray) -> Any: ...
+    def constant(self, table: np.ndarray) -> Any:
+        """Return a table as an array of the device."""
 
     @abstractmethod
-    def _warp(self, array: Any) -> Any: ...
+    def warp(self, array: Any) -> Any:
+        """Return an array of the device as Warp's, in one row: the same memory."""
+
+    def fields(self, buffer: str) -> Any:
+        """Return all fields of "state", "counts", "actions", "outs" or "flags", [fields, N]: a view, not a copy."""
+        return self._buffers[buffer][:, : self.num_envs]
+
+    def whole(self, buffer: str) -> Any:
+        """Return such fields with those of environments that fill up the arrays, [fields, stride]."""
+        return self._buffers[buffer]
 
     def rows(self, leaf: Leaf) -> Any:
         """Return the fields of a leaf, of shape [size, N], as an array of the device's own library.
@@ -104,10 +118,10 @@ class CpuArrays(Arrays):
     def _zeros(self, fields: int, stride: int, dtype: Any) -> Any:
         return np.zeros((fields, stride), dtype)
 
-    def _constant(self, table: np.ndarray) -> Any:
+    def constant(self, table: np.ndarray) -> Any:
         return table
 
-    def _warp(self, array: Any) -> Any:
+    def warp(self, array: Any) -> Any:
         return wp.array(array.reshape(-1), copy=False, device="cpu")
 
     def write(self, leaf: Leaf, values: Any) -> None:
@@ -147,8 +161,9 @@ class CpuArrays(Arrays):
         self.all[list(_TYPES).index("outs")] = room.warp
 
     def _present(self, leaf: Leaf, array: np.ndarray, library: str) -> Any:
-        if len(leaf.shape) > 1:
-            array = array.reshape(self.num_envs, *leaf.shape)
+        return self.presented(array.reshape(self.num_envs, *leaf.shape) if len(leaf.shape) > 1 else array, library)
+
+    def presented(self, array: np.ndarray, library: str) -> Any:
         if library == "torch":
             import torch
 
@@ -187,12 +202,12 @@ class CudaArrays(Arrays):
 
         return torch.zeros((fields, stride), dtype=torch.from_numpy(np.zeros(1, dtype)).dtype, device="cuda")
 
-    def _constant(self, table: np.ndarray) -> Any:
+    def constant(self, table: np.ndarray) -> Any:
         import torch
 
         return torch.from_numpy(table).cuda()
 
-    def _warp(self, array: Any) -> Any:
+    def warp(self, array: Any) -> Any:
         return wp.from_torch(array.reshape(-1))
 
     def write(self, leaf: Leaf, values: Any) -> None:
@@ -230,12 +245,20 @@ class CudaArrays(Arrays):
         array = rows.t().reshape(self.num_envs, *leaf.shape) if len(leaf.shape) != 1 else rows.t()
         if leaf.dtype == "bool":
             array = array.view(torch.bool)
-        if library == "torch":
-            return array
-        host = array.cpu().numpy()
-        host = np.ascontiguousarray(host).view(np.uint32) if leaf.dtype == "uint32" else host
+        if leaf.dtype != "uint32" or library == "torch":
+            return self.presented(array, library)
+        host = np.ascontiguousarray(array.cpu().numpy()).view(np.uint32)
         if library == "numpy":
             return host
         import jax
 
-        return jax.numpy.asarray(host) if leaf.dtype == "uint32" else jax.dlpack.from_dlpack(array.contiguous())
+        return jax.numpy.asarray(host)
+
+    def presented(self, array: Any, library: str) -> Any:
+        if library == "torch":
+            return array
+        if library == "numpy":
+            return array.cpu().numpy()
+        import jax
+
+        return jax.dlpack.from_dlpack(array.contiguous())

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from surgical_marl.engines.fused.arrays import make_arrays
+from surgical_marl.engines.fused.guard import Guard
 from surgical_marl.engines.fused.kernel import compile_kernels, has_cuda, large_branches
 from surgical_marl.engines.fused.load import load_source
 from surgical_marl.engines.fused.order import Order
@@ -56,6 +57,7 @@ class FusedEngine:
         self._stride = -(-num_envs // LANES) * LANES
         self._arrays = make_arrays(self.device, self.source, self._filled_tables(), self._stride, num_envs)
         self._kernels = compile_kernels(self.source.bodies, self.device, num_envs)
+        self._guard: Guard | None = None
         self._order: Order | None = None
         if self.device == "cuda" and large_branches(self.source.bodies):
             self._order = Order(self._arrays.order[:num_envs], self._arrays.work[:num_envs], env.decimation)
@@ -100,6 +102,39 @@ class FusedEngine:
         else:
             self._launch("step")
         self._stepped = True
+
+    @property
+    def guard(self) -> Guard:
+        """What finds environments that are not finite; made when first needed."""
+        if self._guard is None:
+            carry = {name: self._leaves[name] for name in self.carry_shapes}
+            self._guard = Guard(self.source, carry, self._arrays)
+        return self._guard
+
+    @property
+    def fault_places(self) -> list[str]:
+        """Names of the places where a fault can be, by code (see `surgical_marl/engines/faults.py`)."""
+        return self.guard.names
+
+    def end_faulty(self, limit: int, library: str) -> Any:
+        """End the episode of every environment that the last step left NaN or infinite; call it before `outcome`.
+
+        Its episode is terminated, its rewards are 0, and so are observations that are not finite. If its state is at
+        fault, it has reached `limit` steps, so that the next step begins a new episode, and what that step returns
+        besides is no new fault. Nothing waits for a GPU, and a CUDA graph can hold it.
+
+        Args:
+            limit: steps after which an episode ends.
+            library: of what is returned.
+
+        Returns:
+            Code of the fault in each environment, [N] int32; -1 where there is none.
+        """
+        return self._arrays.presented(self.guard.check(limit), library)
+
+    def expect_end(self, leaving: np.ndarray) -> None:
+        """Take note of the environments, [N] bool, whose next step ends an episode because of an older fault."""
+        self.guard.clear(leaving)
 
     def outcome(self, library: str) -> dict[str, Any]:
         """Return what the last step or reset led to: fields of the environment's `State` as dicts of dicts.

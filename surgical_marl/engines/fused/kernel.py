@@ -146,11 +146,12 @@ class Kernel:
             inputs=[*arrays, stride, start, lanes],
             device=self._device,
             block_dim=self._block,
-            stream=_torch_stream() if cuda else None,
+            stream=torch_stream() if cuda else None,
         )
 
 
-def _torch_stream() -> Any:
+def torch_stream() -> Any:
+    """Return torch's current stream, for Warp."""
     import torch
 
     return wp.stream_from_torch(torch.cuda.current_stream())

@@ -1,0 +1,208 @@
+"""Finds environments that are not finite after a step, and ends their episodes, in the arrays that the kernels left.
+
+On a GPU this is one kernel, which reads a step's results once and writes nothing where all is well, so that it can be
+part of a CUDA graph and nothing waits for it. On a CPU it is a sum over fields: a sum of numbers is finite if they are.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from surgical_marl.cache import locked
+from surgical_marl.engines.faults import FINE, NEXT, checked, is_reward, places
+from surgical_marl.engines.fused.arrays import Arrays
+from surgical_marl.engines.fused.kernel import torch_stream
+from surgical_marl.engines.fused.program import Leaf, Source
+from surgical_marl.runtime import cache_dir, prepare_warp
+
+wp = prepare_warp()
+
+_reals: Any = wp.array(dtype=wp.float32)
+_wholes: Any = wp.array(dtype=wp.int32)
+_bytes: Any = wp.array(dtype=wp.uint8)
+FEW = 64
+"""Environments, up to which one sum of squares is quicker than a sum for each."""
+_RESULT, _REWARD, _NEXT = 0, 1, 2
+"""Kinds of results: any, a reward, one that the next step depends on."""
+
+
+class Guard:
+    """The check of all environments of an engine.
+
+    Args:
+        source: of the kernels.
+        carry: leaves of the `Carry` by their path.
+        arrays: that the kernels work on.
+
+    Attributes:
+        names: of the places where a fault can be, by code.
+    """
+
+    def __init__(self, source: Source, carry: dict[str, Leaf], arrays: Arrays) -> None:
+        self._arrays = arrays
+        floats = {name: leaf for name, leaf in carry.items() if leaf.dtype == "float32"}
+        results = _fields(checked(source.results))
+        self.names = [place for name, leaf in floats.items() for place in places(name, leaf.shape)]
+        self.names += [place for place, _ in results.values()]
+        self._state = np.array([row for leaf in floats.values() for row in _range(leaf)], np.int32)
+        self._outs = np.array(list(results), np.int32)
+        self._kinds = np.array([kind for _, kind in results.values()], np.int32)
+        self._steps = carry[".steps"].first
+        self._ends = [source.results[name].first for name in ("terminated", "truncated")]
+        # Terms of a reward are not finite only if the reward is not.
+        sums = [row for row, (place, _) in results.items() if not place.startswith("infos.")]
+        self._pieces = [("state", *piece) for piece in _pieces(self._state)]
+        self._pieces += [("outs", *piece) for piece in _pieces(sums)]
+        # Where the next step will end an episode that was told to end: its numbers are no new fault.
+        self._leaving, self._waiting = np.zeros(arrays.num_envs, np.int32), False
+        self._fine = np.full(arrays.num_envs, FINE, np.int32)
+        self._none = np.zeros(0, np.int64)
+        if arrays.device == "cuda":
+            self._own = self.on_device()
+            # Here, because nothing can be compiled while a CUDA graph is captured; Warp itself does not lock.
+            with locked(cache_dir() / "kernels" / "guard"):
+                _check.module.load(wp.get_device("cuda"))
+
+    def clear(self, leaving: np.ndarray) -> None:
+        """Take note of the environments, [N] bool, that the next step ends because of an older fault."""
+        self._leaving[:], self._waiting = leaving, bool(leaving.any())
+        if self._arrays.device == "cuda":
+            self._own[-2].copy_(self._arrays.constant(self._leaving))
+
+    def check(self, limit: int) -> Any:
+        """End the episode of every environment at fault, and return the codes of faults, [N] int32.
+
+        The codes are a numpy array, or a torch tensor on a GPU. See `FusedEngine.end_faulty`.
+        """
+        if self._arrays.device == "cuda":
+            self.launch(limit, self._own)
+            return self._own[-1].clone()
+        suspects = self._suspects()
+        if not suspects.size:
+            if self._waiting:
+                self._leaving[:], self._waiting = 0, False
+            return self._fine
+        return self._end(suspects, limit)
+
+    def on_device(self) -> list[Any]:
+        """Return the arrays that a kernel needs besides: three constants, where episodes are to end, and the codes."""
+        constants = (self._state, self._outs, self._kinds, self._leaving.copy(), self._fine.copy())
+        return [self._arrays.constant(one) for one in constants]
+
+    def launch(self, limit: int, own: list[Any]) -> None:
+        """Let a kernel check all environments; `own` are arrays from `on_device`."""
+        arrays = self._arrays
+        state, counts, _, outs, flags = arrays.all[:5]
+        numbers = (arrays.stride, self._steps, *self._ends, limit)
+        wp.launch(
+            _check,
+            dim=arrays.num_envs,
+            inputs=[state, counts, outs, flags, *map(arrays.warp, own), *numbers],
+            device=arrays.device,
+            stream=torch_stream() if arrays.device == "cuda" else None,
+        )
+
+    def _suspects(self) -> np.ndarray:
+        """Return the environments of which a sum is not finite. This is what takes time in a step where all is well."""
+        arrays = self._arrays
+        if arrays.stride <= FEW:  # one number for all of them, and for those that fill up the arrays
+            total = 0.0
+            for buffer, a, b in self._pieces:
+                part = arrays.whole(buffer)[a:b].reshape(-1)
+                total += np.vdot(part, part)  # without warnings
+            return self._none if math.isfinite(total) else np.arange(arrays.num_envs)
+        with np.errstate(all="ignore"):
+            sums = sum(np.add.reduce(arrays.fields(buffer)[a:b], 0) for buffer, a, b in self._pieces)
+            good = np.isfinite(sums)
+        return self._none if good.all() else np.flatnonzero(~good)
+
+    def _end(self, suspects: np.ndarray, limit: int) -> np.ndarray:
+        """As `_check` does it, for some environments."""
+        state, outs, counts, flags = (self._arrays.fields(name) for name in ("state", "outs", "counts", "flags"))
+        found = np.concatenate([state[np.ix_(self._state, suspects)], outs[np.ix_(self._outs, suspects)]])
+        bad = ~np.isfinite(found)
+        first = np.where(bad.any(0), bad.argmax(0), FINE).astype(np.int32)
+        begun = len(self._state)
+        broken = bad[:begun].any(0) | bad[begun:][self._kinds == _NEXT].any(0)
+        faulty = first != FINE
+        results = np.where(bad[begun:], np.float32(0), found[begun:])
+        results[np.ix_(self._kinds == _REWARD, faulty)] = 0
+        outs[np.ix_(self._outs, suspects)] = results
+        for row, value in zip(self._ends, (1, 0), strict=True):
+            flags[row, suspects[faulty]] = value
+        counts[self._steps, suspects[broken]] = limit
+        codes = self._fine.copy()
+        codes[suspects] = np.where(faulty & ~broken & (self._leaving[suspects] > 0), FINE, first)
+        self._leaving[:] = 0
+        self._leaving[suspects] = broken
+        self._waiting = bool(broken.any())
+        return codes
+
+
+@wp.kernel(enable_backward=False)
+def _check(
+    state: _reals, counts: _wholes, outs: _reals, flags: _bytes, state_rows: _wholes, outs_rows: _wholes,
+    kinds: _wholes, leaving: _wholes, codes: _wholes, stride: int, steps: int, terminated: int, truncated: int,
+    limit: int,
+) -> None:  # fmt: skip
+    e = wp.tid()
+    code = wp.int32(-1)
+    broken = wp.int32(0)
+    count = state_rows.shape[0]
+    for i in range(count):
+        if not wp.isfinite(state[state_rows[i] * stride + e]):
+            broken = 1
+            if code < 0:
+                code = i
+    for j in range(outs_rows.shape[0]):
+        at = outs_rows[j] * stride + e
+        if not wp.isfinite(outs[at]):
+            outs[at] = 0.0
+            if kinds[j] == _NEXT:
+                broken = 1
+            if code < 0:
+                code = count + j
+    if code >= 0:
+        for j in range(outs_rows.shape[0]):
+            if kinds[j] == _REWARD:
+                outs[outs_rows[j] * stride + e] = 0.0
+        flags[terminated * stride + e] = wp.uint8(1)
+        flags[truncated * stride + e] = wp.uint8(0)
+    if broken == 1:
+        counts[steps * stride + e] = limit
+    elif leaving[e] == 1:
+        code = -1
+    leaving[e] = broken
+    codes[e] = code
+
+
+def _kind(name: str) -> int:
+    if is_reward(name):
+        return _REWARD
+    return _NEXT if name.partition(".")[0] in NEXT else _RESULT
+
+
+def _fields(results: Iterable[tuple[str, Leaf]]) -> dict[int, tuple[str, int]]:
+    """Return name and kind by field: results that are always equal share a field, which has its first one's name."""
+    found: dict[int, tuple[str, int]] = {}
+    for name, leaf in results:
+        for row, place in zip(_range(leaf), places(name, leaf.shape), strict=True):
+            first, kind = found.get(row, (place, _RESULT))
+            found[row] = (first, max(kind, _kind(name)))
+    return found
+
+
+def _range(leaf: Leaf) -> range:
+    return range(leaf.first, leaf.first + leaf.size)
+
+
+def _pieces(rows: Any) -> list[tuple[int, int]]:
+    """Return the first and the end of all runs of neighbouring fields."""
+    fields = np.unique(rows)
+    edges = [0, *(np.flatnonzero(np.diff(fields) > 1) + 1).tolist(), len(fields)]
+    return [(int(fields[a]), int(fields[b - 1]) + 1) for a, b in pairwise(edges) if b > a]
