@@ -313,6 +313,16 @@ class BatchedEnv:
         return self._free_objects.held(self.engine, self.num_envs)
 
     @property
+    def grip_forces(self) -> np.ndarray:
+        """Normal force of each finger on each free object in the last step, [N, k, fingers], N, numpy.
+
+        Fingers are the plates of the jaws, two for each arm with a jaw, in the order of `agents`. A scene without free
+        objects has no fingers here.
+        """
+        self._part(".steps", "numpy")
+        return self._free_objects.grip_forces(self.engine, self.num_envs)
+
+    @property
     def goal(self) -> SimpleNamespace:
         """What the episodes are after: the fields of the task's goal, [N, ...] each, numpy."""
         names = [name for name in self.engine.carry_shapes if name.startswith(".goal.")]
