@@ -214,6 +214,16 @@ def test_pictures_that_agents_observe_are_shown() -> None:
     np.testing.assert_array_equal(seen["ecm_0 observes rgb"], colours[0])
 
 
+def test_a_choice_stays_in_its_menu_until_the_session_has_heard_of_it(viewer: Viewer) -> None:
+    arms, agent = viewer._arms, viewer.session.env.agents[0]
+    menu, before = arms._menus[agent], viewer.session.movers.who[agent]
+    menu.value = "you"  # as the page sets it; what is to be done about it waits in the queue
+    arms.sync()
+    assert menu.value == "you"
+    arms.sync(refused=True)
+    assert menu.value == before
+
+
 def test_a_run_is_named_in_the_menu(viewer: Viewer, tmp_path: Path) -> None:
     run = shutil.copytree(find("policies", "reach-bimanual_psm"), tmp_path / "run")
     arms, (first, second) = viewer._arms, viewer.session.env.agents

@@ -26,6 +26,8 @@ from surgical_marl.envs.env import Env
 from surgical_marl.envs.free_objects import FreeObjects
 from surgical_marl.envs.observations import each, with_vector
 from surgical_marl.physics.views import Contacts
+from surgical_marl.plugins.tasks import TASKS, list_tasks
+from surgical_marl.scenes.load import load_scene
 from surgical_marl.scenes.poses import Poses
 
 if TYPE_CHECKING:
@@ -98,7 +100,10 @@ class BatchedEnv:
             raise ValueError(f"unknown arrays {arrays!r}; the libraries are {', '.join(ARRAYS)}")
         self._made = {"task": task, "scene": scene, "num_envs": num_envs, "engine": engine, "device": device,
                       "arrays": arrays, **options}  # fmt: skip
-        self.env = Env(task, scene, **options)
+        try:
+            self.env = Env(task, scene, **options)
+        except ValueError as error:
+            raise ValueError(f"{error}{_meant_for(task, scene, str(error))}") from None
         self._engine: Engine | None = make_engine(self.env, num_envs, engine, device)
         self.num_envs, self.arrays = num_envs, arrays
         self.agents = list(self.env.agents)
@@ -370,6 +375,18 @@ class BatchedEnv:
         if not self._started:
             raise ValueError("no episode yet: call reset() first")
         return engine.read(name, library)
+
+
+def _meant_for(task: str, scene: str, error: str) -> str:
+    """Return the scenes that a task is meant for, as the end of an error about a scene that is none of them."""
+    if task not in list_tasks() or "choose from" in error:
+        return ""
+    meant = TASKS.load(task).scenes or ()
+    try:
+        load_scene(scene)
+    except ValueError:  # it fits no task
+        return ""
+    return f"; {task} is meant for the scenes {', '.join(meant)}" if meant and scene not in meant else ""
 
 
 def _seed(seed: Any) -> int | None:

@@ -40,6 +40,8 @@ class Arms:
         self._menus: dict[str, Any] = {}
         self._folders: dict[str, Any] = {}
         self._controls: dict[str, Controls] = {}
+        self._told = dict(session.movers.who)
+        """Who moves the arms as the menus were last told."""
         with folder:
             for agent in session.env.agents:
                 self._folders[agent] = server.gui.add_folder(agent)
@@ -48,14 +50,17 @@ class Arms:
             self._add_run()
         self._keys()
 
-    def sync(self) -> None:
-        """Show who moves the arms and what a person wants, as the session has it."""
+    def sync(self, refused: bool = False) -> None:
+        """Show who moves the arms and what a person wants, as the session has it.
+
+        What was just chosen in a menu stays there until the session has heard of it, unless it was refused.
+        """
         movers = self._session.movers
         for agent, menu in self._menus.items():
             if len(menu.options) != len(self._session.choices):
                 menu.options = tuple(self._session.choices)
-            if menu.value != movers.who[agent]:
-                menu.value = movers.who[agent]
+            if self._told[agent] != movers.who[agent] or (refused and menu.value != movers.who[agent]):
+                self._told[agent] = menu.value = movers.who[agent]
             if agent in self._controls and movers.who[agent] != YOU:
                 self._controls.pop(agent).remove()
             elif agent in movers.hands and agent not in self._controls:
@@ -72,7 +77,8 @@ class Arms:
         @menu.on_update
         async def _(event: Any) -> None:
             if event.client is not None:
-                self._ask(lambda: self._session.set_mover(agent, str(menu.value)))
+                wanted = str(menu.value)
+                self._ask(lambda: self._session.set_mover(agent, wanted))
 
         return menu
 

@@ -122,7 +122,7 @@ class Viewer:
             act()
         except ValueError as error:
             self._say("Not possible", str(error), 10, color="red")
-            self._arms.sync()
+            self._arms.sync(refused=True)
 
     def _say(self, title: str, text: str, seconds: float, **look: Any) -> None:
         for client in self.server.get_clients().values():
