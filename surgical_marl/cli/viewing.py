@@ -111,10 +111,13 @@ def _film(arguments: argparse.Namespace) -> Path:
             f"cannot write --out {arguments.out}: name an .mp4, .gif or .webp file in a folder that exists"
         )
 
+    import torch
+
     from surgical_marl.runs.environment import make_env
     from surgical_marl.view.film import Look, camera_of, film
     from surgical_marl.view.movers import Movers, first
 
+    torch.set_num_threads(1)  # the cores draw meanwhile
     look = Look(arguments.grid, arguments.slow, words=not arguments.plain, size=arguments.size)
     env = make_env(settings, look.grid[0] * look.grid[1], "numpy")
     look = replace(look, camera=camera_of(arguments.camera, env))
