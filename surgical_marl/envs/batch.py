@@ -12,6 +12,7 @@ from __future__ import annotations
 import numbers
 import secrets
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -381,12 +382,10 @@ def _meant_for(task: str, scene: str, error: str) -> str:
     """Return the scenes that a task is meant for, as the end of an error about a scene that is none of them."""
     if task not in list_tasks() or "choose from" in error:
         return ""
-    meant = TASKS.load(task).scenes or ()
-    try:
-        load_scene(scene)
-    except ValueError:  # it fits no task
-        return ""
-    return f"; {task} is meant for the scenes {', '.join(meant)}" if meant and scene not in meant else ""
+    with suppress(ValueError):  # of a scene that fits no task
+        if (meant := TASKS.load(task).scenes) and load_scene(scene).name not in meant:
+            return f"; {task} is meant for the scenes {', '.join(meant)}"
+    return ""
 
 
 def _seed(seed: Any) -> int | None:
