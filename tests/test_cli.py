@@ -121,7 +121,8 @@ def test_doctor_looks_at_everything(
     monkeypatch.setattr("surgical_marl.cli.doctor._growth", lambda flag: growth)
     assert main(["doctor"]) == 0
     out = capsys.readouterr().out
-    for word in ("Python", "mujoco", "jax devices", "torch devices", "compile cache", verdict):
+    caches = "compile cache", "suite's cache", "Warp's kernels", "clear caches     rm -r /"
+    for word in ("Python", "mujoco", "jax devices", "torch devices", *caches, verdict):
         assert word in out
     assert "works, no OpenGL needed" in out
 

@@ -262,7 +262,11 @@ def test_a_nan_loss_stops(tmp_path: Path, fakes: list[Any], monkeypatch: pytest.
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_the_iteration_and_saves(
-    number: int, tmp_path: Path, fakes: list[Any], monkeypatch: pytest.MonkeyPatch
+    number: int,
+    tmp_path: Path,
+    fakes: list[Any],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     original = trainer.Trainer.iterate
 
@@ -278,6 +282,20 @@ def test_a_signal_ends_the_iteration_and_saves(
     assert stopped.type is (KeyboardInterrupt if number == signal.SIGINT else SystemExit)
     assert signal.getsignal(number) is before
     assert read_checkpoint(tmp_path / "run")["iteration"] == 3
+    told = capsys.readouterr().err
+    assert f"--resume {tmp_path / 'run'}`" in told and f"report {tmp_path / 'run'}`" in told
+
+
+def test_a_refused_run_leaves_no_folder(tmp_path: Path, fakes: list[Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: Any) -> None:
+        raise ValueError("there is no room")
+
+    monkeypatch.setattr(train, "check_room", refuse)
+    (tmp_path / "mine").mkdir()
+    for out in (tmp_path / "runs" / "first", tmp_path / "mine" / "runs" / "first"):
+        with pytest.raises(ValueError, match="no room"):
+            train.train(SMALL, out=out)
+    assert [path.name for path in tmp_path.rglob("*")] == ["mine"]
 
 
 def test_folders_that_cannot_be_used(tmp_path: Path, fakes: list[Any]) -> None:

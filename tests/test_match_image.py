@@ -204,6 +204,7 @@ def test_gymnasium_accepts_it(scene: str) -> None:
     ("options", "words"),
     [
         ({"scene": "bimanual_psm"}, "scene 'bimanual_psm' has no endoscope"),
+        ({"scene": "psm"}, "is meant for the scenes ecm, trimanual_psm_ecm"),
         ({"scene": "ecm", "difficulty": "harder"}, "unknown difficulty 'harder'"),
         ({"scene": "ecm", "reward": {"pixels": 1}}, "unknown reward term 'pixels'"),
     ],

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import io
 import sys
+import time
 
 import pytest
 
 from surgical_marl.runs import progress as module
-from surgical_marl.runs.progress import progress
+from surgical_marl.runs.progress import preparing, progress
 
 
 class Terminal(io.StringIO):
@@ -37,6 +38,26 @@ def test_a_file_gets_a_line_for_each_state_that_is_old_enough(
     monkeypatch.setattr(module, "EVERY", 0.0)
     count("")
     assert [line.split(" of ")[0] for line in capsys.readouterr().err.splitlines()] == ["0", "1", "2", "3"]
+
+
+def test_what_takes_long_is_named_once_and_not_beside_a_bar(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with preparing("tea"):
+        pass
+    with pytest.raises(ValueError, match="milk"), preparing("tea"):
+        raise ValueError("no milk")
+    monkeypatch.setattr(module, "PATIENCE", 0.0)
+    with preparing("tea"):
+        while not (said := capsys.readouterr().err):
+            time.sleep(0.01)
+    assert said == "surgical-marl: preparing tea\n"
+    monkeypatch.setattr(module, "PATIENCE", 60.0)
+    with preparing("tea"):
+        (timer,) = module._waiting
+        count("evaluating")
+        assert timer.finished.is_set()
+    assert not module._waiting
 
 
 def test_a_terminal_gets_a_bar(monkeypatch: pytest.MonkeyPatch) -> None:

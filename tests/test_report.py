@@ -217,3 +217,12 @@ def test_what_shows_itself_in_a_notebook(tmp_path: Path) -> None:
         sm.Video(tmp_path / "none.mp4")
     shown = Evaluation(json.loads((run / RESULT).read_text()))._repr_html_()
     assert "<table>" in shown and html.escape(HOSTILE) in shown and not Page(shown).of("img")
+
+
+def test_a_metric_without_a_unit_says_what_it_is() -> None:
+    from surgical_marl.evaluation.report import explained
+
+    assert explained("cost") == "cost (limits broken, mean of a step)"
+    assert explained("cost_force") == "cost force (share of steps)"
+    assert explained("reward_distance") == "reward distance (mean of a step)"
+    assert explained("median_error_mm") == "median error (mm)"

@@ -74,13 +74,21 @@ def test_the_reference_describes_every_public_name() -> None:
 
 
 def test_the_readmes_speeds_are_those_of_the_benchmarks() -> None:
-    """Other tables are of policies: their cards."""
     _, _, rest = (ROOT / "README.md").read_text(encoding="utf-8").partition("## Speed")
     rows = [row for row in rest.partition("##")[0].splitlines() if row.startswith("|")][2:]
     figures = [figure for row in rows for figure in re.findall(r"\d[\d,.]*\d", row.split("|")[4])]
     measured = (ROOT / "docs" / "benchmarks.md").read_text(encoding="utf-8")
     assert len(figures) >= len(rows) > 5
     assert not [figure for figure in figures if figure not in measured]
+
+
+def test_the_comparison_has_our_own_figures() -> None:
+    text = (ROOT / "docs" / "comparison.md").read_text(encoding="utf-8")
+    measured = (ROOT / "docs" / "benchmarks.md").read_text(encoding="utf-8")
+    ours = [row.split("|")[2] for row in text.splitlines() if row.startswith("| surgical-marl,")]
+    assert len(ours) == 3 and all(" ".join(row.split()[:2]) in measured for row in ours)
+    (tasks,) = (row.split("|")[2].strip() for row in text.splitlines() if row.startswith("| tasks registered"))
+    assert int(tasks) == len(sm.list_tasks())
 
 
 def test_every_algorithm_has_its_place_in_the_page() -> None:

@@ -20,7 +20,7 @@ from surgical_marl.view.browser.gate import open_server
 from surgical_marl.view.browser.text import status
 from surgical_marl.view.hand import Hand
 from surgical_marl.view.history import History, summary
-from surgical_marl.view.moment import Observer
+from surgical_marl.view.moment import Near, Observer
 from surgical_marl.view.pace import MOST, Pace
 from surgical_marl.view.paths import Paths
 from surgical_marl.view.session import Session
@@ -60,6 +60,35 @@ def test_contacts_have_the_force_that_the_engine_says(session: Session) -> None:
     ((push,),) = Observer(session.env.scene).look(session.env, forces).pushes
     assert push.force == 2.5
     assert np.linalg.norm(push.direction) == pytest.approx(1.0)
+
+
+def test_contacts_point_from_one_shape_into_the_other_also_where_they_overlap(session: Session) -> None:
+    observer, forces = Observer(session.env.scene), np.zeros((1, len(session.env.scene.pairs)), np.float32)
+    forces[0, 5] = 2.5
+    for ends in ([[0.0, 0, 0], [0.001, 0, 0]], [[0.001, 0, 0], [0.0, 0, 0]]):  # a gap, and an overlap, of 1 mm
+        line = Near(0.001 if ends[1][0] else -0.001, np.array(ends))
+        observer._line = lambda *_, line=line: line  # type: ignore[method-assign,misc]
+        ((push,),) = observer.look(session.env, forces).pushes
+        np.testing.assert_allclose(push.direction, [1.0, 0.0, 0.0])
+        np.testing.assert_allclose(push.place, [0.0005, 0.0, 0.0])
+
+
+def test_fingers_press_on_what_they_hold_from_both_sides() -> None:
+    session = Session(Settings(task="needle_pick", scene="psm_needle", seed=0), "oracle")
+    assert session.moment().grips == [[]]
+    for _ in range(400):
+        session.step()
+        if session.moment().held.any():
+            break
+    (one, other) = session.moment().grips[0]
+    assert one.push.direction @ other.push.direction < -0.7
+    assert {grip.push.force for grip in (one, other)} == set(session.env.grip_forces[0, 0].astype(float))
+    needle, tip = session.moment().objects[0, 0], session.moment().tips[0, 0]
+    for grip in (one, other):
+        assert grip.arm == 0 and grip.push.force > 1.0
+        assert np.linalg.norm(grip.push.place - tip) < 0.008
+        assert np.linalg.norm(grip.push.place - needle) < 0.02
+    session.close()
 
 
 def test_a_path_passes_through_its_targets() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import http.client
+import shutil
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,6 +21,7 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from surgical_marl.cli.main import main
+from surgical_marl.content import find
 from surgical_marl.runs.settings import Settings
 from surgical_marl.scenes.load import load_scene
 from surgical_marl.view.browser.gate import close_server, open_server, unlocked
@@ -212,9 +214,34 @@ def test_pictures_that_agents_observe_are_shown() -> None:
     np.testing.assert_array_equal(seen["ecm_0 observes rgb"], colours[0])
 
 
-def test_a_run_without_a_checkpoint_can_not_move_an_arm(viewer: Viewer, tmp_path: Path) -> None:
-    from surgical_marl.content import find
+def test_a_choice_stays_in_its_menu_until_the_session_has_heard_of_it(viewer: Viewer) -> None:
+    arms, agent = viewer._arms, viewer.session.env.agents[0]
+    menu, before = arms._menus[agent], viewer.session.movers.who[agent]
+    menu.value = "you"  # as the page sets it; what is to be done about it waits in the queue
+    arms.sync()
+    assert menu.value == "you"
+    arms.sync(refused=True)
+    assert menu.value == before
 
+
+def test_a_run_is_named_in_the_menu(viewer: Viewer, tmp_path: Path) -> None:
+    run = shutil.copytree(find("policies", "reach-bimanual_psm"), tmp_path / "run")
+    arms, (first, second) = viewer._arms, viewer.session.env.agents
+    before = viewer.session.movers.who[first]
+    for wrong, words in (("", "type the folder of a run"), (str(tmp_path / "none"), "no such folder")):
+        with pytest.raises(ValueError, match=words):
+            arms._let_run(wrong, [second])
+    arms._let_run(str(run), [second])
+    assert viewer.session.movers.who == {first: before, second: str(run)}
+    arms.sync()
+    assert str(run) in arms._menus[first].options and arms._menus[second].value == str(run)
+    viewer.session.set_mover(second, "zero")
+    viewer.ask(lambda: viewer.choose(Choice("reach", "bimanual_psm", "default", 1, 50)))
+    turn(viewer, 2)
+    assert str(run) in viewer.session.choices
+
+
+def test_a_run_without_a_checkpoint_can_not_move_an_arm(viewer: Viewer, tmp_path: Path) -> None:
     (tmp_path / "config.yaml").write_text((find("policies", "reach-bimanual_psm") / "config.yaml").read_text())
     with pytest.raises(ValueError, match=r"it has no checkpoint\.pt"):
         viewer.session.set_mover(viewer.session.env.agents[0], str(tmp_path))

@@ -9,13 +9,16 @@ is shown in the row of its arm, object, scene or task. `tests/test_site.py` hold
 from __future__ import annotations
 
 import ast
+import json
 import re
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 from surgical_marl import list_arms, list_objects, list_policies, list_scenes, list_tasks
+from surgical_marl.content import find
 from surgical_marl.plugins.tasks import TASKS, scenes_for
 from surgical_marl.robots.arm import load_arm
+from surgical_marl.runs.folder import read_metrics, read_origin
 from surgical_marl.scenes.load import load_scene
 from surgical_marl.scenes.objects import load_object
 
@@ -31,7 +34,8 @@ def main() -> None:
 
 def pages() -> list[Path]:
     """Return the pages that have tables of content."""
-    return [path for path in sorted(DOCS.rglob("*.md")) if MARKED.search(path.read_text(encoding="utf-8"))]
+    places = [DOCS.parent / "README.md", *sorted(DOCS.rglob("*.md"))]
+    return [path for path in places if MARKED.search(path.read_text(encoding="utf-8"))]
 
 
 def written(text: str) -> str:
@@ -105,8 +109,51 @@ def examples() -> str:
     return table(["program", "what it is"], rows())
 
 
+def results() -> str:
+    """Return how well the shipped policies do, of those without objects all in one row."""
+    cards = [Card(name) for name in list_policies()]
+    objects, without = [card for card in cards if card.objects], [card for card in cards if not card.objects]
+    usual = [card for card in without if card.level == "default"]
+    seen = [card for card in usual if card.task == "match_image"]
+
+    def rows() -> Iterator[list[str]]:
+        for card in objects:
+            yield [card.link, card.training, f"{card.success} of {card.episodes} unseen starts, {card.time:.1f} s each"]
+        worst = max(card.error for card in usual if card not in seen)
+        pictures = " and ".join(f"{error:.2f}" for error in sorted(card.error for card in seen))
+        times = [card.seconds for card in usual]
+        yield [
+            f"{len(usual)} policies, one for each task without objects on each scene",
+            f"{min(times):.0f} to {max(times):.0f} s each on an H200 that up to 15 others share",
+            f"median error of the worst arm at most {worst:.2f} mm; {pictures} mm where pictures are matched",
+        ]
+        for card in without:
+            if card not in usual:
+                yield [card.link, card.training, f"{card.success} within 2 mm in {card.episodes} episodes"]
+
+    return table(["policies", "training", "result"], rows())
+
+
+class Card:
+    """What the files of a shipped policy say about it."""
+
+    def __init__(self, name: str) -> None:
+        folder = find("policies", name)
+        result = json.loads((folder / "evaluation.json").read_text(encoding="utf-8"))
+        origin = read_origin(folder)["origin"]
+        self.link = f"[`{name}`](policies/{name}/README.md)"
+        self.task, self.level, self.episodes = result["task"], result["difficulty"], result["episodes"]
+        self.objects = bool(load_scene(result["scene"]).free_objects)
+        self.seconds = sum(row["seconds"] for row in read_metrics(folder))
+        self.training = f"{self.seconds:.0f} s, {origin.get('device')}"
+        low, high = result["intervals"]["success_rate"]
+        self.success = f"{100 * result['success_rate']:.1f} % ({100 * low:.1f} to {100 * high:.1f})"
+        self.error = max(own["median_error_mm"] for own in result["agents"].values())
+        self.time = result["time_to_success_s"]
+
+
 TABLES: dict[str, Callable[[], str]] = {
-    function.__name__: function for function in (arms, objects, scenes, tasks, examples)
+    function.__name__: function for function in (arms, objects, scenes, tasks, examples, results)
 }
 
 

@@ -6,6 +6,7 @@ import importlib.metadata
 import json
 import os
 import platform
+import shlex
 import subprocess
 import sys
 import time
@@ -13,7 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from surgical_marl.runtime import FLAG, knows_flag, prepare_jax
+from surgical_marl.runtime import FLAG, cache_dir, knows_flag, prepare_jax, prepare_warp
 
 _PACKAGES = (
     "surgical-marl", "mujoco", "mujoco-mjx", "warp-lang", "jax", "jaxlib", "torch", "rsl-rl-lib",
@@ -31,8 +32,11 @@ def report() -> Iterator[tuple[str, str]]:
         yield package, _version(package)
     yield "jax devices", _jax_devices()
     yield "torch devices", _torch_devices()
-    folder = _compile_cache()
-    yield "compile cache", f"{folder}, {_size_mb(folder):.1f} MB"
+    caches = _caches()
+    for what, folder in caches.items():
+        yield what, f"{folder}, {_size_mb(folder):.1f} MB"
+    own = [str(folder) for folder in caches.values() if cache_dir() not in folder.parents]
+    yield "clear caches", f"rm -r {shlex.join(own)}; what is missing is made again"
     yield "rendering", _rendering()
     yield "video", _video()
     yield from _xla_fault()
@@ -97,9 +101,17 @@ def _torch_devices() -> str:
     return f"cpu, {', '.join(names)}"
 
 
-def _compile_cache() -> Path:
+def _caches() -> dict[str, Path]:
+    """Return the folders of what takes a while to make.
+
+    They have what JAX compiles, our own tables and the sources of kernels, and the kernels that Warp compiles.
+    """
     prepare_jax()
-    return Path(os.environ["JAX_COMPILATION_CACHE_DIR"])
+    return {
+        "compile cache": Path(os.environ["JAX_COMPILATION_CACHE_DIR"]),
+        "suite's cache": cache_dir(),
+        "Warp's kernels": Path(prepare_warp().config.kernel_cache_dir),
+    }
 
 
 def _size_mb(folder: Path) -> float:

@@ -11,6 +11,7 @@ from typing import Any
 from surgical_marl.cli.flags import add_flags, whole
 from surgical_marl.content import BASELINES, PARTNERS, find, list_policies, list_scenes, unknown
 from surgical_marl.plugins.tasks import list_tasks
+from surgical_marl.runs.progress import preparing
 from surgical_marl.tasks.base.options import Options
 from surgical_marl.untrusted.files import is_file, is_folder
 
@@ -72,11 +73,12 @@ def _eval(arguments: argparse.Namespace) -> None:
     partners = _partners(arguments.partner)
     _check_files(("--csv", arguments.csv, ".csv"), ("--figure", arguments.figure, ".png"))
 
-    from surgical_marl.evaluation.command import CHOSEN, OWN, play_all, read_result, report
+    with preparing(f"the episodes of {', '.join(policies)}"):
+        from surgical_marl.evaluation.command import CHOSEN, OWN, play_all, read_result, report
 
-    older = None if arguments.against is None else (str(arguments.against), read_result(arguments.against))
-    asked = {key: getattr(arguments, key) for key in (*OWN, *CHOSEN)}
-    played = play_all(policies, asked, arguments.episodes, arguments.seed, partners)
+        older = None if arguments.against is None else (str(arguments.against), read_result(arguments.against))
+        asked = {key: getattr(arguments, key) for key in (*OWN, *CHOSEN)}
+        played = play_all(policies, asked, arguments.episodes, arguments.seed, partners)
     print(report(played, older, arguments.json, arguments.csv, arguments.figure))
 
 
@@ -84,11 +86,12 @@ def _crossplay(arguments: argparse.Namespace) -> None:
     _check(arguments, arguments.teams)
     _check_files(("--figure", arguments.figure, ".png"))
 
-    from surgical_marl.evaluation.command import CHOSEN, OWN
-    from surgical_marl.evaluation.crossplay import crossplay, report
+    with preparing(f"the episodes of {', '.join(arguments.teams)}"):
+        from surgical_marl.evaluation.command import CHOSEN, OWN
+        from surgical_marl.evaluation.crossplay import crossplay, report
 
-    asked = {key: getattr(arguments, key) for key in (*OWN, *CHOSEN)}
-    result = crossplay(arguments.teams, asked, arguments.episodes, arguments.seed)
+        asked = {key: getattr(arguments, key) for key in (*OWN, *CHOSEN)}
+        result = crossplay(arguments.teams, asked, arguments.episodes, arguments.seed)
     print(report(result, arguments.json, arguments.figure))
 
 

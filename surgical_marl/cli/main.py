@@ -20,6 +20,7 @@ from surgical_marl.cli.viewing import add_play, add_replay, add_view
 from surgical_marl.content import find, list_arms, list_objects, list_policies, list_scenes, unknown
 from surgical_marl.plugins.algorithms import list_algorithms
 from surgical_marl.plugins.tasks import list_tasks
+from surgical_marl.runs.progress import preparing
 from surgical_marl.runs.settings import Settings
 from surgical_marl.runtime import defer_compiler
 from surgical_marl.tasks.base.options import choices
@@ -301,7 +302,8 @@ def _train(arguments: argparse.Namespace) -> None:
     from surgical_marl.runs.lock import owned
 
     try:
-        run = train(settings, out=out, resume=resume)
+        with preparing(f"{settings.task} on {Path(settings.scene).stem}") if is_first() else contextlib.nullcontext():
+            run = train(settings, out=out, resume=resume)
     except (FloatingPointError, KeyboardInterrupt):
         if is_first() and has_begun(out):
             with contextlib.suppress(ValueError):  # what stopped the training says more

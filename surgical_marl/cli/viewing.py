@@ -12,6 +12,7 @@ from typing import Any
 from surgical_marl.cli.flags import add_flags, whole
 from surgical_marl.content import BASELINES, find, list_policies, list_scenes, unknown
 from surgical_marl.plugins.tasks import list_tasks
+from surgical_marl.runs.progress import preparing
 from surgical_marl.tasks.base.options import Options
 from surgical_marl.untrusted.files import is_file, is_folder
 
@@ -65,15 +66,27 @@ def _add_what(parser: argparse.ArgumentParser) -> None:
 
 
 def _view(arguments: argparse.Namespace) -> None:
+    with preparing(f"the page of {arguments.task}"):
+        viewer = _open(arguments)
+    print(viewer.address, flush=True)
+
+    import signal
+    import threading
+
+    end = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: end.set())
+    viewer.run(end)
+
+
+def _open(arguments: argparse.Namespace) -> Any:
+    """Return the viewer that is asked for."""
     settings, who = _settings(arguments)
     from surgical_marl.view.browser.gate import NEEDED, check_port
 
     if importlib.util.find_spec("viser") is None:  # this and the port are looked at before anything is compiled
         raise ValueError(NEEDED)
     check_port(arguments.port)
-
-    import signal
-    import threading
 
     import torch
 
@@ -83,30 +96,34 @@ def _view(arguments: argparse.Namespace) -> None:
     if arguments.record is not None:
         check_writable(arguments.record)
     torch.set_num_threads(1)  # for a few environments, threads of torch wait for each other longer than they compute
-    viewer = Viewer(settings, who, arguments.num_envs, arguments.port, arguments.record)
-    print(viewer.address, flush=True)
-    end = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: end.set())
-    viewer.run(end)
+    return Viewer(settings, who, arguments.num_envs, arguments.port, arguments.record)
 
 
 def _play(arguments: argparse.Namespace) -> None:
+    with preparing(f"a film of {arguments.task}"):
+        print(_film(arguments))
+
+
+def _film(arguments: argparse.Namespace) -> Path:
+    """Write the film that is asked for, and return its path."""
     settings, who = _settings(arguments)
     if arguments.out.suffix not in (".mp4", ".gif", ".webp") or not is_folder(arguments.out.parent):
         raise ValueError(
             f"cannot write --out {arguments.out}: name an .mp4, .gif or .webp file in a folder that exists"
         )
 
+    import torch
+
     from surgical_marl.runs.environment import make_env
     from surgical_marl.view.film import Look, camera_of, film
     from surgical_marl.view.movers import Movers, first
 
+    torch.set_num_threads(1)  # the cores draw meanwhile
     look = Look(arguments.grid, arguments.slow, words=not arguments.plain, size=arguments.size)
     env = make_env(settings, look.grid[0] * look.grid[1], "numpy")
     look = replace(look, camera=camera_of(arguments.camera, env))
     movers = Movers(env, first(env) if who is None else who)
-    print(film(env, movers, arguments.out, look, arguments.episodes, arguments.seed))
+    return film(env, movers, arguments.out, look, arguments.episodes, arguments.seed)
 
 
 def _grid(text: str) -> tuple[int, int]:
@@ -134,12 +151,13 @@ def _replay(arguments: argparse.Namespace) -> int:
     if not is_file(arguments.file):
         raise ValueError(f"there is no file {arguments.file}")
 
-    from surgical_marl.runs.fault import read_fault
-    from surgical_marl.view.take import replay
+    with preparing(f"the steps of {arguments.file}"):
+        from surgical_marl.runs.fault import read_fault
+        from surgical_marl.view.take import replay
 
-    if (fault := read_fault(arguments.file)) is not None:
-        return _reproduce(arguments.file, *fault)
-    found = replay(arguments.file)
+        if (fault := read_fault(arguments.file)) is not None:
+            return _reproduce(arguments.file, *fault)
+        found = replay(arguments.file)
     if found.differs_at is None:
         print(f"{arguments.file}: {found.steps} steps, the same numbers")
         return 0

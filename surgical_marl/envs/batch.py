@@ -12,6 +12,7 @@ from __future__ import annotations
 import numbers
 import secrets
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -27,6 +28,8 @@ from surgical_marl.envs.fault_place import FaultPlace, fault_place
 from surgical_marl.envs.free_objects import FreeObjects
 from surgical_marl.envs.observations import each, with_vector
 from surgical_marl.physics.views import Contacts
+from surgical_marl.plugins.tasks import TASKS, list_tasks
+from surgical_marl.scenes.load import load_scene
 from surgical_marl.scenes.poses import Poses
 
 if TYPE_CHECKING:
@@ -104,7 +107,10 @@ class BatchedEnv:
             raise ValueError(f"unknown arrays {arrays!r}; the libraries are {', '.join(ARRAYS)}")
         self._made = {"task": task, "scene": scene, "num_envs": num_envs, "engine": engine, "device": device,
                       "arrays": arrays, **options}  # fmt: skip
-        self.env = Env(task, scene, **options)
+        try:
+            self.env = Env(task, scene, **options)
+        except ValueError as error:
+            raise ValueError(f"{error}{_meant_for(task, scene, str(error))}") from None
         self._engine: Engine | None = make_engine(self.env, num_envs, engine, device)
         self.num_envs, self.arrays = num_envs, arrays
         self.agents = list(self.env.agents)
@@ -327,6 +333,16 @@ class BatchedEnv:
         return self._free_objects.held(self.engine, self.num_envs)
 
     @property
+    def grip_forces(self) -> np.ndarray:
+        """Normal force of each finger on each free object in the last step, [N, k, fingers], N, numpy.
+
+        Fingers are the plates of the jaws, two for each arm with a jaw, in the order of `agents`. A scene without free
+        objects has no fingers here.
+        """
+        self._part(".steps", "numpy")
+        return self._free_objects.grip_forces(self.engine, self.num_envs)
+
+    @property
     def goal(self) -> SimpleNamespace:
         """What the episodes are after: the fields of the task's goal, [N, ...] each, numpy."""
         names = [name for name in self.engine.carry_shapes if name.startswith(".goal.")]
@@ -383,6 +399,16 @@ class BatchedEnv:
         if not self._started:
             raise ValueError("no episode yet: call reset() first")
         return engine.read(name, library)
+
+
+def _meant_for(task: str, scene: str, error: str) -> str:
+    """Return the scenes that a task is meant for, as the end of an error about a scene that is none of them."""
+    if task not in list_tasks() or "choose from" in error:
+        return ""
+    with suppress(ValueError):  # of a scene that fits no task
+        if (meant := TASKS.load(task).scenes) and load_scene(scene).name not in meant:
+            return f"; {task} is meant for the scenes {', '.join(meant)}"
+    return ""
 
 
 def _seed(seed: Any) -> int | None:

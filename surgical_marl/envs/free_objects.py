@@ -18,6 +18,8 @@ SIZE = ".hidden.objects.size"
 """Where it has by what their lengths are multiplied, if the scene randomises objects."""
 HELD = ".physics.objects.grips.held"
 """Where it has for how long arms have held them."""
+FORCE = ".physics.objects.grips.force"
+"""Where it has the normal forces of fingers on them."""
 
 
 class FreeObjects:
@@ -35,6 +37,12 @@ class FreeObjects:
         from surgical_marl.physics.handling import DWELL
 
         return np.asarray(engine.read(HELD, "numpy") >= np.float32(DWELL))
+
+    def grip_forces(self, engine: Engine, num_envs: int) -> np.ndarray:
+        """Return the normal forces of fingers on objects, [N, k, fingers], N."""
+        if not self.count:
+            return np.zeros((num_envs, 0, 0), np.float32)
+        return np.array(engine.read(FORCE, "numpy"))
 
     def read(self, engine: Engine, num_envs: int, library: str = "numpy", place: str = "") -> Poses:
         """Return poses in arrays of "numpy" or "torch".

@@ -23,6 +23,9 @@ from surgical_marl.scenes.load import load_scene
 if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv
 
+Pairing = tuple[str, tuple[tuple[str, str], ...]]
+"""A team, and who plays which role instead of it."""
+
 
 def crossplay(teams: Sequence[str], asked: Mapping[str, str | None], episodes: int, seed: int) -> dict[str, Any]:
     """Play the episodes of `surgical-marl crossplay`, all on the same goals.
@@ -43,17 +46,18 @@ def crossplay(teams: Sequence[str], asked: Mapping[str, str | None], episodes: i
     if len(load_scene(find("scenes", settings.scene)).agents) < 2:
         raise ValueError(f"crossplay needs a scene with several agents, and {settings.scene!r} has one")
     env = make_env(settings, min(episodes, MAX_BATCH))
-    known: dict[tuple[str, tuple[tuple[str, str], ...]], Played] = {}
+    roles = env.agents[1:] if len(env.agents) == 2 else env.agents  # of two, one is the other one's transpose
+    others = [(team, role, other) for role in roles for team in teams for other in teams]
+    others += [(team, role, who) for team in teams for role in env.agents for who in _partners(env)]
+    pairings = list(dict.fromkeys([*map(_pairing, teams), *(_pairing(*other) for other in others)]))
+    known: dict[Pairing, Played] = {}
+    for number, (team, changed) in enumerate(pairings, 1):
+        who = f"{number} of {len(pairings)}: playing {team}" + "".join(f", {role} is {own}" for role, own in changed)
+        known[team, changed] = play(env, Team(env, find_policy(team), dict(changed)), episodes, seed, who)
 
     def played(team: str, role: str = "", partner: str = "") -> Played:
-        partners = {} if role == "" or partner == team else {role: partner}
-        key = team, tuple(partners.items())
-        if key not in known:
-            who = f"playing {team}" + "".join(f", {role} is {other}" for role, other in partners.items())
-            known[key] = play(env, Team(env, find_policy(team), partners), episodes, seed, who)
-        return known[key]
+        return known[_pairing(team, role, partner)]
 
-    roles = env.agents[1:] if len(env.agents) == 2 else env.agents  # of two, one is the other one's transpose
     cells = {role: [[played(team, role, other) for other in teams] for team in teams] for role in roles}
     partners = {
         team: {role: {who: _cell(played(team, role, who), role) for who in _partners(env)} for role in env.agents}
@@ -70,6 +74,11 @@ def crossplay(teams: Sequence[str], asked: Mapping[str, str | None], episodes: i
         **found,
         "partners": partners,
     }
+
+
+def _pairing(team: str, role: str = "", partner: str = "") -> Pairing:
+    """Return a team, and who plays which role instead of it."""
+    return team, () if role == "" or partner == team else ((role, partner),)
 
 
 def _partners(env: BatchedEnv) -> tuple[str, ...]:

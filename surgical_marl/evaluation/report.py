@@ -66,7 +66,7 @@ def _rows(result: Mapping[str, Any], columns: Mapping[str, Mapping[str, Any]]) -
     rows = [["", "all", "95 % interval", *columns]]
     for name, bounds in result["intervals"].items():
         span = "-" if bounds is None else " to ".join(number(name, bound) for bound in bounds)
-        rows.append([title(name), number(name, result[name]), span])
+        rows.append([explained(name), number(name, result[name]), span])
         rows[-1] += [number(name, values.get(name)) for values in columns.values()]
     return rows
 
@@ -102,6 +102,17 @@ UNITS = {"_mm": " (mm)", "_s": " (s)", "_deg": " (degrees)", "_n": " (N)", "imag
 """Units of metrics, by the suffix of their names."""
 
 
+KINDS = {
+    "reward_": "mean of a step",
+    "cost_": "share of steps",
+    "cost": "limits broken, mean of a step",
+    "stage_": "share of episodes",
+    "smoothness": "spectral arc length",
+    "action_change": "rms at the goal, of -1 to 1",
+}
+"""What metrics without a unit are, by how their names begin; the first that fits counts."""
+
+
 def title(name: str) -> str:
     """Return the name of a metric in words, with its unit."""
     name = name.replace("p95_", "95th-percentile_")
@@ -110,6 +121,11 @@ def title(name: str) -> str:
     for threshold in ("1mm", "2mm", "5mm"):
         name = name.replace(f"_{threshold}", f" within {threshold[0]} mm")
     return name.replace("_", " ")
+
+
+def explained(name: str) -> str:
+    """Return the title of a metric, and what it is where neither a unit nor a percent sign says so."""
+    return title(name) + next((f" ({what})" for start, what in KINDS.items() if name.startswith(start)), "")
 
 
 def number(name: str, value: float | None) -> str:

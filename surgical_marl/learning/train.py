@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+import shlex
 import signal
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from types import FrameType
@@ -152,7 +153,7 @@ def _claimed(out: Path, resume: Path | None, settings: Settings, closing: ExitSt
     if distributed.rank() > 0:
         yield
         return
-    new = not out.exists()
+    made = [folder for folder in (out, *out.parents) if not folder.exists()]
     if _same(out, resume):
         check_writable(out)
         (out / DIVERGED).unlink(missing_ok=True)
@@ -168,8 +169,9 @@ def _claimed(out: Path, resume: Path | None, settings: Settings, closing: ExitSt
         if resume is None:
             (out / CONFIG).unlink()
         (out / LOCK).unlink(missing_ok=True)
-        if new:
-            out.rmdir()
+        with suppress(OSError):  # another run may have begun in `runs` meanwhile
+            for folder in made:
+                folder.rmdir()
         raise
 
 
@@ -196,7 +198,7 @@ def _save(training: Trainer, out: Path) -> None:
 
 def _run(training: Trainer, out: Path) -> None:
     settings = training.settings
-    with _signals(training) as received, ExitStack() as files:
+    with _signals(training, out) as received, ExitStack() as files:
         log = files.enter_context(Log(training, out)) if distributed.rank() == 0 else None
         keep = lambda fault: _keep_fault(training, out, fault)  # noqa: E731
         reports = Reports(training, log.write if log else lambda row: None, keep)
@@ -296,7 +298,7 @@ def _say(what: str, by: int = 0) -> None:
 
 
 @contextmanager
-def _signals(training: Trainer) -> Iterator[list[int]]:
+def _signals(training: Trainer, out: Path) -> Iterator[list[int]]:
     """Collect Ctrl-C and SIGTERM, so that the iteration ends and is saved.
 
     A second signal stops a single process at once. It does not stop one of several processes, because the others would
@@ -314,7 +316,12 @@ def _signals(training: Trainer) -> Iterator[list[int]]:
         if distributed.size() == 1:
             for each, handler in old.items():
                 signal.signal(each, handler)
-            tqdm.write("stopping after this iteration (again to stop at once)", file=sys.stderr)
+            run = shlex.quote(str(out))
+            tqdm.write(
+                f"surgical-marl: stopping after this iteration (again to stop at once); `surgical-marl train --resume "
+                f"{run}` goes on, `surgical-marl report {run}` shows what there is",
+                file=sys.stderr,
+            )
 
     for number in old:
         signal.signal(number, receive)

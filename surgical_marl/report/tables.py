@@ -9,7 +9,7 @@ import numpy as np
 import yaml
 
 from surgical_marl.evaluation.card import SHOWN
-from surgical_marl.evaluation.report import number, title
+from surgical_marl.evaluation.report import explained, number
 from surgical_marl.report.charts import percent, plain
 from surgical_marl.report.groups import Group, differences, numbers
 from surgical_marl.report.run import Run
@@ -135,7 +135,7 @@ def results(groups: Sequence[Group]) -> Table | None:
     if not columns:
         return None
     names = [name for name in (*SHOWN, *ALSO) if any(name in cells for cells in columns.values())]
-    rows = [[title(name), *(cells.get(name, "-") for cells in columns.values())] for name in names]
+    rows = [[explained(name), *(cells.get(name, "-") for cells in columns.values())] for name in names]
     rows = [row for row in rows if set(row[1:]) != {"-"}]
     return Table("Evaluation, with 95 % intervals in brackets", ["metric", *columns], rows)
 
@@ -161,7 +161,7 @@ def rewards(run: Run) -> Table | None:
         return None
     parts = {"all": run.result, **run.result["agents"]}
     names = [name for name in run.result["intervals"] if name.startswith(("reward_", "cost"))]
-    rows = [[title(name), *(_plain(part.get(name)) for part in parts.values())] for name in names]
+    rows = [[explained(name), *(_plain(part.get(name)) for part in parts.values())] for name in names]
     return Table("Reward terms and costs of a step in the evaluation", ["term", *parts], rows) if rows else None
 
 

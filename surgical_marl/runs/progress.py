@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, TextIO
 
 from tqdm import tqdm
 
 EVERY = 30.0
 """Seconds between the lines of a bar that goes to a file or a pipe."""
+PATIENCE = 1.0
+"""Seconds without a word after which `preparing` speaks."""
+_waiting: list[threading.Timer] = []
+"""What `preparing` would say."""
 _LINE = "{desc}{n_fmt} of {total_fmt} {unit}, {elapsed} done, {remaining} left{postfix}"
 
 
@@ -25,6 +32,8 @@ def progress(total: int, unit: str, what: str = "", begun: int = 0, leave: bool 
         begun: how many are done already.
         leave: whether the bar stays when it is closed.
     """
+    for timer in _waiting:
+        timer.cancel()
     options: dict[str, Any] = {
         "total": total,
         "unit": unit,
@@ -41,6 +50,27 @@ def progress(total: int, unit: str, what: str = "", begun: int = 0, leave: bool 
     # tqdm's monitor would write a line after maxinterval, by default 10 s, even where nothing is new.
     lines = {"file": _Lines(sys.stderr), "mininterval": EVERY, "maxinterval": EVERY, "bar_format": _LINE}
     return tqdm(**{**options, **lines, "leave": True})
+
+
+@contextmanager
+def preparing(what: str) -> Iterator[None]:
+    """Say on stderr what is prepared if that takes longer than `PATIENCE`, and no bar has appeared meanwhile.
+
+    Bad input is found sooner than that in most cases, and then there is only its error.
+    """
+    timer = threading.Timer(PATIENCE, _say, (what,))
+    timer.daemon = True
+    _waiting.append(timer)
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+        _waiting.remove(timer)
+
+
+def _say(what: str) -> None:
+    print(f"surgical-marl: preparing {what}", file=sys.stderr, flush=True)
 
 
 def _has_widgets() -> bool:

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import mujoco
 import numpy as np
 
+from surgical_marl.robots.spec import PAD_GROUP
+
 if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv
     from surgical_marl.scenes.scene import Scene
@@ -36,9 +38,18 @@ class Push(NamedTuple):
     place: np.ndarray
     """In the world, [3], m."""
     direction: np.ndarray
-    """Unit vector from the first shape to the second one, [3]."""
+    """Unit vector from the first shape into the second one, [3]: this way the first one pushes."""
     force: float
     """Normal force, N."""
+
+
+class Grip(NamedTuple):
+    """A finger of a jaw that presses on an object."""
+
+    arm: int
+    """Number of the arm."""
+    push: Push
+    """Of the finger on the object."""
 
 
 class Moment(NamedTuple):
@@ -60,6 +71,8 @@ class Moment(NamedTuple):
     """For each environment; None in a scene of one arm."""
     pushes: list[list[Push]]
     """Contacts of arms in the last step, for each environment."""
+    grips: list[list[Grip]]
+    """Fingers that pressed on free objects at the end of the last step, for each environment."""
 
 
 class Observer:
@@ -72,6 +85,18 @@ class Observer:
         self._geoms = list(zip(scene.model.pair_geom1.tolist(), scene.model.pair_geom2.tolist(), strict=True))
         self._between = [k for k, (one, other) in enumerate(names) if _owner(one) != _owner(other)]
         self._sites = [scene.model.site(f"{agent}/tool_tip").id for agent in scene.agents]
+        self._fingers = [
+            (arm, int(geom))
+            for arm, agent in enumerate(scene.agents)
+            for geom in np.flatnonzero(scene.model.geom_group == PAD_GROUP)
+            if _owner(scene.model.geom(int(geom)).name) == agent
+        ]
+        """Number of the arm and geom of each finger, in the order of `env.grip_forces`."""
+        self._shapes = [
+            [scene.model.geom(f"{name}/{number}").id for number in range(len(place.object.shapes))]
+            for name, place in scene.free_objects.items()
+        ]
+        """Geoms of each free object."""
 
     def look(self, env: BatchedEnv, forces: Any = None) -> Moment:
         """Return what there is to see now.
@@ -86,14 +111,17 @@ class Observer:
         tips = np.empty((count, len(self._sites), 3))
         nearest: list[Near | None] = []
         pushes: list[list[Push]] = []
+        grips: list[list[Grip]] = []
+        pressed = env.grip_forces
         for row in range(count):
             self._place(qpos[row], poses.origin[row], poses.quaternion[row])
             positions[row], quaternions[row] = self._data.xpos, self._data.xquat
             tips[row] = self._data.site_xpos[self._sites]
             nearest.append(self._nearest())
             pushes.append([] if forces is None else self._pushes(np.asarray(forces)[row]))
+            grips.append(self._grips(pressed[row]))
         marks = np.asarray(marks, float) if marks.size else np.zeros((count, 0, 3))
-        return Moment(positions, quaternions, tips, poses.origin, env.held, marks, nearest, pushes)
+        return Moment(positions, quaternions, tips, poses.origin, env.held, marks, nearest, pushes, grips)
 
     def _place(self, qpos: np.ndarray, origins: np.ndarray, quaternions: np.ndarray) -> None:
         data = self._data
@@ -101,23 +129,37 @@ class Observer:
         mujoco.mj_kinematics(self._scene.model, data)
 
     def _nearest(self) -> Near | None:
-        lines = [self._line(k) for k in self._between]
+        lines = [self._line(*self._geoms[k]) for k in self._between]
         return min(lines, key=lambda line: line.distance) if lines else None
 
-    def _line(self, pair: int) -> Near:
+    def _line(self, one: int, other: int) -> Near:
         ends = np.zeros(6)
-        distance = mujoco.mj_geomDistance(self._scene.model, self._data, *self._geoms[pair], FAR, ends)
+        distance = mujoco.mj_geomDistance(self._scene.model, self._data, one, other, FAR, ends)
         return Near(float(distance), ends.reshape(2, 3))
 
     def _pushes(self, forces: np.ndarray) -> list[Push]:
+        return [
+            _push(self._line(*self._geoms[pair]), float(forces[pair])) for pair in np.flatnonzero(forces > 0).tolist()
+        ]
+
+    def _grips(self, forces: np.ndarray) -> list[Grip]:
+        """Return which fingers press on which objects where their surfaces are nearest; forces [k, fingers], N."""
         found = []
-        for pair in np.flatnonzero(forces > 0):
-            start, end = self._line(int(pair)).ends
-            way = end - start
-            length = float(np.linalg.norm(way))
-            direction = way / length if length > 1e-9 else np.array([0.0, 0.0, 1.0])
-            found.append(Push((start + end) / 2, direction, float(forces[pair])))
+        for item, finger in np.argwhere(forces > 0).tolist():
+            arm, pad = self._fingers[finger]
+            lines = [self._line(pad, geom) for geom in self._shapes[item]]
+            line = min(lines, key=lambda line: line.distance)
+            found.append(Grip(arm, _push(line, float(forces[item, finger]))))
         return found
+
+
+def _push(line: Near, force: float) -> Push:
+    """Return what the first shape does to the second one at the shortest line between the two."""
+    start, end = line.ends
+    way = start - end if line.distance < 0 else end - start  # shapes that overlap have each end inside the other
+    length = float(np.linalg.norm(way))
+    direction = way / length if length > 1e-9 else np.array([0.0, 0.0, 1.0])
+    return Push((start + end) / 2, direction, force)
 
 
 def _owner(geom: str) -> str:

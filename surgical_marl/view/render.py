@@ -64,7 +64,8 @@ class Renderer:
 
     Args:
         model: whose geoms are primitives or meshes.
-        width, height: of a picture, pixels.
+        width: of a picture, pixels.
+        height: likewise.
         stage: shapes besides those of the model, such as a table.
         paint: geom -> rgb in place of its own.
 

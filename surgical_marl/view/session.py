@@ -117,6 +117,8 @@ class Session:
             ValueError: that can't be done; nothing has changed then.
         """
         self.movers.set(agent, who, self.observations)
+        if who not in self.choices:
+            self.choices.append(who)
         if self._take is not None:
             self._take.moved_by(agent, who)
 

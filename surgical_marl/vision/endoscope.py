@@ -60,7 +60,8 @@ class Endoscope:
         scene: a scene of which an arm has a `camera`.
         num_envs: N.
         device: "cpu" or "cuda".
-        width, height: of a picture, pixels. The field of view is the arm's, from top to bottom.
+        width: of a picture, pixels.
+        height: likewise. The field of view is the arm's, from top to bottom.
         stereo: both eyes; else the left one.
         channels: what to draw, of `CHANNELS`.
         agent: whose camera; None for the first agent that has one.

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,8 @@ KEYS = {
     "pageup": (0, 0, STEP), "pagedown": (0, 0, -STEP),
 }  # fmt: skip
 JAW_KEY = "J"
+ALL = "all arms"
+"""On the button that lets a run move them all."""
 _DIGITS = 4
 """Digits of a joint's position, rad or m, in a slider."""
 _QUIET = 0.5
@@ -37,19 +40,27 @@ class Arms:
         self._menus: dict[str, Any] = {}
         self._folders: dict[str, Any] = {}
         self._controls: dict[str, Controls] = {}
+        self._told = dict(session.movers.who)
+        """Who moves the arms as the menus were last told."""
         with folder:
             for agent in session.env.agents:
                 self._folders[agent] = server.gui.add_folder(agent)
                 with self._folders[agent]:
                     self._menus[agent] = self._menu(agent)
+            self._add_run()
         self._keys()
 
-    def sync(self) -> None:
-        """Show who moves the arms and what a person wants, as the session has it."""
+    def sync(self, refused: bool = False) -> None:
+        """Show who moves the arms and what a person wants, as the session has it.
+
+        What was just chosen in a menu stays there until the session has heard of it, unless it was refused.
+        """
         movers = self._session.movers
         for agent, menu in self._menus.items():
-            if menu.value != movers.who[agent]:
-                menu.value = movers.who[agent]
+            if len(menu.options) != len(self._session.choices):
+                menu.options = tuple(self._session.choices)
+            if self._told[agent] != movers.who[agent] or (refused and menu.value != movers.who[agent]):
+                self._told[agent] = menu.value = movers.who[agent]
             if agent in self._controls and movers.who[agent] != YOU:
                 self._controls.pop(agent).remove()
             elif agent in movers.hands and agent not in self._controls:
@@ -66,9 +77,29 @@ class Arms:
         @menu.on_update
         async def _(event: Any) -> None:
             if event.client is not None:
-                self._ask(lambda: self._session.set_mover(agent, str(menu.value)))
+                wanted = str(menu.value)
+                self._ask(lambda: self._session.set_mover(agent, wanted))
 
         return menu
+
+    def _add_run(self) -> None:
+        """Add a field for a policy that no menu has, as one that was just trained, and a button for each arm."""
+        gui, agents = self._server.gui, self._session.env.agents
+        name = gui.add_text("run folder", "", hint="of a training for this task and scene, as in runs/reach-psm")
+        arms = gui.add_button_group("moves", agents if len(agents) == 1 else (*agents, ALL))
+
+        @arms.on_click
+        async def _(event: Any) -> None:
+            if event.client is not None:
+                run, chosen = str(name.value).strip(), str(arms.value)
+                self._ask(lambda: self._let_run(run, agents if chosen == ALL else [chosen]))
+
+    def _let_run(self, run: str, agents: Sequence[str]) -> None:
+        """Let a run move arms; ValueError if it can't, and then nobody else does."""
+        if not run:
+            raise ValueError("type the folder of a run into the field above first, such as runs/reach-psm")
+        for agent in agents:
+            self._session.set_mover(agent, str(Path(run).expanduser()))
 
     def _keys(self) -> None:
         """Let keys move the first arm that a person moves."""

@@ -13,12 +13,12 @@ import trimesh
 from surgical_marl.tasks.base.task import APPROACH
 from surgical_marl.view.browser.shapes import body_glb
 from surgical_marl.view.colours import AGENTS, GOAL_RADIUS
-from surgical_marl.view.moment import Moment
+from surgical_marl.view.moment import Moment, Push
 from surgical_marl.view.paths import Paths
 from surgical_marl.view.session import Session
 
 RED, GREY, GOLD = np.array([226, 40, 40]), np.array([120, 130, 140]), np.array([226, 168, 20])
-PARTS = ("targets", "paths", "trails", "trocars", "contacts", "distance")
+PARTS = ("targets", "paths", "trails", "trocars", "contacts", "grips", "distance")
 """What can be hidden, beside arms and objects."""
 ROOM = 0.7
 """Between environments that stand side by side, m, beside what the frames of their bodies take."""
@@ -93,7 +93,11 @@ class Nodes:
         if self._shown["distance"]:
             self._draw_distances(moment)
         if self._shown["contacts"]:
-            self._draw_contacts(moment)
+            pushes = [[(push, RED) for push in own] for own in moment.pushes]
+            self._draw_forces(self._arrows, pushes)
+        if self._shown["grips"]:
+            grips = [[(grip.push, colour(grip.arm)) for grip in own] for own in moment.grips]
+            self._draw_forces(self._presses, grips, ahead=False)
 
     def draw_trails(self) -> None:
         """Show trails and paths: seldom enough that a browser keeps up with their points."""
@@ -181,15 +185,19 @@ class Nodes:
             )
 
         self._trails, self._lines, self._ways = line("/trails", 3.0), line("/distance", 2.5), line("/paths", 1.5)
-        self._arrows = self._scene.add_arrows(
-            "/contacts", _NONE, np.zeros((0, 3), np.uint8), shaft_radius=0.0012, head_radius=0.003, head_length=0.006
-        )
+
+        def arrows(name: str, shaft: float) -> Any:
+            size = {"shaft_radius": shaft, "head_radius": 2.5 * shaft, "head_length": 5 * shaft}
+            return self._scene.add_arrows(name, _NONE, np.zeros((0, 3), np.uint8), **size)
+
+        self._arrows, self._presses = arrows("/contacts", 0.0012), arrows("/grips", 0.0008)
         self._parts = {
             "targets": [] if self._marks is None else [self._marks],
             "paths": [self._ways],
             "trails": [self._trails],
             "trocars": self._trocars,
             "contacts": [self._arrows],
+            "grips": [self._presses],
             "distance": [self._lines],
         }
 
@@ -199,15 +207,16 @@ class Nodes:
             colours = np.array([[distance_colour(line.distance)] * 2 for line, _ in near])
             _set(self._lines, np.array([line.ends + offset for line, offset in near]), colours)
 
-    def _draw_contacts(self, moment: Moment) -> None:
-        arrows = [
-            (push.place + offset, push.place + offset + push.direction * min(0.05, 0.008 + 0.002 * push.force))
-            for pushes, offset in zip(moment.pushes, self.offsets, strict=True)
-            for push in pushes
-        ]
-        if arrows or len(self._arrows.points):
-            points = np.array(arrows) if arrows else _NONE
-            _set(self._arrows, points, np.tile(RED, (len(points), 1)))
+    def _draw_forces(self, handle: Any, pushes: list[list[tuple[Push, np.ndarray]]], ahead: bool = True) -> None:
+        """Draw arrows of forces and their colours, for each environment: from where they act, or up to there."""
+        points, colours = [], []
+        for own, offset in zip(pushes, self.offsets, strict=True):
+            for push, rgb in own:
+                place, way = push.place + offset, push.direction * min(0.05, 0.008 + 0.002 * push.force)
+                points.append((place, place + way) if ahead else (place - way, place))
+                colours.append(rgb)
+        if points or len(handle.points):
+            _set(handle, np.array(points) if points else _NONE, np.array(colours).reshape(-1, 3))
 
     def _draw_paths(self, paths: np.ndarray) -> None:
         arms = range(paths.shape[2])

@@ -43,14 +43,17 @@ class Panel:
 
     def __init__(self, server: Any, session: Session, pace: Pace, ask: Callable[[Callable[[], None]], None]) -> None:
         self._gui, self._session, self._pace, self._ask = server.gui, session, pace, ask
+        self._told = session.seed
+        """The seed that the page was last told."""
         self._make_time()
         self._status = self._gui.add_html(status(session))
 
     def sync(self) -> None:
         """Show how things are."""
         self._status.content = status(self._session, self._pace.paused)
-        if self._seed.value != self._session.seed:
-            self._seed.value = self._session.seed
+        if self._told != self._session.seed:  # and not whenever it is another one: somebody may just have typed it
+            self._told = self._session.seed
+            self._seed.value = self._told
 
     def add_parts(self, folder: Any, nodes: Nodes) -> None:
         """Add a box for each part of the scene that can be hidden."""
@@ -67,7 +70,7 @@ class Panel:
         gui, pace = self._gui, self._pace
         buttons = gui.add_button_group("time", (GO, STEP, RESET), hint="keys: space, N, R")
         speed = gui.add_dropdown("speed", SPEEDS, initial_value=f"{pace.speed:g}")
-        self._seed = gui.add_number("seed", self._session.seed, min=0, max=2**31 - 1, step=1)
+        self._seed = gui.add_number("seed", self._told, min=0, max=2**31 - 1, step=1)
 
         def turn() -> None:
             pace.paused = not pace.paused

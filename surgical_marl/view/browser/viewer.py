@@ -109,6 +109,7 @@ class Viewer:
         self._say("Preparing", f"{choice.task} on {choice.scene}", 5)
         try:
             settings, who = _settings(choice, old)
+            self._further = tuple(dict.fromkeys([*self._further, *old.choices]))  # with runs that a person named
             self.session = Session(settings, who, choice.num_envs, self._record, self._further)
         except ValueError:
             self._show()  # with menus that say what is looked at
@@ -121,7 +122,7 @@ class Viewer:
             act()
         except ValueError as error:
             self._say("Not possible", str(error), 10, color="red")
-            self._arms.sync()
+            self._arms.sync(refused=True)
 
     def _say(self, title: str, text: str, seconds: float, **look: Any) -> None:
         for client in self.server.get_clients().values():
