@@ -309,8 +309,8 @@ class Task(ObjectTask):
         """Return the terms of every task with objects, and the grip that is at hand: `to_grasp` and `grasp_axis`.
 
         A block can be gripped at three bars, and which of them turns the tool least jumps as the block is turned. A
-        network that is to say it from the block's pose alone wavers between two of them (docs/tuning.md). At `hard` there
-        are the terms of the block whose turn it is, too.
+        network that is to say it from the block's pose alone wavers between two of them (docs/tuning.md). At `hard`
+        there are the terms of the block whose turn it is, too.
         """
         far, one = np.full(3, FAR), np.ones(3)
         grasp = {
@@ -328,7 +328,7 @@ class Task(ObjectTask):
         return found
 
     def observes(self, agent: str) -> tuple[str, ...]:
-        """Return the terms of every such task, and those of the grip after `to_object`; an arm without a jaw has none."""
+        """Return the terms of every such task, and after `to_object` those of the grip, if the arm has a jaw."""
         names = super().observes(agent)
         after = names.index("to_object") + 1
         grips = self.scene.mounts[agent].arm.jaw is not None
