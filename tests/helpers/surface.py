@@ -2,7 +2,7 @@
 
     python -m tests.helpers.surface       # write tests/public_surface.json anew, after a change that is meant
 
-Nothing here is a list kept by hand: names come from the pages in docs/api, commands from the parser, settings from their
+No list here is kept by hand: names come from the pages in docs/api, commands from the parser, settings from their
 dataclass, ids from the registries, and the rest from what environments, evaluations and runs return.
 """
 
@@ -75,7 +75,7 @@ def documented() -> list[str]:
 
 
 def names() -> Iterator[tuple[str, Any]]:
-    """Each documented name, and those of `surgical_marl` itself, with its signature; of a class those of its members."""
+    """Documented names and those of `surgical_marl` itself with their signatures; of classes those of their members."""
     for path in {*documented(), *(f"surgical_marl.{name}" for name in dir(sm) if not name.startswith("__"))}:
         found: Any = locate(path)
         if isinstance(found, type):
