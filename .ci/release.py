@@ -1,8 +1,9 @@
 """Build what is published, and try it as a user gets it: `make release`.
 
 Writes into dist/: the wheel, the source archive, and sbom.cdx.json, a list of what the wheel brings along, in
-CycloneDX's format. The wheel is installed into a new environment outside of the repository, every file of its dependencies checked
-against constraints.hashes.txt, and there it lists, trains, evaluates, and is type-checked from a client's program.
+CycloneDX's format. The wheel is installed into a new environment outside of the repository, every file of its
+dependencies checked against constraints.hashes.txt. There it lists, trains and evaluates, and mypy reads its types from
+a client's program.
 """
 
 from __future__ import annotations
