@@ -16,7 +16,6 @@ import surgical_marl as sm
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.evaluation.evaluate import evaluate
 from surgical_marl.learning import train
-from surgical_marl.plugins.tasks import TASKS, scenes_for
 from surgical_marl.policies.policy import load_policy
 from surgical_marl.runs.environment import make_env
 from surgical_marl.runs.folder import read_metrics
@@ -24,6 +23,7 @@ from surgical_marl.runs.settings import Settings
 from tests.helpers.devices import needs_cuda
 from tests.helpers.processes import end, start
 from tests.helpers.runs import SMALL, same_state
+from tests.helpers.surface import first_scene
 
 TRAINING = replace(SMALL, num_envs=16, iterations=2, max_steps=12, engine="fused")
 """On a real scene: episodes end within an iteration, and checkpoints are of the end alone."""
@@ -68,10 +68,6 @@ def in_processes(function: Any, *calls: tuple[Any, ...], first: bool, **environm
         found.append(said.get())
         assert end([process]) == [0]
     return found
-
-
-def first_scene(task: str) -> str:
-    return TASKS.load(task).default_scene or scenes_for(task)[0]
 
 
 def test_an_environment_is_bit_equal_in_every_process() -> None:

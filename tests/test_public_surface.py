@@ -41,10 +41,15 @@ def test_a_seed_leads_to_the_numbers_that_it_led_to() -> None:
     check(surface.environment("reach", "psm"), KEPT["reach on psm"])
 
 
+def test_an_evaluation_has_the_keys_that_it_had() -> None:
+    check(surface.evaluation("reach", "psm"), KEPT["json of eval, reach on psm"])
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("task", list_tasks())
 def test_each_task_gives_what_it_gave(task: str) -> None:
     check(surface.environment(task), KEPT["environments"][task])
+    check(surface.evaluation(task), KEPT["json of eval"][task])
 
 
 @pytest.mark.slow

@@ -27,13 +27,9 @@ import gymnasium
 import numpy as np
 
 import surgical_marl as sm
-from surgical_marl.bench import face, learning, render, sim
 from surgical_marl.cli import main as cli
-from surgical_marl.learning import train
 from surgical_marl.plugins.tasks import TASKS, scenes_for
-from surgical_marl.runs.folder import METRICS, read_metrics
 from surgical_marl.runs.settings import Settings
-from tests.helpers.runs import SMALL, fake_env
 
 ROOT = Path(__file__).parents[2]
 FILE = ROOT / "tests/public_surface.json"
@@ -53,7 +49,7 @@ def quick() -> dict[str, Any]:
         "content": {kind: found() for kind, found in cli._LISTS.items() if kind != "policies"},
         "commands": dict(commands(cli._parser(), "surgical-marl")),
         "settings": dict(settings(Settings)),
-        "json of bench": {f"{of.__module__}.{of.__name__}": record(of) for of in BENCHES},
+        "json of bench": benches(),
         "run folder": run_folder(),
     }
 
@@ -63,7 +59,9 @@ def whole() -> dict[str, Any]:
     return {
         **quick(),
         "reach on psm": environment("reach", "psm"),
+        "json of eval, reach on psm": evaluation("reach", "psm"),
         "environments": {task: environment(task) for task in sm.list_tasks()},
+        "json of eval": {task: evaluation(task) for task in sm.list_tasks()},
         "crossplay": of_teams(),
     }
 
@@ -155,15 +153,20 @@ def settings(of: type, prefix: str = "") -> Iterator[tuple[str, str]]:
             yield f"{prefix}{item.name}", f"{text(item.type)} = {default!r}"
 
 
-BENCHES = (sim.Speed, learning.Speed, render.Rendering, render.Pictures, face.Face)
+def benches() -> dict[str, list[str]]:
+    """The keys of what each benchmark prints."""
+    from surgical_marl.bench import face, learning, render, sim  # with torch, which `environment` does without
 
-
-def record(of: type) -> list[str]:
-    return [item.name for item in dataclasses.fields(of)]
+    kinds = (sim.Speed, learning.Speed, render.Rendering, render.Pictures, face.Face)
+    return {f"{of.__module__}.{of.__name__}": [item.name for item in dataclasses.fields(of)] for of in kinds}
 
 
 def run_folder() -> dict[str, Any]:
     """Files that a training leaves, and the columns of its metrics."""
+    from surgical_marl.learning import train
+    from surgical_marl.runs.folder import METRICS, read_metrics
+    from tests.helpers.runs import SMALL, fake_env
+
     with tempfile.TemporaryDirectory() as folder, mock.patch.object(train, "make_env", fake_env), silent():
         out = Path(folder) / "run"
         train.train(dataclasses.replace(SMALL, iterations=1), out=out)
@@ -196,7 +199,7 @@ def environment(task: str, scene: str | None = None) -> dict[str, Any]:
     Fingerprints are sums with fixed weights, and no hashes: another processor rounds last digits in another way, which
     changes all of a hash.
     """
-    scene = scene or TASKS.load(task).default_scene or scenes_for(task)[0]
+    scene = scene or first_scene(task)
     env = sm.parallel_env(task, scene=scene, engine="fused", device="cpu")
     rng = np.random.default_rng(0)
     first, _ = env.reset(seed=0)
@@ -218,16 +221,24 @@ def environment(task: str, scene: str | None = None) -> dict[str, Any]:
         }
         for agent in env.possible_agents
     }
-    evaluation = printed("eval", "zero", "--task", task, "--scene", scene, "--episodes", "2", "--json")
     return {
         "name": env.metadata["name"],
         "scene": scene,
         "max_steps": env.max_cycles,
         "agents": agents,
         "state": {"size": env.state_space.shape[0], "numbers": {"last": fingerprint(env.state())}},
-        "eval": sorted(evaluation),
-        "eval of an agent": sorted(next(iter(evaluation["agents"].values()))),
     }
+
+
+def evaluation(task: str, scene: str | None = None) -> dict[str, list[str]]:
+    """The keys of an evaluation of a task, and of one of its agents."""
+    scene = scene or first_scene(task)
+    found = printed("eval", "zero", "--task", task, "--scene", scene, "--episodes", "2", "--json")
+    return {"all": sorted(found), "agent": sorted(next(iter(found["agents"].values())))}
+
+
+def first_scene(task: str) -> str:
+    return TASKS.load(task).default_scene or scenes_for(task)[0]
 
 
 def fingerprint(found: Any) -> Any:
