@@ -41,7 +41,7 @@ def asked(name: str, versions: str) -> str:
     bounds = allowed()[name]
     oldest = re.search(r">=([\d.]+)", bounds)
     assert oldest
-    return f"{name}{bounds}" if versions == "newest" else f"{name}=={oldest[1]}.*"
+    return f"{name}{bounds}" if versions == "newest" else f"{name}=={oldest[1]}"
 
 
 def run(*command: str | Path, **environment: str) -> subprocess.CompletedProcess[str]:

@@ -56,7 +56,7 @@ def test_an_audit_that_looked_at_nothing_says_so() -> None:
 
 def test_the_oldest_and_the_newest_versions_are_those_of_the_project() -> None:
     matrix = script("matrix")
-    assert matrix.asked("gymnasium", "oldest") == "gymnasium==1.1.*"
+    assert matrix.asked("gymnasium", "oldest") == "gymnasium==1.1"
     assert all(matrix.asked(name, "newest").startswith(f"{name}>=") for name in matrix.NAMES)
 
 
