@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-import multiprocessing
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,7 +19,7 @@ from surgical_marl.runs.environment import make_env
 from surgical_marl.runs.folder import read_metrics
 from surgical_marl.runs.settings import Settings
 from tests.helpers.devices import needs_cuda
-from tests.helpers.processes import end, start
+from tests.helpers.processes import answer
 from tests.helpers.runs import SMALL, same_state
 from tests.helpers.surface import first_scene
 
@@ -48,39 +46,24 @@ def episodes(task: str, scene: str, engine: str, device: str, seed: int = 0, num
     return digest.hexdigest()
 
 
-def trained(settings: Settings, out: Path, said: Any = None) -> None:
-    """Train and evaluate, for a process of its own; say what the evaluation says."""
+def trained(settings: Settings, out: Path) -> str:
+    """Train, evaluate, and return what the evaluation says."""
     train.train(settings, out=out)
     env = make_env(replace(settings, goals="held_out"), num_envs=4)
-    said.put(json.dumps(evaluate(env, load_policy(out, env), episodes=4, seed=0)))
-
-
-def hashed(said: Any, *arguments: Any) -> None:
-    said.put(episodes(*arguments))
-
-
-def in_processes(function: Any, *calls: tuple[Any, ...], first: bool, **environment: Any) -> list[Any]:
-    """What a function puts into a queue in a new process for each call; the queue is its first or last argument."""
-    found = []
-    for call in calls:
-        said = multiprocessing.get_context("forkserver").SimpleQueue()
-        process = start(function, *((said, *call) if first else (*call, said)), **environment)
-        found.append(said.get())
-        assert end([process]) == [0]
-    return found
+    return json.dumps(evaluate(env, load_policy(out, env), episodes=4, seed=0))
 
 
 def test_an_environment_is_bit_equal_in_every_process() -> None:
     call = "reach", "psm", "fused", "cpu"
-    assert in_processes(hashed, call, first=True) == [episodes(*call)]
+    assert answer(episodes, *call) == episodes(*call)
     assert episodes(*call, 1) != episodes(*call)
 
 
 def test_training_and_evaluation_are_bit_equal_in_every_process(tmp_path: Path) -> None:
     one, other = tmp_path / "one", tmp_path / "other"
-    results = in_processes(trained, (TRAINING, one), (TRAINING, other), first=False)
+    first, second = (answer(trained, TRAINING, out) for out in (one, other))
     assert same_state(one, other)
-    assert results[0] == results[1] and '"median_error_mm": ' in results[0]
+    assert first == second and '"median_error_mm": ' in first
 
 
 @pytest.mark.slow
@@ -89,8 +72,7 @@ def test_training_and_evaluation_are_bit_equal_in_every_process(tmp_path: Path) 
 def test_each_task_is_bit_equal_also_where_it_was_just_compiled(task: str, engine: str, tmp_path: Path) -> None:
     """Once more from the caches of this machine, and once with caches that are empty."""
     call = task, first_scene(task), engine, "cpu"
-    again = in_processes(hashed, call, first=True)
-    assert again == in_processes(hashed, call, first=True, XDG_CACHE_HOME=tmp_path)
+    assert answer(episodes, *call) == answer(episodes, *call, XDG_CACHE_HOME=tmp_path)
     assert list(tmp_path.glob("surgical-marl/*")), "it used other caches"
 
 
@@ -98,15 +80,15 @@ def test_each_task_is_bit_equal_also_where_it_was_just_compiled(task: str, engin
 @pytest.mark.parametrize("task", sm.list_tasks())
 def test_on_a_gpu_each_task_is_bit_equal_in_every_process(task: str) -> None:
     call = task, first_scene(task), "fused", "cuda", 0, 1024
-    one, other = in_processes(hashed, call, call, first=True)
-    assert one == other
+    one, other = (answer(episodes, *call) for _ in range(2))
+    assert one and one == other
 
 
 @needs_cuda
 def test_on_a_gpu_training_stays_within_bounds(tmp_path: Path) -> None:
     """Sums of gradients are added in an order that varies: two runs of a seed begin alike and end alike."""
     one, other = tmp_path / "one", tmp_path / "other"
-    in_processes(trained, (MANY, one), (MANY, other), first=False)
+    assert all(answer(trained, MANY, out) for out in (one, other))
     rewards = np.array([[row["reward"] for row in read_metrics(run)] for run in (one, other)])
     apart = np.abs(rewards[0] - rewards[1]) / np.abs(rewards).max(0)
     assert apart[0] <= FIRST and apart.max() <= LATER, apart
