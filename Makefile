@@ -2,6 +2,10 @@
 # make test    set up .venv, run the tests                                  (ARGS="-k cli")
 # make docs    set up .venv, write the site of the documentation into site/ (open site/index.html)
 # make gallery set up .venv, draw docs/gallery.md and its pictures again     (ARGS="--only psm reach")
+# make audit   known weaknesses and licences of all dependencies; skipped, and said so, where no service answers
+# make release build the wheel, try it in a new environment, list what it brings (SBOM): dist/
+# make matrix  tests with other versions of Python and of dependencies       (ARGS="--python 3.13")
+# make lock    constraints.hashes.txt, the hashes of all that constraints.txt names
 # make lint    style       make typecheck    types       make clean    remove what was built
 
 PYTHON ?= $(firstword $(shell command -v python3.11 python3 python))
@@ -9,10 +13,11 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 SITE_READY := $(VENV)/.ready-for-docs
+SUPPLY_READY := $(VENV)/.ready-for-supply
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help train test docs gallery lint typecheck clean
+.PHONY: help train test docs gallery audit release matrix lock lint typecheck clean
 
 help:
 	@sed -n 's/^# make/make/p' Makefile
@@ -30,6 +35,21 @@ docs: $(SITE_READY)
 
 gallery: $(READY)
 	$(BIN)/python -m surgical_marl.studies.gallery --results docs $(ARGS)
+
+audit: $(SUPPLY_READY)
+	@$(BIN)/python .ci/audit.py $(ARGS)
+
+release: $(SUPPLY_READY)
+	$(BIN)/python .ci/release.py
+
+matrix: $(SUPPLY_READY)
+	$(BIN)/python .ci/matrix.py $(ARGS)
+
+# For all platforms, by the index that uv uses; 3.11.5 is the oldest Python that all of the pinned versions take.
+lock: $(SUPPLY_READY)
+	$(BIN)/uv pip compile --quiet --universal --python-version 3.11.5 --no-deps --no-annotate --generate-hashes \
+	  --custom-compile-command "make lock" --default-index https://pypi.org/simple \
+	  --output-file constraints.hashes.txt constraints.txt
 
 lint: $(READY)
 	$(BIN)/ruff check .
@@ -54,4 +74,9 @@ $(READY): pyproject.toml constraints.txt
 # What the site is made of, which nothing else needs.
 $(SITE_READY): $(READY)
 	$(BIN)/python -m pip install --no-input --quiet --progress-bar off -c constraints.txt -e '.[docs]'
+	@touch $@
+
+# What looks after the dependencies, likewise.
+$(SUPPLY_READY): $(READY)
+	$(BIN)/python -m pip install --no-input --quiet --progress-bar off -c constraints.txt -e '.[supply]'
 	@touch $@

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from surgical_marl.content import list_arms, list_objects, list_policies, list_scenes
 from surgical_marl.interfaces.registration import register_ids, register_task
 from surgical_marl.plugins.algorithms import list_algorithms, register_algorithm
-from surgical_marl.plugins.tasks import list_tasks
+from surgical_marl.plugins.tasks import list_tasks, module_name
 
 if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv
@@ -73,4 +73,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return [*__all__, *(f"{task}_v0" for task in list_tasks()), "__version__"]
+    return [*__all__, *map(module_name, list_tasks()), "__version__"]

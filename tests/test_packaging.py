@@ -40,6 +40,7 @@ def test_a_wheel_carries_code_and_content(tmp_path: Path) -> None:
     names = set(zipfile.ZipFile(wheel).namelist())
     assert {
         "surgical_marl/cli/main.py",
+        "surgical_marl/py.typed",
         "surgical_marl/content/arms/psm/arm.yaml",
         "surgical_marl/content/arms/psm/psm.urdf",
         "surgical_marl/content/scenes/bimanual_psm.yaml",
@@ -58,7 +59,14 @@ def test_an_editable_install_carries_no_copy(tmp_path: Path) -> None:
 def test_every_dependency_is_pinned() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extras = project["optional-dependencies"]
-    wanted = [*project["dependencies"], *extras["test"], *extras["docs"], *extras["tune"], *extras["view"]]
+    wanted = [
+        *project["dependencies"],
+        *extras["test"],
+        *extras["docs"],
+        *extras["tune"],
+        *extras["view"],
+        *extras["supply"],
+    ]
     lines = (ROOT / "constraints.txt").read_text().splitlines()
     pins = {line.split("==")[0].lower() for line in lines if not line.startswith("#")}
     for requirement in wanted:

@@ -21,6 +21,7 @@ from pettingzoo import ParallelEnv
 
 from surgical_marl.envs.actions import check_actions
 from surgical_marl.interfaces.rendering import MODES, Rendering, check_mode, check_size
+from surgical_marl.plugins.tasks import module_name
 
 if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv, BatchStep
@@ -41,7 +42,7 @@ class _Face:
     ) -> None:
         self.batch = batch
         self.metadata = {
-            "name": f"{batch.task_name}_v0",
+            "name": module_name(batch.task_name),
             "render_modes": render_modes,
             "render_fps": round(1 / batch.control_dt),
             "is_parallelizable": True,

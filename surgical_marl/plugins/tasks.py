@@ -11,6 +11,22 @@ TASKS = Registry(
     base="surgical_marl.tasks.base.task:Task",
 )
 
+VERSIONS: dict[str, int] = {}
+"""Versions of the tasks whose numbers are no longer those of their first release; every other task is at version 0."""
+
+
+def task_version(task: str) -> int:
+    """Return the number in the names of a task's environments, such as 0 of `reach_v0`.
+
+    It is raised when the same seed and actions no longer give the same numbers (docs/reliability.md).
+    """
+    return VERSIONS.get(task, 0)
+
+
+def module_name(task: str) -> str:
+    """Return the name of a task's module in `surgical_marl`, such as `reach_v0`."""
+    return f"{task}_v{task_version(task)}"
+
 
 def list_tasks() -> list[str]:
     """Return the names of all tasks: shipped ones, those of installed packages, and registered ones."""
