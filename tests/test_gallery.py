@@ -31,7 +31,7 @@ def test_the_page_shows_all_content_and_its_pictures_exist() -> None:
 
 def test_a_task_is_played_by_its_policy_or_by_the_oracle() -> None:
     assert gallery.player("reach") == ("reach-trimanual_psm_ecm", "trimanual_psm_ecm")
-    assert gallery.player("needle_pick") == ("oracle", "psm_needle")
+    assert gallery.player("peg_transfer") == ("oracle", "bimanual_psm_pegs")
 
 
 def test_objects_stand_on_the_ground_in_the_middle_of_their_picture() -> None:

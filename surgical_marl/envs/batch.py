@@ -9,10 +9,8 @@ An environment that ends starts its next episode within the same step.
 
 from __future__ import annotations
 
-import numbers
 import secrets
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -26,10 +24,10 @@ from surgical_marl.envs.actions import check_actions
 from surgical_marl.envs.env import Env
 from surgical_marl.envs.fault_place import FaultPlace, fault_place
 from surgical_marl.envs.free_objects import FreeObjects
+from surgical_marl.envs.meant_for import meant_for
 from surgical_marl.envs.observations import each, with_vector
+from surgical_marl.envs.seeds import check_seed, is_whole
 from surgical_marl.physics.views import Contacts
-from surgical_marl.plugins.tasks import TASKS, list_tasks
-from surgical_marl.scenes.load import load_scene
 from surgical_marl.scenes.poses import Poses
 
 if TYPE_CHECKING:
@@ -98,7 +96,7 @@ class BatchedEnv:
         arrays: str = "numpy",
         **options: Any,
     ) -> None:
-        if not _is_whole(num_envs) or num_envs < 1:
+        if not is_whole(num_envs) or num_envs < 1:
             raise ValueError(f"num_envs must be a whole number of at least 1, not {num_envs!r}")
         num_envs = int(num_envs)
         if engine not in ENGINES:
@@ -110,7 +108,9 @@ class BatchedEnv:
         try:
             self.env = Env(task, scene, **options)
         except ValueError as error:
-            raise ValueError(f"{error}{_meant_for(task, scene, str(error))}") from None
+            if more := meant_for(task, scene, error):
+                raise ValueError(f"{error}{more}") from None
+            raise
         self._engine: Engine | None = make_engine(self.env, num_envs, engine, device)
         self.num_envs, self.arrays = num_envs, arrays
         self.agents = list(self.env.agents)
@@ -231,7 +231,7 @@ class BatchedEnv:
         """
         engine = self.engine
         if mask is None and not isinstance(seed, Sequence | np.ndarray):
-            whole = _seed(seed)
+            whole = check_seed(seed)
             if whole is None and self._started:
                 engine.restart()
             else:
@@ -274,13 +274,13 @@ class BatchedEnv:
     def _keys(self, seed: Any, first: int) -> tuple[np.ndarray, np.ndarray]:
         """Return which environments get a seed, [N] bool, and the keys that the seeds lead to, [N, 2]."""
         if not isinstance(seed, Sequence | np.ndarray):
-            one = _seed(seed)
+            one = check_seed(seed)
             return np.full(self.num_envs, one is not None), episode_keys(one or 0, self.num_envs, first)
         if len(seed) != self.num_envs:
             raise ValueError(
                 f"a list of {len(seed)} seeds does not fit {self.num_envs} environments: give one for each"
             )
-        seeds = [_seed(own) for own in seed]
+        seeds = [check_seed(own) for own in seed]
         keys = np.concatenate([episode_keys(own or 0, 1) for own in seeds])
         return np.array([own is not None for own in seeds]), keys
 
@@ -294,10 +294,9 @@ class BatchedEnv:
             ValueError: an agent is missing or unknown, a shape is wrong, a value is not a finite number, no episode has
                 begun, or the environment is closed. Nothing has changed then.
         """
-        engine = self.engine
         self.step_raw(actions)
-        faults = engine.end_faulty(self.max_steps, self.arrays)
-        found = engine.outcome(self.arrays)
+        faults = self.engine.end_faulty(self.max_steps, self.arrays)
+        found = self.engine.outcome(self.arrays)
         if self._sight is not None:
             self._sight.show(found)
         return BatchStep(**{**found, "contacts": Contacts(**found["contacts"])}, faults=faults)
@@ -365,7 +364,7 @@ class BatchedEnv:
         return {name: np.array(self.engine.read(name, "numpy")) for name in self.engine.carry_shapes}
 
     def carry_tensors(self) -> dict[str, Any]:
-        """All that the next step depends on, as torch tensors on the device; nothing waits for it."""
+        """`carry()` as torch tensors on the device; nothing waits for it."""
         return {name: self.engine.read(name, "torch") for name in self.engine.carry_shapes}
 
     def set_carry(self, carry: dict[str, Any], mask: np.ndarray | None = None) -> None:
@@ -399,25 +398,3 @@ class BatchedEnv:
         if not self._started:
             raise ValueError("no episode yet: call reset() first")
         return engine.read(name, library)
-
-
-def _meant_for(task: str, scene: str, error: str) -> str:
-    """Return the scenes that a task is meant for, as the end of an error about a scene that is none of them."""
-    if task not in list_tasks() or "choose from" in error:
-        return ""
-    with suppress(ValueError):  # of a scene that fits no task
-        if (meant := TASKS.load(task).scenes) and load_scene(scene).name not in meant:
-            return f"; {task} is meant for the scenes {', '.join(meant)}"
-    return ""
-
-
-def _seed(seed: Any) -> int | None:
-    """Return a seed as an int, or None for none; ValueError if it is no whole number in range."""
-    if seed is not None and not (_is_whole(seed) and 0 <= seed < 2**63):
-        raise ValueError(f"seed must be a whole number from 0 to 2**63 - 1, not {seed!r}")
-    return None if seed is None else int(seed)
-
-
-def _is_whole(value: Any) -> bool:
-    """Whether a value is a whole number, of Python or of numpy."""
-    return isinstance(value, numbers.Integral) and not isinstance(value, bool)

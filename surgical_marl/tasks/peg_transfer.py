@@ -3,10 +3,8 @@
 The first task of the Fundamentals of Laparoscopic Surgery, on the board of the ICRA 2026 challenge.
 
 Agents        the arms of the scene. The first two whose jaws have pads move the block; if `easy` the first one alone.
-Observation   as in `needle_handover`, but for `to_useful`, and with `to_grasp`, the way from the tool tip to the middle
-              of the upper bar that is most along the tool, as it would be gripped, and `grasp_axis`, that bar's
-              direction, the way in which it is along the tool. The goal is where the middle of the block's underside
-              should be.
+Observation   as in `needle_handover`, but for `to_useful`; and the upper bar that is most along the tool: `to_grasp`,
+              from the tool tip, and `grasp_axis`. The goal is where the middle of the block's underside should be.
 Action        one number in [-1, 1] for every joint; the jaw opens above 0 and closes otherwise.
 Reward        the same for all arms, but for `clearance` and `collision`; weights in brackets. Progress over the best of
               the episode so far: `reach`, first tool to block (20 / m); `grasp` (2); `lift`, over 10 mm of height (2);
@@ -41,14 +39,14 @@ from surgical_marl.cache import cached
 from surgical_marl.runtime import jax, jnp
 from surgical_marl.scenes.poses import Pose
 from surgical_marl.tasks.base.blocks import OUT, as_numbers, find_pegs, upright
+from surgical_marl.tasks.base.grasp_terms import grasp_terms
 from surgical_marl.tasks.base.grips import frames
-from surgical_marl.tasks.base.object_task import FAR, NEAR, Best, Now, ObjectTask
+from surgical_marl.tasks.base.object_task import NEAR, Best, Now, ObjectTask
 from surgical_marl.tasks.base.object_terms import AT_HAND, PARTS, object_terms
 from surgical_marl.tasks.base.peg_script import SETTINGS, Transfer
 from surgical_marl.tasks.base.peg_trial import APART, POOL, Trial, Turns, draw_trials, in_turn
 from surgical_marl.tasks.base.script import Snapshot, Step
 from surgical_marl.tasks.base.task import Start
-from surgical_marl.tasks.base.terms import Term
 from surgical_marl.tasks.base.workspace import choose
 
 if TYPE_CHECKING:
@@ -56,7 +54,7 @@ if TYPE_CHECKING:
 
     from surgical_marl.scenes.scene import Scene
     from surgical_marl.tasks.base.options import Options
-    from surgical_marl.tasks.base.terms import Picture
+    from surgical_marl.tasks.base.terms import Picture, Term
     from surgical_marl.tasks.base.world import World
 
 ROWS = 2048
@@ -128,10 +126,6 @@ class Task(ObjectTask):
         if not self.level.handover:
             self.presenter, self.max_steps = self.picker, 300
         self._item = scene.objects[self.object].object
-        grasps = [site for name, site in self._item.sites.items() if name.startswith("grasp_")]
-        self._places = np.array([place for place, _ in grasps], np.float32)
-        self._bars = np.array([axes for _, axes in grasps], np.float32)
-        """Places [bars, 3] and axes [bars, 3, 3] of the upper bars, x along them, in the block's frame."""
         self._pegs = find_pegs(scene, options.task).astype(np.float32)
         about = repr((self.object, self.level, self.seed, SHIFT, OUT, SETTINGS, APART, POOL, TRIALS))
         content = about, scene.fingerprint, self._item.content
@@ -306,18 +300,9 @@ class Task(ObjectTask):
     # -- what agents observe
 
     def terms(self, agent: str) -> dict[str, Term | Picture]:
-        """Return the terms of every task with objects, and the grip that is at hand: `to_grasp` and `grasp_axis`.
-
-        A block can be gripped at three bars, and which of them turns the tool least jumps as the block is turned. A
-        network that is to say it from the block's pose alone wavers between two of them (docs/tuning.md). At `hard`
-        there are the terms of the block whose turn it is, too.
-        """
-        far, one = np.full(3, FAR), np.ones(3)
-        grasp = {
-            "to_grasp": Term(lambda world: self._grasp(world, agent)[0], -far, far, "object"),
-            "grasp_axis": Term(lambda world: self._grasp(world, agent)[1], -one, one, "object"),
-        }
-        found = {**super().terms(agent), **grasp}
+        """Return the terms of every task with objects and of the grip; at `hard` also those of the block in turn."""
+        body = lambda world: self.at_hand(world).objects[self.object]  # noqa: E731
+        found = {**super().terms(agent), **grasp_terms(self.scene.mounts[agent], agent, self._item, body)}
         if self.turns is None:
             return found
         own = object_terms(self.scene, agent)
@@ -333,19 +318,6 @@ class Task(ObjectTask):
         after = names.index("to_object") + 1
         grips = self.scene.mounts[agent].arm.jaw is not None
         return (*names[:after], *(("to_grasp", "grasp_axis") if grips else ()), *names[after:])
-
-    def _grasp(self, world: World, agent: str) -> tuple[Array, Array]:
-        """Return the way from a tool tip to the bar that is most along the tool, m, and its direction, [3] each.
-
-        Both in the arm's base frame; the direction is the one that is less than a right angle from the tool's x axis.
-        """
-        mount, body, view = self.scene.mounts[agent], self.at_hand(world).objects[self.object], world.arms[agent]
-        turn = mount.rotation.astype(np.float32)
-        along = self._bars[:, :, 0] @ (turn.T @ body.rotation).T
-        share = along @ view.tool_axes[:, 0]
-        best = jnp.argmax(jnp.abs(share))
-        places = body.position + body.size * self._places @ body.rotation.T - mount.position.astype(np.float32)
-        return (places @ turn)[best] - view.tool_tip, jnp.where(share[best] < 0, -along[best], along[best])
 
     def goal_content(self, goal: Any) -> list[np.ndarray]:
         """Return where the block begins and should be; at `hard` where all blocks begin, and all goals of the trial."""
