@@ -15,14 +15,12 @@ from surgical_marl.physics.views import ObjectView
 from surgical_marl.runtime import jnp
 from surgical_marl.scenes.objects import Object
 from surgical_marl.scenes.scene import Mount
+from surgical_marl.tasks.base.object_task import FAR
 from surgical_marl.tasks.base.terms import Term
 from surgical_marl.tasks.base.world import World
 
 if TYPE_CHECKING:
     from jax import Array
-
-FAR = 0.5
-"""Greatest distance that is observed, m."""
 
 
 def grasp_terms(mount: Mount, agent: str, item: Object, body: Callable[[World], ObjectView]) -> dict[str, Term]:
