@@ -47,6 +47,7 @@ class Scripted:
         """Control steps until the next one is planned."""
         self._pauses = np.array([round(step.wait / env.control_dt) for step in steps])
         """How many of these each step waits."""
+        self._paces = np.array([step.pace for step in steps])
         self.waits = np.zeros(env.num_envs, bool)
 
     def __call__(self, observations: Mapping[str, Any]) -> dict[str, Any]:
@@ -61,8 +62,7 @@ class Scripted:
             self._plan(due, began[due])
         self._left -= 1
         self.waits = self._left <= self._pauses[self._now]
-        pace = np.array([step.pace for step in self._steps])[self._now]
-        share = np.minimum(1.0, pace / np.maximum(self._furthest(), 1e-9))[:, None]
+        share = np.minimum(1.0, self._paces[self._now] / np.maximum(self._furthest(), 1e-9))[:, None]
         ways = {agent: share * self._tools[agent].way() for agent in self._led} | self._attend()
         moves = {agent: self._tools[agent].action(ways[agent]) for agent in self._moved}
         return {agent: like(seen[agent], without_words(env, move)) for agent, move in moves.items()}
@@ -74,7 +74,7 @@ class Scripted:
         every = np.arange(self._env.num_envs)
         wishes = self._env.task.attend(self._look(every))
         for agent in self._attending:
-            self._tools[agent].send(every, wishes[agent])
+            self._tools[agent].send([(every, wishes[agent])])
         return {agent: np.clip(self._tools[agent].way(), -1.0, 1.0) for agent in self._attending}
 
     def _furthest(self, rows: Any = slice(None)) -> np.ndarray:
@@ -94,13 +94,15 @@ class Scripted:
         self._now[due] = after
         for agent, tool in self._tools.items():
             tool.start(due[began], qpos[:, self._env.scene.qpos_index(agent)])
+        wishes: dict[str, list[tuple[np.ndarray, Wish]]] = {}
         for number in np.unique(after):
-            rows, step = np.flatnonzero(after == number), self._steps[number]
-            wishes = step.plan(_rows(snapshot, rows))
-            for agent, wish in wishes.items():
-                self._tools[agent].send(due[rows], wish)
-            furthest = self._furthest(due[rows])
-            self._left[due[rows]] = np.ceil(furthest / step.pace - 1e-6) + self._pauses[number] + 1
+            rows = np.flatnonzero(after == number)
+            for agent, wish in self._steps[number].plan(_rows(snapshot, rows)).items():
+                wishes.setdefault(agent, []).append((due[rows], wish))
+        for agent, wanted in wishes.items():
+            self._tools[agent].send(wanted)
+        steps_away = np.ceil(self._furthest(due) / self._paces[after] - 1e-6)
+        self._left[due] = steps_away + self._pauses[after] + 1
 
     def _look(self, due: np.ndarray) -> Snapshot:
         env = self._env
@@ -142,13 +144,22 @@ class _Tool:
         """Stay where the arm is in some environments, with a closed jaw."""
         self.q[rows], self.opens[rows] = qpos[rows], 0.0
 
-    def send(self, rows: np.ndarray, wish: Wish) -> None:
-        """Go where a wish [rows] says."""
-        if wish.joints is not None:
-            self.q[rows] = wish.joints
-        elif wish.tool is not None:
-            self.q[rows], _ = joints_at(self.mount, wish.tool, self.q[rows])
-        self.opens[rows] = wish.opens
+    def send(self, wanted: Sequence[tuple[np.ndarray, Wish]]) -> None:
+        """Go where wishes say, each for some environments [n].
+
+        Inverse kinematics of all of them is one call: its time is hardly longer for many than for a few.
+        """
+        home, poses, starts, places = self.mount.arm.home, [], [], []
+        for rows, wish in wanted:
+            self.opens[rows] = wish.opens
+            if wish.joints is not None:
+                self.q[rows] = wish.joints
+            elif wish.tool is not None:
+                poses.append(wish.tool)
+                starts.append(np.tile(home, (len(rows), 1)) if wish.from_home else self.q[rows])
+                places.append(rows)
+        if places:
+            self.q[np.concatenate(places)], _ = joints_at(self.mount, np.concatenate(poses), np.concatenate(starts))
 
     def way(self) -> np.ndarray:
         """Return how far the commands have to move, in units of an action of 1, [N, n]."""

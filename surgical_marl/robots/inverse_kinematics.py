@@ -30,8 +30,12 @@ FAR = 0.5
 least squares for inverse kinematics, 2005)."""
 LEAST_DAMPING = 1e-7
 """Damping in m2. It keeps steps finite at a singularity, and is too small to slow the last steps."""
+SETTLED = 1e-13
+"""A search in numpy ends where a step moves no joint by more, a share of its range. Rounding moves them by 1e-15."""
 CANDIDATES = 1024
 """Number of configurations spread over the joint ranges. A search also starts from those nearest to the target."""
+
+Step = Callable[[Any, Any, Any, Any], Any]
 
 
 def inverse_kinematics(
@@ -43,8 +47,9 @@ def inverse_kinematics(
     damped least squares methods", 2004) in joint coordinates that are shares of their ranges. The damping falls with
     the square of the error (T. Sugihara, "Solvability-unconcerned inverse kinematics by the Levenberg-Marquardt
     method", IEEE Transactions on Robotics 27, 2011). A joint that would leave its range rests at the limit. The search
-    runs from `start` and from the configurations of a fixed Halton set whose tips are nearest to the target. It always
-    takes `iterations` steps, so it runs under `jax.jit` and `jax.vmap`; in JAX call it from a compiled function.
+    runs from `start` and from the configurations of a fixed Halton set whose tips are nearest to the target. In JAX it
+    always takes `iterations` steps, so it runs under `jax.jit` and `jax.vmap`; call it from a compiled function there.
+    In numpy it ends earlier where steps no longer move the joints.
 
     Args:
         arm: the arm.
@@ -54,7 +59,7 @@ def inverse_kinematics(
             For positions the joints stay near it where they can.
         starts: from how many configurations to search, `start` among them. 1 is enough for targets near `start` and for
             nearly all positions. The time is proportional to this number.
-        iterations: steps from each.
+        iterations: steps from each, at most.
         length: weight of an orientation error relative to a position error, m/rad.
 
     Returns:
@@ -74,13 +79,14 @@ def inverse_kinematics(
     targets = targets[..., None, :] if targets.shape[-1] == 3 else targets[..., None, :, :]
     pull = PULL * (targets.shape[-1] == 3)
 
-    def step(i: Any, share: Any) -> Any:
-        error, jacobian = _residual(arm, lower + share * scale, targets, length)
+    def step(i: Any, share: Any, target: Any, first: Any) -> Any:
+        error, jacobian = _residual(arm, lower + share * scale, target, length)
         # the last half of the steps only has to reach the target
-        rest = pull * (2 * i < iterations) * (begin[..., None, :] - share)
+        rest = pull * (2 * i < iterations) * (first - share)
         return _step(share, error, jacobian * scale, rest).astype(share.dtype)
 
-    shares = _repeat(step, seeds, iterations, xp)
+    search = _search_each if xp is np else _search_all
+    shares = search(step, seeds, targets, begin[..., None, :], iterations, (iterations + 1) // 2 if pull else 0)
     error, _ = _residual(arm, lower + shares * scale, targets, length)
     error = xp.linalg.vector_norm(error, axis=-1)
     away = xp.linalg.vector_norm(shares - begin[..., None, :], axis=-1)
@@ -139,7 +145,7 @@ def _residual(arm: Arm, q: Any, targets: Any, length: float) -> tuple[Any, Any]:
     The error is [..., 3] for target points. For target poses it is [..., 6], and the last three are rotation vectors
     times `length`.
     """
-    pose, jacobian = arm.forward_kinematics(q), arm.jacobian(q)
+    pose, jacobian = arm.pose_and_jacobian(q)
     xp = pose.__array_namespace__()
     if targets.shape[-1] == 3:
         return targets - pose[..., :3, 3], jacobian[..., :3, :]
@@ -184,15 +190,38 @@ def _step(share: Any, error: Any, jacobian: Any, pull: Any) -> Any:
     return xp.clip(share + xp.clip(change, -STEP, STEP), 0.0, 1.0)
 
 
-def _repeat(step: Callable[[Any, Any], Any], state: Any, times: int, xp: Any) -> Any:
-    """Apply `step(i, state)` `times` times; in JAX as one loop, which compiles in the time of a single step."""
-    if xp is np:
-        for i in range(times):
-            state = step(i, state)
-        return state
+def _search_all(step: Step, shares: Any, targets: Any, begin: Any, iterations: int, free: int) -> Any:
+    """Take all steps of all searches, in JAX as one loop, which compiles in the time of a single step.
+
+    Args:
+        step: (number of a step, joint coordinates, targets, where searches began) -> the next joint coordinates.
+        shares: joint coordinates to start from, [..., starts, n].
+        targets: [..., 1, 3] or [..., 1, 4, 4].
+        begin: [..., 1, n].
+        iterations: steps.
+        free: from which step on nothing pulls a search back to where it began.
+    """
     from jax import lax
 
-    return lax.fori_loop(0, times, step, state)
+    return lax.fori_loop(0, iterations, lambda i, now: step(i, now, targets, begin), shares)
+
+
+def _search_each(step: Step, shares: Any, targets: Any, begin: Any, iterations: int, free: int) -> Any:
+    """Do what `_search_all` does, but end each search when it has settled: most of them need a third of the steps."""
+    many = shares.shape[:-1]
+    flat = shares.reshape(-1, shares.shape[-1]).copy()
+    kind = targets.shape[begin.ndim - 1 :]
+    targets = np.broadcast_to(targets, (*many, *kind)).reshape(-1, *kind)
+    begin = np.broadcast_to(begin, shares.shape).reshape(flat.shape)
+    going = np.arange(len(flat))
+    for i in range(iterations):
+        if not len(going):
+            break
+        before = flat[going]
+        flat[going] = after = step(i, before, targets[going], begin[going])
+        if i >= free:
+            going = going[np.abs(after - before).max(-1) > SETTLED]
+    return flat.reshape(shares.shape)
 
 
 @lru_cache(maxsize=64)

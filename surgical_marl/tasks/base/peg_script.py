@@ -115,7 +115,8 @@ class Transfer:
             return self._grip(seen, agent, self.aligned(seen.objects[self.name]), beyond)
 
         return (
-            Step(lambda seen: {agent: self._as_from_home(agent, grip(seen, -OVER)[agent])}, wait=0.1),
+            # From home, so that turns do not add up from block to block.
+            Step(lambda seen: {agent: grip(seen, -OVER)[agent]._replace(from_home=True)}, wait=0.1),
             Step(lambda seen: grip(seen, PAST), wait=0.1, pace=0.3),
             Step(lambda seen: {agent: Wish()}, wait=0.4, pace=0.3, good=holds, back=first),
             Step(lambda seen: _shifted(seen, agent, [0, 0, RAISE / 2]), pace=0.3, good=holds, back=first),
@@ -137,7 +138,7 @@ class Transfer:
             held = np.linalg.inv(seen.objects[self.name]) @ seen.tools[giver]
             taken = gripping(self.scene.mounts[taker], there, self.sites[self.taken(grip)], 0.0)
             waits = moved(taken, AWAY * across + [0.0, 0.0, OVER])
-            waiting = self._as_from_home(taker, Wish(waits, opens=WIDE))
+            waiting = Wish(waits, WIDE, from_home=True)
             return {giver: Wish(moved(there, way) @ held), taker: waiting}
 
         def take(seen: Snapshot, beyond: float) -> dict[str, Wish]:
@@ -178,11 +179,6 @@ class Transfer:
         """Return the bar [n] that is nearest to the giver's tool."""
         tool = (np.linalg.inv(seen.objects[self.name]) @ seen.tools[self.giver])[:, :3, 3]
         return np.asarray(np.linalg.norm(tool[:, None] - self.sites, axis=-1).argmin(1))
-
-    def _as_from_home(self, agent: str, wish: Wish) -> Wish:
-        """Return a wish with joint positions as from home, so that turns do not add up from block to block."""
-        assert wish.tool is not None
-        return Wish(joints=joints_at(self.scene.mounts[agent], wish.tool)[0], opens=wish.opens)
 
     def _grip(self, seen: Snapshot, agent: str, number: np.ndarray, beyond: float) -> dict[str, Wish]:
         tool = gripping(self.scene.mounts[agent], seen.objects[self.name], self.sites[number], beyond)

@@ -42,6 +42,8 @@ class Wish(NamedTuple):
     """How far the jaw opens, as a share of its way; at 0 it closes, and then presses."""
     joints: np.ndarray | None = None
     """Where its joints should be instead, [n, joints]."""
+    from_home: bool = False
+    """Whether inverse kinematics starts from home, and not from where the joints were sent last."""
 
 
 class Step(NamedTuple):
