@@ -5,7 +5,8 @@
 
 Each face is a process of its own (`soak_faces.py`). They take turns of --turn seconds, one at a time, and are stopped
 between them. After each turn its process is looked at from outside: memory that is its own (`RssAnon`), open files,
-threads, and steps by the seconds of processor that they took. Linux only, because it reads /proc.
+threads, and steps by the seconds of processor that they took. The table's speeds are relative to the median of all
+faces in the same round, because other programs slow them all alike. Linux only, because it reads /proc.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -151,34 +152,47 @@ def soak(faces: Sequence[str], out: Path, minutes: float, seconds: float) -> Non
                 process.end()
 
 
-def read(path: Path) -> dict[str, np.recarray]:
-    """Return the samples by face. A row that was cut short is left out."""
+def read(path: Path) -> dict[str, Any]:
+    """Return the samples by face, as record arrays. A row that was cut short is left out."""
     found: dict[str, list[Sample]] = {}
     with path.open(newline="") as file:
         for row in csv.DictReader(line for line in file if line.endswith("\n")):
-            numbers = [float(row[name]) for name in Sample._fields[1:]]
-            found.setdefault(row["face"], []).append(Sample(row["face"], *numbers))  # type: ignore[arg-type]
-    return {face: np.rec.fromrecords(own, names=Sample._fields) for face, own in found.items()}
+            numbers: list[Any] = [float(row[name]) for name in Sample._fields[1:]]
+            found.setdefault(row["face"], []).append(Sample(row["face"], *numbers))
+    kinds = [("face", "U32"), *((name, float) for name in Sample._fields[1:])]
+    return {face: np.array([tuple(each) for each in own], kinds).view(np.recarray) for face, own in found.items()}
 
 
-def speeds(own: np.recarray) -> np.ndarray:
+def speeds(own: Any) -> np.ndarray:
     """Return the steps by second of processor in each turn but the first, [N - 1]."""
     return np.asarray(np.diff(own.steps) / np.maximum(np.diff(own.cpu_s), 1e-2))
 
 
-def table(samples: dict[str, np.recarray]) -> str:
+def busy(samples: dict[str, Any]) -> np.ndarray:
+    """Return by how much a second of processor was worth in each round but the first, [N - 1]; 1 is usual.
+
+    Programs beside these take cache, memory's bandwidth and half of a core from all faces alike: the median over them.
+    """
+    rates = [speeds(own) for own in samples.values()]
+    rounds = min(map(len, rates))
+    return np.asarray(np.median([rate[:rounds] / np.median(rate) for rate in rates], 0))
+
+
+def table(samples: dict[str, Any]) -> str:
     """Return a row for each face: levels, changes within an hour of its own processor time, and what that is called."""
     lines = [
         "| face | processor, min | steps | memory, MB | change in an hour, MB | | steps/s of processor "
         "| change in an hour | | files | threads |",
         "|" + "---|" * 11,
     ]
+    machine = busy(samples)
     for face, own in samples.items():
-        warm = own[int(WARM * len(own)) :]
+        first = int(WARM * len(own))
+        warm, rate = own[first:], speeds(own[: len(machine) + 1]) / machine
         cells = [face, f"{own.cpu_s[-1] / 60:.0f}", f"{own.steps[-1]:,.0f}"]
         for values, hours, most, unit in (
             (warm.memory_mb, warm.cpu_s / 3600, MEMORY, "MB"),
-            (speeds(warm), warm.cpu_s[1:] / 3600, SPEED, "%"),
+            (rate[first:], own.cpu_s[first + 1 : len(machine) + 1] / 3600, SPEED, "%"),
         ):
             line = trend(hours, values)
             if line is None:
@@ -193,7 +207,7 @@ def table(samples: dict[str, np.recarray]) -> str:
     return "\n".join(lines)
 
 
-def draw(samples: dict[str, np.recarray], path: Path) -> None:
+def draw(samples: dict[str, Any], path: Path) -> None:
     """Draw memory, speed, and files and threads over the time of the run."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -211,6 +225,7 @@ def draw(samples: dict[str, np.recarray], path: Path) -> None:
         counts.plot(hours, own.files, color=color)
         counts.plot(hours, own.threads, color=color, linestyle="--")
     memory.set(title="memory of its own (MB)", ylim=(0, None))
+    speed.plot(own.wall_s[1 : len(machine := busy(samples)) + 1] / 3600, 100 * machine, "k", label="median of all")
     speed.set(title="steps by second of processor (% of the median)", ylim=(0, 150))
     counts.set(title="open files, and threads (dashed)", ylim=(0, None))
     for axis in (memory, speed, counts):

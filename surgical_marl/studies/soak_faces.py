@@ -73,7 +73,7 @@ def gymnasium_vector() -> Iterator[int]:
 
 
 def rsl_rl() -> Iterator[int]:
-    """The face that training uses, for rsl_rl."""
+    """rsl_rl, whose face training uses."""
     import torch
 
     from surgical_marl.interfaces.rsl_rl import RslRlVecEnv
