@@ -33,8 +33,8 @@ def free_memory(device: str) -> int | None:
 
 
 _SIGNS = (
-    "out of memory", "can't allocate memory", "cannot allocate memory", "not enough memory", "resource_exhausted",
-    "bad_alloc", "failed to map segment", "can't start new thread",
+    "out of memory", "can't allocate memory", "cannot allocate memory", "could not allocate memory",
+    "not enough memory", "resource_exhausted", "bad_alloc", "failed to map segment", "can't start new thread",
 )  # fmt: skip
 """What errors of libraries, of C++, of the linker and of threads say of a lack of memory."""
 

@@ -29,6 +29,7 @@ def raising(error: Exception) -> Callable[[], None]:
         chained,
         raising(MemoryError()),
         raising(RuntimeError("std::bad_alloc")),
+        raising(Exception("Could not allocate memory")),
         raising(RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: you tried 8 bytes")),
         raising(ImportError("libx.so: cannot allocate memory in static TLS block")),
         raising(RuntimeError("can't start new thread")),

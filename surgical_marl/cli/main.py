@@ -303,6 +303,7 @@ def _train(arguments: argparse.Namespace) -> None:
     out = arguments.out or arguments.resume or _run_folder(settings)
 
     from surgical_marl.evaluation.command import judge
+    from surgical_marl.files import remove_temporaries
     from surgical_marl.learning.train import train
     from surgical_marl.report.command import report_run
     from surgical_marl.runs.lock import owned
@@ -317,6 +318,7 @@ def _train(arguments: argparse.Namespace) -> None:
         raise
     if is_first():
         with owned(run):
+            remove_temporaries(run)  # of a process that was killed in what follows
             judge(run)
             report_run(run)
 
