@@ -31,9 +31,9 @@ def write_atomic(path: Path, write: Callable[[Path], object]) -> None:
 
 
 def remove_temporaries(folder: Path) -> None:
-    """Remove temporary files that `write_atomic` leaves in a folder if its process is killed."""
-    for temporary in folder.glob(".*.tmp"):
-        if re.fullmatch(r"\..+\.\d+\.tmp", temporary.name):
+    """Remove temporary files that `write_atomic`, or a film, leaves in a folder if its process is killed."""
+    for temporary in folder.glob(".*"):
+        if re.fullmatch(r"\..+\.\d+\.(tmp|mp4|gif|webp)", temporary.name):
             temporary.unlink(missing_ok=True)
 
 

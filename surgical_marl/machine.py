@@ -32,6 +32,22 @@ def free_memory(device: str) -> int | None:
     return next((1024 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")), None)
 
 
+_SIGNS = (
+    "out of memory", "can't allocate memory", "cannot allocate memory", "could not allocate memory",
+    "not enough memory", "resource_exhausted", "bad_alloc", "failed to map segment", "can't start new thread",
+)  # fmt: skip
+"""What errors of libraries, of C++, of the linker and of threads say of a lack of memory."""
+
+
+def lacks_memory(error: BaseException | None) -> bool:
+    """Return whether an error, or one that led to it, says that memory is out."""
+    if error is None:
+        return False
+    if isinstance(error, MemoryError) or any(sign in str(error).lower() for sign in _SIGNS):
+        return True
+    return lacks_memory(error.__cause__ or error.__context__)
+
+
 def cores() -> int:
     """Return how many CPU cores this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -18,6 +18,7 @@ import torch
 from filelock import FileLock
 
 from surgical_marl.cli.main import main
+from surgical_marl.files import remove_temporaries
 from surgical_marl.learning import train
 from surgical_marl.runs import folder
 from surgical_marl.runs.folder import read_checkpoint, read_metrics
@@ -158,6 +159,14 @@ def test_a_new_run_that_is_refused_leaves_no_folder(tmp_path: Path, monkeypatch:
     with pytest.raises(ValueError, match="no"):
         train.train(FEW, out=tmp_path / "run")
     assert not list(tmp_path.iterdir())
+
+
+def test_what_a_killed_process_left_is_removed_and_nothing_else(tmp_path: Path) -> None:
+    kept = [".hidden.mp4", "video.12.mp4", ".video.x.mp4", ".tmp"]
+    for name in [*kept, ".checkpoint.pt.12.tmp", ".video.12.mp4", ".video.12.gif", ".a.b.7.webp"]:
+        (tmp_path / name).write_bytes(b"")
+    remove_temporaries(tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(kept)
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")

@@ -18,6 +18,7 @@ from surgical_marl.cli.evaluating import add_crossplay, add_eval, add_report
 from surgical_marl.cli.flags import add_flags, flagged, given, one_of, whole
 from surgical_marl.cli.viewing import add_play, add_replay, add_view
 from surgical_marl.content import find, list_arms, list_objects, list_policies, list_scenes, unknown
+from surgical_marl.machine import lacks_memory
 from surgical_marl.plugins.algorithms import list_algorithms
 from surgical_marl.plugins.tasks import list_tasks
 from surgical_marl.runs.progress import preparing
@@ -67,6 +68,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     except OSError as error:  # a full disk, a folder that is read-only, a name that no file can have
         about = f"{shown(str(error.filename))}: " if error.filename is not None else ""
         print(f"surgical-marl: {about}{error.strerror or error}", file=sys.stderr)
+        return 2
+    except Exception as error:  # each library has its own for a lack of memory, which may be met when it is imported
+        if not lacks_memory(error):
+            raise
+        print("surgical-marl: there is not enough memory for that", file=sys.stderr)
         return 2
     return code
 
@@ -297,6 +303,7 @@ def _train(arguments: argparse.Namespace) -> None:
     out = arguments.out or arguments.resume or _run_folder(settings)
 
     from surgical_marl.evaluation.command import judge
+    from surgical_marl.files import remove_temporaries
     from surgical_marl.learning.train import train
     from surgical_marl.report.command import report_run
     from surgical_marl.runs.lock import owned
@@ -311,6 +318,7 @@ def _train(arguments: argparse.Namespace) -> None:
         raise
     if is_first():
         with owned(run):
+            remove_temporaries(run)  # of a process that was killed in what follows
             judge(run)
             report_run(run)
 

@@ -6,7 +6,7 @@ import contextlib
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from surgical_marl.machine import free_memory
+from surgical_marl.machine import free_memory, lacks_memory
 from surgical_marl.plugins.algorithms import ALGORITHMS
 from surgical_marl.policies.layout import Layout
 from surgical_marl.policies.policy import zeros
@@ -14,8 +14,6 @@ from surgical_marl.runs.settings import Settings
 
 if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv
-
-_SIGNS = ("out of memory", "can't allocate memory", "resource_exhausted")
 
 
 def rollout_bytes(settings: Settings, env: BatchedEnv) -> int:
@@ -53,7 +51,7 @@ def in_memory(num_envs: int) -> Iterator[None]:
     try:
         yield
     except (RuntimeError, MemoryError) as error:
-        if not isinstance(error, MemoryError) and not any(sign in str(error).lower() for sign in _SIGNS):
+        if not lacks_memory(error):
             raise
         advice = f"try num_envs={num_envs // 2}" if num_envs > 1 else "try fewer steps_per_iteration"
         raise ValueError(f"num_envs {num_envs} does not fit into memory: {advice}") from None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import itertools
 import os
 import subprocess
@@ -59,10 +60,13 @@ def ffmpeg_runs() -> bool:
 
 def _write_gif(path: Path, shape: tuple[int, ...], frames: Frames, fps: float) -> None:
     # Gif counts time in hundredths of a second, and viewers slow down below two of them.
+    # In memory first: where a disk is full, the writer would try again when it is freed, and print that error.
     writer: Any
-    with imageio.get_writer(path, duration=max(20.0, 1000 / fps), loop=0) as writer:
+    whole = io.BytesIO()
+    with imageio.get_writer(whole, format="GIF", duration=max(20.0, 1000 / fps), loop=0) as writer:
         for frame in frames:
             writer.append_data(frame)
+    path.write_bytes(whole.getvalue())
 
 
 def _write_webp(path: Path, shape: tuple[int, ...], frames: Frames, fps: float) -> None:

@@ -1,0 +1,267 @@
+"""Trains and steps each face for hours, and says whether memory and speed stay, and handles and threads are freed.
+
+    python -m surgical_marl.studies.soak --minutes 240           # soak.csv, and at the end soak.png and a table
+    python -m surgical_marl.studies.soak --report                # these two of what there is, also meanwhile
+
+Each face is a process of its own (`soak_faces.py`). They take turns of --turn seconds, one at a time, and are stopped
+between them. After each turn its process is looked at from outside: memory that is its own (`RssAnon`), open files,
+threads, and steps by the seconds of processor that they took. The table's speeds are relative to the median of all
+faces in the same round, because other programs slow them all alike. Linux only, because it reads /proc.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from surgical_marl.cli.main import whole
+from surgical_marl.studies.command import make_parser, run
+from surgical_marl.studies.soak_faces import ALL, counted
+
+CSV, FIGURE = "soak.csv", "soak.png"
+WARM = 0.25
+"""Share of the samples, from the first on, in which caches and pools may still fill."""
+BLOCKS = 8
+"""Samples near each other are alike, so that a line goes through the means of so many blocks of them."""
+T = 2.447
+"""97.5 % quantile of Student's t with `BLOCKS` - 2 degrees of freedom."""
+MEMORY, SPEED = 0.01, 0.05
+"""Shares of the mean by which memory and speed may change within an hour of processor and be called flat."""
+PATIENCE = 1800.0
+"""Seconds in which a face must have made its first step."""
+
+
+class Sample(NamedTuple):
+    """What is seen of a process after a turn."""
+
+    face: str
+    wall_s: float
+    cpu_s: float
+    steps: int
+    memory_mb: float
+    files: int
+    threads: int
+
+
+class Trend(NamedTuple):
+    """A line through values over time."""
+
+    mean: float
+    slope: float
+    """Change within an hour."""
+    low: float
+    high: float
+    """95 % interval of the slope."""
+
+    def verdict(self, tolerance: float) -> str:
+        """Return "flat" if the whole interval is within a share of the mean, and else whether it has a sign."""
+        within = tolerance * abs(self.mean)
+        if -within <= self.low and self.high <= within:
+            return "flat"
+        return "grows" if self.low > 0 else "falls" if self.high < 0 else "not known yet"
+
+
+def trend(hours: np.ndarray, values: np.ndarray) -> Trend | None:
+    """Fit a line by least squares to the means of `BLOCKS` blocks; None if there are too few samples."""
+    if len(values) < 2 * BLOCKS:
+        return None
+    x, y = (np.array([part.mean() for part in np.array_split(each, BLOCKS)]) for each in (hours, values))
+    spread = x - x.mean()
+    slope = float(spread @ y / (spread @ spread))
+    left = y - y.mean() - slope * spread
+    error = T * float(np.sqrt(left @ left / (BLOCKS - 2) / (spread @ spread)))
+    return Trend(float(y.mean()), slope, slope - error, slope + error)
+
+
+class Process:
+    """One face, which runs only in its turns."""
+
+    def __init__(self, face: str, out: Path) -> None:
+        self.face, self._out = face, out
+        command = [sys.executable, "-m", "surgical_marl.studies.soak_faces", face, "--out", str(out)]
+        own = {"OMP_NUM_THREADS": "1", **os.environ}  # torch's threads wait for each other by spinning
+        with (out / f"{face}.log").open("w") as log:
+            self._process = subprocess.Popen(command, stdout=log, stderr=log, env=own)
+
+    def begin(self) -> None:
+        """Wait for the first step, and stop. ValueError if it does not come."""
+        end = time.monotonic() + PATIENCE
+        while not counted(self._out, self.face):
+            time.sleep(0.2)
+            if self._process.poll() is not None or time.monotonic() > end:
+                raise ValueError(f"{self.face} made no step: {self._out / self.face}.log says why")
+        self._process.send_signal(signal.SIGSTOP)
+
+    def turn(self, seconds: float, began: float) -> Sample | None:
+        """Let it run, stop it and look at it; None if it has ended."""
+        self._process.send_signal(signal.SIGCONT)
+        try:
+            self._process.wait(seconds)
+            return None
+        except subprocess.TimeoutExpired:
+            self._process.send_signal(signal.SIGSTOP)
+        own = Path("/proc", str(self._process.pid))
+        status = dict(line.split(":", 1) for line in (own / "status").read_text().splitlines())
+        times = (own / "stat").read_text().rpartition(")")[2].split()[11:13]  # user, system
+        return Sample(
+            self.face,
+            round(time.monotonic() - began, 1),
+            sum(map(int, times)) / os.sysconf("SC_CLK_TCK"),
+            counted(self._out, self.face),
+            int(status["RssAnon"].split()[0]) / 1024,
+            len(os.listdir(own / "fd")),
+            int(status["Threads"]),
+        )
+
+    def end(self) -> None:
+        """End it, whether it is stopped or not."""
+        self._process.kill()
+        self._process.wait()
+
+
+def soak(faces: Sequence[str], out: Path, minutes: float, seconds: float) -> None:
+    """Let faces take turns, and add a row to `soak.csv` after each. ValueError if one of them ends."""
+    processes: list[Process] = []
+    with (out / CSV).open("x", newline="") as file:
+        rows = csv.writer(file)
+        rows.writerow(Sample._fields)
+        try:
+            for face in faces:
+                processes.append(Process(face, out))
+                processes[-1].begin()
+            began = time.monotonic()
+            while time.monotonic() < began + 60 * minutes:
+                for process in processes:
+                    sample = process.turn(seconds, began)
+                    if sample is None:
+                        raise ValueError(f"{process.face} has ended: {out / process.face}.log says why")
+                    rows.writerow(sample)
+                    file.flush()
+        finally:
+            for process in processes:
+                process.end()
+
+
+def read(path: Path) -> dict[str, Any]:
+    """Return the samples by face, as record arrays. A row that was cut short is left out."""
+    found: dict[str, list[Sample]] = {}
+    with path.open(newline="") as file:
+        for row in csv.DictReader(line for line in file if line.endswith("\n")):
+            numbers: list[Any] = [float(row[name]) for name in Sample._fields[1:]]
+            found.setdefault(row["face"], []).append(Sample(row["face"], *numbers))
+    kinds = [("face", "U32"), *((name, float) for name in Sample._fields[1:])]
+    return {face: np.array([tuple(each) for each in own], kinds).view(np.recarray) for face, own in found.items()}
+
+
+def speeds(own: Any) -> np.ndarray:
+    """Return the steps by second of processor in each turn but the first, [N - 1]."""
+    return np.asarray(np.diff(own.steps) / np.maximum(np.diff(own.cpu_s), 1e-2))
+
+
+def busy(samples: dict[str, Any]) -> np.ndarray:
+    """Return by how much a second of processor was worth in each round but the first, [N - 1]; 1 is usual.
+
+    Programs beside these take cache, memory's bandwidth and half of a core from all faces alike: the median over them.
+    """
+    rates = [speeds(own) for own in samples.values()]
+    rounds = min(map(len, rates))
+    return np.asarray(np.median([rate[:rounds] / np.median(rate) for rate in rates], 0))
+
+
+def table(samples: dict[str, Any]) -> str:
+    """Return a row for each face: levels, changes within an hour of its own processor time, and what that is called."""
+    lines = [
+        "| face | processor, min | steps | memory, MB | change in an hour, MB | | steps/s of processor "
+        "| change in an hour | | files | threads |",
+        "|" + "---|" * 11,
+    ]
+    machine = busy(samples)
+    for face, own in samples.items():
+        first = int(WARM * len(own))
+        warm, rate = own[first:], speeds(own[: len(machine) + 1]) / machine
+        cells = [face, f"{own.cpu_s[-1] / 60:.0f}", f"{own.steps[-1]:,.0f}"]
+        for values, hours, most, unit in (
+            (warm.memory_mb, warm.cpu_s / 3600, MEMORY, "MB"),
+            (rate[first:], own.cpu_s[first + 1 : len(machine) + 1] / 3600, SPEED, "%"),
+        ):
+            line = trend(hours, values)
+            if line is None:
+                cells += ["", "", "too few samples"]
+                continue
+            scale, digits = (1.0, 1) if unit == "MB" else (100 / line.mean, 0)
+            slope, error = scale * line.slope, scale * (line.high - line.slope)
+            change = f"{slope:+.{digits + 1}f} ± {error:.{digits + 1}f}" + (" %" if unit == "%" else "")
+            cells += [f"{line.mean:,.0f}", change, line.verdict(most)]
+        cells += [f"{int(each.min())} to {int(each.max())}" for each in (warm.files, warm.threads)]
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def draw(samples: dict[str, Any], path: Path) -> None:
+    """Draw memory, speed, and files and threads over the time of the run."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    from surgical_marl.files import write_atomic
+
+    figure = Figure(figsize=(12, 4), layout="constrained")
+    FigureCanvasAgg(figure)
+    memory, speed, counts = figure.subplots(1, 3)
+    for number, (face, own) in enumerate(samples.items()):
+        hours, color = own.wall_s / 3600, f"C{number}"
+        memory.plot(hours, own.memory_mb, color=color, label=face)
+        rate = speeds(own)
+        speed.plot(hours[1:], 100 * rate / np.median(rate), color=color, linewidth=0.8)
+        counts.plot(hours, own.files, color=color)
+        counts.plot(hours, own.threads, color=color, linestyle="--")
+    memory.set(title="memory of its own (MB)", ylim=(0, None))
+    speed.plot(own.wall_s[1 : len(machine := busy(samples)) + 1] / 3600, 100 * machine, "k", label="median of all")
+    speed.set(title="steps by second of processor (% of the median)", ylim=(0, 150))
+    counts.set(title="open files, and threads (dashed)", ylim=(0, None))
+    for axis in (memory, speed, counts):
+        axis.set_xlabel("hours")
+        axis.grid(True, color="#dddddd", linewidth=0.6)
+        axis.spines[["top", "right"]].set_visible(False)
+    memory.legend(fontsize=7, ncols=2)
+    write_atomic(path, lambda temporary: figure.savefig(temporary, format="png", dpi=110))
+
+
+def main(argv: list[str] | None = None) -> int:
+    arguments = _parse(argv)
+    out = arguments.out
+    if not arguments.report:
+        if (out / CSV).exists():
+            raise ValueError(f"{out} holds {CSV} already: name another folder with --out, or --report on it")
+        out.mkdir(parents=True, exist_ok=True)
+        try:
+            soak(arguments.only, out, arguments.minutes, arguments.turn)
+        except KeyboardInterrupt:
+            print("soak: interrupted; this is of what there is", file=sys.stderr)
+    samples = read(out / CSV)
+    draw(samples, out / FIGURE)
+    print(table(samples))
+    return 0
+
+
+def _parse(argv: list[str] | None) -> argparse.Namespace:
+    parser = make_parser(__doc__)
+    parser.add_argument("--minutes", type=float, default=240.0, help="of all turns together (%(default)s)")
+    parser.add_argument("--turn", type=whole(1), default=20, metavar="SECONDS", help="(%(default)s)")
+    parser.add_argument("--only", nargs="+", choices=ALL, default=ALL, help="some faces")
+    parser.add_argument("--out", type=Path, default=Path("runs/soak"), metavar="DIR", help="(%(default)s)")
+    parser.add_argument("--report", action="store_true", help="table and figure of what there is")
+    return parser.parse_args(argv)
+
+
+if __name__ == "__main__":
+    sys.exit(run("soak", main))
