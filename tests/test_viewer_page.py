@@ -42,11 +42,16 @@ def address() -> Iterator[str]:
     close_server(server)
 
 
-def answer(address: str, path: str) -> int:
+def fetched(address: str, path: str, **headers: str) -> tuple[int, bytes]:
     parts = urlsplit(address)
     connection = http.client.HTTPConnection(str(parts.hostname), parts.port, timeout=10)
-    connection.request("GET", path)
-    return connection.getresponse().status
+    connection.request("GET", path, headers=headers)
+    response = connection.getresponse()
+    return response.status, response.read()
+
+
+def answer(address: str, path: str) -> int:
+    return fetched(address, path)[0]
 
 
 def test_a_page_needs_its_secret(address: str) -> None:
@@ -54,6 +59,26 @@ def test_a_page_needs_its_secret(address: str) -> None:
     assert answer(address, secret) == 200
     for path in ("/", "/index.html", secret[:-2] + "/", secret.upper(), "/x" + secret, f"/?{secret}", "/%00"):
         assert answer(address, path) == 403, path
+
+
+@pytest.mark.parametrize("up", ["../", "%2e%2e/", "..%2f", "%2e%2e%2f", "..\\", "....//", "%252e%252e/", "/", ""])
+def test_no_file_outside_of_the_page_is_served(address: str, up: str) -> None:
+    secret = urlsplit(address).path
+    page = Path(viser.__file__).parent / "client" / "build"
+    for path in (
+        f"{up * 30}etc/passwd",
+        f"{up * 2}__init__.py",
+        f"{up * 3}_version.py",
+        f"{page.parent.parent}/infra.py",
+    ):
+        status, body = fetched(address, f"{secret}{path}")
+        assert status in (403, 404) or body == fetched(address, secret)[1], path
+
+
+def test_another_name_of_this_machine_opens_nothing(address: str) -> None:
+    """A site whose name leads to 127.0.0.1 does not know the secret, whatever its browser says."""
+    for name in ("evil.example", "localhost.evil.example:80", "127.0.0.1"):
+        assert fetched(address, "/", Host=name, Origin=f"http://{name}")[0] == 403
 
 
 def test_a_websocket_needs_its_secret(address: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -20,6 +21,7 @@ from surgical_marl.runs.environment import make_env
 from surgical_marl.runs.folder import read_metrics, read_settings
 from surgical_marl.runs.settings import Settings
 from surgical_marl.untrusted.files import MAX_JSON, check_file, read_json
+from surgical_marl.untrusted.values import as_number
 
 if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv
@@ -152,7 +154,7 @@ def read_result(path: Path) -> dict[str, Any]:
 
     If the file holds several runs, this is the result of all of them together.
 
-    ValueError if the file is no such result.
+    ValueError if the file is no such result, or a metric in it is no number.
     """
     try:
         check_file(path, MAX_JSON)
@@ -166,8 +168,28 @@ def read_result(path: Path) -> dict[str, Any]:
         known = False
     if not known:
         raise ValueError(f"{path} is not a result that `surgical-marl eval --json` of this version wrote")
+    agents = result.get("agents")
+    try:
+        good = isinstance(agents, dict) and all(_has_numbers(part) for part in (result, *agents.values()))
+        good = good and isinstance(result["goal_set"], str)
+    except (KeyError, TypeError, AttributeError):
+        good = False
+    if not good:
+        raise ValueError(f"{path} is damaged: a metric in it is not a number")
     found: dict[str, Any] = result
     return found
+
+
+def _has_numbers(part: Mapping[str, Any]) -> bool:
+    """Return whether all metrics are numbers or None, and their intervals pairs of numbers or None."""
+    return all(
+        _is_number(part.get(name)) and (bounds is None or (len(bounds) == 2 and all(map(_is_number, bounds))))
+        for name, bounds in part["intervals"].items()
+    )
+
+
+def _is_number(value: Any) -> bool:
+    return value is None or math.isfinite(as_number(value))
 
 
 def _settings(policy: str, asked: Mapping[str, str]) -> Settings:

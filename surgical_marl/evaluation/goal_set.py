@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import yaml
 
+from surgical_marl.untrusted.values import one_line
+
 if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv
 
@@ -99,4 +101,5 @@ def check_same(result: Mapping[str, Any], other: Mapping[str, Any], name: str) -
 
 def _describe(result: Mapping[str, Any]) -> str:
     words = "{task} in {scene}, {difficulty}, {control} control, {goals} goals, {start} start, {episodes} episodes"
-    return f"{result['goal_set']:.12} ({words.format(**result)}, seed {result['seed']})"
+    shown = {name: one_line(value) for name, value in result.items()}
+    return f"{shown['goal_set']:.12} ({words.format(**shown)}, seed {shown['seed']})"

@@ -47,6 +47,7 @@ from surgical_marl.runs.folder import (
 )
 from surgical_marl.runs.lock import LOCK, owned
 from surgical_marl.runs.settings import Settings
+from surgical_marl.untrusted.values import shown
 
 if TYPE_CHECKING:
     pass
@@ -254,7 +255,9 @@ def _read_resumed(settings: Settings, run: Path, goes_on: bool) -> dict[str, Any
     state = read_checkpoint(run)
     for name, value in state.get("of", {}).items():
         if value != (now := getattr(settings, name)):
-            raise ValueError(f"{run / CHECKPOINT} is of {name} {value!r}, and not of {now!r} as the run it lies in")
+            raise ValueError(
+                f"{run / CHECKPOINT} is of {name} {shown(value)}, and not of {now!r} as the run it lies in"
+            )
     if state["iteration"] > settings.iterations or (state["iteration"] == settings.iterations and not goes_on):
         raise ValueError(
             f"the run in {run} already has {state['iteration']} iterations: ask for more than {settings.iterations}"
@@ -283,6 +286,8 @@ def _own(state: dict[str, Any], run: Path) -> dict[str, Any]:
     rank, processes = distributed.rank(), state["processes"]
     own = state if rank == 0 else read_environments(run, state["iteration"], rank, processes)
     if processes == distributed.size() and own is not None:
+        if missing := sorted(set(OWN) - own.keys()):
+            raise ValueError(f"{run / CHECKPOINT} is damaged, it lacks {', '.join(missing)}: restore it from a copy")
         return {**state, **{name: own[name] for name in OWN}}
     if processes != distributed.size():
         who = f"{processes} process{'es' if processes > 1 else ''}, not {distributed.size()}"

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv
 
 
+_DAMAGED = (KeyError, TypeError, AttributeError, IndexError)
+"""What Python raises for a checkpoint in which something is of another type."""
 OWN = ("env", "collided", "random", "random_cuda")
 """Parts of `Trainer.state` that belong to one process alone: of its environments, and its random numbers."""
 
@@ -339,16 +341,23 @@ class Trainer:
         """Continue from what `state` returned, before the first iteration; without `OWN` the environments start anew.
 
         Raises:
-            ValueError: it is of other agents or networks.
+            ValueError: it is of other agents, networks or environments, or not whole.
         """
         self.iteration, self.env_steps = state["iteration"], state["env_steps"]
         try:
             self.algorithm.load(state["algorithm"])
-        except (RuntimeError, ValueError, KeyError):  # with a line for each weight
+        except (RuntimeError, ValueError, *_DAMAGED):  # with a line for each weight
             raise ValueError("the networks in the checkpoint are not of the shapes that the settings ask for") from None
         if "env" not in state:
             torch.manual_seed(distributed.own_seed(self.settings.seed, self.iteration))
             return
+        try:
+            self._set_own(state)
+        except (RuntimeError, *_DAMAGED):
+            raise ValueError("the environments in the checkpoint are not of this run, or not whole") from None
+
+    def _set_own(self, state: Mapping[str, Any]) -> None:
+        """Set what each process has of its own."""
         self.env.set_carry(state["env"])
         for name, kept in self._observations.items():
             kept.copy_(state["env"]["observations"][name])

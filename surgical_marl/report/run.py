@@ -165,27 +165,4 @@ def _why_not_evaluated(folder: Path) -> str:
 
 def _read_result(path: Path) -> dict[str, Any] | None:
     """Read an evaluation; None if there is none. ValueError if it is damaged, or a number in it is none."""
-    if not path.is_file():
-        return None
-    result = read_result(path)
-    agents = result.get("agents")
-    try:
-        good = isinstance(agents, dict) and all(_has_numbers(part) for part in (result, *agents.values()))
-        good = good and isinstance(result["goal_set"], str)
-    except (TypeError, AttributeError):
-        good = False
-    if not good:
-        raise ValueError(f"{path} is damaged: a metric in it is not a number")
-    return result
-
-
-def _has_numbers(part: Mapping[str, Any]) -> bool:
-    """Return whether all metrics are numbers or None, and their intervals pairs of numbers or None."""
-    return all(
-        _is_number(part.get(name)) and (bounds is None or (len(bounds) == 2 and all(map(_is_number, bounds))))
-        for name, bounds in part["intervals"].items()
-    )
-
-
-def _is_number(value: Any) -> bool:
-    return value is None or (isinstance(value, (int, float)) and math.isfinite(value))
+    return read_result(path) if path.is_file() else None

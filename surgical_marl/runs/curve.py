@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -22,13 +23,15 @@ PANELS = (
 def draw_curve(run: Path, title: str) -> None:
     """Draw `curve.png` from `metrics.csv`: error, success, collisions against steps."""
     rows = read_metrics(run)
-    steps = np.array([row["env_steps"] for row in rows])
+    steps = np.array([row.get("env_steps", math.nan) for row in rows])
     figure = Figure(figsize=(12, 3.6), layout="constrained")
     FigureCanvasAgg(figure)
     figure.suptitle(title, fontsize=11)
     for axis, (name, label, color) in zip(figure.subplots(1, 3), PANELS, strict=True):
-        values = np.array([row[name] for row in rows])
-        known = np.isfinite(values)
+        values = np.array([row.get(name, math.nan) for row in rows])
+        known = np.isfinite(values) & np.isfinite(steps)
+        if name == "tip_error_mm":
+            known &= values > 0  # others have no place on its axis
         axis.plot(steps[known], values[known], color=color, alpha=0.25, linewidth=1)
         axis.plot(steps[known], smooth(values[known]), color=color, linewidth=2)
         axis.set(title=label, xlabel="environment steps")

@@ -26,7 +26,7 @@ from surgical_marl.runs.environment import make_env
 from surgical_marl.runs.settings import Settings
 from surgical_marl.runtime import has_cuda
 from surgical_marl.untrusted.arrays import read_npz
-from surgical_marl.untrusted.values import check_count
+from surgical_marl.untrusted.values import check_count, one_line, shown
 
 if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv
@@ -35,7 +35,7 @@ LAYOUT = 1
 MOST_STEPS = 100_000
 """Steps of a file that is read."""
 _START = "start"
-_PACKAGES = ("surgical-marl", "jax", "warp-lang", "numpy")
+PACKAGES = ("surgical-marl", "jax", "warp-lang", "numpy")
 _KNOWN = {"environment", "engine", "device", "seed", "index", "place", "versions"}
 
 
@@ -79,7 +79,7 @@ def write_fault(
         "environment": settings.of_environment(),
         "engine": env.engine.name,
         "device": env.device,
-        "versions": {name: importlib.metadata.version(name) for name in _PACKAGES},
+        "versions": {name: importlib.metadata.version(name) for name in PACKAGES},
         "iteration": None,
         **told,
     }
@@ -108,11 +108,14 @@ def read_fault(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]] | Non
     if not isinstance(about, dict) or about.get("kind") != "fault":
         return None
     if about.get("layout") != LAYOUT:
-        raise ValueError(f"{path} is a fault of layout {about.get('layout')!r}: this version reads layout {LAYOUT}")
+        raise ValueError(
+            f"{path} is a fault of layout {shown(about.get('layout'))}: this version reads layout {LAYOUT}"
+        )
     texts = all(isinstance(about.get(name), str) for name in ("engine", "device", "place"))
     mappings = all(isinstance(about.get(name), dict) for name in ("environment", "versions"))
     if not (about.keys() >= _KNOWN and texts and mappings):
         raise ValueError(f"{path} is no whole fault: it needs {', '.join(sorted(_KNOWN))}")
+    about |= {name: one_line(about[name]) for name in ("seed", "index", "device")}
     return about, arrays
 
 
@@ -152,13 +155,17 @@ def reproduce(path: Path, about: Mapping[str, Any], arrays: Mapping[str, np.ndar
             at = number
             break
     env.close()
-    told = f"seed {about['seed']}, environment {about['index']}: {about['place']}"
-    changed = [
-        f"{name} {was} -> {now}"
-        for name, was in about["versions"].items()
-        if name in _PACKAGES and (now := importlib.metadata.version(name)) != was
+    told = f"seed {about['seed']}, environment {about['index']}: {one_line(about['place'])}"
+    return Reproduced(count, at, found, told, device, changed_versions(about["versions"]))
+
+
+def changed_versions(versions: Mapping[str, Any]) -> list[str]:
+    """Return the packages that have another version here than a recording says, as texts."""
+    return [
+        f"{name} {one_line(was)} -> {now}"
+        for name, was in versions.items()
+        if name in PACKAGES and (now := importlib.metadata.version(name)) != was
     ]
-    return Reproduced(count, at, found, told, device, changed)
 
 
 def not_finite(env: BatchedEnv) -> list[str]:

@@ -156,11 +156,20 @@ def read_checkpoint(run: str | Path) -> dict[str, Any]:
             checkpoint = torch.load(path, map_location="cpu", weights_only=True)
     except Exception:  # torch.load raises many types of errors for a damaged file
         checkpoint = None
-    if not isinstance(checkpoint, dict) or not {"iteration", "groups", "algorithm"} <= checkpoint.keys():
+    if not isinstance(checkpoint, dict) or not _is_whole(checkpoint):
         raise ValueError(f"{path} is damaged, or not a checkpoint of this program: restore it from a copy")
     if bad := not_finite(checkpoint["algorithm"]):
         raise ValueError(f"{path} holds numbers that are not finite ({listed(bad, 3)}): restore it from a copy")
     return checkpoint
+
+
+def _is_whole(checkpoint: dict[str, Any]) -> bool:
+    """Return whether a checkpoint has what every reader needs, counts that are some, and says what it is of."""
+    counts = [checkpoint.get(name, 0) for name in ("iteration", "env_steps", "processes")]
+    good = all(type(count) is int and 0 <= count < 2**62 for count in counts)
+    of = checkpoint.get("of", {})
+    known = isinstance(of, dict) and of.keys() <= {"task", "scene", "algo"}
+    return good and known and {"iteration", "groups", "algorithm"} <= checkpoint.keys()
 
 
 def not_finite(tree: Any, name: str = "") -> list[str]:

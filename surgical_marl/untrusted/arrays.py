@@ -11,7 +11,7 @@ from typing import IO, Any
 import numpy as np
 
 from surgical_marl.untrusted.files import MB, check_file
-from surgical_marl.untrusted.values import check_count
+from surgical_marl.untrusted.values import check_count, one_line
 
 MAX_NPZ = 500 * MB
 """Bytes of all arrays of an npz file, unpacked."""
@@ -34,7 +34,7 @@ def read_npz(path: Path, most: int = MAX_NPZ) -> dict[str, np.ndarray]:
             _check_members(archive, most, path)
             return {info.filename.removesuffix(".npy"): _read_array(archive, info) for info in archive.infolist()}
     except Exception as error:  # zipfile, zlib and numpy have many types of errors for damaged data
-        raise ValueError(f"{path} is no npz file that can be read: {' '.join(str(error).split())[:200]}") from None
+        raise ValueError(f"{path} is no npz file that can be read: {one_line(' '.join(str(error).split()))}") from None
 
 
 def check_checkpoint(path: Path) -> None:

@@ -42,6 +42,14 @@ def shown(value: Any) -> str:
     return text if len(text) <= _TEXT else text[: _TEXT - 3] + "..."
 
 
+def one_line(value: Any, most: int = _TEXT) -> str:
+    """Return a text as one line that a terminal can show, in at most `most` characters: other characters as escapes."""
+    text = "".join(
+        letter if letter.isprintable() else letter.encode("unicode_escape").decode() for letter in str(value)[:most]
+    )
+    return text if len(text) <= most else text[: most - 3] + "..."
+
+
 def listed(names: Iterable[Any], most: int = 40) -> str:
     """Return names with commas between them, the first `most` of them, and then how many more there are."""
     left = iter(names)

@@ -21,12 +21,10 @@ from surgical_marl.runs.settings import Settings
 from surgical_marl.view.history import History
 from surgical_marl.view.moment import Moment, Observer
 from surgical_marl.view.movers import Movers, choices, first
-from surgical_marl.view.take import MOST_STEPS, Take
+from surgical_marl.view.take import MOST_ENVS, MOST_STEPS, Take
 
 TRAIL = 100
 """Steps that trails show."""
-MOST_ENVS = 4
-"""Environments side by side at most."""
 
 
 class Session:

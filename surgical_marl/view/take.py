@@ -25,8 +25,10 @@ import numpy as np
 
 from surgical_marl.files import write_atomic
 from surgical_marl.runs.environment import make_env
+from surgical_marl.runs.fault import PACKAGES, changed_versions
 from surgical_marl.runs.settings import Settings
 from surgical_marl.untrusted.arrays import read_npz
+from surgical_marl.untrusted.values import check_count, shown
 
 if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv, BatchStep
@@ -34,8 +36,9 @@ if TYPE_CHECKING:
 LAYOUT = 1
 MOST_STEPS = 10_000
 """Steps of a take, so that its arrays stay small; the next take goes on from there."""
+MOST_ENVS = 4
+"""Environments of a viewer, and so of a take."""
 _START = "start"
-_PACKAGES = ("surgical-marl", "jax", "warp-lang", "numpy")
 
 
 class Take:
@@ -51,7 +54,7 @@ class Take:
             "num_envs": env.num_envs,
             "seed": seed,
             "movers": [[0, agent, who] for agent, who in movers.items()],
-            "versions": {name: importlib.metadata.version(name) for name in _PACKAGES},
+            "versions": {name: importlib.metadata.version(name) for name in PACKAGES},
         }
         self._steps: list[dict[str, np.ndarray]] = []
 
@@ -107,26 +110,32 @@ def replay(path: Path) -> Replayed:
     except TypeError:  # options of another version
         raise ValueError(f"{path} was recorded in an environment that this version does not know") from None
     env = make_env(settings, about["num_envs"], "numpy")
-    needed = {"objects", "ended", *(f"{kind}/{agent}" for kind in ("actions", "rewards") for agent in env.agents)}
+    needed = {
+        "qpos",
+        "objects",
+        "ended",
+        *(f"{kind}/{agent}" for kind in ("actions", "rewards") for agent in env.agents),
+    }
     if missing := sorted(needed - arrays.keys()):
         raise ValueError(f"{path} is no whole take: it lacks {', '.join(missing)}")
     env.set_carry({name.removeprefix(_START): value for name, value in arrays.items() if name.startswith(_START)})
-    count, first, largest = len(arrays["qpos"]), None, 0.0
+    counts = {len(arrays[name]) if arrays[name].ndim else 0 for name in needed}
+    if len(counts) != 1:
+        raise ValueError(f"{path} is no whole take: its arrays are of different numbers of steps: {sorted(counts)}")
+    count, first, largest = counts.pop(), None, 0.0
+    check_count(count, MOST_STEPS, "steps", path)
     for number in range(count):
         step = env.step({agent: arrays[f"actions/{agent}"][number] for agent in env.agents})
         for name, value in _after(env, step).items():
             wanted = arrays[name][number]
+            if wanted.shape != value.shape:
+                raise ValueError(f"{path} is no whole take: {name} has the shape {wanted.shape}, not {value.shape}")
             if not np.array_equal(wanted, value, equal_nan=True):
                 first = number if first is None else first
                 if name in ("qpos", "objects"):
                     largest = max(largest, float(np.max(np.abs(wanted - value), initial=0.0)))
     env.close()
-    changed = [
-        f"{name} {was} -> {now}"
-        for name, was in about["versions"].items()
-        if (now := importlib.metadata.version(name)) != was
-    ]
-    return Replayed(count, first, largest, changed)
+    return Replayed(count, first, largest, changed_versions(about["versions"]))
 
 
 def read_take(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -140,7 +149,13 @@ def read_take(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     if not isinstance(about, dict) or not known <= about.keys() or "qpos" not in arrays:
         raise ValueError(f"{path} is not a take that `surgical-marl view --record` wrote")
     if about["layout"] != LAYOUT:
-        raise ValueError(f"{path} is a take of layout {about['layout']!r}: this version reads layout {LAYOUT}")
+        raise ValueError(f"{path} is a take of layout {shown(about['layout'])}: this version reads layout {LAYOUT}")
+    texts = all(isinstance(about[name], str) for name in ("engine", "device"))
+    mappings = all(isinstance(about[name], dict) for name in ("environment", "versions"))
+    if not (texts and mappings) or any(value.dtype.kind not in "fiub" for value in arrays.values()):
+        raise ValueError(f"{path} is no whole take: something in it is of another type than what `view` writes")
+    if type(about["num_envs"]) is not int or not 1 <= about["num_envs"] <= MOST_ENVS:
+        raise ValueError(f"{path} is a take of {shown(about['num_envs'])} environments; 1 to {MOST_ENVS} are replayed")
     return about, arrays
 
 

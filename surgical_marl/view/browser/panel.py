@@ -11,7 +11,8 @@ from surgical_marl.plugins.tasks import TASKS, list_tasks
 from surgical_marl.view.browser.nodes import PARTS, Nodes
 from surgical_marl.view.browser.text import status
 from surgical_marl.view.pace import Pace
-from surgical_marl.view.session import MOST_ENVS, Session
+from surgical_marl.view.session import Session
+from surgical_marl.view.take import MOST_ENVS
 
 GO, STEP, RESET = "Pause / go on", "One step", "Reset"
 LONGEST = 3600.0
