@@ -1,13 +1,13 @@
 """Change the package in one place at a time, and see whether its tests notice: `make mutants`.
 
-cosmic-ray makes the mutants. Of each operator of the code it gives one or two others (`SWAPS`): to put every operator in
-place of every other would mostly count errors of types, which any test finds. Annotations are not run, and stay. Of an
-area's mutants a sample is tried, the same for the same seed and source, each by the tests that are meant to hold its
-module.
+cosmic-ray makes the mutants. In place of an operator of the code it puts one or two others (`SWAPS`): to put every
+operator in place of every other would mostly count errors of types, which any test finds. Annotations are not run, and
+stay. Of an area's mutants a sample is tried, the same for the same seed and source, each by the tests that are meant to
+hold its module.
 
 Each mutant has a process of its own, made from one that has imported all but the package. It reads the mutant from a
-copy of the repository, with caches of its own, so that nothing compiled before hides what was changed. A mutant is killed
-if a test fails, if the package cannot be imported, or if its tests take several times the CPU time that they need.
+copy of the repository, with caches of its own, so that nothing compiled before hides what was changed. A mutant is
+killed if a test fails, if the package cannot be imported, or if its tests take several times the CPU time they need.
 
 Mutants that are the same program for every input that can occur are in `equivalent_mutants.toml`, each with its reason.
 
