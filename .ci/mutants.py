@@ -282,7 +282,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--out", type=Path, help="file for a JSON list of all mutants that were tried")
-    parser.add_argument("--again", type=Path, help="such a file: try the mutants that survived once more")
+    parser.add_argument("--again", type=Path, help="such a file: try only those of its mutants once more that survived")
     arguments = parser.parse_args()
     import_others()
     same, done, rows = equivalents(), [], []
@@ -292,11 +292,12 @@ def main() -> int:
         found = [mutant for module in modules for mutant in mutants_of(module, (ROOT / module).read_text())]
         drawn = random.Random(arguments.seed).sample(found, min(arguments.sample or len(found), len(found)))
         if arguments.again:
-            before = json.loads(arguments.again.read_text())
-            key = {(m["module"], m["operator"], m["occurrence"]) for m in before if m["outcome"] == "survived"}
-            drawn = [mutant for mutant in found if (mutant.module, mutant.operator, mutant.occurrence) in key]
-        used = [module for module in modules if any(mutant.module == module for mutant in drawn)]
-        try_all(drawn, tests, measured(used, tests), arguments.jobs)
+            before = [Mutant(**item) for item in json.loads(arguments.again.read_text())]
+            drawn = [mutant for mutant in before if mutant.module in tests]
+        work = [mutant for mutant in drawn if mutant.outcome in ("", "survived")]
+        used = [module for module in modules if any(mutant.module == module for mutant in work)]
+        if work:
+            try_all(work, tests, measured(used, tests), arguments.jobs)
         for mutant in drawn:
             for entry in same.get((mutant.module.removeprefix("surgical_marl/"), mutant.was, mutant.operator), ()):
                 if entry.get("now", mutant.now) == mutant.now:
