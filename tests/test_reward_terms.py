@@ -174,6 +174,7 @@ def test_bounds_and_choices_of_terms() -> None:
     nothing = task.nothing
     assert np.isinf(nothing.reach) and [float(x) for x in nothing[1:]] == [0, 0, -1, -1]
     assert task.constants == (True, "psm_0", "psm_1")
+    assert (task.tolerance, task.angle, object_task.NEAR) == (0.002, pytest.approx(np.pi / 18), 0.01)
     hold = lambda value: float(object_task.known(np.float32(value)))  # noqa: E731
     assert [hold(9.9), hold(10.1), hold(np.nan)] == pytest.approx([9.9, 10.0, 10.0])
     with pytest.raises(ValueError, match="needs a scene with 2 arms whose jaws have pads; 'psm_needle' has 1"):
@@ -352,3 +353,4 @@ def test_a_cost_counts_from_its_limit_on(joint: int) -> None:
         broken(speed=0.201) == {"speed"} and broken(distance=0.0049) == {"distance"} and broken(force=1.01) == {"force"}
     )
     assert broken(speed=0.199, distance=0.0051, force=0.99) == set()
+    assert broken(speed=safety.SPEED, distance=safety.NEAR, force=safety.FORCE) == set()
