@@ -255,21 +255,15 @@ def equivalents() -> dict[tuple[str, str, str], list[dict[str, str]]]:
     return found
 
 
-def wilson(hits: int, tries: int) -> tuple[float, float]:
-    """Return the 95 % interval of a share (Wilson, J. Am. Stat. Assoc. 22, 1927)."""
-    if not tries:
-        return 0.0, 1.0
-    z, share = 1.959964, hits / tries
-    middle, half = share + z**2 / (2 * tries), z * (share * (1 - share) / tries + z**2 / (4 * tries**2)) ** 0.5
-    return (middle - half) / (1 + z**2 / tries), (middle + half) / (1 + z**2 / tries)
-
-
 def row(area: str, everything: int, tried: Sequence[Mutant]) -> str:
     """Return the row of a table about an area's mutants."""
     same = sum(bool(mutant.reason) and mutant.outcome == "survived" for mutant in tried)
     killed = sum(mutant.outcome != "survived" for mutant in tried)
-    low, high = wilson(killed, len(tried) - same)
-    share = f"{killed / max(1, len(tried) - same):.1%} ({low:.0%} to {high:.0%})"
+    from scipy.stats import binomtest
+
+    found = binomtest(killed, len(tried) - same)
+    low, high = found.proportion_ci(method="wilson")
+    share = f"{found.statistic:.0%} ({low:.0%} to {high:.0%})"
     return f"| {area} | {everything} | {len(tried)} | {killed} | {same} | {len(tried) - killed - same} | {share} |"
 
 

@@ -114,3 +114,23 @@ def test_loops_count_and_carry_as_jax_has_them() -> None:
         return forth, back, rounds, nested, chosen, lax.cond(x > 0, lambda: (x, n), lambda: (-x, n + 1))
 
     compare(function, X, np.int32([0, 1, 2, 5, -1]), rtol=1e-5)
+
+
+def test_functions_of_known_numbers_are_numbers() -> None:
+    def function(x: Any) -> Any:
+        known = x - x + np.float32(0.3)
+        return [f(known) for f in (jnp.sin, jnp.cos, jnp.exp, jnp.tan, jnp.log1p)]
+
+    assert compare(function, X) <= 1
+
+
+def test_a_switch_takes_the_branch_of_its_number_or_the_nearest() -> None:
+    branches = [lambda x: x + 1, lambda x: x * 3, lambda x: -x, lambda x: x / 4, lambda x: x * x]
+    compare(lambda n, x: lax.switch(n, branches, x), np.int32([-2, 0, 1, 2, 3, 4, 9]), np.float32(range(7)))
+
+
+def test_whole_numbers_divide_as_in_jax() -> None:
+    ends = np.array([0, 1, 2, 7, 2**31 - 1, 2**31, 2**32 - 1], np.uint32)
+    a, b = (pair.ravel() for pair in np.meshgrid(ends, ends))
+    compare(lambda a, b: (lax.div(a, b), lax.rem(a, b)), a, b)
+    compare(lambda a, b: (lax.div(a, b), lax.rem(a, b)), a.view(np.int32), b.view(np.int32))

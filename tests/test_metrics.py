@@ -231,9 +231,12 @@ def test_the_time_that_a_success_must_last_is_a_step_at_least() -> None:
         assert measure(played, dt, False)["held"][0, 0] == pytest.approx(played.error[12 - steps, 0, 0])
 
 
-def test_speed_that_is_all_at_rest_but_for_a_moment_has_a_long_arc_and_one_sample_none() -> None:
+def test_a_spectrum_of_one_or_two_frequencies_has_an_arc_too() -> None:
+    """Of movements so short that 10 Hz is below their first frequency, or between that and the second one."""
+    assert spectral_arc_length(np.array([1.0, 2.0]), 0.001) == 0.0
+    found = spectral_arc_length(np.array([1.0, 2.0]), 1 / (32 * 7))
+    assert found == pytest.approx(arc_length([1.0, 2.0], 1 / (32 * 7))) and found < -1
     assert spectral_arc_length(np.array([1.0]), 0.3) == pytest.approx(arc_length([1.0], 0.3))
-    assert spectral_arc_length(np.array([1.0, 1.0]), 100.0) == pytest.approx(arc_length([1.0, 1.0], 100.0))
 
 
 def test_an_interval_needs_two_episodes_and_shrinks_with_its_confidence() -> None:
