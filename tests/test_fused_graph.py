@@ -142,7 +142,7 @@ def test_a_scope_shares_only_what_costs_nothing() -> None:
 
 @pytest.mark.parametrize("op", ["lt", "le", "gt", "ge", "eq", "ne"])
 def test_comparisons_of_counters_are_decided_where_all_rounds_agree(op: str) -> None:
-    """And only there, for equality where they are apart: of a counter with a number, and of two counters of loops of different lengths."""
+    """And only there; for equality, where they are apart. Of a counter and a number, and of two counters."""
     for rounds, shift, other, away in product((1, 2, 4), (-3, 0, 2), (1, 3), (-5, -1, 0, 1, 4)):
         g = Graph()
         first, second = (g.fresh("counter", k, n, kind="i") for k, n in enumerate((rounds, other)))

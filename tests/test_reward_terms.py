@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from surgical_marl.envs import costs as safety
 from surgical_marl.physics.views import ObjectView
+from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.robots.arm import load_arm
 from surgical_marl.scenes.load import load_scene
 from surgical_marl.tasks.base import object_task
@@ -167,6 +168,10 @@ def test_bounds_and_choices_of_terms() -> None:
     assert task.observes("psm_1") == own + object_ + goal + ("others_hold", "to_nearest_tip", "min_distance")
     assert "target_rotation" not in bring(ONE, "easy").observes("psm_0")
     assert (task.picker, task.presenter, task.informed, alone.presenter) == ("psm_0", "psm_1", "psm_0", "psm_0")
+    every = tuple(task.scene.objects[NEEDLE].object.sites)
+    assert object_task.find_object(task.scene, "needle_pick", every) == NEEDLE
+    with pytest.raises(ValueError, match="the sites tip and knob; 'psm_needle' has none"):
+        object_task.find_object(alone.scene, "needle_pick", ("tip", "knob"))
     goals = SimpleNamespace(row=np.array([2, 0]))
     np.testing.assert_array_equal(task.marks(goals)[:, 0], task.tables["points"][[2, 0]])
     assert [len(part) for part in task.goal_content(goals)] == [2, 2, 2]
@@ -290,6 +295,8 @@ def test_what_a_task_says_where_it_says_nothing() -> None:
     )
     assert task.marks(world.goal).shape == (1, 0, 3) and task.constants == () and task.informed == "psm_0"
     assert (task.seed, Task(task.scene, Options("reach", "psm")).seed) == (1, 0)
+    assert (Task.max_steps, ObjectTask.hands, Level(0.1, 0.2).speed) == (100, 1, 0.0)
+    assert TASKS.load("reach").summary().startswith("Target reaching: ") and Reach.summary() == "Tips at targets."
     other = task.bound({"action_change": 5.0}, {"a": np.ones(1)})
     assert other.weights == {"action_change": 5.0} and task.weights == {"action_change": 0.0} and not task.tables
     for wrong, words in (({"difficulty": "odd"}, "difficulty"), ({"start": "random"}, "start of task"),
@@ -353,4 +360,11 @@ def test_a_cost_counts_from_its_limit_on(joint: int) -> None:
         broken(speed=0.201) == {"speed"} and broken(distance=0.0049) == {"distance"} and broken(force=1.01) == {"force"}
     )
     assert broken(speed=0.199, distance=0.0051, force=0.99) == set()
+    edge = 0.01 * (arm.upper - arm.lower)[joint]
+    q = (arm.lower + arm.upper) / 2
+    for at in (arm.lower[joint] + edge, arm.upper[joint] - edge):  # at the limit of the limit is not beyond it
+        q = q.astype(np.float32)
+        q[joint] = np.float32(at)
+        view: Any = SimpleNamespace(qpos=q, min_distance=1.0, bump_force=0.0)
+        assert not safety.costs(arm, view, np.float32(0))["limit"]  # type: ignore[arg-type]
     assert broken(speed=safety.SPEED, distance=safety.NEAR, force=safety.FORCE) == set()
