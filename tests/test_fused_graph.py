@@ -181,3 +181,14 @@ def test_an_element_is_read_from_where_it_was_put() -> None:
     assert [g.read(array, g.constant(np.int32(k))) for k in range(3)] == values
     found = g.read(array, index)
     assert g.ops[found] == "read" and g.args[found] == (array, index) and g.kinds[found] == "f"
+
+
+def test_a_table_that_is_given_later_is_looked_up_then() -> None:
+    g = Graph()
+    one = g.table(np.arange(3, dtype=np.float32))
+    example = np.ones(4, np.int32)
+    given = g.input_table(example)
+    assert (one, given, g.inputs) == (0, 1, {1}) and g.tables[given] is example
+    found = g.lookup(given, g.constant(np.int32(2)))
+    assert found >= 0 and g.kinds[found] == "i" and g.args[found][0] == given
+    assert g.input_table(example) == 2  # never the same one

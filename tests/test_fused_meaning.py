@@ -134,3 +134,24 @@ def test_whole_numbers_divide_as_in_jax() -> None:
     a, b = (pair.ravel() for pair in np.meshgrid(ends, ends))
     compare(lambda a, b: (lax.div(a, b), lax.rem(a, b)), a, b)
     compare(lambda a, b: (lax.div(a, b), lax.rem(a, b)), a.view(np.int32), b.view(np.int32))
+
+
+def test_truths_are_compared_as_zero_and_one() -> None:
+    a, b = np.array([False, False, True, True]), np.array([False, True, False, True])
+    operations = (lax.lt, lax.le, lax.gt, lax.ge, lax.eq, lax.ne, lax.max, lax.min, lax.bitwise_and, lax.bitwise_xor)
+    compare(lambda a, b: [operation(a, b) for operation in operations], a, b)
+
+
+def test_windows_that_reach_out_are_filled_or_moved() -> None:
+    """Gathers at places that are not known, of constants and of values, within and without their range."""
+    table = np.arange(40, dtype=np.float32).reshape(20, 2)
+
+    def function(k: Any, x: Any) -> Any:
+        own = jnp.stack([x, x + 1, x * 2, -x])
+        return [
+            jnp.asarray(part).at[k].get(mode=mode, fill_value=-7.0)
+            for part in (table[:, 0], table[:5, 1], own)
+            for mode in ("fill", "clip")
+        ] + [lax.dynamic_slice(own, (k,), (2,)), lax.dynamic_slice(jnp.asarray(table), (k, k), (2, 1))]
+
+    compare(function, np.int32([-30, -4, -1, 0, 1, 3, 4, 5, 18, 19, 20, 50]), np.float32(range(12)))
