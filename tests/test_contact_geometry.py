@@ -220,7 +220,7 @@ def test_a_fork_is_led_by_its_first_point_and_nothing_is_no_patch() -> None:
     assert float(patch_of([1e-3], [[0, 0, 0]], count=0).reach) == 2 * AWAY
     none = no_patch()
     assert none.points.depth.tolist() == [AWAY] * POINTS and float(none.reach) == AWAY and float(none.radius) == 1
-    assert not none.frame.any() and not none.centre.any() and not none.points.normal.any()
+    assert not none.frame.any() and none.centre.tolist() == [0, 0, 0] and not none.points.normal.any()
 
 
 def cone(rng: np.random.Generator, points: int = 4) -> Cone:
