@@ -60,6 +60,14 @@ def test_a_step_is_damped_least_squares_of_the_joints_that_can_move() -> None:
     assert seen == {False, True}
 
 
+def test_steps_of_many_searches_are_those_of_each() -> None:
+    rng = np.random.default_rng(5)
+    many = rng.random((4, 3, 5)), 10 * rng.normal(size=(4, 3, 3)), rng.normal(size=(4, 3, 3, 5)), np.zeros((4, 3, 5))
+    found = inverse._step(*many)
+    for place in np.ndindex(4, 3):
+        np.testing.assert_allclose(found[place], inverse._step(*(part[place] for part in many)), atol=1e-12)
+
+
 def test_a_step_in_single_precision_is_finite_where_only_one_way_is_open() -> None:
     """The damping grows with what single precision rounds off; a step then does nothing across the way."""
     rng = np.random.default_rng(4)
@@ -137,6 +145,20 @@ def test_poses_in_warp_are_c_mujocos() -> None:
                     np.testing.assert_allclose(
                         mine.reshape(len(mine), -1), getattr(data, name), atol=2e-5, err_msg=name
                     )
+    text = """<mujoco><worldbody><body pos="0.1 0.2 0.3" euler="20 30 40"><joint axis="1 2 3" pos="0.05 -0.1 0.2"/>
+        <joint type="slide" axis="0 1 1"/><geom size="1" pos="0.3 0 0.1" euler="10 0 50"/>
+        <body pos="0.2 0 0"><joint pos="0 0.3 0.1" axis="0 1 0" ref="20"/><geom type="capsule" size="0.1 0.2"/></body>
+        </body></worldbody></mujoco>"""
+    model = mujoco.MjModel.from_xml_string(text)  # joints beside the origins of their bodies, two in one of them
+    data = mujoco.MjData(model)
+    with wp.ScopedDevice("cpu"):
+        known = Kinematics(model, 1)
+        known.qpos.assign(np.float32([[0.7, -0.2, 1.1]]))
+        known.update()
+        data.qpos[:] = [0.7, -0.2, 1.1]
+        mujoco.mj_kinematics(model, data)
+        np.testing.assert_allclose(known.geom_xpos.numpy()[0], data.geom_xpos, atol=1e-6)
+        np.testing.assert_allclose(known.geom_xmat.numpy()[0].reshape(-1, 9), data.geom_xmat, atol=1e-6)
     for other in ('<joint type="ball"/>', '<camera mode="track"/>'):
         text = f'<mujoco><worldbody><body>{other}<geom size="1"/></body></worldbody></mujoco>'
         with pytest.raises(ValueError, match="hinges and slides"):
