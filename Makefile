@@ -6,6 +6,8 @@
 # make release build the wheel, try it in a new environment, list what it brings (SBOM): dist/
 # make matrix  tests with other versions of Python and of dependencies       (ARGS="--python 3.13")
 # make lock    constraints.hashes.txt, the hashes of all that constraints.txt names
+# make coverage  lines of the package that the tests run, module by module  (ARGS="-k cli")
+# make mutants   change the package in places, and count what tests notice   (ARGS="--area rewards --sample 50")
 # make lint    style       make typecheck    types       make clean    remove what was built
 
 PYTHON ?= $(firstword $(shell command -v python3.11 python3 python))
@@ -14,10 +16,12 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 SITE_READY := $(VENV)/.ready-for-docs
 SUPPLY_READY := $(VENV)/.ready-for-supply
+QUALITY_READY := $(VENV)/.ready-for-quality
 ARGS ?=
+FULL_DISK := test_a_full_disk_is_one_sentence_and_the_run_goes_on_when_there_is_room
 
 .DEFAULT_GOAL := help
-.PHONY: help train test docs gallery audit release matrix lock lint typecheck clean
+.PHONY: help train test docs gallery audit release matrix lock coverage mutants lint typecheck clean
 
 help:
 	@sed -n 's/^# make/make/p' Makefile
@@ -51,6 +55,18 @@ lock: $(SUPPLY_READY)
 	  --custom-compile-command "make lock" --default-index https://pypi.org/simple \
 	  --output-file constraints.hashes.txt constraints.txt
 
+# Not a part of `make test`, and slower. One process at a time, because what a worker of pytest-xdist had run was lost once;
+# processes that tests start are counted too. Coverage can't write to a full disk, so the tests of that are left out.
+coverage: export COVERAGE_FILE := $(CURDIR)/build/coverage/data
+coverage: $(QUALITY_READY)
+	rm -rf build/coverage && mkdir -p build/coverage
+	-$(BIN)/coverage run -m pytest --deselect tests/test_reliability.py::$(FULL_DISK) $(ARGS)
+	-$(BIN)/coverage combine --quiet
+	$(BIN)/coverage report | tee build/coverage/report.txt
+
+mutants: $(QUALITY_READY)
+	$(BIN)/python .ci/mutants.py $(ARGS)
+
 lint: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -79,4 +95,10 @@ $(SITE_READY): $(READY)
 # What looks after the dependencies, likewise.
 $(SUPPLY_READY): $(READY)
 	$(BIN)/python -m pip install --no-input --quiet --progress-bar off -c constraints.txt -e '.[supply]'
+	@touch $@
+
+# Of cosmic-ray only what makes mutants: it brings a server and reports, which are not used, and a library under the LGPL.
+$(QUALITY_READY): $(READY)
+	$(BIN)/python -m pip install --no-input --quiet --progress-bar off -c constraints.txt coverage
+	$(BIN)/python -m pip install --no-input --quiet --progress-bar off -c constraints.txt --no-deps cosmic-ray parso stevedore
 	@touch $@

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import product
 
 import numpy as np
 import pytest
@@ -137,3 +138,57 @@ def test_a_scope_shares_only_what_costs_nothing() -> None:
     assert inner != total and g.add(y, x) == inner and load(g, "f", 0) == x
     g.close_scope()
     assert g.add(x, y) == total
+
+
+@pytest.mark.parametrize("op", ["lt", "le", "gt", "ge", "eq", "ne"])
+def test_comparisons_of_counters_are_decided_where_all_rounds_agree(op: str) -> None:
+    """And only there; for equality, where they are apart. Of a counter and a number, and of two counters."""
+    for rounds, shift, other, away in product((1, 2, 4), (-3, 0, 2), (1, 3), (-5, -1, 0, 1, 4)):
+        g = Graph()
+        first, second = (g.fresh("counter", k, n, kind="i") for k, n in enumerate((rounds, other)))
+        moved = g.add(first, g.constant(np.int32(shift)))
+        number = g.constant(np.int32(away))
+        mine = {k + shift for k in range(rounds)}
+        for value, theirs in ((number, {away}), (g.add(second, number), {k + away for k in range(other)})):
+            truths = {bool(FOLD[op](np.int32(a), np.int32(b))) for a in mine for b in theirs}
+            for a, b, way in ((moved, value, op), (value, moved, {"lt": "gt", "le": "ge"}.get(op, op))):
+                if (a, b) == (value, moved) and op in ("gt", "ge"):
+                    continue
+                found = g.compare(way, a, b)
+                apart = max(mine) < min(theirs) or max(theirs) < min(mine)
+                if len(truths) == 1 and (apart or op not in ("eq", "ne")):
+                    assert found == (g.true if truths == {True} else g.false)
+                else:
+                    assert found >= 0
+            for kind, best in (("max", max), ("min", min)):
+                found = g.extreme(kind, moved, value)
+                results = {best(a, b) for a in mine for b in theirs}
+                if found == moved:
+                    assert results <= mine
+                if found == value:
+                    assert results <= theirs
+                certain = max(mine) <= min(theirs) or max(theirs) <= min(mine)
+                assert (found in (moved, value)) == certain or moved < 0
+
+
+def test_an_element_is_read_from_where_it_was_put() -> None:
+    """At a number that is known without a node; at the first node of the graph, whose number is 0, by one."""
+    g = Graph()
+    index = load(g, "i")
+    assert index == 0
+    values = [load(g, "f", k) for k in range(3)]
+    array = g.array(values)
+    assert [g.read(array, g.constant(np.int32(k))) for k in range(3)] == values
+    found = g.read(array, index)
+    assert g.ops[found] == "read" and g.args[found] == (array, index) and g.kinds[found] == "f"
+
+
+def test_a_table_that_is_given_later_is_looked_up_then() -> None:
+    g = Graph()
+    one = g.table(np.arange(3, dtype=np.float32))
+    example = np.ones(4, np.int32)
+    given = g.input_table(example)
+    assert (one, given, g.inputs) == (0, 1, {1}) and g.tables[given] is example
+    found = g.lookup(given, g.constant(np.int32(2)))
+    assert found >= 0 and g.kinds[found] == "i" and g.args[found][0] == given
+    assert g.input_table(example) == 2  # never the same one

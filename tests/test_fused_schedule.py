@@ -182,7 +182,10 @@ def compute(g: Graph, node: Value, read: Callable[[Value], Any], loads: Mapping[
 
 
 class Scheduled:
-    """Values of a graph for one environment, computed as a schedule has them. KeyError for one that comes too late."""
+    """Values of a graph for one environment, computed as a schedule has them. KeyError for one that comes too late.
+
+    What takes over the memory of an array changes it there: whatever reads the array afterwards reads something else.
+    """
 
     def __init__(self, graph: Graph, plan: Schedule, loads: Mapping[tuple[str, int], Any]) -> None:
         self.graph, self.plan, self.loads = graph, plan, loads
@@ -199,7 +202,11 @@ class Scheduled:
             return known[value] if value >= 0 else self.graph.constants[~value]
 
         for kind, item in self.plan.regions[number].items:
-            if kind == "node":
+            if kind == "node" and item in self.plan.takers:
+                array, index, *values = map(read, self.graph.args[item])
+                array[int(index) : int(index) + len(values)] = values
+                known[item] = array
+            elif kind == "node":
                 known[item] = compute(self.graph, item, read, self.loads)
             elif kind == "group":
                 group = self.graph.groups[item]
@@ -217,14 +224,14 @@ class Scheduled:
 
     def _loop(self, number: int, loop: Loop, known: Any, read: Callable[[Value], Any]) -> None:
         wanted, tested, count = self.plan.alive[number], loop.condition is not None, 0
-        values = [read(loop.starts[j]) for j in wanted]
+        values = [np.array(read(loop.starts[j])) for j in wanted]  # a loop begins with copies
         while tested or count < loop.length:
             found: list[Any] = []
 
             def result(k: int, read: Callable[[Value], Any], found: list[Any] = found) -> bool:
                 if tested and k == 0:
                     return bool(read(loop.condition))  # type: ignore[arg-type]
-                found.append(read(loop.nexts[wanted[k - tested]]))
+                found.append(np.array(read(loop.nexts[wanted[k - tested]])))
                 return True
 
             inside = known.new_child(dict(zip((loop.phis[j] for j in wanted), values, strict=True)))

@@ -144,6 +144,106 @@ def test_what_an_episode_does_not_have_is_undefined() -> None:
     assert (one_step["path"] == 0).all()
 
 
+def test_what_is_reported_of_runs_is_reduced_as_documented() -> None:
+    """Three runs of eleven episodes of two arms, each metric by a loop over what was measured; units and names too."""
+    rng = np.random.default_rng(7)
+    shape = (3, 11, 2)
+    raw = {name: 10 ** rng.uniform(-4, -2, shape) for name in ("error", "held", "squared", "distance", "path")}
+    raw |= {"success": rng.random(shape) < 0.5, "collided": rng.random(shape) < 0.2, "drop": np.zeros(shape)}
+    raw |= {name: np.where(rng.random(shape) < 0.3, np.nan, rng.random(shape)) for name in
+            ("center", "time", "smoothness", "action_change", "angle_error", "centre_error", "in_view",
+             "camera_travel", "contact_force", "cost_force", "stage_lifted", "reward_lift", "other")}  # fmt: skip
+    raw["drop"][:, :4, 0] = 1
+    flat = {name: [float(value) for value in values.ravel()] for name, values in raw.items()}
+    known = {name: [value for value in values if not math.isnan(value)] for name, values in flat.items()}
+    teams = {name: [tuple(arms) for run in raw[name] for arms in run] for name in ("held", "collided", "drop")}
+    mean, mm = (lambda values: math.fsum(values) / len(values)), 1000.0
+    errors = sorted(mm * error for error in flat["error"])
+    place = 0.95 * (len(errors) - 1)
+    low = int(place)
+    expected = {
+        "median_error_mm": (errors[32] + errors[33]) / 2,
+        "mean_error_mm": mean(errors),
+        "p95_error_mm": errors[low] + (place - low) * (errors[low + 1] - errors[low]),
+        **{f"success_{n}mm": mean([error < n / mm for error in flat["held"]]) for n in (1, 2, 5)},
+        "team_success_2mm": mean([max(arms) < 0.002 for arms in teams["held"]]),
+        "success_rate": mean(flat["success"]),
+        "collision_rate": mean([max(arms) for arms in teams["collided"]]),
+        "time_to_success_s": mean(known["time"]),
+        "path_length_mm": mm * mean(flat["path"]),
+        "smoothness": mean(known["smoothness"]),
+        "action_change": mean(known["action_change"]),
+        "min_distance_mm": mm * min(flat["distance"]),
+        "remote_center_error_mm": mm * max(known["center"]),
+        "drop_rate": mean([max(arms) for arms in teams["drop"]]),
+        "angle_error_deg": math.degrees(1) * mean(known["angle_error"]),
+        "centre_error": mean(known["centre_error"]),
+        "in_view_rate": mean(known["in_view"]),
+        "camera_travel_mm": mm * mean(known["camera_travel"]),
+        "peak_force_n": mean(known["contact_force"]),
+        **{name: mean(known[name]) for name in ("cost_force", "stage_lifted", "reward_lift")},
+    }
+    found = metrics(raw, following=False)
+    assert {name: float(metric.reduce(metric.values.ravel())) for name, metric in found.items()} == pytest.approx(
+        expected
+    )
+    assert {name for name, metric in found.items() if metric.extreme} == {"min_distance_mm", "remote_center_error_mm"}
+    rows = [metric.reduce(metric.values.reshape(3, -1)) for metric in found.values()]  # as in a bootstrap
+    for metric, row in zip(found.values(), rows, strict=True):
+        np.testing.assert_allclose(row, [metric.reduce(metric.values[run].ravel()) for run in range(3)])
+        assert metric.values.shape in ((3, 11, 2), (3, 11, 1))
+    moving = metrics(raw, following=True)
+    assert set(moving) - set(found) == {"rmse_mm"}
+    rmse = moving["rmse_mm"]
+    assert float(rmse.reduce(rmse.values.ravel())) == pytest.approx(mm * math.sqrt(mean(flat["squared"])))
+    few = {name: values for name, values in raw.items() if name not in ("drop", "angle_error")}
+    assert set(found) - set(metrics(few, following=False)) == {"drop_rate", "angle_error_deg"}
+
+
+def test_terms_are_reduced_by_their_names_over_the_steps_that_count() -> None:
+    lengths = [3, 5]
+    played, rng = random_trajectory(0, lengths, 2), np.random.default_rng(1)
+    drawn = {name: rng.random((5, 2, 2)) for name in ("cost", "in_view", "camera_travel", "angle_error", "reward_lift")}
+    searching = (np.arange(5)[:, None, None] < [[1], [3]]) * np.ones((5, 2, 2))
+    stages = np.zeros((5, 2, 2))
+    stages[1, 0], stages[4, 0] = 1.0, 1.0  # reached and left again; after the end of the first episode
+    found = measure(played._replace(terms={**drawn, "searching": searching, "stage_lifted": stages}), DT, False)
+    plain = measure(played._replace(terms=drawn), DT, False)
+    for episode, length in enumerate(lengths):
+        own = {name: values[:length, episode] for name, values in drawn.items()}
+        shown = own["in_view"][[1, 3][episode] :]
+        for name, value in {
+            "cost": own["cost"].mean(0), "reward_lift": own["reward_lift"].mean(0), "in_view": shown.mean(0),
+            "camera_travel": own["camera_travel"].sum(0), "angle_error": own["angle_error"][-1],
+            "stage_lifted": [1.0, 1.0] if episode == 0 else [0.0, 0.0],
+        }.items():  # fmt: skip
+            np.testing.assert_allclose(found[name][episode], value, err_msg=name)
+        np.testing.assert_allclose(plain["in_view"][episode], own["in_view"].mean(0))
+    never = measure(played._replace(terms={"in_view": drawn["in_view"], "searching": np.ones((5, 2, 2))}), DT, False)
+    assert np.isnan(never["in_view"]).all()
+
+
+def test_the_time_that_a_success_must_last_is_a_step_at_least() -> None:
+    """Of steps that are longer than `HOLD` the last one is judged, and of shorter ones as many as `HOLD` has."""
+    played = random_trajectory(0, [12], 1)
+    played.error[:, 0, 0] = np.linspace(0.012, 0.001, 12)
+    for dt, steps in ((1.0, 1), (0.5, 1), (0.1, 2), (0.05, 4)):
+        assert measure(played, dt, False)["held"][0, 0] == pytest.approx(played.error[12 - steps, 0, 0])
+
+
+def test_a_spectrum_of_one_or_two_frequencies_has_an_arc_too() -> None:
+    """Of movements so short that 10 Hz is below their first frequency, or between that and the second one."""
+    assert spectral_arc_length(np.array([1.0, 2.0]), 0.001) == 0.0
+    found = spectral_arc_length(np.array([1.0, 2.0]), 1 / (32 * 7))
+    assert found == pytest.approx(arc_length([1.0, 2.0], 1 / (32 * 7))) and found < -1
+    assert spectral_arc_length(np.array([1.0]), 0.3) == pytest.approx(arc_length([1.0], 0.3))
+
+
+def test_an_interval_needs_two_episodes_and_shrinks_with_its_confidence() -> None:
+    found = interval(mean_of([[[0.0], [1.0]]]))
+    assert found == [0.0, 1.0]
+
+
 @settings(deadline=None, max_examples=25)
 @given(
     st.lists(st.floats(0.0, 1.0), min_size=2, max_size=40).filter(lambda speed: max(speed) > 0.01),
