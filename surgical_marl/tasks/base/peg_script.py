@@ -26,6 +26,8 @@ after the exchange, m."""
 SIDE, NEXT = 150.0, -120.0
 """In the exchange a tool of the left grips the bar that is this way from the block's axis, degrees about z, and one of
 the right the next bar clockwise, at 30 degrees."""
+THERE = 0.004
+"""How near to the place of the exchange the block's middle is before the oracle's taker comes, m."""
 SETTINGS = (ABOVE_WALL, PAST, WIDE, OVER, RAISE, AWAY, SIDE, NEXT)
 
 
@@ -144,18 +146,26 @@ class Transfer:
         def take(seen: Snapshot, beyond: float) -> dict[str, Wish]:
             return self._grip(seen, taker, self.taken(self._held_at(seen)), beyond)
 
+        def offered_there(seen: Snapshot) -> np.ndarray:
+            """Return whether the block is there: a giver with a policy of its own takes its own time."""
+            return np.asarray(np.linalg.norm(seen.objects[self.name][:, :3, 3] - self.place, axis=-1) < THERE)
+
+        def left(seen: Snapshot) -> np.ndarray:
+            """Return whether the giver is out of the taker's way."""
+            return np.asarray((seen.tools[taker] - seen.tools[giver])[:, :3, 3] @ across > AWAY)
+
         def again(seen: Snapshot) -> np.ndarray:
             return np.where(self._holds(giver)(seen), offered + 2, first)
 
         return (
             Step(lambda seen: offer(seen, [0.0, 0.0, 0.01] - AWAY * across), pace=0.6),
-            Step(lambda seen: offer(seen, [0.0, 0.0, 0.0]), wait=0.2, pace=0.5),
+            Step(lambda seen: offer(seen, [0.0, 0.0, 0.0]), wait=0.2, pace=0.5, good=offered_there, back=offered + 1),
             Step(lambda seen: take(seen, -OVER), wait=0.1, pace=0.6),
             Step(lambda seen: take(seen, PAST), wait=EARLY, pace=0.3),
             Step(lambda seen: {taker: Wish()}, wait=0.4, pace=0.3, good=self._holds(taker), back=again),
             Step(lambda seen: {giver: Wish(opens=WIDE)}, wait=0.2),
             Step(lambda seen: _shifted(seen, giver, [0, 0, RAISE / 2], WIDE), pace=0.3),
-            Step(lambda seen: _shifted(seen, giver, -AWAY * across, WIDE), pace=0.6),
+            Step(lambda seen: _shifted(seen, giver, -AWAY * across, WIDE), pace=0.6, good=left, back=offered + 7),
             Step(lambda seen: self._carry(seen, self.place + AWAY * across), pace=0.5),
         )
 
