@@ -31,7 +31,8 @@ def test_the_page_shows_all_content_and_its_pictures_exist() -> None:
 
 def test_a_task_is_played_by_its_policy_or_by_the_oracle() -> None:
     assert gallery.player("reach") == ("reach-trimanual_psm_ecm", "trimanual_psm_ecm")
-    assert gallery.player("peg_transfer") == ("oracle", "bimanual_psm_pegs")
+    assert gallery.player("peg_transfer") == ("peg_transfer-bimanual_psm_pegs", "bimanual_psm_pegs")
+    assert gallery.player("camera_assist")[0] == "oracle"
 
 
 def test_objects_stand_on_the_ground_in_the_middle_of_their_picture() -> None:
