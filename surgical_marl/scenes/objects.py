@@ -22,6 +22,7 @@ from surgical_marl.robots.rotation import matrix_of, quaternion, turned
 from surgical_marl.scenes.poses import Pose
 from surgical_marl.scenes.shapes import Shape as Shape
 from surgical_marl.scenes.shapes import read_colour, read_material, read_number, read_shapes
+from surgical_marl.untrusted.markup import check_name
 from surgical_marl.untrusted.values import check_count, shown
 from surgical_marl.yaml_file import check_keys, read_mapping, read_vector, read_yaml
 
@@ -131,6 +132,7 @@ def load_object(name: str | Path, colour: Any = None) -> Object:
         ValueError: the name is unknown, or the file lacks something or has a bad value.
     """
     path = find("objects", name)
+    check_name(path.stem, "an object's file")
     settings, where = read_yaml(path), str(path)
     check_keys(settings, KEYS, path)
     free = settings.get("free")
