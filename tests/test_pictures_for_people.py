@@ -17,7 +17,7 @@ from surgical_marl.scenes.shapes import MATERIALS
 from surgical_marl.view.camera import best_view, seen
 from surgical_marl.view.colours import AGENTS, TEAM, goal_colour
 from surgical_marl.view.render import Renderer, View
-from surgical_marl.view.shading import GAMMA, LOOKS, RUBBER, STEEL, materials
+from surgical_marl.view.shading import GAMMA, LOOKS, RUBBER, STEEL, material, materials
 from surgical_marl.view.stage import TABLE, paint, stage
 from surgical_marl.vision.endoscope import Endoscope
 from tests.test_objects import FILE, SCENE
@@ -140,6 +140,16 @@ def test_colours_say_what_things_are_made_of() -> None:
     assert shaft and shaft[0].gloss[2] == 1.0  # bare steel
 
 
+def test_a_geom_may_be_painted_with_a_colour_or_a_material() -> None:
+    model, data = posed("<worldbody><geom size='.1' rgba='.2 .2 .2 1'/></worldbody>")
+    front, green = View(elevation=0.0), (0.1, 0.8, 0.1)
+    plain, colour, made = (
+        Renderer(model, 60, 60, paint=paint).render(data, front)[30, 30].astype(int)
+        for paint in ({}, {0: green}, {0: material(np.array(green))})
+    )
+    assert plain[1] < 1.3 * plain[0] and (colour == made).all() and colour[1] > 2 * colour[0]
+
+
 def test_every_material_has_a_look_of_its_own() -> None:
     assert set(LOOKS) == set(MATERIALS) and len(set(LOOKS.values())) == len(MATERIALS)
 
@@ -152,13 +162,13 @@ def test_an_object_looks_as_its_file_says_and_otherwise_as_its_colour_suggests(t
         "arms: {ecm_0: {arm: ecm, position: [0, 0, 0.3]}}\nobjects: {it: {object: it.yaml, position: [0, 0, 0.06]}}"
     )
     drawn, observed = [], []
-    for material, own in (("", ""), ("material: steel,", ""), ("material: steel,", ", material: rubber")):
-        (tmp_path / "it.yaml").write_text(file % (material, f"{{{ball}}}}}", f"{{{stick}{own}}}}}"))
+    for of_all, own in (("", ""), ("material: steel,", ""), ("material: steel,", ", material: rubber")):
+        (tmp_path / "it.yaml").write_text(file % (of_all, f"{{{ball}}}}}", f"{{{stick}{own}}}}}"))
         scene = sm.load_scene(tmp_path / "one.yaml")
         sphere, capsule = (scene.model.geom(f"it/{number}").id for number in (0, 1))
         named = paint(scene)
         found = [named[geom].gloss if geom in named else None for geom in (sphere, capsule)]
-        assert found == [STEEL if material else None, RUBBER if own else STEEL if material else None]
+        assert found == [STEEL if of_all else None, RUBBER if own else STEEL if of_all else None]
         view = View((0, 0, 0.06), 0.1, elevation=-10)
         drawn.append(Renderer(scene.model, 60, 60, stage(scene), named).render(at_home(scene), view).astype(int))
         observed.append(Endoscope(scene).render(scene.home[None]).rgb)

@@ -24,6 +24,7 @@ from websockets.sync.client import connect
 
 from surgical_marl.cli.main import main
 from surgical_marl.content import find
+from surgical_marl.engines.stages import compiling
 from surgical_marl.runs.settings import Settings
 from surgical_marl.scenes.load import load_scene
 from surgical_marl.view.browser.gate import close_server, open_server, unlocked
@@ -189,6 +190,22 @@ def test_other_environments_are_looked_at(viewer: Viewer) -> None:
     assert (env.num_envs, env.max_steps, viewer.session.settings.difficulty) == (3, 40, "default")
     assert viewer.session.movers.who == {agents[0]: "oracle", agents[1]: "frozen"}
     assert viewer.session.seed == 3
+
+
+def test_the_page_says_what_a_compilation_is_at(viewer: Viewer, monkeypatch: pytest.MonkeyPatch) -> None:
+    said: list[str] = []
+
+    def make(*_: Any) -> None:
+        with compiling("reach on psm") as stage:
+            stage("tracing the step")
+            raise ValueError("no such thing")
+
+    monkeypatch.setattr("surgical_marl.view.browser.viewer.Session", make)
+    monkeypatch.setattr(viewer, "_say", lambda title, text, seconds, **_: said.append(f"{title}, {text}"))
+    with pytest.raises(ValueError, match="no such thing"):
+        viewer.choose(Choice("reach", "bimanual_psm", "default", 2, 77))
+    assert said == ["Preparing, reach on bimanual_psm", "Compiling, reach on psm: tracing the step",
+                    "Compiling, reach on psm: failed"]  # fmt: skip
 
 
 def test_every_visible_geom_has_a_surface_where_it_is() -> None:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from surgical_marl.view.colours import visual_rgba
 from surgical_marl.view.lighting import GLOW, GRAIN
-from surgical_marl.view.shading import GAMMA, PLASTIC, Material, materials
+from surgical_marl.view.shading import GAMMA, PLASTIC, Material, material, materials
 from surgical_marl.view.tracer import PLANE, Shape, World, wp
 from surgical_marl.vision.raycaster import GROUPS, KINDS, corner_normals, warp_mesh
 from surgical_marl.vision.rays import CAPSULE, CYLINDER, ELLIPSOID, FAR, MESH
@@ -50,14 +50,14 @@ class Drawn:
     Args:
         model: whose geoms are primitives or meshes; of other kinds nothing is seen.
         stage: shapes besides those of the model.
-        paint: geom -> what it is made of, in place of what its colour suggests.
+        paint: geom -> what it is made of, or the rgb that suggests it, in place of its own colour.
     """
 
     def __init__(
         self,
         model: mujoco.MjModel,
         stage: Sequence[Extra] = (),
-        paint: Mapping[int, Material] = MappingProxyType({}),
+        paint: Mapping[int, Material | Sequence[float]] = MappingProxyType({}),
     ) -> None:
         seen = (model.geom_group < GROUPS) & (visual_rgba(model)[:, 3] > 0)
         known = np.array([mujoco.mjtGeom(kind) in _KINDS for kind in model.geom_type], bool)
@@ -70,7 +70,9 @@ class Drawn:
         shapes["radius"] = np.where(shapes["kind"] == PLANE, float(FAR), np.linalg.norm(_halves(shapes), axis=1))
         shapes["shadow_kind"], shapes["shadow_size"] = _shadows(shapes["kind"], shapes["size"])
         shapes["breadth"], shapes["alpha"] = _breadths(shapes["shadow_size"]), 1.0
-        made = [paint.get(geom, found) for geom, found in enumerate(materials(model))]
+        made = materials(model)
+        for geom, look in paint.items():
+            made[geom] = look if isinstance(look, Material) else material(np.asarray(look))
         for row, of in zip(
             shapes, [*(made[geom] for geom in geoms), *(extra.material for extra in stage)], strict=True
         ):

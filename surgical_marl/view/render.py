@@ -68,7 +68,7 @@ class Renderer:
         width: of a picture, pixels.
         height: likewise.
         stage: shapes besides those of the model, such as a table.
-        paint: geom -> what it is made of, in place of what its colour suggests.
+        paint: geom -> what it is made of, or the rgb that suggests it, in place of its own colour.
 
     Raises:
         ValueError: a size without pixels.
@@ -80,7 +80,7 @@ class Renderer:
         width: int = 480,
         height: int = 360,
         stage: Sequence[Extra] = (),
-        paint: Mapping[int, Material] = MappingProxyType({}),
+        paint: Mapping[int, Material | Sequence[float]] = MappingProxyType({}),
     ) -> None:
         if width < 1 or height < 1:
             raise ValueError(f"a picture of {width} x {height} pixels has nothing to show: use 1 or more")
