@@ -242,11 +242,21 @@ def drag(viewer: Viewer, page: Any, axis: np.ndarray, way: float) -> None:
 
 
 def test_hostile_names_stay_text(browser: Any, tmp_path: Path) -> None:
-    scene = tmp_path / "<img src=x onerror=window.hit=1>.yaml"
-    scene.write_text(find("scenes", "psm").read_text())
+    """Of a scene's file, of an arm and its agent, and of a run that nobody finds."""
+    name = "<img src=x onerror=window.hit=1>"
+    scene, arm = tmp_path / f"{name}.yaml", shutil.copytree(find("arms", "psm"), tmp_path / f"{name} psm")
+    text = find("scenes", "psm").read_text().replace("psm_0:", f"{arm.name}_0:")
+    scene.write_text(text.replace("arm: psm", f"arm: '{arm.name}'"))
     running = Running(browser, Settings(task="reach", scene=str(scene)), "zero")
     page = running.open()
-    page.get_by_text("<img src=x onerror=window.hit=1>").first.wait_for()
+    page.get_by_text(name).first.wait_for()
+    assert running.viewer.session.env.agents == [f"{arm.name}_0"]
+    running.viewer.ask(lambda: running.viewer.session.set_mover(f"{arm.name}_0", name))
+    page.get_by_text(f"unknown run or policy '{name}'").first.wait_for()
+    page.get_by_role("tab", name="Plots").click()
+    page.get_by_text(f"terms of the reward of {arm.name}_0").first.wait_for()
+    page.locator(".u-legend").get_by_text(f"{arm.name}_0").first.wait_for()
+    page.wait_for_timeout(1000)
     assert page.evaluate("window.hit") is None
     assert not running.complaints
     page.close()

@@ -245,6 +245,9 @@ def test_another_mass_is_another_program(tmp_path: Path) -> None:
 
 
 START = """
+import logging
+logging.basicConfig()
+logging.getLogger("surgical_marl").setLevel("INFO")
 from surgical_marl.envs.batch import BatchedEnv
 env = BatchedEnv("reach", "ecm", num_envs=2, engine="fused", device="cpu")
 print(float(env.reset(seed=0)[1].sum()))

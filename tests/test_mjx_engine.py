@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from surgical_marl.engines.mjx import MjxEngine
+from surgical_marl.engines.stages import DONE, told
 from surgical_marl.envs.env import Env
 
 
@@ -36,12 +37,17 @@ def play(engine: MjxEngine) -> np.ndarray:
 
 
 def test_a_second_engine_for_such_environments_compiles_nothing(capfd: pytest.CaptureFixture[str]) -> None:
-    with watch() as first:
+    said: list[tuple[str, str]] = []
+    listener = lambda title, stage: said.append((title, stage))  # noqa: E731
+    with watch() as first, told(listener):
         one = play(MjxEngine(Env("reach", "ecm"), 64, "cpu"))
-    assert first and "compiling reach on ecm" in capfd.readouterr().err
-    with watch() as second:
+    title = "reach on ecm (mjx, cpu)"
+    assert first and said == [(title, what) for name in ("reset", "step") for what in
+                              (f"tracing and compiling the {name}", DONE)]  # fmt: skip
+    assert not capfd.readouterr().err  # nobody asked
+    with watch() as second, told(listener):
         other = play(MjxEngine(Env("reach", "ecm", max_steps=50, reward={"distance": -3.0}), 64, "cpu"))
-    assert not second and not capfd.readouterr().err
+    assert not second and len(said) == 4 and not capfd.readouterr().err
     np.testing.assert_array_equal(one, other)
 
 

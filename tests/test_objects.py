@@ -313,6 +313,9 @@ ARC = "arc: {radius: 0.0015, degrees: 180.0, wire: 0.001, segments: 4, tilt: [0.
         ("degrees: 180.0", "degrees: 400", "degrees must be up to 360"),
         ("wire: 0.001", "wire: 0.1", "the wire thinner than the arc"),
         ("colour: [0.75, 0.75, 0.80]", "colour: [2, 0, 0]", "colour .* from 0 to 1"),
+        ("material: steel", "material: stel", "unknown material in .* 'stel', did you mean 'steel'"),
+        ("material: steel", "material: [steel]", "unknown material .* .choose from steel, paint, plastic, rubber,"),
+        (ARC, "sphere: {radius: 0.001, material: 3}", "unknown material in .* shape 2, sphere: '3' "),
         ("  grasp: {position", "  grasp: {positon", "site 'grasp': unknown key 'positon'"),
     ],
 )

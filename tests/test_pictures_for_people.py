@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import mujoco
 import numpy as np
 import pytest
 
 import surgical_marl as sm
+from surgical_marl.envs.env import Env
 from surgical_marl.robots.rotation import turned
+from surgical_marl.scenes.objects import load_object
 from surgical_marl.scenes.scene import Scene
+from surgical_marl.scenes.shapes import MATERIALS
 from surgical_marl.view.camera import best_view, seen
 from surgical_marl.view.colours import AGENTS, TEAM, goal_colour
 from surgical_marl.view.render import Renderer, View
-from surgical_marl.view.shading import materials
+from surgical_marl.view.shading import GAMMA, LOOKS, RUBBER, STEEL, material, materials
 from surgical_marl.view.stage import TABLE, paint, stage
 from surgical_marl.vision.endoscope import Endoscope
+from tests.test_objects import FILE, SCENE
 
 SIZE = 96
 KINDS = ("sphere", "ellipsoid", "capsule", "cylinder", "box", "mesh")
@@ -134,11 +140,70 @@ def test_colours_say_what_things_are_made_of() -> None:
     assert shaft and shaft[0].gloss[2] == 1.0  # bare steel
 
 
+def test_a_geom_may_be_painted_with_a_colour_or_a_material() -> None:
+    model, data = posed("<worldbody><geom size='.1' rgba='.2 .2 .2 1'/></worldbody>")
+    front, green = View(elevation=0.0), (0.1, 0.8, 0.1)
+    plain, colour, made = (
+        Renderer(model, 60, 60, paint=paint).render(data, front)[30, 30].astype(int)
+        for paint in ({}, {0: green}, {0: material(np.array(green))})
+    )
+    assert plain[1] < 1.3 * plain[0] and (colour == made).all() and colour[1] > 2 * colour[0]
+
+
+def test_every_material_has_a_look_of_its_own() -> None:
+    assert set(LOOKS) == set(MATERIALS) and len(set(LOOKS.values())) == len(MATERIALS)
+
+
+def test_an_object_looks_as_its_file_says_and_otherwise_as_its_colour_suggests(tmp_path: Path) -> None:
+    """The endoscope's pictures are the same in any case."""
+    file = "{free: false, friction: {sliding: 1, torsion: 0}, stiffness: 1.0e+5, %s shapes: [%s, %s]}"
+    ball, stick = "sphere: {radius: 0.02", "capsule: {radius: 0.002, from: [0.03, 0, 0], to: [0.03, 0, 0.03]"
+    (tmp_path / "one.yaml").write_text(
+        "arms: {ecm_0: {arm: ecm, position: [0, 0, 0.3]}}\nobjects: {it: {object: it.yaml, position: [0, 0, 0.06]}}"
+    )
+    drawn, observed = [], []
+    for of_all, own in (("", ""), ("material: steel,", ""), ("material: steel,", ", material: rubber")):
+        (tmp_path / "it.yaml").write_text(file % (of_all, f"{{{ball}}}}}", f"{{{stick}{own}}}}}"))
+        scene = sm.load_scene(tmp_path / "one.yaml")
+        sphere, capsule = (scene.model.geom(f"it/{number}").id for number in (0, 1))
+        named = paint(scene)
+        found = [named[geom].gloss if geom in named else None for geom in (sphere, capsule)]
+        assert found == [STEEL if of_all else None, RUBBER if own else STEEL if of_all else None]
+        view = View((0, 0, 0.06), 0.1, elevation=-10)
+        drawn.append(Renderer(scene.model, 60, 60, stage(scene), named).render(at_home(scene), view).astype(int))
+        observed.append(Endoscope(scene).render(scene.home[None]).rgb)
+    assert np.abs(drawn[1] - drawn[2]).max() > 8
+    assert all(np.array_equal(one, observed[0]) for one in observed)
+
+
+def test_a_material_is_no_part_of_what_is_compiled(tmp_path: Path) -> None:
+    """Files that differ in materials alone have the same keys of caches, and give the same model."""
+    text, made = FILE + "# end", []
+    variants = (text.replace("material: steel", ""), text, text.replace("0.0], to", "0.0], material: cloth, to", 1))
+    assert len(set(variants)) == 3
+    for number, variant in enumerate(variants):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        (folder / "clip.yaml").write_text(variant)
+        (folder / "clip_on_pad.yaml").write_text(SCENE)
+        item = load_object(folder / "clip.yaml")
+        env = Env("reach", str(folder / "clip_on_pad.yaml"))
+        made.append((item.content, env.content, *(shape.material for shape in item.shapes[:2])))
+    contents, envs, first, second = zip(*made, strict=True)
+    assert len(set(contents)) == len(set(envs)) == 1
+    assert first == ("", "steel", "cloth") and second == ("", "steel", "steel")
+    heavier = tmp_path / "clip.yaml"
+    heavier.write_text(text.replace("density: 4500.0", "density: 4600.0"))
+    assert load_object(heavier).content != contents[0]
+
+
 def test_goals_have_the_colour_of_the_arm_that_goes_there() -> None:
     scene = sm.load_scene("trimanual_psm_ecm")
     painted = paint(scene)
     for number, agent in enumerate(scene.agents):
-        assert painted[scene.model.geom(f"{agent}_trocar").id] == goal_colour(number, 3, 3) == AGENTS[number]
+        assert goal_colour(number, 3, 3) == AGENTS[number]
+        made = painted[scene.model.geom(f"{agent}_trocar").id]
+        np.testing.assert_allclose(made.colour ** (1 / GAMMA), AGENTS[number])
     assert goal_colour(0, 1, 2) == TEAM and goal_colour(0, 1, 1) == AGENTS[0]
 
 

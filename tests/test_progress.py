@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import io
+import logging
+import re
 import sys
 import time
 
 import pytest
 
+from surgical_marl.engines.stages import compiling, told
 from surgical_marl.runs import progress as module
-from surgical_marl.runs.progress import preparing, progress
+from surgical_marl.runs.progress import Compilations, preparing, progress
 
 
 class Terminal(io.StringIO):
@@ -58,6 +61,82 @@ def test_what_takes_long_is_named_once_and_not_beside_a_bar(
         count("evaluating")
         assert timer.finished.is_set()
     assert not module._waiting
+
+
+def test_a_terminal_gets_one_line_on_a_compilation_that_changes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stderr", stream := Terminal())
+    monkeypatch.setattr(module, "TICK", 0.01)
+    monkeypatch.setenv("COLUMNS", "100")
+    with told(Compilations()), compiling("reach on psm (fused, cpu)") as stage:
+        stage("tracing the step")
+        while stream.getvalue().count("tracing") < 3:  # it counts seconds within a stage, too
+            time.sleep(0.01)
+        stage("compiling the C code")
+    shown = stream.getvalue().split("\r\x1b[K")
+    line = r"surgical-marl: compiling, \d+ s, {}: reach on psm \(fused, cpu\)"
+    assert re.fullmatch(line.format("tracing the step"), shown[1])
+    assert re.fullmatch(line.format("compiling the C code"), shown[-2])
+    assert re.fullmatch(r"surgical-marl: compiled reach on psm \(fused, cpu\) in \d+ s; .*cache\n", shown[-1])
+    assert "\n" not in "".join(shown[:-1])
+    size = len(stream.getvalue())
+    time.sleep(0.05)
+    assert len(stream.getvalue()) == size  # nothing ticks on
+
+
+def test_a_narrow_terminal_gets_no_second_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stderr", stream := Terminal())
+    monkeypatch.setenv("COLUMNS", "40")
+    with pytest.raises(RuntimeError), told(Compilations()), compiling("reach on " + 100 * "x") as stage:
+        stage("tracing the step")
+        raise RuntimeError
+    *lines, last = stream.getvalue().split("\r\x1b[K")
+    assert lines[1].endswith("...") and all(len(line) < 40 for line in lines)
+    assert last == ""  # nothing is left of what failed
+
+
+def test_a_file_gets_lines_on_a_compilation(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def compile_all() -> list[str]:
+        with told(Compilations()), compiling("reach on psm (fused, cpu)") as stage:
+            for name in ("tracing the step", "scheduling the step", "compiling the C code"):
+                stage(name)
+        text = capsys.readouterr().err
+        assert "\r" not in text and "\x1b" not in text
+        return text.splitlines()
+
+    monkeypatch.setattr(module, "PAUSE", 1000.0)
+    start, end = compile_all()  # stages that follow soon are not worth a line
+    assert start.startswith("surgical-marl: compiling reach on psm (fused, cpu): tracing the step; a second start")
+    assert end.startswith("surgical-marl: compiled reach on psm (fused, cpu) in ")
+    monkeypatch.setattr(module, "PAUSE", 0.0)
+    _, *stages, _ = compile_all()
+    assert stages == [f"surgical-marl: compiling reach on psm (fused, cpu): {name}" for name in
+                      ("scheduling the step", "compiling the C code")]  # fmt: skip
+
+
+def test_what_is_kept_on_disk_and_what_nobody_asked_for_is_not_told(
+    capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    with told(Compilations()), compiling("tea"):
+        pass
+    assert not capsys.readouterr().err and not caplog.records
+    with compiling("tea") as stage:
+        stage("boiling")
+    assert not capsys.readouterr().err
+    with caplog.at_level(logging.INFO, "surgical_marl"), compiling("tea") as stage:
+        stage("boiling")
+    assert caplog.messages == ["compiling tea: boiling", "compiling tea: done"]
+    assert not capsys.readouterr().err
+
+
+def test_a_compilation_is_told_in_place_of_what_is_prepared(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with preparing("tea"), told(Compilations()), compiling("a kettle") as stage:
+        (timer,) = module._waiting
+        stage("boiling")
+        assert timer.finished.is_set()
 
 
 def test_a_terminal_gets_a_bar(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,7 +6,9 @@ import http.client
 import shutil
 import time
 from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -22,15 +24,18 @@ from websockets.sync.client import connect
 
 from surgical_marl.cli.main import main
 from surgical_marl.content import find
+from surgical_marl.engines.stages import compiling
 from surgical_marl.runs.settings import Settings
 from surgical_marl.scenes.load import load_scene
 from surgical_marl.view.browser.gate import close_server, open_server, unlocked
 from surgical_marl.view.browser.nodes import distance_colour, offsets, segments
 from surgical_marl.view.browser.panel import Choice
 from surgical_marl.view.browser.pictures import observed
-from surgical_marl.view.browser.plots import curves
+from surgical_marl.view.browser.plots import Plots, curves
 from surgical_marl.view.browser.shapes import geom_mesh
 from surgical_marl.view.browser.viewer import Viewer
+from surgical_marl.view.history import History
+from surgical_marl.view.session import Session
 
 
 @pytest.fixture(scope="module")
@@ -187,6 +192,22 @@ def test_other_environments_are_looked_at(viewer: Viewer) -> None:
     assert viewer.session.seed == 3
 
 
+def test_the_page_says_what_a_compilation_is_at(viewer: Viewer, monkeypatch: pytest.MonkeyPatch) -> None:
+    said: list[str] = []
+
+    def make(*_: Any) -> None:
+        with compiling("reach on psm") as stage:
+            stage("tracing the step")
+            raise ValueError("no such thing")
+
+    monkeypatch.setattr("surgical_marl.view.browser.viewer.Session", make)
+    monkeypatch.setattr(viewer, "_say", lambda title, text, seconds, **_: said.append(f"{title}, {text}"))
+    with pytest.raises(ValueError, match="no such thing"):
+        viewer.choose(Choice("reach", "bimanual_psm", "default", 2, 77))
+    assert said == ["Preparing, reach on bimanual_psm", "Compiling, reach on psm: tracing the step",
+                    "Compiling, reach on psm: failed"]  # fmt: skip
+
+
 def test_every_visible_geom_has_a_surface_where_it_is() -> None:
     model = load_scene("trimanual_psm_ecm_pegs").model
     for geom in np.flatnonzero(model.geom_group <= 2):
@@ -226,6 +247,60 @@ def test_plots_show_what_happened(viewer: Viewer) -> None:
     assert plots["error, mm"][0].values[-1] == pytest.approx(1000 * viewer.session.infos[agent]["tip_error"][0])
     total = np.sum([line.values for line in terms], axis=0)
     np.testing.assert_allclose(total, plots["reward"][0].values, atol=1e-5)
+
+
+def test_plots_show_how_arms_grip_objects() -> None:
+    """Two steps: the first arm presses and then holds, the second one has no jaw and so no such infos."""
+    history = History(["psm_0", "ecm_0"], dt=0.5, objects=["block_red", "needle"])
+    for force, holding, slip in ((2.0, False, 0.0), (3.0, True, 0.004)):
+        infos = {
+            "block_red_force": [force],
+            "block_red_holding": [holding],
+            "block_red_slip": [slip],
+            "cost_force": [1],
+        }
+        history.add({"psm_0": {**infos, "contact_force": [9.0]}, "ecm_0": {}}, {"psm_0": [0.0], "ecm_0": [0.0]})
+    assert history.names("psm_0") == [
+        "block_red_force",
+        "block_red_holding",
+        "block_red_slip",
+        "contact_force",
+        "reward",
+    ]
+    plots = curves(history)
+    force, held = plots["grip on block_red, N"]
+    assert (force.label, held.label) == ("psm_0", "psm_0 holds") and force.colour == held.colour
+    np.testing.assert_array_equal(force.values, [2.0, 3.0])
+    np.testing.assert_array_equal(held.values, [0.0, 3.0])
+    (slip,) = plots["slip of block_red, mm"]
+    np.testing.assert_allclose(slip.values, [0.0, 4.0])
+    assert not any("needle" in title for title in plots)
+
+
+def test_an_area_is_filled_while_an_arm_holds_an_object() -> None:
+    drawn: list[Any] = []
+    server = SimpleNamespace(gui=SimpleNamespace(add_uplot=lambda data, series, **_: drawn.append((data, series))))
+    history = History(["psm_0"], dt=0.5, objects=["needle"])
+    for force in (1.0, 2.0, 3.0):
+        info = {"needle_force": [force], "needle_holding": [force > 1], "needle_slip": [0.0]}
+        history.add({"psm_0": info}, {"psm_0": [0.0]})
+    Plots(server, nullcontext()).draw(history)
+    data, (time_axis, force, held) = drawn[0]
+    assert time_axis == {"label": "s"} and held["fill"].startswith(force["stroke"]) and "fill" not in force
+    np.testing.assert_array_equal(data, [[-1.0, -0.5, 0.0], [1.0, 2.0, 3.0], [0.0, 2.0, 3.0]])
+
+
+def test_forces_of_grips_are_those_of_the_engine() -> None:
+    """An oracle picks a needle up: what is plotted is what the arrows show."""
+    session = Session(Settings(task="needle_pick", scene="psm_needle", seed=1), "oracle")
+    pressed = []
+    for _ in range(60):
+        session.step()
+        pressed.append(session.env.grip_forces[0].sum())
+    force, held = curves(session.history)["grip on needle, N"]
+    np.testing.assert_allclose(force.values, pressed, rtol=1e-4, atol=1e-6)
+    assert max(pressed) > 0 and 0 < (held.values > 0).sum() < len(pressed)
+    session.close()
 
 
 def test_pictures_that_agents_observe_are_shown() -> None:

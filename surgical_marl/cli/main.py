@@ -18,10 +18,11 @@ from surgical_marl.cli.evaluating import add_crossplay, add_eval, add_report
 from surgical_marl.cli.flags import add_flags, flagged, given, one_of, whole
 from surgical_marl.cli.viewing import add_play, add_replay, add_view
 from surgical_marl.content import find, list_arms, list_objects, list_policies, list_scenes, unknown
+from surgical_marl.engines.stages import told
 from surgical_marl.machine import lacks_memory
 from surgical_marl.plugins.algorithms import list_algorithms
 from surgical_marl.plugins.tasks import list_tasks
-from surgical_marl.runs.progress import preparing
+from surgical_marl.runs.progress import Compilations, preparing
 from surgical_marl.runs.settings import Settings
 from surgical_marl.runtime import defer_compiler
 from surgical_marl.tasks.base.options import choices
@@ -51,7 +52,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     defer_compiler()
     try:
         arguments = _parse(argv)
-        code = arguments.command(arguments) or 0
+        with told(Compilations()):
+            code = arguments.command(arguments) or 0
         sys.stdout.flush()
     except ValueError as error:
         print(f"surgical-marl: {' '.join(str(error).split())}", file=sys.stderr)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
@@ -15,7 +15,8 @@ import numpy as np
 from jax import Array
 
 from surgical_marl.engines.faults import FINE, NEXT, checked, is_reward, places
-from surgical_marl.engines.stepper import MOST_KEPT, Stepper, announce, representative
+from surgical_marl.engines.stages import compiling
+from surgical_marl.engines.stepper import MOST_KEPT, Stepper, representative
 from surgical_marl.machine import cores
 from surgical_marl.runtime import no_collection
 
@@ -135,10 +136,7 @@ class MjxEngine:
         self._begin(carry.key, carry.episode + ~begun)
 
     def _begin(self, keys: Array, episodes: Array) -> None:
-        if not self._functions.traced:
-            announce(self.env, self.name, self.device)
-            self._functions.traced.add("reset")
-        with jax.default_device(self._on):
+        with self._compiling("reset"), jax.default_device(self._on):
             self._state, self._stepped = self._functions.reset(keys, episodes, self._parameters), False
 
     def step(self, actions: dict[str, Any], sense: Callable[[], dict[str, Any]] | None = None) -> None:
@@ -161,7 +159,7 @@ class MjxEngine:
         """Run a function on all environments, with a share of them on each core."""
         function, traced = getattr(self._functions, name), name in self._functions.traced
         # Tracing makes some million objects that all stay: looking for garbage among them takes a quarter of the time.
-        with contextlib.nullcontext() if traced else no_collection():
+        with self._compiling(name), contextlib.nullcontext() if traced else no_collection():
             if self._shares == 1:
                 found = self._run_share(function, given)
             else:
@@ -171,8 +169,18 @@ class MjxEngine:
                 )  # compiles once, not in each thread
                 rest = self._pool.map(lambda share: self._run_share(function, share), shares)
                 found = _join(*first, *rest)
-        self._functions.traced.add(name)
         return found
+
+    @contextlib.contextmanager
+    def _compiling(self, name: str) -> Iterator[None]:
+        """Say that a function is compiled, if this block is the first that calls it."""
+        if name in self._functions.traced:
+            yield
+            return
+        with compiling(f"{self.env.title} ({self.name}, {self.device})") as stage:
+            stage(f"tracing and compiling the {name}")
+            yield
+        self._functions.traced.add(name)
 
     @property
     def fault_places(self) -> list[str]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -99,12 +98,3 @@ def describe(parameters: Any) -> str:
     if isinstance(parameters, Mapping):
         return repr({name: describe(value) for name, value in sorted(parameters.items())})
     return f"{np.shape(parameters)} {parameters.dtype.name}"
-
-
-def announce(stepper: Stepper, engine: str, device: str) -> None:
-    """Say on stderr that a compilation takes a while."""
-    print(
-        f"surgical-marl: compiling {stepper.title} ({engine}, {device}); a second start takes it from the cache",
-        file=sys.stderr,
-        flush=True,
-    )

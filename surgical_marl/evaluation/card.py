@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import operator
+import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from surgical_marl.runs.folder import CURVE, read_metrics, read_origin, read_set
 from surgical_marl.runs.settings import Settings
 from surgical_marl.scenes.load import load_scene
 from surgical_marl.untrusted.files import read_json
+from surgical_marl.untrusted.markup import as_code, as_link, as_markdown
 
 CARD, CLIP, EVALUATION = "README.md", "clip.mp4", "evaluation.json"
 SHOWN = ("median_error_mm", "p95_error_mm", "rmse_mm", "success_1mm", "success_2mm", "success_5mm", "team_success_2mm",
@@ -68,7 +70,7 @@ def _row(folder: Path) -> tuple[str, ...]:
     seen, elsewhere = also.get("training goals"), also.get("random starts", {})
     last, origin = _training(folder), read_origin(folder)["origin"]
     return (
-        f"[{folder.name}]({folder.name})",
+        as_link(folder.name),
         _worst(result),
         _worst(seen) if seen else "-",
         number("rmse_mm", result.get("rmse_mm")),
@@ -76,7 +78,7 @@ def _row(folder: Path) -> tuple[str, ...]:
         number("success_2mm", elsewhere.get("success_2mm")),
         number("collision_rate", result["collision_rate"]),
         ", ".join(_worst(run) for run in result["seeds"]["runs"]),
-        f"{last['seconds']:.0f} s, {origin.get('device') or 'unknown device'}",
+        f"{last['seconds']:.0f} s, {as_markdown(origin.get('device') or 'unknown device')}",
         "; ".join(misses(result)) or "-",
     )
 
@@ -99,10 +101,10 @@ def _what(settings: Settings, name: str, folder: Path) -> str:
     clip = f"\n[A video of two episodes]({CLIP}) on held-out goals. Balls mark the goals.\n"
     if not (folder / CLIP).is_file():
         clip = ""
-    return f"""# {name}
+    return f"""# {as_markdown(name)}
 
-This policy plays the task `{settings.task}` in the scene `{settings.scene}`. The task: {task}
-The scene: {scene.description}; agents {", ".join(f"`{agent}`" for agent in scene.agents)}.
+This policy plays the task {as_code(settings.task)} in the scene {as_code(settings.scene)}. The task: {task}
+The scene: {as_markdown(scene.description)}; agents {", ".join(map(as_code, scene.agents))}.
 {clip}"""
 
 
@@ -110,18 +112,20 @@ def _how_well(result: Mapping[str, Any], name: str) -> str:
     every = result["seeds"]
     together, protocol = f"all training seeds ({len(every['runs'])})", every["aggregate"]["protocol"]
     if protocol != result["protocol"]:
-        together += f", by protocol {protocol}"
-    rows = [f"| | these weights (seed {every['best']}) | {together} |", "|---|---|---|"]
+        together += f", by protocol {as_markdown(protocol)}"
+    rows = [f"| | these weights (seed {as_markdown(every['best'])}) | {together} |", "|---|---|---|"]
     shown = [key for key in SHOWN if key in result]
     rows += [
         f"| {title(key)} | {_with_interval(key, result)} | {_with_interval(key, every['aggregate'])} |" for key in shown
     ]
-    each = ", ".join(f"{run['policy']}: {_worst(run)} mm" for run in every["runs"])
+    each = ", ".join(f"{as_markdown(run['policy'])}: {_worst(run)} mm" for run in every["runs"])
+    command = as_code(shlex.join(["surgical-marl", "eval", name]))
+    goal_set = as_code(result["goal_set"][:12])
     goals = "the standard goal set" if is_standard(result) else "goal set"
     return f"""## How well
 
-`surgical-marl eval {name}` repeats this evaluation: {result["episodes"]} episodes on {goals}
-`{result["goal_set"]:.12}`, without exploration noise. Brackets hold 95 % intervals: over episodes for these weights,
+{command} repeats this evaluation: {as_markdown(result["episodes"])} episodes on {goals}
+{goal_set}, without exploration noise. Brackets hold 95 % intervals: over episodes for these weights,
 over episodes and training seeds for all seeds ([docs/evaluation.md](../../docs/evaluation.md)). `{EVALUATION}` has
 all metrics, of each arm and of each seed.
 
@@ -137,7 +141,7 @@ def _elsewhere(result: Mapping[str, Any], shown: Sequence[str]) -> str:
     also = result.get("also") or {}
     if not also:
         return ""
-    columns = ["held-out goals", *also]
+    columns = ["held-out goals", *map(as_markdown, also)]
     rows = [
         f"| {title(key)} | " + " | ".join(_with_interval(key, r) for r in (result, *also.values())) for key in shown
     ]
@@ -156,21 +160,22 @@ def _with_interval(key: str, result: Mapping[str, Any]) -> str:
 def _how_trained(folder: Path, settings: Settings) -> str:
     last, notes = _training(folder), read_origin(folder)
     device, commit, started = (notes["origin"].get(key) or "unknown" for key in ("device", "commit", "started"))
-    level = "" if settings.difficulty == "default" else f" --difficulty {settings.difficulty}"
-    start = "" if settings.start == "home" else f" --start {settings.start}"
-    command = f"surgical-marl train {settings.task} --scene {settings.scene}{level}{start} --seed {settings.seed}"
+    level = [] if settings.difficulty == "default" else ["--difficulty", settings.difficulty]
+    start = [] if settings.start == "home" else ["--start", settings.start]
+    what = ["surgical-marl", "train", settings.task, "--scene", settings.scene, *level, *start]
+    command = shlex.join([*what, "--seed", str(settings.seed)])
     steps = f"{last['env_steps']:,.0f} environment steps in {last['seconds']:,.0f} s of rollouts and updates"
     iterations = f"{last['iteration']:,.0f}"
     if last["iteration"] < settings.iterations:
         iterations += f" of {settings.iterations:,}"  # it was stopped
     return f"""## How it was trained
 
-With `{command}`. `config.yaml` holds all settings of that training.
+With {as_code(command)}. `config.yaml` holds all settings of that training.
 
 {_imitation(settings, last["iteration"])}\
-- {settings.algo}, {settings.num_envs:,} environments, {iterations} iterations: {steps}.
-- On {device}, started {started}, commit `{commit}`.
-- {", ".join(f"{name} {version}" for name, version in notes["versions"].items())}.
+- {as_markdown(settings.algo)}, {settings.num_envs:,} environments, {iterations} iterations: {steps}.
+- On {as_markdown(device)}, started {as_markdown(started)}, commit {as_code(commit)}.
+- {", ".join(as_markdown(f"{name} {version}") for name, version in notes["versions"].items())}.
 
 ![learning curve]({CURVE})
 """
@@ -203,9 +208,10 @@ def _limits(result: Mapping[str, Any], settings: Settings) -> str:
         f"{title(name)} {how} {number(name, goal)}" for name, (how, goal) in TASKS.load(settings.task).wanted.items()
     )
     met = [] if missed or not goals else [f"- Meets the goals of its task: {goals}."]
+    level = as_code(settings.difficulty)
     return "\n".join([
         "## Limits\n", *missed, *met, *(none if result["collision_rate"] == 0 else []),
-        f"- Made for {settings.control} control, difficulty `{settings.difficulty}` and the arm poses of this scene.",
+        f"- Made for {as_markdown(settings.control)} control, difficulty {level} and the arm poses of this scene.",
         *_words(settings),
         "- The goals of the evaluation were never drawn in training, but they are of the same distribution.",
         "- Trained and tested in simulation only. Not fit for use on a patient or near one.\n",
@@ -217,7 +223,7 @@ def _words(settings: Settings) -> list[str]:
     if settings.knowledge == "task" and not settings.messages:
         return []
     said = f"says {settings.messages} numbers to its teammates in each step" if settings.messages else "says nothing"
-    return [f"- Made for `knowledge: {settings.knowledge}`; each agent {said}."]
+    return [f"- Made for {as_code(f'knowledge: {settings.knowledge}')}; each agent {said}."]
 
 
 def _files(folder: Path) -> str:
@@ -225,10 +231,11 @@ def _files(folder: Path) -> str:
     lines = []
     for name, (count, observation, action) in groups.items():
         one_hot = f", of which the last {count} say which of the {count} agents it is" if count > 1 else ""
-        pictures = "".join(f", `{what}` {shape}" for what, shape in read_pictures(folder / f"{name}{SUFFIX}").items())
-        lines.append(
-            f"- `{name}{SUFFIX}`: `observation` [N, {observation}]{one_hot}{pictures} -> `action` [N, {action}]."
+        pictures = "".join(
+            f", {as_code(what)} {shape}" for what, shape in read_pictures(folder / f"{name}{SUFFIX}").items()
         )
+        file = as_code(name + SUFFIX)
+        lines.append(f"- {file}: `observation` [N, {observation}]{one_hot}{pictures} -> `action` [N, {action}].")
     if read_settings(folder).observations == "scaled":
         lines.append("- Observations are scaled: each number from -1 to 1 between its bounds.")
     text = "\n".join(lines)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import csv
-import html
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from surgical_marl.evaluation.goal_set import is_standard
 from surgical_marl.files import write_atomic
+from surgical_marl.untrusted.markup import as_html
 
 ABOUT = (
     *(
@@ -34,9 +34,9 @@ class Evaluation(dict[str, Any]):
 
     def _repr_html_(self) -> str:
         head, *rows = _rows(self, self["agents"])
-        cells = "".join(f"<th>{html.escape(cell)}</th>" for cell in head)
-        lines = "".join("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
-        caption = html.escape(_describe(self))
+        cells = "".join(f"<th>{as_html(cell)}</th>" for cell in head)
+        lines = "".join("<tr>" + "".join(f"<td>{as_html(cell)}</td>" for cell in row) + "</tr>" for row in rows)
+        caption = as_html(_describe(self))
         return f"<table><caption>{caption}</caption><thead><tr>{cells}</tr></thead><tbody>{lines}</tbody></table>"
 
 

@@ -53,7 +53,7 @@ def report_run(run: Path) -> Path:
 
 def write(path: Path, runs: Sequence[Run]) -> None:
     """Write the report of some runs to a file. ValueError as in `report`."""
-    page = render(runs).encode(errors="replace")  # a folder's name may hold bytes that are no text
+    page = render(runs).encode()
     try:
         write_atomic(path, lambda temporary: temporary.write_bytes(page))
     except OSError as error:

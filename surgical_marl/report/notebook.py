@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import html
 import os
 from pathlib import Path
 
 from surgical_marl.report.command import write
 from surgical_marl.report.page import render, video_address
 from surgical_marl.report.run import read_run
+from surgical_marl.untrusted.markup import as_html
 
 
 class Report:
@@ -36,7 +36,7 @@ class Report:
         return Path(path)
 
     def _repr_html_(self) -> str:
-        page, title = html.escape(self.html), html.escape(repr(self))
+        page, title = as_html(self.html), as_html(repr(self))
         style = f"width: 100%; height: {self._height}px; border: 1px solid #ccc"
         return f'<iframe title="{title}" sandbox="" style="{style}" srcdoc="{page}"></iframe>'  # its styles stay inside
 
@@ -61,7 +61,7 @@ class Video:
         return f"Video({str(self.path)!r})"
 
     def _repr_html_(self) -> str:
-        name, address = html.escape(self.path.name), video_address(self.path)
+        name, address = as_html(self.path.name), video_address(self.path)
         style = f"width: {self._width}px; max-width: 100%"
         if self.path.suffix == ".gif":
             return f'<img alt="{name}" style="{style}" src="{address}">'

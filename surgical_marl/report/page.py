@@ -17,6 +17,7 @@ from surgical_marl.report import judged, repeat, tables, training
 from surgical_marl.report.charts import COLORS, Chart, Drawing
 from surgical_marl.report.groups import Group, group
 from surgical_marl.report.run import Run
+from surgical_marl.untrusted.markup import whole
 
 GENERATOR = "surgical-marl report"
 """What marks a file as one of ours, which may be replaced."""
@@ -57,7 +58,7 @@ def render(runs: Sequence[Run]) -> str:
     heading = f"{task} in {', '.join(scenes)}"
     drawing = Drawing()
     sections = [*_evaluation(drawing, groups), *_training(drawing, groups), *_settings(groups)]
-    return _template().render(
+    page = _template().render(
         generator=GENERATOR,
         version=surgical_marl.__version__,
         made=time.strftime("%Y-%m-%d %H:%M %Z"),
@@ -73,6 +74,7 @@ def render(runs: Sequence[Run]) -> str:
         colors=COLORS,
         style=Markup(_file("page.css")),
     )
+    return whole(page)  # a folder's name may hold bytes that are no text
 
 
 def _check(runs: Sequence[Run]) -> None:

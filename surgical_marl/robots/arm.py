@@ -25,6 +25,7 @@ from surgical_marl.robots.reach import Box, box_of
 from surgical_marl.robots.urdf import Faults, read_urdf
 from surgical_marl.robots.urdf_faults import robot_faults
 from surgical_marl.untrusted.files import is_file, read_bytes
+from surgical_marl.untrusted.markup import check_name
 from surgical_marl.untrusted.values import listed, shown
 from surgical_marl.yaml_file import build, check_keys, read_yaml
 
@@ -236,6 +237,7 @@ def load_arm(name: str | Path) -> Arm:
             the error is a `Faults`, which lists everything that is wrong.
     """
     folder = find("arms", name)
+    check_name(folder.name, "an arm's folder")
     where = folder / "arm.yaml"
     settings = read_yaml(where)
     faults: list[str] = []

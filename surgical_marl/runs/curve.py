@@ -12,6 +12,7 @@ from matplotlib.ticker import EngFormatter, FuncFormatter, NullFormatter, Percen
 
 from surgical_marl.files import write_atomic
 from surgical_marl.runs.folder import CURVE, read_metrics
+from surgical_marl.untrusted.values import one_line
 
 PANELS = (
     ("tip_error_mm", "tip error at the end (mm)", "#1f6f8b"),
@@ -26,7 +27,7 @@ def draw_curve(run: Path, title: str) -> None:
     steps = np.array([row.get("env_steps", math.nan) for row in rows])
     figure = Figure(figsize=(12, 3.6), layout="constrained")
     FigureCanvasAgg(figure)
-    figure.suptitle(title, fontsize=11)
+    figure.suptitle(one_line(title), fontsize=11, parse_math=False)  # a name in it may hold anything
     for axis, (name, label, color) in zip(figure.subplots(1, 3), PANELS, strict=True):
         values = np.array([row.get(name, math.nan) for row in rows])
         known = np.isfinite(values) & np.isfinite(steps)

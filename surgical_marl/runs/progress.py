@@ -1,19 +1,28 @@
-"""Progress bars: a bar in a terminal, a widget in a notebook, and now and then a line anywhere else."""
+"""What takes long: a bar or a line that changes in a terminal, a widget in a notebook, at times a line elsewhere."""
 
 from __future__ import annotations
 
+import shutil
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, TextIO
 
 from tqdm import tqdm
 
+from surgical_marl.engines.stages import DONE, FAILED
+
 EVERY = 30.0
 """Seconds between the lines of a bar that goes to a file or a pipe."""
 PATIENCE = 1.0
 """Seconds without a word after which `preparing` speaks."""
+PAUSE = 2.0
+"""Seconds between lines on a compilation that go to a file or a pipe, at least."""
+TICK = 0.5
+"""Seconds after which the line on a compilation changes in a terminal."""
+_KEPT = "a second start takes it from the cache"
 _waiting: list[threading.Timer] = []
 """What `preparing` would say."""
 _LINE = "{desc}{n_fmt} of {total_fmt} {unit}, {elapsed} done, {remaining} left{postfix}"
@@ -32,8 +41,7 @@ def progress(total: int, unit: str, what: str = "", begun: int = 0, leave: bool 
         begun: how many are done already.
         leave: whether the bar stays when it is closed.
     """
-    for timer in _waiting:
-        timer.cancel()
+    _hush()
     options: dict[str, Any] = {
         "total": total,
         "unit": unit,
@@ -67,6 +75,66 @@ def preparing(what: str) -> Iterator[None]:
     finally:
         timer.cancel()
         _waiting.remove(timer)
+
+
+class Compilations:
+    """Shows on stderr what a compilation is at; `engines.stages.told` takes it.
+
+    In a terminal it is one line with the stage and the seconds so far, and at the end with how long it took. Elsewhere
+    it is a line at the start, one for each later stage unless the last line is younger than `PAUSE`, one at the end.
+    """
+
+    def __init__(self) -> None:
+        self._title = self._stage = ""
+        self._begun = self._said = 0.0
+        self._lock = threading.Lock()
+        self._ended = threading.Event()
+
+    def __call__(self, title: str, stage: str) -> None:
+        """Take note of a stage that begins, or of the end."""
+        now, live = time.monotonic(), sys.stderr.isatty()
+        with self._lock:
+            first, self._title, self._stage = title != self._title, title, stage
+            if first:
+                _hush()
+                self._begun, self._said = now, -PAUSE + now
+                self._ended.set()
+                self._ended = threading.Event()
+                if live:
+                    threading.Thread(target=self._tick, args=(self._ended,), daemon=True).start()
+            if stage in (DONE, FAILED):
+                self._ended.set()
+                self._title = ""
+                took = f"surgical-marl: compiled {title} in {now - self._begun:.0f} s; {_KEPT}\n"
+                _write(("\r\x1b[K" if live else "") + (took if stage == DONE else ""))
+            elif live:
+                self._draw()
+            elif now - self._said >= PAUSE:
+                self._said = now
+                _write(f"surgical-marl: compiling {title}: {stage}{f'; {_KEPT}' if first else ''}\n")
+
+    def _tick(self, ended: threading.Event) -> None:
+        while not ended.wait(TICK):
+            with self._lock:
+                if not ended.is_set():
+                    self._draw()
+
+    def _draw(self) -> None:
+        # the title last: it is what a narrow terminal cuts off
+        line = f"surgical-marl: compiling, {time.monotonic() - self._begun:.0f} s, {self._stage}: {self._title}"
+        room = max(shutil.get_terminal_size().columns - 1, 10)
+        _write(f"\r\x1b[K{line if len(line) <= room else line[: room - 3] + '...'}")
+
+
+def _write(text: str) -> None:
+    sys.stderr.write(text)
+    sys.stderr.flush()
+
+
+def _hush() -> None:
+    """Let `preparing` say nothing: something else tells more."""
+    for timer in _waiting:
+        timer.cancel()
 
 
 def _say(what: str) -> None:

@@ -28,6 +28,7 @@ from surgical_marl.scenes.randomisation import read_randomisation
 from surgical_marl.scenes.scene import Mount, Scene
 from surgical_marl.scenes.surroundings import add_surroundings, add_tissue
 from surgical_marl.untrusted.files import is_file
+from surgical_marl.untrusted.markup import check_name
 from surgical_marl.untrusted.values import check_count, shown
 from surgical_marl.yaml_file import check_keys, read_mapping, read_vector, read_yaml
 
@@ -42,6 +43,7 @@ def load_scene(name: str | Path, control: str = "position") -> Scene:
         ValueError: unknown name or control mode, a file that is not a valid scene, or objects that overlap.
     """
     path = find("scenes", name)
+    check_name(path.stem, "a scene's file")
     settings = read_yaml(path)
     check_keys(settings, ("description", "arms", "view", "tissue", "objects", "randomisation", "observe"), path)
     arms = settings.get("arms")

@@ -21,11 +21,12 @@ from surgical_marl.content import find
 from surgical_marl.robots.rotation import matrix_of, quaternion, turned
 from surgical_marl.scenes.poses import Pose
 from surgical_marl.scenes.shapes import Shape as Shape
-from surgical_marl.scenes.shapes import read_colour, read_number, read_shapes
+from surgical_marl.scenes.shapes import read_colour, read_material, read_number, read_shapes
+from surgical_marl.untrusted.markup import check_name
 from surgical_marl.untrusted.values import check_count, shown
 from surgical_marl.yaml_file import check_keys, read_mapping, read_vector, read_yaml
 
-KEYS = ("description", "free", "mass", "density", "friction", "stiffness", "colour", "shapes", "sites")
+KEYS = ("description", "free", "mass", "density", "friction", "stiffness", "colour", "material", "shapes", "sites")
 MAX_SITES = 100
 HEAVIEST, LIGHTEST = 1e6, 1e-12
 """Masses of a free object, kg."""
@@ -86,7 +87,7 @@ class Object:
     sites: dict[str, tuple[np.ndarray, np.ndarray]]
     """Named places: position, m, [3], and axes, [3, 3]."""
     content: bytes = field(repr=False)
-    """Everything that the object is made from. It is a key for caches."""
+    """Everything that the object is made from but materials, which only pictures show. It is a key for caches."""
 
     @property
     def surface(self) -> Surface:
@@ -131,13 +132,15 @@ def load_object(name: str | Path, colour: Any = None) -> Object:
         ValueError: the name is unknown, or the file lacks something or has a bad value.
     """
     path = find("objects", name)
+    check_name(path.stem, "an object's file")
     settings, where = read_yaml(path), str(path)
     check_keys(settings, KEYS, path)
     free = settings.get("free")
     if not isinstance(free, bool):
         raise ValueError(f"{path}: free must be true, for an object that moves, or false, not {shown(free)}")
     painted = read_colour(colour, where, read_colour(settings.get("colour"), where, np.array(GREY)))
-    shapes = read_shapes(settings.get("shapes"), painted, where)
+    made = read_material(settings.get("material"), where)
+    shapes = read_shapes(settings.get("shapes"), painted, made, where)
     density = _density(settings, free, shapes, where)
     try:
         mass, center, inertia = _inertia(shapes, density, free)
@@ -161,8 +164,18 @@ def load_object(name: str | Path, colour: Any = None) -> Object:
         stiffness=read_number(settings.get("stiffness"), f"{where}: stiffness (N/m)", above=0.0),
         shapes=shapes,
         sites=_sites(settings.get("sites"), where),
-        content=repr((path.stem, settings, painted.tolist())).encode(),
+        content=repr((path.stem, _without_materials(settings), painted.tolist())).encode(),
     )
+
+
+def _without_materials(settings: dict[str, Any]) -> dict[str, Any]:
+    """Return the settings of a file as they would be without any material."""
+
+    def bare(given: Any) -> Any:
+        return given and {key: value for key, value in given.items() if key != "material"}
+
+    shapes = [{kind: bare(values) for kind, values in shape.items()} for shape in settings["shapes"]]
+    return {**bare(settings), "shapes": shapes}
 
 
 def _density(settings: dict[str, Any], free: bool, shapes: tuple[Shape, ...], where: str) -> float:

@@ -21,6 +21,8 @@ from surgical_marl.yaml_file import check_keys, read_mapping, read_vector
 
 MAX_SHAPES = 400
 """Shapes of an object, each capsule of an arc counted."""
+MATERIALS = ("steel", "paint", "plastic", "rubber", "cloth", "tissue")
+"""What a file may say that something is made of, for pictures for people alone."""
 
 
 @dataclass(frozen=True)
@@ -39,14 +41,17 @@ class Shape:
     """Red, green and blue, from 0 to 1."""
     volume: float
     """m3, without what overlaps in a chain of capsules; 0 for a plane."""
+    material: str = ""
+    """One of `MATERIALS`, for pictures for people; "" for what the colour suggests."""
 
 
-def read_shapes(settings: Any, colour: np.ndarray, where: str) -> tuple[Shape, ...]:
+def read_shapes(settings: Any, colour: np.ndarray, material: str, where: str) -> tuple[Shape, ...]:
     """Return the shapes that a list in an object's file describes.
 
     Args:
         settings: a list of mappings, each from one kind of shape to its sizes and place.
         colour: of shapes without a colour of their own, [3].
+        material: of shapes without a material of their own.
         where: the file, for errors.
 
     Raises:
@@ -66,7 +71,7 @@ def read_shapes(settings: Any, colour: np.ndarray, where: str) -> tuple[Shape, .
         ((kind, values),) = entry.items()
         if kind not in _READERS:
             raise unknown(f"shape in {where}:", kind, list(_READERS))
-        shapes += _READERS[kind](_Reader(values, colour, f"{where}, shape {number}, {kind}"))
+        shapes += _READERS[kind](_Reader(values, colour, material, f"{where}, shape {number}, {kind}"))
     check_count(len(shapes), MAX_SHAPES, "shapes", where)
     return tuple(shapes)
 
@@ -74,12 +79,13 @@ def read_shapes(settings: Any, colour: np.ndarray, where: str) -> tuple[Shape, .
 class _Reader:
     """Reads the values of one shape."""
 
-    def __init__(self, values: Any, colour: np.ndarray, where: str) -> None:
+    def __init__(self, values: Any, colour: np.ndarray, material: str, where: str) -> None:
         self.values, self.where = read_mapping(values, where), where
         self._colour = read_colour(self.values.get("colour"), where, colour)
+        self._material = read_material(self.values.get("material"), where, material)
 
     def check(self, *keys: str) -> None:
-        check_keys(self.values, (*keys, "colour"), self.where)
+        check_keys(self.values, (*keys, "colour", "material"), self.where)
 
     def above(self, key: str) -> float:
         return read_number(self.values.get(key), f"{self.where}, {key}", above=0.0, least=SHORTEST, most=LONGEST)
@@ -92,7 +98,8 @@ class _Reader:
 
     def shape(self, kind: str, size: Any, position: np.ndarray, rotation: np.ndarray, volume: float) -> Shape:
         red, green, blue = self._colour.tolist()
-        return Shape(kind, np.array(size, float), position, rotation, (red, green, blue), volume)
+        colour = red, green, blue
+        return Shape(kind, np.array(size, float), position, rotation, colour, volume, self._material)
 
 
 def _sphere(reader: _Reader) -> list[Shape]:
@@ -195,3 +202,12 @@ def read_colour(value: Any, where: str, default: np.ndarray) -> np.ndarray:
     if not ((colour >= 0) & (colour <= 1)).all():
         raise ValueError(f"{where}: colour {colour.tolist()} must be from 0 to 1")
     return colour
+
+
+def read_material(value: Any, where: str, default: str = "") -> str:
+    """Return one of `MATERIALS`, or the default for None; raise ValueError for anything else."""
+    if value is None:
+        return default
+    if not isinstance(value, str) or value not in MATERIALS:
+        raise unknown(f"material in {where}:", value, MATERIALS)
+    return value

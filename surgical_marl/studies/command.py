@@ -8,6 +8,9 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+from surgical_marl.engines.stages import told
+from surgical_marl.runs.progress import Compilations
+
 
 def make_parser(description: str | None, usage: str | None = None) -> argparse.ArgumentParser:
     """Return a parser that shows a module's docstring as it is written."""
@@ -42,7 +45,8 @@ def run(name: str, main: Callable[[], int]) -> int:
     """
     signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     try:
-        return main()
+        with told(Compilations()):
+            return main()
     except (ValueError, OSError) as error:
         print(f"{name}: {' '.join(str(error).split())}", file=sys.stderr)
         return 2

@@ -39,7 +39,7 @@ from surgical_marl.view.camera import best_view
 from surgical_marl.view.drawn import Extra
 from surgical_marl.view.lighting import PLAIN
 from surgical_marl.view.render import Renderer, View
-from surgical_marl.view.shading import CLOTH, Material
+from surgical_marl.view.shading import CLOTH, Material, named
 from surgical_marl.view.stage import paint, stage
 from surgical_marl.view.tracer import PLANE
 
@@ -78,7 +78,8 @@ def arm_picture(name: str, folder: Path) -> Picture:
 def object_picture(name: str) -> Picture:
     """Draw one object on a white ground."""
     spec = mujoco.MjSpec()
-    add_objects(spec, {name: Placement(load_object(name), np.zeros(3), np.eye(3))})
+    placed = {name: Placement(load_object(name), np.zeros(3), np.eye(3))}
+    add_objects(spec, placed)
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
@@ -86,7 +87,7 @@ def object_picture(name: str) -> Picture:
     white = Material(np.array([0.72, 0.74, 0.76]), CLOTH, int(PLAIN))
     ground = Extra(int(PLANE), (0.0, 0.0, 0.0), np.array([0.0, 0.0, lowest]), np.eye(3), white)
     view = View(model.stat.center.tolist(), 1.5 * model.stat.extent, OBJECT_AZIMUTH, OBJECT_ELEVATION)
-    return Renderer(model, *SMALL, [ground]).render(data, view)
+    return Renderer(model, *SMALL, [ground], named(model, placed)).render(data, view)
 
 
 def clip(task: str, path: Path) -> str:

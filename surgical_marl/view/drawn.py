@@ -50,14 +50,14 @@ class Drawn:
     Args:
         model: whose geoms are primitives or meshes; of other kinds nothing is seen.
         stage: shapes besides those of the model.
-        paint: geom -> rgb in place of its own.
+        paint: geom -> what it is made of, or the rgb that suggests it, in place of its own colour.
     """
 
     def __init__(
         self,
         model: mujoco.MjModel,
         stage: Sequence[Extra] = (),
-        paint: Mapping[int, Sequence[float]] = MappingProxyType({}),
+        paint: Mapping[int, Material | Sequence[float]] = MappingProxyType({}),
     ) -> None:
         seen = (model.geom_group < GROUPS) & (visual_rgba(model)[:, 3] > 0)
         known = np.array([mujoco.mjtGeom(kind) in _KINDS for kind in model.geom_type], bool)
@@ -71,8 +71,8 @@ class Drawn:
         shapes["shadow_kind"], shapes["shadow_size"] = _shadows(shapes["kind"], shapes["size"])
         shapes["breadth"], shapes["alpha"] = _breadths(shapes["shadow_size"]), 1.0
         made = materials(model)
-        for geom, rgb in paint.items():
-            made[geom] = material(np.asarray(rgb))
+        for geom, look in paint.items():
+            made[geom] = look if isinstance(look, Material) else material(np.asarray(look))
         for row, of in zip(
             shapes, [*(made[geom] for geom in geoms), *(extra.material for extra in stage)], strict=True
         ):

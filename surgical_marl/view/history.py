@@ -1,4 +1,4 @@
-"""What happened lately in one environment, for plots: errors, distances, forces, terms of the reward."""
+"""What happened lately in one environment, for plots: errors, distances, forces, grips, terms of the reward."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ ERRORS = ("tip_error", "goal_error")
 """Infos of how far a tool tip, or an object, is from its goal, m: the first that there is counts."""
 REWARD = "reward_"
 """How infos of terms of the reward begin."""
+GRIP = ("force", "holding", "slip")
+"""Infos of each arm's grip on each free object, `<object>_<one of these>`: N, whether it is held, m."""
 
 
 class History:
@@ -20,10 +22,13 @@ class History:
         agents: names of the agents.
         dt: time of a step, s.
         seconds: how long a step is remembered.
+        objects: names of the free objects.
     """
 
-    def __init__(self, agents: Sequence[str], dt: float, seconds: float = 10.0) -> None:
-        self.agents, self._dt = list(agents), dt
+    def __init__(self, agents: Sequence[str], dt: float, seconds: float = 10.0, objects: Sequence[str] = ()) -> None:
+        self.agents, self.objects, self._dt = list(agents), list(objects), dt
+        grips = (f"{name}_{what}" for name in objects for what in GRIP)
+        self._wanted = {*ERRORS, "min_distance", "contact_force", *grips}
         self._room = max(2, round(seconds / dt))
         self._rows: dict[tuple[str, str], np.ndarray] = {}
         self._count = 0
@@ -32,7 +37,8 @@ class History:
         """Remember a step: infos and rewards of all agents, [N] each, of environment `index`."""
         place = self._count % self._room
         for agent in self.agents:
-            own = {name: float(np.asarray(value)[index]) for name, value in infos[agent].items() if wanted(name)}
+            kept = {name: value for name, value in infos[agent].items() if self._keeps(name)}
+            own = {name: float(np.asarray(value)[index]) for name, value in kept.items()}
             own["reward"] = float(np.asarray(rewards[agent])[index])
             for name, value in own.items():
                 row = self._rows.setdefault((agent, name), np.full(self._room, np.nan))
@@ -60,15 +66,13 @@ class History:
             return np.full(kept, np.nan)
         return np.roll(row, -(self._count % self._room))[-kept:] if self._count > self._room else row[:kept].copy()
 
+    def _keeps(self, name: str) -> bool:
+        return name in self._wanted or name.startswith(REWARD)
+
     def error(self, agent: str) -> tuple[str, np.ndarray]:
         """Return the name of the agent's error and its values in mm, [T]; an empty name if it has none."""
         name = next((name for name in ERRORS if (agent, name) in self._rows), "")
         return name, 1000 * self.read(agent, name)
-
-
-def wanted(name: str) -> bool:
-    """Return whether an info is remembered."""
-    return name in (*ERRORS, "min_distance", "contact_force") or name.startswith(REWARD)
 
 
 def summary(info: Mapping[str, Any], index: int = 0) -> list[str]:

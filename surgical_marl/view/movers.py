@@ -17,6 +17,7 @@ import numpy as np
 from surgical_marl.content import find, list_policies, unknown
 from surgical_marl.policies.team import check_fits
 from surgical_marl.policies.teammates import FROZEN, Teammates
+from surgical_marl.untrusted.markup import check_name
 from surgical_marl.view.hand import Hand
 
 if TYPE_CHECKING:
@@ -132,6 +133,7 @@ def _place(name: str, env: BatchedEnv) -> str | Path:
     """Return a policy as `Teammates` takes it; ValueError if there is none, or it does not fit the environment."""
     if name in SIMPLE:
         return name
+    check_name(name, "a run")
     folder = find("policies", name)
     check_fits(str(folder), env)
     return folder

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from surgical_marl.content import unknown
 from surgical_marl.view import painter, tracer
 from surgical_marl.view.drawn import Drawn, Extra, Sphere
+from surgical_marl.view.shading import Material
 
 Array = NDArray[np.float64]
 
@@ -67,7 +68,7 @@ class Renderer:
         width: of a picture, pixels.
         height: likewise.
         stage: shapes besides those of the model, such as a table.
-        paint: geom -> rgb in place of its own.
+        paint: geom -> what it is made of, or the rgb that suggests it, in place of its own colour.
 
     Raises:
         ValueError: a size without pixels.
@@ -79,7 +80,7 @@ class Renderer:
         width: int = 480,
         height: int = 360,
         stage: Sequence[Extra] = (),
-        paint: Mapping[int, Sequence[float]] = MappingProxyType({}),
+        paint: Mapping[int, Material | Sequence[float]] = MappingProxyType({}),
     ) -> None:
         if width < 1 or height < 1:
             raise ValueError(f"a picture of {width} x {height} pixels has nothing to show: use 1 or more")

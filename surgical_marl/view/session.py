@@ -62,7 +62,7 @@ class Session:
         """Who can move the arms."""
         self.movers = Movers(self.env, first(self.env) if who is None else who)
         self.choices += [name for name in dict.fromkeys(self.movers.who.values()) if name not in self.choices]
-        self.history = History(self.env.agents, self.env.control_dt)
+        self.history = History(self.env.agents, self.env.control_dt, objects=list(self.env.scene.free_objects))
         self.infos: dict[str, dict[str, Any]] = {}
         """Of the last step; empty after a reset."""
         self.steps = 0

@@ -1,13 +1,15 @@
-"""What geoms of a model are made of: colours in linear light, gloss and patterns, read off their colours and names."""
+"""What geoms of a model are made of: colours in linear light, gloss and patterns, as a file or their colours say."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from surgical_marl.scenes.objects import Placement
 from surgical_marl.view.colours import visual_rgba
 from surgical_marl.view.lighting import PLAIN, TISSUE
 
@@ -22,6 +24,15 @@ PLASTIC = (0.045, 0.30, 0.0)
 RUBBER = (0.04, 0.55, 0.0)
 WET = (0.07, 0.20, 0.0)
 CLOTH = (0.0, 1.0, 0.0)
+LOOKS = {
+    "steel": (STEEL, PLAIN),
+    "paint": (PAINT, PLAIN),
+    "plastic": (PLASTIC, PLAIN),
+    "rubber": (RUBBER, PLAIN),
+    "cloth": (CLOTH, PLAIN),
+    "tissue": (WET, TISSUE),
+}
+"""Gloss and pattern of each of `scenes.shapes.MATERIALS`."""
 
 _BROAD = 0.03  # half side of a box, m
 _STILL = 1
@@ -70,6 +81,18 @@ def materials(model: mujoco.MjModel) -> list[Material]:
         made = material(rgb, bool(flesh), bool(broad))
         ground = model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE
         found.append(made._replace(gloss=CLOTH) if ground else made)
+    return found
+
+
+def named(model: mujoco.MjModel, objects: Mapping[str, Placement]) -> dict[int, Material]:
+    """Return geom -> what it is made of, for the shapes of objects whose files name a material."""
+    found = {}
+    for name, place in objects.items():
+        for number, shape in enumerate(place.object.shapes):
+            if shape.material:
+                gloss, pattern = LOOKS[shape.material]
+                colour = np.array(shape.colour) ** GAMMA
+                found[model.geom(f"{name}/{number}").id] = Material(colour, gloss, int(pattern))
     return found
 
 

@@ -12,10 +12,10 @@ import numpy as np
 
 from surgical_marl.robots.spec import VISUAL_GROUP
 from surgical_marl.scenes.scene import Mount, Scene
-from surgical_marl.view.colours import AGENTS, Colour, visual_rgba
+from surgical_marl.view.colours import AGENTS, visual_rgba
 from surgical_marl.view.drawn import Extra
 from surgical_marl.view.lighting import DRAPE, FLOOR, PLAIN
-from surgical_marl.view.shading import CLOTH, GAMMA, PLASTIC, Material, material
+from surgical_marl.view.shading import CLOTH, GAMMA, PLASTIC, Material, material, named
 from surgical_marl.view.tracer import PLANE
 from surgical_marl.vision.rays import BOX, CYLINDER, ELLIPSOID
 
@@ -51,9 +51,12 @@ def stage(scene: Scene) -> list[Extra]:
     return found + _stands(scene, data) + _bed(scene.model)
 
 
-def paint(scene: Scene) -> dict[int, Colour]:
-    """Return geom -> rgb of what shows whose an arm is: its trocar or its foot, and its accent if it has just one."""
-    model, found = scene.model, dict[int, Colour]()
+def paint(scene: Scene) -> dict[int, Material]:
+    """Return geom -> material of objects whose files name one, and of what shows whose an arm is.
+
+    That is its trocar or its foot, and its accent if it has just one: they have the agent's colour.
+    """
+    model, found = scene.model, named(scene.model, scene.objects)
     rgba = visual_rgba(model)
     for number, agent in enumerate(scene.agents):
         own = [geom for geom in range(model.ngeom) if _body(model, geom).startswith(f"{agent}/")]
@@ -62,7 +65,7 @@ def paint(scene: Scene) -> dict[int, Colour]:
         marks = [geom for geom in range(model.ngeom) if model.geom(geom).name == f"{agent}_trocar"]
         marks = marks or [geom for geom in own if _body(model, geom) == _body(model, own[0])]
         for geom in [*marks, *(coloured if len(coloured) == 1 else ())]:
-            found[geom] = AGENTS[number % len(AGENTS)]
+            found[geom] = material(np.array(AGENTS[number % len(AGENTS)]))
     return found
 
 

@@ -26,7 +26,8 @@ from surgical_marl.engines.fused.order import Order
 from surgical_marl.engines.fused.preludes import LANES
 from surgical_marl.engines.fused.program import Source
 from surgical_marl.engines.fused.threefry import episode_keys
-from surgical_marl.engines.stepper import Stepper, announce
+from surgical_marl.engines.stages import compiling
+from surgical_marl.engines.stepper import Stepper
 from surgical_marl.machine import cores
 
 LEAST_SHARE = 32
@@ -48,15 +49,14 @@ class FusedEngine:
             raise ValueError("device 'cuda' is not there: Warp finds no CUDA device; the other is cpu")
         self.env, self.num_envs = env, num_envs
         self.device = ("cuda" if has_cuda() else "cpu") if device == "auto" else device
-        self.source: Source = load_source(
-            env, vector=self.device == "cpu", announce=lambda: announce(env, self.name, self.device)
-        )
+        with compiling(f"{env.title} ({self.name}, {self.device})") as stage:
+            self.source: Source = load_source(env, vector=self.device == "cpu", stage=stage)
+            self._kernels = compile_kernels(self.source.bodies, self.device, num_envs, stage=stage)
         carry = flatten(self.source.carry)
         self.carry_shapes = {name: leaf.shape for name, leaf in carry.items()}
         self._leaves = {**carry, **flatten(self.source.moved, ".moved")}
         self._stride = -(-num_envs // LANES) * LANES
         self._arrays = make_arrays(self.device, self.source, self._filled_tables(), self._stride, num_envs)
-        self._kernels = compile_kernels(self.source.bodies, self.device, num_envs)
         self._guard: Guard | None = None
         self._order: Order | None = None
         if self.device == "cuda" and large_branches(self.source.bodies):

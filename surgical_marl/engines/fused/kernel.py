@@ -19,6 +19,7 @@ from typing import Any
 
 from surgical_marl.cache import locked
 from surgical_marl.engines.fused.preludes import CPU, CUDA, LANES, UNDEFINE
+from surgical_marl.engines.stages import Stage, unsaid
 from surgical_marl.files import write_atomic
 from surgical_marl.runtime import cache_dir, prepare_warp
 
@@ -41,11 +42,15 @@ def large_branches(bodies: dict[str, str]) -> int:
 
 
 def compile_kernels(
-    bodies: dict[str, str], device: str, num_envs: int = 0, max_registers: int | None = None
+    bodies: dict[str, str],
+    device: str,
+    num_envs: int = 0,
+    max_registers: int | None = None,
+    stage: Stage = unsaid,
 ) -> dict[str, Kernel]:
     """Compile C function bodies into kernels by name, in one module, for about so many environments.
 
-    Warp keeps compiled modules in its cache on disk.
+    Warp keeps compiled modules in its cache on disk. `stage` is told if there is none of these bodies.
     """
     cuda, branches = device == "cuda", large_branches(bodies)
     ordered = cuda and branches > 0
@@ -59,6 +64,8 @@ def compile_kernels(
     made = {name: _make(f"{name}_{digest}", source, module, ordered, max_registers) for name, source in sources.items()}
     # Warp itself does not protect a module from two processes that compile it at the same time
     with locked(cache_dir() / "kernels" / module.name), _checked(module.name):
+        if not _folders(module.name):
+            stage("compiling the C code")
         module.load(wp.get_device(device), block_dim=block)
     return {name: Kernel(kernel, device, block) for name, kernel in made.items()}
 

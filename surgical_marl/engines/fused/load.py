@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import asdict
 from typing import Any
 
@@ -11,14 +10,15 @@ import numpy as np
 
 from surgical_marl.cache import cached
 from surgical_marl.engines.fused.program import TREES, Leaf, Source
+from surgical_marl.engines.stages import Stage, unsaid
 from surgical_marl.engines.stepper import Stepper, describe
 from surgical_marl.runtime import no_collection
 
 
-def load_source(env: Stepper, vector: bool, announce: Callable[[], None] = lambda: None) -> Source:
+def load_source(env: Stepper, vector: bool, stage: Stage = unsaid) -> Source:
     """Return the source of an environment's kernels: for a CPU, with vectors, or for CUDA.
 
-    The source is kept on disk. `announce` is called before it is made.
+    The source is kept on disk. `stage` is told the stages in which it is made.
 
     Raises:
         Unsupported: the environment can't be traced.
@@ -27,10 +27,9 @@ def load_source(env: Stepper, vector: bool, announce: Callable[[], None] = lambd
     def compute() -> np.ndarray:
         from surgical_marl.engines.fused.translate import make_source  # imports JAX
 
-        announce()
         # what tracing makes stays: to look for garbage among it takes a fifth of the time
         with no_collection():
-            source = make_source(env, vector)
+            source = make_source(env, vector, stage)
         return np.frombuffer(json.dumps(asdict(source), default=np.ndarray.tolist).encode(), np.uint8)
 
     settings = f"vector={vector} {describe(env.parameters)}"

@@ -15,6 +15,7 @@ from surgical_marl.engines.fused.operations import KINDS
 from surgical_marl.engines.fused.program import Leaf, Source
 from surgical_marl.engines.fused.trace import Tracer
 from surgical_marl.engines.fused.traced import Table, Traced, lift, lower
+from surgical_marl.engines.stages import Stage
 from surgical_marl.engines.stepper import Stepper
 
 BUFFERS = {"f": "outs", "i": "counts", "u": "counts", "b": "flags"}
@@ -38,8 +39,9 @@ class Fields:
         return leaf
 
 
-def make_source(env: Stepper, vector: bool) -> Source:
+def make_source(env: Stepper, vector: bool, stage: Stage) -> Source:
     """Traces an environment's functions."""
+    stage("tracing the step")
     fields, graph = Fields(), Graph()
     key, number = jax.ShapeDtypeStruct((2,), np.uint32), jax.ShapeDtypeStruct((), np.int32)
     given, places = _parameters(graph, env.parameters)
@@ -57,6 +59,7 @@ def make_source(env: Stepper, vector: bool) -> Source:
     else:
         last, found = trace(graph, env.step, (carry, actions), given, shapes)
         kernels["step"] = last
+    stage("tracing the reset")
     first, _ = trace(graph, env.reset, (carry.key, carry.episode), given, shapes)
     known = len(jax.tree.leaves(carry))
     leaves = [
@@ -65,9 +68,12 @@ def make_source(env: Stepper, vector: bool) -> Source:
     ]
     results = _nest([path for path, _ in jax.tree_util.tree_flatten_with_path(found)[0]], leaves)
     stored = {name: jax.tree.leaves(moved) if name == "move" else leaves for name in kernels}
-    bodies = {name: _body(graph, stored[name], values, vector) for name, values in kernels.items()}
+    bodies = {}
+    for name, values in {**kernels, "reset": first}.items():
+        stage(f"scheduling the {name}")
+        bodies[name] = _body(graph, stored.get(name, leaves), values, vector)
     return Source(
-        bodies={**bodies, "reset": _body(graph, leaves, first, vector)},
+        bodies=bodies,
         tables=tables(graph),
         sizes=fields.sizes,
         carry=results.pop("carry"),

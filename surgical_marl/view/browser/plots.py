@@ -1,4 +1,4 @@
-"""Live plots of one environment: error, distance, force, and every term of the reward."""
+"""Live plots of one environment: error, distance, force, grips on objects, and every term of the reward."""
 
 from __future__ import annotations
 
@@ -20,6 +20,8 @@ class Curve(NamedTuple):
     label: str
     colour: str
     values: np.ndarray
+    shaded: bool = False
+    """Whether the area below it is filled instead."""
 
 
 def curves(history: History) -> dict[str, list[Curve]]:
@@ -34,6 +36,7 @@ def curves(history: History) -> dict[str, list[Curve]]:
         "contact force, N": [
             Curve(agent, own[i], history.read(agent, "contact_force")) for i, agent in enumerate(agents)
         ],
+        **_grips(history, own),
         "reward": [Curve(agent, own[i], history.read(agent, "reward")) for i, agent in enumerate(agents)],
     }
     for agent in agents:
@@ -43,6 +46,23 @@ def curves(history: History) -> dict[str, list[Curve]]:
             for k, term in enumerate(terms)
         ]
     return {title: lines for title, lines in plots.items() if any(np.isfinite(line.values).any() for line in lines)}
+
+
+def _grips(history: History, colours: Sequence[str]) -> dict[str, list[Curve]]:
+    """Return two plots for each free object: how hard each arm's fingers press on it, and how far it has slid.
+
+    The area below the force is filled while the arm holds the object.
+    """
+    plots: dict[str, list[Curve]] = {}
+    for name in history.objects:
+        force, slip = plots.setdefault(f"grip on {name}, N", []), plots.setdefault(f"slip of {name}, mm", [])
+        for agent, own in zip(history.agents, colours, strict=True):
+            if f"{name}_force" in history.names(agent):
+                pressed = history.read(agent, f"{name}_force")
+                held = np.where(history.read(agent, f"{name}_holding") > 0, pressed, 0.0)
+                force += [Curve(agent, own, pressed), Curve(f"{agent} holds", own, held, shaded=True)]
+                slip.append(Curve(agent, own, 1000 * history.read(agent, f"{name}_slip")))
+    return plots
 
 
 class Plots:
@@ -65,11 +85,18 @@ class Plots:
                 self._handles[title] = self._make(title, data, lines)
 
     def _make(self, title: str, data: tuple[np.ndarray, ...], lines: Sequence[Curve]) -> Any:
-        series = ({"label": "s"}, *({"label": line.label, "stroke": line.colour, "width": 1.5} for line in lines))
+        series = ({"label": "s"}, *map(_series, lines))
         with self._folder:
             return self._gui.add_uplot(
                 data, series, title=title, scales={"x": {"time": False}}, height=_HEIGHT, legend={"show": True}
             )
+
+
+def _series(line: Curve) -> dict[str, Any]:
+    """Return how uPlot draws a line."""
+    if line.shaded:
+        return {"label": line.label, "stroke": line.colour, "fill": f"{line.colour}40", "width": 0}
+    return {"label": line.label, "stroke": line.colour, "width": 1.5}
 
 
 def _css(rgb: np.ndarray) -> str:

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from surgical_marl.engines.stages import told
 from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.runs.settings import Settings
 from surgical_marl.view.browser.arms import Arms
@@ -110,7 +111,8 @@ class Viewer:
         try:
             settings, who = _settings(choice, old)
             self._further = tuple(dict.fromkeys([*self._further, *old.choices]))  # with runs that a person named
-            self.session = Session(settings, who, choice.num_envs, self._record, self._further)
+            with told(lambda title, stage: self._say("Compiling", f"{title}: {stage}", 5)):
+                self.session = Session(settings, who, choice.num_envs, self._record, self._further)
         except ValueError:
             self._show()  # with menus that say what is looked at
             raise
