@@ -67,5 +67,5 @@ ON_A_CPU = ("one-0-mappo", "one-4-mappo")
 def find_cell(name: str) -> Cell:
     """Return the cell of that name; ValueError if there is none."""
     if name not in CELLS:
-        raise unknown("cell", name, CELLS)
+        raise unknown("cell", name, list(CELLS))
     return CELLS[name]
