@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,11 +14,12 @@ import numpy as np
 import pytest
 import torch
 
+from surgical_marl.learning import train
 from surgical_marl.policies.acting import forget
 from surgical_marl.runs import environment
 from surgical_marl.runs.folder import write_config, write_metrics
 from surgical_marl.runs.settings import Settings, load_config
-from surgical_marl.studies import study, study_report, study_runs
+from surgical_marl.studies import study, study_cells, study_report, study_runs
 
 MEASURES = ("error", "held", "squared", "distance", "center", "path", "time", "smoothness", "action_change")
 
@@ -29,9 +31,9 @@ def runs(tmp_path: Path) -> Path:
     settings = load_config("reach", "bimanual_psm", ["num_envs=8", "iterations=10"])
     for algo in ("mappo", "joint"):
         for seed in range(2):
-            run = tmp_path / f"bimanual_psm-{algo}-seed{seed}"
+            run = tmp_path / f"reach-bimanual_psm-{algo}-seed{seed}"
             run.mkdir()
-            write_config(run, settings)
+            write_config(run, replace(settings, algo=algo))
             rows = [
                 {"env_steps": 100.0 * i, "seconds": 1.0 + seed, "success_rate": i / 10, "collision_rate": 0.0}
                 for i in range(1, 11)
@@ -55,14 +57,14 @@ def runs(tmp_path: Path) -> Path:
 def test_tables_and_files(runs: Path) -> None:
     page = runs / "study.md"
     page.write_text(f"before\n{study_report.BEGIN}\nold\n{study_report.END}\nafter\n")
-    argv = ["--only", "report", "--out", str(runs), "--results", str(runs), "--scenes", "bimanual_psm"]
-    assert study.main([*argv, "--algos", "mappo", "joint"]) == 0
+    argv = ["--only", "report", "--out", str(runs), "--results", str(runs), "--cells"]
+    assert study.main([*argv, "reach-bimanual_psm-mappo", "reach-bimanual_psm-joint"]) == 0
     first, second = json.loads((runs / "study.json").read_text())
     text = page.read_text()
     assert text.startswith("before\n") and text.endswith("after\n") and "old" not in text
     assert f"10 iterations; trained on {first['trained_on']}, played on a CPU." in text
-    assert "| `bimanual_psm` | MAPPO | 75.0% (" in text
-    assert "| `bimanual_psm` | joint PPO | frozen | 75.0% (" in text
+    assert "| `bimanual_psm` | `algo=mappo` | 75.0% (" in text
+    assert "| `bimanual_psm` | `algo=joint` | frozen | 75.0% (" in text
     assert (first["algo"], second["algo"], first["seeds"]) == ("mappo", "joint", [0, 1])
     assert [each["success_2mm"] for each in first["by_seed"]] == [0.5, 1.0]
     assert first["seconds"][0] == 15.0 and first["samples"] == 1000.0
@@ -72,6 +74,10 @@ def test_tables_and_files(runs: Path) -> None:
     # of both seeds together at the same second: the slower one ends after 20 s, the faster one after 10
     assert first["curves"]["seconds"]["x"][-1] == 10.0
     assert len((runs / "study.csv").read_text().splitlines()) == 5
+    assert first["arms"]["psm_1"][0] == 0.75
+    # a second report of one cell keeps the row of the other one
+    assert study.main([*argv, "reach-bimanual_psm-mappo"]) == 0
+    assert [row["cell"] for row in json.loads((runs / "study.json").read_text())] == [first["cell"], second["cell"]]
     assert (runs / "study.png").read_bytes().startswith(b"\x89PNG")
 
 
@@ -85,7 +91,7 @@ def test_what_is_played_are_goals_that_training_never_drew(runs: Path, monkeypat
         raise ValueError(f"{num_envs} episodes of {settings.goals} goals")
 
     monkeypatch.setattr(environment, "make_env", make_env)
-    job = study_runs.Job("bimanual_psm", "mappo", 0)
+    job = study_runs.Job("reach-bimanual_psm-mappo", 0)
     (runs / str(job) / study_runs.PLAYED).unlink()
     with pytest.raises(ValueError, match="200 episodes of held_out goals"):
         study_runs.play(job, runs)
@@ -106,7 +112,7 @@ def test_an_arm_is_taken_over() -> None:
 
 
 def test_what_is_wrong_with_one_run_stops_no_other(tmp_path: Path) -> None:
-    job = study_runs.Job("bimanual_psm", "mappo", 0)
+    job = study_runs.Job("reach-bimanual_psm-mappo", 0)
     assert study_runs.work("train", job, tmp_path, ["num_env=3"]) == (
         job,
         "unknown setting 'num_env'; did you mean 'num_envs'?",
@@ -117,6 +123,7 @@ def test_what_is_wrong_with_one_run_stops_no_other(tmp_path: Path) -> None:
     ("script", "argv", "words"),
     [
         ("study", ["--only", "report"], "study: out holds no run that was played: nothing to report"),
+        ("study", ["--cells", "one-4"], "study: unknown cell 'one-4', did you mean"),
         ("study", ["--seeds", "0"], "argument --seeds: must be a whole number of 1 or more, not '0'"),
         ("tuning", ["--scene", "nope"], "tuning: unknown scene 'nope'"),
     ],
@@ -132,6 +139,7 @@ def test_sizes_are_told_by_scene() -> None:
         "steps_per_iteration": 32,
         "iterations": 9,
         "seeds": [0],
+        "task": "reach",
         "trained_on": "a GPU",
         "gpu": None,
         "cpu": "a CPU",
@@ -142,3 +150,18 @@ def test_sizes_are_told_by_scene() -> None:
         f"`reach`, 1 seeds each, {both.removesuffix(' on `a` and `b`')}; trained on a GPU, played on a CPU."
     )
     assert f"{both}; 16 environments, 32 steps an iteration, 9 iterations on `c`; trained" in study_report.about(found)
+
+
+@pytest.mark.parametrize("cell", study_cells.CELLS.values(), ids=list(study_cells.CELLS))
+def test_every_cell_has_settings_that_are_accepted(cell: study_cells.Cell) -> None:
+    settings = load_config(cell.task, cell.scene, cell.settings)
+    assert cell.question in study_cells.QUESTIONS and settings.scene == cell.scene
+
+
+def test_a_cell_is_trained_with_its_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Any] = []
+    monkeypatch.setattr(train, "finish", lambda settings, run: asked.append((settings, run)))
+    study_runs.learn(study_runs.Job("one-4-ippo", 3), tmp_path, ["iterations=7"])
+    ((settings, run),) = asked
+    assert (settings.knowledge, settings.messages, settings.algo, settings.team_reward) == ("one", 4, "ippo", True)
+    assert (settings.seed, settings.iterations, run) == (3, 7, tmp_path / "one-4-ippo-seed3")

@@ -1,11 +1,13 @@
-"""MAPPO against IPPO and joint PPO on scenes of several arms, for docs/study.md: trains, evaluates, disturbs, reports.
+"""Where teamwork pays, for docs/study.md: trains cells with several seeds, evaluates, takes arms away, reports.
 
     python -m surgical_marl.studies.study                 # all of it; a second call goes on where the first stopped
-    python -m surgical_marl.studies.study --out runs/other iterations=60   # with other settings than those of configs/
+    python -m surgical_marl.studies.study --cells one-0-mappo one-4-mappo iterations=400     # some, on a CPU, say
     python -m surgical_marl.studies.study --only report --results docs     # tables and figures of what there is
 
-Every scene, algorithm and seed is a run of its own, as `surgical-marl train` makes it, in a folder of --out. Seconds
-are meaningful only if runs don't share a machine's cores or GPU: use --jobs 1 for them.
+A cell is a task, a scene and settings (`study_cells.py`). Every cell and seed is a run of its own, as `surgical-marl
+train` makes it, in a folder of --out. Runs and plays that are there are not made again. A report keeps the rows of
+study.json in --results of which --out has no runs. Seconds are meaningful only if runs don't share a machine's cores or
+GPU: use --jobs 1 for them.
 """
 
 from __future__ import annotations
@@ -18,7 +20,8 @@ from pathlib import Path
 
 from surgical_marl.cli.main import whole
 from surgical_marl.studies.command import make_parser, parse_with_settings, run
-from surgical_marl.studies.study_runs import ALGOS, PLAYED, SCENES, Job, work
+from surgical_marl.studies.study_cells import CELLS, find_cell
+from surgical_marl.studies.study_runs import PLAYED, Job, work
 
 PARTS = ("train", "play", "report")
 
@@ -26,7 +29,7 @@ PARTS = ("train", "play", "report")
 def main(argv: list[str] | None = None) -> int:
     arguments = _parse(argv)
     results = arguments.results or arguments.out
-    jobs = [Job(s, a, n) for n in range(arguments.seeds) for s in arguments.scenes for a in arguments.algos]
+    jobs = [Job(find_cell(name).name, seed) for seed in range(arguments.seeds) for name in arguments.cells]
     for folder in (arguments.out, results):
         folder.mkdir(parents=True, exist_ok=True)
     failed: dict[str, str] = {}
@@ -51,8 +54,7 @@ def main(argv: list[str] | None = None) -> int:
 def _parse(argv: list[str] | None) -> argparse.Namespace:
     parser = make_parser(__doc__, usage="%(prog)s [options] [key=value ...]")
     parser.add_argument("--only", nargs="+", choices=PARTS, default=PARTS, help="parts of the work")
-    parser.add_argument("--scenes", nargs="+", choices=SCENES, default=SCENES)
-    parser.add_argument("--algos", nargs="+", choices=ALGOS, default=ALGOS)
+    parser.add_argument("--cells", nargs="+", default=list(CELLS), metavar="NAME", help=f"of {', '.join(CELLS)}")
     parser.add_argument("--seeds", type=whole(1), default=5, metavar="N", help="0 to N - 1")
     parser.add_argument("--jobs", type=whole(1), default=1, metavar="N", help="processes")
     parser.add_argument("--out", type=Path, default=Path("runs/study"), metavar="DIR", help="folder of the runs")

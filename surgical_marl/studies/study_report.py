@@ -19,10 +19,10 @@ from surgical_marl.evaluation.metrics import SUCCESS_MM, Metric, metrics, succes
 from surgical_marl.files import write_atomic
 from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.runs.folder import read_metrics, read_origin, read_settings
-from surgical_marl.studies.study_runs import ALGOS, PLAYED, TASK, WHEN, Job
+from surgical_marl.studies.study_cells import CELLS, QUESTIONS
+from surgical_marl.studies.study_runs import PLAYED, WHEN, Job
 
-NAMES = {"mappo": "MAPPO", "ippo": "IPPO", "joint": "joint PPO"}
-COLORS = {"mappo": "#1f6f8b", "ippo": "#b23a48", "joint": "#7a7a7a"}
+COLORS = ("#1f6f8b", "#b23a48", "#7a7a7a", "#c98a1b")
 FINAL = (f"success_{SUCCESS_MM}mm", f"team_success_{SUCCESS_MM}mm", "median_error_mm", "collision_rate")
 BROKEN = ("untouched", "frozen", "oracle")
 LEVEL = 0.8
@@ -34,44 +34,54 @@ BEGIN, END = "<!-- study begin -->", "<!-- study end -->"
 def report(jobs: Sequence[Job], out: Path, results: Path) -> None:
     """Write study.json, study.csv and study.png, and the tables in study.md.
 
-    ValueError if there is nothing to report yet.
+    Rows of an older study.json stay where there is no run of their cell. ValueError if there is nothing to report yet.
     """
     if not jobs:
         raise ValueError(f"{out} holds no run that was played: nothing to report")
-    groups = groupby(sorted(jobs, key=lambda job: (jobs_order(job), job.seed)), key=lambda job: (job.scene, job.algo))
-    found = [describe(list(members), out) for _, members in groups]
-    write_atomic(results / "study.json", lambda path: path.write_text(json.dumps(found, indent=1) + "\n"))
+    order, page, numbers = list(CELLS), results / "study.md", results / "study.json"
+    groups = groupby(sorted(jobs, key=lambda job: (order.index(job.cell), job.seed)), key=lambda job: job.cell)
+    rows = {row["cell"]: row for row in (json.loads(numbers.read_text()) if numbers.is_file() else [])}
+    rows |= {cell: describe(list(members), out) for cell, members in groups}
+    found = [rows[name] for name in order if name in rows]
+    write_atomic(numbers, lambda path: path.write_text(json.dumps(found, indent=1) + "\n"))
     write_atomic(results / "study.csv", lambda path: _write_csv(path, found))
     draw(found, results / "study.png")
-    page = results / "study.md"
     text = page.read_text() if page.is_file() else f"{BEGIN}\n{END}\n"
     before, _, rest = text.partition(BEGIN)
     after = rest.partition(END)[2]
-    picture = "![success and collisions while training](study.png)"
-    tables = f"{BEGIN}\n\n{picture}\n\n{about(found)}\n\n{final_table(found)}\n\n{broken_table(found)}\n\n{END}"
+    parts = ["![success and collisions while training](study.png)"]
+    for members in _by_question(found).values():
+        title = QUESTIONS[CELLS[members[0]["cell"]].question]
+        parts += [f"### {title}", about(members), final_table(members), broken_table(members)]
+    tables = "\n\n".join([BEGIN, *parts, END])
     write_atomic(page, lambda path: path.write_text(before + tables + after))
 
 
-def jobs_order(job: Job) -> tuple[str, int]:
-    """Scenes by name, algorithms as the study names them."""
-    return job.scene, ALGOS.index(job.algo)
+def _by_question(found: Sequence[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
+    groups: dict[str, list[dict[str, Any]]] = {}
+    for each in found:
+        groups.setdefault(CELLS[each["cell"]].question, []).append(each)
+    return groups
 
 
 def describe(jobs: Sequence[Job], out: Path) -> dict[str, Any]:
-    """Summarise the R runs of one scene and algorithm.
+    """Summarise the R runs of one cell.
 
     Numbers with an interval are [value, low, high], with None where unknown.
     """
     played = [dict(np.load(out / str(job) / PLAYED)) for job in jobs]
     abouts = [json.loads(str(each["about"])) for each in played]
     if len({each["goal_set"] for each in abouts}) > 1:
-        raise ValueError(f"the runs of {jobs[0].scene} did not play the same goals: play them anew")
+        raise ValueError(f"the runs of {jobs[0].cell} did not play the same goals: play them anew")
     rows = [read_metrics(out / str(job)) for job in jobs]
     settings = read_settings(out / str(jobs[0]))
-    final = metrics(_stacked(played, "untouched"), TASKS.load(TASK).follows)
+    played_held = _stacked(played, "untouched")["held"]
+    final = metrics(_stacked(played, "untouched"), TASKS.load(settings.task).follows)
     return {
-        "scene": jobs[0].scene,
-        "algo": jobs[0].algo,
+        "cell": jobs[0].cell,
+        "task": settings.task,
+        "scene": settings.scene,
+        "algo": settings.algo,
         "seeds": [job.seed for job in jobs],
         "num_envs": settings.num_envs,
         "steps_per_iteration": settings.steps_per_iteration,
@@ -83,7 +93,11 @@ def describe(jobs: Sequence[Job], out: Path) -> dict[str, Any]:
         "seconds": number(_over_runs([sum(row["seconds"] for row in run) for run in rows])),
         "by_seed": [{name: _value(final[name], at) for name in FINAL} for at in range(len(jobs))],
         "curves": {axis: curve(rows, axis) for axis in ("samples", "seconds")},
-        "broken": {what: broken(played, abouts[0]["agents"], what) for what in BROKEN},
+        "broken": {what: broken(played, abouts[0]["agents"], what) for what in BROKEN if _was_played(played, what)},
+        "arms": {
+            arm: number(success(1000 * played_held[..., index : index + 1], SUCCESS_MM))
+            for index, arm in enumerate(abouts[0]["agents"])
+        },
     }
 
 
@@ -144,28 +158,31 @@ def about(found: Sequence[dict[str, Any]]) -> str:
         for size, names in scenes.items()
     )
     where = f"trained on {first['trained_on'] or 'an unknown device'}, played on {first['gpu'] or first['cpu']}"
-    return f"`{TASK}`, {' to '.join(map(str, seeds))} seeds each, {how}; {where}."
+    task = " and ".join(dict.fromkeys(f"`{each['task']}`" for each in found))
+    return f"{task}, {' to '.join(map(str, seeds))} seeds each, {how}; {where}."
 
 
 def final_table(found: Sequence[dict[str, Any]]) -> str:
     """Return the results of the frozen evaluation, and how long it took to learn, as a Markdown table."""
     level = f"{LEVEL:.0%} in training"
-    head = ["scene", "algorithm", f"within {SUCCESS_MM} mm", "all arms", "median error (mm)", "collisions",
+    head = ["scene", "settings", f"within {SUCCESS_MM} mm", "all arms", "median error (mm)", "collisions",
             f"M samples to {level}", f"seconds to {level}", "seconds in all"]  # fmt: skip
     rows = []
     for each in found:
         samples, seconds = (each["curves"][axis]["reached"] for axis in ("samples", "seconds"))
         cells = [_cell(each[name], name) for name in FINAL]
         cells += ["-" if samples is None else f"{samples / 1e6:.3g}", "-" if seconds is None else f"{seconds:.3g}"]
-        rows.append([f"`{each['scene']}`", NAMES[each["algo"]], *cells, _cell(each["seconds"], "seconds")])
+        rows.append(
+            [f"`{each['scene']}`", f"`{CELLS[each['cell']].label()}`", *cells, _cell(each["seconds"], "seconds")]
+        )
     return _markdown(head, rows)
 
 
 def broken_table(found: Sequence[dict[str, Any]]) -> str:
     """Return what breaks when an arm is taken from its policy, as a Markdown table."""
-    head = ["scene", "algorithm", f"one arm, after {WHEN:g} s", "other arms", "that arm", "collisions"]
+    head = ["scene", "settings", f"one arm, after {WHEN:g} s", "other arms", "that arm", "collisions"]
     rows = [
-        [f"`{each['scene']}`", NAMES[each["algo"]], {"oracle": "moved by the oracle"}.get(what, what)]
+        [f"`{each['scene']}`", f"`{CELLS[each['cell']].label()}`", {"oracle": "moved by the oracle"}.get(what, what)]
         + [_cell(numbers[name], "rate") for name in ("others", "itself", "collisions")]
         for each in found
         for what, numbers in each["broken"].items()
@@ -174,20 +191,21 @@ def broken_table(found: Sequence[dict[str, Any]]) -> str:
 
 
 def draw(found: Sequence[dict[str, Any]], out: Path) -> None:
-    """Success against samples and seconds, and collisions: a row for each scene, a line for each algorithm."""
-    scenes = list(dict.fromkeys(each["scene"] for each in found))
-    figure = Figure(figsize=(11, 2.9 * len(scenes)), layout="constrained")
+    """Success against samples and seconds, and collisions: a row for a question and scene, a line for a cell."""
+    places = list(dict.fromkeys((CELLS[each["cell"]].question, each["scene"]) for each in found))
+    figure = Figure(figsize=(11, 2.9 * len(places)), layout="constrained")
     FigureCanvasAgg(figure)
     panels = (("samples", "success_rate"), ("seconds", "success_rate"), ("samples", "collision_rate"))
     titles = {"success_rate": f"tips within {SUCCESS_MM} mm", "collision_rate": "episodes with a collision"}
-    for axes, scene in zip(figure.subplots(len(scenes), 3, squeeze=False), scenes, strict=True):
+    for axes, place in zip(figure.subplots(len(places), 3, squeeze=False), places, strict=True):
+        members = [each for each in found if (CELLS[each["cell"]].question, each["scene"]) == place]
         for axis, (x, name) in zip(axes, panels, strict=True):
-            for each in (each for each in found if each["scene"] == scene):
+            for color, each in zip(COLORS, members, strict=False):
                 lines = each["curves"][x]
                 mean, low, high = (np.array(side, float) for side in zip(*lines[name], strict=True))
-                axis.plot(lines["x"], mean, color=COLORS[each["algo"]], label=NAMES[each["algo"]])
-                axis.fill_between(lines["x"], low, high, color=COLORS[each["algo"]], alpha=0.2, linewidth=0)
-            axis.set_title(f"{scene}: {titles[name]}", fontsize=9)
+                axis.plot(lines["x"], mean, color=color, label=CELLS[each["cell"]].label())
+                axis.fill_between(lines["x"], low, high, color=color, alpha=0.2, linewidth=0)
+            axis.set_title(f"{place[1]}: {titles[name]}", fontsize=9)
             axis.set_xlabel(x)
             if x == "samples":
                 axis.xaxis.set_major_formatter(EngFormatter(sep=""))
@@ -197,6 +215,10 @@ def draw(found: Sequence[dict[str, Any]], out: Path) -> None:
             axis.spines[["top", "right"]].set_visible(False)
         axes[0].legend(fontsize=8, frameon=False)
     write_atomic(out, lambda path: figure.savefig(path, format="png", dpi=120))
+
+
+def _was_played(played: Sequence[dict[str, np.ndarray]], what: str) -> bool:
+    return all(any(name.startswith(what) for name in each) for each in played)
 
 
 def _stacked(played: Sequence[dict[str, np.ndarray]], what: str) -> dict[str, np.ndarray]:
@@ -228,7 +250,7 @@ def _markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 def _write_csv(path: Path, found: Sequence[dict[str, Any]]) -> None:
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(["scene", "algo", "seed", *FINAL])
+        writer.writerow(["cell", "seed", *FINAL])
         for each in found:
             for seed, numbers in zip(each["seeds"], each["by_seed"], strict=True):
-                writer.writerow([each["scene"], each["algo"], seed, *(format(numbers[name], ".6g") for name in FINAL)])
+                writer.writerow([each["cell"], seed, *(format(numbers[name], ".6g") for name in FINAL)])

@@ -10,9 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-TASK = "reach"
-SCENES = ("bimanual_psm", "bimanual_star", "trimanual_psm_ecm")
-ALGOS = ("mappo", "ippo", "joint")
+from surgical_marl.studies.study_cells import find_cell
+
 EPISODES = 200
 WHEN = 0.3
 """Seconds after the start of an episode at which an arm is taken from its policy: most are half-way to their goals."""
@@ -20,14 +19,13 @@ PLAYED = "played.npz"
 
 
 class Job(NamedTuple):
-    """One training."""
+    """One training: a cell's name and a seed."""
 
-    scene: str
-    algo: str
+    cell: str
     seed: int
 
     def __str__(self) -> str:
-        return f"{self.scene}-{self.algo}-seed{self.seed}"
+        return f"{self.cell}-seed{self.seed}"
 
 
 def learn(job: Job, out: Path, overrides: list[str]) -> None:
@@ -35,7 +33,8 @@ def learn(job: Job, out: Path, overrides: list[str]) -> None:
     from surgical_marl.learning.train import finish
     from surgical_marl.runs.settings import load_config
 
-    finish(load_config(TASK, job.scene, [f"algo={job.algo}", f"seed={job.seed}", *overrides]), out / str(job))
+    cell = find_cell(job.cell)
+    finish(load_config(cell.task, cell.scene, [*cell.settings, f"seed={job.seed}", *overrides]), out / str(job))
 
 
 def play(job: Job, out: Path) -> None:
@@ -57,7 +56,10 @@ def play(job: Job, out: Path) -> None:
     untouched = evaluate.play(env, policy, EPISODES, seed=0)
     found: dict[str, Any] = {f"untouched/{name}": values for name, values in untouched.measures.items()}
     for arm in env.agents:
-        for what, instead in (("frozen", zero_policy(env)), ("oracle", oracle(env, [arm]))):
+        instead_of = {"frozen": zero_policy(env)}
+        with contextlib.suppress(ValueError):  # some tasks have no oracle
+            instead_of["oracle"] = oracle(env, [arm])
+        for what, instead in instead_of.items():
             measures = evaluate.play(env, taken_over(policy, env, arm, instead, start), EPISODES, seed=0).measures
             found |= {f"{what} {arm}/{name}": measures[name] for name in ("held", "collided")}
     about = json.dumps({**untouched.about, **machine(), "agents": untouched.agents})
