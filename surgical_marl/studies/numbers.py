@@ -23,6 +23,7 @@ import yaml
 
 from surgical_marl import list_scenes, list_tasks, load_scene
 from surgical_marl.content import find
+from surgical_marl.engines.fused.kernel import compile_kernels
 from surgical_marl.envs.batch import BatchedEnv, BatchStep
 from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.robots.rotation import matrix_of
@@ -236,24 +237,34 @@ def _write_wild(folder: Path, scene: str) -> Path:
 
 
 def cost() -> None:
-    """Print what the check of a step takes: steps with and without it take turns."""
+    """Print what the check of every step takes: steps with and without it take turns.
+
+    Without it the kernels don't look at what they store, and nothing looks at the environments after a step.
+    """
     print("| environments | us without | us with | |\n|---|---|---|---|", flush=True)
-    for scene, count in (("psm", 1), ("psm", COUNT), ("bimanual_psm", COUNT)):
-        env = BatchedEnv("reach", scene, num_envs=count, engine="fused", device="cpu")
-        env.reset(seed=0)
-        actions, checked = next(drives(env, np.random.default_rng(0))), env.engine.end_faulty
+    for scene, count in (("psm", 1), ("psm", COUNT), ("bimanual_psm", COUNT), ("bimanual_psm_needle", COUNT)):
+        env, bare = (BatchedEnv("reach", scene, num_envs=count, engine="fused", device="cpu") for _ in range(2))
+        engine: Any = bare.engine
+        bodies = {
+            name: "\n".join(line for line in body.splitlines() if "watch_" not in line)
+            for name, body in engine.source.bodies.items()
+        }
+        engine._kernels = compile_kernels(bodies, "cpu", count)
         fine = np.full(count, -1, np.int32)
+        engine.end_faulty = lambda limit, library, fine=fine: fine
+        env.reset(seed=0), bare.reset(seed=0)
+        actions = next(drives(env, np.random.default_rng(0)))
         taken: tuple[list[float], list[float]] = [], []
-        for number in range(1500 if count > 1 else 20_000):
-            env.engine.end_faulty = checked if number % 2 else lambda limit, library, fine=fine: fine  # type: ignore
+        for number in range(3000 if count > 1 else 40_000):
             began = time.perf_counter()
-            env.step(actions)
+            (bare, env)[number % 2].step(actions)
             taken[number % 2].append(1e6 * (time.perf_counter() - began))
         without, with_it = (float(np.quantile(own, 0.1)) for own in taken)
         print(
-            f"| {count:,} of `{scene}` | {without:,.0f} | {with_it:,.0f} | {with_it / without - 1:+.1%} |", flush=True
+            f"| {count:,} of `{scene}` | {without:,.1f} | {with_it:,.1f} | {with_it / without - 1:+.1%} |", flush=True
         )
-        env.close()
+        for own in (env, bare):
+            own.close()
 
 
 def _looks(task: str) -> bool:

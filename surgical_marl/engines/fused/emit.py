@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -32,22 +32,39 @@ _CODE = {
 }  # fmt: skip
 
 
+class Watch(NamedTuple):
+    """Which stored numbers must be finite, and what says that one was not."""
+
+    fields: frozenset[tuple[str, int]]
+    """(buffer, field) of each number."""
+    flag: int
+    """Field of `flags` that becomes 1. No kernel makes it 0."""
+
+
 class Emitter(ArrayEmitter):
     """Writes the body of a function.
 
     `stores` are (buffer, field, value) in the order in which they should happen. A load is a node "load" of (buffer,
-    field). Buffers are names of parameters.
+    field). Buffers are names of parameters. If there is a `watch`, the function also notices numbers that are not
+    finite.
     """
 
-    def __init__(self, graph: Graph, stores: list[tuple[str, int, Value]], vector: bool) -> None:
+    def __init__(
+        self, graph: Graph, stores: list[tuple[str, int, Value]], vector: bool, watch: Watch | None = None
+    ) -> None:
         super().__init__(graph, Scheduler(graph, [value for _, _, value in stores]).run(), vector)
-        self.stores, self.offsets = stores, table_offsets(graph)
+        self.stores, self.offsets, self.watch = stores, table_offsets(graph), watch
         self.active: list[str] = []
         """Conditions of the code's branch: it applies to the environments of a vector for which all of them hold."""
 
     def body(self) -> str:
         self._postpone_stores()
         self._region(0, self._store)
+        if self.watch:
+            # Adding 0 times each number leaves 0, or NaN if one of them was NaN or infinite.
+            field = self.watch.flag
+            self.lines = ["F watch_=SPLAT(0.0f);", *self.lines]
+            self.lines.append(f"B bad_=watch_!=SPLAT(0.0f);if(ANY(bad_)){{STB(flags,{field},LDB(flags,{field})|bad_)}}")
         if any(line.startswith("WORK(") for line in self.lines):
             self.lines = ["I work_=0;", *self.lines, "work.data[t]=WORKED;"]
         return "\n".join(self.lines)
@@ -83,6 +100,8 @@ class Emitter(ArrayEmitter):
     def _store(self, k: int) -> None:
         buffer, field, value = self.stores[k]
         self.lines.append(f"ST{self.graph.kind(value).upper()}({buffer},{field},{self._name(value)});")
+        if self.watch and (buffer, field) in self.watch.fields:
+            self.lines.append(f"watch_+={self._name(value)}*SPLAT(0.0f);")
 
     def _branch(self, number: int, branch: Branch) -> None:
         wanted, condition = self.schedule.alive[number], self._name(branch.condition)

@@ -154,7 +154,10 @@ class FusedEngine:
 
     def write(self, name: str, values: Any) -> None:
         """Set a part of the `Carry`."""
-        self._arrays.write(self._leaves[name], values)
+        leaf = self._leaves[name]
+        self._arrays.write(leaf, values)
+        if leaf.buffer == "state":  # a kernel checks what it stores alone
+            self._arrays.rows(self.source.fault)[:] = 1
         self._stepped = True
 
     def close(self) -> None:

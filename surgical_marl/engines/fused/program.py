@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-TREES = ("carry", "actions", "results", "parameters", "moved", "sensed")
+TREES = ("carry", "actions", "results", "parameters", "moved", "sensed", "fault")
 
 
 @dataclass(frozen=True)
@@ -55,3 +55,5 @@ class Source:
     moved: dict[str, Any]
     """Leaves of the state between both halves of a step, and of the `sensed` numbers; none if a step is one kernel."""
     sensed: dict[str, Any]
+    fault: Leaf
+    """Whether a number that must be finite (`faults.checked`) was not, when a kernel stored it. Kernels only set it."""

@@ -8,7 +8,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from surgical_marl.engines.fused.emit import Emitter, table_offsets
+from surgical_marl.engines.faults import checked
+from surgical_marl.engines.fused.emit import Emitter, Watch, table_offsets
 from surgical_marl.engines.fused.graph import Graph, Value
 from surgical_marl.engines.fused.indexing import LEAST_TABLE, elements_of
 from surgical_marl.engines.fused.operations import KINDS
@@ -68,10 +69,14 @@ def make_source(env: Stepper, vector: bool, stage: Stage) -> Source:
     ]
     results = _nest([path for path, _ in jax.tree_util.tree_flatten_with_path(found)[0]], leaves)
     stored = {name: jax.tree.leaves(moved) if name == "move" else leaves for name in kernels}
+    fault = fields.leaf((), "bool", "flags")
+    watched = [*jax.tree.leaves(carry), *(leaf for _, leaf in checked(results))]
+    reals = [leaf for leaf in watched if leaf.dtype == "float32"]
+    watch = Watch(frozenset(place for leaf in reals for place in _places(leaf)), fault.first)
     bodies = {}
     for name, values in {**kernels, "reset": first}.items():
         stage(f"scheduling the {name}")
-        bodies[name] = _body(graph, stored.get(name, leaves), values, vector)
+        bodies[name] = _body(graph, stored.get(name, leaves), values, vector, watch)
     return Source(
         bodies=bodies,
         tables=tables(graph),
@@ -82,6 +87,7 @@ def make_source(env: Stepper, vector: bool, stage: Stage) -> Source:
         parameters=places,
         moved=_tree(moved),
         sensed=sensed,
+        fault=fault,
     )
 
 
@@ -149,14 +155,19 @@ def tables(graph: Graph) -> dict[str, np.ndarray]:
     }
 
 
-def _body(graph: Graph, leaves: list[Leaf], values: list[list[Value]], vector: bool) -> str:
+def _body(graph: Graph, leaves: list[Leaf], values: list[list[Value]], vector: bool, watch: Watch) -> str:
     """C that stores the values of each leaf in its fields. What is stored where it was loaded from needs no store."""
     stores: dict[tuple[str, int], Value] = {}
     for leaf, elements in zip(leaves, values, strict=True):
-        for field, value in enumerate(elements, leaf.first):
-            if value < 0 or graph.ops[value] != "load" or graph.args[value] != (leaf.buffer, field):
-                stores[leaf.buffer, field] = value
-    return Emitter(graph, [(*place, value) for place, value in stores.items()], vector).body()
+        for place, value in zip(_places(leaf), elements, strict=True):
+            if value < 0 or graph.ops[value] != "load" or graph.args[value] != place:
+                stores[place] = value
+    return Emitter(graph, [(*place, value) for place, value in stores.items()], vector, watch).body()
+
+
+def _places(leaf: Leaf) -> list[tuple[str, int]]:
+    """Return buffer and field of each element of a leaf."""
+    return [(leaf.buffer, leaf.first + k) for k in range(leaf.size)]
 
 
 def _share_fields(layout: Fields, shapes: list[Any], values: list[list[Value]], first: list[list[Value]]) -> list[Leaf]:
