@@ -66,6 +66,8 @@ STANDS = 0.002
 """Greatest height of a block's underside above the plate where it stands there, m."""
 SHIFT = 0.0015
 """Greatest distance of a block from its peg's axis at the start, m."""
+LOOSE = 0.0026
+"""The same at `hard`, m: as far as a block may stand where an arm has let it go, since turns begin with such blocks."""
 CLEAR = 0.024
 """Height of a block's underside above the plate from which on it is clear of the pegs, m: these are 20 mm high."""
 
@@ -127,7 +129,7 @@ class Task(ObjectTask):
             self.presenter, self.max_steps = self.picker, 300
         self._item = scene.objects[self.object].object
         self._pegs = find_pegs(scene, options.task).astype(np.float32)
-        about = repr((self.object, self.level, self.seed, SHIFT, OUT, SETTINGS, APART, POOL, TRIALS))
+        about = repr((self.object, self.level, self.seed, SHIFT, LOOSE, OUT, SETTINGS, APART, POOL, TRIALS))
         content = about, scene.fingerprint, self._item.content
         self.turns: Turns | None = None
         """At `hard` whose turn it is."""
@@ -359,10 +361,8 @@ class Task(ObjectTask):
         base = self._item.sites[self.point][0]
 
         def batch(_: bool) -> tuple[np.ndarray, np.ndarray]:
-            one, other = (
-                from_pegs[rng.integers(len(from_pegs), size=ROWS)],
-                to_pegs[rng.integers(len(to_pegs), size=ROWS)],
-            )
+            one = from_pegs[rng.integers(len(from_pegs), size=ROWS)]
+            other = to_pegs[rng.integers(len(to_pegs), size=ROWS)]
             far = np.linalg.norm(one - other, axis=-1)
             good = (far > 0) & (far < self.level.distance)
             shift, yaw = SHIFT * np.sqrt(rng.random(ROWS)), rng.uniform(-180.0, 180.0, ROWS)
@@ -385,7 +385,7 @@ class Task(ObjectTask):
         blocks = len(self._transfers) // 2
         there, back = self._transfers[0], self._transfers[blocks]
         base = self._item.sites[self.point][0]
-        poses = draw_trials(rng, TRIALS, blocks, sides, (there.possible, back.possible), SHIFT, base)
+        poses = draw_trials(rng, TRIALS, blocks, sides, (there.possible, back.possible), LOOSE, base)
         return as_numbers(in_turn(poses)).reshape(-1, blocks * 7)
 
     def _side(self, agent: str) -> np.ndarray:
