@@ -26,7 +26,7 @@ Difficulty    easy: one arm moves the block to one of the nearest pegs, 20 or 30
               block stands on its goal peg in its turn, after both arms held it and then the second one alone. Then
               comes the next block, and progress is paid anew. Blocks that are moved out of turn are no points. A drop
               ends nothing; a block that falls off the board does. Success: all have been there and back. In training
-              episodes start with any turn.
+              episodes start with any turn, and blocks as loose on their pegs as arms put them.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ STANDS = 0.002
 SHIFT = 0.0015
 """Greatest distance of a block from its peg's axis at the start, m."""
 LOOSE = 0.0026
-"""The same at `hard`, m: as far as a block may stand where an arm has let it go, since turns begin with such blocks."""
+"""The same in training at `hard`, m: as far as a block may stand where an arm has let it go."""
 CLEAR = 0.024
 """Height of a block's underside above the plate from which on it is clear of the pegs, m: these are 20 mm high."""
 
@@ -129,7 +129,8 @@ class Task(ObjectTask):
             self.presenter, self.max_steps = self.picker, 300
         self._item = scene.objects[self.object].object
         self._pegs = find_pegs(scene, options.task).astype(np.float32)
-        about = repr((self.object, self.level, self.seed, SHIFT, LOOSE, OUT, SETTINGS, APART, POOL, TRIALS))
+        self._shift = LOOSE if self.level.trial and options.goals == "training" else SHIFT
+        about = repr((self.object, self.level, self.seed, self._shift, OUT, SETTINGS, APART, POOL, TRIALS))
         content = about, scene.fingerprint, self._item.content
         self.turns: Turns | None = None
         """At `hard` whose turn it is."""
@@ -385,7 +386,7 @@ class Task(ObjectTask):
         blocks = len(self._transfers) // 2
         there, back = self._transfers[0], self._transfers[blocks]
         base = self._item.sites[self.point][0]
-        poses = draw_trials(rng, TRIALS, blocks, sides, (there.possible, back.possible), LOOSE, base)
+        poses = draw_trials(rng, TRIALS, blocks, sides, (there.possible, back.possible), self._shift, base)
         return as_numbers(in_turn(poses)).reshape(-1, blocks * 7)
 
     def _side(self, agent: str) -> np.ndarray:
