@@ -29,7 +29,7 @@ from surgical_marl.evaluation.goal_set import (
 from surgical_marl.learning import train
 from surgical_marl.plugins.tasks import TASKS, list_tasks, scenes_for
 from surgical_marl.runs.folder import write_config
-from surgical_marl.runs.settings import NetworkSettings, Settings
+from surgical_marl.runs.settings import NetworkSettings, Settings, own_sections
 from tests.helpers.fake_env import FakeEnv
 
 SMALL = Settings(num_envs=8, iterations=1, steps_per_iteration=8, network=NetworkSettings(hidden=(8,)))
@@ -86,12 +86,7 @@ def test_every_task_has_standard_goal_sets_for_its_scenes() -> None:
     assert {one for one in PUBLISHED if one[0] in TASKS.load(one[1]).starts} == {
         (start, task, scene) for task in list_tasks() for start in TASKS.load(task).starts for scene in scenes_for(task)
     }
-    levels = {
-        (name, task)
-        for task in list_tasks()
-        for name, level in TASKS.load(task).levels.items()
-        if getattr(level, "own_starts", False)
-    }
+    levels = {(level, task) for task in list_tasks() for level in own_sections(task, "difficulties")}
     assert {one[:2] for one in PUBLISHED if one[0] not in TASKS.load(one[1]).starts} == levels
 
 

@@ -135,6 +135,17 @@ def test_where_no_tip_has_a_target_the_run_that_succeeds_most_is_best() -> None:
     assert export._rank(good) < export._rank(bad)
 
 
+def test_where_points_are_made_the_way_that_is_left_at_the_end_is_no_error() -> None:
+    agents = {"psm_0": {"median_error_mm": 120.0}}
+    trial = {"task": "peg_transfer", "agents": agents, "score": 24.0, "median_error_mm": 120.0, "success_2mm": 0.0}
+    assert card.worst_median(trial) is None and card._shown(trial) == ["score"]
+    one_block = {name: value for name, value in trial.items() if name != "score"}
+    assert card.worst_median(one_block) == 120.0
+    assert card._shown(one_block) == ["median_error_mm", "success_2mm"]
+    better, worse = ({**trial, "success_rate": share, "drop_rate": 0.0} for share in (0.9, 0.5))
+    assert export._rank(better) < export._rank(worse)
+
+
 def test_what_is_exported_acts_and_measures_as_the_run(runs: list[str], tmp_path: Path) -> None:
     out = export.export_policy(runs[:1], tmp_path / "policy")
     env: Any = FakeEnv(COUNTS, SIZES, num_envs=8)

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from surgical_marl import content
+from surgical_marl.learning import train
 from surgical_marl.runs.settings import NetworkSettings, Settings, load_config
 
 
@@ -101,6 +102,26 @@ def test_a_start_has_settings_of_its_own(reach: Callable[[str], None]) -> None:
     assert asked("start=random") == (64, 3, 0.9)
     assert asked("start=random", "device=cuda") == (256, 3, 0.9)
     assert asked("start=random", "num_envs=5") == (5, 3, 0.9)
+
+
+def test_episodes_of_training_may_be_shorter(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A trial of three minutes is learned from parts of it, and judged as a whole."""
+    settings = load_config("peg_transfer", "bimanual_psm_pegs", ["difficulty=hard", "device=cpu"])
+    assert settings.max_steps is None and settings.in_training().max_steps == 2500
+    assert Settings(max_steps=7).in_training().max_steps == 7
+    assert Settings().in_training() == Settings()
+    made = []
+
+    class Made(Exception): ...
+
+    def make_env(settings: Settings) -> None:
+        made.append(settings.max_steps)
+        raise Made
+
+    monkeypatch.setattr(train, "make_env", make_env)
+    with pytest.raises(Made):
+        train.make_training(Settings(max_steps=7, train_max_steps=3))
+    assert made == [3]
 
 
 def test_the_shipped_settings_load() -> None:

@@ -31,11 +31,12 @@ def script(monkeypatch: pytest.MonkeyPatch) -> Any:
 def test_every_task_and_scene_has_a_policy_and_those_that_ship_are_left_alone(script: Any, tmp_path: Path) -> None:
     assert script.PLACES["needle_pick-psm_needle"]
     assert script.PLACES["match_image-ecm"] == ("match_image", "ecm", "default")
-    levels = [name for name in script.PLACES if name.endswith("-crossing")]
+    levels = [name for name in script.PLACES if name.endswith(("-crossing", "-hard"))]
     usual = sum(len(scenes_for(task)) for task in list_tasks())
     assert len(script.PLACES) == usual + len(levels) and "reach-bimanual_psm-crossing" in levels
     own = ("reach", "bimanual_psm", "crossing")
     assert script.PLACES["reach-bimanual_psm-crossing"] == own and script._fits(*own)
+    assert script.PLACES["peg_transfer-bimanual_psm_pegs-hard"] == ("peg_transfer", "bimanual_psm_pegs", "hard")
     assert not script._fits("reach", "psm", "crossing") and script._fits("reach", "psm", "default")
     known = {path.parent.name for path in (ROOT / "policies").glob("*/config.yaml")}
     assert known <= script.PLACES.keys()

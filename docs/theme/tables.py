@@ -113,12 +113,20 @@ def results() -> str:
     """Return how well the shipped policies do, of those without objects all in one row."""
     cards = [Card(name) for name in list_policies()]
     objects, without = [card for card in cards if card.objects], [card for card in cards if not card.objects]
-    usual = [card for card in without if card.level == "default"]
+    assisting = [card for card in without if "in_view_rate" in card.result]
+    usual = [card for card in without if card.level == "default" and card not in assisting]
     seen = [card for card in usual if card.task == "match_image"]
 
     def rows() -> Iterator[list[str]]:
         for card in objects:
-            yield [card.link, card.training, f"{card.success} of {card.episodes} unseen starts, {card.time:.1f} s each"]
+            done = f"{card.success} of {card.episodes} unseen starts, {card.time:.1f} s each"
+            if "score" in card.result:
+                minutes = card.result["max_steps"] * card.result["control_dt"] / 60
+                done = f"{card.points} points in {minutes:.0f} minutes, {card.episodes} unseen trials"
+            yield [card.link, card.training, done]
+        for card in assisting:
+            seen_share = f"tools in view {100 * card.result['in_view_rate']:.2f} % of the time"
+            yield [card.link, card.training, f"{seen_share}; {card.success} of {card.episodes} unseen starts"]
         worst = max(card.error for card in usual if card not in seen)
         pictures = " and ".join(f"{error:.2f}" for error in sorted(card.error for card in seen))
         times = [card.seconds for card in usual]
@@ -128,7 +136,7 @@ def results() -> str:
             f"median error of the worst arm at most {worst:.2f} mm; {pictures} mm where pictures are matched",
         ]
         for card in without:
-            if card not in usual:
+            if card not in usual and card not in assisting:
                 yield [card.link, card.training, f"{card.success} within 2 mm in {card.episodes} episodes"]
 
     return table(["policies", "training", "result"], rows())
@@ -142,12 +150,15 @@ class Card:
         result = json.loads((folder / "evaluation.json").read_text(encoding="utf-8"))
         origin = read_origin(folder)["origin"]
         self.link = f"[`{name}`](policies/{name}/README.md)"
+        self.result = result
         self.task, self.level, self.episodes = result["task"], result["difficulty"], result["episodes"]
         self.objects = bool(load_scene(result["scene"]).free_objects)
         self.seconds = sum(row["seconds"] for row in read_metrics(folder))
         self.training = f"{self.seconds:.0f} s, {origin.get('device')}"
         low, high = result["intervals"]["success_rate"]
         self.success = f"{100 * result['success_rate']:.1f} % ({100 * low:.1f} to {100 * high:.1f})"
+        low, high = result["intervals"].get("score") or (0.0, 0.0)
+        self.points = f"{result.get('score', 0.0):.1f} ({low:.1f} to {high:.1f})"
         self.error = max(own["median_error_mm"] for own in result["agents"].values())
         self.time = result["time_to_success_s"]
 

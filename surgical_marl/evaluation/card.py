@@ -22,8 +22,11 @@ from surgical_marl.untrusted.markup import as_code, as_link, as_markdown
 
 CARD, CLIP, EVALUATION = "README.md", "clip.mp4", "evaluation.json"
 SHOWN = ("median_error_mm", "p95_error_mm", "rmse_mm", "success_1mm", "success_2mm", "success_5mm", "team_success_2mm",
-         "success_rate", "score", "score_time_s", "drop_rate", "collision_rate", "time_to_success_s", "image_error",
+         "success_rate", "score", "score_time_s", "in_view_rate", "object_in_view_rate", "centre_error",
+         "camera_travel_mm", "drop_rate", "collision_rate", "time_to_success_s", "image_error",
          "angle_error_deg")  # fmt: skip
+SCORE, ERRORS = "score", SHOWN[:7]
+"""Points of an episode, and how near to goals it ends: that says nothing where an episode goes on for points."""
 COLUMNS = (
     *("policy", "median error of the worst arm (mm)", "on training goals (mm)", "RMSE (mm)", "within 2 mm"),
     *("from random starts", "collisions", "median error of each training seed (mm)", "training", "misses"),
@@ -35,8 +38,10 @@ def worst_median(result: Mapping[str, Any]) -> float | None:
     """Return the median error of the arm that has the largest one, in mm.
 
     Arms that only keep still can't hide the error of another arm in this number. Return None in a task whose tool tips
-    have no targets.
+    have no targets, and in one that goes on for points: what is left at its end is some object's way.
     """
+    if SCORE in result:
+        return None
     errors = (agent["median_error_mm"] for agent in result["agents"].values())
     return max((error for error in errors if error is not None), default=None)
 
@@ -74,7 +79,7 @@ def _row(folder: Path) -> tuple[str, ...]:
         _worst(result),
         _worst(seen) if seen else "-",
         number("rmse_mm", result.get("rmse_mm")),
-        number("success_2mm", result["success_2mm"]),
+        "-" if SCORE in result else number("success_2mm", result["success_2mm"]),
         number("success_2mm", elsewhere.get("success_2mm")),
         number("collision_rate", result["collision_rate"]),
         ", ".join(_worst(run) for run in result["seeds"]["runs"]),
@@ -92,13 +97,17 @@ def card(folder: Path, name: str) -> str:
     """
     settings = read_settings(folder)
     result = read_json(folder / EVALUATION)
-    parts = [_what(settings, name, folder), _how_well(result, name), _how_trained(folder, settings)]
+    parts = [_what(settings, name, folder, result), _how_well(result, name), _how_trained(folder, settings)]
     return "\n".join([*parts, _limits(result, settings), _files(folder)])
 
 
-def _what(settings: Settings, name: str, folder: Path) -> str:
+def _what(settings: Settings, name: str, folder: Path, result: Mapping[str, Any]) -> str:
+    from surgical_marl.view.record import LONGEST  # imports the renderer: not for the table
+
     scene, task = load_scene(settings.scene), TASKS.load(settings.task).summary().partition(": ")[2]
-    clip = f"\n[A video of two episodes]({CLIP}) on held-out goals. Balls mark the goals.\n"
+    whole = 2 * result["max_steps"] * result["control_dt"] <= LONGEST
+    shown = "two episodes" if whole else f"the first {LONGEST:.0f} s of an episode"
+    clip = f"\n[A video of {shown}]({CLIP}) on held-out goals. Balls mark the goals.\n"
     if not (folder / CLIP).is_file():
         clip = ""
     return f"""# {as_markdown(name)}
@@ -108,17 +117,28 @@ The scene: {as_markdown(scene.description)}; agents {", ".join(map(as_code, scen
 {clip}"""
 
 
+def _shown(result: Mapping[str, Any]) -> list[str]:
+    """Return the names of the metrics that a card shows."""
+    of_ways = ERRORS if SCORE in result else ()
+    return [key for key in SHOWN if key in result and key not in of_ways]
+
+
 def _how_well(result: Mapping[str, Any], name: str) -> str:
     every = result["seeds"]
     together, protocol = f"all training seeds ({len(every['runs'])})", every["aggregate"]["protocol"]
     if protocol != result["protocol"]:
         together += f", by protocol {as_markdown(protocol)}"
     rows = [f"| | these weights (seed {as_markdown(every['best'])}) | {together} |", "|---|---|---|"]
-    shown = [key for key in SHOWN if key in result]
+    shown = _shown(result)
     rows += [
         f"| {title(key)} | {_with_interval(key, result)} | {_with_interval(key, every['aggregate'])} |" for key in shown
     ]
-    each = ", ".join(f"{as_markdown(run['policy'])}: {_worst(run)} mm" for run in every["runs"])
+    if SCORE in result:
+        each = ", ".join(f"{as_markdown(run['policy'])}: {number(SCORE, run[SCORE])}" for run in every["runs"])
+        each = f"Score, by training seed: {each}."
+    else:
+        each = ", ".join(f"{as_markdown(run['policy'])}: {_worst(run)} mm" for run in every["runs"])
+        each = f"Median error of the worst arm, by training seed: {each}."
     command = as_code(shlex.join(["surgical-marl", "eval", name]))
     goal_set = as_code(result["goal_set"][:12])
     goals = "the standard goal set" if is_standard(result) else "goal set"
@@ -131,7 +151,7 @@ all metrics, of each arm and of each seed.
 
 {chr(10).join(rows)}
 
-Median error of the worst arm, by training seed: {each}. The weights here are those of
+{each} The weights here are those of
 the best seed.
 {_elsewhere(result, shown)}"""
 

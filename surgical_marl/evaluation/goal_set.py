@@ -78,10 +78,10 @@ def is_standard(result: Mapping[str, Any]) -> bool:
 
 @cache
 def standard_hashes() -> dict[str, dict[str, dict[str, str]]]:
-    """Return the hashes of the standard goal sets by start, task and scene; by difficulty if it has starts of its own.
+    """Return the hashes of the standard goal sets by start, task and scene; by difficulty at some levels.
 
     These are the goal sets that `surgical-marl eval` plays if no option chooses others, with `--start random`, and with
-    `--difficulty` of such a level.
+    `--difficulty` of a level that has policies of its own.
     """
     found: dict[str, dict[str, dict[str, str]]] = yaml.safe_load(_FILE.read_text())
     return found

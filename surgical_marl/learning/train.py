@@ -74,6 +74,7 @@ MOST_FAULTS = 10
 
 def make_training(settings: Settings) -> Trainer:
     """Make a run in memory. ValueError if there is not enough memory for it."""
+    settings = settings.in_training()
     with distributed.in_turn():
         env = make_env(settings)
     check_room(settings, env)

@@ -14,9 +14,7 @@ from surgical_marl.report.charts import percent, plain
 from surgical_marl.report.groups import Group, differences, numbers
 from surgical_marl.report.run import Run
 
-ALSO = ("peak_force_n", "min_distance_mm", "path_length_mm", "smoothness", "action_change",
-        "in_view_rate", "object_in_view_rate", "centre_error", "camera_travel_mm",
-        "remote_center_error_mm")  # fmt: skip
+ALSO = ("peak_force_n", "min_distance_mm", "path_length_mm", "smoothness", "action_change", "remote_center_error_mm")
 """Metrics that a report shows beside those of a policy's card."""
 TAIL = 0.05
 """The share of the iterations at the end over which training's own figures are averaged."""

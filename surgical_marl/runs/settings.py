@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, field, fields, is_dataclass
+from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from functools import reduce
 from itertools import pairwise
 from pathlib import Path
@@ -132,8 +132,9 @@ class Settings(Options):
 
     algo: the name of a learning algorithm (see `list_algorithms`); a run can be read even if its algorithm is not
     installed. team_reward: every agent gets the sum of all rewards, instead of its own. precision: of the networks'
-    matrix products on a GPU; on a CPU it is always float32. oracle_episodes: how many the oracle plays, for
-    `oracle_states` and `imitation`.
+    matrix products on a GPU; on a CPU it is always float32. train_max_steps: `max_steps` of training alone, where its
+    episodes are shorter than those of an evaluation; None if they are not. oracle_episodes: how many the oracle plays,
+    for `oracle_states` and `imitation`.
     """
 
     algo: str = choice("mappo", "learning algorithm (see `list algorithms`)")
@@ -144,6 +145,7 @@ class Settings(Options):
     num_envs: int = number(4096, 1, 2**24, "environments that run side by side (default: by task and device)")
     iterations: int = number(500, 1, 10_000_000, "rounds of acting and learning")
     steps_per_iteration: int = number(24, 1, 100_000)
+    train_max_steps: int | None = number(None, 1, 1_000_000)
     checkpoint_every: int = number(50, 1, 10_000_000)
     team_reward: bool = False
     ppo: PPOSettings = field(default_factory=PPOSettings)
@@ -173,6 +175,10 @@ class Settings(Options):
                 f"ppo.mini_batches must be at most num_envs = {self.num_envs} with network.recurrent, "
                 f"not {self.ppo.mini_batches}"
             )
+
+    def in_training(self) -> Settings:
+        """Return these settings with the episodes of training."""
+        return replace(self, max_steps=self.train_max_steps or self.max_steps)
 
 
 def load_config(task: str, scene: str, overrides: Iterable[str] = ()) -> Settings:

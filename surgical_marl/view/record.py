@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv
 
 FPS = 25
+LONGEST = 40.0
+"""Seconds of a video at most: of a trial of three minutes it shows the beginning."""
 WIDTH, HEIGHT = 480, 360
 """Pixels of a picture unless asked otherwise."""
 LEAST = 3.0
@@ -40,7 +42,7 @@ def record(
     episodes: int = 2,
     seed: int = 0,
 ) -> Path:
-    """Film the first environment of `env` for some episodes; return the path of the video."""
+    """Film the first environment of `env` for some episodes, or for `LONGEST`; return the path of the video."""
     return write_video(path, frames(env, policy, episodes, seed), FPS)
 
 
@@ -75,7 +77,7 @@ def _poses(
     every = max(1, round(1 / (FPS * env.control_dt)))
     observations, *_ = env.reset(seed)
     forget(policy)
-    for step in range(episodes * env.max_steps):
+    for step in range(min(episodes * env.max_steps, round(LONGEST / env.control_dt))):
         if step % every == 0:
             yield picture.pose()
         outcome = env.step(dict(policy(observations)))
