@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from surgical_marl.physics.solver import JointRows, Rows, solve
+from surgical_marl.physics.factor import packed
+from surgical_marl.physics.solver import JointRows, Rows, rows_of, solve
 
 ITERATIONS = (6, 4)
 """Newton steps for arms alone at most, and line search steps in each, while contacts are linear functions."""
@@ -61,10 +62,10 @@ class Arms:
 
     def each(self, left: Reduced) -> Array:
         """Return the way [n] of arms of which no two are joined: one problem after the other, no larger than an arm."""
-        n, pad = len(left.force), lambda x: jnp.pad(x, [(0, 1)] * x.ndim)
-        absent = self._none[:, :, None] | self._none[:, None, :]
-        blocks = pad(left.stiff)[self._dofs[:, :, None], self._dofs[:, None, :]]
-        blocks = jnp.where(absent, np.eye(self._dofs.shape[1], dtype=np.float32), blocks)
+        n, m, pad = len(left.force), self._dofs.shape[1], lambda x: jnp.pad(x, [(0, 1)] * x.ndim)
+        one_, other = np.tril_indices(m)
+        blocks = pad(left.stiff)[self._dofs[:, one_], self._dofs[:, other]]
+        blocks = jnp.where(self._none[:, one_] | self._none[:, other], (one_ == other).astype(np.float32), blocks)
 
         def one(row: Any) -> Array:
             arm, stiff, force, joints, start = row
@@ -74,26 +75,14 @@ class Arms:
                 less = lambda total: (total[0] - wide[arm].T @ wide[arm], total[1] - wide[arm].T @ half)  # noqa: E731
                 return jax.lax.cond(touched[arm], less, lambda total: total, total), None
 
-            (stiff, force), _ = jax.lax.scan(subtract, (stiff, force), (left.half, left.wide, left.touched))
-            return _way(stiff, force, _rows(joints), start)
+            start_at = stiff[packed(m)], force
+            (stiff, force), _ = jax.lax.scan(subtract, start_at, (left.half, left.wide, left.touched))
+            return _way(stiff, force, rows_of(joints), start)
 
         by_arm = lambda x: pad(x)[self._dofs]  # noqa: E731
         each = blocks, by_arm(left.force), jax.tree.map(by_arm, left.joints), by_arm(left.start)
         found = jax.lax.map(one, (jnp.arange(len(self._dofs)), *each))
         return jnp.zeros(n + 1).at[self._dofs].set(found)[:n]
-
-
-def _rows(joints: JointRows) -> Rows:
-    """Return friction and limits of m joints as rows, [2 m]."""
-    one = np.eye(len(joints.side), dtype=np.float32)
-    both = lambda first, second: jnp.concatenate([first, second])  # noqa: E731
-    return Rows(
-        both(one, joints.side[:, None] * one),
-        both(joints.friction_impedance, joints.limit_impedance),
-        both(joints.friction_reference, joints.limit_reference),
-        both(-joints.friction, 0 * joints.side),
-        both(joints.friction, jnp.full(len(one), jnp.inf)),
-    )
 
 
 def _way(stiff: Array, force: Array, rows: Rows, start: Array) -> Array:

@@ -14,10 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from surgical_marl.physics.factor import packed
+
 _FIRST, _SECOND = np.tril_indices(6)
-_PACKED = np.zeros((6, 6), int)
-_PACKED[_FIRST, _SECOND] = _PACKED[_SECOND, _FIRST] = np.arange(len(_FIRST))
-"""Where each element of a symmetric matrix is among those of its lower half."""
+_PLACES = packed(6)
 
 
 class Cone(NamedTuple):
@@ -96,10 +96,10 @@ def curvature(cone: Cone, felt: Forces) -> Array:
     turning = across * cone.along[:, _FIRST] * cone.along[:, _SECOND]
     raised = cone.coefficient * (pressed @ cone.normal)
     mixed = rub * rubs - raised / 2
-    packed = (pressed[:, None] * cone.normal)[:, _FIRST] * cone.normal[:, _SECOND]
-    packed = jnp.sum(packed, 0) + rub * (jnp.sum(turning, 0) + (ahead - across) * rubs[_FIRST] * rubs[_SECOND])
-    packed += soft * (raised[_FIRST] * mixed[_SECOND] + raised[_SECOND] * mixed[_FIRST])
-    return packed[_PACKED]
+    lower = (pressed[:, None] * cone.normal)[:, _FIRST] * cone.normal[:, _SECOND]
+    lower = jnp.sum(lower, 0) + rub * (jnp.sum(turning, 0) + (ahead - across) * rubs[_FIRST] * rubs[_SECOND])
+    lower += soft * (raised[_FIRST] * mixed[_SECOND] + raised[_SECOND] * mixed[_FIRST])
+    return lower[_PLACES]
 
 
 def between(cone: Cone, other: Cone, felt: Forces) -> Array:

@@ -116,12 +116,6 @@ class Handling:
     def __init__(self, tables: Tables, newton: Newton) -> None:
         self.tables, self._newton = tables, newton
 
-    def fingers(self, data: Any) -> Fingers:
-        """Return the frames of all fingers, in memory, from MJX's data with poses."""
-        bodies = self.tables.bodies["pads"]
-        axes = data.xmat[bodies]
-        return stored(Fingers(data.xpos[bodies], axes, jax.vmap(_quaternion)(axes)))
-
     def feel(
         self, slots: Slots, joints: Joints | None, fingers: Fingers | None, qvel: Array, bodies: Bodies, grips: Grips,
         dt: Any,
@@ -308,9 +302,13 @@ class Handling:
         return held
 
 
-def _quaternion(axes: Array) -> Array:
+def fingers_of(position: Array, axes: Array) -> Fingers:
+    """Return the frames of fingers by their positions [f, 3] and axes [f, 3, 3], both in memory."""
+    return Fingers(position, axes, jax.lax.map(_quaternion, axes))
+
+
+def _quaternion(m: Array) -> Array:
     """Return the quaternion of a rotation matrix [3, 3]."""
-    m = axes
     trace = m[0, 0] + m[1, 1] + m[2, 2]
     sizes = jnp.stack([trace, m[0, 0], m[1, 1], m[2, 2]])
     a, b, c = m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]

@@ -18,8 +18,10 @@ from jax import Array
 from surgical_marl.physics import elimination
 from surgical_marl.physics.arms import Arms, Reduced
 from surgical_marl.physics.cone import Cone, Forces, between, curvature, fall, forces, nearest, wrench
+from surgical_marl.physics.factor import packed
+from surgical_marl.physics.patches import POINTS
 from surgical_marl.physics.problem import SLIPS, Contact, Point, Pressed, Problem, Solution, not_pressed
-from surgical_marl.physics.rows import filled, row_of, stored
+from surgical_marl.physics.rows import filled, room, row_of, stored
 from surgical_marl.physics.search import search
 from surgical_marl.physics.solver import Rows, row_forces
 
@@ -45,13 +47,24 @@ class _Line(NamedTuple):
     along: Array
 
 
+class _Felt(NamedTuple):
+    """The forces of contacts at a point, in memory: what their sums are made of besides `Pressed`, [s]."""
+
+    normal: Array
+    """Of each point, N, [s, p]."""
+    way: Array
+    """Unit vectors of friction, [s, 3]."""
+    left: Array
+    """Shares of the friction that would stick, [s]."""
+
+
 class _Local(NamedTuple):
     """Sums over contacts: forces, and by how much they fall with the acceleration."""
 
     arm_excess: Array
     """[a, m]"""
     arm: Array
-    """[a, m, m]"""
+    """Lower halves, [a, m (m + 1) / 2]."""
     excess: Array
     """[k, 6]"""
     object: Array
@@ -93,23 +106,23 @@ class Newton:
         """Return the accelerations and forces, beginning with accelerations of arms [n] and objects [k, 6]."""
         slots, no = len(problem.contacts.arm), jnp.bool_(False)
         pressed = not_pressed(slots)._replace(sides=jnp.full(slots, -1, jnp.int32))
-        state = Point(arms, objects), pressed, self._sides(problem, arms), no, no, jnp.int32(0)
+        felt = room(jax.eval_shape(lambda: _Felt(jnp.zeros(POINTS), jnp.zeros(3), jnp.float32(0.0))), slots)
+        state = Point(arms, objects), (pressed, felt), self._sides(problem, arms), no, no, jnp.int32(0)
 
         def going(state: Any) -> Array:
             settled, count = state[-2:]
             return ~settled & (count < PASSES)
 
         def iterate(state: Any) -> Any:
-            here, before, sides, whole, _, count = state
-            local, pressed = self._contacts(problem, here)
-            excess, felt = self._excess(problem, here, local)
+            here, contacts, sides, whole, _, count = state
+            *contacts, same, turned = self._forces(problem, here, *contacts)
             new_sides = self._sides(problem, here.arms)
-            same = whole & (pressed.sides == before.sides).all() & (new_sides == sides).all()
-            turned = jnp.sum((pressed.friction - before.friction) ** 2, -1) > TOLERANCE**2 * pressed.normal**2
-            settled = same & ~(turned & (pressed.sides >= SLIPS)).any()
+            settled = whole & same & (new_sides == sides).all() & ~turned
 
             def on(here: Point) -> Any:
-                way = self._direction(problem, here, pressed, excess, local, felt)
+                local = self._sums(problem, here, *contacts)
+                excess, stiff = self._excess(problem, here, local)
+                way = self._direction(problem, here, contacts[0], excess, local, stiff)
                 slope = -_dot(self._whole(problem, here, excess), way)
                 last = -slope <= LEAST
                 searched = lambda _: search(slope, self._line(problem, here, way))  # noqa: E731
@@ -119,10 +132,10 @@ class Newton:
 
             stay = lambda here: (here, whole, settled)  # noqa: E731
             here, whole, settled = jax.lax.cond(settled, stay, on, here)
-            return here, pressed, new_sides, whole, settled, count + 1
+            return here, tuple(contacts), new_sides, whole, settled, count + 1
 
-        here, pressed, _, _, _, count = jax.lax.while_loop(going, iterate, state)
-        return Solution(here.arms, here.objects, pressed, row_forces(problem.between, here.arms), count)
+        here, (pressed, _), _, _, _, count = jax.lax.while_loop(going, iterate, state)
+        return Solution(here.arms, here.objects, pressed, self._between(problem, here.arms), count)
 
     def _line(self, problem: Problem, here: Point, way: Point) -> Callable[[Array], tuple[Array, Array]]:
         """Return what measures the slope of the cost at a length of a way, and by how much it grows per length.
@@ -141,7 +154,17 @@ class Newton:
         lines = filled(line, problem.total, len(problem.contacts.arm))
         inertia = problem.masses @ jnp.stack([problem.free - here.objects, way.objects], -1)
         power, growth = jnp.sum(way.objects[..., None] * inertia, (0, 1))
-        rows = [_along(own, here.arms, way.arms) for own in (problem.rows, problem.between) if len(own.low)]
+        rows = [_along(problem.rows, here.arms, way.arms)] if len(way.arms) else []
+
+        def press(length: Array) -> Callable[[tuple[Array, Array]], tuple[Array, Array]]:
+            """Return what adds contacts of arms with arms, to the slope and its growth."""
+
+            def add(sums: tuple[Array, Array], row: Rows) -> tuple[tuple[Array, Array], None]:
+                at, by, along, low, high = _along(row, here.arms, way.arms)
+                return _resisted(sums, along, at - length * by, by, low, high), None
+
+            return lambda sums: jax.lax.scan(add, sums, problem.between)[0]
+
         if len(way.arms):
             power += way.arms @ (problem.smooth - problem.mass @ here.arms)
             growth += way.arms @ (problem.mass @ way.arms)
@@ -154,43 +177,62 @@ class Newton:
                 power = felt.normal @ own.normal + felt.friction @ own.along
                 return sums[0] - power, sums[1] + fall(cone, felt, own.normal, own.along)
 
-            slope, grows = jax.lax.fori_loop(0, problem.total, add, (length * growth - power, growth))
+            sums = jax.lax.fori_loop(0, problem.total, add, (length * growth - power, growth))
             for at, by, along, low, high in rows:
-                force = at - length * by
-                slope -= along @ jnp.clip(force, low, high)
-                grows += along @ jnp.where((force > low) & (force < high), by, 0.0)
-            return slope, grows
+                sums = _resisted(sums, along, at - length * by, by, low, high)
+            if len(problem.between.low):
+                sums = jax.lax.cond(problem.overlap, press(length), lambda sums: sums, sums)
+            return sums
 
         return measure
 
     # -- forces at a point
 
-    def _contacts(self, problem: Problem, point: Point) -> tuple[_Local, Pressed]:
-        """Return sums over all contacts, and their forces."""
-        k, (a, m) = self._objects, self._dofs.shape
+    def _forces(
+        self, problem: Problem, point: Point, pressed: Pressed, felt: _Felt
+    ) -> tuple[Pressed, _Felt, Array, Array]:
+        """Return the forces of contacts in the place of those before.
+
+        Also whether each is on the side on which it was, and whether friction that slips has changed, [] both.
+        """
         arms, objects = self.by_arm(point.arms), self.by_object(point.objects)
+
+        def one(n: Array, state: Any) -> Any:
+            pressed, felt, same, turned = state
+            contact, before = row_of(problem.contacts, n), row_of(pressed, n)
+            found = forces(contact.cone, self.twist(contact, arms, objects))
+            bits = jnp.where(found.normal > 0, 1 << np.arange(len(found.normal), dtype=np.int32), 0)
+            sides = jnp.sum(bits) + jnp.where(found.slips, SLIPS, 0)
+            own = Pressed(jnp.sum(found.normal), found.friction, sides)
+            change = jnp.sum((own.friction - before.friction) ** 2) > TOLERANCE**2 * own.normal**2
+            put = lambda all_, x: all_.at[n].set(x)  # noqa: E731
+            pressed = jax.tree.map(put, pressed, own)
+            felt = jax.tree.map(put, felt, _Felt(found.normal, found.way, found.left))
+            return pressed, felt, same & (sides == before.sides), turned | (change & found.slips)
+
+        start = pressed, felt, jnp.bool_(True), jnp.bool_(False)
+        found: tuple[Pressed, _Felt, Array, Array] = jax.lax.fori_loop(0, problem.total, one, start)
+        return found
+
+    def _sums(self, problem: Problem, point: Point, pressed: Pressed, felt: _Felt) -> _Local:
+        """Return sums over all contacts at a point with these forces."""
+        k, (a, m) = self._objects, self._dofs.shape
         inertia = (problem.masses @ (problem.free - point.objects)[..., None])[..., 0]
         none = _Local(
             jnp.zeros((a, m)),
-            jnp.zeros((a, m, m)),
+            jnp.zeros((a, m * (m + 1) // 2)),
             _with_none(inertia),
             self._masses(problem),
             jnp.zeros((k + 1, a, 6, m)),
         )
 
-        def one(n: Array, sums: tuple[_Local, Pressed]) -> tuple[_Local, Pressed]:
-            local, pressed = sums
-            contact = row_of(problem.contacts, n)
-            found = forces(contact.cone, self.twist(contact, arms, objects))
-            bits = jnp.where(found.normal > 0, 1 << np.arange(len(found.normal), dtype=np.int32), 0)
-            sides = jnp.sum(bits) + jnp.where(found.slips, SLIPS, 0)
-            own = Pressed(jnp.sum(found.normal), found.friction, sides)
-            pressed = jax.tree.map(lambda all_, x: all_.at[n].set(x), pressed, own)
-            return self._add(local, contact, found), pressed
+        def one(n: Array, local: _Local) -> _Local:
+            contact, own, its = row_of((problem.contacts, felt, pressed), n)
+            return self._add(local, contact, Forces(own.normal, its.friction, its.sides >= SLIPS, own.way, own.left))
 
-        local, pressed = jax.lax.fori_loop(0, problem.total, one, (none, not_pressed(len(problem.contacts.arm))))
+        local = jax.lax.fori_loop(0, problem.total, one, none)
         own = local.object[:k] if k < 2 else local.object.reshape(k + 1, k + 1, 6, 6)[:k, :k]
-        return local._replace(excess=local.excess[:k], object=own, coupling=local.coupling[:k]), pressed
+        return local._replace(excess=local.excess[:k], object=own, coupling=local.coupling[:k])
 
     def _masses(self, problem: Problem) -> Array:
         """Return the blocks of masses alone, as `_add` adds to them, with those of no object."""
@@ -239,9 +281,10 @@ class Newton:
         def on_arm(local: _Local) -> _Local:
             arm, jacobian = contact.arm, contact.jacobian
             half = stiff @ jacobian
+            first_joint, second_joint = np.tril_indices(jacobian.shape[1])
             return local._replace(
                 arm_excess=local.arm_excess.at[arm].add(jacobian.T @ pull),
-                arm=local.arm.at[arm].add(jacobian.T @ half),
+                arm=local.arm.at[arm].add(jnp.sum(jacobian[:, first_joint] * half[:, second_joint], 0)),
                 coupling=local.coupling.at[first, arm].add(half),
             )
 
@@ -252,10 +295,11 @@ class Newton:
         if not len(point.arms):
             return Point(point.arms, local.excess), problem.mass
         excess, stiff = problem.smooth - problem.mass @ point.arms, problem.mass
+        places = packed(self._dofs.shape[1])
         for arm, own in enumerate(self._own):
             dofs = self._dofs[arm, own]
             excess = excess.at[dofs].add(local.arm_excess[arm, own])
-            stiff = stiff.at[np.ix_(dofs, dofs)].add(local.arm[arm][np.ix_(own, own)])
+            stiff = stiff.at[np.ix_(dofs, dofs)].add(local.arm[arm][places[np.ix_(own, own)]])
 
         def press(total: tuple[Array, Array], row: Rows) -> tuple[tuple[Array, Array], None]:
             force = jnp.maximum(row.impedance * (row.reference - row.jacobian @ point.arms), 0.0)
@@ -264,8 +308,7 @@ class Newton:
 
         if len(problem.between.low):
             with_rows = lambda total: jax.lax.scan(press, total, problem.between)[0]  # noqa: E731
-            presses = self._sides(problem, point.arms).any()
-            excess, stiff = jax.lax.cond(presses, with_rows, lambda total: total, (excess, stiff))
+            excess, stiff = jax.lax.cond(problem.overlap, with_rows, lambda total: total, (excess, stiff))
         return Point(excess, local.excess), stiff
 
     def _whole(self, problem: Problem, point: Point, excess: Point) -> Point:
@@ -275,8 +318,14 @@ class Newton:
 
     def _sides(self, problem: Problem, arms: Array) -> Array:
         """Return which contacts of arms with arms press, [r] bool."""
-        rows = problem.between
-        return rows.reference - rows.jacobian @ arms > 0
+        return self._between(problem, arms) > 0
+
+    def _between(self, problem: Problem, arms: Array) -> Array:
+        """Return the forces of contacts of arms with arms, N, [r]."""
+        none = jnp.zeros(len(problem.between.low))
+        if not len(none):
+            return none
+        return jax.lax.cond(problem.overlap, lambda arms: row_forces(problem.between, arms), lambda _: none, arms)
 
     # -- the way from there
 
@@ -289,7 +338,8 @@ class Newton:
         """
         touched, linked = self._touched(problem), jnp.bool_(False)
         if self._objects > 1:
-            linked = ((problem.contacts.second < self._objects) & (pressed.normal > 0)).any()
+            there = np.arange(len(pressed.normal)) < problem.total
+            linked = (there & (problem.contacts.second < self._objects) & (pressed.normal > 0)).any()
             gone = elimination.touching(local.object, local.excess, local.coupling)
         else:
             gone = elimination.apart(local.object, local.excess, local.coupling, touched.any(1))
@@ -322,6 +372,14 @@ def _along(rows: Rows, arms: Array, way: Array) -> tuple[Array, ...]:
     """Return forces of rows without bounds, by how much they fall per length of a way, its speeds, and the bounds."""
     along = rows.jacobian @ way
     return rows.impedance * (rows.reference - rows.jacobian @ arms), rows.impedance * along, along, rows.low, rows.high
+
+
+def _resisted(
+    sums: tuple[Array, Array], along: Array, force: Array, by: Array, low: Array, high: Array
+) -> tuple[Array, Array]:
+    """Return slope and growth of the cost along a way with those of rows: speeds, forces without bounds, their fall."""
+    gives = jnp.where((force > low) & (force < high), by, 0.0)
+    return sums[0] - jnp.sum(along * jnp.clip(force, low, high)), sums[1] + jnp.sum(along * gives)
 
 
 def _dot(one: Point, other: Point) -> Array:

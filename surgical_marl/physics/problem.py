@@ -40,6 +40,8 @@ class Problem(NamedTuple):
     """The same by joint."""
     between: Rows
     """Contacts of arms with arms."""
+    overlap: Array
+    """Whether any arms overlap, []: if not, there is nothing in `between`."""
     masses: Array
     """Mass matrices of the objects, [k, 6, 6]."""
     free: Array

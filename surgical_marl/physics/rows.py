@@ -20,10 +20,15 @@ def stored(tree: Any) -> Any:
     return jax.lax.map(lambda row: row, tree)
 
 
-def room(tree: Any, rows: int) -> Any:
-    """Return arrays for `rows` trees like this one. They hold nothing that may be read before it is written."""
+def absent(tree: Any) -> Any:
+    """Return arrays like those of a tree. They hold nothing that may be read before it is written; a number is 0."""
     empty = getattr(jax.lax, "empty", jnp.zeros)  # JAX before 0.7 has no other
-    return jax.tree.map(lambda x: empty((rows, *x.shape), x.dtype), tree)
+    return jax.tree.map(lambda x: (empty if x.shape else jnp.zeros)(x.shape, x.dtype), tree)
+
+
+def room(tree: Any, rows: int) -> Any:
+    """Return arrays for `rows` trees like this one, as `absent` does."""
+    return absent(jax.tree.map(lambda x: jax.ShapeDtypeStruct((rows, *x.shape), x.dtype), tree))
 
 
 def filled(row: Callable[[Array], Any], found: Array, rows: int) -> Any:

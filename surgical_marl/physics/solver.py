@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jax.scipy.linalg import cho_solve
 
@@ -55,6 +56,19 @@ class JointRows(NamedTuple):
     side: Array
     limit_impedance: Array
     limit_reference: Array
+
+
+def rows_of(joints: JointRows) -> Rows:
+    """Return friction and limits of n joints as rows, [2 n]: all frictions, then all limits."""
+    one = np.eye(len(joints.side), dtype=np.float32)
+    both = lambda first, second: jnp.concatenate([first, second])  # noqa: E731
+    return Rows(
+        both(one, joints.side[:, None] * one),
+        both(joints.friction_impedance, joints.limit_impedance),
+        both(joints.friction_reference, joints.limit_reference),
+        both(-joints.friction, 0 * joints.side),
+        both(joints.friction, jnp.full(len(one), jnp.inf)),
+    )
 
 
 def relax(mass: Array, smooth: Array, joints: JointRows, qacc: Array) -> Array:

@@ -7,7 +7,7 @@ are solved together.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
@@ -18,11 +18,14 @@ from jax import Array
 from surgical_marl.physics.bodies import Bodies, free_acceleration, inertias, moved, rotation
 from surgical_marl.physics.collision import Pairs
 from surgical_marl.physics.dynamics import Dynamics, Physics
-from surgical_marl.physics.handling import DWELL, Grips, Handling
+from surgical_marl.physics.factor import packed
+from surgical_marl.physics.handling import DWELL, Fingers, Grips, Handling, fingers_of
+from surgical_marl.physics.kind import Kind
 from surgical_marl.physics.newton import Newton
 from surgical_marl.physics.placed import Joints
 from surgical_marl.physics.problem import Contact, Pressed, Problem
-from surgical_marl.physics.solver import JointRows, Rows
+from surgical_marl.physics.rows import absent, stored
+from surgical_marl.physics.solver import JointRows, Rows, rows_of
 from surgical_marl.physics.tables import Tables
 from surgical_marl.physics.touching import Finder, Slots
 from surgical_marl.physics.variation import Factors, grown, varied
@@ -59,8 +62,8 @@ class _Between(NamedTuple):
 class Together:
     """The physics of a scene with objects."""
 
-    def __init__(self, scene: Scene, dynamics: Dynamics, pairs: Pairs) -> None:
-        self._pairs, self._dynamics, self._arms = pairs, dynamics, len(scene.agents)
+    def __init__(self, scene: Scene, dynamics: Dynamics, pairs: Pairs, kinds: Sequence[Kind]) -> None:
+        self._pairs, self._dynamics, self._kinds, self._arms = pairs, dynamics, kinds, len(scene.agents)
         self.tables = Tables(scene)
         self.names = self.tables.names
         joints, none = scene.model.nv, np.zeros((0, 0), int)
@@ -145,6 +148,8 @@ class Together:
         slots, joints = self._find(data, physics)
         overlap = self._pairs.overlap(data.geom_xpos, data.geom_xmat) if self._pairs.count else jnp.bool_(False)
         near = overlap | (self._on_arm(slots) < self._arms).any()
+        bodies = self.tables.bodies["pads"]
+        frames = stored((data.xpos[bodies], data.xmat[bodies]))
 
         def alone(physics: Physics, touch: Touch) -> tuple[Physics, Touch]:
             objects = self._step_objects(physics.objects, slots)
@@ -153,7 +158,7 @@ class Together:
             return physics._replace(objects=objects), touch._replace(overflow=left_out)
 
         def together(physics: Physics, touch: Touch) -> tuple[Physics, Touch]:
-            return self._step(self._dynamics.varied(fields), physics, touch, slots, joints, overlap)
+            return self._step(physics, touch, fields, slots, joints, fingers_of(*frames), overlap)
 
         return jax.lax.cond(near, together, alone, physics, touch)
 
@@ -171,17 +176,17 @@ class Together:
 
     def _solve_objects(self, masses: Array, free: Array, contacts: Contact, total: Array, start: Array) -> Array:
         """Return the accelerations [k, 6] of objects that touch no arm: one by one, if none touches another."""
-        none, k = jnp.zeros(0), len(free)
+        none, no, k = jnp.zeros(0), jnp.bool_(False), len(free)
         rows, joints = Rows(jnp.zeros((0, 0)), none, none, none, none), JointRows(*[none] * len(JointRows._fields))
 
         def whole(contacts: Contact) -> Array:
-            problem = Problem(jnp.zeros((0, 0)), none, rows, joints, rows, masses, free, contacts, total)
+            problem = Problem(jnp.zeros((0, 0)), none, rows, joints, rows, no, masses, free, contacts, total)
             return self._objects_alone.solve(problem, none, start).objects
 
         def single(row: tuple[Array, ...]) -> Array:
             number, mass, free, start = row
             own = contacts._replace(first=jnp.where(contacts.first == number, 0, 1))
-            problem = Problem(jnp.zeros((0, 0)), none, rows, joints, rows, mass[None], free[None], own, total)
+            problem = Problem(jnp.zeros((0, 0)), none, rows, joints, rows, no, mass[None], free[None], own, total)
             return self._object_alone.solve(problem, none, start[None]).objects[0]
 
         def each(_: Contact) -> Array:
@@ -193,25 +198,25 @@ class Together:
         return jax.lax.cond(joined.any(), whole, each, contacts)
 
     def _step(
-        self, dynamics: Dynamics, physics: Physics, touch: Touch, slots: Slots, joints: Joints, overlap: Array
-    ) -> tuple[Physics, Touch]:
+        self, physics: Physics, touch: Touch, fields: dict[str, Array], slots: Slots, joints: Joints, fingers: Fingers,
+        overlap: Array,
+    ) -> tuple[Physics, Touch]:  # fmt: skip
         """Return the state after a step of all arms and objects together.
 
         The arms' damping is part of their mass matrix here, so the solver sees the velocities at the end of the step.
         """
-        dt, (bodies, grips) = dynamics.dt, physics.objects
-        handling, forces = Handling(self.tables, self._newton), dynamics.forces(physics)
-        data = forces.data
-        fingers = handling.fingers(data)
+        dt, (bodies, grips), handling = self._dynamics.dt, physics.objects, Handling(self.tables, self._newton)
         felt = handling.feel(slots, joints, fingers, physics.qvel, bodies, grips, dt)
         masses, free = self._free(bodies)
-        between = self._between(dynamics, data, physics.qvel, overlap)
+        between = self._between(physics, overlap)
+        mass, smooth, own = self._forces(physics, fields)
         problem = Problem(
-            mass=forces.mass + dt * forces.damping,
-            smooth=forces.smooth,
-            rows=forces.rows,
-            joints=dynamics.joint_rows(forces.rows),
+            mass=mass,
+            smooth=smooth,
+            rows=rows_of(own),
+            joints=own,
             between=between.rows,
+            overlap=overlap,
             masses=masses,
             free=free,
             contacts=felt.contacts,
@@ -223,32 +228,53 @@ class Together:
         shift = dt * qvel, dt * objects.velocity
         grips = handling.remember(felt, slots, found.pressed, fingers, bodies, shift, grips, dt)
         after = Physics(physics.qpos + shift[0], qvel, found.arms, physics.ctrl, Objects(objects, grips))
-        left_out = jnp.maximum(between.left_out, slots.total - len(slots.number))
-        each = self._pairs.spread(between.pair, found.between) if self._pairs.count else touch.force
-        return after, Touch(
-            penetration=jnp.maximum(touch.penetration, between.penetration),
-            force=jnp.maximum(touch.force, each),
+        touch = touch._replace(
             handled=jnp.maximum(touch.handled, self._hardest(slots, found.pressed)),
-            overflow=jnp.maximum(touch.overflow, left_out),
+            overflow=jnp.maximum(touch.overflow, slots.total - len(slots.number)),
         )
+        return after, self._bumped(touch, between, found.between, overlap)
 
-    def _between(self, dynamics: Dynamics, data: Any, qvel: Array, overlap: Array) -> _Between:
-        """Return the contacts of arms with arms: none, without looking, unless any overlap."""
+    def _forces(self, physics: Physics, fields: dict[str, Array]) -> tuple[Array, Array, JointRows]:
+        """Return mass matrix [n, n], sum of forces [n], and friction and limits [n] of all arms' joints."""
+        n = len(physics.qvel)
+        mass, smooth, joints = jnp.zeros((n, n)), jnp.zeros(n), JointRows(*[jnp.zeros(n)] * len(JointRows._fields))
+        for kind in self._kinds:
+            found = kind.forces(physics, fields)
+            places = packed(found.dofs.shape[1])
+            for arm, dofs in enumerate(found.dofs):
+                mass = mass.at[np.ix_(dofs, dofs)].set(found.mass[arm][places])
+                smooth = smooth.at[dofs].set(found.smooth[arm])
+                own = (all_.at[dofs].set(x[arm]) for all_, x in zip(joints, found.joints, strict=True))
+                joints = JointRows(*own)
+        return mass, smooth, joints
+
+    def _between(self, physics: Physics, overlap: Array) -> _Between:
+        """Return the contacts of arms with arms. There is nothing in it unless any overlap."""
 
         def found(_: None) -> _Between:
+            data = self._dynamics.axes(physics.qpos)
             closest = self._pairs.closest(data.geom_xpos, data.geom_xmat)
             touching = self._pairs.deepest(data, closest)
-            rows = dynamics.contact_rows(touching.jacobian, touching.distance, touching.weight, qvel)
+            rows = self._dynamics.contact_rows(touching.jacobian, touching.distance, touching.weight, physics.qvel)
             return _Between(rows, touching.pair, -closest.distance, self._pairs.overflow(closest))
-
-        def none(_: None) -> _Between:
-            return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(lambda: found(None)))
 
         if not self._pairs.count:
             empty = jnp.zeros(0)
-            rows = Rows(jnp.zeros((0, len(qvel))), empty, empty, empty, empty)
+            rows = Rows(jnp.zeros((0, len(physics.qvel))), empty, empty, empty, empty)
             return _Between(rows, empty, empty, jnp.int32(0))
-        return jax.lax.cond(overlap, found, none, None)
+        return jax.lax.cond(overlap, found, lambda _: absent(jax.eval_shape(lambda: found(None))), None)
+
+    def _bumped(self, touch: Touch, between: _Between, forces: Array, overlap: Array) -> Touch:
+        """Return the hardest touch with these contacts of arms with arms, and the forces [r] of their rows."""
+
+        def bump(touch: Touch) -> Touch:
+            return touch._replace(
+                penetration=jnp.maximum(touch.penetration, between.penetration),
+                force=jnp.maximum(touch.force, self._pairs.spread(between.pair, forces)),
+                overflow=jnp.maximum(touch.overflow, between.left_out),
+            )
+
+        return jax.lax.cond(overlap, bump, lambda touch: touch, touch) if self._pairs.count else touch
 
     def _on_arm(self, slots: Slots) -> Array:
         """Return the arm that the patch in each slot is on, [s]; the number of arms for none."""
