@@ -25,7 +25,7 @@ from surgical_marl.physics.newton import Newton
 from surgical_marl.physics.placed import Joints
 from surgical_marl.physics.problem import Contact, Pressed, Problem
 from surgical_marl.physics.rows import absent, stored
-from surgical_marl.physics.solver import JointRows, Rows, rows_of
+from surgical_marl.physics.solver import JointRows, Rows
 from surgical_marl.physics.tables import Tables
 from surgical_marl.physics.touching import Finder, Slots
 from surgical_marl.physics.variation import Factors, grown, varied
@@ -176,17 +176,17 @@ class Together:
 
     def _solve_objects(self, masses: Array, free: Array, contacts: Contact, total: Array, start: Array) -> Array:
         """Return the accelerations [k, 6] of objects that touch no arm: one by one, if none touches another."""
-        none, no, k = jnp.zeros(0), jnp.bool_(False), len(free)
-        rows, joints = Rows(jnp.zeros((0, 0)), none, none, none, none), JointRows(*[none] * len(JointRows._fields))
+        none, k = jnp.zeros((0, 0)), len(free)
+        rows = Rows(jnp.zeros((0, 0, 0)), *[jnp.zeros(0)] * 4)
+        arms = none, none, JointRows(*[none] * len(JointRows._fields)), rows, jnp.bool_(False)
 
         def whole(contacts: Contact) -> Array:
-            problem = Problem(jnp.zeros((0, 0)), none, rows, joints, rows, no, masses, free, contacts, total)
-            return self._objects_alone.solve(problem, none, start).objects
+            return self._objects_alone.solve(Problem(*arms, masses, free, contacts, total), none, start).objects
 
         def single(row: tuple[Array, ...]) -> Array:
             number, mass, free, start = row
             own = contacts._replace(first=jnp.where(contacts.first == number, 0, 1))
-            problem = Problem(jnp.zeros((0, 0)), none, rows, joints, rows, no, mass[None], free[None], own, total)
+            problem = Problem(*arms, mass[None], free[None], own, total)
             return self._object_alone.solve(problem, none, start[None]).objects[0]
 
         def each(_: Contact) -> Array:
@@ -209,25 +209,15 @@ class Together:
         felt = handling.feel(slots, joints, fingers, physics.qvel, bodies, grips, dt)
         masses, free = self._free(bodies)
         between = self._between(physics, overlap)
-        mass, smooth, own = self._forces(physics, fields)
-        problem = Problem(
-            mass=mass,
-            smooth=smooth,
-            rows=rows_of(own),
-            joints=own,
-            between=between.rows,
-            overlap=overlap,
-            masses=masses,
-            free=free,
-            contacts=felt.contacts,
-            total=slots.found,
-        )
-        found = self._newton.solve(problem, physics.qacc_warmstart, bodies.acceleration)
-        qvel = physics.qvel + dt * found.arms
+        mass, smooth, rows = self._forces(physics, fields)
+        problem = Problem(mass, smooth, rows, between.rows, overlap, masses, free, felt.contacts, slots.found)
+        found = self._newton.solve(problem, self._newton.by_arm(physics.qacc_warmstart), bodies.acceleration)
+        qacc = jnp.zeros(len(physics.qvel) + 1).at[self.tables.dofs].set(found.arms)[:-1]
+        qvel = physics.qvel + dt * qacc
         objects = moved(bodies, found.objects, dt)
         shift = dt * qvel, dt * objects.velocity
         grips = handling.remember(felt, slots, found.pressed, fingers, bodies, shift, grips, dt)
-        after = Physics(physics.qpos + shift[0], qvel, found.arms, physics.ctrl, Objects(objects, grips))
+        after = Physics(physics.qpos + shift[0], qvel, qacc, physics.ctrl, Objects(objects, grips))
         touch = touch._replace(
             handled=jnp.maximum(touch.handled, self._hardest(slots, found.pressed)),
             overflow=jnp.maximum(touch.overflow, slots.total - len(slots.number)),
@@ -235,18 +225,21 @@ class Together:
         return after, self._bumped(touch, between, found.between, overlap)
 
     def _forces(self, physics: Physics, fields: dict[str, Array]) -> tuple[Array, Array, JointRows]:
-        """Return mass matrix [n, n], sum of forces [n], and friction and limits [n] of all arms' joints."""
-        n = len(physics.qvel)
-        mass, smooth, joints = jnp.zeros((n, n)), jnp.zeros(n), JointRows(*[jnp.zeros(n)] * len(JointRows._fields))
-        for kind in self._kinds:
-            found = kind.forces(physics, fields)
-            places = packed(found.dofs.shape[1])
-            for arm, dofs in enumerate(found.dofs):
-                mass = mass.at[np.ix_(dofs, dofs)].set(found.mass[arm][places])
-                smooth = smooth.at[dofs].set(found.smooth[arm])
-                own = (all_.at[dofs].set(x[arm]) for all_, x in zip(joints, found.joints, strict=True))
-                joints = JointRows(*own)
-        return mass, smooth, joints
+        """Return the arms' mass matrices, sums of forces, and friction and limits of joints, as in `Problem`."""
+        dofs, found = self.tables.dofs, [kind.forces(physics, fields) for kind in self._kinds]
+        if len(found) == 1:
+            return found[0][1:]
+        (a, m), n = dofs.shape, len(physics.qvel)
+        places, there = packed(m), dofs < n
+        mass = jnp.zeros((a, m * (m + 1) // 2)).at[:, np.diag(places)].set(~there * np.float32(1.0))
+        smooth, joints = jnp.zeros((a, m)), JointRows(*[jnp.zeros((a, m))] * len(JointRows._fields))
+        for of_kind in found:
+            arms = np.array([np.flatnonzero(dofs[:, 0] == own[0])[0] for own in of_kind.dofs])
+            m = of_kind.dofs.shape[1]
+            mass = mass.at[arms, : m * (m + 1) // 2].set(of_kind.mass)
+            smooth = smooth.at[arms, :m].set(of_kind.smooth)
+            joints = JointRows(*(all_.at[arms, :m].set(own) for all_, own in zip(joints, of_kind.joints, strict=True)))
+        return stored((mass, smooth, joints))
 
     def _between(self, physics: Physics, overlap: Array) -> _Between:
         """Return the contacts of arms with arms. There is nothing in it unless any overlap."""
@@ -256,11 +249,13 @@ class Together:
             closest = self._pairs.closest(data.geom_xpos, data.geom_xmat)
             touching = self._pairs.deepest(data, closest)
             rows = self._dynamics.contact_rows(touching.jacobian, touching.distance, touching.weight, physics.qvel)
+            by_arm = jnp.pad(rows.jacobian, ((0, 0), (0, 1)))[:, self.tables.dofs]
+            rows = rows._replace(jacobian=by_arm)
             return _Between(rows, touching.pair, -closest.distance, self._pairs.overflow(closest))
 
         if not self._pairs.count:
             empty = jnp.zeros(0)
-            rows = Rows(jnp.zeros((0, len(physics.qvel))), empty, empty, empty, empty)
+            rows = Rows(jnp.zeros((0, *self.tables.dofs.shape)), empty, empty, empty, empty)
             return _Between(rows, empty, empty, jnp.int32(0))
         return jax.lax.cond(overlap, found, lambda _: absent(jax.eval_shape(lambda: found(None))), None)
 
