@@ -131,7 +131,13 @@ class Arms:
         if not len(problem.between.low):
             return found
 
-        with_rows = lambda sums: _added(sums, _flat(problem.between), here.ravel(), way.ravel(), length)  # noqa: E731
+        flat = here.ravel(), way.ravel()
+
+        def press(sums: tuple[Array, Array], row: Rows) -> tuple[tuple[Array, Array], None]:
+            own = Rows(row.jacobian.reshape(1, -1), *(x[None] for x in row[1:]))
+            return _added(sums, own, *flat, length), None
+
+        with_rows = lambda sums: jax.lax.scan(press, sums, problem.between)[0]  # noqa: E731
         return jax.lax.cond(problem.overlap, with_rows, lambda sums: sums, found)
 
     def between(self, problem: Problem, arms: Array) -> Array:

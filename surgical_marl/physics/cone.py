@@ -14,10 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from surgical_marl.physics.factor import packed
-
 _FIRST, _SECOND = np.tril_indices(6)
-_PLACES = packed(6)
 
 
 class Cone(NamedTuple):
@@ -90,7 +87,7 @@ def wrench(cone: Cone, felt: Forces) -> Array:
 
 
 def curvature(cone: Cone, felt: Forces) -> Array:
-    """Return by how much the wrench falls per acceleration, [6, 6]."""
+    """Return by how much the wrench falls per acceleration: the lower half of a matrix [6, 6], row by row, [21]."""
     pressed, rub, soft, ahead, across = _gives(cone, felt)
     rubs = felt.way @ cone.along
     turning = across * cone.along[:, _FIRST] * cone.along[:, _SECOND]
@@ -99,13 +96,13 @@ def curvature(cone: Cone, felt: Forces) -> Array:
     lower = (pressed[:, None] * cone.normal)[:, _FIRST] * cone.normal[:, _SECOND]
     lower = jnp.sum(lower, 0) + rub * (jnp.sum(turning, 0) + (ahead - across) * rubs[_FIRST] * rubs[_SECOND])
     lower += soft * (raised[_FIRST] * mixed[_SECOND] + raised[_SECOND] * mixed[_FIRST])
-    return lower[_PLACES]
+    return lower
 
 
 def between(cone: Cone, other: Cone, felt: Forces) -> Array:
     """Return by how much the wrench falls per acceleration of another body, [6, 6].
 
-    `other` is the cone with its twists at that body's origin. With that of the same body this is the `curvature`.
+    `other` is the cone with its twists at that body's origin. With that of the same body this is `curvature`, whole.
     """
     pressed, rub, soft, ahead, across = _gives(cone, felt)
     (rubs, raised), (its, its_raised) = (

@@ -18,6 +18,7 @@ from jax import Array
 from surgical_marl.physics import elimination
 from surgical_marl.physics.arms import Arms, Left
 from surgical_marl.physics.cone import Cone, Forces, between, curvature, fall, forces, wrench
+from surgical_marl.physics.factor import packed
 from surgical_marl.physics.problem import SLIPS, Contact, Point, Pressed, Problem, Solution
 from surgical_marl.physics.rows import room, row_of, stored
 from surgical_marl.physics.search import search
@@ -54,9 +55,12 @@ class _Local(NamedTuple):
     force: Array
     """With the rest of what an object's acceleration takes, [k, 6]."""
     object: Array
-    """[k, 6, 6]; if there are several objects, each with each one, [k, k, 6, 6]."""
+    """Lower halves, [k, 21]; if there are several objects, each with each one, [k, k, 6, 6]."""
     coupling: Array
     """[k, a, 6, m]"""
+
+
+_WHOLE = packed(6)
 
 
 class Newton:
@@ -174,7 +178,7 @@ class Newton:
     def _masses(self, problem: Problem) -> Array:
         """Return the blocks of masses alone, as `_add` adds to them, with those of no object."""
         if self._objects < 2:
-            return _with_none(problem.masses)
+            return _with_none(problem.masses[:, *np.tril_indices(6)])
 
         def note(blocks: Array, row: tuple[Array, Array]) -> tuple[Array, None]:
             return self._grown(blocks, row[0], row[0], row[1]), None
@@ -183,9 +187,7 @@ class Newton:
         return jax.lax.scan(note, none, (jnp.arange(self._objects), problem.masses))[0]
 
     def _grown(self, blocks: Array, first: Array, second: Array, block: Array) -> Array:
-        """Return blocks with more [6, 6] of two objects. Those of several objects are one array in memory."""
-        if self._objects < 2:
-            return blocks.at[first].add(block)
+        """Return blocks of several objects, one array in memory, with more [6, 6] of two of them."""
         at = (36 * ((self._objects + 1) * first + second),)
         more = jax.lax.dynamic_slice(blocks, at, (36,)) + block.ravel()
         return jax.lax.dynamic_update_slice(blocks, more, at)
@@ -210,14 +212,15 @@ class Newton:
             touches = second < self._objects
             parts = jax.lax.cond(touches, on_other, lambda parts: parts, (local.force, local.object))
             local = local._replace(force=parts[0], object=parts[1])
-        grown = self._grown(local.object, first, first, stiff)
-        local = local._replace(force=local.force.at[first].add(pull), object=grown)
+        whole, one = stiff[_WHOLE], local.object
+        one = one.at[first].add(stiff) if self._objects < 2 else self._grown(one, first, first, whole)
+        local = local._replace(force=local.force.at[first].add(pull), object=one)
         if not len(self._dofs):
             return local
 
         def on_arm(local: _Local) -> _Local:
             arm, jacobian = contact.arm, contact.jacobian
-            half = stiff @ jacobian
+            half = whole @ jacobian
             first_joint, second_joint = np.tril_indices(jacobian.shape[1])
             return local._replace(
                 arm_force=local.arm_force.at[arm].add(jacobian.T @ pull),
