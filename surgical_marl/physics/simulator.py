@@ -192,17 +192,21 @@ class Simulator:
         sites = np.array(list(self._sites.values()))
         return (data.site_xpos[sites], data.site_xmat[sites]), self._pairs.distance(data.geom_xpos, data.geom_xmat)
 
-    def _step(self, physics: Physics, touch: Touch) -> tuple[Physics, Touch]:
+    def _step(self, physics: Physics, touch: Touch, distance: Array | None = None) -> tuple[Physics, Touch]:
         """Return the state after one physics step, and the hardest touch up to the start of that step.
 
-        Arms that touch nothing do not affect each other, so each is stepped on its own.
+        Arms that touch nothing do not affect each other, so each is stepped on its own. `distance` is that of every
+        pair at the start, if it is known.
         """
-        if self._objects:
-            return self._objects.step(physics, touch, self._fields, self._apart)
-        if not self._pairs.count:
+        if not (self._pairs.count or self._objects):
             return self._apart(physics, touch)
         data = self._together.pose(physics.qpos)
-        overlap = self._pairs.overlap(data.geom_xpos, data.geom_xmat)
+        if distance is None:
+            overlap = self._pairs.overlap(data.geom_xpos, data.geom_xmat)
+        else:
+            overlap = (distance < 0).any()
+        if self._objects:
+            return self._objects.step(physics, touch, data, overlap, self._fields, self._apart)
         return jax.lax.cond(overlap, self._touching_step, self._apart, physics, touch)
 
     def _apart(self, physics: Physics, touch: Touch) -> tuple[Physics, Touch]:

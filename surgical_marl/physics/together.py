@@ -135,18 +135,21 @@ class Together:
         joints = self._finder.joints(data)
         return self._finder.find(data, joints, physics.qvel, physics.objects.bodies, self._dynamics.dt), joints
 
-    def step(self, physics: Physics, touch: Touch, fields: dict[str, Array], apart: Callable[..., Any]) -> Any:
+    def step(
+        self, physics: Physics, touch: Touch, data: Any, overlap: Array, fields: dict[str, Array],
+        apart: Callable[..., Any],
+    ) -> Any:  # fmt: skip
         """Return the state after one physics step, and the hardest touch up to the start of that step.
 
         Args:
             physics: the state of arms and objects.
             touch: the hardest touch so far.
+            data: MJX's data with the poses of the arms.
+            overlap: whether any arms overlap, [].
             fields: other values of some fields of the model.
             apart: steps arms that touch nothing.
         """
-        data = self._dynamics.pose(physics.qpos)
         slots, joints = self._find(data, physics)
-        overlap = self._pairs.overlap(data.geom_xpos, data.geom_xmat) if self._pairs.count else jnp.bool_(False)
         near = overlap | (self._on_arm(slots) < self._arms).any()
         bodies = self.tables.bodies["pads"]
         frames = stored((data.xpos[bodies], data.xmat[bodies]))
