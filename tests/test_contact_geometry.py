@@ -26,6 +26,7 @@ from surgical_marl.physics.patches import (
     no_patch,
     tangents,
 )
+from surgical_marl.physics.rows import row_of
 from surgical_marl.physics.shapes import EVEN, NEAR, Plate, Points, Segments, between_segments, on_plate, plate_of_box
 
 COUNT = 200
@@ -149,7 +150,8 @@ def test_tangents_are_the_frame_of_a_right_hand() -> None:
 
 @jax.jit
 def found_patch(points: Points, soon: Any, count: Any, centre: Any) -> Any:
-    return find_patch(points, soon, count, jnp.eye(3)[:2], TILT, jnp.float32(0.002), centre)
+    look, rows, middle = lambda n: row_of((points, soon), n), len(soon), points.place[0, 0]
+    return find_patch(look, count, rows, middle, jnp.eye(3)[:2], TILT, jnp.float32(0.002), centre)
 
 
 def patch_of(

@@ -16,7 +16,7 @@ from surgical_marl.scenes.scene import Scene
 
 
 class ArmForces(NamedTuple):
-    """What moves arms of one type but for contacts: a arms of m joints each, in memory."""
+    """What moves arms of one type but for contacts: a arms of m joints each."""
 
     dofs: np.ndarray
     """Numbers of their joints in the scene, [a, m]."""

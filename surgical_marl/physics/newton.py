@@ -20,7 +20,7 @@ from surgical_marl.physics.arms import Arms, Left
 from surgical_marl.physics.cone import Cone, Forces, between, curvature, fall, forces, wrench
 from surgical_marl.physics.factor import packed
 from surgical_marl.physics.problem import SLIPS, Contact, Point, Pressed, Problem, Solution
-from surgical_marl.physics.rows import room, row_of, stored
+from surgical_marl.physics.rows import add, put, room, row_of
 from surgical_marl.physics.search import search
 
 PASSES = 12
@@ -84,12 +84,12 @@ class Newton:
         return twist
 
     def by_arm(self, joints: Array) -> Array:
-        """Return what belongs to the joints [n] of all arms by arm, in memory, [a, m]; 0 for joints that are not."""
-        return stored(jnp.append(joints, 0.0)[np.minimum(self._dofs, len(joints))])
+        """Return what belongs to the joints [n] of all arms by arm, [a, m]; 0 for joints that are not."""
+        return jnp.append(joints, 0.0)[np.minimum(self._dofs, len(joints))]
 
     def by_object(self, each: Array) -> Array:
-        """Return what belongs to objects [k, ...], and 0 for the one that stands for none, in memory, [k + 1, ...]."""
-        return stored(_with_none(each))
+        """Return what belongs to objects [k, ...], and 0 for the one that stands for none, [k + 1, ...]."""
+        return _with_none(each)
 
     def solve(self, problem: Problem, arms: Array, objects: Array) -> Solution:
         """Return the accelerations and forces, beginning with accelerations of arms [a, m] and objects [k, 6]."""
@@ -132,7 +132,7 @@ class Newton:
         arms_way, objects_way = way.arms, self.by_object(way.objects)
 
         def measure(length: Array, seen: _Seen) -> tuple[Array, Array, _Seen]:
-            def add(n: Array, state: tuple[Array, Array, _Seen]) -> tuple[Array, Array, _Seen]:
+            def look(n: Array, state: tuple[Array, Array, _Seen]) -> tuple[Array, Array, _Seen]:
                 contact, before = row_of((problem.contacts, state[2].pressed), n)
                 cone, by = contact.cone, self.twist(contact, arms_way, objects_way)
                 felt = forces(cone, self.twist(contact, arms, objects) + length * by)
@@ -140,13 +140,12 @@ class Newton:
                 slope = state[0] - felt.normal @ normal - felt.friction @ along
                 change = jnp.sum((own.friction - before.friction) ** 2) > TOLERANCE**2 * own.normal**2
                 same = state[2].same & (own.sides == before.sides)
-                pressed = jax.tree.map(lambda all_, x: all_.at[n].set(x), state[2].pressed, own)
-                seen = _Seen(pressed, same, state[2].turned | (change & felt.slips))
+                seen = _Seen(put(state[2].pressed, n, own), same, state[2].turned | (change & felt.slips))
                 return slope, state[1] + fall(cone, felt, normal, along), seen
 
             resists, gives = self._arms.resisted(problem, arms, arms_way, length)
             start = slope + length * growth + resists, growth + gives, seen
-            return jax.lax.fori_loop(0, problem.total, add, start)  # type: ignore[no-any-return]
+            return jax.lax.fori_loop(0, problem.total, look, start)
 
         return measure
 
@@ -168,8 +167,7 @@ class Newton:
         def one(n: Array, sums: tuple[_Local, Pressed]) -> tuple[_Local, Pressed]:
             contact = row_of(problem.contacts, n)
             found = forces(contact.cone, self.twist(contact, point.arms, objects))
-            pressed = jax.tree.map(lambda all_, x: all_.at[n].set(x), sums[1], _pressed(found))
-            return self._add(sums[0], contact, found), pressed
+            return self._add(sums[0], contact, found), put(sums[1], n, _pressed(found))
 
         local, pressed = jax.lax.fori_loop(0, problem.total, one, (none, pressed))
         own = local.object[:k] if k < 2 else local.object.reshape(k + 1, k + 1, 6, 6)[:k, :k]
@@ -199,22 +197,22 @@ class Newton:
         if self._objects > 1:
 
             def on_other(parts: tuple[Array, Array]) -> tuple[Array, Array]:
-                both = jax.tree.map(lambda *x: stored(jnp.stack(x)), cone, _moved_cone(contact))
+                both = jax.tree.map(lambda *x: jnp.stack(x), cone, _moved_cone(contact))
                 bodies = jnp.stack([first, second])
 
-                def add(blocks: Array, pair: Array) -> tuple[Array, None]:
+                def couple(blocks: Array, pair: Array) -> tuple[Array, None]:
                     block = between(row_of(both, pair[0]), row_of(both, pair[1]), felt)
                     return self._grown(blocks, bodies[pair[0]], bodies[pair[1]], block), None
 
-                pulled = parts[0].at[second].add(wrench(row_of(both, 1), felt))
-                return pulled, jax.lax.scan(add, parts[1], jnp.asarray(_OTHERS))[0]
+                pulled = add(parts[0], second, wrench(row_of(both, 1), felt))
+                return pulled, jax.lax.scan(couple, parts[1], jnp.asarray(_OTHERS))[0]
 
             touches = second < self._objects
             parts = jax.lax.cond(touches, on_other, lambda parts: parts, (local.force, local.object))
             local = local._replace(force=parts[0], object=parts[1])
         whole, one = stiff[_WHOLE], local.object
-        one = one.at[first].add(stiff) if self._objects < 2 else self._grown(one, first, first, whole)
-        local = local._replace(force=local.force.at[first].add(pull), object=one)
+        one = add(one, first, stiff) if self._objects < 2 else self._grown(one, first, first, whole)
+        local = local._replace(force=add(local.force, first, pull), object=one)
         if not len(self._dofs):
             return local
 
@@ -223,9 +221,9 @@ class Newton:
             half = whole @ jacobian
             first_joint, second_joint = np.tril_indices(jacobian.shape[1])
             return local._replace(
-                arm_force=local.arm_force.at[arm].add(jacobian.T @ pull),
-                arm=local.arm.at[arm].add(jnp.sum(jacobian[:, first_joint] * half[:, second_joint], 0)),
-                coupling=local.coupling.at[first, arm].add(half),
+                arm_force=add(local.arm_force, arm, jacobian.T @ pull),
+                arm=add(local.arm, arm, jnp.sum(jacobian[:, first_joint] * half[:, second_joint], 0)),
+                coupling=add(local.coupling, (first, arm), half),
             )
 
         return jax.lax.cond(contact.arm < len(self._dofs), on_arm, lambda local: local, local)

@@ -27,7 +27,7 @@ class Contact(NamedTuple):
 
 
 class Problem(NamedTuple):
-    """What is to be solved: a arms with m joints each at most, k objects, s contacts. What an arm has is in memory."""
+    """What is to be solved: a arms with m joints each at most, k objects, s contacts."""
 
     mass: Array
     """Mass matrices of the arms with the implicit parts of other forces, lower halves, [a, m (m + 1) / 2]."""

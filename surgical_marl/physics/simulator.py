@@ -201,10 +201,7 @@ class Simulator:
         if not (self._pairs.count or self._objects):
             return self._apart(physics, touch)
         data = self._together.pose(physics.qpos)
-        if distance is None:
-            overlap = self._pairs.overlap(data.geom_xpos, data.geom_xmat)
-        else:
-            overlap = (distance < 0).any()
+        overlap = self._pairs.overlap(data.geom_xpos, data.geom_xmat) if distance is None else (distance < 0).any()
         if self._objects:
             return self._objects.step(physics, touch, data, overlap, self._fields, self._apart)
         return jax.lax.cond(overlap, self._touching_step, self._apart, physics, touch)

@@ -148,8 +148,19 @@ def solve(
         rest = mass @ qacc - smooth
         gives = jnp.where(above & below, rows.impedance, 0.0)
         search = _newton_step(mass, rows.jacobian, gives, rows.jacobian.T @ force - rest, between)
-        step, end = _line_search(mass, rows, unbounded, rest, search, line_search)
-        return qacc + step * search, (((end > rows.low) == above) & ((end < rows.high) == below)).all()
+        looked = partial(_line_search, mass, rows, unbounded, rest, search, line_search)
+        kept = lambda end: (((end > rows.low) == above) & ((end < rows.high) == below)).all()  # noqa: E731
+        if iterations == 1:
+            return qacc + looked()[0] * search, jnp.bool_(True)
+        # the whole step is the best one if no row changes sides over it
+        whole = kept(unbounded - rows.impedance * (rows.jacobian @ search))
+
+        def part() -> tuple[Array, Array]:
+            step, end = looked()
+            return step, kept(end)
+
+        step, settled = jax.lax.cond(whole, lambda: (jnp.float32(1.0), jnp.bool_(True)), part)
+        return qacc + step * search, settled
 
     def unsettled(state: tuple[Array, Array, Array]) -> Array:
         _, settled, count = state

@@ -24,7 +24,7 @@ from surgical_marl.physics.kind import Kind
 from surgical_marl.physics.newton import Newton
 from surgical_marl.physics.placed import Joints
 from surgical_marl.physics.problem import Contact, Pressed, Problem
-from surgical_marl.physics.rows import absent, stored
+from surgical_marl.physics.rows import absent
 from surgical_marl.physics.solver import JointRows, Rows
 from surgical_marl.physics.tables import Tables
 from surgical_marl.physics.touching import Finder, Slots
@@ -152,7 +152,7 @@ class Together:
         slots, joints = self._find(data, physics)
         near = overlap | (self._on_arm(slots) < self._arms).any()
         bodies = self.tables.bodies["pads"]
-        frames = stored((data.xpos[bodies], data.xmat[bodies]))
+        frames = (data.xpos[bodies], data.xmat[bodies])
 
         def alone(physics: Physics, touch: Touch) -> tuple[Physics, Touch]:
             objects = self._step_objects(physics.objects, slots)
@@ -242,7 +242,7 @@ class Together:
             mass = mass.at[arms, : m * (m + 1) // 2].set(of_kind.mass)
             smooth = smooth.at[arms, :m].set(of_kind.smooth)
             joints = JointRows(*(all_.at[arms, :m].set(own) for all_, own in zip(joints, of_kind.joints, strict=True)))
-        return stored((mass, smooth, joints))
+        return (mass, smooth, joints)
 
     def _between(self, physics: Physics, overlap: Array) -> _Between:
         """Return the contacts of arms with arms. There is nothing in it unless any overlap."""

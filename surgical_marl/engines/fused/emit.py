@@ -231,7 +231,7 @@ class Emitter(ArrayEmitter):
     def _head(self, number: int, loop: Loop) -> str:
         r, length = f"r{number}", loop.length
         if loop.condition is not None:
-            return "for(;;){"
+            return "#pragma unroll 1\nfor(;;){"  # how many rounds there are is not known, and code is long
         if loop.counter is not None:
             self.names[loop.counter], self.wholes[loop.counter] = f"SPLATI({r})", r
         return f"for(int {r}={length - 1};{r}>=0;--{r}){{" if loop.backwards else f"for(int {r}=0;{r}<{length};++{r}){{"
