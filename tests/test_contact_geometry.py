@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from surgical_marl.physics.collision import SLOTS, Pairs
 from surgical_marl.physics.cone import Cone, between, curvature, forces, nearest, wrench
+from surgical_marl.physics.factor import packed
 from surgical_marl.physics.patches import (
     ALIKE,
     ASIDE,
@@ -276,7 +277,7 @@ def curvatures(c: Cone, other: Cone, at: Any) -> Any:
     its = jax.vmap(lambda d: pulled(zero, -d) - pulled(zero, d), out_axes=1)(steps) / (2 * STEP)
     presses = lambda at: forces(c, at).normal > 0  # noqa: E731
     corner = jax.vmap(lambda d: presses(at + d) != presses(at - d))(steps).any()
-    return felt.slips, corner, curvature(c, felt), between(c, c, felt), between(c, other, felt), own, its
+    return felt.slips, corner, curvature(c, felt)[packed(6)], between(c, c, felt), between(c, other, felt), own, its
 
 
 def test_curvatures_are_differences_of_the_wrench() -> None:
