@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from surgical_marl.physics.collision import SLOTS, Pairs
 from surgical_marl.physics.cone import Cone, between, curvature, forces, nearest, wrench
+from surgical_marl.physics.factor import packed
 from surgical_marl.physics.patches import (
     ALIKE,
     ASIDE,
@@ -26,6 +27,7 @@ from surgical_marl.physics.patches import (
     no_patch,
     tangents,
 )
+from surgical_marl.physics.rows import row_of
 from surgical_marl.physics.shapes import EVEN, NEAR, Plate, Points, Segments, between_segments, on_plate, plate_of_box
 
 COUNT = 200
@@ -149,7 +151,8 @@ def test_tangents_are_the_frame_of_a_right_hand() -> None:
 
 @jax.jit
 def found_patch(points: Points, soon: Any, count: Any, centre: Any) -> Any:
-    return find_patch(points, soon, count, jnp.eye(3)[:2], TILT, jnp.float32(0.002), centre)
+    look, rows, middle = lambda n: row_of((points, soon), n), len(soon), points.place[0, 0]
+    return find_patch(look, count, rows, middle, jnp.eye(3)[:2], TILT, jnp.float32(0.002), centre)
 
 
 def patch_of(
@@ -274,7 +277,7 @@ def curvatures(c: Cone, other: Cone, at: Any) -> Any:
     its = jax.vmap(lambda d: pulled(zero, -d) - pulled(zero, d), out_axes=1)(steps) / (2 * STEP)
     presses = lambda at: forces(c, at).normal > 0  # noqa: E731
     corner = jax.vmap(lambda d: presses(at + d) != presses(at - d))(steps).any()
-    return felt.slips, corner, curvature(c, felt), between(c, c, felt), between(c, other, felt), own, its
+    return felt.slips, corner, curvature(c, felt)[packed(6)], between(c, c, felt), between(c, other, felt), own, its
 
 
 def test_curvatures_are_differences_of_the_wrench() -> None:

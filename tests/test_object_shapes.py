@@ -9,6 +9,7 @@ from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
 from surgical_marl.physics.patches import BLEND, TILT_IN_JAW, Patch, find_patch
+from surgical_marl.physics.rows import row_of
 from surgical_marl.physics.shapes import NEAR, Plate, Points, Segments, between_segments, on_plate
 
 HALF, THICK, WIRE = np.array([0.0042, 0.0018]), 0.0006, 0.0005
@@ -53,7 +54,9 @@ PLATE = Plate(jnp.zeros((1, 3)), jnp.eye(3)[None], jnp.asarray(HALF)[None], jnp.
 def touch(pose: jnp.ndarray) -> tuple[Points, Patch]:
     points = on_plate(wire_at(pose), PLATE)
     flat = Points(*(part.reshape(-1, *part.shape[2:]) for part in points))
-    return flat, find_patch(points, points.depth, len(points.depth), jnp.eye(3)[:2], TILT_IN_JAW, jnp.float32(0.002))
+    count, look = len(points.depth), lambda n: row_of((points, points.depth), n)
+    middle, axes, torsion = points.place[0, 0], jnp.eye(3)[:2], jnp.float32(0.002)
+    return flat, find_patch(look, count, count, middle, axes, TILT_IN_JAW, torsion)
 
 
 @jax.jit

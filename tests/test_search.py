@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from surgical_marl.physics.cone import Cone, curvature, fall, forces, wrench
+from surgical_marl.physics.factor import packed
 from surgical_marl.physics.search import ENOUGH, search
 
 POINTS = 4
@@ -29,7 +30,7 @@ def drawn(rng: np.random.Generator) -> Cone:
 def along(cone: Cone, at: jax.Array, way: jax.Array) -> tuple[jax.Array, jax.Array]:
     """How the power of the forces falls along a way: by `fall`, and by the whole curvature."""
     felt = forces(cone, at)
-    return fall(cone, felt, cone.normal @ way, cone.along @ way), way @ curvature(cone, felt) @ way
+    return fall(cone, felt, cone.normal @ way, cone.along @ way), way @ curvature(cone, felt)[packed(6)] @ way
 
 
 def test_what_falls_along_a_way_is_the_curvature_there() -> None:
@@ -57,14 +58,21 @@ def test_a_length_is_found_where_the_slope_is_small(
 ) -> None:
     """Of a slope that grows with a corner here and there, as where points begin to press."""
 
-    def measure(length: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def measure(length: jax.Array, seen: list[jax.Array]) -> tuple[jax.Array, jax.Array, list[jax.Array]]:
         slope, grows = begin * (growth * length - 1), begin * jnp.float32(growth)
         for place, more in corners:
             slope += begin * more * jnp.maximum(length - place, 0.0)
             grows += jnp.where(length > place, begin * more, 0.0)
-        return slope, grows
+        return slope, grows, [length]
 
-    length = search(jnp.float32(-begin), measure)
-    slope, _ = measure(length)
+    found = search(jnp.float32(-begin), 0.0, measure, [jnp.float32(0.0)])
+    length, (seen,) = found.length, found.seen
+    slope, *_ = measure(length, [])
+    assert float(length) == float(seen), "what was seen is not of this length"
     assert 0 < float(length) <= 1 / growth * (1 + ENOUGH) + 1e-6
     assert abs(float(slope)) <= ENOUGH * begin
+
+
+def test_a_slope_that_is_next_to_none_takes_the_whole_way_without_a_look() -> None:
+    found = search(jnp.float32(-1e-3), 1e-3, lambda length, seen: (length, length, length), jnp.float32(-1.0))
+    assert (float(found.length), int(found.looks), float(found.seen)) == (1.0, 0, -1.0)

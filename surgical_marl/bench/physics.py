@@ -32,7 +32,7 @@ class PhysicsAlone(Env):
     def step(self, carry: Carry, actions: dict[str, Array], parameters: Any = None) -> State:
         """Do one physics step; there are no actions."""
         _, distance = self.simulator._look(carry.physics.qpos)
-        physics, _ = self.plant.actual(carry.hidden)._step(carry.physics, self.simulator.untouched)
+        physics, _ = self.plant.actual(carry.hidden)._step(carry.physics, self.simulator.untouched, distance)
         return bare_state(carry._replace(physics=physics), distance)
 
     @property

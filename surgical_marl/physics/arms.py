@@ -1,4 +1,8 @@
-"""The Newton step of arms, once objects are eliminated from it."""
+"""The Newton step of arms, once objects are eliminated from it.
+
+What belongs to arms has one row for each of a arms, with m numbers for their joints. An arm with fewer joints than
+others has joints in its row that are not there: nothing pushes them, and they stay at rest.
+"""
 
 from __future__ import annotations
 
@@ -9,25 +13,21 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from surgical_marl.physics.solver import JointRows, Rows, solve
+from surgical_marl.physics.factor import packed
+from surgical_marl.physics.problem import Problem
+from surgical_marl.physics.solver import JointRows, Rows, row_forces, rows_of, solve
 
 ITERATIONS = (6, 4)
 """Newton steps for arms alone at most, and line search steps in each, while contacts are linear functions."""
 
 
-class Reduced(NamedTuple):
-    """What is left to be solved for n joints of a arms with m joints each, after k objects."""
+class Left(NamedTuple):
+    """What k objects and all contacts leave of the equations of arms."""
 
     stiff: Array
-    """How forces fall with the acceleration of joints, but for what objects do, [n, n]."""
+    """How forces of contacts fall with the acceleration of joints, lower halves, [a, m (m + 1) / 2]."""
     force: Array
-    """Forces that are left over, [n]."""
-    start: Array
-    """Acceleration of joints, [n]."""
-    rows: Rows
-    """Friction and limits of joints."""
-    joints: JointRows
-    """The same by joint."""
+    """Forces of contacts, [a, m]."""
     half: Array
     """Forces left over on objects, divided by the Cholesky factor of how these fall, [k, 6]."""
     wide: Array
@@ -40,60 +40,140 @@ class Arms:
     """Solves for the ways of arms. `dofs` [a, m] are the numbers of their joints, as for `Newton`."""
 
     def __init__(self, dofs: np.ndarray, joints: int) -> None:
-        self._dofs, self._none = dofs, dofs == joints
+        self._there = dofs < joints
+        self._places = packed(dofs.shape[1])
 
-    def together(self, left: Reduced) -> Array:
-        """Return the way [n] of arms that objects, or contacts of arms with arms, join."""
+    def together(self, problem: Problem, here: Array, left: Left) -> Array:
+        """Return the ways [a, m] from an acceleration [a, m] of arms that objects, or contacts of arms, join."""
+        there = self._there
+
+        def flat(each: Array) -> Array:
+            return jnp.concatenate([row[own] for row, own in zip(each, there, strict=True)])
+
+        stiff, force = self._dense(problem.mass + left.stiff), flat(problem.smooth + left.force)
+        start, mass = flat(here), self._dense(problem.mass)
+
+        def press(total: tuple[Array, Array], row: Rows) -> tuple[tuple[Array, Array], None]:
+            jacobian = flat(row.jacobian)
+            pressed = jnp.maximum(row.impedance * (row.reference - jacobian @ start), 0.0)
+            whole = jnp.where(pressed > 0, row.impedance, 0.0) * jacobian
+            return (total[0] + whole[:, None] * jacobian, total[1] + pressed * jacobian), None
 
         def subtract(total: tuple[Array, Array], row: Any) -> tuple[tuple[Array, Array], None]:
             half, each, touched = row
 
             def less(total: tuple[Array, Array]) -> tuple[Array, Array]:
-                wide = jnp.zeros((6, len(left.force)))
-                for arm, (dofs, none) in enumerate(zip(self._dofs, self._none, strict=True)):
-                    wide = wide.at[:, dofs[~none]].set(each[arm][:, ~none])
+                wide = jnp.concatenate([of_arm[:, own] for of_arm, own in zip(each, there, strict=True)], 1)
                 return total[0] - wide.T @ wide, total[1] - wide.T @ half
 
             return jax.lax.cond(touched.any(), less, lambda total: total, total), None
 
-        (stiff, force), _ = jax.lax.scan(subtract, (left.stiff, left.force), (left.half, left.wide, left.touched))
-        return _way(stiff, force, left.rows, left.start)
+        total = stiff, force - mass @ start
+        if len(problem.between.low):
+            with_rows = lambda total: jax.lax.scan(press, total, problem.between)[0]  # noqa: E731
+            total = jax.lax.cond(problem.overlap, with_rows, lambda total: total, total)
+        (stiff, force), _ = jax.lax.scan(subtract, total, (left.half, left.wide, left.touched))
+        found, rows = _way(stiff, force, rows_of(JointRows(*map(flat, problem.joints))), start), np.cumsum(there.sum(1))
+        ways = [
+            jnp.zeros(len(own)).at[own].set(way) for own, way in zip(there, jnp.split(found, rows[:-1]), strict=True)
+        ]
+        return jnp.stack(ways)
 
-    def each(self, left: Reduced) -> Array:
-        """Return the way [n] of arms of which no two are joined: one problem after the other, no larger than an arm."""
-        n, pad = len(left.force), lambda x: jnp.pad(x, [(0, 1)] * x.ndim)
-        absent = self._none[:, :, None] | self._none[:, None, :]
-        blocks = pad(left.stiff)[self._dofs[:, :, None], self._dofs[:, None, :]]
-        blocks = jnp.where(absent, np.eye(self._dofs.shape[1], dtype=np.float32), blocks)
+    def each(self, problem: Problem, here: Array, left: Left) -> Array:
+        """Return the ways [a, m] of arms of which no two are joined: one problem after the other."""
 
         def one(row: Any) -> Array:
-            arm, stiff, force, joints, start = row
+            arm, mass, smooth, joints, start, stiff, force = row
 
             def subtract(total: tuple[Array, Array], of_object: Any) -> tuple[tuple[Array, Array], None]:
                 half, wide, touched = of_object
                 less = lambda total: (total[0] - wide[arm].T @ wide[arm], total[1] - wide[arm].T @ half)  # noqa: E731
                 return jax.lax.cond(touched[arm], less, lambda total: total, total), None
 
-            (stiff, force), _ = jax.lax.scan(subtract, (stiff, force), (left.half, left.wide, left.touched))
-            return _way(stiff, force, _rows(joints), start)
+            total = (mass + stiff)[self._places], smooth + force - mass[self._places] @ start
+            (stiff, force), _ = jax.lax.scan(subtract, total, (left.half, left.wide, left.touched))
+            return _way(stiff, force, rows_of(joints), start)
 
-        by_arm = lambda x: pad(x)[self._dofs]  # noqa: E731
-        each = blocks, by_arm(left.force), jax.tree.map(by_arm, left.joints), by_arm(left.start)
-        found = jax.lax.map(one, (jnp.arange(len(self._dofs)), *each))
-        return jnp.zeros(n + 1).at[self._dofs].set(found)[:n]
+        arms = jnp.arange(len(self._there))
+        rows = arms, problem.mass, problem.smooth, problem.joints, here, left.stiff, left.force
+        found: Array = jax.lax.map(one, rows)
+        return found
+
+    def slopes(self, problem: Problem, here: Array, way: Array, force: Array) -> tuple[Array, Array, Array]:
+        """Return slopes of the cost along ways [a, m], from an acceleration [a, m], [] each.
+
+        The first is that of the whole cost, with forces of contacts [a, m]. The second is the slope, there, of what
+        does not depend on contacts, nor on friction and limits; the third is by how much that grows per length.
+        """
+
+        def add(sums: tuple[Array, Array, Array], row: Any) -> tuple[tuple[Array, Array, Array], None]:
+            mass, smooth, joints, here, way, force = row
+            mass, rows = mass[self._places], rows_of(joints)
+            rest = mass @ here - smooth
+            whole = rest - force - rows.jacobian.T @ row_forces(rows, here)
+            return (sums[0] + way @ whole, sums[1] + way @ rest, sums[2] + way @ (mass @ way)), None
+
+        zero = jnp.float32(0.0)
+        rows = problem.mass, problem.smooth, problem.joints, here, way, force
+        whole, slope, growth = jax.lax.scan(add, (zero, zero, zero), rows)[0]
+        if len(problem.between.low):
+            whole = jax.lax.cond(problem.overlap, lambda: whole - self._power(problem, here, way), lambda: whole)
+        return whole, slope, growth
+
+    def resisted(self, problem: Problem, here: Array, way: Array, length: Array) -> tuple[Array, Array]:
+        """Return the slope of friction and limits of joints at a length of ways, and how much it grows per length."""
+
+        def add(sums: tuple[Array, Array], row: Any) -> tuple[tuple[Array, Array], None]:
+            joints, here, way = row
+            return _added(sums, rows_of(joints), here, way, length), None
+
+        found: tuple[Array, Array] = jax.lax.scan(add, (jnp.float32(0.0),) * 2, (problem.joints, here, way))[0]
+        if not len(problem.between.low):
+            return found
+
+        flat = here.ravel(), way.ravel()
+
+        def press(sums: tuple[Array, Array], row: Rows) -> tuple[tuple[Array, Array], None]:
+            own = Rows(row.jacobian.reshape(1, -1), *(x[None] for x in row[1:]))
+            return _added(sums, own, *flat, length), None
+
+        with_rows = lambda sums: jax.lax.scan(press, sums, problem.between)[0]  # noqa: E731
+        return jax.lax.cond(problem.overlap, with_rows, lambda sums: sums, found)
+
+    def between(self, problem: Problem, arms: Array) -> Array:
+        """Return the forces of contacts of arms with arms at an acceleration [a, m], N, [r]."""
+        none = jnp.zeros(len(problem.between.low))
+        if not len(none):
+            return none
+        pressed = lambda arms: row_forces(_flat(problem.between), arms.ravel())  # noqa: E731
+        return jax.lax.cond(problem.overlap, pressed, lambda _: none, arms)
+
+    def _power(self, problem: Problem, here: Array, way: Array) -> Array:
+        """Return the power along ways of contacts of arms with arms, []."""
+        rows = _flat(problem.between)
+        return row_forces(rows, here.ravel()) @ (rows.jacobian @ way.ravel())
+
+    def _dense(self, lower: Array) -> Array:
+        """Return one matrix [n, n] for all n joints that are there, of the lower halves of each arm's."""
+        sizes = self._there.sum(1)
+        whole, starts = jnp.zeros((sizes.sum(),) * 2), np.cumsum(sizes) - sizes
+        for arm, own in enumerate(self._there):
+            places = starts[arm] + np.arange(sizes[arm])
+            whole = whole.at[np.ix_(places, places)].set(lower[arm][self._places[np.ix_(own, own)]])
+        return whole
 
 
-def _rows(joints: JointRows) -> Rows:
-    """Return friction and limits of m joints as rows, [2 m]."""
-    one = np.eye(len(joints.side), dtype=np.float32)
-    both = lambda first, second: jnp.concatenate([first, second])  # noqa: E731
-    return Rows(
-        both(one, joints.side[:, None] * one),
-        both(joints.friction_impedance, joints.limit_impedance),
-        both(joints.friction_reference, joints.limit_reference),
-        both(-joints.friction, 0 * joints.side),
-        both(joints.friction, jnp.full(len(one), jnp.inf)),
-    )
+def _flat(rows: Rows) -> Rows:
+    """Return rows [r] whose Jacobian [r, a, m] has one axis for all joints."""
+    return rows._replace(jacobian=rows.jacobian.reshape(len(rows.low), -1))
+
+
+def _added(sums: tuple[Array, Array], rows: Rows, here: Array, way: Array, length: Array) -> tuple[Array, Array]:
+    """Return slope and growth of the cost along a way with those of rows, at a length of it."""
+    along = rows.jacobian @ way
+    force, by = rows.impedance * (rows.reference - rows.jacobian @ here - length * along), rows.impedance * along
+    gives = jnp.where((force > rows.low) & (force < rows.high), by, 0.0)
+    return sums[0] - along @ jnp.clip(force, rows.low, rows.high), sums[1] + along @ gives
 
 
 def _way(stiff: Array, force: Array, rows: Rows, start: Array) -> Array:

@@ -30,6 +30,10 @@ BLOCK = 36
 """Pairs among which the deepest are found at a time, if there are more than `AT_ONCE`."""
 
 
+APART = 1e-5
+"""Distance of two groups of capsules from which on no rounding error lets them overlap, m."""
+
+
 class Closest(NamedTuple):
     """Where the geoms of each pair are closest, [P]."""
 
@@ -70,6 +74,10 @@ class Pairs:
         self._blocks = np.minimum(np.arange(-(-self.count // BLOCK) * BLOCK), self.count - 1).reshape(-1, BLOCK)
         self._sign = (moved[bodies[1]] - moved[bodies[0]]).astype(single)
         self._roots = model.body_rootid[model.dof_bodyid]
+        trees = np.sort([model.body_rootid[body] for body in bodies], 0)
+        self._trees = model.body_rootid[model.geom_bodyid]
+        self._groups = {tuple(both): np.flatnonzero((both == trees.T).all(1)) for both in np.unique(trees, axis=1).T}
+        """Pairs by the two arms that they are between."""
 
     def overlap(self, geom_xpos: Array, geom_xmat: Array) -> Array:
         """Return whether any pair overlaps, []: for less than what `distance` costs."""
@@ -78,7 +86,19 @@ class Pairs:
             gap, reach = axis_gap(one, other)[1], one.radius + other.radius
             return jnp.min(jnp.where(is_pair, jnp.sum(gap * gap, -1) - reach * reach, np.inf), initial=np.inf)
 
-        return jnp.min(self._each(least, geom_xpos, geom_xmat)) < 0
+        if self.tiles is not None:
+            return jnp.min(self._each(least, geom_xpos, geom_xmat)) < 0
+        found = jnp.bool_(False)  # also if there are no pairs
+        for arms, pairs in self._groups.items():
+            ends = [self._capsules(of[pairs], geom_xpos, geom_xmat) for of in self._geoms]
+            exact = lambda one, other: least(one, other, np.bool_(True)) < 0  # noqa: E731
+            geoms = np.unique([of[pairs] for of in self._geoms])
+            if arms[0] == arms[1] or len(pairs) < len(geoms):
+                found |= exact(*ends)
+                continue
+            sides = (self._capsules(geoms[self._trees[geoms] == arm], geom_xpos, geom_xmat) for arm in arms)
+            found |= jax.lax.cond(_apart(*sides), lambda *_: jnp.bool_(False), exact, *ends)
+        return found
 
     def distance(self, geom_xpos: Array, geom_xmat: Array) -> Array:
         """Return the signed distance of every pair, m, [P]; negative where they overlap."""
@@ -146,6 +166,18 @@ class Pairs:
         if self.tiles is None:
             return jnp.where(pair == np.arange(self.count)[:, None], values, 0.0).sum(-1)
         return jnp.zeros(self.count, values.dtype).at[pair].add(values)
+
+
+def _apart(one: Capsule, other: Capsule) -> Array:
+    """Return whether a plane is between two groups of capsules, across the way from the first to the first, []."""
+    way = other.centre[0] - one.centre[0]
+    length = jnp.sqrt(jnp.sum(way * way))
+
+    def reach(capsules: Capsule) -> tuple[Array, Array]:
+        middle, half = capsules.centre @ way, jnp.abs(capsules.axis @ way) * capsules.half + capsules.radius * length
+        return jnp.min(middle - half), jnp.max(middle + half)
+
+    return reach(other)[0] - reach(one)[1] > APART * length
 
 
 def _closest(one: Capsule, other: Capsule, is_pair: Any) -> Closest:

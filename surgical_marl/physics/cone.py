@@ -15,9 +15,6 @@ import numpy as np
 from jax import Array
 
 _FIRST, _SECOND = np.tril_indices(6)
-_PACKED = np.zeros((6, 6), int)
-_PACKED[_FIRST, _SECOND] = _PACKED[_SECOND, _FIRST] = np.arange(len(_FIRST))
-"""Where each element of a symmetric matrix is among those of its lower half."""
 
 
 class Cone(NamedTuple):
@@ -90,22 +87,22 @@ def wrench(cone: Cone, felt: Forces) -> Array:
 
 
 def curvature(cone: Cone, felt: Forces) -> Array:
-    """Return by how much the wrench falls per acceleration, [6, 6]."""
+    """Return by how much the wrench falls per acceleration: the lower half of a matrix [6, 6], row by row, [21]."""
     pressed, rub, soft, ahead, across = _gives(cone, felt)
     rubs = felt.way @ cone.along
     turning = across * cone.along[:, _FIRST] * cone.along[:, _SECOND]
     raised = cone.coefficient * (pressed @ cone.normal)
     mixed = rub * rubs - raised / 2
-    packed = (pressed[:, None] * cone.normal)[:, _FIRST] * cone.normal[:, _SECOND]
-    packed = jnp.sum(packed, 0) + rub * (jnp.sum(turning, 0) + (ahead - across) * rubs[_FIRST] * rubs[_SECOND])
-    packed += soft * (raised[_FIRST] * mixed[_SECOND] + raised[_SECOND] * mixed[_FIRST])
-    return packed[_PACKED]
+    lower = (pressed[:, None] * cone.normal)[:, _FIRST] * cone.normal[:, _SECOND]
+    lower = jnp.sum(lower, 0) + rub * (jnp.sum(turning, 0) + (ahead - across) * rubs[_FIRST] * rubs[_SECOND])
+    lower += soft * (raised[_FIRST] * mixed[_SECOND] + raised[_SECOND] * mixed[_FIRST])
+    return lower
 
 
 def between(cone: Cone, other: Cone, felt: Forces) -> Array:
     """Return by how much the wrench falls per acceleration of another body, [6, 6].
 
-    `other` is the cone with its twists at that body's origin. With that of the same body this is the `curvature`.
+    `other` is the cone with its twists at that body's origin. With that of the same body this is `curvature`, whole.
     """
     pressed, rub, soft, ahead, across = _gives(cone, felt)
     (rubs, raised), (its, its_raised) = (

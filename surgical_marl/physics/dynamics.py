@@ -74,6 +74,10 @@ class Dynamics:
         """Return MJX's data with the poses of all bodies, geoms and sites."""
         return self._mjx.kinematics(self.model, self._data.replace(qpos=qpos))
 
+    def axes(self, qpos: Array) -> Any:
+        """Return MJX's data with the axes of all joints, beside the poses."""
+        return self._mjx.com_pos(self.model, self.pose(qpos))
+
     def forces(self, physics: Physics) -> Forces:
         """Compute all of `mjx.forward` except collision and solver."""
         qpos, qvel, warmstart, ctrl, _ = physics

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import Array
 from jax.lax.linalg import triangular_solve
 
-from surgical_marl.physics.factor import cholesky
+from surgical_marl.physics.factor import cholesky, packed
 
 
 class Eliminated(NamedTuple):
@@ -27,7 +27,7 @@ def apart(own: Array, force: Array, coupling: Array, coupled: Array) -> Eliminat
     """Return what is left of objects of which no two touch.
 
     Args:
-        own: each object's block, [k, 6, 6].
+        own: the lower half of each object's block, [k, 21].
         force: forces on the objects, [k, 6].
         coupling: how they fall with the acceleration of arms, [k, a, 6, m].
         coupled: which objects touch an arm, [k].
@@ -35,7 +35,7 @@ def apart(own: Array, force: Array, coupling: Array, coupled: Array) -> Eliminat
 
     def one(row: Any) -> Any:
         own, force, coupling, coupled = row
-        factor = cholesky(own)
+        factor = cholesky(own[packed(6)])
         wide = coupling
         if coupling.size:
             divided = lambda coupling: _on_arms(factor, coupling)  # noqa: E731
@@ -61,7 +61,8 @@ def ways_apart(found: Eliminated, arms: Array, coupled: Array) -> Array:
 def touching(blocks: Array, force: Array, coupling: Array) -> Eliminated:
     """Return what is left of objects of which some touch each other.
 
-    Arguments are those of `apart`, but `blocks` [k, k, 6, 6]: those of an object with each one. What is 0 costs little.
+    Arguments are those of `apart`, but `blocks` [k, k, 6, 6] are whole: those of an object with each one. What is 0
+    costs little.
 
     A row of blocks is kept as columns of six: those of all objects, the force, and those of all arms. All rows are one
     array, [k * columns * 6], and what works on a column is in a loop: so the code is the same for any number of them.

@@ -1,13 +1,22 @@
-"""The Cholesky factor of what is positive definite, but for float32."""
+"""Symmetric matrices: their lower halves, and the Cholesky factor of what is positive definite but for float32."""
 
 from __future__ import annotations
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 LEAST = 1e-7
 """Least pivot, as a share of the element of the diagonal that it is left of. What is smaller is rounding: of a light
 object in a stiff contact, the eigenvalues lie a million times apart."""
+
+
+def packed(n: int) -> np.ndarray:
+    """Return where each element of a symmetric matrix [n, n] is among those of its lower half, row by row."""
+    places = np.zeros((n, n), int)
+    rows, columns = np.tril_indices(n)
+    places[rows, columns] = places[columns, rows] = np.arange(len(rows))
+    return places
 
 
 def cholesky(matrix: Array) -> Array:

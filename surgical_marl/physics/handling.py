@@ -15,7 +15,7 @@ from surgical_marl.physics.newton import Newton
 from surgical_marl.physics.patches import AWAY, Patch
 from surgical_marl.physics.placed import Joints
 from surgical_marl.physics.problem import SLIPS, Contact, Pressed
-from surgical_marl.physics.rows import filled, row_of, stored
+from surgical_marl.physics.rows import filled, put, row_of
 from surgical_marl.physics.tables import Tables
 from surgical_marl.physics.touching import AHEAD, MARGIN, Slots
 
@@ -86,14 +86,12 @@ class Felt(NamedTuple):
 
 
 class _Speeds(NamedTuple):
-    """Velocities, in memory."""
+    """Velocities."""
 
     joints: Array
     """Of arms, [a, m]."""
     objects: Array
     """[k, 6]"""
-    bends: Array | None
-    """What `Joints.bends` returns; None without arms."""
 
 
 class _Motion(NamedTuple):
@@ -116,22 +114,14 @@ class Handling:
     def __init__(self, tables: Tables, newton: Newton) -> None:
         self.tables, self._newton = tables, newton
 
-    def fingers(self, data: Any) -> Fingers:
-        """Return the frames of all fingers, in memory, from MJX's data with poses."""
-        bodies = self.tables.bodies["pads"]
-        axes = data.xmat[bodies]
-        return stored(Fingers(data.xpos[bodies], axes, jax.vmap(_quaternion)(axes)))
-
     def feel(
         self, slots: Slots, joints: Joints | None, fingers: Fingers | None, qvel: Array, bodies: Bodies, grips: Grips,
         dt: Any,
     ) -> Felt:  # fmt: skip
         """Return how the patches that were found resist. There are neither joints nor fingers without arms."""
-        joint_speeds = self._newton.by_arm(qvel)
-        bends = None if joints is None else joints.bends(self.tables, joint_speeds)
-        speeds = _Speeds(joint_speeds, self._newton.by_object(bodies.velocity), bends)
+        speeds = _Speeds(self._newton.by_arm(qvel), self._newton.by_object(bodies.velocity))
         at = self._newton.by_object(bodies.position), self._newton.by_object(bodies.quaternion)
-        grips = stored(grips)
+        grips = grips
 
         def felt(n: Array) -> Felt:
             patch, number = row_of(slots.patch, n), slots.number[n]
@@ -202,12 +192,9 @@ class Handling:
         if t.count > 1:
             spin = speeds.objects[contact.second][3:]
             bends -= jnp.cross(spin, jnp.cross(spin, places - contact.offset))
-        if t.arms and speeds.bends is not None:
-            sign = jnp.asarray(t.sign)[number]
-            moving, turning = jnp.split(contact.jacobian @ speeds.joints.at[contact.arm].get(mode="clip"), 2)
-            own = jnp.asarray(t.pulls)[number] @ speeds.bends.at[contact.arm].get(mode="clip")
-            straight = own[:3] + jnp.cross(own[3:], origin + places)
-            bends += straight + sign * jnp.cross(turning, moving + jnp.cross(turning, places))
+        if len(speeds.joints):
+            columns = contact.jacobian * speeds.joints.at[contact.arm].get(mode="clip")
+            bends += jnp.asarray(t.sign)[number] * _bends(columns, places)
         return _Motion(twist, bends)
 
     def _finger(self, number: Array) -> Array:
@@ -247,7 +234,7 @@ class Handling:
         t, k = self.tables, len(bodies.position)
         if not t.grip:
             return grips
-        old = stored(grips)
+        old = grips
         moves = self._newton.by_arm(shift[0]), self._newton.by_object(shift[1])
         at = self._newton.by_object(bodies.position), self._newton.by_object(bodies.quaternion)
         normal = jnp.zeros((k, len(t.fingers), 3))
@@ -263,8 +250,10 @@ class Handling:
                 own = old._replace(**{name: getattr(old, name)[place] for name in OF_FINGERS})
                 pose = at[0][contact.first], at[1][contact.first]
                 new = self._kept(patch, number, forces, after, row_of(fingers, f), pose, own)
-                found = {name: getattr(kept[0], name).at[place].set(y) for name, y in zip(OF_FINGERS, new, strict=True)}
-                return kept[0]._replace(**found), kept[1].at[place].set(patch.frame[0])
+                found = put(tuple(getattr(kept[0], name) for name in OF_FINGERS), place, new)
+                return kept[0]._replace(**dict(zip(OF_FINGERS, found, strict=True))), put(
+                    kept[1], place, patch.frame[0]
+                )
 
             return jax.lax.cond(f < len(t.fingers), note, lambda kept: kept, kept)
 
@@ -308,9 +297,29 @@ class Handling:
         return held
 
 
-def _quaternion(axes: Array) -> Array:
+def _bends(columns: Array, places: Array) -> Array:
+    """Return the acceleration of places on a link whose joints do not accelerate, m/s2, [n, 3].
+
+    `columns` [6, m] are the twists that its joints, one after the other, give it about the origin of the places: each
+    joint is moved by those before it (R. Featherstone, "Rigid Body Dynamics Algorithms", 2008, section 2.8).
+    """
+    moving, turning = columns[:3].T, columns[3:].T
+    lift = spin = straight = curved = jnp.zeros(3)
+    for move, turn_ in zip(moving, turning, strict=True):
+        straight = straight + jnp.cross(spin, move) + jnp.cross(lift, turn_)
+        curved = curved + jnp.cross(spin, turn_)
+        lift, spin = lift + move, spin + turn_
+    straight = straight + jnp.cross(spin, lift)
+    return straight + jnp.cross(curved, places) + jnp.cross(spin, jnp.cross(spin, places))
+
+
+def fingers_of(position: Array, axes: Array) -> Fingers:
+    """Return the frames of fingers by their positions [f, 3] and axes [f, 3, 3]."""
+    return Fingers(position, axes, jax.lax.map(_quaternion, axes))
+
+
+def _quaternion(m: Array) -> Array:
     """Return the quaternion of a rotation matrix [3, 3]."""
-    m = axes
     trace = m[0, 0] + m[1, 1] + m[2, 2]
     sizes = jnp.stack([trace, m[0, 0], m[1, 1], m[2, 2]])
     a, b, c = m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]

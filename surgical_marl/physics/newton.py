@@ -16,12 +16,12 @@ import numpy as np
 from jax import Array
 
 from surgical_marl.physics import elimination
-from surgical_marl.physics.arms import Arms, Reduced
-from surgical_marl.physics.cone import Cone, Forces, between, curvature, fall, forces, nearest, wrench
-from surgical_marl.physics.problem import SLIPS, Contact, Point, Pressed, Problem, Solution, not_pressed
-from surgical_marl.physics.rows import filled, row_of, stored
+from surgical_marl.physics.arms import Arms, Left
+from surgical_marl.physics.cone import Cone, Forces, between, curvature, fall, forces, wrench
+from surgical_marl.physics.factor import packed
+from surgical_marl.physics.problem import SLIPS, Contact, Point, Pressed, Problem, Solution
+from surgical_marl.physics.rows import add, put, room, row_of
 from surgical_marl.physics.search import search
-from surgical_marl.physics.solver import Rows, row_forces
 
 PASSES = 12
 """Newton steps at most. A GPU waits for the last one of its environments (docs/physics.md)."""
@@ -34,30 +34,33 @@ TOLERANCE = 1e-2
 """Change of friction in a Newton step, as a share of the normal force, at which sliding contacts have converged."""
 
 
-class _Line(NamedTuple):
-    """A contact along a way."""
+class _Seen(NamedTuple):
+    """The forces of contacts at a point, and how they differ from those at the point where a Newton step began."""
 
-    push: Array
-    """Normal forces that stick, at the beginning, N, [s]; friction likewise, `pull` [3]."""
-    pull: Array
-    normal: Array
-    """Acceleration along the normals per length of the way, [s]; along the surface, `along` [3]."""
-    along: Array
+    pressed: Pressed
+    """[s]"""
+    same: Array
+    """Whether each contact is on the same side, [] bool."""
+    turned: Array
+    """Whether friction has changed of any that slips, [] bool."""
 
 
 class _Local(NamedTuple):
     """Sums over contacts: forces, and by how much they fall with the acceleration."""
 
-    arm_excess: Array
+    arm_force: Array
     """[a, m]"""
     arm: Array
-    """[a, m, m]"""
-    excess: Array
-    """[k, 6]"""
+    """Lower halves, [a, m (m + 1) / 2]."""
+    force: Array
+    """With the rest of what an object's acceleration takes, [k, 6]."""
     object: Array
-    """[k, 6, 6]; if there are several objects, each with each one, [k, k, 6, 6]."""
+    """Lower halves, [k, 21]; if there are several objects, each with each one, [k, k, 6, 6]."""
     coupling: Array
     """[k, a, 6, m]"""
+
+
+_WHOLE = packed(6)
 
 
 class Newton:
@@ -68,7 +71,6 @@ class Newton:
 
     def __init__(self, dofs: np.ndarray, joints: int, objects: int) -> None:
         self._dofs, self._objects, self._arms = dofs, objects, Arms(dofs, joints)
-        self._own = [np.flatnonzero(row < joints) for row in dofs]
 
     def twist(self, contact: Contact, arms: Array, objects: Array) -> Array:
         """Return the twist [6] of a contact by motions of arms (`by_arm`) and of objects (`by_object`)."""
@@ -82,120 +84,99 @@ class Newton:
         return twist
 
     def by_arm(self, joints: Array) -> Array:
-        """Return what belongs to the joints [n] of all arms by arm, in memory, [a, m]; 0 for joints that are not."""
-        return stored(jnp.append(joints, 0.0)[np.minimum(self._dofs, len(joints))])
+        """Return what belongs to the joints [n] of all arms by arm, [a, m]; 0 for joints that are not."""
+        return jnp.append(joints, 0.0)[np.minimum(self._dofs, len(joints))]
 
     def by_object(self, each: Array) -> Array:
-        """Return what belongs to objects [k, ...], and 0 for the one that stands for none, in memory, [k + 1, ...]."""
-        return stored(_with_none(each))
+        """Return what belongs to objects [k, ...], and 0 for the one that stands for none, [k + 1, ...]."""
+        return _with_none(each)
 
     def solve(self, problem: Problem, arms: Array, objects: Array) -> Solution:
-        """Return the accelerations and forces, beginning with accelerations of arms [n] and objects [k, 6]."""
-        slots, no = len(problem.contacts.arm), jnp.bool_(False)
-        pressed = not_pressed(slots)._replace(sides=jnp.full(slots, -1, jnp.int32))
-        state = Point(arms, objects), pressed, self._sides(problem, arms), no, no, jnp.int32(0)
+        """Return the accelerations and forces, beginning with accelerations of arms [a, m] and objects [k, 6]."""
+        shape = jax.eval_shape(lambda: Pressed(jnp.float32(0.0), jnp.zeros(3), jnp.int32(0)))
+        state = Point(arms, objects), room(shape, len(problem.contacts.arm)), jnp.bool_(False), jnp.int32(0)
 
         def going(state: Any) -> Array:
             settled, count = state[-2:]
             return ~settled & (count < PASSES)
 
         def iterate(state: Any) -> Any:
-            here, before, sides, whole, _, count = state
-            local, pressed = self._contacts(problem, here)
-            excess, felt = self._excess(problem, here, local)
-            new_sides = self._sides(problem, here.arms)
-            same = whole & (pressed.sides == before.sides).all() & (new_sides == sides).all()
-            turned = jnp.sum((pressed.friction - before.friction) ** 2, -1) > TOLERANCE**2 * pressed.normal**2
-            settled = same & ~(turned & (pressed.sides >= SLIPS)).any()
+            here, pressed, _, count = state
+            local, pressed = self._contacts(problem, here, pressed)
+            way = self._direction(problem, here, pressed, local)
+            begin, slope, growth = self._arms.slopes(problem, here.arms, way.arms, local.arm_force)
+            begin -= jnp.sum(local.force * way.objects)
+            inertia = problem.masses @ jnp.stack([here.objects - problem.free, way.objects], -1)
+            of_objects = jnp.sum(way.objects[..., None] * inertia, (0, 1))
+            slope, growth = slope + of_objects[0], growth + of_objects[1]
+            seen = _Seen(pressed, jnp.bool_(True), jnp.bool_(False))
+            found = search(begin, LEAST, self._measure(problem, here, way, slope, growth), seen)
+            there = jax.tree.map(lambda x, step: x + found.length * step, here, way)
+            settled = (found.looks < 2) & found.seen.same & ~found.seen.turned
+            if len(problem.between.low):
+                settled &= (self._sides(problem, here.arms) == self._sides(problem, there.arms)).all()
+            return there, found.seen.pressed, settled | (found.looks == 0), count + 1
 
-            def on(here: Point) -> Any:
-                way = self._direction(problem, here, pressed, excess, local, felt)
-                slope = -_dot(self._whole(problem, here, excess), way)
-                last = -slope <= LEAST
-                searched = lambda _: search(slope, self._line(problem, here, way))  # noqa: E731
-                length = jax.lax.cond(last, lambda _: jnp.float32(1.0), searched, None)
-                there = jax.tree.map(lambda x, step: x + length * step, here, way)
-                return there, length == 1, last
+        here, pressed, _, _ = jax.lax.while_loop(going, iterate, state)
+        return Solution(here.arms, here.objects, pressed, self._arms.between(problem, here.arms))
 
-            stay = lambda here: (here, whole, settled)  # noqa: E731
-            here, whole, settled = jax.lax.cond(settled, stay, on, here)
-            return here, pressed, new_sides, whole, settled, count + 1
-
-        here, pressed, _, _, _, count = jax.lax.while_loop(going, iterate, state)
-        return Solution(here.arms, here.objects, pressed, row_forces(problem.between, here.arms), count)
-
-    def _line(self, problem: Problem, here: Point, way: Point) -> Callable[[Array], tuple[Array, Array]]:
+    def _measure(
+        self, problem: Problem, here: Point, way: Point, slope: Array, growth: Array
+    ) -> Callable[[Array, _Seen], tuple[Array, Array, _Seen]]:
         """Return what measures the slope of the cost at a length of a way, and by how much it grows per length.
 
-        What all lengths have in common is computed once: the speeds of contacts along the way, and of rows.
+        It also notes the forces of contacts there. `slope` and `growth` are those at the beginning, without contacts,
+        friction and limits.
         """
-        arms, objects = self.by_arm(here.arms), self.by_object(here.objects)
-        arms_way, objects_way = self.by_arm(way.arms), self.by_object(way.objects)
+        arms, objects = here.arms, self.by_object(here.objects)
+        arms_way, objects_way = way.arms, self.by_object(way.objects)
 
-        def line(n: Array) -> _Line:
-            contact = row_of(problem.contacts, n)
-            cone, at, by = contact.cone, self.twist(contact, arms, objects), self.twist(contact, arms_way, objects_way)
-            push, pull = cone.push - cone.stiff * (cone.normal @ at), cone.pull - cone.rub * (cone.along @ at)
-            return _Line(push, pull, cone.normal @ by, cone.along @ by)
+        def measure(length: Array, seen: _Seen) -> tuple[Array, Array, _Seen]:
+            def look(n: Array, state: tuple[Array, Array, _Seen]) -> tuple[Array, Array, _Seen]:
+                contact, before = row_of((problem.contacts, state[2].pressed), n)
+                cone, by = contact.cone, self.twist(contact, arms_way, objects_way)
+                felt = forces(cone, self.twist(contact, arms, objects) + length * by)
+                own, normal, along = _pressed(felt), cone.normal @ by, cone.along @ by
+                slope = state[0] - felt.normal @ normal - felt.friction @ along
+                change = jnp.sum((own.friction - before.friction) ** 2) > TOLERANCE**2 * own.normal**2
+                same = state[2].same & (own.sides == before.sides)
+                seen = _Seen(put(state[2].pressed, n, own), same, state[2].turned | (change & felt.slips))
+                return slope, state[1] + fall(cone, felt, normal, along), seen
 
-        lines = filled(line, problem.total, len(problem.contacts.arm))
-        inertia = problem.masses @ jnp.stack([problem.free - here.objects, way.objects], -1)
-        power, growth = jnp.sum(way.objects[..., None] * inertia, (0, 1))
-        rows = [_along(own, here.arms, way.arms) for own in (problem.rows, problem.between) if len(own.low)]
-        if len(way.arms):
-            power += way.arms @ (problem.smooth - problem.mass @ here.arms)
-            growth += way.arms @ (problem.mass @ way.arms)
-
-        def measure(length: Array) -> tuple[Array, Array]:
-            def add(n: Array, sums: tuple[Array, Array]) -> tuple[Array, Array]:
-                own, cone = row_of(lines, n), row_of(problem.contacts.cone, n)
-                push, pull = own.push - length * cone.stiff * own.normal, own.pull - length * cone.rub * own.along
-                felt = nearest(cone, push, pull)
-                power = felt.normal @ own.normal + felt.friction @ own.along
-                return sums[0] - power, sums[1] + fall(cone, felt, own.normal, own.along)
-
-            slope, grows = jax.lax.fori_loop(0, problem.total, add, (length * growth - power, growth))
-            for at, by, along, low, high in rows:
-                force = at - length * by
-                slope -= along @ jnp.clip(force, low, high)
-                grows += along @ jnp.where((force > low) & (force < high), by, 0.0)
-            return slope, grows
+            resists, gives = self._arms.resisted(problem, arms, arms_way, length)
+            start = slope + length * growth + resists, growth + gives, seen
+            return jax.lax.fori_loop(0, problem.total, look, start)
 
         return measure
 
     # -- forces at a point
 
-    def _contacts(self, problem: Problem, point: Point) -> tuple[_Local, Pressed]:
-        """Return sums over all contacts, and their forces."""
+    def _contacts(self, problem: Problem, point: Point, pressed: Pressed) -> tuple[_Local, Pressed]:
+        """Return sums over all contacts, and their forces, in the place of those before."""
         k, (a, m) = self._objects, self._dofs.shape
-        arms, objects = self.by_arm(point.arms), self.by_object(point.objects)
+        objects = self.by_object(point.objects)
         inertia = (problem.masses @ (problem.free - point.objects)[..., None])[..., 0]
         none = _Local(
             jnp.zeros((a, m)),
-            jnp.zeros((a, m, m)),
+            jnp.zeros((a, m * (m + 1) // 2)),
             _with_none(inertia),
             self._masses(problem),
             jnp.zeros((k + 1, a, 6, m)),
         )
 
         def one(n: Array, sums: tuple[_Local, Pressed]) -> tuple[_Local, Pressed]:
-            local, pressed = sums
             contact = row_of(problem.contacts, n)
-            found = forces(contact.cone, self.twist(contact, arms, objects))
-            bits = jnp.where(found.normal > 0, 1 << np.arange(len(found.normal), dtype=np.int32), 0)
-            sides = jnp.sum(bits) + jnp.where(found.slips, SLIPS, 0)
-            own = Pressed(jnp.sum(found.normal), found.friction, sides)
-            pressed = jax.tree.map(lambda all_, x: all_.at[n].set(x), pressed, own)
-            return self._add(local, contact, found), pressed
+            found = forces(contact.cone, self.twist(contact, point.arms, objects))
+            return self._add(sums[0], contact, found), put(sums[1], n, _pressed(found))
 
-        local, pressed = jax.lax.fori_loop(0, problem.total, one, (none, not_pressed(len(problem.contacts.arm))))
+        local, pressed = jax.lax.fori_loop(0, problem.total, one, (none, pressed))
         own = local.object[:k] if k < 2 else local.object.reshape(k + 1, k + 1, 6, 6)[:k, :k]
-        return local._replace(excess=local.excess[:k], object=own, coupling=local.coupling[:k]), pressed
+        return local._replace(force=local.force[:k], object=own, coupling=local.coupling[:k]), pressed
 
     def _masses(self, problem: Problem) -> Array:
         """Return the blocks of masses alone, as `_add` adds to them, with those of no object."""
         if self._objects < 2:
-            return _with_none(problem.masses)
+            return _with_none(problem.masses[:, *np.tril_indices(6)])
 
         def note(blocks: Array, row: tuple[Array, Array]) -> tuple[Array, None]:
             return self._grown(blocks, row[0], row[0], row[1]), None
@@ -204,9 +185,7 @@ class Newton:
         return jax.lax.scan(note, none, (jnp.arange(self._objects), problem.masses))[0]
 
     def _grown(self, blocks: Array, first: Array, second: Array, block: Array) -> Array:
-        """Return blocks with more [6, 6] of two objects. Those of several objects are one array in memory."""
-        if self._objects < 2:
-            return blocks.at[first].add(block)
+        """Return blocks of several objects, one array in memory, with more [6, 6] of two of them."""
         at = (36 * ((self._objects + 1) * first + second),)
         more = jax.lax.dynamic_slice(blocks, at, (36,)) + block.ravel()
         return jax.lax.dynamic_update_slice(blocks, more, at)
@@ -218,92 +197,66 @@ class Newton:
         if self._objects > 1:
 
             def on_other(parts: tuple[Array, Array]) -> tuple[Array, Array]:
-                both = jax.tree.map(lambda *x: stored(jnp.stack(x)), cone, _moved_cone(contact))
+                both = jax.tree.map(lambda *x: jnp.stack(x), cone, _moved_cone(contact))
                 bodies = jnp.stack([first, second])
 
-                def add(blocks: Array, pair: Array) -> tuple[Array, None]:
+                def couple(blocks: Array, pair: Array) -> tuple[Array, None]:
                     block = between(row_of(both, pair[0]), row_of(both, pair[1]), felt)
                     return self._grown(blocks, bodies[pair[0]], bodies[pair[1]], block), None
 
-                pulled = parts[0].at[second].add(wrench(row_of(both, 1), felt))
-                return pulled, jax.lax.scan(add, parts[1], jnp.asarray(_OTHERS))[0]
+                pulled = add(parts[0], second, wrench(row_of(both, 1), felt))
+                return pulled, jax.lax.scan(couple, parts[1], jnp.asarray(_OTHERS))[0]
 
             touches = second < self._objects
-            parts = jax.lax.cond(touches, on_other, lambda parts: parts, (local.excess, local.object))
-            local = local._replace(excess=parts[0], object=parts[1])
-        grown = self._grown(local.object, first, first, stiff)
-        local = local._replace(excess=local.excess.at[first].add(pull), object=grown)
+            parts = jax.lax.cond(touches, on_other, lambda parts: parts, (local.force, local.object))
+            local = local._replace(force=parts[0], object=parts[1])
+        whole, one = stiff[_WHOLE], local.object
+        one = add(one, first, stiff) if self._objects < 2 else self._grown(one, first, first, whole)
+        local = local._replace(force=add(local.force, first, pull), object=one)
         if not len(self._dofs):
             return local
 
         def on_arm(local: _Local) -> _Local:
             arm, jacobian = contact.arm, contact.jacobian
-            half = stiff @ jacobian
+            half = whole @ jacobian
+            first_joint, second_joint = np.tril_indices(jacobian.shape[1])
             return local._replace(
-                arm_excess=local.arm_excess.at[arm].add(jacobian.T @ pull),
-                arm=local.arm.at[arm].add(jacobian.T @ half),
-                coupling=local.coupling.at[first, arm].add(half),
+                arm_force=add(local.arm_force, arm, jacobian.T @ pull),
+                arm=add(local.arm, arm, jnp.sum(jacobian[:, first_joint] * half[:, second_joint], 0)),
+                coupling=add(local.coupling, (first, arm), half),
             )
 
         return jax.lax.cond(contact.arm < len(self._dofs), on_arm, lambda local: local, local)
 
-    def _excess(self, problem: Problem, point: Point, local: _Local) -> tuple[Point, Array]:
-        """Return the forces that are left over, but for joints' rows, and how those on arms fall, [n, n]."""
-        if not len(point.arms):
-            return Point(point.arms, local.excess), problem.mass
-        excess, stiff = problem.smooth - problem.mass @ point.arms, problem.mass
-        for arm, own in enumerate(self._own):
-            dofs = self._dofs[arm, own]
-            excess = excess.at[dofs].add(local.arm_excess[arm, own])
-            stiff = stiff.at[np.ix_(dofs, dofs)].add(local.arm[arm][np.ix_(own, own)])
-
-        def press(total: tuple[Array, Array], row: Rows) -> tuple[tuple[Array, Array], None]:
-            force = jnp.maximum(row.impedance * (row.reference - row.jacobian @ point.arms), 0.0)
-            whole = jnp.where(force > 0, row.impedance, 0.0) * row.jacobian
-            return (total[0] + force * row.jacobian, total[1] + whole[:, None] * row.jacobian), None
-
-        if len(problem.between.low):
-            with_rows = lambda total: jax.lax.scan(press, total, problem.between)[0]  # noqa: E731
-            presses = self._sides(problem, point.arms).any()
-            excess, stiff = jax.lax.cond(presses, with_rows, lambda total: total, (excess, stiff))
-        return Point(excess, local.excess), stiff
-
-    def _whole(self, problem: Problem, point: Point, excess: Point) -> Point:
-        """Return the forces that are left over, with those of joints' rows."""
-        rows = problem.rows
-        return excess._replace(arms=excess.arms + rows.jacobian.T @ row_forces(rows, point.arms))
-
-    def _sides(self, problem: Problem, arms: Array) -> Array:
-        """Return which contacts of arms with arms press, [r] bool."""
-        rows = problem.between
-        return rows.reference - rows.jacobian @ arms > 0
-
     # -- the way from there
 
-    def _direction(
-        self, problem: Problem, here: Point, pressed: Pressed, excess: Point, local: _Local, stiff: Array
-    ) -> Point:
+    def _direction(self, problem: Problem, here: Point, pressed: Pressed, local: _Local) -> Point:
         """Return the way to the least cost if contacts are linear functions; friction and limits of joints are not.
 
         Objects are eliminated, arms solved, each alone if nothing joins them, and objects found from them.
         """
         touched, linked = self._touched(problem), jnp.bool_(False)
         if self._objects > 1:
-            linked = ((problem.contacts.second < self._objects) & (pressed.normal > 0)).any()
-            gone = elimination.touching(local.object, local.excess, local.coupling)
+            there = np.arange(len(pressed.normal)) < problem.total
+            linked = (there & (problem.contacts.second < self._objects) & (pressed.normal > 0)).any()
+            gone = elimination.touching(local.object, local.force, local.coupling)
         else:
-            gone = elimination.apart(local.object, local.excess, local.coupling, touched.any(1))
-        found = excess.arms
+            gone = elimination.apart(local.object, local.force, local.coupling, touched.any(1))
+        found = here.arms
         if len(self._dofs):
             on = touched | (linked & touched.any(0))  # what an object touches moves those that it touches
-            left = Reduced(stiff, excess.arms, here.arms, problem.rows, problem.joints, gone.half, gone.wide, on)
+            left = Left(local.arm, local.arm_force, gone.half, gone.wide, on)
             joined = (on.sum(1) > 1).any() | self._sides(problem, here.arms).any()
-            each, several = self._arms.each, len(self._dofs) > 1
-            found = jax.lax.cond(joined, self._arms.together, each, left) if several else each(left)
-        by_arm = self.by_arm(found)
+            each = lambda left: self._arms.each(problem, here.arms, left)  # noqa: E731
+            together = lambda left: self._arms.together(problem, here.arms, left)  # noqa: E731
+            found = jax.lax.cond(joined, together, each, left) if len(self._dofs) > 1 else each(left)
         if self._objects > 1:
-            return Point(found, elimination.ways_touching(gone, by_arm))
-        return Point(found, elimination.ways_apart(gone, by_arm, touched.any(1)))
+            return Point(found, elimination.ways_touching(gone, found))
+        return Point(found, elimination.ways_apart(gone, found, touched.any(1)))
+
+    def _sides(self, problem: Problem, arms: Array) -> Array:
+        """Return which contacts of arms with arms press, [r] bool."""
+        return self._arms.between(problem, arms) > 0
 
     def _touched(self, problem: Problem) -> Array:
         """Return which objects touch which arms, [k, a]."""
@@ -318,14 +271,10 @@ def _with_none(each: Array) -> Array:
     return jnp.concatenate([each, jnp.zeros((1, *each.shape[1:]))])
 
 
-def _along(rows: Rows, arms: Array, way: Array) -> tuple[Array, ...]:
-    """Return forces of rows without bounds, by how much they fall per length of a way, its speeds, and the bounds."""
-    along = rows.jacobian @ way
-    return rows.impedance * (rows.reference - rows.jacobian @ arms), rows.impedance * along, along, rows.low, rows.high
-
-
-def _dot(one: Point, other: Point) -> Array:
-    return jnp.sum(one.arms * other.arms) + jnp.sum(one.objects * other.objects)
+def _pressed(felt: Forces) -> Pressed:
+    """Return what is kept of the forces of a contact."""
+    bits = jnp.where(felt.normal > 0, 1 << np.arange(len(felt.normal), dtype=np.int32), 0)
+    return Pressed(jnp.sum(felt.normal), felt.friction, jnp.sum(bits) + jnp.where(felt.slips, SLIPS, 0))
 
 
 def _moved_to(twist: Array, offset: Array) -> Array:

@@ -11,6 +11,7 @@ manipulation", 1996).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -18,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from surgical_marl.physics.rows import row_of
+from surgical_marl.physics.rows import put, room, row_of
 from surgical_marl.physics.shapes import Points
 
 POINTS = 4
@@ -65,32 +66,78 @@ class Patch(NamedTuple):
 
 
 def find_patch(
-    points: Points, soon: Array, count: Any, axes: Array, tilt: float, torsion: Array, centre: Array | None = None
-) -> Patch:
+    look: Callable[[Array], tuple[Points, Array]], count: Any, rows: int, middle: Array, axes: Array, tilt: float,
+    torsion: Array, centre: Array | None = None,
+) -> Patch:  # fmt: skip
     """Return the patch of a pair of bodies.
 
     Args:
-        points: all points at which their shapes may touch, [c, d]: d for each of c shapes.
-        soon: their depths after a step with the velocities of now, [c, d]. A point counts by the larger one of both
-            depths, so that no part of a fast object comes in unseen.
-        count: how many of the c shapes there are, []; without any, the patch is nothing.
+        look: from the number of a shape to all points at which it may touch, [d], and their depths after a step with
+            the velocities of now, [d]. A point counts by the larger one of both depths, so that no part of a fast
+            object comes in unseen.
+        count: how many shapes there are, []; without any, the patch is nothing.
+        rows: how many there may be.
+        middle: a place near the points, from which they are measured, [3].
         axes: two directions, [2, 3]: bodies are tilted about those across them.
         tilt: by how much, rad.
         torsion: radius of the contact at a point, m, [].
         centre: where the weight of one of the bodies acts, [3]. The deepest point is then looked for under a slight
             tilt of this body if the other three do not bear its weight. None: under no tilt.
     """
-    middle = points.place[0, 0]
-    rims, limits = tilt * jnp.asarray(_TILTS) @ axes, np.full(len(_TILTS), ALIKE, np.float32)
+    rims = _Tilts(tilt * jnp.asarray(_TILTS) @ axes, np.full(len(_TILTS), ALIKE, np.float32), middle)
     if centre is None:
-        tilts = jnp.concatenate([jnp.zeros((1, 3)), rims])
-        chosen, reach = _supports(points, soon, count, middle, tilts, np.append(np.float32(-AWAY), limits))
-        return _with_frame(chosen, torsion, reach)
-    rim, reach = _supports(points, soon, count, middle, rims, limits)
+        tilts = _Tilts(jnp.pad(rims.by, ((1, 0), (0, 0))), np.append(np.float32(-AWAY), rims.limits), middle)
+        points, most, reach = _seen(look, count, rows, tilts)
+        return _with_frame(_supports(points, count, tilts, most), torsion, reach)
+    points, most, reach = _seen(look, count, rows, rims)
+    rim = _supports(points, count, rims, most)
     lean = LEAN * _beyond(axes @ centre, rim.place @ axes.T) @ axes
-    deepest, _ = _supports(points, soon, count, middle, lean[None], np.full(1, -AWAY, np.float32))
+    leant = _Tilts(lean[None], np.full(1, -AWAY, np.float32), middle)
+    find = lambda n, most: jnp.maximum(most, leant.deepest(*row_of(points, n)))  # noqa: E731
+    deepest = _supports(points, count, leant, jax.lax.fori_loop(0, count, find, jnp.full(1, 2 * AWAY)))
     chosen = Points(*(jnp.concatenate(parts) for parts in zip(deepest, rim, strict=True)))
     return _with_frame(chosen, torsion, reach)
+
+
+class _Tilts(NamedTuple):
+    """Ways to tilt one of two bodies, p of them."""
+
+    by: Array
+    """How fast a place comes nearer, by how far it is from the middle, [p, 3]."""
+    limits: Any
+    """Depths beyond these count as these, m, [p]."""
+    middle: Array
+    """[3]"""
+
+    def depths(self, points: Points, soon: Array) -> Array:
+        """Return the depths of points [d], tilted, [d, p]."""
+        depth = jnp.minimum(jnp.maximum(points.depth, soon)[:, None], self.limits)
+        return depth + (points.place - self.middle) @ self.by.T
+
+    def deepest(self, points: Points, soon: Array) -> Array:
+        """Return the largest of these depths, m, [p]."""
+        return jnp.max(self.depths(points, soon), 0)
+
+
+def _seen(
+    look: Callable[[Array], tuple[Points, Array]], count: Any, rows: int, tilts: _Tilts
+) -> tuple[tuple[Points, Array], Array, Array]:
+    """Return all points, the largest depth under each tilt, m, [p], and without any, m, []."""
+
+    def see(n: Array, state: Any) -> Any:
+        kept, most, reach = state
+        one = look(n)
+        kept = put(kept, n, one)
+        return (
+            kept,
+            jnp.maximum(most, tilts.deepest(*one)),
+            jnp.maximum(reach, jnp.max(jnp.maximum(one[0].depth, one[1]))),
+        )
+
+    kept = room(jax.eval_shape(lambda: look(jnp.int32(0))), rows)
+    start = kept, jnp.full(len(tilts.by), 2 * AWAY), jnp.float32(2 * AWAY)
+    found: tuple[tuple[Points, Array], Array, Array] = jax.lax.fori_loop(0, count, see, start)
+    return found
 
 
 def _beyond(point: Array, corners: Array) -> Array:
@@ -105,36 +152,19 @@ def _beyond(point: Array, corners: Array) -> Array:
     return jnp.clip((1 + beyond / ASIDE) / 2, 0.0, 1.0) @ out
 
 
-def _supports(
-    points: Points, soon: Array, count: Any, middle: Array, tilts: Array, limits: np.ndarray
-) -> tuple[Points, Array]:
-    """Return the points that are deepest under p tilts, [p], and the largest depth of all without any, m, [].
-
-    Under each tilt depths beyond a limit [p] count as that.
-    """
-
-    def tilted(depth: Array, place: Array, soon: Array) -> Array:
-        """Return the depths of points [d], tilted, [d, p]."""
-        return jnp.minimum(jnp.maximum(depth, soon)[:, None], limits) + (place - middle) @ tilts.T
-
-    def deepest(n: Array, most: tuple[Array, Array]) -> tuple[Array, Array]:
-        one, then = row_of((points, soon), n)
-        under = jnp.max(tilted(one.depth, one.place, then), 0)
-        return jnp.maximum(most[0], under), jnp.maximum(most[1], jnp.max(jnp.maximum(one.depth, then)))
-
-    most, reach = jax.lax.fori_loop(0, count, deepest, (jnp.full(len(tilts), 2 * AWAY), jnp.float32(2 * AWAY)))
+def _supports(points: tuple[Points, Array], count: Any, tilts: _Tilts, most: Array) -> Points:
+    """Return the points that are deepest under p tilts, [p], from all points and the largest depths under each, [p]."""
 
     def add(n: Array, total: tuple[Array, Points]) -> tuple[Array, Points]:
-        one, then = row_of((points, soon), n)
-        weight = jnp.maximum(tilted(one.depth, one.place, then) - most + BLEND, 0.0).T  # [p, d]
-        own = Points(weight @ one.depth, weight @ (one.place - middle), weight @ one.normal)
+        one, then = row_of(points, n)
+        weight = jnp.maximum(tilts.depths(one, then) - most + BLEND, 0.0).T  # [p, d]
+        own = Points(weight @ one.depth, weight @ (one.place - tilts.middle), weight @ one.normal)
         return total[0] + jnp.sum(weight, 1), jax.tree.map(jnp.add, total[1], own)
 
-    zeros = jnp.zeros((len(tilts), 3))
+    zeros = jnp.zeros((len(most), 3))
     weight, found = jax.lax.fori_loop(0, count, add, (zeros[:, 0], Points(zeros[:, 0], zeros, zeros)))
-    return Points(
-        found.depth / weight, middle + found.place / weight[:, None], _unit(found.normal / weight[:, None])
-    ), reach
+    place, normal = found.place / weight[:, None], found.normal / weight[:, None]
+    return Points(found.depth / weight, tilts.middle + place, _unit(normal))
 
 
 def _with_frame(points: Points, torsion: Array, reach: Array) -> Patch:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from surgical_marl.physics.bodies import Bodies, rotation
-from surgical_marl.physics.rows import row_of, stored
+from surgical_marl.physics.rows import row_of
 from surgical_marl.physics.shapes import Plate, Points, Segments, between_segments
 from surgical_marl.physics.tables import Tables
 
@@ -39,22 +39,6 @@ class Joints(NamedTuple):
         """Return the velocity of places [..., 3] and the angular velocity by joint velocity, [..., 3] both."""
         moving = jnp.where(slides[..., None], self.axis, jnp.cross(self.axis, place - self.anchor))
         return moving, jnp.where(slides[..., None], 0.0, self.axis)
-
-    def bends(self, tables: Tables, speeds: Array) -> Array:
-        """Return how each joint's motion at these speeds [a, m] bends with those before it, in memory, [a, m, 6].
-
-        The sum over the joints that move a body is its acceleration without joint accelerations: as a twist about the
-        world's origin, without the part that comes from turning past that origin (R. Featherstone, "Rigid Body Dynamics
-        Algorithms", 2008, section 2.8).
-        """
-
-        def of_arm(row: tuple[Joints, Array, Array, Array]) -> Array:
-            joints, slides, before, speed = row
-            moving, turning = (x * speed[:, None] for x in joints.columns(slides, jnp.zeros(3)))
-            lift, spin = before @ moving, before @ turning
-            return jnp.concatenate([jnp.cross(spin, moving) + jnp.cross(lift, turning), jnp.cross(spin, turning)], -1)
-
-        return jax.lax.map(of_arm, (self, tables.slides, tables.before, speeds))
 
 
 class Ball(NamedTuple):
@@ -92,12 +76,12 @@ class Places:
         self._tables = tables
 
     def joints(self, data: Any) -> Joints:
-        """Return the axes of the arms' joints, in memory, from MJX's data with poses."""
+        """Return the axes of the arms' joints from MJX's data with poses."""
         pad = lambda x: jnp.concatenate([x, jnp.zeros((1, 3))])[self._tables.dofs]  # noqa: E731
-        return stored(Joints(pad(data.xaxis), pad(data.xanchor)))
+        return Joints(pad(data.xaxis), pad(data.xanchor))
 
     def place(self, data: Any, joints: Joints, qvel: Array, bodies: Bodies, dt: Any) -> Placed:
-        """Return where all bodies are, in memory, and how they move in a step of `dt`, s.
+        """Return where all bodies are, and how they move in a step of `dt`, s.
 
         Args:
             data: MJX's data with the poses of the arms.
@@ -108,23 +92,20 @@ class Places:
         """
         t, turn, frames = self._tables, dt * bodies.velocity[:, 3:], rotation(bodies.quaternion)
         axes = jnp.matmul(data.geom_xmat[t.pad_geoms], jnp.asarray(t.pad_axes))
-        pads = Plate(
-            stored(data.geom_xpos[t.pad_geoms]), stored(axes), jnp.asarray(t.pad_half), jnp.asarray(t.pad_radius)
-        )
+        pads = Plate(data.geom_xpos[t.pad_geoms], axes, jnp.asarray(t.pad_half), jnp.asarray(t.pad_radius))
         centre = data.geom_xpos[t.near]
         half = jnp.asarray(t.link_half)[:, None] * data.geom_xmat[t.near][:, :, 2]
-        links = Segments(stored(centre - half), stored(centre + half), jnp.asarray(t.link_radius))
-        ways = {"objects": stored(Way(dt * bodies.velocity[:, :3] - jnp.cross(turn, bodies.position), turn))}
+        links = Segments(centre - half, centre + half, jnp.asarray(t.link_radius))
+        ways = {"objects": Way(dt * bodies.velocity[:, :3] - jnp.cross(turn, bodies.position), turn)}
         moves, columns = dt * jnp.append(qvel, 0.0)[t.dofs], joints.columns(jnp.asarray(t.slides), jnp.zeros(3))
-        by_joint = stored(tuple(column * moves[..., None] for column in columns))
+        by_joint = tuple(column * moves[..., None] for column in columns)
         for kind in t.bodies:
             own = t.arm_of[kind], t.moves[kind]
             ways[kind] = Way(*jax.lax.map(lambda row: _moved(row[0], row[1], by_joint), own))
-        frames = stored(frames)
         around = {"objects": (bodies.position, jnp.asarray(t.bound)), "pads": _around(pads), "links": _around(links)}
         around |= {"plates": _around(t.plates), "rods": _around(t.rods)}
         balls = {kind: _ball(*ball, ways.get(kind)) for kind, ball in around.items()}
-        return Placed(stored(bodies.position), frames, pads, links, ways, balls)
+        return Placed(bodies.position, frames, pads, links, ways, balls)
 
     def capsules(self, placed: Placed, kind: str, i: Array) -> Segments:
         """Return all capsules of one body, [c]; there is one but for objects."""
@@ -188,4 +169,4 @@ def _ball(centre: Any, radius: Any, way: Way | None) -> Ball:
     moves = jnp.zeros(len(centre))
     if way is not None:
         moves = size(way.shift + jnp.cross(way.turn, centre)) + size(way.turn) * radius
-    return stored(Ball(jnp.asarray(centre), jnp.asarray(radius), moves))
+    return Ball(jnp.asarray(centre), jnp.asarray(radius), moves)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
 from jax import Array
 
 from surgical_marl.physics.cone import Cone
@@ -28,18 +27,18 @@ class Contact(NamedTuple):
 
 
 class Problem(NamedTuple):
-    """What is to be solved: n joints of a arms, k objects, s contacts."""
+    """What is to be solved: a arms with m joints each at most, k objects, s contacts."""
 
     mass: Array
-    """Mass matrix of the arms with the implicit parts of other forces, [n, n]."""
+    """Mass matrices of the arms with the implicit parts of other forces, lower halves, [a, m (m + 1) / 2]."""
     smooth: Array
-    """Sum of all other forces on the arms, [n]."""
-    rows: Rows
-    """Friction and limits of joints."""
+    """Sums of all other forces on the arms, [a, m]."""
     joints: JointRows
-    """The same by joint."""
+    """Friction and limits of joints, [a, m]."""
     between: Rows
-    """Contacts of arms with arms."""
+    """Contacts of arms with arms; their Jacobian is [r, a, m]."""
+    overlap: Array
+    """Whether any arms overlap, []: if not, there is nothing in `between`."""
     masses: Array
     """Mass matrices of the objects, [k, 6, 6]."""
     free: Array
@@ -60,27 +59,21 @@ class Pressed(NamedTuple):
     """Which points press, and whether friction slips: bits, [s]."""
 
 
-def not_pressed(slots: int) -> Pressed:
-    """Return the forces of contacts that do not press."""
-    return Pressed(jnp.zeros(slots), jnp.zeros((slots, 3)), jnp.zeros(slots, jnp.int32))
-
-
 SLIPS = 1 << 8
 """The bit of `Pressed.sides` for friction that slips."""
 
 
 class Solution(NamedTuple):
-    """Accelerations of arms [n] and objects [k, 6], forces of contacts and of arms on arms, and passes taken []."""
+    """Accelerations of arms [a, m] and objects [k, 6], forces of contacts and of arms on arms."""
 
     arms: Array
     objects: Array
     pressed: Pressed
     between: Array
-    passes: Array
 
 
 class Point(NamedTuple):
-    """Accelerations of arms [n] and objects [k, 6], or forces on them."""
+    """Accelerations of arms [a, m] and objects [k, 6], or ways between two such points."""
 
     arms: Array
     objects: Array

@@ -15,15 +15,25 @@ def row_of(tree: Any, i: Array | int) -> Any:
     return jax.tree.map(lambda x: x[i], tree)
 
 
-def stored(tree: Any) -> Any:
-    """Return the same arrays: the fused engine keeps what a loop has written in memory, where it can be looked up."""
-    return jax.lax.map(lambda row: row, tree)
+def put(tree: Any, i: Any, row: Any) -> Any:
+    """Return the arrays of a tree with another row: at a number, or at one for each of the first axes, within them."""
+    return jax.tree.map(lambda x, own: x.at[i].set(own, mode="promise_in_bounds"), tree, row)
+
+
+def add(tree: Any, i: Any, row: Any) -> Any:
+    """Return the arrays of a tree with more in one row, as `put` does."""
+    return jax.tree.map(lambda x, own: x.at[i].add(own, mode="promise_in_bounds"), tree, row)
+
+
+def absent(tree: Any) -> Any:
+    """Return arrays like those of a tree. They hold nothing that may be read before it is written; a number is 0."""
+    empty = getattr(jax.lax, "empty", jnp.zeros)  # JAX before 0.7 has no other
+    return jax.tree.map(lambda x: (empty if x.shape else jnp.zeros)(x.shape, x.dtype), tree)
 
 
 def room(tree: Any, rows: int) -> Any:
-    """Return arrays for `rows` trees like this one. They hold nothing that may be read before it is written."""
-    empty = getattr(jax.lax, "empty", jnp.zeros)  # JAX before 0.7 has no other
-    return jax.tree.map(lambda x: empty((rows, *x.shape), x.dtype), tree)
+    """Return arrays for `rows` trees like this one, as `absent` does."""
+    return absent(jax.tree.map(lambda x: jax.ShapeDtypeStruct((rows, *x.shape), x.dtype), tree))
 
 
 def filled(row: Callable[[Array], Any], found: Array, rows: int) -> Any:
@@ -31,6 +41,6 @@ def filled(row: Callable[[Array], Any], found: Array, rows: int) -> Any:
     shape = jax.eval_shape(lambda: row(jnp.int32(0)))
 
     def note(n: Array, all_: Any) -> Any:
-        return jax.tree.map(lambda x, own: x.at[n].set(own), all_, row(n))
+        return put(all_, n, row(n))
 
     return jax.lax.fori_loop(0, found, note, room(shape, rows))

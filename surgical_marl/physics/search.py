@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,20 +27,26 @@ class _Tried(NamedTuple):
     looks: Array
     """How many there were."""
     done: Array
+    seen: Any
+    """What the last look saw."""
 
 
-def search(begin: Array, measure: Callable[[Array], tuple[Array, Array]]) -> Array:
-    """Return a length at which the slope of a convex function is small.
+def search(begin: Array, least: float, measure: Callable[[Array, Any], tuple[Array, Array, Any]], seen: Any) -> _Tried:
+    """Return a length at which the slope of a convex function is small, and what was seen there.
 
-    Newton's method on the slope, within a bracket. The first length is 1.
+    Newton's method on the slope, within a bracket. The first length is 1. If the slope at the beginning is no more than
+    `least`, that is taken without a look.
 
     Args:
         begin: slope at length 0, below 0, [].
-        measure: from a length to the slope there, and by how much it grows per length.
+        least: size of a slope that counts as none.
+        measure: from a length, and what was seen at the one before, to the slope there, by how much it grows per
+            length, and what is seen.
+        seen: what is seen at length 0.
     """
 
     def look(tried: _Tried) -> _Tried:
-        slope, growth = measure(tried.length)
+        slope, growth, seen = measure(tried.length, tried.seen)
         looks = tried.looks + 1
         done, short = (jnp.abs(slope) <= -ENOUGH * begin) | (looks >= LOOKS), slope < 0
         low, high = jnp.where(short, tried.length, tried.low), jnp.where(short, tried.high, tried.length)
@@ -48,8 +54,8 @@ def search(begin: Array, measure: Callable[[Array], tuple[Array, Array]]) -> Arr
         length = jnp.where(
             (length > low) & (length < high), length, jnp.where(high < jnp.inf, (low + high) / 2, 2 * low)
         )
-        return _Tried(jnp.where(done, tried.length, length), low, high, looks, done)
+        return _Tried(jnp.where(done, tried.length, length), low, high, looks, done, seen)
 
-    start = _Tried(jnp.float32(1.0), jnp.float32(0.0), jnp.float32(jnp.inf), jnp.int32(0), jnp.bool_(False))
+    start = _Tried(jnp.float32(1.0), jnp.float32(0.0), jnp.float32(jnp.inf), jnp.int32(0), -begin <= least, seen)
     found: _Tried = jax.lax.while_loop(lambda tried: ~tried.done, look, start)
-    return found.length
+    return found

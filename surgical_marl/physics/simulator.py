@@ -22,11 +22,11 @@ from jax import Array
 from surgical_marl.content import unknown
 from surgical_marl.physics.collision import Pairs
 from surgical_marl.physics.dynamics import Dynamics, Physics
+from surgical_marl.physics.kind import Kind
 from surgical_marl.physics.solver import Rows, solve
 from surgical_marl.physics.together import Together
 from surgical_marl.physics.variation import Factors
 from surgical_marl.physics.views import ArmView, Contacts, ObjectView, Touch
-from surgical_marl.scenes.build import alone
 from surgical_marl.scenes.poses import Pose
 from surgical_marl.scenes.scene import PAYLOAD, Scene
 from surgical_marl.scenes.timing import DECIMATION
@@ -36,46 +36,6 @@ TOUCHING_ITERATIONS = (6, 6)
 
 MOST_JOINED = 32
 """Joints up to which arms that touch are one dense problem: the code of a dense one grows with the cube of them."""
-
-
-class Kind:
-    """The arms of one type in a scene.
-
-    Arms of one type move in the same way wherever they stand, because gravity is off. So each arm is stepped in its own
-    base frame, and the same code steps all of them, one after the other. The instruction cache of a GPU has no room for
-    one copy of the code per arm.
-    """
-
-    def __init__(self, scene: Scene, agents: tuple[str, ...]) -> None:
-        model = scene.model
-        self._dynamics = Dynamics(alone(scene, agents[0]))
-        owner = lambda name: name.split("/")[0]  # noqa: E731
-        joints, bodies, actuators = (
-            np.array([owner(get(i).name) for i in range(count)])
-            for get, count in ((model.joint, model.njnt), (model.body, model.nbody), (model.actuator, model.nu))
-        )
-        self._dofs, self._bodies, self._actuators = (
-            np.stack([np.flatnonzero(owners == agent) for agent in agents]) for owners in (joints, bodies, actuators)
-        )
-
-    def step(self, physics: Physics, fields: dict[str, Array]) -> Physics:
-        """Return the physics of the scene after one step of these arms.
-
-        `fields` replaces values of some fields of the scene's model.
-        """
-        dofs, actuators = self._dofs, self._actuators
-        own = Physics(physics.qpos[dofs], physics.qvel[dofs], physics.qacc_warmstart[dofs], physics.ctrl[actuators])
-        where = {"actuator": actuators, "dof": dofs, "body": np.insert(self._bodies, 0, 0, axis=1)}
-        others = {name: field[where[name.split("_")[0]]] for name, field in fields.items()}
-
-        def next_arm(queue: tuple[Physics, dict[str, Array]], _: None) -> tuple[tuple[Physics, dict[str, Array]], None]:
-            first = jax.tree.map(lambda x: x[0], queue)
-            moved = self._dynamics.varied(first[1]).step(first[0]), first[1]
-            return jax.tree.map(lambda x, y: jnp.concatenate([x[1:], y[None]]), queue, moved), None
-
-        (own, _), _ = jax.lax.scan(next_arm, (own, others), None, length=len(dofs))
-        qpos, qvel, qacc = (part.at[dofs].set(found) for part, found in zip(physics[:3], own[:3], strict=True))
-        return physics._replace(qpos=qpos, qvel=qvel, qacc_warmstart=qacc)
 
 
 class Simulator:
@@ -90,7 +50,7 @@ class Simulator:
         self._fields: dict[str, Array] = {}
         self._pairs, self._together = Pairs(scene.model), Dynamics(scene.model)
         self._kinds = [Kind(scene, agents) for agents in scene.types.values()]
-        self._objects = Together(scene, self._together, self._pairs) if scene.objects else None
+        self._objects = Together(scene, self._together, self._pairs, self._kinds) if scene.objects else None
         self.decimation, self.control_dt = decimation, decimation * scene.model.opt.timestep
         self._index_joints()
         self._index_pairs()
@@ -232,17 +192,18 @@ class Simulator:
         sites = np.array(list(self._sites.values()))
         return (data.site_xpos[sites], data.site_xmat[sites]), self._pairs.distance(data.geom_xpos, data.geom_xmat)
 
-    def _step(self, physics: Physics, touch: Touch) -> tuple[Physics, Touch]:
+    def _step(self, physics: Physics, touch: Touch, distance: Array | None = None) -> tuple[Physics, Touch]:
         """Return the state after one physics step, and the hardest touch up to the start of that step.
 
-        Arms that touch nothing do not affect each other, so each is stepped on its own.
+        Arms that touch nothing do not affect each other, so each is stepped on its own. `distance` is that of every
+        pair at the start, if it is known.
         """
-        if self._objects:
-            return self._objects.step(physics, touch, self._fields, self._apart)
-        if not self._pairs.count:
+        if not (self._pairs.count or self._objects):
             return self._apart(physics, touch)
         data = self._together.pose(physics.qpos)
-        overlap = self._pairs.overlap(data.geom_xpos, data.geom_xmat)
+        overlap = self._pairs.overlap(data.geom_xpos, data.geom_xmat) if distance is None else (distance < 0).any()
+        if self._objects:
+            return self._objects.step(physics, touch, data, overlap, self._fields, self._apart)
         return jax.lax.cond(overlap, self._touching_step, self._apart, physics, touch)
 
     def _apart(self, physics: Physics, touch: Touch) -> tuple[Physics, Touch]:

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jax.scipy.linalg import cho_solve
 
@@ -55,6 +56,19 @@ class JointRows(NamedTuple):
     side: Array
     limit_impedance: Array
     limit_reference: Array
+
+
+def rows_of(joints: JointRows) -> Rows:
+    """Return friction and limits of n joints as rows, [2 n]: all frictions, then all limits."""
+    one = np.eye(len(joints.side), dtype=np.float32)
+    both = lambda first, second: jnp.concatenate([first, second])  # noqa: E731
+    return Rows(
+        both(one, joints.side[:, None] * one),
+        both(joints.friction_impedance, joints.limit_impedance),
+        both(joints.friction_reference, joints.limit_reference),
+        both(-joints.friction, 0 * joints.side),
+        both(joints.friction, jnp.full(len(one), jnp.inf)),
+    )
 
 
 def relax(mass: Array, smooth: Array, joints: JointRows, qacc: Array) -> Array:
@@ -134,8 +148,19 @@ def solve(
         rest = mass @ qacc - smooth
         gives = jnp.where(above & below, rows.impedance, 0.0)
         search = _newton_step(mass, rows.jacobian, gives, rows.jacobian.T @ force - rest, between)
-        step, end = _line_search(mass, rows, unbounded, rest, search, line_search)
-        return qacc + step * search, (((end > rows.low) == above) & ((end < rows.high) == below)).all()
+        looked = partial(_line_search, mass, rows, unbounded, rest, search, line_search)
+        kept = lambda end: (((end > rows.low) == above) & ((end < rows.high) == below)).all()  # noqa: E731
+        if iterations == 1:
+            return qacc + looked()[0] * search, jnp.bool_(True)
+        # the whole step is the best one if no row changes sides over it
+        whole = kept(unbounded - rows.impedance * (rows.jacobian @ search))
+
+        def part() -> tuple[Array, Array]:
+            step, end = looked()
+            return step, kept(end)
+
+        step, settled = jax.lax.cond(whole, lambda: (jnp.float32(1.0), jnp.bool_(True)), part)
+        return qacc + step * search, settled
 
     def unsettled(state: tuple[Array, Array, Array]) -> Array:
         _, settled, count = state

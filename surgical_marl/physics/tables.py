@@ -135,10 +135,6 @@ class Tables:
         """Degrees of freedom of each arm, [a, m]; `model.nv` where it has fewer than others."""
         for arm, own in enumerate(joints):
             self.dofs[arm, : len(own)] = own
-        ancestors = np.array([[_moves(model, i, j) for i in range(model.nv)] for j in range(model.nv)])
-        ancestors = np.pad(ancestors, ((0, 1), (0, 1)))
-        self.before = ancestors[self.dofs[:, :, None], self.dofs[:, None, :]].astype(np.float32)
-        """Which joints of an arm move each of its joints, [a, m, m]."""
         self.slides = np.append(model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE, False)[self.dofs]
         moved = np.pad(moved_bodies(model), ((0, 0), (0, 1)))
         self.arm_of, self.moves = {}, {}
@@ -218,16 +214,6 @@ def _stacked(rows: list[tuple[Any, ...]], *shapes: tuple[int, ...]) -> Iterator[
     """Return an array for each column of some rows; `shapes` are those of one row."""
     for k, shape in enumerate(shapes):
         yield np.array([row[k] for row in rows], np.float32).reshape(-1, *shape)
-
-
-def _moves(model: mujoco.MjModel, i: int, j: int) -> bool:
-    """Return whether joint i moves joint j, and is not it; each joint has a degree of freedom."""
-    body, own = int(model.dof_bodyid[j]), int(model.dof_bodyid[i])
-    if body == own:
-        return i < j
-    while body > 0 and body != own:
-        body = int(model.body_parentid[body])
-    return body == own
 
 
 def _depth(model: mujoco.MjModel, body: int) -> int:

@@ -61,7 +61,7 @@ class Tiles:
             of: takes the capsules of both sides, [A, 1] and [1, B], and which of their cells are pairs, [A, B].
             capsules: of `geoms`, [c].
         """
-        centres, axes = _in_memory(capsules)
+        centres, axes = capsules.centre, capsules.axis
 
         def tile(rows: Any) -> Any:
             sides, sizes, is_pair = rows
@@ -75,16 +75,8 @@ class Tiles:
 
     def ends_of(self, pair: Array, capsules: Capsule) -> tuple[Capsule, Capsule]:
         """Return both capsules of some pairs [K], from those of `geoms` [c]."""
-        centres, axes = _in_memory(capsules)
         one, other = (_at(end, pair) for end in self._ends)
-        parts = (centres, axes, capsules.half, capsules.radius)
-        return Capsule(*(_at(part, one) for part in parts)), Capsule(*(_at(part, other) for part in parts))
-
-
-def _in_memory(capsules: Capsule) -> tuple[Array, Array]:
-    """Return centres and axes as rows that the fused engine finds by a number: a map puts its rows into memory."""
-    centres, axes = (jax.lax.map(lambda row: row, part) for part in (capsules.centre, capsules.axis))
-    return centres, axes
+        return Capsule(*(_at(part, one) for part in capsules)), Capsule(*(_at(part, other) for part in capsules))
 
 
 def _at(rows: Any, which: Any) -> Array:

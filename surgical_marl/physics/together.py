@@ -7,7 +7,7 @@ are solved together.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
@@ -18,10 +18,13 @@ from jax import Array
 from surgical_marl.physics.bodies import Bodies, free_acceleration, inertias, moved, rotation
 from surgical_marl.physics.collision import Pairs
 from surgical_marl.physics.dynamics import Dynamics, Physics
-from surgical_marl.physics.handling import DWELL, Grips, Handling
+from surgical_marl.physics.factor import packed
+from surgical_marl.physics.handling import DWELL, Fingers, Grips, Handling, fingers_of
+from surgical_marl.physics.kind import Kind
 from surgical_marl.physics.newton import Newton
 from surgical_marl.physics.placed import Joints
 from surgical_marl.physics.problem import Contact, Pressed, Problem
+from surgical_marl.physics.rows import absent
 from surgical_marl.physics.solver import JointRows, Rows
 from surgical_marl.physics.tables import Tables
 from surgical_marl.physics.touching import Finder, Slots
@@ -59,8 +62,8 @@ class _Between(NamedTuple):
 class Together:
     """The physics of a scene with objects."""
 
-    def __init__(self, scene: Scene, dynamics: Dynamics, pairs: Pairs) -> None:
-        self._pairs, self._dynamics, self._arms = pairs, dynamics, len(scene.agents)
+    def __init__(self, scene: Scene, dynamics: Dynamics, pairs: Pairs, kinds: Sequence[Kind]) -> None:
+        self._pairs, self._dynamics, self._kinds, self._arms = pairs, dynamics, kinds, len(scene.agents)
         self.tables = Tables(scene)
         self.names = self.tables.names
         joints, none = scene.model.nv, np.zeros((0, 0), int)
@@ -132,19 +135,24 @@ class Together:
         joints = self._finder.joints(data)
         return self._finder.find(data, joints, physics.qvel, physics.objects.bodies, self._dynamics.dt), joints
 
-    def step(self, physics: Physics, touch: Touch, fields: dict[str, Array], apart: Callable[..., Any]) -> Any:
+    def step(
+        self, physics: Physics, touch: Touch, data: Any, overlap: Array, fields: dict[str, Array],
+        apart: Callable[..., Any],
+    ) -> Any:  # fmt: skip
         """Return the state after one physics step, and the hardest touch up to the start of that step.
 
         Args:
             physics: the state of arms and objects.
             touch: the hardest touch so far.
+            data: MJX's data with the poses of the arms.
+            overlap: whether any arms overlap, [].
             fields: other values of some fields of the model.
             apart: steps arms that touch nothing.
         """
-        data = self._dynamics.pose(physics.qpos)
         slots, joints = self._find(data, physics)
-        overlap = self._pairs.overlap(data.geom_xpos, data.geom_xmat) if self._pairs.count else jnp.bool_(False)
         near = overlap | (self._on_arm(slots) < self._arms).any()
+        bodies = self.tables.bodies["pads"]
+        frames = (data.xpos[bodies], data.xmat[bodies])
 
         def alone(physics: Physics, touch: Touch) -> tuple[Physics, Touch]:
             objects = self._step_objects(physics.objects, slots)
@@ -153,7 +161,7 @@ class Together:
             return physics._replace(objects=objects), touch._replace(overflow=left_out)
 
         def together(physics: Physics, touch: Touch) -> tuple[Physics, Touch]:
-            return self._step(self._dynamics.varied(fields), physics, touch, slots, joints, overlap)
+            return self._step(physics, touch, fields, slots, joints, fingers_of(*frames), overlap)
 
         return jax.lax.cond(near, together, alone, physics, touch)
 
@@ -171,17 +179,17 @@ class Together:
 
     def _solve_objects(self, masses: Array, free: Array, contacts: Contact, total: Array, start: Array) -> Array:
         """Return the accelerations [k, 6] of objects that touch no arm: one by one, if none touches another."""
-        none, k = jnp.zeros(0), len(free)
-        rows, joints = Rows(jnp.zeros((0, 0)), none, none, none, none), JointRows(*[none] * len(JointRows._fields))
+        none, k = jnp.zeros((0, 0)), len(free)
+        rows = Rows(jnp.zeros((0, 0, 0)), *[jnp.zeros(0)] * 4)
+        arms = none, none, JointRows(*[none] * len(JointRows._fields)), rows, jnp.bool_(False)
 
         def whole(contacts: Contact) -> Array:
-            problem = Problem(jnp.zeros((0, 0)), none, rows, joints, rows, masses, free, contacts, total)
-            return self._objects_alone.solve(problem, none, start).objects
+            return self._objects_alone.solve(Problem(*arms, masses, free, contacts, total), none, start).objects
 
         def single(row: tuple[Array, ...]) -> Array:
             number, mass, free, start = row
             own = contacts._replace(first=jnp.where(contacts.first == number, 0, 1))
-            problem = Problem(jnp.zeros((0, 0)), none, rows, joints, rows, mass[None], free[None], own, total)
+            problem = Problem(*arms, mass[None], free[None], own, total)
             return self._object_alone.solve(problem, none, start[None]).objects[0]
 
         def each(_: Contact) -> Array:
@@ -193,62 +201,78 @@ class Together:
         return jax.lax.cond(joined.any(), whole, each, contacts)
 
     def _step(
-        self, dynamics: Dynamics, physics: Physics, touch: Touch, slots: Slots, joints: Joints, overlap: Array
-    ) -> tuple[Physics, Touch]:
+        self, physics: Physics, touch: Touch, fields: dict[str, Array], slots: Slots, joints: Joints, fingers: Fingers,
+        overlap: Array,
+    ) -> tuple[Physics, Touch]:  # fmt: skip
         """Return the state after a step of all arms and objects together.
 
         The arms' damping is part of their mass matrix here, so the solver sees the velocities at the end of the step.
         """
-        dt, (bodies, grips) = dynamics.dt, physics.objects
-        handling, forces = Handling(self.tables, self._newton), dynamics.forces(physics)
-        data = forces.data
-        fingers = handling.fingers(data)
+        dt, (bodies, grips), handling = self._dynamics.dt, physics.objects, Handling(self.tables, self._newton)
         felt = handling.feel(slots, joints, fingers, physics.qvel, bodies, grips, dt)
         masses, free = self._free(bodies)
-        between = self._between(dynamics, data, physics.qvel, overlap)
-        problem = Problem(
-            mass=forces.mass + dt * forces.damping,
-            smooth=forces.smooth,
-            rows=forces.rows,
-            joints=dynamics.joint_rows(forces.rows),
-            between=between.rows,
-            masses=masses,
-            free=free,
-            contacts=felt.contacts,
-            total=slots.found,
-        )
-        found = self._newton.solve(problem, physics.qacc_warmstart, bodies.acceleration)
-        qvel = physics.qvel + dt * found.arms
+        between = self._between(physics, overlap)
+        mass, smooth, rows = self._forces(physics, fields)
+        problem = Problem(mass, smooth, rows, between.rows, overlap, masses, free, felt.contacts, slots.found)
+        found = self._newton.solve(problem, self._newton.by_arm(physics.qacc_warmstart), bodies.acceleration)
+        qacc = jnp.zeros(len(physics.qvel) + 1).at[self.tables.dofs].set(found.arms)[:-1]
+        qvel = physics.qvel + dt * qacc
         objects = moved(bodies, found.objects, dt)
         shift = dt * qvel, dt * objects.velocity
         grips = handling.remember(felt, slots, found.pressed, fingers, bodies, shift, grips, dt)
-        after = Physics(physics.qpos + shift[0], qvel, found.arms, physics.ctrl, Objects(objects, grips))
-        left_out = jnp.maximum(between.left_out, slots.total - len(slots.number))
-        each = self._pairs.spread(between.pair, found.between) if self._pairs.count else touch.force
-        return after, Touch(
-            penetration=jnp.maximum(touch.penetration, between.penetration),
-            force=jnp.maximum(touch.force, each),
+        after = Physics(physics.qpos + shift[0], qvel, qacc, physics.ctrl, Objects(objects, grips))
+        touch = touch._replace(
             handled=jnp.maximum(touch.handled, self._hardest(slots, found.pressed)),
-            overflow=jnp.maximum(touch.overflow, left_out),
+            overflow=jnp.maximum(touch.overflow, slots.total - len(slots.number)),
         )
+        return after, self._bumped(touch, between, found.between, overlap)
 
-    def _between(self, dynamics: Dynamics, data: Any, qvel: Array, overlap: Array) -> _Between:
-        """Return the contacts of arms with arms: none, without looking, unless any overlap."""
+    def _forces(self, physics: Physics, fields: dict[str, Array]) -> tuple[Array, Array, JointRows]:
+        """Return the arms' mass matrices, sums of forces, and friction and limits of joints, as in `Problem`."""
+        dofs, found = self.tables.dofs, [kind.forces(physics, fields) for kind in self._kinds]
+        if len(found) == 1:
+            return found[0][1:]
+        (a, m), n = dofs.shape, len(physics.qvel)
+        places, there = packed(m), dofs < n
+        mass = jnp.zeros((a, m * (m + 1) // 2)).at[:, np.diag(places)].set(~there * np.float32(1.0))
+        smooth, joints = jnp.zeros((a, m)), JointRows(*[jnp.zeros((a, m))] * len(JointRows._fields))
+        for of_kind in found:
+            arms = np.array([np.flatnonzero(dofs[:, 0] == own[0])[0] for own in of_kind.dofs])
+            m = of_kind.dofs.shape[1]
+            mass = mass.at[arms, : m * (m + 1) // 2].set(of_kind.mass)
+            smooth = smooth.at[arms, :m].set(of_kind.smooth)
+            joints = JointRows(*(all_.at[arms, :m].set(own) for all_, own in zip(joints, of_kind.joints, strict=True)))
+        return (mass, smooth, joints)
+
+    def _between(self, physics: Physics, overlap: Array) -> _Between:
+        """Return the contacts of arms with arms. There is nothing in it unless any overlap."""
 
         def found(_: None) -> _Between:
+            data = self._dynamics.axes(physics.qpos)
             closest = self._pairs.closest(data.geom_xpos, data.geom_xmat)
             touching = self._pairs.deepest(data, closest)
-            rows = dynamics.contact_rows(touching.jacobian, touching.distance, touching.weight, qvel)
+            rows = self._dynamics.contact_rows(touching.jacobian, touching.distance, touching.weight, physics.qvel)
+            by_arm = jnp.pad(rows.jacobian, ((0, 0), (0, 1)))[:, self.tables.dofs]
+            rows = rows._replace(jacobian=by_arm)
             return _Between(rows, touching.pair, -closest.distance, self._pairs.overflow(closest))
-
-        def none(_: None) -> _Between:
-            return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(lambda: found(None)))
 
         if not self._pairs.count:
             empty = jnp.zeros(0)
-            rows = Rows(jnp.zeros((0, len(qvel))), empty, empty, empty, empty)
+            rows = Rows(jnp.zeros((0, *self.tables.dofs.shape)), empty, empty, empty, empty)
             return _Between(rows, empty, empty, jnp.int32(0))
-        return jax.lax.cond(overlap, found, none, None)
+        return jax.lax.cond(overlap, found, lambda _: absent(jax.eval_shape(lambda: found(None))), None)
+
+    def _bumped(self, touch: Touch, between: _Between, forces: Array, overlap: Array) -> Touch:
+        """Return the hardest touch with these contacts of arms with arms, and the forces [r] of their rows."""
+
+        def bump(touch: Touch) -> Touch:
+            return touch._replace(
+                penetration=jnp.maximum(touch.penetration, between.penetration),
+                force=jnp.maximum(touch.force, self._pairs.spread(between.pair, forces)),
+                overflow=jnp.maximum(touch.overflow, between.left_out),
+            )
+
+        return jax.lax.cond(overlap, bump, lambda touch: touch, touch) if self._pairs.count else touch
 
     def _on_arm(self, slots: Slots) -> Array:
         """Return the arm that the patch in each slot is on, [s]; the number of arms for none."""

@@ -17,7 +17,7 @@ from jax import Array
 from surgical_marl.physics.bodies import Bodies
 from surgical_marl.physics.patches import BLEND, TILT, TILT_IN_JAW, Patch, find_patch, no_patch
 from surgical_marl.physics.placed import Joints, Placed, Places, Way, size
-from surgical_marl.physics.rows import room, row_of
+from surgical_marl.physics.rows import put, room, row_of
 from surgical_marl.physics.shapes import Points, Segments, between_segments, on_plate
 from surgical_marl.physics.tables import Meeting, Tables
 from surgical_marl.scenes.object_contacts import SLOTS
@@ -56,7 +56,7 @@ class Finder:
         self.slots = min(SLOTS, len(tables.stiffness))
 
     def joints(self, data: Any) -> Joints:
-        """Return the axes of the arms' joints, in memory, from MJX's data with poses."""
+        """Return the axes of the arms' joints from MJX's data with poses."""
         return self._places.joints(data)
 
     def find(self, data: Any, joints: Joints, qvel: Array, bodies: Bodies, dt: Any) -> Slots:
@@ -70,13 +70,13 @@ class Finder:
             dt: time over which motions are looked ahead, s.
         """
         placed = self._places.place(data, joints, qvel, bodies, dt)
-        none, number = jnp.int32(0), 0
-        numbers = jnp.zeros(self.slots, jnp.int32)
-        slots = Slots(room(jax.eval_shape(no_patch), self.slots), numbers, none)
+        none, number, rows = jnp.int32(0), 0, self.slots + 1  # what finds no room goes to the last one
+        slots = Slots(room(jax.eval_shape(no_patch), rows), jnp.zeros(rows, jnp.int32), none)
         for meeting in self._tables.meetings:
             slots = self._meet(placed, meeting, number, slots)
             number += len(meeting.one)
-        return slots
+        patch, numbers = jax.tree.map(lambda x: x[:-1], (slots.patch, slots.number))
+        return Slots(patch, numbers, slots.total)
 
     def _meet(self, placed: Placed, meeting: Meeting, start: int, slots: Slots) -> Slots:
         """Return the slots with the patches of a meeting, whose numbers begin at `start`.
@@ -94,10 +94,9 @@ class Finder:
 
         def meet(n: Array, slots: Slots) -> Slots:
             patch, touches = self._patch(placed, meeting, start, pairs[n])
-            place = jnp.where(touches, slots.total, self.slots)
-            put = lambda all_, one: all_.at[place].set(one, mode="drop")  # noqa: E731
-            number = start + pairs[n]
-            return Slots(jax.tree.map(put, slots.patch, patch), put(slots.number, number), slots.total + touches)
+            place = jnp.where(touches, jnp.minimum(slots.total, self.slots), self.slots)
+            kept = put((slots.patch, slots.number), place, (patch, start + pairs[n]))
+            return Slots(kept[0], kept[1], slots.total + touches.astype(jnp.int32))
 
         if most == 1:
             return jax.lax.cond(count > 0, lambda slots: meet(jnp.int32(0), slots), lambda slots: slots, slots)
@@ -124,23 +123,20 @@ class Finder:
         return row_of(placed.ways[meeting.first], i), None if its is None else row_of(its, j)
 
     def _patch(self, placed: Placed, meeting: Meeting, start: int, pair: Array) -> tuple[Patch, Array]:
-        """Return the patch of two bodies, and whether they touch, 1 or 0."""
+        """Return the patch of two bodies, and whether they touch."""
         i, j = _numbers(meeting, pair)
         touch, axes = self._touch(placed, meeting.second, j)
         ways, (capsules, count) = self._ways(placed, meeting, i, j), self._near_capsules(placed, meeting, i, j)
 
-        def near(n: Array, found: tuple[Points, Array]) -> tuple[Points, Array]:
+        def look(n: Array) -> tuple[Points, Array]:
             points = touch(self._places.capsule(placed, meeting.first, i, capsules[n]))
             nearer = ways[0].of(points) - (0.0 if ways[1] is None else ways[1].of(points))
-            soon = points.depth + jnp.minimum(nearer, AHEAD)
-            return jax.tree.map(lambda all_, x: all_.at[n].set(x), found, (points, soon))
+            return points, points.depth + jnp.minimum(nearer, AHEAD)
 
-        shape = jax.eval_shape(lambda: touch(self._places.capsule(placed, meeting.first, i, jnp.int32(0))))
-        points, soon = jax.lax.fori_loop(0, count, near, room((shape, shape.depth), len(capsules)))
-        torsion = jnp.asarray(self._tables.torsion)[start + pair]
-        centre = placed.balls["objects"].centre[i] if meeting.first == "objects" and meeting.second != "pads" else None
-        patch = find_patch(points, soon, count, axes, _tilt(meeting), torsion, centre)
-        return patch, (patch.reach > -NEAR).astype(jnp.int32)
+        torsion, middle = jnp.asarray(self._tables.torsion)[start + pair], placed.balls[meeting.first].centre[i]
+        centre = middle if meeting.first == "objects" and meeting.second != "pads" else None
+        patch = find_patch(look, count, len(capsules), middle, axes, _tilt(meeting), torsion, centre)
+        return patch, patch.reach > -NEAR
 
     def _near_capsules(self, placed: Placed, meeting: Meeting, i: Array, j: Array) -> tuple[Array, Array]:
         """Return the numbers of a body's capsules that may have a part in a patch, and how many they are.

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 from jax import Array
 
 from surgical_marl.physics.bodies import Masses
-from surgical_marl.physics.rows import stored
 from surgical_marl.physics.tables import Tables
 
 LENGTHS = "start", "end", "middle", "radius", "around", "bound", "centers"
@@ -32,12 +31,12 @@ def varied(tables: Tables, factors: Factors) -> Tables:
     own: Any = copy.copy(tables)
     size, mass = factors.size, factors.mass
     long = lambda values: size.reshape(-1, *[1] * (values.ndim - 1)) * values  # noqa: E731
-    vars(own).update(stored({name: long(getattr(tables, name)) for name in LENGTHS}))
+    vars(own).update({name: long(getattr(tables, name)) for name in LENGTHS})
     inertia = (mass * size * size)[:, None, None] * tables.masses.inertia
-    own.masses = Masses(*stored((mass * tables.masses.mass, inertia)))
+    own.masses = Masses(mass * tables.masses.mass, inertia)
     # of two surfaces the geometric mean counts
     rough = jnp.sqrt(jnp.append(factors.friction, 1.0))
-    own.sliding = stored(rough[tables.first_object] * rough[tables.second_object] * tables.sliding)
+    own.sliding = rough[tables.first_object] * rough[tables.second_object] * tables.sliding
     found: Tables = own
     return found
 

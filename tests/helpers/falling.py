@@ -42,7 +42,7 @@ class Falling:
         arms = {"psm_0": {"arm": "psm", "position": [0.0, 0.0, 5.0]}}
         path.write_text(yaml.safe_dump({"arms": arms, "objects": objects}, sort_keys=False))
         self.scene = sm.load_scene(path)
-        self.together = Together(self.scene, Dynamics(self.scene.model), Pairs(self.scene.model))
+        self.together = Together(self.scene, Dynamics(self.scene.model), Pairs(self.scene.model), ())
         self.masses, self.names = self.together.tables.masses, self.together.names
         self._arms = Simulator(self.scene).home
         self._play = jax.jit(jax.vmap(self._advance, in_axes=(0, 0, None)), static_argnums=2)

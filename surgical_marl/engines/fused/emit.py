@@ -20,6 +20,9 @@ LARGE = 500
 """Least number of operations in a branch whose inputs are hidden from the compiler (`HIDEF`), or in a branch or a round
 of a loop that counts as work."""
 
+TAKEN = ("array", "out", "room", "phi")
+"""What an array may be made by whose memory a loop takes over: all but `put`, which may itself have taken it over."""
+
 _CODE = {
     "add": "{}+{}", "sub": "{}-{}", "mul": "{}*{}", "neg": "-{}", "lt": "{}<{}", "le": "{}<={}", "gt": "{}>{}",
     "ge": "{}>={}", "eq": "{}=={}", "ne": "{}!={}", "and": "{}&{}", "or": "{}|{}", "xor": "{}^{}", "shl": "{}<<{}",
@@ -181,7 +184,7 @@ class Emitter(ArrayEmitter):
         self.active.pop()
 
     def _loop(self, number: int, loop: Loop) -> None:
-        tested = loop.condition is not None
+        tested, kept = loop.condition is not None, dict(self.kept)
         for k in self.schedule.alive[number]:
             self._start(number, loop, k)
         if tested and self.vector:
@@ -204,8 +207,7 @@ class Emitter(ArrayEmitter):
         self.active = active
         self._next(number, loop)
         self.lines.append("}")
-        for k in self.schedule.alive[number]:
-            self.kept.pop(self.names[loop.phis[k]], None)
+        self.kept = kept
 
     def _start(self, number: int, loop: Loop, k: int) -> None:
         """Declare what a loop carries, and set it to what it starts with."""
@@ -213,11 +215,14 @@ class Emitter(ArrayEmitter):
         kind, name = self.graph.kinds[phi], f"v{phi}"
         if not self._is_array(phi):
             self.lines.append(f"{TYPES[kind]} {name}={self._name(start)};")
-        elif self.graph.ops[start] in ("array", "out", "room") and self._is_free(start, self._place[loop.outs[k]]):
+        elif self.graph.ops[start] in TAKEN and self._is_free(start, self._place[loop.outs[k]]):
             name = self.names[start]
         else:
             self._declare(name, kind)
-            if self.graph.ops[start] != "room":
+            elements = self.graph.args[start] if self.graph.ops[start] == "array" else ()
+            if elements and max(elements) < 0:  # to copy constants would be to read them too
+                self._fill(name, "0", list(elements))
+            elif self.graph.ops[start] != "room":
                 self._copy(name, self.names[start], kind)
         self.names[phi] = self.names[loop.outs[k]] = name
         if self._is_array(phi) and loop.condition is not None and self.vector:
@@ -226,7 +231,7 @@ class Emitter(ArrayEmitter):
     def _head(self, number: int, loop: Loop) -> str:
         r, length = f"r{number}", loop.length
         if loop.condition is not None:
-            return "for(;;){"
+            return "#pragma unroll 1\nfor(;;){"  # how many rounds there are is not known, and code is long
         if loop.counter is not None:
             self.names[loop.counter], self.wholes[loop.counter] = f"SPLATI({r})", r
         return f"for(int {r}={length - 1};{r}>=0;--{r}){{" if loop.backwards else f"for(int {r}=0;{r}<{length};++{r}){{"

@@ -121,10 +121,10 @@ class ArrayEmitter:
             return
         kind = TYPES[self.graph.kinds[value][0]]
         (element,) = values
-        stored, kept = self._name(element), self.kept.get(name, "")
+        stored, kept, place = self._name(element), self.kept.get(name, ""), self._within(value, index)
         if kept:
-            stored = f"SELECT({kept},AT({kind},{name},{self._name(index)}),{stored})"
-        self.lines.append(f"PUT({kind},{name},{self._name(index)},{stored})")
+            stored = f"SELECT({kept},AT({kind},{name},{place}),{stored})"
+        self.lines.append(f"PUT({kind},{name},{place},{stored})")
 
     def _fill(self, name: str, start: str, values: list[Value], stored: Set[int] = frozenset()) -> None:
         """Store values from `start` on; elements of one other array, and equal constants, by a loop."""
@@ -174,8 +174,13 @@ class ArrayEmitter:
         array, index = self.graph.args[value]
         at = self._whole(index)
         if at is None:
-            return f"AT({TYPES[self.graph.kinds[value]]},{self.names[array]},{self._name(index)})"
+            return f"AT({TYPES[self.graph.kinds[value]]},{self.names[array]},{self._within(array, index)})"
         return f"{self.names[array]}[{at}]"
+
+    def _within(self, array: Value, index: Value) -> str:
+        """Return a place in an array. In a vector, environments that sit out this branch or round may be anywhere."""
+        last = int(self.graph.kinds[array][1:]) - 1
+        return f"WITHIN({self._name(index)},{last})" if self.vector else self._name(index)
 
 
 def _plus(start: str, more: int) -> str:

@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 
 from surgical_marl.engines.fused.graph import Graph, Value
-from surgical_marl.engines.fused.memory import depth, pack, unpack, view
+from surgical_marl.engines.fused.memory import View, depth, pack, unpack, view
 from surgical_marl.engines.fused.operations import KIND_OF
 from surgical_marl.engines.fused.scalars import convert
 from surgical_marl.engines.fused.traced import Symbolic, Table, Traced, lift
 
 LEAST_TABLE = 16
-"""Least number of constants that are looked up in memory instead of being selected one by one."""
+"""Least number of constants, or of real values, that are looked up in memory instead of being selected one by one."""
 
 Places = list[np.ndarray]
 """For each axis of an array, where on it each element of a result comes from."""
@@ -91,7 +91,10 @@ def scatter(
     indices: Traced,
     updates: Traced,
 ) -> Traced:
-    """`lax.scatter` and its kin. A window that is not all inside is left out, or moved there."""
+    """`lax.scatter` and its kin. A window that is not all inside is left out, or moved there.
+
+    If all windows are promised to be inside, nothing looks whether they are.
+    """
     numbers, new = params["dimension_numbers"], lift(g, updates)
     grid = np.indices(new.shape)
     batch = [grid[axis] for axis in range(new.ndim) if axis not in numbers.update_window_dims]
@@ -99,11 +102,11 @@ def scatter(
     place = _windows(new.shape, operand, numbers.inserted_window_dims, numbers.operand_batching_dims, windows)
     for axis, start in zip(numbers.operand_batching_dims, numbers.scatter_indices_batching_dims, strict=True):
         place[axis] = place[axis] + batch[start]
-    clip = "clip" in str(params["mode"]).lower()
+    clip, promised = ("clip" in str(params["mode"]).lower(), "promise" in str(params["mode"]).lower())
     if isinstance(indices, Symbolic):
         axes = numbers.scatter_dims_to_operand_dims
         starts = {axis: np.broadcast_to(indices.ids[(*batch, k)], new.shape) for k, axis in enumerate(axes)}
-        return _write(g, lift(g, operand), place, starts, new, clip, combine)
+        return _write(g, lift(g, operand), place, starts, new, clip, combine, promised)
     inside = np.ones(new.shape, bool)
     for k, axis in enumerate(numbers.scatter_dims_to_operand_dims):
         start, last = indices[(*batch, k)].astype(int), shape[axis] - 1 - place[axis].max(initial=0)
@@ -188,10 +191,14 @@ def elements_of(g: Graph, table: Table) -> Symbolic:
 def _read_or_choose(
     g: Graph, ids: np.ndarray, lasts: dict[int, int], fixed: list[int], moving: dict[int, Value]
 ) -> Value:
-    """Return the element at `fixed + moving`: from memory if the elements that it may be are there."""
-    found = view(g, ids[tuple(slice(None) if axis in moving else place for axis, place in enumerate(fixed))])
+    """Return the element at `fixed + moving`: from memory if the elements that it may be are there, or many."""
+    block = ids[tuple(slice(None) if axis in moving else place for axis, place in enumerate(fixed))]
+    found = view(g, block)
     if found is None or found.op != "read":
-        return _choose_one(g, ids, lasts, fixed, moving)
+        if block.size < LEAST_TABLE or g.kind(int(block.flat[0])) != "f":
+            return _choose_one(g, ids, lasts, fixed, moving)
+        strides = tuple(int(n) for n in np.cumprod([1, *block.shape[:0:-1]])[::-1])
+        found = View("read", g.array(block.ravel().tolist()), None, 0, strides, "f")
     return found.at(g, [g.add(_like(g, moving[axis], fixed[axis]), moving[axis]) for axis in sorted(moving)])
 
 
@@ -254,10 +261,11 @@ def _write(
     new: np.ndarray,
     clip: bool,
     combine: Callable[[Graph, Value, Value], Value] = lambda g, old, new: new,
+    promised: bool = False,
 ) -> Symbolic:
     """Return an array in memory with the values `new` put at `place + starts`.
 
-    A window that is not all inside is moved there if `clip`, and left out otherwise.
+    A window that is not all inside is moved there if `clip`, and left out otherwise. `promised` says that all are.
     """
     axes = max(depth(g, ids), *(axis + 1 for axis in starts))
     strides = np.cumprod([1, *ids.shape[axes - 1 : 0 : -1]])[::-1]
@@ -266,8 +274,10 @@ def _write(
         index, valid = g.constant(np.int32(0)), g.true
         for axis in range(axes):
             start = int(starts[axis][element]) if axis in starts else g.constant(np.int32(0))
-            inside = _bounded(g, start, ids.shape[axis] - 1 - int(place[axis].max(initial=0)))
-            valid = valid if clip else g.logic("and", valid, g.compare("eq", start, inside))
+            inside = start
+            if not promised:
+                inside = _bounded(g, start, ids.shape[axis] - 1 - int(place[axis].max(initial=0)))
+                valid = valid if clip else g.logic("and", valid, g.compare("eq", start, inside))
             at = g.add(g.constant(np.int32(place[axis][element])), convert(g, inside, "i"))
             index = g.add(index, g.mul(g.constant(np.int32(strides[axis])), at))
         column = (

@@ -113,6 +113,7 @@ typedef unsigned char C __attribute__((ext_vector_type(SM_W)));
 #define ROWF(k,i) SPLAT(reals.data[k+(i)])
 #define ROWI(k,i) SPLATI(wholes.data[k+(i)])
 #define AT(T,a,i) ({I i_=(i);LANEWISE(T,a[i_[l]][l]);})
+#define WITHIN(i,last) __builtin_elementwise_min(__builtin_elementwise_max((I)(i),SPLATI(0)),SPLATI(last))
 #define PUT(T,a,i,x) {I i_=(i);T r_=(x);for(int l=0;l<SM_W;++l)a[i_[l]][l]=r_[l];}
 #define DIVF(a,b) ((a)/(b))
 #define DIVI(a,b) ((a)/(b))

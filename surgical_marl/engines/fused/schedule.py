@@ -240,12 +240,24 @@ class Scheduler:
             self.room[value] = max([need + k for k, need in enumerate(needs)], default=1)
 
     def _order(self, number: int) -> None:
-        region = self.regions[number]
+        region, results = self.regions[number], self._region_results(number)
         done: set[tuple[str, int]] = set()
-        for k, result in enumerate(self._region_results(number)):
+        for k, result in enumerate(results):
             if result >= 0 and self._here(result, number):
                 self._visit(number, result, done)
             region.items.append(("result", k))
+        if number == 0:
+            self._store_early(region, results)
+
+    def _store_early(self, region: Region, results: list[Value]) -> None:
+        """Put each store right behind what computes its value, which then needs no register any more."""
+        waiting: dict[tuple[str, int], list[tuple[str, int]]] = {}
+        for k, result in enumerate(results):
+            if result >= 0 and self._here(result, 0):
+                waiting.setdefault(self._item(result), []).append(("result", k))
+        early = {item for group in waiting.values() for item in group}
+        items = [item for item in region.items if item not in early]
+        region.items = [item for one in items for item in (one, *waiting.get(one, ()))]
 
     def _region_results(self, number: int) -> list[Value]:
         if number == 0:
