@@ -21,6 +21,7 @@ import torch
 from rsl_rl.runners import OnPolicyRunner
 
 import surgical_marl as sm
+from surgical_marl.engines.fused import kernel
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.interfaces.rsl_rl import RslRlVecEnv
 from surgical_marl.view.record import ScenePicture
@@ -305,6 +306,41 @@ def test_environments_leave_nothing_behind(task: str, scene: str, options: dict[
     for thread in started:  # one that is on its way out may take a moment
         thread.join(10)
     assert not any(thread.is_alive() for thread in started)
+
+
+@pytest.mark.usefixtures("own_garbage")
+@pytest.mark.parametrize("face", ["parallel", "gymnasium", "gymnasium_vector", "rsl_rl"])
+def test_a_closed_environment_is_freed_at_once(face: str) -> None:
+    """It does not wait until Python looks for cycles among its objects, which on a GPU that is full may be too late."""
+
+    def used() -> list[weakref.ref[Any]]:
+        env: Any
+        if face == "parallel":
+            env = sm.parallel_env("reach", scene="psm", engine="fused", device="cpu")
+        elif face == "rsl_rl":
+            env = RslRlVecEnv(BatchedEnv("reach", "psm", engine="fused", device="cpu", arrays="torch"))
+        else:
+            made = gymnasium.make_vec if face == "gymnasium_vector" else gymnasium.make
+            env = made("surgical_marl:surgical_marl/Reach-v0", scene="psm", engine="fused", device="cpu")
+        if face == "rsl_rl":
+            env.step(torch.zeros(1, env.num_actions))
+        else:
+            env.reset(seed=0)
+            env.step(env.action_space.sample() if face != "parallel" else {"psm_0": np.zeros(7)})
+        batch = env.env if face == "rsl_rl" else env.unwrapped.batch
+        gone = [weakref.ref(part) for part in (batch, batch.env, batch.engine._arrays)]
+        env.close()
+        return gone
+
+    gc.collect()
+    gc.disable()
+    try:
+        for kept in (False, True):  # kernels of another environment of this process
+            if not kept:
+                kernel._made.cache_clear()
+            assert [reference() for reference in used()] == [None] * 3, kept
+    finally:
+        gc.enable()
 
 
 MANY = """

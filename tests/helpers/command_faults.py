@@ -6,7 +6,6 @@ them need Linux and a program of the system: see `missing`.
 
 from __future__ import annotations
 
-import ctypes.util
 import os
 import random
 import re
@@ -24,6 +23,7 @@ import imageio.v3 as iio
 from PIL import Image
 
 from surgical_marl.runs.folder import has_begun, read_checkpoint, read_metrics, read_settings
+from tests.helpers.clock import JUMPS, can_jump, jump, own_clock
 from tests.helpers.runs import same_state
 
 PROGRAM = [sys.executable, "-m", "surgical_marl"]
@@ -53,7 +53,7 @@ def missing(fault: str, folder: Path) -> str | None:
         _thaw(folder)
         return None if tried is not None and tried.returncode == 0 else "chattr +i is not possible"
     if fault == "clock":
-        return None if _faketime() else "libfaketime is not installed"
+        return None if can_jump() else "there is no C compiler"
     if fault == "full disk":
         return None if _mounted(folder, 1_000_000) and not _unmount(folder) else "no tmpfs can be mounted"
     return None if sys.platform == "linux" else "not Linux"
@@ -81,9 +81,7 @@ def run_with(fault: str, name: str, folder: Path, moments: random.Random, usual:
     """Run a command, let it meet a fault at a moment of its `usual` seconds, and undo the fault when it has ended."""
     own, log, began = _surroundings(name, folder), folder.parent / "stderr", time.monotonic()
     if fault == "clock":
-        (folder.parent / "clock").write_text("+0")
-        own |= {"LD_PRELOAD": str(_faketime()), "FAKETIME_TIMESTAMP_FILE": str(folder.parent / "clock"),
-                "FAKETIME_NO_CACHE": "1", "DONT_FAKE_MONOTONIC": "1"}  # fmt: skip
+        own |= own_clock(folder.parent / "clock")
     with log.open("w") as file:
         process = subprocess.Popen([*PROGRAM, *COMMANDS[name][0]], cwd=folder, env=own, stdout=file, stderr=file)
         try:
@@ -114,7 +112,7 @@ def _strike(fault: str, process: Any, folder: Path, moments: random.Random) -> N
         for path in [folder, *(path for path in folder.rglob("*") if path.is_dir())]:
             subprocess.run(["chattr", "+i", path], capture_output=True)
     elif fault == "clock":
-        (folder.parent / "clock").write_text(moments.choice(["-400d", "-1h", "+1h", "+400d"]))
+        jump(folder.parent / "clock", moments.choice(JUMPS))
 
 
 def full(folder: Path, moments: random.Random, size: int) -> bool:
@@ -223,9 +221,3 @@ def _mounted(folder: Path, size: int) -> bool:
 
 def _unmount(folder: Path) -> int:
     return subprocess.run(["umount", "-l", folder], capture_output=True).returncode
-
-
-def _faketime() -> str | None:
-    """Return the library that shows a process another time; of Debian, or where the linker finds it."""
-    found = sorted(Path("/usr/lib").glob("*/faketime/libfaketimeMT.so.1"))
-    return str(found[0]) if found else ctypes.util.find_library("faketimeMT")

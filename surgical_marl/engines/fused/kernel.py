@@ -13,13 +13,16 @@ import hashlib
 import re
 import shutil
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 from surgical_marl.cache import locked
 from surgical_marl.engines.fused.preludes import CPU, CUDA, LANES, UNDEFINE
 from surgical_marl.engines.stages import Stage, unsaid
+from surgical_marl.engines.stepper import MOST_KEPT
 from surgical_marl.files import write_atomic
 from surgical_marl.runtime import cache_dir, prepare_warp
 
@@ -56,18 +59,32 @@ def compile_kernels(
     ordered = cuda and branches > 0
     block = WIDE if cuda and branches >= BRANCHES and num_envs >= MANY else BLOCK if cuda else 1
     prelude = CUDA if cuda else CPU
-    sources = {name: f"{prelude}\n{body}\n{UNDEFINE}\n" for name, body in bodies.items()}
-    digest = hashlib.sha256("\0".join(sources.values()).encode()).hexdigest()[:16]
+    sources = tuple((name, f"{prelude}\n{body}\n{UNDEFINE}\n") for name, body in bodies.items())
+    digest = hashlib.sha256("\0".join(source for _, source in sources).encode()).hexdigest()[:16]
     module = wp.get_module(f"surgical_marl_{digest}")
     # contraction: a * b + c is one rounding, as on a GPU
     module.options.update(enable_backward=False, cpu_compiler_flags="-march=native -ffp-contract=fast")
-    made = {name: _make(f"{name}_{digest}", source, module, ordered, max_registers) for name, source in sources.items()}
+    made = _made(digest, sources, module, ordered, max_registers)
     # Warp itself does not protect a module from two processes that compile it at the same time
     with locked(cache_dir() / "kernels" / module.name), _checked(module.name):
         if not _folders(module.name):
             stage("compiling the C code")
         module.load(wp.get_device(device), block_dim=block)
     return {name: Kernel(kernel, device, block) for name, kernel in made.items()}
+
+
+@lru_cache(MOST_KEPT)
+def _made(
+    digest: str, sources: tuple[tuple[str, str], ...], module: Any, ordered: bool, max_registers: int | None
+) -> dict[str, Any]:
+    """Return Warp's kernels by name: the same for all environments of a process whose code is the same.
+
+    `wp.func_native` keeps its frame, and so all frames that led to it and what they hold, until Python looks for cycles
+    among its objects. Memory of a closed environment must not wait for that: a thread without such frames makes them.
+    """
+    with ThreadPoolExecutor(1, "surgical_marl") as apart:
+        calls = [apart.submit(_make, f"{name}_{digest}", own, module, ordered, max_registers) for name, own in sources]
+        return {name: call.result() for (name, _), call in zip(sources, calls, strict=True)}
 
 
 @contextmanager
