@@ -20,8 +20,6 @@ MOVED_MM = 1e-3
 """How far the floats of another machine may move the error of an episode. For a policy of reach in bimanual_psm the
 other engine moved it by 6e-5 mm at most, noise in the actions by 5e-5 mm (1e-6 of them) and 2e-3 mm (1e-4): arms
 that come to rest at their goals forget how they came there."""
-FEW = {"camera_assist-trimanual_psm_ecm_needle": 2}
-"""Training seeds of policies that ship with fewer than three: a third one is to be trained."""
 OTHERWISE = 1
 """Episodes of 200 that may go another way altogether: where arms touch, the last digit can decide on which side."""
 
@@ -43,7 +41,7 @@ def test_a_folder_is_whole(name: str) -> None:
     assert name == f"{result['task']}-{result['scene']}{level}" and is_standard(result)
     page = (folder / "README.md").read_text()
     assert bool(level) == ("--difficulty" in page) and result["difficulty"] in page
-    assert len(result["seeds"]["runs"]) >= FEW.get(name, 3)
+    assert len(result["seeds"]["runs"]) >= 3
     assert all(read_origin(folder)["origin"].values())
 
 
