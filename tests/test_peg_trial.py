@@ -146,7 +146,7 @@ def test_agents_observe_the_block_whose_turn_it_is() -> None:
         terms, world = task().terms("psm_1"), played.world()
         seen = terms["object_position"].read(world._replace(goal=played.goal._replace(row=row)))
         own = terms[f"{block}_position"].read(world)
-        np.testing.assert_array_equal(seen, own)
+        np.testing.assert_allclose(seen, own, atol=1e-7)  # the same to rounding, which depends on the processor
 
 
 def test_a_block_that_is_handed_over_and_placed_is_a_point_and_the_next_one_follows() -> None:
