@@ -20,7 +20,7 @@ from surgical_marl.engines.fused.emit import Emitter
 from surgical_marl.engines.fused.preludes import CUDA, UNDEFINE
 from surgical_marl.engines.fused.traced import Unsupported
 from tests.helpers.fused_blocks import all_blocks, random_arrays
-from tests.helpers.fused_kernels import make_stores, run
+from tests.helpers.fused_kernels import gpu_code, make_stores, run
 from tests.helpers.fused_programs import several
 
 RNG = np.random.default_rng(2)
@@ -120,6 +120,37 @@ def test_code_does_not_grow_with_the_number_of_rows() -> None:
     expected = jax.jit(jax.vmap(partial(grouped, 30)))(*columns)
     for found, values in zip(run(partial(grouped, 30), *columns), expected, strict=True):
         np.testing.assert_allclose(found, values, rtol=1e-5)
+
+
+def changed(count: int, x: Any, which: Any) -> Any:
+    """An array that loops change in branches, in a loop, next to what only reads it."""
+
+    def add(rows: Any, r: Any) -> tuple[Any, None]:
+        return rows.at[(r + which) % count].add(x), None
+
+    def halve(rows: Any, r: Any) -> tuple[Any, None]:
+        row = rows[(r + which) % count]
+        return lax.cond(row > x, lambda rows: lax.scan(add, rows, jnp.arange(2))[0], lambda rows: rows, rows), None
+
+    def sweep(rows: Any, r: Any) -> tuple[Any, None]:
+        total = rows[which % count] + rows[(which + 1) % count]
+        rows = lax.cond(
+            which % 3 > 0, lambda rows: lax.scan(halve, rows, jnp.arange(count))[0], lambda rows: rows, rows
+        )
+        return rows.at[r].add(total / 9), None
+
+    rows = lax.scan(lambda rows, r: (rows.at[r].set(x * r), None), jnp.zeros(count), jnp.arange(count))[0]
+    return lax.scan(sweep, rows, jnp.arange(3))[0]
+
+
+def test_loops_and_branches_change_arrays_in_place() -> None:
+    columns = RNG.uniform(-1, 1, 19).astype(np.float32), RNG.integers(0, 2**30, 19).astype(np.int32)
+    for vector in (False, True):
+        assert not re.search(r"\bv\d+\[k\]=.*v\d+\[k\]", body(partial(changed, 24), *columns, vector=vector))
+    expected = jax.jit(jax.vmap(partial(changed, 24)))(*columns)
+    np.testing.assert_allclose(run(partial(changed, 24), *columns), expected, rtol=1e-5)
+    with gpu_code():
+        np.testing.assert_allclose(run(partial(changed, 24), *columns), expected, rtol=1e-5)
 
 
 def test_a_scan_that_is_to_be_unrolled_is() -> None:

@@ -224,7 +224,9 @@ class Scheduled:
 
     def _loop(self, number: int, loop: Loop, known: Any, read: Callable[[Value], Any]) -> None:
         wanted, tested, count = self.plan.alive[number], loop.condition is not None, 0
-        values = [np.array(read(loop.starts[j])) for j in wanted]  # a loop begins with copies
+        taken = [loop.outs[j] in self.plan.takers for j in wanted]
+        starts = [read(loop.starts[j]) for j in wanted]
+        values = [start if takes else np.array(start) for start, takes in zip(starts, taken, strict=True)]
         while tested or count < loop.length:
             found: list[Any] = []
 
@@ -238,7 +240,11 @@ class Scheduled:
             inside[loop.counter] = np.int32(loop.length - 1 - count if loop.backwards else count)
             if not self._region(self.plan.inside[number][0], inside, result):
                 break
-            values, count = found, count + 1
+            for value, new, takes in zip(values, found, taken, strict=True):
+                if takes:
+                    value[:] = new
+            values = [value if takes else new for value, new, takes in zip(values, found, taken, strict=True)]
+            count += 1
         known.update({loop.outs[j]: value for j, value in zip(wanted, values, strict=True)})
 
 

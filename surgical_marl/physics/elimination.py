@@ -10,6 +10,7 @@ from jax import Array
 from jax.lax.linalg import triangular_solve
 
 from surgical_marl.physics.factor import cholesky, packed
+from surgical_marl.physics.rows import absent
 
 
 class Eliminated(NamedTuple):
@@ -99,7 +100,7 @@ def touching(blocks: Array, force: Array, coupling: Array) -> Eliminated:
         rows = _put(rows, diagonal, factor.ravel())
         return jax.lax.scan(subtract, rows, count)[0], None
 
-    start = jnp.zeros(k * width * 6)
+    start = absent(jax.ShapeDtypeStruct((k * width * 6,), force.dtype))
     rows = jax.lax.scan(note, start, (count, blocks, force, coupling))[0]
     rows = jax.lax.scan(eliminate, rows, count)[0]
     parts = rows.reshape(k, width, 6)

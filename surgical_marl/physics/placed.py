@@ -140,6 +140,14 @@ class Places:
         share = jnp.clip((point - rod.start) @ way / jnp.maximum(way @ way, 1e-12), 0.0, 1.0)
         return size(point - rod.start - share * way) - rod.radius
 
+    def gap(self, placed: Placed, kind: str, i: Array, box: Any) -> Array:
+        """Return a lower bound of the distance of an object or a link from a box [2, 3] along the axes, m."""
+        start = end = placed.position[i] if kind == "objects" else placed.links.start[i]
+        if kind == "links":
+            end = placed.links.end[i]
+        radius = jnp.asarray(self._tables.bound)[i] if kind == "objects" else placed.links.radius[i]
+        return jnp.max(jnp.maximum(jnp.minimum(start, end) - box[1], box[0] - jnp.maximum(start, end))) - radius
+
     def link_distance(self, placed: Placed, kind: str, j: Array, link: Segments) -> Array:
         """Return a lower bound of the distance of a link from what is fixed, m; exact for rods."""
         if kind == "rods":

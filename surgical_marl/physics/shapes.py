@@ -20,8 +20,8 @@ capsule of some mm turns as its one end goes in by the overlap of a firm grip.""
 EVEN = 0.2
 """Angle likewise up to which a capsule has a point near its farther end: more than it turns within a step, so that a
 step knows on what it will rest."""
-HUGE = 1e9
-"""More than any slope, m2."""
+_POINTS = ((0.5, NEAR), (0.0, EVEN), (1.0, EVEN))
+"""From where each of a capsule's three points is drawn away, as a share of its length, and by which angle."""
 
 
 class Segments(NamedTuple):
@@ -112,26 +112,38 @@ def _nearest(start: Array, way: Array, half: Array, price: Array) -> Array:
 
     Half the squared distance has a slope along the segment that grows piecewise linearly, with corners where the
     segment passes a side of the rectangle. So has the price, a length times the angle. The root of their sum lies
-    between those two corners between which it changes sign.
+    between the last corner where it is negative and the first one where it is positive.
     """
     slope = jnp.where(jnp.abs(way[..., :2]) < 1e-9, 1e-9, way[..., :2])
-    breaks = jnp.clip(
-        jnp.concatenate([-half - start[..., :2], half - start[..., :2]], -1) / jnp.tile(slope, 2), 0.0, 1.0
-    )
-    ends = jnp.zeros((*breaks.shape[:-1], 1))
-    corners = jnp.concatenate([breaks, ends, ends + 1.0], -1)
+    ends = (-half - start[..., :2]) / slope, (half - start[..., :2]) / slope
+    first, last = (jnp.clip(order(*ends), 0.0, 1.0) for order in (jnp.minimum, jnp.maximum))
+    corners = jnp.stack(_sorted(*(first[..., 0], last[..., 0], first[..., 1], last[..., 1])), -1)
+    none = jnp.zeros((*corners.shape[:-1], 1))
+    corners = jnp.concatenate([none, corners, none + 1.0], -1)
     point = start[..., None, :] + corners[..., None] * way[..., None, :]
     rise = jnp.sum(_off(point, half) * way[..., None, :], -1)
-    found = []
-    for anchor, even in ((0.5, NEAR), (0.0, EVEN), (1.0, EVEN)):
-        slope = rise + even * price[..., None] * (corners - anchor)
-        low = jnp.max(jnp.where(slope <= 0, corners, 0.0), -1)
-        high = jnp.min(jnp.where(slope >= 0, corners, 1.0), -1)
-        at_low = jnp.max(jnp.where((slope <= 0) & (corners >= low[..., None]), slope, -HUGE), -1)
-        at_high = jnp.min(jnp.where((slope >= 0) & (corners <= high[..., None]), slope, HUGE), -1)
-        inside = low - at_low / jnp.maximum(at_high - at_low, 1e-20) * (high - low)
-        found.append(jnp.where(at_low == -HUGE, 0.0, jnp.where(at_high == HUGE, 1.0, inside)))
+    found = [_root(corners, rise + even * price[..., None] * (corners - anchor)) for anchor, even in _POINTS]
     return jnp.stack(found, -1)
+
+
+def _sorted(a: Array, b: Array, c: Array, d: Array) -> tuple[Array, Array, Array, Array]:
+    """Return four numbers in order, of which `a <= b` and `c <= d`."""
+    low, middle, other, high = jnp.minimum(a, c), jnp.maximum(a, c), jnp.minimum(b, d), jnp.maximum(b, d)
+    return low, jnp.minimum(middle, other), jnp.maximum(middle, other), high
+
+
+def _root(corners: Array, slope: Array) -> Array:
+    """Return where a function that grows from corner to corner [..., n] is 0, or the end that is nearest to that."""
+    low, high = (corners[..., 0], slope[..., 0]), (corners[..., -1], slope[..., -1])
+    for k in range(1, corners.shape[-1] - 1):
+        low = _where(slope[..., k] <= 0, (corners[..., k], slope[..., k]), low)
+        high = _where(slope[..., -1 - k] >= 0, (corners[..., -1 - k], slope[..., -1 - k]), high)
+    share = jnp.clip(-low[1] / jnp.maximum(high[1] - low[1], 1e-20), 0.0, 1.0)
+    return low[0] + share * (high[0] - low[0])
+
+
+def _where(condition: Array, one: tuple[Array, Array], other: tuple[Array, Array]) -> tuple[Array, Array]:
+    return jnp.where(condition, one[0], other[0]), jnp.where(condition, one[1], other[1])
 
 
 def _off(point: Array, half: Array) -> Array:

@@ -46,6 +46,8 @@ class Meeting(NamedTuple):
     """Numbers of the second bodies, [m]."""
     surfaces: tuple[Surface, ...]
     """How each pair feels."""
+    partners: int
+    """So many pairs in a row have the same first body."""
 
 
 class Tables:
@@ -122,6 +124,11 @@ class Tables:
         thin = [(part, place) for part, place in parts if part.kind in ("capsule", "sphere")]
         self.plates = Plate(*_stacked([_plate(*each) for each in flat], (3,), (3, 3), (2,), ()))  # type: ignore[arg-type]
         self.rods = Segments(*_stacked([_segment(*each) for each in thin], (3,), (3,), ()))  # type: ignore[arg-type]
+        self.boxes = {
+            "plates": _box(*_spans(self.plates)),
+            "rods": _box(self.rods.start, self.rods.end, self.rods.radius),
+        }
+        """Two corners [2, 3] of a box that holds all fixed bodies of a kind. World, m."""
         self._fixed_surfaces = {
             kind: [place.object.surface for _, place in of] for kind, of in (("plates", flat), ("rods", thin))
         }
@@ -151,17 +158,18 @@ class Tables:
                 **self._fixed_surfaces}  # fmt: skip
         objects, fingers, links = range(self.count), range(len(self.fingers)), range(len(self.near))
         fixed = {kind: range(len(surfaces)) for kind, surfaces in self._fixed_surfaces.items()}
-        pairs = [
-            ("objects", "pads", list(product(objects, fingers))),
-            ("objects", "links", list(product(objects, self.bare.tolist()))),
-            *(("objects", kind, list(product(objects, all_))) for kind, all_ in fixed.items()),
-            ("objects", "objects", list(combinations(objects, 2))),
-            *(("links", kind, list(product(links, all_))) for kind, all_ in fixed.items()),
+        products = [
+            ("objects", objects, "pads", fingers),
+            ("objects", objects, "links", self.bare.tolist()),
+            *(("objects", objects, kind, all_) for kind, all_ in fixed.items()),
+            *(("links", links, kind, all_) for kind, all_ in fixed.items()),
         ]
+        pairs = [(first, second, list(product(one, other)), len(other)) for first, one, second, other in products]
+        pairs.insert(2 + len(fixed), ("objects", "objects", list(combinations(objects, 2)), 1))
         self.meetings = tuple(
             Meeting(first, np.array([a for a, _ in which]), second, np.array([b for _, b in which]),
-                    tuple(felt[first][a].against(felt[second][b]) for a, b in which))
-            for first, second, which in pairs if which
+                    tuple(felt[first][a].against(felt[second][b]) for a, b in which), partners)
+            for first, second, which, partners in pairs if which
         )  # fmt: skip
         surfaces = [surface for meeting in self.meetings for surface in meeting.surfaces]
         each = lambda of: np.array([getattr(surface, of) for surface in surfaces], np.float32)  # noqa: E731
@@ -233,6 +241,18 @@ def _plate(part: Any, place: Placement) -> tuple[np.ndarray, np.ndarray, np.ndar
         centre = np.zeros(3)
     frame = place.rotation @ part.rotation @ axes
     return place.position + place.rotation @ (part.position + part.rotation @ centre), frame, half, radius
+
+
+def _spans(plates: Plate) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return two opposite corners of boxes that hold the cores of plates, [n, 3] both, and their radii [n]."""
+    half = (np.abs(plates.frame[..., :2]) @ plates.half[..., None])[..., 0]
+    return plates.centre - half, plates.centre + half, plates.radius
+
+
+def _box(one: Any, other: Any, radius: Any) -> np.ndarray:
+    """Return two corners [2, 3] of the box about all that lies within a radius of the lines between points [n, 3]."""
+    low, high = np.minimum(one, other) - radius[:, None], np.maximum(one, other) + radius[:, None]
+    return np.stack([low.min(0, initial=np.inf), high.max(0, initial=-np.inf)]).astype(np.float32)
 
 
 def _segment(part: Any, place: Placement) -> tuple[np.ndarray, np.ndarray, float]:

@@ -16,7 +16,7 @@ from jax import Array
 
 from surgical_marl.physics.bodies import Bodies
 from surgical_marl.physics.patches import BLEND, TILT, TILT_IN_JAW, Patch, find_patch, no_patch
-from surgical_marl.physics.placed import Joints, Placed, Places, Way, size
+from surgical_marl.physics.placed import Ball, Joints, Placed, Places, Way, size
 from surgical_marl.physics.rows import put, room, row_of
 from surgical_marl.physics.shapes import Points, Segments, between_segments, on_plate
 from surgical_marl.physics.tables import Meeting, Tables
@@ -24,6 +24,8 @@ from surgical_marl.scenes.object_contacts import SLOTS
 
 NEAREST = 16
 """Pairs of two kinds of body that are near at one time; more are counted as patches that found no room."""
+MANY = 8
+"""Fixed bodies of a kind that are passed by together, if what comes is far from a box around all of them."""
 MARGIN = 2e-4
 """Distance within which a point that might touch during the step is watched, m: its stiffness grows from none there."""
 AHEAD = 0.02
@@ -85,12 +87,7 @@ class Finder:
         the one of them with most, and not at all that are near in any of them.
         """
         most = min(NEAREST, len(meeting.one))
-
-        def look(found: tuple[Array, Array], pair: Array) -> tuple[tuple[Array, Array], None]:
-            return _listed(found, pair, self._is_near(placed, meeting, pair)), None
-
-        none = jnp.zeros(most, jnp.int32), jnp.int32(0)
-        (pairs, count), _ = jax.lax.scan(look, none, jnp.arange(len(meeting.one), dtype=jnp.int32))
+        pairs, count = self._near_pairs(placed, meeting, most)
 
         def meet(n: Array, slots: Slots) -> Slots:
             patch, touches = self._patch(placed, meeting, start, pairs[n])
@@ -103,11 +100,34 @@ class Finder:
         slots = jax.lax.fori_loop(0, jnp.minimum(count, most), meet, slots)
         return slots._replace(total=slots.total + jnp.maximum(count - most, 0))
 
-    def _is_near(self, placed: Placed, meeting: Meeting, pair: Array) -> Array:
-        """Return whether two bodies may touch in the next step, []."""
-        i, j = _numbers(meeting, pair)
-        one, other = row_of(placed.balls[meeting.first], i), row_of(placed.balls[meeting.second], j)
-        reach = NEAR + jnp.minimum(one.moves + other.moves, AHEAD)
+    def _near_pairs(self, placed: Placed, meeting: Meeting, most: int) -> tuple[Array, Array]:
+        """Return the numbers of pairs that may touch in the next step, at most so many, and how many they are.
+
+        What the first bodies may meet is gone through for each of them, but not for one that is far from all of it.
+        """
+        numbers = jnp.arange(len(meeting.one), dtype=jnp.int32).reshape(-1, meeting.partners)
+
+        def of_one(found: tuple[Array, Array], pairs: Array) -> tuple[tuple[Array, Array], None]:
+            i = jnp.asarray(meeting.one.astype(np.int32))[pairs[0]]
+            one = row_of(placed.balls[meeting.first], i)
+
+            def look(found: tuple[Array, Array], pair: Array) -> tuple[tuple[Array, Array], None]:
+                return _listed(found, pair, self._is_near(placed, meeting, i, one, pair)), None
+
+            if meeting.partners < MANY or meeting.second not in self._tables.boxes:
+                return jax.lax.scan(look, found, pairs)
+            near = self._places.gap(placed, meeting.first, i, self._tables.boxes[meeting.second]) < _reach(one)
+            return jax.lax.cond(near, lambda f: jax.lax.scan(look, f, pairs)[0], lambda f: f, found), None
+
+        none = jnp.zeros(most, jnp.int32), jnp.int32(0)
+        found: tuple[Array, Array] = jax.lax.scan(of_one, none, numbers)[0]
+        return found
+
+    def _is_near(self, placed: Placed, meeting: Meeting, i: Array, one: Ball, pair: Array) -> Array:
+        """Return whether the two bodies of a pair may touch in the next step, []; `one` is around the first, i."""
+        j = jnp.asarray(meeting.other.astype(np.int32))[pair]
+        other = row_of(placed.balls[meeting.second], j)
+        reach = _reach(one, other)
 
         def looked_at(_: None) -> Array:
             if meeting.first == "objects":
@@ -141,13 +161,16 @@ class Finder:
     def _near_capsules(self, placed: Placed, meeting: Meeting, i: Array, j: Array) -> tuple[Array, Array]:
         """Return the numbers of a body's capsules that may have a part in a patch, and how many they are.
 
-        A capsule has none that is farther away than the one that touches by more than tilting can make up for.
+        A capsule has none that is farther away than the one that touches by more than tilting can make up for: by the
+        angle, times the way from a place of the one to a place of the other.
         """
         t, c = self._tables, self._tables.radius.shape[1]
         if meeting.first != "objects" or c == 1:
             return jnp.zeros(1, jnp.int32), jnp.int32(1)
-        one, moves = row_of(placed.balls["objects"], i), placed.balls[meeting.second].moves[j]
-        reach = NEAR + jnp.minimum(one.moves + moves, AHEAD) + 2 * _tilt(meeting) * one.radius + BLEND
+        one, other = (row_of(placed.balls[kind], n) for kind, n in (("objects", i), (meeting.second, j)))
+        # places between the surfaces of both are that far from each other at most, but for half of their distances
+        spread, tilt = 2 * jnp.minimum(one.radius, other.radius), _tilt(meeting)
+        reach = (_reach(one, other) + tilt * spread + BLEND) / (1 - tilt)
         frame = placed.frames[i]
 
         def look(found: tuple[Array, Array], capsule: Array) -> tuple[tuple[Array, Array], None]:
@@ -178,6 +201,11 @@ class Finder:
 
             found.append(jax.lax.map(deepest, np.arange(len(meeting.one), dtype=np.int32)))
         return jnp.concatenate(found)
+
+
+def _reach(*balls: Ball) -> Array:
+    """Return the distance below which bodies may touch in the next step, m."""
+    return NEAR + jnp.minimum(sum(ball.moves for ball in balls), AHEAD)
 
 
 def _tilt(meeting: Meeting) -> float:

@@ -20,9 +20,6 @@ LARGE = 500
 """Least number of operations in a branch whose inputs are hidden from the compiler (`HIDEF`), or in a branch or a round
 of a loop that counts as work."""
 
-TAKEN = ("array", "out", "room", "phi")
-"""What an array may be made by whose memory a loop takes over: all but `put`, which may itself have taken it over."""
-
 _CODE = {
     "add": "{}+{}", "sub": "{}-{}", "mul": "{}*{}", "neg": "-{}", "lt": "{}<{}", "le": "{}<={}", "gt": "{}>{}",
     "ge": "{}>={}", "eq": "{}=={}", "ne": "{}!={}", "and": "{}&{}", "or": "{}|{}", "xor": "{}^{}", "shl": "{}<<{}",
@@ -126,7 +123,7 @@ class Emitter(ArrayEmitter):
         def take(values: list[Value], first: bool) -> Any:
             def result(k: int) -> None:
                 name, value = self.names[outs[k]], self._name(values[wanted[k]])
-                kept = condition if self.vector and not first else ""
+                kept = self.kept.get(name, condition if self.vector and not first else "")
                 if self._is_array(outs[k]):
                     self._copy(name, value, self.graph.kinds[outs[k]], kept)
                 else:
@@ -215,7 +212,7 @@ class Emitter(ArrayEmitter):
         kind, name = self.graph.kinds[phi], f"v{phi}"
         if not self._is_array(phi):
             self.lines.append(f"{TYPES[kind]} {name}={self._name(start)};")
-        elif self.graph.ops[start] in TAKEN and self._is_free(start, self._place[loop.outs[k]]):
+        elif loop.outs[k] in self.schedule.takers:
             name = self.names[start]
         else:
             self._declare(name, kind)
@@ -254,7 +251,8 @@ class Emitter(ArrayEmitter):
         for k in wanted:
             phi, tested = loop.phis[k], loop.condition is not None and self.vector
             if k in arrays:
-                self._copy(self.names[phi], sources[k], self.graph.kinds[phi], f"NOT(m{number})" if tested else "")
+                name = self.names[phi]
+                self._copy(name, sources[k], self.graph.kinds[phi], self.kept.get(name, ""))
             else:
                 self.lines.append(f"v{phi}={f'SELECT(m{number},{sources[k]},v{phi})' if tested else sources[k]};")
 

@@ -6,13 +6,12 @@ writes them in place.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator, Set
 from itertools import groupby
 
 import numpy as np
 
-from surgical_marl.engines.fused.graph import Branch, Graph, Value
+from surgical_marl.engines.fused.graph import Graph, Value
 from surgical_marl.engines.fused.memory import split, view
 from surgical_marl.engines.fused.schedule import Schedule
 
@@ -33,37 +32,22 @@ class ArrayEmitter:
         """What values are called as plain ints, if they are equal for all environments."""
         self.kept: dict[str, str] = {}
         """For which environments of a vector an array must not change."""
-        self._uses: Counter[Value] = Counter()
         self._place: dict[Value, int] = {}
         self._awaited: dict[Value, list[tuple[Value, int]]] = {}
         """The elements of arrays that a value is stored in as soon as it is known, so that it needs no register."""
         self._stored: dict[Value, set[int]] = {}
         for number, region in enumerate(schedule.regions):
             for kind, item in region.items:
-                if kind != "result":
-                    self._note(number, kind, item)
+                if kind == "node":
+                    self._note(number, item)
 
-    def _note(self, region: int, kind: str, item: int) -> None:
-        """Note where arrays are made, and how often they are read."""
+    def _note(self, region: int, node: Value) -> None:
+        """Note where a value is computed, and which elements of arrays wait for it there."""
         g = self.graph
-        if kind == "node":
-            self._place[item] = region
-            self._uses.update(g.reads(item))
-            for k, value in enumerate(g.args[item] if g.ops[item] == "array" else ()):
-                if self._place.get(value) == region and g.ops[value] not in ("read", "out"):
-                    self._awaited.setdefault(value, []).append((item, k))
-            return
-        group = g.groups[item]
-        sides = (group.chosen, group.others) if isinstance(group, Branch) else (group.starts, group.nexts)
-        for k in self.schedule.alive[item]:
-            self._place[group.outs[k]] = region
-            self._uses.update(side[k] for side in sides)
-            if not isinstance(group, Branch):
-                self._place[group.phis[k]] = self.schedule.inside[item][0]
-
-    def _is_free(self, array: Value, region: int) -> bool:
-        """Whether what is made of an array in a region may take over its memory."""
-        return self._uses[array] == 1 and self._place[array] == region
+        self._place[node] = region
+        for k, value in enumerate(g.args[node] if g.ops[node] == "array" else ()):
+            if self._place.get(value) == region and g.ops[value] != "read":
+                self._awaited.setdefault(value, []).append((node, k))
 
     def _is_in_place(self, value: Value) -> bool:
         """Whether an element of an array is read wherever it is used: at a known place of what does not change."""
