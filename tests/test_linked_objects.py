@@ -66,12 +66,12 @@ def test_objects_are_eliminated_as_from_a_dense_matrix(linked: list[tuple[int, i
         np.testing.assert_allclose(divided.T @ half, wide.T @ np.linalg.solve(dense, force.ravel()), atol=5e-3)
         np.testing.assert_allclose(divided.T @ divided, wide.T @ np.linalg.solve(dense, wide), atol=5e-3)
 
-    together = elimination.touching(single(blocks), single(force), single(coupling))
-    compared(together, elimination.ways_touching(together, single(arms)))
-    if not linked:
-        own = single(blocks[np.arange(OBJECTS), np.arange(OBJECTS)][:, *np.tril_indices(6)])
-        alone = elimination.apart(own, single(force), single(coupling), jnp.asarray(coupled))
-        compared(alone, elimination.ways_apart(alone, single(arms), jnp.asarray(coupled)))
+    own = single(blocks[np.arange(OBJECTS), np.arange(OBJECTS)][:, *np.tril_indices(6)])
+    cross = np.where(np.triu(np.ones((OBJECTS, OBJECTS)), 1)[..., None, None], blocks, np.nan)
+    given = elimination.Blocks(own, single(cross.ravel())), single(force), single(coupling), jnp.asarray(coupled)
+    for joined in {True, bool(linked)}:
+        found = elimination.eliminate(*given, jnp.bool_(joined))
+        compared(found, elimination.ways(found, single(arms), given[3], jnp.bool_(joined)))
 
 
 def test_the_curvature_between_two_bodies_is_how_the_force_on_one_falls_with_the_other_s_acceleration() -> None:

@@ -21,7 +21,43 @@ class Eliminated(NamedTuple):
     wide: Array
     """How they fall with the acceleration of arms, likewise, [k, a, 6, m]."""
     factor: Array
-    """Blocks on the factor's diagonal, lower, [k, 6, 6]. If objects may touch each other, all rows: see `touching`."""
+    """Blocks on the factor's diagonal, lower, [k, 6, 6]: of objects that touch no other."""
+    rows: Array
+    """Of objects that touch each other, all that the elimination leaves: see `touching`. None of it is there of
+    others."""
+
+
+class Blocks(NamedTuple):
+    """A symmetric matrix of objects: how forces on each of them fall with the accelerations of all."""
+
+    own: Array
+    """The lower half of each object's own block, [k, 21]."""
+    cross: Array
+    """The block of objects i and j of each pair `i < j`, from 36 (k i + j) on; only read of objects that touch."""
+
+
+def eliminate(blocks: Blocks, force: Array, coupling: Array, coupled: Array, linked: Array) -> Eliminated:
+    """Return what is left of objects.
+
+    Args:
+        blocks: how forces fall with accelerations.
+        force: forces on the objects, [k, 6].
+        coupling: how they fall with the acceleration of arms, [k, a, 6, m].
+        coupled: which objects touch an arm, [k].
+        linked: whether any objects touch each other, [].
+    """
+    alone = lambda: apart(blocks.own, force, coupling, coupled)  # noqa: E731
+    if len(force) < 2:
+        return alone()
+    return jax.lax.cond(linked, lambda: touching(blocks, force, coupling), alone)
+
+
+def ways(found: Eliminated, arms: Array, coupled: Array, linked: Array) -> Array:
+    """Return the ways [k, 6] of objects, by those of the arms' joints [a, m]; the rest as for `eliminate`."""
+    alone = lambda: ways_apart(found, arms, coupled)  # noqa: E731
+    if len(coupled) < 2:
+        return alone()
+    return jax.lax.cond(linked, lambda: ways_touching(found, arms), alone)
 
 
 def apart(own: Array, force: Array, coupling: Array, coupled: Array) -> Eliminated:
@@ -43,7 +79,9 @@ def apart(own: Array, force: Array, coupling: Array, coupled: Array) -> Eliminat
             wide = jax.lax.cond(coupled, divided, jnp.zeros_like, coupling)
         return _divided(factor, force), wide, factor
 
-    return Eliminated(*jax.lax.map(one, (own, force, coupling, coupled)))
+    rows = absent(jax.ShapeDtypeStruct((_size(coupling) if len(own) > 1 else 0,), force.dtype))
+    half, wide, factor = jax.lax.map(one, (own, force, coupling, coupled))
+    return Eliminated(half, wide, factor, rows)
 
 
 def ways_apart(found: Eliminated, arms: Array, coupled: Array) -> Array:
@@ -55,26 +93,31 @@ def ways_apart(found: Eliminated, arms: Array, coupled: Array) -> Array:
         left = jax.lax.cond(coupled, less, lambda half: half, half) if len(arms) else half
         return _back(factor, left)
 
-    ways: Array = jax.lax.map(one, (*found, coupled))
-    return ways
+    found_ways: Array = jax.lax.map(one, (found.half, found.wide, found.factor, coupled))
+    return found_ways
 
 
-def touching(blocks: Array, force: Array, coupling: Array) -> Eliminated:
-    """Return what is left of objects of which some touch each other.
-
-    Arguments are those of `apart`, but `blocks` [k, k, 6, 6] are whole: those of an object with each one. What is 0
-    costs little.
+def touching(blocks: Blocks, force: Array, coupling: Array) -> Eliminated:
+    """Return what is left of objects of which some touch each other. What is 0 costs little.
 
     A row of blocks is kept as columns of six: those of all objects, the force, and those of all arms. All rows are one
     array, [k * columns * 6], and what works on a column is in a loop: so the code is the same for any number of them.
     """
     k, a, _, m = coupling.shape
-    count, width = jnp.arange(k), 6 * k + 1 + a * m
+    count, width = jnp.arange(k), _size(coupling) // (6 * k)
 
     def note(rows: Array, row: Any) -> tuple[Array, None]:
-        j, blocks, force, coupling = row
-        columns = [jnp.moveaxis(blocks, 1, 2).ravel(), force, jnp.moveaxis(coupling, 1, 2).ravel()]
-        return _put(rows, j * width, jnp.concatenate(columns)), None
+        j, own, force, coupling = row
+
+        def other(rows: Array, i: Array) -> tuple[Array, None]:
+            at = 36 * (k * jnp.minimum(i, j) + jnp.maximum(i, j))
+            block = jax.lax.dynamic_slice(blocks.cross, (at,), (36,)).reshape(6, 6)
+            block = jnp.where(i == j, own[packed(6)], jnp.where(i < j, block, block.T))  # its columns, one by one
+            return _put(rows, j * width + 6 * i, block), None
+
+        rows = jax.lax.scan(other, rows, count)[0]
+        columns = jnp.concatenate([force, jnp.moveaxis(coupling, 1, 2).ravel()])
+        return _put(rows, j * width + 6 * k, columns), None
 
     def eliminate(rows: Array, j: Array) -> tuple[Array, None]:
         diagonal = j * (width + 6)
@@ -97,20 +140,20 @@ def touching(blocks: Array, force: Array, coupling: Array) -> Eliminated:
             return jax.lax.cond((i > j) & (block != 0).any(), all_, lambda rows: rows, rows), None
 
         rows = jax.lax.scan(divide, rows, j * width + jnp.arange(width))[0]
-        rows = _put(rows, diagonal, factor.ravel())
+        rows = _put(rows, diagonal, factor)
         return jax.lax.scan(subtract, rows, count)[0], None
 
-    start = absent(jax.ShapeDtypeStruct((k * width * 6,), force.dtype))
-    rows = jax.lax.scan(note, start, (count, blocks, force, coupling))[0]
+    start = absent(jax.ShapeDtypeStruct((_size(coupling),), force.dtype))
+    rows = jax.lax.scan(note, start, (count, blocks.own, force, coupling))[0]
     rows = jax.lax.scan(eliminate, rows, count)[0]
     parts = rows.reshape(k, width, 6)
     wide = jnp.moveaxis(parts[:, 6 * k + 1 :].reshape(k, a, m, 6), 2, 3)
-    return Eliminated(parts[:, 6 * k], wide, rows)
+    return Eliminated(parts[:, 6 * k], wide, absent(jax.ShapeDtypeStruct((k, 6, 6), force.dtype)), rows)
 
 
 def ways_touching(found: Eliminated, arms: Array) -> Array:
     """Return the ways [k, 6] of objects of which some touch each other, by those of the arms' joints [a, m]."""
-    k, rows = len(found.half), found.factor
+    k, rows = len(found.half), found.rows
     width = rows.size // (6 * k)
 
     def one(ways: Array, j: Array) -> tuple[Array, None]:
@@ -121,9 +164,14 @@ def ways_touching(found: Eliminated, arms: Array) -> Array:
         factor = _columns(rows, j * (width + 6), 6)
         return jax.lax.dynamic_update_slice(ways, _back(factor, left), (6 * j,)), None
 
-    ways = jnp.concatenate([jnp.zeros(6 * k), -jnp.ones(1), arms.ravel()])
-    ways = jax.lax.scan(one, ways, jnp.arange(k), reverse=True)[0]
-    return ways[: 6 * k].reshape(k, 6)
+    all_ = jnp.concatenate([jnp.zeros(6 * k), -jnp.ones(1), arms.ravel()])
+    return jax.lax.scan(one, all_, jnp.arange(k), reverse=True)[0][: 6 * k].reshape(k, 6)
+
+
+def _size(coupling: Array) -> int:
+    """Return how many numbers the rows of `touching` are."""
+    k, a, _, m = coupling.shape
+    return k * (6 * k + 1 + a * m) * 6
 
 
 def _columns(rows: Array, at: Array, count: int) -> Array:
@@ -132,7 +180,7 @@ def _columns(rows: Array, at: Array, count: int) -> Array:
 
 
 def _put(rows: Array, at: Array, columns: Array) -> Array:
-    return jax.lax.dynamic_update_slice(rows, columns, (6 * at,))
+    return jax.lax.dynamic_update_slice(rows, columns.ravel(), (6 * at,))
 
 
 def _divided(factor: Array, right: Array) -> Array:

@@ -20,7 +20,7 @@ from surgical_marl.physics.arms import Arms, Left
 from surgical_marl.physics.cone import Cone, Forces, between, curvature, fall, forces, wrench
 from surgical_marl.physics.factor import packed
 from surgical_marl.physics.problem import SLIPS, Contact, Point, Pressed, Problem, Solution
-from surgical_marl.physics.rows import add, put, room, row_of
+from surgical_marl.physics.rows import absent, add, put, room, row_of
 from surgical_marl.physics.search import search
 
 PASSES = 12
@@ -28,8 +28,6 @@ PASSES = 12
 LEAST = 1e-7
 """Fall of the cost in a Newton step, N m/s2, after which none follows: that of a needle of 0.03 g whose acceleration
 changes by 0.06 m/s2."""
-_OTHERS = np.array([[0, 1], [1, 0], [1, 1]])
-"""Of which of a contact's two bodies there are blocks, besides that of the first one alone."""
 TOLERANCE = 1e-2
 """Change of friction in a Newton step, as a share of the normal force, at which sliding contacts have converged."""
 
@@ -55,7 +53,9 @@ class _Local(NamedTuple):
     force: Array
     """With the rest of what an object's acceleration takes, [k, 6]."""
     object: Array
-    """Lower halves, [k, 21]; if there are several objects, each with each one, [k, k, 6, 6]."""
+    """Lower halves, [k, 21]."""
+    cross: Array
+    """Of objects with each other: see `elimination.Blocks`."""
     coupling: Array
     """[k, a, 6, m]"""
 
@@ -160,7 +160,8 @@ class Newton:
             jnp.zeros((a, m)),
             jnp.zeros((a, m * (m + 1) // 2)),
             _with_none(inertia),
-            self._masses(problem),
+            _with_none(problem.masses[:, *np.tril_indices(6)]),
+            jax.lax.cond(self._linked(problem), jnp.zeros_like, absent, jnp.zeros(36 * k * k if k > 1 else 0)),
             jnp.zeros((k + 1, a, 6, m)),
         )
 
@@ -170,25 +171,9 @@ class Newton:
             return self._add(sums[0], contact, found), put(sums[1], n, _pressed(found))
 
         local, pressed = jax.lax.fori_loop(0, problem.total, one, (none, pressed))
-        own = local.object[:k] if k < 2 else local.object.reshape(k + 1, k + 1, 6, 6)[:k, :k]
-        return local._replace(force=local.force[:k], object=own, coupling=local.coupling[:k]), pressed
-
-    def _masses(self, problem: Problem) -> Array:
-        """Return the blocks of masses alone, as `_add` adds to them, with those of no object."""
-        if self._objects < 2:
-            return _with_none(problem.masses[:, *np.tril_indices(6)])
-
-        def note(blocks: Array, row: tuple[Array, Array]) -> tuple[Array, None]:
-            return self._grown(blocks, row[0], row[0], row[1]), None
-
-        none = jnp.zeros((self._objects + 1) ** 2 * 36)
-        return jax.lax.scan(note, none, (jnp.arange(self._objects), problem.masses))[0]
-
-    def _grown(self, blocks: Array, first: Array, second: Array, block: Array) -> Array:
-        """Return blocks of several objects, one array in memory, with more [6, 6] of two of them."""
-        at = (36 * ((self._objects + 1) * first + second),)
-        more = jax.lax.dynamic_slice(blocks, at, (36,)) + block.ravel()
-        return jax.lax.dynamic_update_slice(blocks, more, at)
+        cut = lambda each: each[:k]  # noqa: E731
+        local = local._replace(force=cut(local.force), object=cut(local.object), coupling=cut(local.coupling))
+        return local, pressed
 
     def _add(self, local: _Local, contact: Contact, felt: Forces) -> _Local:
         """Return sums with one more contact."""
@@ -196,29 +181,24 @@ class Newton:
         pull, stiff = wrench(cone, felt), curvature(cone, felt)
         if self._objects > 1:
 
-            def on_other(parts: tuple[Array, Array]) -> tuple[Array, Array]:
-                both = jax.tree.map(lambda *x: jnp.stack(x), cone, _moved_cone(contact))
-                bodies = jnp.stack([first, second])
+            def on_other(local: _Local) -> _Local:
+                moved = _moved_cone(contact)
+                at = (36 * (self._objects * first + second),)
+                block = jax.lax.dynamic_slice(local.cross, at, (36,)) + between(cone, moved, felt).ravel()
+                return local._replace(
+                    force=add(local.force, second, wrench(moved, felt)),
+                    object=add(local.object, second, curvature(moved, felt)),
+                    cross=jax.lax.dynamic_update_slice(local.cross, block, at),
+                )
 
-                def couple(blocks: Array, pair: Array) -> tuple[Array, None]:
-                    block = between(row_of(both, pair[0]), row_of(both, pair[1]), felt)
-                    return self._grown(blocks, bodies[pair[0]], bodies[pair[1]], block), None
-
-                pulled = add(parts[0], second, wrench(row_of(both, 1), felt))
-                return pulled, jax.lax.scan(couple, parts[1], jnp.asarray(_OTHERS))[0]
-
-            touches = second < self._objects
-            parts = jax.lax.cond(touches, on_other, lambda parts: parts, (local.force, local.object))
-            local = local._replace(force=parts[0], object=parts[1])
-        whole, one = stiff[_WHOLE], local.object
-        one = add(one, first, stiff) if self._objects < 2 else self._grown(one, first, first, whole)
-        local = local._replace(force=add(local.force, first, pull), object=one)
+            local = jax.lax.cond(second < self._objects, on_other, lambda local: local, local)
+        local = local._replace(force=add(local.force, first, pull), object=add(local.object, first, stiff))
         if not len(self._dofs):
             return local
 
         def on_arm(local: _Local) -> _Local:
             arm, jacobian = contact.arm, contact.jacobian
-            half = whole @ jacobian
+            half = stiff[_WHOLE] @ jacobian
             first_joint, second_joint = np.tril_indices(jacobian.shape[1])
             return local._replace(
                 arm_force=add(local.arm_force, arm, jacobian.T @ pull),
@@ -235,13 +215,10 @@ class Newton:
 
         Objects are eliminated, arms solved, each alone if nothing joins them, and objects found from them.
         """
-        touched, linked = self._touched(problem), jnp.bool_(False)
-        if self._objects > 1:
-            there = np.arange(len(pressed.normal)) < problem.total
-            linked = (there & (problem.contacts.second < self._objects) & (pressed.normal > 0)).any()
-            gone = elimination.touching(local.object, local.force, local.coupling)
-        else:
-            gone = elimination.apart(local.object, local.force, local.coupling, touched.any(1))
+        touched, pressing = self._touched(problem), pressed.normal > 0
+        linked = self._linked(problem, pressing)
+        blocks = elimination.Blocks(local.object, local.cross)
+        gone = elimination.eliminate(blocks, local.force, local.coupling, touched.any(1), linked)
         found = here.arms
         if len(self._dofs):
             on = touched | (linked & touched.any(0))  # what an object touches moves those that it touches
@@ -250,9 +227,15 @@ class Newton:
             each = lambda left: self._arms.each(problem, here.arms, left)  # noqa: E731
             together = lambda left: self._arms.together(problem, here.arms, left)  # noqa: E731
             found = jax.lax.cond(joined, together, each, left) if len(self._dofs) > 1 else each(left)
-        if self._objects > 1:
-            return Point(found, elimination.ways_touching(gone, found))
-        return Point(found, elimination.ways_apart(gone, found, touched.any(1)))
+        return Point(found, elimination.ways(gone, found, touched.any(1), linked))
+
+    def _linked(self, problem: Problem, pressing: Any = True) -> Array:
+        """Return whether any contact joins two objects, [], of those that are `pressing`, [s]."""
+        if self._objects < 2:
+            return jnp.bool_(False)
+        contacts = problem.contacts
+        there = np.arange(len(contacts.arm)) < problem.total
+        return (there & (contacts.second < self._objects) & pressing).any()
 
     def _sides(self, problem: Problem, arms: Array) -> Array:
         """Return which contacts of arms with arms press, [r] bool."""

@@ -122,12 +122,12 @@ class Emitter(ArrayEmitter):
 
         def take(values: list[Value], first: bool) -> Any:
             def result(k: int) -> None:
-                name, value = self.names[outs[k]], self._name(values[wanted[k]])
-                kept = self.kept.get(name, condition if self.vector and not first else "")
+                name, value = self.names[outs[k]], values[wanted[k]]
                 if self._is_array(outs[k]):
-                    self._copy(name, value, self.graph.kinds[outs[k]], kept)
+                    self._become(name, value)
                 else:
-                    self.lines.append(self._assign(name, value, kept))
+                    kept = condition if self.vector and not first else ""
+                    self.lines.append(self._assign(name, self._name(value), kept))
 
             return result
 
@@ -136,7 +136,8 @@ class Emitter(ArrayEmitter):
             self._count(chosen)
             self._region(chosen, take(branch.chosen, True))
         self.lines.append(f"}}\nif(ANY(NOT({condition}))){{" if self.vector else "}else{")
-        with self._side(number, f"NOT({condition})"), self._kept(kept, condition):
+        arrays = [self.names[out] for out in outs if self._is_array(out)]
+        with self._side(number, f"NOT({condition})"), self._kept(arrays, condition):
             self._count(other)
             self._region(other, take(branch.others, False))
         self.lines.append("}")
@@ -216,11 +217,7 @@ class Emitter(ArrayEmitter):
             name = self.names[start]
         else:
             self._declare(name, kind)
-            elements = self.graph.args[start] if self.graph.ops[start] == "array" else ()
-            if elements and max(elements) < 0:  # to copy constants would be to read them too
-                self._fill(name, "0", list(elements))
-            elif self.graph.ops[start] != "room":
-                self._copy(name, self.names[start], kind)
+            self._become(name, start)
         self.names[phi] = self.names[loop.outs[k]] = name
         if self._is_array(phi) and loop.condition is not None and self.vector:
             self.kept[name] = f"NOT(m{number})"
@@ -272,8 +269,10 @@ class Emitter(ArrayEmitter):
             self.lines.append(f"int v{value}={code};")
             self.names[value], self.wholes[value] = f"SPLATI(v{value})", f"v{value}"
         elif op == "room":
-            self._declare(f"v{value}", g.kinds[value])
-            self.names[value] = f"v{value}"
+            given = self.schedule.given.get(value)
+            if given is None:
+                self._declare(f"v{value}", g.kinds[value])
+            self.names[value] = f"v{value}" if given is None else self.names[given]
         else:
             code = self._operation(value)
             self.names[value] = f"v{value}"

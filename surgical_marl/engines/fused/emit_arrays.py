@@ -68,6 +68,14 @@ class ArrayEmitter:
     def _declare(self, name: str, kind: str) -> None:
         self.lines.append(f"{TYPES[kind[0]]} {name}[{kind[1:]}];")
 
+    def _become(self, target: str, value: Value) -> None:
+        """Let an array in memory be like a value, except for environments that must keep theirs."""
+        g, op = self.graph, self.graph.ops[value]
+        if op == "array" and max(g.args[value], default=0) < 0:  # to copy constants would be to read them too
+            self._fill(target, "0", list(g.args[value]))
+        elif op != "room" or value in self.schedule.given:
+            self._copy(target, self.names[value], g.kinds[value], self.kept.get(target, ""))
+
     def _copy(self, target: str, source: str, kind: str, kept: str = "") -> None:
         """Copy an array, except for environments that `kept` holds for."""
         if target != source:

@@ -30,7 +30,7 @@ wp = prepare_warp()
 
 BLOCK = 32
 """Threads in a CUDA block: so few that few environments are spread over all multiprocessors."""
-WIDE, MANY, BRANCHES = 128, 32768, 8
+WIDE, MANY, BRANCHES = 256, 32768, 8
 """Threads in a block for many environments and at least so many large branches, in long code. Threads of a block are
 near each other in it, and so find its instructions in the cache."""
 

@@ -50,6 +50,8 @@ class Schedule:
     """The `put`s that take over the memory of the array they change, as all else that reads it comes before."""
     kept: dict[Value, Value]
     """Out of a branch -> the array whose memory it takes over: both sides leave it there, changed or not."""
+    given: dict[Value, Value]
+    """Empty array in a side of a branch -> the out of the branch that it becomes there, and whose memory it gets."""
 
 
 class Scheduler:
@@ -86,6 +88,7 @@ class Scheduler:
             taken.replaced,
             taken.takers,
             taken.kept,
+            taken.given,
         )
 
     # -- what is needed
@@ -169,7 +172,8 @@ class Scheduler:
                     self._place_group(number)
                 continue
             region = self.place[value]
-            if op != "read":  # to keep what is in memory in registers too would need many of them
+            # to keep what is in memory in registers too would need many of them, and a room is best near what fills it
+            if op not in ("read", "room"):
                 region = self._hoist(region, self.loops[value])
             self.place[value] = region
             for read in g.reads(value):

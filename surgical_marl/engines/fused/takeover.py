@@ -25,8 +25,8 @@ class Places:
 class Takeovers:
     """Which arrays are changed in place: by a `put`, by a loop that begins with one, or by a branch.
 
-    `replaced`, `takers` and `kept` are as in `Schedule`; `before` says what has to come before a value, or before the
-    group whose first result it is.
+    `replaced`, `takers`, `kept` and `given` are as in `Schedule`; `before` says what has to come before a value, or
+    before the group whose first result it is.
     """
 
     def __init__(self, graph: Graph, needed: list[Value], places: Places) -> None:
@@ -35,6 +35,7 @@ class Takeovers:
         self.replaced: set[Value] = set()
         self.takers: set[Value] = set()
         self.kept: dict[Value, Value] = {}
+        self.given: dict[Value, Value] = {}
         self.before: dict[Value, list[Value]] = {}
         self._readers: dict[Value, list[Value]] = {}
         self._find(needed)
@@ -68,6 +69,7 @@ class Takeovers:
                 for k in self.alive[number]:
                     if len(g.kinds[branch.outs[k]]) > 1:
                         self._keep(number, branch, k, held)
+                        self._give(number, branch, k, held)
 
     def _keep(self, number: int, branch: Branch, k: int, held: Counter[Value]) -> None:
         """Let a branch leave an array where it is, if each side changes it by `put`s and loops, or not at all."""
@@ -98,6 +100,13 @@ class Takeovers:
             return
         self._take(array, takers, {**inside, first: before})  # type: ignore[dict-item]
         self.kept[branch.outs[k]] = array
+
+    def _give(self, number: int, branch: Branch, k: int, held: Counter[Value]) -> None:
+        """Let the sides of a branch fill its result, where they would fill an empty array of their own."""
+        for end, side in zip((branch.chosen[k], branch.others[k]), self.inside[number], strict=True):
+            room = self._chain(end, side)[-1]
+            if held[end] == 1 and self.place.get(room) == side and self.graph.ops[room] == "room":
+                self.given[room] = branch.outs[k]
 
     def _take(self, array: Value, takers: list[Value], before: dict[Value, list[Value]]) -> None:
         self.replaced.add(array)
