@@ -103,7 +103,9 @@ def test_an_object_is_handed_over_as_in_plain_mujoco() -> None:
     nine tenths of them are bounded here. In three series of 120 needles half were within 0.17 mm after the first jaw
     had opened, and nine of ten within 0.44 mm.
 
-    This hardly depends on friction, since a needle weighs next to nothing: the next test does.
+    With one Newton step instead of `PASSES` nine of ten are within 0.66 mm after the first jaw has opened, and within
+    1.3 mm in the end; two steps are enough. Friction hardly matters, since a needle weighs next to nothing: the next
+    test sees that.
     """
     grasps, begin, held = two_arms_hold(NEEDLES)
     still, back, away = (np.array([*way, 0, 0, 0]) for way in ((0, 0, 0), (0, 0, -SPEED), (SPEED, 0, -SPEED)))
@@ -123,11 +125,12 @@ def test_a_needle_slides_in_jaws_that_pull_at_it_as_far_as_in_plain_mujoco() -> 
     """Two arms hold a needle, and one draws back until the needle slides in a jaw.
 
     Which jaw it slides in, and when, differs from needle to needle. How much farther apart the jaws are in the end does
-    not: the rest of the way is what the arms give way under friction. All needles together slide 0.9 to 1.0 times as
-    far as in C MuJoCo, 1.5 times as far with 20 % less friction, and 0.6 times as far with 20 % more.
+    not: the rest of the way is what the arms give way under friction. In four series of 60 needles they slid 0.85 to
+    0.89 times as far as in C MuJoCo, all of a series together. With 20 % less friction in ours it was 1.50 to 1.60
+    times as far, and with 20 % more 0.51 and 0.66 times.
     """
     grasps, begin, held = two_arms_hold(NEEDLES)
-    way = np.array([[0, 0, 0, 0, 0, 0, -1], [SPEED / 5, 0, -SPEED / 5, 0, 0, 0, -1]], np.float32)
+    way = np.array([[0, 0, 0, 0, 0, 0, -1], [0.4 * SPEED, 0, -0.4 * SPEED, 0, 0, 0, -1]], np.float32)
     _, seen = played(grasps, begin, [way], held)
     assert grasps.simulator._objects
     tables = grasps.simulator._objects.tables
@@ -142,4 +145,4 @@ def test_a_needle_slides_in_jaws_that_pull_at_it_as_far_as_in_plain_mujoco() -> 
     ours = np.linalg.norm(of_needle[:, :, 0] - of_needle[:, :, 1], axis=-1)
     theirs = in_mujoco(grasps, begin, seen.command, held, between)
     slid, should = (np.mean(far[:, -1] - far[:, 0]) for far in (ours, theirs))
-    assert should > NEAR and 0.75 < slid / should < 1.2, (slid, should)
+    assert should > NEAR and 0.75 < slid / should < 1.15, (slid, should)
