@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import mujoco
@@ -20,21 +21,34 @@ SPEED = 0.5
 """Share of full speed at which arms move: at full speed steps of 2.5 ms alone put an arm 0.3 mm elsewhere."""
 NEAR = 3e-4
 """Most by which an object may be elsewhere, m."""
+NEEDLES = 60
+"""Needles that two arms hold."""
+TOLERANCE = 1e-14
+"""At which C MuJoCo's solver stops. Its default of 1e-8 is too early for an `impratio` of 10,000: of two starts that
+differ by a ten millionth, half of the needles end up more than 0.06 mm apart after a handover, and one of 120 more than
+1 mm. With this tolerance half stay within a nanometre, and the steps take no longer."""
 
 
-def in_mujoco(grasps: Grasps, begin: Any, command: np.ndarray, held: np.ndarray) -> np.ndarray:
-    """Return where the held objects are in C MuJoCo, m, [E, steps, 3].
+def in_mujoco(
+    grasps: Grasps,
+    begin: Any,
+    command: np.ndarray,
+    held: np.ndarray,
+    look: Callable[[mujoco.MjData, str], Any] = lambda data, name: data.body(name).xipos,
+) -> np.ndarray:
+    """Return what is seen in C MuJoCo: where the held objects are, m, [E, steps, 3], if nothing else is asked for.
 
     Args:
         grasps: arms and objects.
         begin: our states [E] at the start.
         command: of all actuators in each control step, [E, steps, nu].
         held: number of the object, [E].
+        look: what to return, from the data and the name of the object.
     """
     scene, bodies = grasps.scene, begin.objects.bodies
     model, nq = mujoco.MjModel.from_xml_string(mjcf(scene, timestep=DT / FINE)), scene.model.nq
-    model.opt.impratio = 1e4
-    found = np.zeros((*command.shape[:2], 3))
+    model.opt.impratio, model.opt.tolerance = 1e4, TOLERANCE
+    found: list[Any] = []
     for e, o in enumerate(held):
         data = mujoco.MjData(model)
         for k, name in enumerate(grasps.names):
@@ -47,8 +61,8 @@ def in_mujoco(grasps: Grasps, begin: Any, command: np.ndarray, held: np.ndarray)
             mujoco.mj_step(model, data, FINE * DECIMATION)
             mujoco.mj_kinematics(model, data)
             mujoco.mj_comPos(model, data)
-            found[e, t] = data.body(grasps.names[o]).xipos
-    return found
+            found.append(np.array(look(data, grasps.names[o])))
+    return np.array(found).reshape(*command.shape[:2], *found[0].shape)
 
 
 def played(grasps: Grasps, begin: Any, chunks: list[np.ndarray], held: np.ndarray) -> tuple[Any, Seen]:
@@ -72,21 +86,63 @@ def test_a_grasped_object_is_lifted_swung_and_let_go_as_in_plain_mujoco() -> Non
     assert off[grips].max() < NEAR
 
 
+def two_arms_hold(count: int) -> tuple[Grasps, Any, np.ndarray]:
+    """Return arms in pairs, their states once each pair has closed its jaws on a needle, and the needles' numbers."""
+    grasps, held = Grasps(["needle_sh"], arms=2), np.zeros(count, int)
+    begin, _ = grasps.play(grasps.begin(held, seed=5), grasps.still(count, CLOSING), held)
+    return grasps, begin, held
+
+
 @pytest.mark.slow
 def test_an_object_is_handed_over_as_in_plain_mujoco() -> None:
     """Two arms hold a needle; the first opens its jaw and draws back, and the second carries the needle away.
 
-    As a jaw opens, what it held may slip in the other one. C MuJoCo with half its step is then up to 0.4 mm away from
-    itself, and the open finger may strike the needle as it leaves.
+    As a jaw opens, what it held may slip in the other one, and the open finger may strike the needle as it leaves. Few
+    needles do, but how far those go hangs by so little that C MuJoCo with half its step is 1.6 mm away from itself for
+    one of 120, while nine of ten are within 0.08 mm. So the farthest needle says nothing about the solver, and half and
+    nine tenths of them are bounded here. In three series of 120 needles half were within 0.17 mm after the first jaw
+    had opened, and nine of ten within 0.44 mm.
+
+    With one Newton step instead of `PASSES` nine of ten are within 0.66 mm after the first jaw has opened, and within
+    1.3 mm in the end; two steps are enough. Friction hardly matters, since a needle weighs next to nothing: the next
+    test sees that.
     """
-    grasps, held = Grasps(["needle_sh"], arms=2), np.zeros(12, int)
-    begin, _ = grasps.play(grasps.begin(held, seed=5), grasps.still(len(held), CLOSING), held)
+    grasps, begin, held = two_arms_hold(NEEDLES)
     still, back, away = (np.array([*way, 0, 0, 0]) for way in ((0, 0, 0), (0, 0, -SPEED), (SPEED, 0, -SPEED)))
     moves = ((still, still, -1), (still, still, 1), (back, still, 1), (back, still, 1), (still, away, 1))
     chunks = [np.array([[*first, jaw], [*second, -1]], np.float32) for first, second, jaw in moves]
     _, seen = played(grasps, begin, chunks, held)
     off = np.linalg.norm(in_mujoco(grasps, begin, seen.command, held) - seen.place, axis=-1)
-    assert seen.holding[:, CHUNK - 1].all() and (seen.holding[:, -1] == [False, True]).all()
-    assert off[:, :CHUNK].max() < NEAR, "while both hold it"
-    assert np.median(off[:, : 4 * CHUNK].max(1)) < NEAR and off[:, : 4 * CHUNK].max() < 8e-4
-    assert np.median(off.max(1)) < 2 * NEAR and off.max() < 2e-3
+    within = lambda steps, share: np.quantile(off[:, :steps].max(1), share)  # noqa: E731
+    assert seen.holding[:, CHUNK - 1].all() and (seen.holding[:, -1] == [False, True]).all(1).mean() > 0.95
+    assert off[:, :CHUNK].max() < NEAR and within(CHUNK, 0.5) < NEAR / 4, "while both hold it"
+    assert within(4 * CHUNK, 0.5) < 2.5e-4 and within(4 * CHUNK, 0.9) < 6e-4, "when one has let go"
+    assert within(5 * CHUNK, 0.5) < NEAR and within(5 * CHUNK, 0.9) < 8e-4, "when the other one has carried it away"
+
+
+@pytest.mark.slow
+def test_a_needle_slides_in_jaws_that_pull_at_it_as_far_as_in_plain_mujoco() -> None:
+    """Two arms hold a needle, and one draws back until the needle slides in a jaw.
+
+    Which jaw it slides in, and when, differs from needle to needle. How much farther apart the jaws are in the end does
+    not: the rest of the way is what the arms give way under friction. In four series of 60 needles they slid 0.85 to
+    0.89 times as far as in C MuJoCo, all of a series together. With 20 % less friction in ours it was 1.50 to 1.60
+    times as far, and with 20 % more 0.51 and 0.66 times.
+    """
+    grasps, begin, held = two_arms_hold(NEEDLES)
+    way = np.array([[0, 0, 0, 0, 0, 0, -1], [0.4 * SPEED, 0, -0.4 * SPEED, 0, 0, 0, -1]], np.float32)
+    _, seen = played(grasps, begin, [way], held)
+    assert grasps.simulator._objects
+    tables = grasps.simulator._objects.tables
+    fingers = [[grasps.scene.model.body(body).name for body in tables.bodies["pads"][list(jaw)]]
+               for jaw in tables.jaws.values()]  # fmt: skip
+
+    def between(data: mujoco.MjData, _: str) -> Any:
+        first, second = (np.mean([data.body(name).xpos for name in jaw], 0) for jaw in fingers)
+        return np.linalg.norm(first - second)
+
+    of_needle = np.einsum("etaji,etaj->etai", seen.rotation, seen.position)  # from a jaw to the needle, in its axes
+    ours = np.linalg.norm(of_needle[:, :, 0] - of_needle[:, :, 1], axis=-1)
+    theirs = in_mujoco(grasps, begin, seen.command, held, between)
+    slid, should = (np.mean(far[:, -1] - far[:, 0]) for far in (ours, theirs))
+    assert should > NEAR and 0.75 < slid / should < 1.15, (slid, should)
