@@ -320,21 +320,17 @@ class Task(BaseTask):
     def _views(self) -> dict[str, Term | Picture]:
         """Return the terms of the camera: it has to know where to look.
 
-        Without `tools_hold` it would not know when an object begins its way to the goal, and would follow it only once
-        it moves. But its tool does not move it before it sees the goal, and so both would wait.
+        Without `tools_hold` it would follow an object to its goal only once it moves there, and wait for a tool that
+        does not move it before it sees the goal.
         """
         things = (self.object, GOAL) if self.object else tuple(f"{agent}/target" for agent in self.tools)
         held = {"tools_hold": Term(self._tools_hold, np.zeros(2), np.ones(2), "others")} if self.object else {}
-        return {
-            "tips_in_view": seen_places(self.sights, *self.tools, always=True),
-            "work_in_view": seen_places(self.sights, *things, always=True, about="goal"),
-            **held,
-        }
+        tips, work = (seen_places(self.sights, *names, always=True) for names in (self.tools, things))
+        return {"tips_in_view": tips, "work_in_view": work._replace(about="goal"), **held}
 
     def _tools_hold(self, world: World) -> Array:
         """Return whether each tool holds the object of the work, [tools]."""
-        work: Any = self.work
-        arms = work.at_hand(self._inside(world)).arms
+        arms = self.work.at_hand(self._inside(world)).arms  # type: ignore[attr-defined]
         return jnp.stack([arms[tool].handles[self.object].holding for tool in self.tools]).astype(jnp.float32)
 
     def observes(self, agent: str) -> tuple[str, ...]:
