@@ -215,6 +215,19 @@ def test_an_object_is_hidden_out_of_view_and_so_is_its_goal(looks_at: str, shown
     assert both[:, 3].tolist() == [shown, not shown]
 
 
+def test_the_camera_knows_which_tools_hold_the_object() -> None:
+    """It looks at the goal once the second tool holds: that does not go there unseen, so it can't be waited for."""
+    task: Any = over_a_needle().task
+    held = Handled(np.float32(1.0), np.bool_(True), np.float32(0.0))  # type: ignore[arg-type]
+    seen = world(over_a_needle().scene.mounts[CAMERA].arm.home, {}, over_a_needle(), {"needle": held})
+    free = {"needle": held._replace(holding=np.bool_(False))}  # type: ignore[arg-type]
+    assert "tools_hold" in task.observes(CAMERA) and "tools_hold" not in env().task.observes(CAMERA)
+    term = task.terms(CAMERA)["tools_hold"]
+    assert np.asarray(term.read(seen)).tolist() == [1, 1]
+    vars(seen.arms["psm_0"])["handles"] = free
+    assert np.asarray(term.read(seen)).tolist() == [0, 1]
+
+
 def test_rewards_are_the_teams_and_say_what_is_in_view() -> None:
     known, task = eye(), env().task
     first, second = tips()

@@ -8,7 +8,8 @@ Observation   of a tool: what it observes at its work, but what depends on a pla
               tip where that counts, is in view. Instead of the way to the nearest tip it observes, in the endoscope's
               frame, `tip_seen`, `other_tips_seen`, `target_seen` and that of the object: each a position and 1, or
               zeros out of view. And the endoscope's axes in its own base frame, which the joints of both arms say. Of
-              the camera: its joints, and all these places in its frame, whether or not they are in view, with a flag.
+              the camera: its joints, and all these places in its frame, whether or not they are in view, with a flag;
+              beside an object which of the tools hold it, as that says where to look next.
 Action        one number in [-1, 1] for every joint; the jaw opens above 0 and closes otherwise.
 Reward        the team's; weights in brackets, beside work with objects a tenth of them. The terms of the work, the mean
               of both tools. `in_view`, the share of what is to be seen that is in view (1); `centring`, the angle
@@ -317,12 +318,20 @@ class Task(BaseTask):
         return {**found, **touch, **goal, "to_target": (self.object, GOAL), "others_hold": (self.object,)}
 
     def _views(self) -> dict[str, Term | Picture]:
-        """Return the terms of the camera: it has to know where to look."""
+        """Return the terms of the camera: it has to know where to look.
+
+        Without `tools_hold` it would follow an object to its goal only once it moves there, and wait for a tool that
+        does not move it before it sees the goal.
+        """
         things = (self.object, GOAL) if self.object else tuple(f"{agent}/target" for agent in self.tools)
-        return {
-            "tips_in_view": seen_places(self.sights, *self.tools, always=True),
-            "work_in_view": seen_places(self.sights, *things, always=True, about="goal"),
-        }
+        held = {"tools_hold": Term(self._tools_hold, np.zeros(2), np.ones(2), "others")} if self.object else {}
+        tips, work = (seen_places(self.sights, *names, always=True) for names in (self.tools, things))
+        return {"tips_in_view": tips, "work_in_view": work._replace(about="goal"), **held}
+
+    def _tools_hold(self, world: World) -> Array:
+        """Return whether each tool holds the object of the work, [tools]."""
+        arms = self.work.at_hand(self._inside(world)).arms  # type: ignore[attr-defined]
+        return jnp.stack([arms[tool].handles[self.object].holding for tool in self.tools]).astype(jnp.float32)
 
     def observes(self, agent: str) -> tuple[str, ...]:
         """Return what a tool observes at its work and what it sees; of the camera its joints and the view."""
