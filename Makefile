@@ -17,6 +17,8 @@ READY := $(VENV)/.ready
 SITE_READY := $(VENV)/.ready-for-docs
 SUPPLY_READY := $(VENV)/.ready-for-supply
 QUALITY_READY := $(VENV)/.ready-for-quality
+# On Linux without an NVIDIA driver, PyTorch's build for CPUs: the one of PyPI brings gigabytes of CUDA libraries.
+CPU_TORCH := $(if $(filter Linux,$(shell uname -s)),$(if $(shell command -v nvidia-smi),,yes))
 ARGS ?=
 FULL_DISK := test_a_full_disk_is_one_sentence_and_the_run_goes_on_when_there_is_room
 
@@ -83,7 +85,11 @@ $(READY): pyproject.toml constraints.txt
 	@test -n "$(PYTHON)" || { echo "surgical-marl: no Python found, install Python 3.11 or newer" >&2; exit 2; }
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo \
 	  "surgical-marl: $$($(PYTHON) --version) is too old, name Python 3.11 or newer: make PYTHON=python3.11" >&2; exit 2; }
+	@echo "surgical-marl: setting up $(VENV), once; pip takes some minutes and says nothing" >&2
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	@test -z "$(CPU_TORCH)" || $(BIN)/python -m pip install --no-input --quiet --progress-bar off --retries 1 --no-deps \
+	  -c constraints.txt --index-url https://download.pytorch.org/whl/cpu torch || echo \
+	  "surgical-marl: no PyTorch for CPUs at download.pytorch.org, taking the one of PyPI" >&2
 	$(BIN)/python -m pip install --no-input --quiet --progress-bar off -c constraints.txt -e '.[test]'
 	@touch $@
 

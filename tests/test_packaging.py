@@ -7,6 +7,7 @@ import importlib.metadata
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -180,3 +181,17 @@ print(torch.compile(lambda x: 2 * x, backend="eager")(torch.ones(1)).item(), "sy
 
 def test_torchs_compiler_is_imported_when_it_is_used() -> None:
     assert run_python(DEFERRED).splitlines() == ["False", "2.0 True"]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere PyPI's torch has no CUDA libraries")
+@pytest.mark.parametrize("has_gpu", [True, False])
+def test_make_takes_torch_for_cpus_where_there_is_no_gpu(has_gpu: bool, tmp_path: Path) -> None:
+    if not has_gpu and shutil.which("nvidia-smi"):
+        pytest.skip("this machine has a GPU")
+    if has_gpu:
+        (tmp_path / "nvidia-smi").write_text("#!/bin/sh\n")
+        (tmp_path / "nvidia-smi").chmod(0o755)
+    env = {**os.environ, "PATH": f"{tmp_path}{os.pathsep}{os.environ['PATH']}"}
+    command = ["make", "--dry-run", "--always-make", ".venv/.ready"]
+    said = subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True, check=True).stdout
+    assert f'test -z "{"" if has_gpu else "yes"}" || .venv/bin/python -m pip install' in said

@@ -30,6 +30,7 @@ from surgical_marl.plugins.tasks import TASKS, scenes_for
 from surgical_marl.runs.folder import write_checkpoint
 from surgical_marl.scenes.load import load_scene
 from surgical_marl.tasks.base.options import Options, make_options
+from surgical_marl.view.browser import gate
 
 from .helpers.pages import PAGES, ROOT, commands, free_names, pieces
 
@@ -197,6 +198,8 @@ BENCHES = (f"bench.{kind}.run" for kind in ("report", "learning", "solve", "face
 WORK = ("cli.doctor.report", "evaluation.export.export_policy", "report.command.report",
         "view.take.replay", *BENCHES)  # fmt: skip
 """Where the work of commands begins."""
+BIND = gate._bind
+"""Takes a port for a page of the viewer; `view` serves before it makes an environment."""
 
 
 def check_surgical_marl(argv: list[str]) -> None:
@@ -206,7 +209,7 @@ def check_surgical_marl(argv: list[str]) -> None:
         for work in WORK:
             patch.setattr(f"surgical_marl.{work}", no_work)
         patch.setattr("surgical_marl.envs.batch.Env", no_env)
-        patch.setattr("surgical_marl.view.browser.gate.check_port", lambda port: None)  # others may use it now
+        patch.setattr("surgical_marl.view.browser.gate._bind", lambda _: BIND(0))  # another test may serve on it now
         patch.setattr("surgical_marl.bench.command._no_caches", nullcontext)  # it would outlast the command
         assert cli.main(argv) == 0, argv
     shutil.rmtree("runs", ignore_errors=True)

@@ -35,6 +35,17 @@ def test_a_file_gets_lines_and_few_of_them(capsys: pytest.CaptureFixture[str]) -
     assert lines[1].endswith("error 2 mm\n")
 
 
+def test_a_bar_leaves_room_for_figures_in_a_terminal_of_80_columns(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stderr", stream := Terminal())
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setenv("LINES", "24")
+    figures = "tip 0.24 mm, success 100%, collision 0%"
+    with progress(160, "it") as bar:
+        bar.set_postfix_str(figures, refresh=False)
+        bar.update(160)
+    assert re.search(rf"160/160 \[00:0\d<00:00, {figures}\]", stream.getvalue())
+
+
 def test_a_file_gets_a_line_for_each_state_that_is_old_enough(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

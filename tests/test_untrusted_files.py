@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import os
 import pickle
 import shutil
 import struct
+import sys
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +26,7 @@ from surgical_marl.policies.policy import _read
 from surgical_marl.policies.weights import read_weights
 from surgical_marl.report.run import read_run
 from surgical_marl.robots.mesh import read_mesh
-from surgical_marl.runs.folder import read_checkpoint, read_metrics
+from surgical_marl.runs.folder import read_checkpoint, read_environments, read_metrics, write_environments
 from surgical_marl.untrusted.arrays import read_npz
 from surgical_marl.view.take import read_take
 
@@ -111,6 +113,48 @@ def test_checkpoints(tmp_path: Path) -> None:
     path.unlink()
     os.mkfifo(path)
     assert "has no checkpoint.pt" in refused(lambda: read_checkpoint(tmp_path))
+
+
+def bombs() -> Iterator[Any]:
+    """Yield parts of a small checkpoint that would take 40 GB, hours, or more calls in each other than Python makes."""
+    yield torch.zeros(1).expand(100_000, 100_000)
+    yield torch.zeros(100_000, 100_000, device="meta")
+    yield torch.sparse_coo_tensor(size=(100_000, 100_000), check_invariants=True)
+    doubled: list[Any] = [1.0]
+    for _ in range(40):
+        doubled = [doubled, doubled]
+    yield doubled
+    deep: list[Any] = []
+    for _ in range(5_000):
+        deep = [deep]
+    yield deep
+    circle: list[Any] = []
+    circle.append(circle)
+    yield circle
+
+
+@pytest.mark.parametrize("number", range(6))
+def test_a_small_checkpoint_that_stands_for_a_large_one(number: int, tmp_path: Path) -> None:
+    bomb = list(bombs())[number]
+    good = {"iteration": 1, "groups": {"psm": [1, 2, 3]}, "algorithm": {"actor_state_dict": {"a": torch.zeros(2)}}}
+    with more_calls():
+        torch.save({**good, "algorithm": {"a": bomb}}, tmp_path / "checkpoint.pt")
+        write_environments(tmp_path, 1, 1, 2, {"a": bomb})
+    assert (tmp_path / "checkpoint.pt").stat().st_size < 200_000
+    assert "is damaged" in refused(lambda: read_checkpoint(tmp_path))
+    found = read_environments(tmp_path, 1, 1, 2)
+    assert found is None or isinstance(found["a"], list)  # how deep it is matters to nobody there
+
+
+@contextlib.contextmanager
+def more_calls() -> Iterator[None]:
+    """Let Python make enough calls in each other to write what it can't read."""
+    usual = sys.getrecursionlimit()
+    sys.setrecursionlimit(50_000)
+    try:
+        yield
+    finally:
+        sys.setrecursionlimit(usual)
 
 
 def npz(**members: bytes) -> bytes:

@@ -103,7 +103,9 @@ def _report(arguments: argparse.Namespace) -> None:
 
     from surgical_marl.report.command import report
 
-    print(report(arguments.runs, arguments.out, arguments.evaluate))
+    with preparing("the report"):
+        path = report(arguments.runs, arguments.out, arguments.evaluate)
+    print(path)
 
 
 def _check(arguments: argparse.Namespace, policies: Sequence[str]) -> None:

@@ -322,7 +322,9 @@ def _train(arguments: argparse.Namespace) -> None:
         with owned(run):
             remove_temporaries(run)  # of a process that was killed in what follows
             judge(run)
-            report_run(run)
+            with preparing(f"the report of {run}"):
+                report_run(run)
+            print(run, flush=True)
 
 
 def _run_folder(settings: Any) -> Path:

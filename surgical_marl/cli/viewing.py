@@ -5,6 +5,7 @@ from __future__ import annotations
 # Only light imports here, as in main.py.
 import argparse
 import importlib.util
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -69,6 +70,8 @@ def _view(arguments: argparse.Namespace) -> None:
     with preparing(f"the page of {arguments.task}"):
         viewer = _open(arguments)
     print(viewer.address, flush=True)
+    if sys.stderr.isatty():
+        print("surgical-marl: open this address in a browser; Ctrl-C ends it", file=sys.stderr)
 
     import signal
     import threading

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -56,7 +55,7 @@ def play_all(
     played = {}
     for policy in policies:
         acting = Team(env, find_policy(policy), partners or {})
-        run = play(env, acting, episodes, seed, f"evaluating {policy}, {episodes} episodes")
+        run = play(env, acting, episodes, seed, f"evaluating {Path(policy).name}")
         played[policy] = run._replace(about={**run.about, "partners": dict(partners)}) if partners else run
     return played
 
@@ -133,12 +132,10 @@ def judge(run: Path) -> None:
     text = json.dumps(result, indent=2) + "\n"
     write_played(run / EPISODES, played)
     write_atomic(run / RESULT, lambda path: path.write_text(text))
-    print(format_table(result))
-    print(run, flush=True)
+    print(format_table(result), flush=True)
 
     from surgical_marl.view.record import record
 
-    print("recording a video", file=sys.stderr)
     record(env, policy, run / FILM)
 
 

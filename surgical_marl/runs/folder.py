@@ -41,6 +41,8 @@ DIVERGED = "diverged.json"
 WEIGHTS = ".safetensors"
 """Suffix of the weight files of a shipped policy."""
 MAX_METRICS = 100 * MB
+MOST_PARTS = 100_000
+"""Values of a checkpoint, each tensor as one."""
 """Bytes of `metrics.csv`, a quarter of a million iterations."""
 PACKAGES = ("surgical-marl", "torch", "rsl-rl-lib", "jax", "mujoco", "mujoco-mjx", "numpy")
 
@@ -154,13 +156,37 @@ def read_checkpoint(run: str | Path) -> dict[str, Any]:
         check_checkpoint(path)
         with warnings.catch_warnings(action="ignore"):  # torch's error for a file of another format
             checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+        _check_parts(checkpoint)
+        bad = not_finite(checkpoint["algorithm"])
     except Exception:  # torch.load raises many types of errors for a damaged file
-        checkpoint = None
+        checkpoint, bad = None, []
     if not isinstance(checkpoint, dict) or not _is_whole(checkpoint):
         raise ValueError(f"{path} is damaged, or not a checkpoint of this program: restore it from a copy")
-    if bad := not_finite(checkpoint["algorithm"]):
+    if bad:
         raise ValueError(f"{path} holds numbers that are not finite ({listed(bad, 3)}): restore it from a copy")
     return checkpoint
+
+
+def _check_parts(tree: Any) -> None:
+    """Raise ValueError if what was loaded has too many parts, or a tensor has more numbers than the file.
+
+    A tensor may repeat one number along an axis, and a list may hold another one many times: a file of a kilobyte could
+    take any amount of memory or time.
+    """
+    waiting = [tree]
+    for _ in range(MOST_PARTS):
+        if not waiting:
+            return
+        part = waiting.pop()
+        if isinstance(part, Mapping):
+            waiting += part.values()
+        elif isinstance(part, (list, tuple, set)):
+            waiting += part
+        elif isinstance(part, torch.Tensor):
+            needed = part.numel() * part.element_size()
+            if part.is_meta or needed > part.untyped_storage().nbytes():
+                raise ValueError("a tensor has more numbers than the file")
+    raise ValueError(f"more than {MOST_PARTS} parts")
 
 
 def _is_whole(checkpoint: dict[str, Any]) -> bool:
@@ -193,6 +219,7 @@ def read_environments(run: Path, iteration: int, rank: int, processes: int) -> d
     try:
         check_checkpoint(path)
         state = torch.load(path, map_location="cpu", weights_only=True)
+        _check_parts(state)
     except Exception:  # as in `read_checkpoint`
         return None
     return state if isinstance(state, dict) else None

@@ -25,6 +25,8 @@ TICK = 0.5
 _KEPT = "a second start takes it from the cache"
 _waiting: list[threading.Timer] = []
 """What `preparing` would say."""
+_BAR = "{l_bar}{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}{postfix}]"
+"""Without tqdm's rate, for which a terminal of 80 columns has no room beside the figures."""
 _LINE = "{desc}{n_fmt} of {total_fmt} {unit}, {elapsed} done, {remaining} left{postfix}"
 
 
@@ -54,7 +56,7 @@ def progress(total: int, unit: str, what: str = "", begun: int = 0, leave: bool 
 
         return widget(**options)
     if sys.stderr.isatty():
-        return tqdm(**options, file=sys.stderr, dynamic_ncols=True)
+        return tqdm(**options, file=sys.stderr, dynamic_ncols=True, bar_format=_BAR)
     # tqdm's monitor would write a line after maxinterval, by default 10 s, even where nothing is new.
     lines = {"file": _Lines(sys.stderr), "mininterval": EVERY, "maxinterval": EVERY, "bar_format": _LINE}
     return tqdm(**{**options, **lines, "leave": True})

@@ -5,15 +5,18 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import mujoco
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from surgical_marl.machine import cores
 from surgical_marl.policies.acting import forget
+from surgical_marl.runs.progress import progress
 from surgical_marl.view.camera import best_view, task_places
 from surgical_marl.view.colours import GOAL_RADIUS, goal_colour
 from surgical_marl.view.drawn import Sphere
@@ -43,7 +46,26 @@ def record(
     seed: int = 0,
 ) -> Path:
     """Film the first environment of `env` for some episodes, or for `LONGEST`; return the path of the video."""
-    return write_video(path, frames(env, policy, episodes, seed), FPS)
+    every = _every(env)
+    with _one_thread(), progress(-(-_steps(env, episodes) // every), "frame", "filming") as bar:
+
+        def shown() -> Iterator[NDArray[np.uint8]]:
+            for frame in frames(env, policy, episodes, seed):
+                bar.update()
+                yield frame
+
+        return write_video(path, shown(), FPS)
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Let torch compute in one thread, in this block: while all cores draw, its threads wait for each other."""
+    usual = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(usual)
 
 
 def frames(
@@ -74,15 +96,25 @@ def _poses(
     seed: int,
 ) -> Iterator[Pose]:
     """Yield the poses that the pictures of `frames` show."""
-    every = max(1, round(1 / (FPS * env.control_dt)))
+    every = _every(env)
     observations, *_ = env.reset(seed)
     forget(policy)
-    for step in range(min(episodes * env.max_steps, round(LONGEST / env.control_dt))):
+    for step in range(_steps(env, episodes)):
         if step % every == 0:
             yield picture.pose()
         outcome = env.step(dict(policy(observations)))
         observations = outcome.observations
         forget(policy, outcome.terminated | outcome.truncated)
+
+
+def _every(env: BatchedEnv) -> int:
+    """Return after how many steps there is a picture."""
+    return max(1, round(1 / (FPS * env.control_dt)))
+
+
+def _steps(env: BatchedEnv, episodes: int) -> int:
+    """Return how many steps a video shows."""
+    return min(episodes * env.max_steps, round(LONGEST / env.control_dt))
 
 
 class Pose(NamedTuple):

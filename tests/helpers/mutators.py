@@ -115,7 +115,7 @@ def _regrouped(old: Any, rng: random.Random, words: list[Any]) -> Any:
     elif way < 0.5 and isinstance(old, list):
         items.insert(at, inside)
     elif way < 0.6 and items and isinstance(old, list):
-        items = items * rng.choice((2, 10, 100)) if len(items) < 1000 else items[:3]
+        items = items * rng.choice((2, 10, 100)) if len(places(old)) < 1000 else items[:3]
     elif way < 0.7:
         rng.shuffle(items)
     elif isinstance(old, dict):
@@ -200,6 +200,7 @@ def _npy(value: Any) -> bytes:
         return file.getvalue()
     kind, shape, numbers = value
     try:
+        assert np.dtype(kind).itemsize <= 64
         data = _filled(np.array(numbers).astype(kind), shape).tobytes()
     except Exception:  # what it says is no array: it stays, over other data
         data = b"\0" * 64
@@ -236,6 +237,7 @@ def _write_zip(tree: Any) -> bytes:
 def _parse_checkpoint(data: bytes) -> Any:
     def tree(value: Any) -> Any:
         if isinstance(value, torch.Tensor):
+            assert value.numel() <= MOST_NUMBERS  # it may repeat the few that the file holds
             return {"~": [str(value.dtype), list(value.shape), value.flatten()[:200].tolist()]}
         if isinstance(value, dict):
             return {key: tree(part) for key, part in value.items()}
