@@ -22,7 +22,8 @@ def run(arguments: Namespace) -> int:
 
     `arguments.given` are the options of what is measured, as far as flags gave them.
     """
-    find("scenes", arguments.scene)
+    if arguments.scene is not None:
+        find("scenes", arguments.scene)
     if arguments.kind == "render":
         from surgical_marl.bench.render import run, run_pictures
 
@@ -36,6 +37,10 @@ def run(arguments: Namespace) -> int:
     if arguments.task not in list_tasks():
         raise unknown("task", arguments.task, list_tasks())
     with _no_caches() if arguments.cold else contextlib.nullcontext():
+        if arguments.scene is None:
+            from surgical_marl.plugins.tasks import TASKS
+
+            arguments.scene = TASKS.load(arguments.task).default_scene or "psm"
         return {"sim": _sim, "train": _train, "solve": _solve, "face": _face}[arguments.kind](arguments)
 
 

@@ -38,6 +38,7 @@ _LISTS = {
 }
 
 _CONTROL = choices("control")
+_OWN_SCENE = "a name (see `list scenes`) or a .yaml file (default: the task's own, or psm)"
 _TAKE_SETTINGS = ("train", "bench train", "bench solve")
 """Commands that take `key=value`."""
 
@@ -186,7 +187,7 @@ def _parser() -> argparse.ArgumentParser:
 
     face = kinds.add_parser("face", help="what the PettingZoo face adds to a step of the engine, on a CPU")
     face.add_argument("--task", default="reach", help=f"one of: {', '.join(list_tasks())}")
-    face.add_argument("--scene", default="psm", help="a name (see `list scenes`) or a .yaml file")
+    face.add_argument("--scene", help=_OWN_SCENE)
     face.add_argument("--num-envs", type=whole(1), metavar="N", help="default: one environment, not batched")
     face.add_argument("--json", action="store_true", help="one JSON object instead of a sentence")
     face.set_defaults(command=_bench, name="bench face", kind="face", of=Settings, cold=False)
@@ -200,7 +201,7 @@ def _bench_parser(kinds: Any, kind: str, what: str, of: type) -> argparse.Argume
     """Return the parser of one benchmark: the flags of what it measures, and those that all benchmarks take."""
     parser: argparse.ArgumentParser = kinds.add_parser(kind, help=what)
     parser.add_argument("--task", default="reach", help=f"one of: {', '.join(list_tasks())}")
-    parser.add_argument("--scene", default="psm", help="a name (see `list scenes`) or a .yaml file")
+    parser.add_argument("--scene", help=_OWN_SCENE)
     add_flags(parser, of, [name for name in flagged(of) if name != "iterations"])
     parser.add_argument("--cold", action="store_true", help="start without caches")
     parser.add_argument("--json", action="store_true", help="one JSON object instead of a table")
