@@ -166,7 +166,7 @@ def test_what_falls_on_a_board_and_on_pegs_comes_to_rest_there(tmp_path: Path) -
     rng, start = np.random.default_rng(0), falling.begin(32)
     shift = rng.uniform(-5e-4, 5e-4, (32, 3, 3)) * [1, 1, 0]
     start = thrown(start, position=np.array(start.bodies.position) + shift)
-    apart = np.flatnonzero(np.asarray(jax.vmap(falling.depth)(start)) < 0)[:8]
+    apart = np.flatnonzero(np.asarray(falling.depths(start)) < 0)[:8]
     assert len(apart) == 8
     path = comes_to_rest(falling, jax.tree.map(lambda x: x[apart], start))
     assert path.position[..., 2].min() > 0

@@ -78,8 +78,8 @@ def test_what_moves_without_arms_gains_no_energy(scene: int, seed: int) -> None:
     start = states(space, np.random.default_rng(seed), 0.0, 0.02)
     _, path = space.play(start, STEPS * DT)
     assert all(np.isfinite(part).all() for part in path)
-    depth = jax.vmap(space.depth)(start)
-    apart, begin = np.asarray(depth) < 0, jax.tree.map(lambda x: np.asarray(x, float)[:, None], start.bodies)
+    apart = np.asarray(space.depths(start)) < 0
+    begin = jax.tree.map(lambda x: np.asarray(x, float)[:, None], start.bodies)
     before = space.energy(begin)  # type: ignore[arg-type]
     energy = np.concatenate([before, space.energy(path)], 1).sum(-1)[apart]
     scale = np.maximum(energy[:, :1] - 9.81 * -0.01 * space.masses.mass.sum(), 1e-9)

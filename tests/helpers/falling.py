@@ -46,6 +46,9 @@ class Falling:
         self.masses, self.names = self.together.tables.masses, self.together.names
         self._arms = Simulator(self.scene).home
         self._play = jax.jit(jax.vmap(self._advance, in_axes=(0, 0, None)), static_argnums=2)
+        self.depths = jax.jit(jax.vmap(self.depth))
+        """`depth` in many environments [E]. Without `jit` each call would compile each of its loops once more, and some
+        hundred calls take all the memory maps that Linux gives to a process."""
 
     def begin(self, count: int) -> Objects:
         """Return the objects where the scene has them, [count]."""
