@@ -121,7 +121,6 @@ class Handling:
         """Return how the patches that were found resist. There are neither joints nor fingers without arms."""
         speeds = _Speeds(self._newton.by_arm(qvel), self._newton.by_object(bodies.velocity))
         at = self._newton.by_object(bodies.position), self._newton.by_object(bodies.quaternion)
-        grips = grips
 
         def felt(n: Array) -> Felt:
             patch, number = row_of(slots.patch, n), slots.number[n]
@@ -234,7 +233,6 @@ class Handling:
         t, k = self.tables, len(bodies.position)
         if not t.grip:
             return grips
-        old = grips
         moves = self._newton.by_arm(shift[0]), self._newton.by_object(shift[1])
         at = self._newton.by_object(bodies.position), self._newton.by_object(bodies.quaternion)
         normal = jnp.zeros((k, len(t.fingers), 3))
@@ -247,7 +245,7 @@ class Handling:
                 patch, contact, slip, forces = row_of((slots.patch, felt.contacts, felt.slip, pressed), n)
                 after = slip + contact.cone.along @ self._newton.twist(contact, *moves)
                 place = contact.first, f
-                own = old._replace(**{name: getattr(old, name)[place] for name in OF_FINGERS})
+                own = grips._replace(**{name: getattr(grips, name)[place] for name in OF_FINGERS})
                 pose = at[0][contact.first], at[1][contact.first]
                 new = self._kept(patch, number, forces, after, row_of(fingers, f), pose, own)
                 found = put(tuple(getattr(kept[0], name) for name in OF_FINGERS), place, new)
@@ -257,8 +255,8 @@ class Handling:
 
             return jax.lax.cond(f < len(t.fingers), note, lambda kept: kept, kept)
 
-        grips, normal = jax.lax.fori_loop(0, slots.found, one, (fresh, normal))
-        return grips._replace(held=self._held(normal, grips.force, grips.held, dt))
+        kept, normal = jax.lax.fori_loop(0, slots.found, one, (fresh, normal))
+        return kept._replace(held=self._held(normal, kept.force, kept.held, dt))
 
     def _kept(
         self, patch: Patch, number: Array, forces: Pressed, after: Array, finger: Fingers, at: tuple[Array, Array],

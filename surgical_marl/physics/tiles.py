@@ -61,12 +61,12 @@ class Tiles:
             of: takes the capsules of both sides, [A, 1] and [1, B], and which of their cells are pairs, [A, B].
             capsules: of `geoms`, [c].
         """
-        centres, axes = capsules.centre, capsules.axis
 
         def tile(rows: Any) -> Any:
             sides, sizes, is_pair = rows
             one, other = (
-                Capsule(_at(centres, side), _at(axes, side), *size) for side, size in zip(sides, sizes, strict=True)
+                Capsule(_at(capsules.centre, side), _at(capsules.axis, side), *size)
+                for side, size in zip(sides, sizes, strict=True)
             )
             return of(jax.tree.map(lambda x: x[:, None], one), jax.tree.map(lambda x: x[None], other), is_pair)
 

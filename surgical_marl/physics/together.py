@@ -242,7 +242,7 @@ class Together:
             mass = mass.at[arms, : m * (m + 1) // 2].set(of_kind.mass)
             smooth = smooth.at[arms, :m].set(of_kind.smooth)
             joints = JointRows(*(all_.at[arms, :m].set(own) for all_, own in zip(joints, of_kind.joints, strict=True)))
-        return (mass, smooth, joints)
+        return mass, smooth, joints
 
     def _between(self, physics: Physics, overlap: Array) -> _Between:
         """Return the contacts of arms with arms. There is nothing in it unless any overlap."""
