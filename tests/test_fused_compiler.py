@@ -176,7 +176,7 @@ def test_code_for_cuda_compiles(tmp_path: Path) -> None:
         pytest.skip("Warp has no NVRTC that knows sm_90 here")
     module = kernel.wp.get_module("surgical_marl_test_cuda")
     module.options["enable_backward"] = False
-    kernel._make("test_cuda", f"{CUDA}\n{code}\n{UNDEFINE}\n", module, ordered=True)
+    kernel._make("test_cuda", f"{CUDA}\n{code}\n{UNDEFINE}\n", module)
     kernel.wp.compile_aot_module(module, arch=90, module_dir=tmp_path, use_ptx=True)
     assert list(tmp_path.glob("*.ptx"))
 

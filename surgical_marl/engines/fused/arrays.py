@@ -6,10 +6,13 @@ import weakref
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
 
+from surgical_marl.engines.fused.order import Order
+from surgical_marl.engines.fused.preludes import LANES
 from surgical_marl.engines.fused.program import Leaf, Source
 from surgical_marl.machine import free_memory
 from surgical_marl.runtime import prepare_warp
@@ -21,22 +24,26 @@ _VIEWS = {"bool": np.bool_, "uint32": np.uint32}
 """Types of leaves that are not the type of their buffer: the same bits, seen as another type."""
 _READ = ("outs", "flags", "counts")
 """Buffers that a step's results are in. Nothing else is in the first one, which is by far the largest."""
+_KEPT = ("state", "counts", "flags")
+"""Buffers that the next step reads."""
 _ROOMS = 3
 """Rooms for results that are kept to be used again: a loop holds the last step's results, and some hold two."""
 
 
 def make_arrays(device: str, source: Source, tables: dict[str, np.ndarray], stride: int, num_envs: int) -> Arrays:
-    """Arrays for a program, zero. ValueError if there is no room for them."""
+    """Arrays for a program, zero, with a column for each environment. ValueError if there is no room for them."""
     return (CudaArrays if device == "cuda" else CpuArrays)(source, tables, stride, num_envs)
 
 
 class Arrays(ABC):
     """`all` is what `Kernel.launch` takes; columns from `num_envs` on are padding.
 
-    Its last two are `order`, in which a GPU runs environments, and `work`, how much each had to do.
+    Its last one is `work`, how much the environment in each column had to do. `order` says which that is; if it is None,
+    environments are in the order of their numbers.
     """
 
     device: str
+    order: Order | None = None
 
     def __init__(self, source: Source, tables: dict[str, np.ndarray], stride: int, num_envs: int) -> None:
         self.num_envs, self.stride = num_envs, stride
@@ -48,12 +55,12 @@ class Arrays(ABC):
                 f"{room // (2 * each)} fit"
             )
         self._buffers = {name: self._zeros(max(source.sizes[name], 1), stride, dtype) for name, dtype in _TYPES.items()}
-        self.order, self.work = self.constant(np.arange(stride, dtype=np.int32)), self._zeros(1, stride, np.int32)[0]
+        self.work = self._zeros(1, stride, np.int32)[0]
         constants = [self.constant(table) for table in tables.values()]
         self.all = [
             *(self.warp(buffer) for buffer in self._buffers.values()),
             *(self.warp(constant) for constant in constants),
-            *(self.warp(array) for array in (self.order, self.work)),
+            self.warp(self.work),
         ]
 
     @abstractmethod
@@ -77,6 +84,20 @@ class Arrays(ABC):
         """Make room for results, before a kernel is launched."""
 
     @abstractmethod
+    def _argsort(self, shares: int) -> Any:
+        """Return the columns in the order of how much they had to do, most first, for so many threads of a CPU."""
+
+    def sort_columns(self, decimation: int, shares: int) -> None:
+        """Sort columns from time to time (`order.py`).
+
+        Args:
+            decimation: physics steps of a control step.
+            shares: threads of a CPU, each of which takes a part of the columns.
+        """
+        numbers = self.constant(np.arange(self.num_envs, dtype=np.int32))
+        self.order = Order(numbers, [self.fields(name) for name in _KEPT], partial(self._argsort, shares), decimation)
+
+    @abstractmethod
     def _zeros(self, fields: int, stride: int, dtype: Any) -> Any: ...
 
     @abstractmethod
@@ -88,15 +109,11 @@ class Arrays(ABC):
         """Return an array of the device as Warp's, in one row: the same memory."""
 
     def fields(self, buffer: str) -> Any:
-        """Return all fields of "state", "counts", "actions", "outs" or "flags", [fields, N]: a view, not a copy."""
+        """Return all fields of "state", "counts", "actions", "outs" or "flags", [fields, columns]: a view, not a copy."""
         return self._buffers[buffer][:, : self.num_envs]
 
-    def whole(self, buffer: str) -> Any:
-        """Return such fields with those of environments that fill up the arrays, [fields, stride]."""
-        return self._buffers[buffer]
-
     def rows(self, leaf: Leaf) -> Any:
-        """Return the fields of a leaf, of shape [size, N], as an array of the device's own library.
+        """Return the fields of a leaf, of shape [size, columns], as an array of the device's own library.
 
         It is a view, not a copy.
         """
@@ -106,7 +123,7 @@ class Arrays(ABC):
 class CpuArrays(Arrays):
     """numpy arrays.
 
-    Results are not copied. A kernel writes them into a room that nobody holds an array of.
+    Results are not copied, unless columns are sorted. A kernel writes them into a room that nobody holds an array of.
     """
 
     device = "cpu"
@@ -128,17 +145,31 @@ class CpuArrays(Arrays):
         if type(values).__module__.startswith("torch"):
             values = values.detach().cpu().numpy()
         values = np.asarray(values, leaf.dtype).reshape(self.num_envs, leaf.size)
+        if self.order:
+            values = values[self.order.envs]
         self.rows(leaf)[:] = values.T.view(np.int32) if leaf.dtype == "uint32" else values.T
 
     def read(self, leaf: Leaf, library: str) -> Any:
-        fields = self.rows(leaf).copy().view(_VIEWS.get(leaf.dtype, leaf.dtype)).T
+        fields = self._by_environment(self.rows(leaf)).view(_VIEWS.get(leaf.dtype, leaf.dtype)).T
         return self._present(leaf, fields if leaf.shape else fields[:, 0], library)
 
     def read_tree(self, tree: dict[str, Any], library: str) -> dict[str, Any]:
-        flags, counts = (self._buffers[name].copy() for name in ("flags", "counts"))
-        typed = {"float32": self._buffers["outs"], "bool": flags.view(np.bool_), "int32": counts}
-        typed["uint32"] = counts.view(np.uint32)
-        return self._cut(tree, {dtype: own[:, : self.num_envs].T for dtype, own in typed.items()}, library)
+        flags, counts = (self._by_environment(self.fields(name)) for name in ("flags", "counts"))
+        outs = self._by_environment(self.fields("outs")) if self.order else self.fields("outs")
+        typed = {"float32": outs, "bool": flags.view(np.bool_), "int32": counts, "uint32": counts.view(np.uint32)}
+        return self._cut(tree, {dtype: own.T for dtype, own in typed.items()}, library)
+
+    def _by_environment(self, rows: np.ndarray) -> np.ndarray:
+        """Return a copy of rows [..., columns] in the order of the environments' numbers."""
+        return rows[:, self.order.columns] if self.order else rows.copy()
+
+    def _argsort(self, shares: int) -> Any:
+        new = np.argsort(-self.work[: self.num_envs], kind="stable")
+        whole = self.num_envs // LANES * LANES
+        vectors = new[:whole].reshape(-1, LANES)
+        # dealt out, so that no thread gets all of those with the most to do
+        new[:whole] = np.concatenate([vectors[k::shares] for k in range(shares)]).ravel()
+        return new
 
     def _cut(self, tree: dict[str, Any], columns: dict[str, np.ndarray], library: str) -> dict[str, Any]:
         """Return the leaves, taken out of arrays [N, fields] by dtype. Most of what Python does in a step is this."""
@@ -217,13 +248,26 @@ class CudaArrays(Arrays):
             values = torch.from_numpy(
                 np.array(values, leaf.dtype).view(np.int32 if leaf.dtype == "uint32" else leaf.dtype)
             )
-        self.rows(leaf).copy_(values.detach().reshape(self.num_envs, leaf.size).t())
+        values = values.detach().reshape(self.num_envs, leaf.size)
+        if self.order:
+            values = values.to("cuda").index_select(0, self.order.envs)
+        self.rows(leaf).copy_(values.t())
 
     def read(self, leaf: Leaf, library: str) -> Any:
-        return self._present(leaf, self.rows(leaf).clone(), library)
+        return self._present(leaf, self._by_environment(self.rows(leaf)), library)
 
     def read_tree(self, tree: dict[str, Any], library: str) -> dict[str, Any]:
-        return self._cut(tree, {name: self._buffers[name].clone() for name in _READ}, library)
+        return self._cut(tree, {name: self._by_environment(self.fields(name)) for name in _READ}, library)
+
+    def _by_environment(self, rows: Any) -> Any:
+        """As in `CpuArrays`."""
+        return rows.index_select(1, self.order.columns) if self.order else rows.clone()
+
+    def _argsort(self, shares: int) -> Any:
+        import torch
+
+        # Those with the most to do come first: others run beside them, where they would be waited for at the end.
+        return torch.argsort(self.work[: self.num_envs].to(torch.int16), descending=True, stable=True)
 
     def renew(self) -> None:
         pass  # a CUDA graph writes to the same place at every replay, so what is read is copied

@@ -66,7 +66,7 @@ class Emitter(ArrayEmitter):
             self.lines = ["F watch_=SPLAT(0.0f);", *self.lines]
             self.lines.append(f"B bad_=watch_!=SPLAT(0.0f);if(ANY(bad_)){{STB(flags,{field},LDB(flags,{field})|bad_)}}")
         if any(line.startswith("WORK(") for line in self.lines):
-            self.lines = ["I work_=0;", *self.lines, "work.data[t]=WORKED;"]
+            self.lines = ["I work_=SPLATI(0);", *self.lines, "STI(work,0,WORKED)"]
         return "\n".join(self.lines)
 
     def _postpone_stores(self) -> None:
@@ -145,8 +145,8 @@ class Emitter(ArrayEmitter):
     def _count(self, region: int) -> None:
         """Add the operations of a part that not all environments go through to how much this one had to do."""
         size = len(self.schedule.regions[region].items)
-        if size >= LARGE and not self.vector:
-            self.lines.append(f"WORK({size})")
+        if size >= LARGE:
+            self.lines.append(f"WORK({size},{'&'.join(self.active) or 'SPLATB(1)'})")
 
     @contextmanager
     def _kept(self, arrays: Iterable[str], condition: str) -> Iterator[None]:

@@ -5,7 +5,8 @@
     engine.step(actions)
     engine.outcome("torch")["rewards"]
 
-The state of all environments stays in four arrays on the device, [field, environment], between steps.
+The state of all environments stays in arrays on the device, [field, column], between steps. Which environment
+is in which column may change (`order.py`).
 """
 
 from __future__ import annotations
@@ -20,9 +21,8 @@ import numpy as np
 
 from surgical_marl.engines.fused.arrays import make_arrays
 from surgical_marl.engines.fused.guard import Guard
-from surgical_marl.engines.fused.kernel import compile_kernels, has_cuda, large_branches
+from surgical_marl.engines.fused.kernel import BRANCHES, compile_kernels, has_cuda, large_branches
 from surgical_marl.engines.fused.load import load_source
-from surgical_marl.engines.fused.order import Order
 from surgical_marl.engines.fused.preludes import LANES
 from surgical_marl.engines.fused.program import Source
 from surgical_marl.engines.fused.threefry import episode_keys
@@ -32,6 +32,8 @@ from surgical_marl.machine import cores
 
 LEAST_SHARE = 32
 """Least number of environments per thread."""
+LEAST_BRANCHES = {"cuda": 1, "cpu": BRANCHES}
+"""Least number of large branches for which environments are sorted. A CPU's results have to be copied then."""
 
 
 class FusedEngine:
@@ -58,15 +60,14 @@ class FusedEngine:
         self._stride = -(-num_envs // LANES) * LANES
         self._arrays = make_arrays(self.device, self.source, self._filled_tables(), self._stride, num_envs)
         self._guard: Guard | None = None
-        self._order: Order | None = None
-        if self.device == "cuda" and large_branches(self.source.bodies):
-            self._order = Order(self._arrays.order[:num_envs], self._arrays.work[:num_envs], env.decimation)
         vectors = self._stride // LANES
         shares = min(cores(), max(1, num_envs // LEAST_SHARE)) if self.device == "cpu" else 1
         edges = [round(vectors * k / shares) * LANES for k in range(shares + 1)]
         self._shares = [(a, b - a) for a, b in pairwise(edges)]
         if shares == 1:
             self._shares = [(0, num_envs if self.device == "cuda" else self._stride)]
+        if num_envs > LANES and large_branches(self.source.bodies) >= LEAST_BRANCHES[self.device]:
+            self._arrays.sort_columns(env.decimation, shares)
         self._pool: ThreadPoolExecutor | None = None
         self._process = 0
         self._stepped = False
@@ -92,6 +93,8 @@ class FusedEngine:
             actions: [N, n] by agent, of any array library.
             sense: called after the physics, when `.moved` can be read; returns the sensed numbers, [N] each.
         """
+        if self._arrays.order:
+            self._arrays.order.renew()
         for agent, action in actions.items():
             self._arrays.write(self.source.actions[agent], action)
         if self.env.pauses:
@@ -176,8 +179,6 @@ class FusedEngine:
 
     def _launch(self, name: str) -> None:
         self._arrays.renew()
-        if self._order:
-            self._order.renew()
         launch = lambda share: self._kernels[name].launch(self._arrays.all, self._stride, *share)  # noqa: E731
         if len(self._shares) == 1:
             launch(self._shares[0])

@@ -56,6 +56,7 @@ class Guard:
         # Where the next step will end an episode that was told to end: its numbers are no new fault.
         self._leaving, self._waiting = np.zeros(arrays.num_envs, np.int32), False
         self._fine = np.full(arrays.num_envs, FINE, np.int32)
+        self._envs = arrays.order.envs if arrays.order else arrays.constant(np.arange(arrays.num_envs, dtype=np.int32))
         self._none = np.zeros(0, np.int64)
         if arrays.device == "cuda":
             self._own = self.on_device()
@@ -97,7 +98,7 @@ class Guard:
         wp.launch(
             _check,
             dim=arrays.num_envs,
-            inputs=[state, counts, outs, flags, *map(arrays.warp, own), *numbers],
+            inputs=[state, counts, outs, flags, *map(arrays.warp, own), arrays.warp(self._envs), *numbers],
             device=arrays.device,
             stream=torch_stream() if arrays.device == "cuda" else None,
         )
@@ -124,10 +125,10 @@ class Guard:
             flags[row, suspects[faulty]] = value
         flags[self._flag, suspects] = 0
         counts[self._steps, suspects[broken]] = limit
-        codes = self._fine.copy()
-        codes[suspects] = np.where(faulty & ~broken & (self._leaving[suspects] > 0), FINE, first)
+        codes, envs = self._fine.copy(), self._envs[suspects]
+        codes[envs] = np.where(faulty & ~broken & (self._leaving[envs] > 0), FINE, first)
         self._leaving[:] = 0
-        self._leaving[suspects] = broken
+        self._leaving[envs] = broken
         self._waiting = bool(broken.any())
         return codes
 
@@ -135,24 +136,25 @@ class Guard:
 @wp.kernel(enable_backward=False)
 def _check(
     state: _reals, counts: _wholes, outs: _reals, flags: _bytes, state_rows: _wholes, outs_rows: _wholes,
-    kinds: _wholes, leaving: _wholes, codes: _wholes, stride: int, steps: int, terminated: int, truncated: int,
-    flag: int, limit: int,
+    kinds: _wholes, leaving: _wholes, codes: _wholes, envs: _wholes, stride: int, steps: int, terminated: int,
+    truncated: int, flag: int, limit: int,
 ) -> None:  # fmt: skip
-    e = wp.tid()
-    if flags[flag * stride + e] == wp.uint8(0) and leaving[e] == 0:
+    c = wp.tid()
+    e = envs[c]
+    if flags[flag * stride + c] == wp.uint8(0) and leaving[e] == 0:
         codes[e] = -1
         return
-    flags[flag * stride + e] = wp.uint8(0)
+    flags[flag * stride + c] = wp.uint8(0)
     code = wp.int32(-1)
     broken = wp.int32(0)
     count = state_rows.shape[0]
     for i in range(count):
-        if not wp.isfinite(state[state_rows[i] * stride + e]):
+        if not wp.isfinite(state[state_rows[i] * stride + c]):
             broken = 1
             if code < 0:
                 code = i
     for j in range(outs_rows.shape[0]):
-        at = outs_rows[j] * stride + e
+        at = outs_rows[j] * stride + c
         if not wp.isfinite(outs[at]):
             outs[at] = 0.0
             if kinds[j] == _NEXT:
@@ -162,11 +164,11 @@ def _check(
     if code >= 0:
         for j in range(outs_rows.shape[0]):
             if kinds[j] == _REWARD:
-                outs[outs_rows[j] * stride + e] = 0.0
-        flags[terminated * stride + e] = wp.uint8(1)
-        flags[truncated * stride + e] = wp.uint8(0)
+                outs[outs_rows[j] * stride + c] = 0.0
+        flags[terminated * stride + c] = wp.uint8(1)
+        flags[truncated * stride + c] = wp.uint8(0)
     if broken == 1:
-        counts[steps * stride + e] = limit
+        counts[steps * stride + c] = limit
     elif leaving[e] == 1:
         code = -1
     leaving[e] = broken

@@ -2,8 +2,7 @@
 
 A kernel works on five arrays whose columns are environments: `state` (float32) and `counts` (int32; uint32 by their
 bits) are read and written, `actions` (float32) read, `outs` (float32) and `flags` (uint8) written; and on two arrays of
-constants. If there are large branches, thread k of a GPU runs environment `order[k]`, and writes how much it had to do
-to `work`.
+constants. If there are large branches, each thread of a GPU writes how much it had to do to `work`.
 """
 
 from __future__ import annotations
@@ -56,7 +55,6 @@ def compile_kernels(
     Warp keeps compiled modules in its cache on disk. `stage` is told if there is none of these bodies.
     """
     cuda, branches = device == "cuda", large_branches(bodies)
-    ordered = cuda and branches > 0
     block = WIDE if cuda and branches >= BRANCHES and num_envs >= MANY else BLOCK if cuda else 1
     prelude = CUDA if cuda else CPU
     sources = tuple((name, f"{prelude}\n{body}\n{UNDEFINE}\n") for name, body in bodies.items())
@@ -64,7 +62,7 @@ def compile_kernels(
     module = wp.get_module(f"surgical_marl_{digest}")
     # contraction: a * b + c is one rounding, as on a GPU
     module.options.update(enable_backward=False, cpu_compiler_flags="-march=native -ffp-contract=fast")
-    made = _made(digest, sources, module, ordered, max_registers)
+    made = _made(digest, sources, module, max_registers)
     # Warp itself does not protect a module from two processes that compile it at the same time
     with locked(cache_dir() / "kernels" / module.name), _checked(module.name):
         if not _folders(module.name):
@@ -74,16 +72,14 @@ def compile_kernels(
 
 
 @lru_cache(MOST_KEPT)
-def _made(
-    digest: str, sources: tuple[tuple[str, str], ...], module: Any, ordered: bool, max_registers: int | None
-) -> dict[str, Any]:
+def _made(digest: str, sources: tuple[tuple[str, str], ...], module: Any, max_registers: int | None) -> dict[str, Any]:
     """Return Warp's kernels by name: the same for all environments of a process whose code is the same.
 
     `wp.func_native` keeps its frame, and so all frames that led to it and what they hold, until Python looks for cycles
     among its objects. Memory of a closed environment must not wait for that: a thread without such frames makes them.
     """
     with ThreadPoolExecutor(1, "surgical_marl") as apart:
-        calls = [apart.submit(_make, f"{name}_{digest}", own, module, ordered, max_registers) for name, own in sources]
+        calls = [apart.submit(_make, f"{name}_{digest}", own, module, max_registers) for name, own in sources]
         return {name: call.result() for (name, _), call in zip(sources, calls, strict=True)}
 
 
@@ -123,7 +119,7 @@ def _digest(folders: list[Path]) -> str:
     return "\n".join(f"{file.name} {hashlib.sha256(file.read_bytes()).hexdigest()}" for file in files)
 
 
-def _make(name: str, source: str, module: Any, ordered: bool, max_registers: int | None = None) -> Any:
+def _make(name: str, source: str, module: Any, max_registers: int | None = None) -> Any:
     def body(
         state: _reals, counts: _wholes, actions: _reals, outs: _reals, flags: _bytes, reals: _reals, wholes: _wholes,
         work: _wholes, stride: int, t: int,
@@ -132,22 +128,15 @@ def _make(name: str, source: str, module: Any, ordered: bool, max_registers: int
     body.__qualname__ = body.__name__ = f"body_{name}"
     body = wp.func_native(source)(body)
 
-    def in_turn(
+    def run(
         state: _reals, counts: _wholes, actions: _reals, outs: _reals, flags: _bytes, reals: _reals, wholes: _wholes,
-        order: _wholes, work: _wholes, stride: int, start: int, lanes: int,
+        work: _wholes, stride: int, start: int, lanes: int,
     ) -> None:  # fmt: skip
         body(state, counts, actions, outs, flags, reals, wholes, work, stride, start + wp.tid() * lanes)
 
-    def in_order(
-        state: _reals, counts: _wholes, actions: _reals, outs: _reals, flags: _bytes, reals: _reals, wholes: _wholes,
-        order: _wholes, work: _wholes, stride: int, start: int, lanes: int,
-    ) -> None:  # fmt: skip
-        body(state, counts, actions, outs, flags, reals, wholes, work, stride, order[start + wp.tid()])
-
     return wp.kernel(
-        in_order if ordered else in_turn, name=name, module=module, enable_backward=False, grid_stride=False,
-        cuda_max_registers=max_registers,
-    )  # fmt: skip
+        run, name=name, module=module, enable_backward=False, grid_stride=False, cuda_max_registers=max_registers
+    )
 
 
 class Kernel:
@@ -157,9 +146,9 @@ class Kernel:
         self._kernel, self._device, self._block = kernel, device, block
 
     def launch(self, arrays: list[Any], stride: int, start: int, count: int) -> None:
-        """Run the environments from `start` up to, but without, `start + count`.
+        """Run the columns from `start` up to, but without, `start + count`, of `stride`.
 
-        The arrays have one column for each of `stride` environments. On a GPU the work goes to torch's current stream,
+        On a GPU the work goes to torch's current stream,
         and can be captured in a CUDA graph.
         """
         cuda = self._device == "cuda"

@@ -1,13 +1,15 @@
-"""Which environments a GPU runs side by side.
+"""Which environments run side by side.
 
-Threads of a GPU go through the code in groups of 32, and a group goes through every branch, and every round of a loop,
-that one of them needs. What an environment has to do is about the same for many steps: an arm that holds something
-goes on to hold it. So those that had about as much to do are put next to each other. An environment's results do not
-depend on which thread makes them.
+Threads of a GPU go through the code in groups of 32, and a CPU's vectors hold 8 environments. Such a group goes through
+every branch, and every round of a loop, that one of them needs. What an environment has to do is about the same for
+many steps: an arm that holds something goes on to hold it. So those that had as much to do are put next to each other:
+the columns of the arrays change places, as neighbours are read together fastest from where they lie together in memory.
+An environment's results do not depend on its column.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 EVERY = 64
@@ -15,25 +17,39 @@ EVERY = 64
 
 
 def launches(decimation: int) -> int:
-    """Return after how many launches of so many physics steps each environments are sorted."""
+    """Return after how many control steps of so many physics steps each environments are sorted."""
     return max(1, EVERY // decimation)
 
 
 class Order:
-    """The order of environments: `order` [N] holds their numbers, and `work` [N] is written by kernels.
+    """Which environment is in which column.
 
-    Those with the most to do come first: others run beside them, where they would be waited for at the end. Sorting is
-    stable, so that neighbours that do the same remain neighbours, and read neighbouring memory.
+    Args:
+        numbers: 0, 1, ... [N] int32, of the library that the arrays are of.
+        kept: arrays [fields, N] whose columns kernels read again in the next step.
+        argsort: returns how columns are to be arranged by what they had to do, [N].
+        decimation: physics steps of a control step.
+
+    Attributes:
+        envs: the environment in each column, [N] int32.
+        columns: the column of each environment, [N] int32.
     """
 
-    def __init__(self, order: Any, work: Any, decimation: int) -> None:
-        self._order, self._work = order, work
-        self._every, self._launches = launches(decimation), 0
+    def __init__(self, numbers: Any, kept: list[Any], argsort: Callable[[], Any], decimation: int) -> None:
+        self._numbers, self._kept, self._argsort = numbers, kept, argsort
+        self._every, self._steps = launches(decimation), 0
+        self.envs, self.columns = numbers + 0, numbers + 0
 
     def renew(self) -> None:
-        """Sort environments if it is time, before a launch."""
-        import torch
+        """Sort the columns if it is time, before a control step."""
+        if self._steps % self._every == 1 % self._every:
+            self.sort()
+        self._steps += 1
 
-        if self._launches % self._every == 1 % self._every:
-            self._order.copy_(torch.argsort(self._work.to(torch.uint8), descending=True, stable=True))
-        self._launches += 1
+    def sort(self) -> None:
+        """Sort the columns now."""
+        new = self._argsort()
+        for array in self._kept:
+            array[:] = array[:, new]
+        self.envs[:] = self.envs[new]
+        self.columns[self.envs] = self._numbers

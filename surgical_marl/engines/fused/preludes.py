@@ -4,7 +4,7 @@ Division and square root are CUDA's approximate ones, right to two units in the 
 2^-126 for 0, which saves the scaling of such numbers: one instruction in twenty of a physics step. That division gives
 0 for a divisor above 2^126.
 
-`WORKED` is how much there was to do, to the quarter of a doubling: the exponent and two more bits of a float.
+`WORKED` is how much there was to do. On a GPU it fits 16 bits, to 1 %: the exponent and seven more bits of a float.
 """
 
 from __future__ import annotations
@@ -73,8 +73,8 @@ typedef float F; typedef int I; typedef unsigned int U; typedef bool B;
 #define HIDEF(x) asm volatile("":"+f"(x));
 #define HIDEI(x) asm volatile("":"+r"(x));
 #define HIDEU(x) asm volatile("":"+r"(x));
-#define WORK(n) work_+=n;
-#define WORKED (max((int)(__float_as_uint((F)work_)>>21)-508,0))
+#define WORK(n,c) work_+=n;
+#define WORKED (max((int)(__float_as_uint((F)work_)>>16)-16256,0))
 #define BITS(x) __float_as_uint(x)
 #define FLOAT(x) __uint_as_float(x)
 """
@@ -151,6 +151,8 @@ typedef unsigned char C __attribute__((ext_vector_type(SM_W)));
 #define U2I(x) ((I)(x))
 #define BITS(x) ((U)(x))
 #define FLOAT(x) ((F)(x))
+#define WORK(n,c) work_+=(c)&SPLATI(n);
+#define WORKED work_
 """
 )
 

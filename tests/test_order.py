@@ -1,0 +1,99 @@
+"""Environments change columns, so that those with as much to do are neighbours, and nobody can see it from outside."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from surgical_marl.engines.fused import engine, order
+from surgical_marl.envs.batch import BatchedEnv
+from tests.helpers.actions import random_actions
+
+N = 45  # the last vector of a CPU is not full
+BAD = [2, 30, 44]
+
+
+@pytest.fixture(params=["1 thread", "2 threads"])
+def both(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> list[BatchedEnv]:
+    """An environment with columns that never move, and one in which they move before each step."""
+    monkeypatch.setattr(engine, "cores", lambda: int(request.param[0]))
+    monkeypatch.setattr(engine, "LEAST_SHARE", 8)
+    made = []
+    for least, every in ((10**6, order.EVERY), (1, 1)):
+        monkeypatch.setitem(engine.LEAST_BRANCHES, "cpu", least)
+        monkeypatch.setattr(order, "EVERY", every)
+        made.append(BatchedEnv("reach", "bimanual_psm", num_envs=N, engine="fused", device="cpu", start="random"))
+        made[-1].reset(seed=0)
+    return made
+
+
+def columns(env: BatchedEnv) -> Any:
+    return env.engine._arrays.order  # type: ignore[attr-defined]
+
+
+def same(one: BatchedEnv, other: BatchedEnv, steps: int) -> None:
+    """Step both, and compare all that they return and keep."""
+    for seed in range(steps):
+        found, wanted = (env.step(random_actions(env, np.random.default_rng(seed))) for env in (one, other))
+        for agent in one.agents:
+            for part in ("observations", "rewards", "final_observations"):
+                assert np.array_equal(getattr(found, part)[agent], getattr(wanted, part)[agent], equal_nan=True)
+        for part in ("state", "terminated", "truncated", "faults"):
+            assert np.array_equal(getattr(found, part), getattr(wanted, part))
+    here, there = one.carry(), other.carry()
+    assert all(np.array_equal(here[name], there[name]) for name in here)
+
+
+def test_what_an_environment_does_does_not_depend_on_its_column(both: list[BatchedEnv]) -> None:
+    still, moving = both
+    same(still, moving, 5)
+    assert columns(still) is None
+    assert (columns(moving).envs != np.arange(N)).mean() > 0.5
+    assert np.array_equal(columns(moving).columns[columns(moving).envs], np.arange(N))
+
+
+def test_a_state_is_written_to_the_environment_that_it_is_of(both: list[BatchedEnv]) -> None:
+    still, moving = both
+    same(still, moving, 3)
+    carry = still.carry()
+    same(still, moving, 3)
+    for env in both:
+        env.set_carry(carry)
+    same(still, moving, 3)
+
+
+def test_a_fault_is_told_of_the_environment_that_it_is_in(both: list[BatchedEnv]) -> None:
+    still, moving = both
+    same(still, moving, 3)
+    for env in both:
+        carry = env.carry()
+        carry[".physics.qvel"][BAD, 0] = np.nan
+        env.set_carry(carry)
+    found, wanted = (env.step(random_actions(env, np.random.default_rng(0))).faults for env in both)
+    assert np.flatnonzero(found >= 0).tolist() == BAD and np.array_equal(found, wanted)
+    same(still, moving, 3)
+
+
+def test_environments_that_have_as_much_to_do_become_neighbours(both: list[BatchedEnv]) -> None:
+    _, moving = both
+    for seed in range(3):
+        moving.step(random_actions(moving, np.random.default_rng(seed)))
+    work = moving.engine._arrays.work[:N]  # type: ignore[attr-defined]
+    before = {env: work[column] for env, column in enumerate(columns(moving).columns)}
+    assert len(set(before.values())) > 1, "else there is nothing to sort"
+    columns(moving).sort()
+    vectors = np.array([before[env] for env in columns(moving).envs])[: N // 8 * 8].reshape(-1, 8)
+    spans = sorted(map(tuple, np.sort(vectors, 1)[:, [0, -1]]))
+    assert all(high <= low for (_, high), (low, _) in zip(spans[:-1], spans[1:], strict=True))
+
+
+def test_threads_of_a_cpu_get_as_much_to_do(both: list[BatchedEnv]) -> None:
+    _, moving = both
+    arrays: Any = moving.engine._arrays  # type: ignore[attr-defined]
+    arrays.work[:N] = np.arange(N)
+    new = arrays._argsort(2)
+    first, second = new[:24], new[24:40]  # three vectors and two, and what is left over
+    assert sorted(new) == list(range(N)) and new[-1] == 0
+    assert abs(np.mean(first) - np.mean(second)) < 8 < np.ptp(np.arange(N))
