@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -86,7 +87,7 @@ def test_environments_that_have_as_much_to_do_become_neighbours(both: list[Batch
     columns(moving).sort()
     vectors = np.array([before[env] for env in columns(moving).envs])[: N // 8 * 8].reshape(-1, 8)
     spans = sorted(map(tuple, np.sort(vectors, 1)[:, [0, -1]]))
-    assert all(high <= low for (_, high), (low, _) in zip(spans[:-1], spans[1:], strict=True))
+    assert all(high <= low for (_, high), (low, _) in pairwise(spans))
 
 
 def test_threads_of_a_cpu_get_as_much_to_do(both: list[BatchedEnv]) -> None:

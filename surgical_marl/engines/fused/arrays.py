@@ -38,8 +38,8 @@ def make_arrays(device: str, source: Source, tables: dict[str, np.ndarray], stri
 class Arrays(ABC):
     """`all` is what `Kernel.launch` takes; columns from `num_envs` on are padding.
 
-    Its last one is `work`, how much the environment in each column had to do. `order` says which that is; if it is None,
-    environments are in the order of their numbers.
+    Its last one is `work`, how much the environment in each column had to do. `order` says which environment that is;
+    if it is None, columns are in the order of the environments' numbers.
     """
 
     device: str
@@ -109,7 +109,7 @@ class Arrays(ABC):
         """Return an array of the device as Warp's, in one row: the same memory."""
 
     def fields(self, buffer: str) -> Any:
-        """Return all fields of "state", "counts", "actions", "outs" or "flags", [fields, columns]: a view, not a copy."""
+        """Return a view of all fields of "state", "counts", "actions", "outs" or "flags", [fields, columns]."""
         return self._buffers[buffer][:, : self.num_envs]
 
     def rows(self, leaf: Leaf) -> Any:
