@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-EVERY = 64
+EVERY = 128
 """Physics steps after which environments are sorted. Work that is captured in a CUDA graph must be as long at least."""
 
 
