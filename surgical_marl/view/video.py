@@ -6,7 +6,7 @@ import io
 import itertools
 import os
 import subprocess
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -37,11 +37,12 @@ def write_video(path: str | os.PathLike[str], frames: Frames, fps: float, small:
         raise ValueError(f"no frames to write to {str(path)!r}: a video needs 1 or more")
     if path.suffix not in (".gif", ".webp"):
         path = path.with_suffix(".mp4" if ffmpeg_runs() else ".gif")
-    write = {".gif": _write_gif, ".webp": _write_webp, ".mp4": partial(_write_mp4, small=small)}[path.suffix]
+    mp4 = partial(_write_mp4, small=small)
+    writers: dict[str, Callable[..., None]] = {".gif": _write_gif, ".webp": _write_webp, ".mp4": mp4}
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
     try:
-        write(part, first.shape, itertools.chain([first], frames), fps)
+        writers[path.suffix](part, first.shape, itertools.chain([first], frames), fps)
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)
