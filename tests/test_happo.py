@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from surgical_marl.learning import train
+from surgical_marl.learning.algorithm import clip_gradient
 from surgical_marl.learning.algorithms.happo import HAPPO
 from surgical_marl.policies.policy import load_actor, load_policy
 from surgical_marl.policies.weights import write_weights
@@ -162,6 +163,15 @@ def test_who_learns_later_sees_what_others_became(recurrent: Any) -> None:
     ratio = torch.stack(ratios)
     assert (ratio - 1).abs().max() > 0.05
     torch.testing.assert_close(store.advantages, advantages * ratio, rtol=1e-4, atol=1e-5)
+
+
+def test_a_critic_without_a_gradient_stays_on_its_device() -> None:
+    # "meta" stands for a GPU: only the first agent's loss has a part for the critic
+    critic = torch.nn.Linear(2, 1, device="meta")
+    assert clip_gradient(critic, 1.0).device.type == "meta"
+    here = torch.nn.Linear(1, 1, bias=False)
+    here.weight.grad = torch.full((1, 1), 3.0)
+    assert clip_gradient(here, 1.0) == 3.0 and torch.allclose(here.weight.grad, torch.ones(1))
 
 
 def test_orders_are_random_and_go_on_from_a_checkpoint() -> None:

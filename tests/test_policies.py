@@ -77,7 +77,7 @@ def fakes(monkeypatch: pytest.MonkeyPatch) -> None:
 
     for module in (train, command, export):
         monkeypatch.setattr(module, "make_env", make_env)
-    monkeypatch.setattr(export, "record", lambda env, policy, path: path.write_bytes(b"film"))
+    monkeypatch.setattr(export, "record", lambda env, policy, path, small: path.write_bytes(b"film"))
 
 
 @pytest.fixture
@@ -178,7 +178,7 @@ def test_runs_that_are_no_policy_together(runs: list[str], tmp_path: Path) -> No
 def test_a_machine_without_films_leaves_the_clip_out(
     runs: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def fail(*_: Any) -> None:
+    def fail(*_: Any, small: bool) -> None:
         raise RuntimeError("ffmpeg could not write")
 
     monkeypatch.setattr(export, "record", fail)

@@ -151,6 +151,17 @@ def test_a_video_holds_its_frames(tmp_path: Path, suffix: str) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
+@pytest.mark.filterwarnings("ignore:os.fork:RuntimeWarning")
+def test_a_small_video_holds_as_many_frames(tmp_path: Path) -> None:
+    noise = np.random.default_rng(0).integers(0, 255, (8, 64, 64, 3)).astype(np.uint8)
+    usual, small = (
+        video.write_video(tmp_path / f"{size}.mp4", iter(noise), 25, small=size == "small")
+        for size in ("usual", "small")
+    )
+    assert len(list(imageio.imiter(small))) == 8
+    assert small.stat().st_size < usual.stat().st_size
+
+
 def test_without_ffmpeg_a_video_is_a_gif(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(video, "ffmpeg_runs", lambda: False)
     assert video.write_video(tmp_path / "film.mp4", frames(2), fps=25) == tmp_path / "film.gif"

@@ -150,6 +150,9 @@ def test_sizes_are_told_by_scene() -> None:
         f"`reach`, 1 seeds each, {both.removesuffix(' on `a` and `b`')}; trained on a GPU, played on a CPU."
     )
     assert f"{both}; 16 environments, 32 steps an iteration, 9 iterations on `c`; trained" in study_report.about(found)
+    found[2] |= {"trained_on": "another", "gpu": "another"}
+    where = "trained on a GPU, played on a CPU on `a` and `b`; trained on another, played on another on `a`."
+    assert study_report.about(found[:3]).endswith(where)
 
 
 @pytest.mark.parametrize("cell", study_cells.CELLS.values(), ids=list(study_cells.CELLS))

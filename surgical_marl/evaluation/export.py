@@ -130,7 +130,7 @@ def _fill(folder: Path, run: Path, settings: Settings, evaluation: dict[str, Any
     draw_curve(folder, f"{settings.task} in {settings.scene}, {settings.algo}, seed {settings.seed}")
     print("recording a clip", file=sys.stderr)
     try:
-        record(env, load_policy(run, env), folder / CLIP)
+        record(env, load_policy(run, env), folder / CLIP, small=True)
     except (OSError, RuntimeError) as error:
         print(f"surgical-marl: no clip, since this machine cannot make one: {error}", file=sys.stderr)
     (folder / CARD).write_text(card(folder, evaluation["policy"]))

@@ -266,8 +266,7 @@ class Algorithm(PPO):
         if self.schedule == "adaptive":
             self._adapt_rate(divergence)
         models = (self.actor, self.critic)
-        norms = [nn.utils.clip_grad_norm_(model.parameters(), self.max_grad_norm) for model in models]
-        self._norms += torch.stack(norms)
+        self._norms += torch.stack([clip_gradient(model, self.max_grad_norm) for model in models])
         self._good += self._norms.isfinite()
         self.optimizer.step()
 
@@ -360,3 +359,14 @@ class Algorithm(PPO):
         storage = MultiAgentStorage(*sizes, obs, env.num_actions, device)
         del options["class_name"]
         return cls(actor.to(device), critic.to(device), storage, constraint=constraint, device=device, **options)
+
+
+def clip_gradient(model: nn.Module, most: float) -> Tensor:
+    """Let the norm of a model's gradient be at most `most`; return what it was, `[]` on the model's device.
+
+    It is 0 where a loss does not depend on the model. torch's own 0 would then be on the CPU.
+    """
+    weights = list(model.parameters())
+    if all(weight.grad is None for weight in weights):
+        return torch.zeros((), device=weights[0].device)
+    return nn.utils.clip_grad_norm_(weights, most)

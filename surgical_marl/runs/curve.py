@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, FuncFormatter, NullFormatter, PercentFormatter
+from PIL import Image
 
 from surgical_marl.files import write_atomic
 from surgical_marl.runs.folder import CURVE, read_metrics
@@ -20,13 +21,16 @@ PANELS = (
     ("collision_rate", "episodes with a collision", "#b23a48"),
 )
 
+COLOURS = 128
+"""In the picture: nobody sees the difference, and the file is a third as large as with all."""
+
 
 def draw_curve(run: Path, title: str) -> None:
     """Draw `curve.png` from `metrics.csv`: error, success, collisions against steps."""
     rows = read_metrics(run)
     steps = np.array([row.get("env_steps", math.nan) for row in rows])
-    figure = Figure(figsize=(12, 3.6), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = Figure(figsize=(12, 3.6), dpi=150, layout="constrained")
+    canvas = FigureCanvasAgg(figure)
     figure.suptitle(one_line(title), fontsize=11, parse_math=False)  # a name in it may hold anything
     for axis, (name, label, color) in zip(figure.subplots(1, 3), PANELS, strict=True):
         values = np.array([row.get(name, math.nan) for row in rows])
@@ -49,7 +53,10 @@ def draw_curve(run: Path, title: str) -> None:
         else:
             axis.set_ylim(-0.02, 1.02)
             axis.yaxis.set_major_formatter(PercentFormatter(1.0))
-    write_atomic(run / CURVE, lambda path: figure.savefig(path, format="png", dpi=150))
+    canvas.draw()
+    picture = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
+    picture = picture.quantize(COLOURS, dither=Image.Dither.NONE)
+    write_atomic(run / CURVE, lambda path: picture.save(path, format="png", optimize=True))
 
 
 def smooth(values: np.ndarray) -> np.ndarray:

@@ -46,7 +46,7 @@ CELLS = {
     cell.name: cell
     for cell in [
         *_cells("free", "reach-bimanual_psm", "reach", "bimanual_psm", (),
-                ("algo=mappo",), ("algo=ippo",), ("algo=happo",), ("algo=joint",)),
+                ("algo=mappo",), ("algo=ippo",), ("algo=joint",), ("algo=happo",)),
         *_cells("free", "reach-bimanual_star", "reach", "bimanual_star", (),
                 ("algo=mappo",), ("algo=ippo",), ("algo=joint",)),
         *_cells("free", "reach-trimanual_psm_ecm", "reach", "trimanual_psm_ecm", (),

@@ -28,6 +28,7 @@ BROKEN = ("untouched", "frozen", "oracle")
 LEVEL = 0.8
 """Level of training's own success for which the table gives samples and seconds."""
 POINTS = 60
+SIZE = "{num_envs:,} environments, {steps_per_iteration} steps an iteration, {iterations} iterations"
 BEGIN, END = "<!-- study begin -->", "<!-- study end -->"
 
 
@@ -146,20 +147,23 @@ def number(metric: Metric) -> list[float | None]:
 
 def about(found: Sequence[dict[str, Any]]) -> str:
     """Return a sentence that says what was run."""
-    first = found[0]
     seeds = sorted({len(each["seeds"]) for each in found})
-    scenes: dict[tuple[int, int, int], dict[str, None]] = {}  # of each size, in order
-    for each in found:
-        size = each["num_envs"], each["steps_per_iteration"], each["iterations"]
-        scenes.setdefault(size, {})[f"`{each['scene']}`"] = None
-    how = "; ".join(
-        "{:,} environments, {} steps an iteration, {} iterations".format(*size)
-        + (f" on {' and '.join(names)}" if len(scenes) > 1 else "")
-        for size, names in scenes.items()
-    )
-    where = f"trained on {first['trained_on'] or 'an unknown device'}, played on {first['gpu'] or first['cpu']}"
+    how = _by_scene(found, SIZE.format_map)
+    where = _by_scene(found, _devices)
     task = " and ".join(dict.fromkeys(f"`{each['task']}`" for each in found))
     return f"{task}, {' to '.join(map(str, seeds))} seeds each, {how}; {where}."
+
+
+def _devices(row: dict[str, Any]) -> str:
+    return f"trained on {row['trained_on'] or 'an unknown device'}, played on {row['gpu'] or row['cpu']}"
+
+
+def _by_scene(found: Sequence[dict[str, Any]], say: Callable[[dict[str, Any]], str]) -> str:
+    """Return what is said of rows; what differs between them with the scenes that it is about."""
+    scenes: dict[str, dict[str, None]] = {}  # of each text, in order
+    for each in found:
+        scenes.setdefault(say(each), {})[f"`{each['scene']}`"] = None
+    return "; ".join(text + (f" on {' and '.join(names)}" if len(scenes) > 1 else "") for text, names in scenes.items())
 
 
 def final_table(found: Sequence[dict[str, Any]]) -> str:

@@ -44,8 +44,12 @@ def record(
     path: Path,
     episodes: int = 2,
     seed: int = 0,
+    small: bool = False,
 ) -> Path:
-    """Film the first environment of `env` for some episodes, or for `LONGEST`; return the path of the video."""
+    """Film the first environment of `env` for some episodes, or for `LONGEST`; return the path of the video.
+
+    `small`: as for `write_video`.
+    """
     every = _every(env)
     with _one_thread(), progress(-(-_steps(env, episodes) // every), "frame", "filming") as bar:
 
@@ -54,7 +58,7 @@ def record(
                 bar.update()
                 yield frame
 
-        return write_video(path, shown(), FPS)
+        return write_video(path, shown(), FPS, small)
 
 
 @contextmanager

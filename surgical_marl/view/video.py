@@ -6,7 +6,8 @@ import io
 import itertools
 import os
 import subprocess
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +22,11 @@ QUALITY = 55
 Frames = Iterable[NDArray[np.uint8]]
 
 
-def write_video(path: str | os.PathLike[str], frames: Frames, fps: float) -> Path:
+def write_video(path: str | os.PathLike[str], frames: Frames, fps: float, small: bool = False) -> Path:
     """Write frames [height, width, 3] as a video and return its path.
 
-    A path with `.gif` or `.webp` becomes that. Any other becomes an mp4, or a gif beside it where ffmpeg cannot run.
-    The file is written completely or not at all.
+    A path with `.gif` or `.webp` becomes that. Any other becomes an mp4, or a gif beside it where ffmpeg cannot run;
+    `small` makes an mp4 a third smaller and takes longer. The file is written completely or not at all.
     """
     if not fps > 0:
         raise ValueError(f"a video of {fps!r} frames a second never moves on: use more than 0")
@@ -36,11 +37,12 @@ def write_video(path: str | os.PathLike[str], frames: Frames, fps: float) -> Pat
         raise ValueError(f"no frames to write to {str(path)!r}: a video needs 1 or more")
     if path.suffix not in (".gif", ".webp"):
         path = path.with_suffix(".mp4" if ffmpeg_runs() else ".gif")
-    write = {".gif": _write_gif, ".webp": _write_webp, ".mp4": _write_mp4}[path.suffix]
+    mp4 = partial(_write_mp4, small=small)
+    writers: dict[str, Callable[..., None]] = {".gif": _write_gif, ".webp": _write_webp, ".mp4": mp4}
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
     try:
-        write(part, first.shape, itertools.chain([first], frames), fps)
+        writers[path.suffix](part, first.shape, itertools.chain([first], frames), fps)
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)
@@ -74,13 +76,14 @@ def _write_webp(path: Path, shape: tuple[int, ...], frames: Frames, fps: float) 
     first.save(path, save_all=True, append_images=rest, duration=round(1000 / fps), loop=0, quality=QUALITY, method=4)
 
 
-def _write_mp4(path: Path, shape: tuple[int, ...], frames: Frames, fps: float) -> None:
+def _write_mp4(path: Path, shape: tuple[int, ...], frames: Frames, fps: float, small: bool) -> None:
     import imageio_ffmpeg
 
     # Not by imageio's own writer: it forks with a Python hook, which threads of JAX may deadlock.
     source = f"-f rawvideo -pix_fmt rgb24 -s {shape[1]}x{shape[0]} -r {fps:g} -i -"
     even = "-vf pad=ceil(iw/2)*2:ceil(ih/2)*2"
-    target = f"{even} -c:v libx264 -crf 20 -pix_fmt yuv420p -movflags +faststart"
+    effort = "-preset veryslow -crf 23" if small else "-crf 20"
+    target = f"{even} -c:v libx264 {effort} -pix_fmt yuv420p -movflags +faststart"
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error", *source.split()]
     with subprocess.Popen(
         [*command, *target.split(), str(path)],
