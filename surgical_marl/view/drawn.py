@@ -121,6 +121,9 @@ class Drawn:
         for row, (centre, radius, rgba) in zip(more, (spheres[ball] for ball in farthest), strict=True):
             row["place"], row["size"], row["shadow_size"], row["radius"] = centre, radius, radius, radius
             row["breadth"], row["colour"], row["alpha"] = radius, np.array(rgba[:3]) ** GAMMA, rgba[3]
+        towards = eye - shapes["place"]
+        shapes["viewer"] = np.einsum("nij,nj->ni", shapes["back"], towards)
+        shapes["near"] = np.linalg.norm(towards, axis=1) - shapes["radius"]
         reach = np.einsum("ni,ni->n", np.abs(shapes["back"][:, :, 2]), _halves(shapes))
         shapes["bottom"], shapes["top"] = shapes["place"][:, 2] - reach, shapes["place"][:, 2] + reach
         thin = shapes["kind"] == CAPSULE  # a needle is a line at least, not a row of dots
