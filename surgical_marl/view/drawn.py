@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from surgical_marl.view.colours import visual_rgba
 from surgical_marl.view.lighting import GLOW, GRAIN
-from surgical_marl.view.shading import GAMMA, PLASTIC, Material, material, materials
+from surgical_marl.view.shading import GAMMA, PLASTIC, Material, materials
 from surgical_marl.view.tracer import PLANE, Shape, World, wp
 from surgical_marl.vision.raycaster import GROUPS, KINDS, corner_normals, warp_mesh
 from surgical_marl.vision.rays import CAPSULE, CYLINDER, ELLIPSOID, FAR, MESH
@@ -70,9 +70,7 @@ class Drawn:
         shapes["radius"] = np.where(shapes["kind"] == PLANE, float(FAR), np.linalg.norm(_halves(shapes), axis=1))
         shapes["shadow_kind"], shapes["shadow_size"] = _shadows(shapes["kind"], shapes["size"])
         shapes["breadth"], shapes["alpha"] = _breadths(shapes["shadow_size"]), 1.0
-        made = materials(model)
-        for geom, look in paint.items():
-            made[geom] = look if isinstance(look, Material) else material(np.asarray(look))
+        made = materials(model, paint)
         for row, of in zip(
             shapes, [*(made[geom] for geom in geoms), *(extra.material for extra in stage)], strict=True
         ):
