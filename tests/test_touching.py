@@ -64,6 +64,7 @@ def test_every_pair_that_overlaps_is_found_and_none_that_is_far(thrown: Thrown) 
     for own, numbers, total in zip(depths, np.asarray(slots.number), np.asarray(slots.total), strict=True):
         found = set(numbers[:total].tolist())
         assert all(own[number] > -2 * NEAR for number in found)
+        assert len(found) == min(total, len(numbers))  # none twice
         if total <= len(numbers):
             overlaps = set(np.flatnonzero(own > 1e-5).tolist())
             assert overlaps <= found
