@@ -288,6 +288,8 @@ def main() -> int:
         if arguments.again:
             before = [Mutant(**item) for item in json.loads(arguments.again.read_text())]
             drawn = [mutant for mutant in before if mutant.module in tests]
+        if not drawn:  # a file of --again may be of other areas
+            continue
         work = [mutant for mutant in drawn if mutant.outcome in ("", "survived")]
         used = [module for module in modules if any(mutant.module == module for mutant in work)]
         if work:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import signal
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,12 +14,14 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from surgical_marl.learning import train
 from surgical_marl.learning.demonstrations import Demonstrations, _jaws_rest, _record
-from surgical_marl.learning.imitation import RATE, ImitationLoss, imitate
+from surgical_marl.learning.imitation import RATE, Imitation, ImitationLoss
 from surgical_marl.learning.trainer import Trainer
 from surgical_marl.policies.networks import MultiAgentActor, actor_config
 from surgical_marl.policies.scripted import Scripted
 from surgical_marl.runs.environment import make_env
+from surgical_marl.runs.folder import read_checkpoint
 from surgical_marl.runs.settings import ImitationSettings, NetworkSettings, OracleStatesSettings, Settings
 from surgical_marl.tasks.base.script import Step, Wish
 
@@ -140,12 +145,53 @@ def test_imitation_fits_the_actions_and_leaves_the_deviation(trainer: Trainer) -
             return float((actor(found.shown) - found.actions).square().mean())
 
     before = error()
-    imitate(actor, found, steps=300, batch_size=1024)
+    assert Imitation(actor, found, steps=300, batch_size=1024).run()
     assert error() < 0.3 * before
     with torch.no_grad():
         assert (actor(found.shown)[:, -1] < 0).float().mean() > 0.99  # the jaw stays closed
     for name, weight in actor.named_parameters():
         assert name not in deviation or torch.equal(weight, deviation[name])
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_imitation_within_a_step_and_it_goes_on_bit_for_bit(
+    number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    settings = replace(SETTINGS, iterations=1, imitation=ImitationSettings(steps=20, batch_size=64, hold=0))
+    whole, stopped = tmp_path / "whole", tmp_path / "stopped"
+    train.train(settings, out=whole)
+    assert "imitating: 20 of 20 step" in capsys.readouterr().err
+    descend = Imitation._descend
+
+    def interrupted(self: Imitation) -> None:
+        if self.done == 7:
+            os.kill(os.getpid(), number)
+        descend(self)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Imitation, "_descend", interrupted)
+        with pytest.raises((KeyboardInterrupt, SystemExit)):
+            train.train(settings, out=stopped)
+    told = capsys.readouterr().err
+    assert "stopping (again to stop at once)" in told and f"--resume {stopped}`" in told
+    kept = read_checkpoint(stopped)
+    assert kept["iteration"] == 0 and kept["imitation"]["done"] == 8
+    train.train(settings, out=stopped, resume=stopped)
+    ends = [read_checkpoint(run)["algorithm"]["actor_state_dict"] for run in (whole, stopped)]
+    assert all(torch.equal(weight, ends[1][name]) for name, weight in ends[0].items())
+
+
+def test_imitation_of_another_actor_is_refused(trainer: Trainer) -> None:
+    found = Demonstrations(SETTINGS, trainer.env.layout, "cpu")
+    imitation = Imitation(trainer.algorithm.actor, found, steps=5, batch_size=8)
+    good = imitation.state()
+    with pytest.raises(ValueError, match="6 of 5 steps"):
+        imitation.load({**good, "done": 6})
+    with pytest.raises(ValueError):
+        imitation.load({**good, "moments": good["moments"][:-1]})
+    wrong = [{name: torch.zeros(3, 3, 3) for name in moment} for moment in good["moments"]]
+    with pytest.raises(RuntimeError):
+        imitation.load({**good, "moments": wrong})
 
 
 def test_the_loss_of_imitation_is_that_of_normal_distributions() -> None:

@@ -183,6 +183,20 @@ def test_torchs_compiler_is_imported_when_it_is_used() -> None:
     assert run_python(DEFERRED).splitlines() == ["False", "2.0 True"]
 
 
+@pytest.mark.parametrize("own, found", [(None, "PASSIVE"), ("ACTIVE", "ACTIVE")])
+def test_the_command_lets_torchs_threads_sleep_unless_told_otherwise(
+    own: str | None, found: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
+    if own is not None:
+        monkeypatch.setenv("OMP_WAIT_POLICY", own)
+    said = run_python(
+        "import os, sys\nfrom surgical_marl.cli.main import main\nmain(['list', 'tasks'])\n"
+        "print(os.environ['OMP_WAIT_POLICY'], 'torch' in sys.modules)"
+    )
+    assert said.splitlines()[-1] == f"{found} False"  # torch reads it when it is imported
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere PyPI's torch has no CUDA libraries")
 @pytest.mark.parametrize("has_gpu", [True, False])
 def test_make_takes_torch_for_cpus_where_there_is_no_gpu(has_gpu: bool, tmp_path: Path) -> None:

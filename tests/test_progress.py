@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import io
 import logging
+import os
 import re
 import sys
+import termios
 import time
+from contextlib import suppress
 
 import pytest
 
@@ -35,15 +38,52 @@ def test_a_file_gets_lines_and_few_of_them(capsys: pytest.CaptureFixture[str]) -
     assert lines[1].endswith("error 2 mm\n")
 
 
-def test_a_bar_leaves_room_for_figures_in_a_terminal_of_80_columns(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "stderr", stream := Terminal())
-    monkeypatch.setenv("COLUMNS", "80")
-    monkeypatch.setenv("LINES", "24")
-    figures = "tip 0.24 mm, success 100%, collision 0%"
-    with progress(160, "it") as bar:
-        bar.set_postfix_str(figures, refresh=False)
-        bar.update(160)
-    assert re.search(rf"160/160 \[00:0\d<00:00, {figures}\]", stream.getvalue())
+FIGURES = "error 0.24 mm, success 100%, collision 0%, 1,234,567 steps/s"
+
+
+@pytest.mark.parametrize(
+    ("columns", "shown"),
+    [
+        (160, rf"100%\|█+\| 160/160 \[00:0\d<00:00, {FIGURES}\]"),
+        (90, rf"160/160 \[00:0\d<00:00, {FIGURES}\]"),
+        (80, r"160/160 \[00:0\d<00:00, error 0.24 mm, success 100%, collision 0%\]"),
+        (60, r"160/160 \[00:0\d<00:00, error 0.24 mm, success 100%\]"),
+        (30, r"160/160 \[00:0\d<00:00\]"),
+        (8, "100%"),
+    ],
+)
+def test_a_narrow_terminal_gets_whole_figures_instead_of_a_bar(
+    monkeypatch: pytest.MonkeyPatch, columns: int, shown: str
+) -> None:
+    lines = drawn(monkeypatch, columns, "", FIGURES)
+    assert re.fullmatch(shown, lines[-1])
+    assert all(len(line) <= columns for line in lines)
+
+
+def test_a_bar_in_a_terminal_of_80_columns_has_room_for_what_evaluation_and_films_say(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    lines = drawn(monkeypatch, 80, "evaluating reach-bimanual_psm", "error 0.24 mm, success 100%, collision 0%")
+    assert lines[0] == "evaluating reach-bimanual_psm"  # above, because both don't fit into a line
+    assert re.fullmatch(r"160/160 \[.*, error 0.24 mm, success 100%, collision 0%\]", lines[-1])
+    assert re.fullmatch(r"filming: 100%\|█+\| 160/160 \[.*\]", drawn(monkeypatch, 80, "filming", "")[-1])
+
+
+def drawn(monkeypatch: pytest.MonkeyPatch, columns: int, what: str, figures: str) -> list[str]:
+    """Return all states of a bar in a terminal of so many columns, after what stands above it."""
+    reader, terminal = os.openpty()
+    termios.tcsetwinsize(terminal, (24, columns))
+    with open(terminal, "w", encoding="utf-8") as stream:
+        monkeypatch.setattr(sys, "stderr", stream)
+        with progress(160, "it", what) as bar:
+            bar.set_postfix_str(figures, refresh=False)
+            bar.update(160)
+    text = b""
+    with suppress(OSError):  # where Linux says that the other end is closed
+        while part := os.read(reader, 4096):
+            text += part
+    os.close(reader)
+    return [line.rstrip(" ") for line in re.split(r"[\r\n]+", text.decode()) if line.strip()]
 
 
 def test_a_file_gets_a_line_for_each_state_that_is_old_enough(

@@ -19,6 +19,7 @@ from surgical_marl.envs import costs as safety
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.envs.env import Env
 from surgical_marl.plugins.tasks import TASKS as KNOWN
+from surgical_marl.plugins.tasks import scene_of
 from surgical_marl.policies.oracle import oracle
 from surgical_marl.policies.policy import load_policy, zero_policy
 from surgical_marl.robots.arm import load_arm
@@ -298,3 +299,11 @@ def test_a_task_is_restored_where_it_was() -> None:
     env.reset(2)
     env.set_carry(saved)
     np.testing.assert_array_equal(env.step(actions).state, expected)
+
+
+def test_where_no_scene_is_named_a_task_has_its_own_or_psm() -> None:
+    assert {task: scene_of(task) for task in ("reach", "needle_handover", "camera_assist")} == {
+        "reach": "psm",
+        "needle_handover": "bimanual_psm_needle",
+        "camera_assist": "trimanual_psm_ecm",
+    }

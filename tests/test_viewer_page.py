@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import http.client
+import io
 import shutil
 import time
 from collections.abc import Iterator
@@ -12,8 +13,10 @@ from types import SimpleNamespace
 from typing import Any
 from urllib.parse import urlsplit
 
+import mujoco
 import numpy as np
 import pytest
+import trimesh
 
 pytest.importorskip("viser", reason="the viewer's page needs viser: pip install 'surgical-marl[view]'")
 
@@ -32,10 +35,12 @@ from surgical_marl.view.browser.nodes import distance_colour, offsets, segments
 from surgical_marl.view.browser.panel import Choice
 from surgical_marl.view.browser.pictures import observed
 from surgical_marl.view.browser.plots import Plots, curves
-from surgical_marl.view.browser.shapes import geom_mesh
+from surgical_marl.view.browser.shapes import body_glb, geom_mesh
 from surgical_marl.view.browser.viewer import Viewer
 from surgical_marl.view.history import History
+from surgical_marl.view.lighting import PLAIN
 from surgical_marl.view.session import Session
+from surgical_marl.view.shading import CLOTH, LOOKS, WET, Material
 
 
 @pytest.fixture(scope="module")
@@ -216,6 +221,22 @@ def test_every_visible_geom_has_a_surface_where_it_is() -> None:
         half = model.geom_aabb[geom, 3:]
         assert np.abs(mesh.vertices - model.geom_pos[geom]).max() <= np.linalg.norm(half) + 1e-6
         assert mesh.is_watertight or len(mesh.faces) > 0
+
+
+def test_the_page_knows_what_things_are_made_of() -> None:
+    steel, wet, cloth = (
+        Material(np.array([0.2, 0.2, 0.2]), gloss, int(PLAIN)) for gloss in (LOOKS["steel"][0], WET, CLOTH)
+    )
+    model = mujoco.MjModel.from_xml_string(
+        "<mujoco><worldbody><geom size='.1'/><geom size='.1' rgba='1 1 1 .5'/><geom size='.1'/></worldbody></mujoco>"
+    )
+    glb = body_glb(model, 0, [steel, wet, cloth])
+    assert glb is not None
+    made = [mesh.visual.material for mesh in trimesh.load_scene(io.BytesIO(glb), file_type="glb").geometry.values()]
+    assert [one.metallicFactor > 0 for one in made] == [True, False, False]
+    assert made[0].roughnessFactor == made[1].roughnessFactor < made[2].roughnessFactor
+    assert [one.alphaMode for one in made] == ["OPAQUE", "BLEND", "OPAQUE"]
+    np.testing.assert_allclose(made[0].baseColorFactor[:3] / 255, 0.2 ** (1 / 2.2), atol=1 / 255)
 
 
 def test_distances_turn_red() -> None:

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping
 
 from surgical_marl.bench.workload import NUM_ENVS, Workload
 from surgical_marl.content import find, unknown
-from surgical_marl.plugins.tasks import list_tasks
+from surgical_marl.plugins.tasks import list_tasks, scene_of
 from surgical_marl.runs.settings import Settings
 from surgical_marl.untrusted.files import is_folder
 
@@ -38,9 +38,7 @@ def run(arguments: Namespace) -> int:
         raise unknown("task", arguments.task, list_tasks())
     with _no_caches() if arguments.cold else contextlib.nullcontext():
         if arguments.scene is None:
-            from surgical_marl.plugins.tasks import TASKS
-
-            arguments.scene = TASKS.load(arguments.task).default_scene or "psm"
+            arguments.scene = scene_of(arguments.task)
         return {"sim": _sim, "train": _train, "solve": _solve, "face": _face}[arguments.kind](arguments)
 
 

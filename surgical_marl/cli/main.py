@@ -24,7 +24,7 @@ from surgical_marl.plugins.algorithms import list_algorithms
 from surgical_marl.plugins.tasks import list_tasks
 from surgical_marl.runs.progress import Compilations, preparing
 from surgical_marl.runs.settings import Settings
-from surgical_marl.runtime import defer_compiler
+from surgical_marl.runtime import calm_threads, defer_compiler
 from surgical_marl.tasks.base.options import choices
 from surgical_marl.untrusted.values import shown
 
@@ -50,6 +50,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     interrupted the command.
     """
     code = 0
+    calm_threads()
     defer_compiler()
     try:
         arguments = _parse(argv)

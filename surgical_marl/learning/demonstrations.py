@@ -116,7 +116,7 @@ def _record(env: BatchedEnv) -> dict[str, np.ndarray]:
         rows[kind].append(_joined([parts[name] for name in shapes[kind]], at))
         places[kind].append(np.stack([at, np.full(len(at), step)]))
 
-    bar = progress(env.max_steps, "step", "the oracle's episodes", leave=False)
+    bar = progress(env.max_steps, "step", "oracle's episodes", leave=False)
     for step in range(env.max_steps):
         actions = {agent: np.clip(action, -1.0, 1.0) for agent, action in policy(observations).items()}
         if step and step % EVERY == 0:

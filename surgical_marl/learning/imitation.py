@@ -2,49 +2,100 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+from contextlib import nullcontext
+from typing import Any
+
 import torch
 from torch import Tensor, nn
 
 from surgical_marl.learning.demonstrations import Demonstrations
 from surgical_marl.learning.graphs import Replayed
 from surgical_marl.policies.networks import MultiAgentActor
+from surgical_marl.runs.progress import progress
 
 RATE = 1e-3
 """Learning rate at the start; it falls to nothing in the form of a cosine."""
+EVERY = 100
+"""Steps between two figures of the progress bar: a GPU waits where one is read."""
 
 
-def imitate(actor: MultiAgentActor, demonstrations: Demonstrations, steps: int, batch_size: int) -> None:
-    """Let an actor's mean actions become those of the oracle, in the least squares sense; its deviation stays as it is.
+class Imitation:
+    """Lets an actor's mean actions become those of the oracle, in the least squares sense.
 
-    Its normalisers of observations learn from the demonstrations first.
+    Its deviation stays as it is. Its normalisers of observations learn from the demonstrations first.
 
     Args:
         actor: without recurrent networks.
         demonstrations: on the actor's device.
         steps: gradient steps, of Adam.
         batch_size: pairs of observation and action in each.
+
+    Attributes:
+        done: how many steps are done.
     """
-    shown, actions = demonstrations.shown, demonstrations.actions
-    cuda = actions.is_cuda
-    actor.update_normalization(shown)
-    weights = [weight for name, weight in actor.named_parameters() if "distribution" not in name]
-    done, rate = torch.zeros((), device=actions.device), torch.tensor(RATE, device=actions.device)
-    optimizer = torch.optim.Adam(weights, lr=rate, fused=True, capturable=cuda)
 
-    def descend() -> None:
-        rate.copy_(RATE * (1 + torch.cos(torch.pi * done / steps)) / 2)
-        chosen = torch.randint(len(actions), (batch_size,), device=actions.device)
-        loss = nn.functional.mse_loss(actor(shown[chosen]), actions[chosen])
-        optimizer.zero_grad()
+    def __init__(self, actor: MultiAgentActor, demonstrations: Demonstrations, steps: int, batch_size: int) -> None:
+        self.steps, self.done = steps, 0
+        self._actor, self._shown, self._actions = actor, demonstrations.shown, demonstrations.actions
+        self._batch_size, device = batch_size, self._actions.device
+        self._step, self._loss = torch.zeros((), device=device), torch.zeros((), device=device)
+        self._rate = torch.tensor(RATE, device=device)
+        weights = [weight for name, weight in actor.named_parameters() if "distribution" not in name]
+        cuda = self._actions.is_cuda
+        self._optimizer = torch.optim.Adam(weights, lr=self._rate, fused=True, capturable=cuda)
+        # as Adam itself would begin, but at once, so that `load` has where to copy to
+        self._moments = [
+            {"step": torch.zeros((), device=device), **{n: torch.zeros_like(weight) for n in ("exp_avg", "exp_avg_sq")}}
+            for weight in weights
+        ]
+        self._optimizer.state.update(zip(weights, self._moments, strict=True))
+        self._graph = Replayed(self._descend, enabled=cuda)
+
+    def run(self, stopped: Callable[[], bool] = lambda: False, show: bool = False) -> bool:
+        """Do the steps that are left, until something has `stopped` it; return whether none is left.
+
+        Args:
+            stopped: asked before each step.
+            show: whether to show a progress bar on stderr.
+        """
+        with progress(self.steps, "step", "imitating", self.done) if show else nullcontext() as bar:
+            while self.done < self.steps and not stopped():
+                if not self.done:
+                    self._actor.update_normalization(self._shown)
+                self._graph()
+                self.done += 1
+                if bar is not None:
+                    if self.done % EVERY == 0:
+                        bar.set_postfix_str(f"actions off by {float(self._loss) ** 0.5:.3f}", refresh=False)
+                    bar.update()
+        self._graph.release()
+        self._optimizer.zero_grad()
+        return self.done == self.steps
+
+    def state(self) -> dict[str, Any]:
+        """Return what `load` needs to go on, beside the actor's weights and random numbers."""
+        return {"done": self.done, "moments": self._moments}
+
+    def load(self, state: Mapping[str, Any]) -> None:
+        """Go on from what `state` returned. ValueError, RuntimeError or TypeError if it is of another actor."""
+        if not 0 <= state["done"] <= self.steps:
+            raise ValueError(f"{state['done']} of {self.steps} steps can't be done")
+        self.done = state["done"]
+        self._step.fill_(self.done)
+        for own, kept in zip(self._moments, state["moments"], strict=True):
+            for name, moment in own.items():
+                moment.copy_(kept[name])
+
+    def _descend(self) -> None:
+        self._rate.copy_(RATE * (1 + torch.cos(torch.pi * self._step / self.steps)) / 2)
+        chosen = torch.randint(len(self._actions), (self._batch_size,), device=self._actions.device)
+        loss = nn.functional.mse_loss(self._actor(self._shown[chosen]), self._actions[chosen])
+        self._optimizer.zero_grad()
         loss.backward()
-        optimizer.step()
-        done.add_(1)
-
-    graph = Replayed(descend, enabled=cuda)
-    for _ in range(steps):
-        graph()
-    graph.release()
-    optimizer.zero_grad()
+        self._optimizer.step()
+        self._step.add_(1)
+        self._loss.copy_(loss.detach())
 
 
 class ImitationLoss:

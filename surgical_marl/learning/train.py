@@ -8,11 +8,11 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from tqdm import tqdm
@@ -48,9 +48,6 @@ from surgical_marl.runs.folder import (
 from surgical_marl.runs.lock import LOCK, owned
 from surgical_marl.runs.settings import Settings
 from surgical_marl.untrusted.values import shown
-
-if TYPE_CHECKING:
-    pass
 
 # Settings that may change when a run is resumed; all others shape the checkpoint or the problem.
 CHANGEABLE = {
@@ -200,8 +197,26 @@ def _save(training: Trainer, out: Path) -> None:
 
 def _run(training: Trainer, out: Path) -> None:
     settings = training.settings
-    with _signals(training, out) as received, ExitStack() as files:
-        log = files.enter_context(Log(training, out)) if distributed.rank() == 0 else None
+    with _signals(training, out) as received:
+        if training.imitate():
+            _iterate(training, out)
+        else:
+            training.stopping = True
+            _save(training, out)
+    if distributed.rank() == 0:
+        from surgical_marl.runs.curve import draw_curve  # matplotlib: not before training has begun
+
+        draw_curve(out, f"{settings.task} in {settings.scene}, {settings.algo}, seed {settings.seed}")
+    distributed.wait()  # where one process ends early, torchrun ends them all
+    if training.stopping:
+        number = received[0] if received else signal.SIGTERM
+        raise KeyboardInterrupt if number == signal.SIGINT else SystemExit(128 + number)
+
+
+def _iterate(training: Trainer, out: Path) -> None:
+    """Do all iterations that are left, with their metrics and checkpoints, or stop after one that a signal ended."""
+    settings = training.settings
+    with Log(training, out) if distributed.rank() == 0 else nullcontext() as log:
         keep = lambda fault: _keep_fault(training, out, fault)  # noqa: E731
         reports = Reports(training, log.write if log else lambda row: None, keep)
         done = False
@@ -218,14 +233,6 @@ def _run(training: Trainer, out: Path) -> None:
             if log:
                 write_divergence(out, {**error.summary, "last_checkpoint": read_checkpoint(out)["iteration"]})
             raise
-    if log:
-        from surgical_marl.runs.curve import draw_curve  # matplotlib: not before training has begun
-
-        draw_curve(out, f"{settings.task} in {settings.scene}, {settings.algo}, seed {settings.seed}")
-    distributed.wait()  # where one process ends early, torchrun ends them all
-    if training.stopping:
-        number = received[0] if received else signal.SIGTERM
-        raise KeyboardInterrupt if number == signal.SIGINT else SystemExit(128 + number)
 
 
 def _keep_fault(training: Trainer, out: Path, fault: Fault) -> None:
@@ -305,7 +312,7 @@ def _say(what: str, by: int = 0) -> None:
 
 @contextmanager
 def _signals(training: Trainer, out: Path) -> Iterator[list[int]]:
-    """Collect Ctrl-C and SIGTERM, so that the iteration ends and is saved.
+    """Collect Ctrl-C and SIGTERM, so that the iteration ends and is saved, or before the first one a step of imitation.
 
     A second signal stops a single process at once. It does not stop one of several processes, because the others would
     wait for it.
@@ -322,9 +329,9 @@ def _signals(training: Trainer, out: Path) -> Iterator[list[int]]:
         if distributed.size() == 1:
             for each, handler in old.items():
                 signal.signal(each, handler)
-            run = shlex.quote(str(out))
+            run, after = shlex.quote(str(out)), "" if training.imitating else " after this iteration"
             tqdm.write(
-                f"surgical-marl: stopping after this iteration (again to stop at once); `surgical-marl train --resume "
+                f"surgical-marl: stopping{after} (again to stop at once); `surgical-marl train --resume "
                 f"{run}` goes on, `surgical-marl report {run}` shows what there is",
                 file=sys.stderr,
             )

@@ -19,7 +19,7 @@ from surgical_marl.learning.constraint import METRICS
 from surgical_marl.learning.demonstrations import Demonstrations
 from surgical_marl.learning.episodes import ENDED, Episodes
 from surgical_marl.learning.graphs import Replayed
-from surgical_marl.learning.imitation import RATE, ImitationLoss, imitate
+from surgical_marl.learning.imitation import RATE, Imitation, ImitationLoss
 from surgical_marl.learning.stopwatch import Mark, mark, seconds_between
 from surgical_marl.plugins.algorithms import ALGORITHMS
 from surgical_marl.runs.settings import Settings
@@ -124,9 +124,13 @@ class Trainer:
         wanted = settings.oracle_states.rate > 0 or imitation.steps > 0 or imitation.weight > 0
         self._demonstrations = Demonstrations(settings, self.env.layout, device) if wanted else None
         self.algorithm.imitates = imitation.steps > 0
-        if self._demonstrations is not None and imitation.weight > 0:
-            shown, batch_size, weight = self._demonstrations, imitation.batch_size, imitation.weight
-            self.algorithm.imitation = ImitationLoss(self.algorithm.actor, shown, batch_size, weight)
+        self._imitation: Imitation | None = None
+        if self._demonstrations is not None:
+            pairs = self.algorithm.actor, self._demonstrations
+            if imitation.steps > 0:
+                self._imitation = Imitation(*pairs, imitation.steps, imitation.batch_size)
+            if imitation.weight > 0:
+                self.algorithm.imitation = ImitationLoss(*pairs, imitation.batch_size, imitation.weight)
         self._samples = settings.steps_per_iteration * env.num_envs * distributed.size()
         self._read = 0.0
         self.rollout = Replayed(self._rollout, enabled=self._cuda and self.env.capturable)
@@ -142,7 +146,8 @@ class Trainer:
     def iterate(self) -> Report:
         """Do one rollout and one update; return the report, which `row` reads."""
         started = time.perf_counter()
-        self._imitate()
+        self.imitate()
+        self._hold_actor()
         self._place()
         marks = [mark(self._cuda)]
         self.rollout()
@@ -159,16 +164,29 @@ class Trainer:
         arrived.record()
         return Report(self.iteration, self.env_steps, started, host, arrived, marks)
 
-    def _imitate(self) -> None:
-        """Let the actor imitate the oracle before the first iteration, and then the critic learn first."""
+    @property
+    def imitating(self) -> bool:
+        """Whether the actor has yet to imitate the oracle before the first iteration, or to go on with it."""
+        return self._imitation is not None and self.iteration == 0 and self._imitation.done < self._imitation.steps
+
+    def imitate(self) -> bool:
+        """Let the actor imitate the oracle before the first iteration; return whether nothing of that is left.
+
+        Something is left after `stop_wanted` was set meanwhile, but not in one of several processes: the others would
+        wait for it.
+        """
+        if self._imitation is None or not self.imitating:
+            return True
+        alone = distributed.size() == 1
+        done = self._imitation.run(lambda: alone and self.stop_wanted, show=distributed.rank() == 0)
+        if not alone:
+            self.algorithm.broadcast_parameters()
+        return done
+
+    def _hold_actor(self) -> None:
+        """Let the critic learn alone in the first iterations after imitation."""
         asked = self.settings.imitation
-        if self._demonstrations is None or not asked.steps:
-            return
-        if self.iteration == 0:
-            imitate(self.algorithm.actor, self._demonstrations, asked.steps, asked.batch_size)
-            if distributed.size() > 1:
-                self.algorithm.broadcast_parameters()
-        if self.iteration <= asked.hold:  # a run may have been resumed within these iterations
+        if asked.steps and self.iteration <= asked.hold:  # a run may have been resumed within these iterations
             held = self.iteration < asked.hold
             self.algorithm.hold_actor(held, RATE if held else self.settings.ppo.learning_rate)
 
@@ -325,6 +343,7 @@ class Trainer:
             "of": {name: getattr(self.settings, name) for name in ("task", "scene", "algo")},
             "groups": {name: _widths(actor, name) for name in actor.counts},
             "algorithm": self.algorithm.save(),
+            "imitation": self._imitation.state() if self._imitation is not None and self.imitating else None,
             "env": {
                 **self.env.carry(),
                 "observations": self._observations.to_dict(),
@@ -346,6 +365,8 @@ class Trainer:
         self.iteration, self.env_steps = state["iteration"], state["env_steps"]
         try:
             self.algorithm.load(state["algorithm"])
+            if self._imitation is not None and state.get("imitation") is not None:
+                self._imitation.load(state["imitation"])
         except (RuntimeError, ValueError, *_DAMAGED):  # with a line for each weight
             raise ValueError("the networks in the checkpoint are not of the shapes that the settings ask for") from None
         if "env" not in state:

@@ -25,8 +25,12 @@ TICK = 0.5
 _KEPT = "a second start takes it from the cache"
 _waiting: list[threading.Timer] = []
 """What `preparing` would say."""
-_BAR = "{l_bar}{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}{postfix}]"
+SHORT = 20
+"""Characters of what is done for which there is room before a bar in a terminal; what is longer stands above it."""
+_NUMBERS = "{n_fmt}/{total_fmt} [{elapsed}<{remaining}{postfix}]"
 """Without tqdm's rate, for which a terminal of 80 columns has no room beside the figures."""
+_LAYOUTS = "{l_bar}{bar}| " + _NUMBERS, "{desc}" + _NUMBERS, _NUMBERS
+"""From the widest to the narrowest."""
 _LINE = "{desc}{n_fmt} of {total_fmt} {unit}, {elapsed} done, {remaining} left{postfix}"
 
 
@@ -34,12 +38,12 @@ def progress(total: int, unit: str, what: str = "", begun: int = 0, leave: bool 
     """Return a bar on stderr to call `update()` and `set_postfix_str(figures, refresh=False)` of, and to close.
 
     In a notebook with `ipywidgets` it is a widget. Where stderr is no terminal, it is a line at the start, one at
-    most every `EVERY` seconds, and one at the end.
+    most every `EVERY` seconds, and one at the end. In a narrow terminal numbers and figures take the place of the bar.
 
     Args:
         total: how many there are to do.
         unit: what is counted, such as "step".
-        what: what is done, before the bar.
+        what: what is done, before the bar, or on a line above it if it is longer than `SHORT`.
         begun: how many are done already.
         leave: whether the bar stays when it is closed.
     """
@@ -56,7 +60,10 @@ def progress(total: int, unit: str, what: str = "", begun: int = 0, leave: bool 
 
         return widget(**options)
     if sys.stderr.isatty():
-        return tqdm(**options, file=sys.stderr, dynamic_ncols=True, bar_format=_BAR)
+        if len(what) > SHORT:
+            _write(f"{what}\n")
+            options["desc"] = None
+        return _Bar(**options, file=sys.stderr, dynamic_ncols=True)
     # tqdm's monitor would write a line after maxinterval, by default 10 s, even where nothing is new.
     lines = {"file": _Lines(sys.stderr), "mininterval": EVERY, "maxinterval": EVERY, "bar_format": _LINE}
     return tqdm(**{**options, **lines, "leave": True})
@@ -151,6 +158,28 @@ def _has_widgets() -> bool:
     from tqdm.notebook import tqdm as widget
 
     return issubclass(automatic, widget)
+
+
+class _Bar(tqdm):
+    """A bar in a terminal that leaves out, as a whole, what there is no room for: the bar first, the last figures last.
+
+    tqdm itself would cut figures off in the middle of a word.
+    """
+
+    @property
+    def format_dict(self) -> dict[str, Any]:
+        """Return what tqdm draws a bar from."""
+        found: dict[str, Any] = super().format_dict
+        room = found["ncols"]
+        if not room:  # unknown
+            return {**found, "bar_format": _LAYOUTS[0]}
+        figures = str(found["postfix"]).split(", ") if found["postfix"] else []
+        told = [", ".join(figures[:count]) for count in range(len(figures), -1, -1)]
+        for layout, postfix in [(layout, told[0]) for layout in _LAYOUTS] + [(_LAYOUTS[-1], less) for less in told]:
+            drawn = {**found, "bar_format": layout, "postfix": postfix}
+            if len(self.format_meter(**{**drawn, "ncols": None})) <= room:  # with a bar of ten characters
+                return drawn
+        return {**found, "bar_format": "{percentage:.0f}%"}
 
 
 class _Lines:

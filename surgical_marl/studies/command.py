@@ -10,6 +10,7 @@ from pathlib import Path
 
 from surgical_marl.engines.stages import told
 from surgical_marl.runs.progress import Compilations
+from surgical_marl.runtime import calm_threads
 
 
 def make_parser(description: str | None, usage: str | None = None) -> argparse.ArgumentParser:
@@ -43,6 +44,7 @@ def run(name: str, main: Callable[[], int]) -> int:
 
     What ends this process ends the processes that it started, too.
     """
+    calm_threads()
     signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     try:
         with told(Compilations()):

@@ -29,7 +29,7 @@ from surgical_marl import (
     load_object,
     load_scene,
 )
-from surgical_marl.plugins.tasks import TASKS
+from surgical_marl.plugins.tasks import scene_of
 from surgical_marl.robots.spec import VISUAL_GROUP
 from surgical_marl.scenes.objects import Placement
 from surgical_marl.scenes.placing import add_objects, scenes_without_objects
@@ -115,7 +115,7 @@ def player(task: str) -> tuple[str, str]:
     if shipped:
         best = max(shipped, key=lambda name: len(load_scene(known[name]).agents))
         return best, known[best]
-    return "oracle", TASKS.load(task).default_scene or "psm"
+    return "oracle", scene_of(task)
 
 
 def page(captions: dict[str, str]) -> str:

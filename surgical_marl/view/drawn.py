@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from surgical_marl.view.colours import visual_rgba
 from surgical_marl.view.lighting import GLOW, GRAIN
-from surgical_marl.view.shading import GAMMA, PLASTIC, Material, material, materials
+from surgical_marl.view.shading import GAMMA, PLASTIC, Material, materials
 from surgical_marl.view.tracer import PLANE, Shape, World, wp
 from surgical_marl.vision.raycaster import GROUPS, KINDS, corner_normals, warp_mesh
 from surgical_marl.vision.rays import CAPSULE, CYLINDER, ELLIPSOID, FAR, MESH
@@ -70,9 +70,7 @@ class Drawn:
         shapes["radius"] = np.where(shapes["kind"] == PLANE, float(FAR), np.linalg.norm(_halves(shapes), axis=1))
         shapes["shadow_kind"], shapes["shadow_size"] = _shadows(shapes["kind"], shapes["size"])
         shapes["breadth"], shapes["alpha"] = _breadths(shapes["shadow_size"]), 1.0
-        made = materials(model)
-        for geom, look in paint.items():
-            made[geom] = look if isinstance(look, Material) else material(np.asarray(look))
+        made = materials(model, paint)
         for row, of in zip(
             shapes, [*(made[geom] for geom in geoms), *(extra.material for extra in stage)], strict=True
         ):
@@ -121,6 +119,9 @@ class Drawn:
         for row, (centre, radius, rgba) in zip(more, (spheres[ball] for ball in farthest), strict=True):
             row["place"], row["size"], row["shadow_size"], row["radius"] = centre, radius, radius, radius
             row["breadth"], row["colour"], row["alpha"] = radius, np.array(rgba[:3]) ** GAMMA, rgba[3]
+        towards = eye - shapes["place"]
+        shapes["viewer"] = np.einsum("nij,nj->ni", shapes["back"], towards)
+        shapes["near"] = np.linalg.norm(towards, axis=1) - shapes["radius"]
         reach = np.einsum("ni,ni->n", np.abs(shapes["back"][:, :, 2]), _halves(shapes))
         shapes["bottom"], shapes["top"] = shapes["place"][:, 2] - reach, shapes["place"][:, 2] + reach
         thin = shapes["kind"] == CAPSULE  # a needle is a line at least, not a row of dots

@@ -11,7 +11,16 @@ from surgical_marl.runtime import prepare_warp
 from surgical_marl.vision.rays import BOX, ELLIPSOID, TINY
 
 wp = prepare_warp()
-wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "fast_math": True})
+OPTIONS = {
+    "enable_backward": False,
+    "default_grid_stride": False,
+    "fast_math": True,
+    "optimization_level": 3,
+    # Sums and quotients in another order: a sixth less time. Not -ffast-math, which knows no infinity.
+    "cpu_compiler_flags": "-march=native -funsafe-math-optimizations -ffp-contract=fast",
+}
+"""Of all modules with kernels that draw pictures for people."""
+wp.set_module_options(OPTIONS)
 
 PLAIN, TISSUE, DRAPE, FLOOR, GLOW = map(wp.constant, range(5))
 """Patterns of a material."""

@@ -8,12 +8,12 @@ They run on a CPU, one picture a thread of the caller. `view/render.py` calls th
 # ruff: noqa: UP018, RUF046, SIM102, SIM108
 # mypy: ignore-errors
 from surgical_marl.runtime import prepare_warp
-from surgical_marl.view.lighting import backdrop, patterned, ramp, shaded
+from surgical_marl.view.lighting import OPTIONS, backdrop, patterned, ramp, shaded
 from surgical_marl.view.tracer import PLANE, SIDES, Eye, Shape, World, lamps, meet, ray_of
 from surgical_marl.vision.rays import ball
 
 wp = prepare_warp()
-wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "fast_math": True})
+wp.set_module_options(OPTIONS)
 
 COARSE = wp.constant(2)
 """Light is found for every so many pixels of every so many rows."""

@@ -175,8 +175,10 @@ class Renderer:
         lists = [wp.array(eyes, dtype=tracer.Eye, device="cpu")]
         lists.append(wp.empty((tiles, max(len(drawn), 1)), dtype=wp.uint16, device="cpu"))
         lists.append(wp.zeros(tiles, dtype=int, device="cpu"))
-        # The largest first: they may hide all of the lamp. From below: if one is too high, so are all after it.
-        orders = [np.arange(self._drawn.count), np.argsort(-drawn["radius"]), np.argsort(drawn["bottom"])]
+        # For the eye the nearest first: if one begins behind what a ray has met, so do all after it. For the lamp the
+        # largest first: they may hide all of it. For the sky from below: if one is too high, so are all after it.
+        nearest = np.argsort(drawn["near"][: self._drawn.count])
+        orders = [nearest, np.argsort(-drawn["radius"]), np.argsort(drawn["bottom"])]
         for number, order in enumerate(orders):
             numbers = wp.array(order.astype(np.int32), dtype=int, device="cpu")
             wp.launch(tracer.list_shapes, 1, [shapes, *lists, numbers, number], device="cpu")

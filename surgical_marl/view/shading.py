@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple
 
 import mujoco
@@ -66,8 +67,10 @@ def material(rgb: Array, fleshy: bool = False, broad: bool = False) -> Material:
     return Material(colour, STEEL if light > 0.55 else PAINT if light > 0.3 else RUBBER, int(PLAIN))
 
 
-def materials(model: mujoco.MjModel) -> list[Material]:
-    """Return what each geom of a model is made of.
+def materials(
+    model: mujoco.MjModel, paint: Mapping[int, Material | Sequence[float]] = MappingProxyType({})
+) -> list[Material]:
+    """Return what each geom of a model is made of: a material or an rgb of `paint`, or else what its colour suggests.
 
     Tissue is what stands in the scene as tissue or as the operating field, and fixed objects in the colour of skin.
     """
@@ -81,6 +84,8 @@ def materials(model: mujoco.MjModel) -> list[Material]:
         made = material(rgb, bool(flesh), bool(broad))
         ground = model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE
         found.append(made._replace(gloss=CLOTH) if ground else made)
+    for geom, look in paint.items():
+        found[geom] = look if isinstance(look, Material) else material(np.asarray(look))
     return found
 
 

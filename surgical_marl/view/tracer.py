@@ -9,11 +9,11 @@ then test only those. The kernels run on a CPU, one picture a thread of the call
 # ruff: noqa: UP018, RUF046, SIM109
 # mypy: ignore-errors
 from surgical_marl.runtime import prepare_warp
-from surgical_marl.view.lighting import hidden, ramp
+from surgical_marl.view.lighting import OPTIONS, hidden, ramp
 from surgical_marl.vision.rays import BOX, CYLINDER, FAR, MESH, outwards, reach, span
 
 wp = prepare_warp()
-wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "fast_math": True})
+wp.set_module_options(OPTIONS)
 
 TILE = wp.constant(8)
 """Pixels along each side of a tile."""
@@ -61,6 +61,10 @@ class Shape:
     radius: wp.float32
     """Of a ball about the shape's origin that holds it."""
     place: wp.vec3
+    viewer: wp.vec3
+    """Where the picture is seen from, in the shape's frame."""
+    near: wp.float32
+    """From there to the ball about the shape, m; below 0 inside it."""
     bottom: wp.float32
     """Height of its lowest point, or less, m."""
     top: wp.float32
@@ -252,8 +256,9 @@ def meet(
     u, w = float(0.0), float(0.0)
     for i in range(counts[tile]):
         shape = int(listed[tile, i])
-        back, kind = shapes[shape].back, shapes[shape].kind
-        p, v = back @ (eye.place - shapes[shape].place), back @ ray
+        if shapes[shape].near > best:  # so are all that follow
+            break
+        kind, p, v = shapes[shape].kind, shapes[shape].viewer, shapes[shape].back @ ray
         t = float(-1.0)
         if kind == MESH:
             query = wp.mesh_query_ray(shapes[shape].mesh, p, v, best)
@@ -265,7 +270,8 @@ def meet(
             depths = span(kind, shapes[shape].size, p, v)
             if depths[0] <= depths[1]:
                 t = depths[0]  # below 0 if the eye is inside, as a scope's is in its sleeve: then it looks out
-        if t >= 0.0 and t <= best * 1.000001:
+        # of two in one place the later one of the model is seen
+        if t >= 0.0 and t <= best * wp.where(shape > hit, 1.000001, 0.999999):
             best, hit = t, shape
     normal, side = wp.vec3(0.0, 0.0, 1.0), int(0)
     if hit >= 0:

@@ -16,6 +16,8 @@ from surgical_marl.view.colours import AGENTS, GOAL_RADIUS
 from surgical_marl.view.moment import Moment, Push
 from surgical_marl.view.paths import Paths
 from surgical_marl.view.session import Session
+from surgical_marl.view.shading import materials
+from surgical_marl.view.stage import paint
 
 RED, GREY, GOLD = np.array([226, 40, 40]), np.array([120, 130, 140]), np.array([226, 168, 20])
 PARTS = ("targets", "paths", "trails", "trocars", "contacts", "grips", "distance")
@@ -124,10 +126,11 @@ class Nodes:
         return (points + self.offsets[:, None]).reshape(-1, 3).astype(np.float32)
 
     def _make_bodies(self, moment: Moment) -> None:
-        model = self._session.env.scene.model
+        scene = self._session.env.scene
+        model, looks = scene.model, materials(scene.model, paint(scene))
         self._moving: dict[int, Any] = {}
         for body in range(model.nbody):
-            glb = body_glb(model, body)
+            glb = body_glb(model, body, looks)
             if glb is None:
                 continue
             moves = bool(model.body_weldid[body]) or model.body_mocapid[body] >= 0

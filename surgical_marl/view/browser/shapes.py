@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import mujoco
@@ -12,23 +12,33 @@ from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
 from surgical_marl.view.colours import visual_rgba
+from surgical_marl.view.shading import GAMMA, Material
 
 _VISIBLE = 2
 """The last group of visual geoms."""
+_METAL = 0.4
+"""How metallic steel is here, from 0 to 1. A full metal only mirrors the room, and would be black without one. A room,
+as the environment maps of viser are, makes a browser without a GPU seven times as slow."""
 _CREASE = 0.6
 """Angle of two faces in rad from which on their edge is sharp."""
 
 _Geom: Any = mujoco.mjtGeom
 
 
-def body_glb(model: mujoco.MjModel, body: int) -> bytes | None:
-    """Return the visual geoms of a body as a GLB file in the body's frame; None if it has none that can be drawn."""
+def body_glb(model: mujoco.MjModel, body: int, looks: Sequence[Material]) -> bytes | None:
+    """Return the visual geoms of a body as a GLB file in the body's frame; None if it has none that can be drawn.
+
+    Args:
+        model: of the scene.
+        body: its number.
+        looks: what each geom of the model is made of.
+    """
     scene = trimesh.Scene()
     colours = visual_rgba(model)
-    for geom in np.flatnonzero((model.geom_bodyid == body) & (model.geom_group <= _VISIBLE)):
-        mesh = geom_mesh(model, int(geom))
+    for geom in np.flatnonzero((model.geom_bodyid == body) & (model.geom_group <= _VISIBLE)).tolist():
+        mesh = geom_mesh(model, geom)
         if mesh is not None and colours[geom, 3] > 0:
-            mesh.visual = TextureVisuals(material=_material(colours[geom]))
+            mesh.visual = TextureVisuals(material=_material(looks[geom], float(colours[geom, 3])))
             scene.add_geometry(mesh)
     if not scene.geometry:
         return None
@@ -75,13 +85,12 @@ def _mesh(model: mujoco.MjModel, index: int) -> trimesh.Trimesh:
     )
 
 
-def _material(rgba: np.ndarray) -> PBRMaterial:
-    """Return steel for greys, and plastic or tissue for colours."""
-    saturation = float(np.ptp(rgba[:3]) / max(rgba[:3].max(), 1e-6))
-    steel = float(np.clip(1 - 4 * saturation, 0.0, 1.0) * (0.3 < rgba[:3].mean() < 0.8))
+def _material(look: Material, alpha: float) -> PBRMaterial:
+    """Return a material as a browser knows it; patterns are left out."""
+    _, blur, metal = look.gloss
     return PBRMaterial(
-        baseColorFactor=(255 * np.asarray(rgba)).astype(np.uint8),
-        metallicFactor=0.35 * steel,
-        roughnessFactor=0.65 - 0.3 * steel,
-        alphaMode="BLEND" if rgba[3] < 1 else "OPAQUE",
+        baseColorFactor=(255 * np.array([*look.colour ** (1 / GAMMA), alpha])).round().astype(np.uint8),
+        metallicFactor=_METAL * metal,
+        roughnessFactor=min(0.15 + blur, 1.0),
+        alphaMode="BLEND" if alpha < 1 else "OPAQUE",
     )
