@@ -5,8 +5,8 @@
     engine.step(actions)
     engine.outcome("torch")["rewards"]
 
-The state of all environments stays in arrays on the device, [field, column], between steps. Which environment
-is in which column may change (`order.py`).
+The state of all environments stays in arrays on the device, [field, column], between steps. Which environment is in
+which column may change (`order.py`).
 """
 
 from __future__ import annotations

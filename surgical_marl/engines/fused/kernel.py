@@ -2,7 +2,7 @@
 
 A kernel works on five arrays whose columns are environments: `state` (float32) and `counts` (int32; uint32 by their
 bits) are read and written, `actions` (float32) read, `outs` (float32) and `flags` (uint8) written; and on two arrays of
-constants. If there are large branches, each thread of a GPU writes how much it had to do to `work`.
+constants. If there are large branches, how much there was to do in each column is written to `work`.
 """
 
 from __future__ import annotations
@@ -148,8 +148,7 @@ class Kernel:
     def launch(self, arrays: list[Any], stride: int, start: int, count: int) -> None:
         """Run the columns from `start` up to, but without, `start + count`, of `stride`.
 
-        On a GPU the work goes to torch's current stream,
-        and can be captured in a CUDA graph.
+        On a GPU the work goes to torch's current stream, and can be captured in a CUDA graph.
         """
         cuda = self._device == "cuda"
         lanes = 1 if cuda else LANES
