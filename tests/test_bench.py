@@ -24,7 +24,7 @@ from surgical_marl.bench.render import measure_rendering
 from surgical_marl.bench.report import QUOTED, draw, ratios, sweep_table
 from surgical_marl.bench.rivals import Contender
 from surgical_marl.bench.sim import Point, Speed, measure, sweep
-from surgical_marl.bench.workload import MOTIONS, Workload
+from surgical_marl.bench.workload import DISTINCT, MOTIONS, Workload
 from surgical_marl.cli.main import main
 from surgical_marl.engines.choose import make_engine
 from surgical_marl.envs.env import Env
@@ -66,7 +66,7 @@ def made_up(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
     monkeypatch.setattr(sim, "prepare", prepare)
     monkeypatch.setattr(machine, "restart_peak", lambda: machine.peak())  # without a search for garbage
-    monkeypatch.setattr(sim, "make_course", lambda scene, motion: None)
+    monkeypatch.setattr(sim, "make_course", lambda workload: None)
     yield
 
 
@@ -102,6 +102,16 @@ def test_all_engines_stand_beside_what_is_quoted(made_up: None, capsys: pytest.C
     assert "500,000" in measured[0]
 
 
+def test_some_engines_stand_beside_each_other(made_up: None, capsys: pytest.CaptureFixture[str]) -> None:
+    argv = ["bench", "sim", "--num-envs", "64", "--device", "cpu", "--json", "--engine"]
+    assert main([*argv, "fused,mujoco,fused"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert [speed["engine"] for speed in found["engines"]] == ["fused", "mujoco"]
+    assert list(found["ratios"]["physics"]) == ["mujoco"]
+    assert main([*argv, "mujoco,all"]) == 0
+    assert len(json.loads(capsys.readouterr().out)["engines"]) == 3
+
+
 def test_on_a_gpu_mujoco_warp_stands_beside_c_mujoco(
     made_up: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -118,7 +128,7 @@ def test_on_a_gpu_mujoco_warp_stands_beside_c_mujoco(
 def test_mujoco_warp_steps_as_c_mujoco_does(scene: str, motion: Any, near: float) -> None:
     """A lap of a course, on a CPU: joints, and where objects are."""
     workload = Workload(scene=scene, motion=motion, num_envs=3, device="cpu")
-    course = make_course(load_scene(scene), motion)
+    course = make_course(workload)
     prepare_mjx()
     model, states = rivals._exported(workload, course)
     controls = rivals._controls(course)[:3]
@@ -207,8 +217,7 @@ def test_a_picture_of_one_point(tmp_path: Path) -> None:
 
 def test_what_is_timed_is_what_c_mujoco_steps() -> None:
     """Half a lap of a course, from a state in motion: the fused engine's physics alone ends where C MuJoCo does."""
-    scene = load_scene("ecm")
-    course = make_course(scene)
+    scene, course = load_scene("ecm"), make_course(Workload(scene="ecm"))
     assert np.abs(course.qvel).max() > 0.1, "nothing moves at the start"
     assert 0 <= course.touching <= 1
     rows, steps = 8, HOLD * LAPS // 2
@@ -230,10 +239,24 @@ def test_what_is_timed_is_what_c_mujoco_steps() -> None:
 
 @pytest.mark.parametrize("motion", [motion for motion in MOTIONS if motion != "grasp"])
 def test_a_course_takes_back_what_it_did(motion: str) -> None:
-    course = make_course(load_scene("ecm"), motion)
+    course = make_course(Workload(scene="ecm", motion=motion))
     total = sum(actions["ecm_0"] for actions in course.actions)
     np.testing.assert_allclose(total, 0, atol=1e-6)
     assert len(course.commands) == len(course.actions) == LAPS
+
+
+def test_objects_are_carried_along_a_course_and_environments_differ() -> None:
+    """Half of what is held in a jaw at the start still is at the end; as many environments differ as are asked for."""
+    workload = Workload(
+        task="needle_pick", scene="psm_needle", motion="grasp", device="cpu", num_envs=300, distinct=280
+    )
+    course = make_course(workload)
+    assert len(np.unique(course.qpos, axis=0)) == len(course.qpos) == 280
+    assert set(course.parts) >= {".physics.qpos", ".physics.ctrl", ".physics.objects.bodies.position"}
+    start, above = load_scene("psm_needle").objects["needle"].position, course.objects.bodies.position[..., 2]
+    assert 0.4 < (np.abs(above - start[2]) > 2e-3).mean() < 0.9, "a quarter lies where the scene puts it"
+    assert 0.4 < course.touching < 0.95
+    assert len(make_course(Workload(scene="ecm", num_envs=8, distinct=10**6)).qpos) == DISTINCT
 
 
 @pytest.mark.parametrize("name", ["psm_needle", "bimanual_psm_pegs"])
@@ -313,6 +336,7 @@ def test_what_the_face_adds_as_json_and_as_a_sentence(
         ([], ["sim"]),
         (["sin"], ["'sin'", "sim"]),
         (["sim", "--engine", "fuzed"], ["'fuzed'", "did you mean 'fused'", "mjx", "mujoco", "all"]),
+        (["sim", "--engine", "fused,"], ["''", "mjx", "mujoco", "all"]),
         (["sim", "--scene", "psmm"], ["'psmm'", "did you mean 'psm'", "bimanual_psm"]),
         (["sim", "--task", "reech"], ["'reech'", "did you mean 'reach'"]),
         (["sim", "--num-envs", "0"], ["--num-envs", "'0'"]),

@@ -143,6 +143,27 @@ def changed(count: int, x: Any, which: Any) -> Any:
     return lax.scan(sweep, rows, jnp.arange(3))[0]
 
 
+def test_threads_wait_for_each_other_in_long_loops_that_all_of_them_go_through(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A thread that waits in a branch, or in a round that others don't make, would wait for ever."""
+    monkeypatch.setattr("surgical_marl.engines.fused.emit.BRANCHES", 2)
+
+    def long(x: Any) -> Any:
+        return lax.cond(x > 0, lambda: sum(jnp.sin(k * x) for k in range(1, 40)), lambda: x)
+
+    def loop(x: Any, branches: int) -> Any:
+        return lax.fori_loop(0, 3, lambda _, y: sum(long(y + k) for k in range(branches)), x)
+
+    def waits(function: Callable[[Any], Any]) -> int:
+        return body(function, np.ones(3, np.float32), vector=False).count("TOGETHER")
+
+    assert waits(lambda x: loop(x, 2)) == 1
+    assert waits(lambda x: loop(loop(x, 2), 2)) == 2
+    assert waits(lambda x: loop(x, 1)) == waits(lambda x: long(x) + long(x + 1)) == 0
+    assert waits(lambda x: lax.cond(x > 1, lambda: loop(x, 2), lambda: x)) == 0
+    assert waits(lambda x: lax.while_loop(lambda y: y < 9, lambda y: loop(y, 2) + 1, x)) == 0
+    assert waits(lambda x: lax.while_loop(lambda y: y < 9, lambda y: long(y) + long(-y) + 1, x)) == 0
+
+
 def test_loops_and_branches_change_arrays_in_place() -> None:
     columns = RNG.uniform(-1, 1, 19).astype(np.float32), RNG.integers(0, 2**30, 19).astype(np.int32)
     for vector in (False, True):
@@ -167,8 +188,9 @@ def test_a_scan_that_is_to_be_unrolled_is() -> None:
         np.testing.assert_allclose(run(partial(function, unroll), x)[1], run(partial(function, 1), x)[1], rtol=1e-6)
 
 
-def test_code_for_cuda_compiles(tmp_path: Path) -> None:
+def test_code_for_cuda_compiles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every macro of the prelude, by NVRTC, which needs no GPU."""
+    monkeypatch.setattr("surgical_marl.engines.fused.emit.BRANCHES", 0)
     code = body(everything, random_arrays(0), vector=False)
     used = set(re.findall(r"\w+", code))
     assert not [name for name in re.findall("^#define (\\w+)", CUDA, re.M) if name not in used]

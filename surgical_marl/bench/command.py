@@ -49,15 +49,15 @@ def _sim(arguments: Namespace) -> int:
         raise ValueError(f"--out {arguments.out} is for the picture of a sweep: add --sweep")
     if arguments.out and not (arguments.out.suffix == ".png" and is_folder(arguments.out.parent)):
         raise ValueError(f"cannot write {arguments.out}: name a .png file in a folder that exists")
-    if arguments.engine == "mujoco" and arguments.device == "cuda":
+    engines: tuple[str, ...] = arguments.engine
+    if engines == ("mujoco",) and arguments.device == "cuda":
         raise ValueError("engine 'mujoco' has no device 'cuda': it runs on a CPU")
 
     from surgical_marl.bench.contenders import ENGINES
     from surgical_marl.bench.report import run
 
     workload = Workload(task=arguments.task, scene=arguments.scene, **arguments.given)
-    engines: tuple[str, ...] = (arguments.engine,)
-    if arguments.engine == "all":  # MuJoCo Warp is made for GPUs; on a CPU it has to be named
+    if "all" in engines:  # MuJoCo Warp is made for GPUs; on a CPU it has to be named
         engines = tuple(name for name in ENGINES if name != "mujoco_warp" or workload.where == "cuda")
     print(run(workload, engines, arguments.sweep, arguments.json, arguments.out))
     return 0

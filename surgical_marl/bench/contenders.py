@@ -54,6 +54,7 @@ def _batched(name: str, workload: Workload, course: Course) -> Contender:
     batch.step(actions[0])
     _wait(batch.engine)
     compile_s = time.perf_counter() - start
+    _start(batch.engine, course, count, give)
     # otherwise all episodes would end in the same step
     batch.steps = give(np.random.default_rng(0).integers(0, batch.max_steps, count, dtype=np.int32))
 
@@ -64,10 +65,7 @@ def _batched(name: str, workload: Workload, course: Course) -> Contender:
 
     physics = make_engine(PhysicsAlone(batch.env), count, name, workload.where)
     physics.reset(0)
-    physics.write(".physics.qpos", give(tile(course.qpos, count)))
-    physics.write(".physics.qvel", give(tile(course.qvel, count)))
-    for part, values in course.parts.items():
-        physics.write(f".physics.objects{part}", give(tile(values, count)))
+    _start(physics, course, count, give)
     step_physics = _along(physics, [give(tile(rows, count)) for rows in course.commands])
     step_physics()  # compiles
     _wait(physics)
@@ -79,6 +77,12 @@ def _batched(name: str, workload: Workload, course: Course) -> Contender:
     else:
         clocks = cpu_clock(step_physics, lambda: _wait(physics)), cpu_clock(step_env, lambda: _wait(batch.engine))
     return Contender(count, workload.where, compile_s, *clocks, bytes_per_env=_bytes_per_env(batch.engine))
+
+
+def _start(engine: Engine, course: Course, count: int, give: Callable[[np.ndarray], Any]) -> None:
+    """Put arms and objects of all environments where a course starts."""
+    for part, values in course.parts.items():
+        engine.write(part, give(tile(values, count)))
 
 
 def _along(physics: Engine, commands: list[Any]) -> Callable[[], None]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -11,9 +12,14 @@ import numpy as np
 from mujoco import rollout
 
 from surgical_marl.bench.grasping import Starts, grasps
+from surgical_marl.bench.physics import PhysicsAlone
+from surgical_marl.bench.workload import DISTINCT, Workload
+from surgical_marl.engines.choose import make_engine
+from surgical_marl.envs.env import Env
 from surgical_marl.physics.simulator import Simulator
 from surgical_marl.robots.rotation import matrix_of
 from surgical_marl.scenes.grasps import graspers
+from surgical_marl.scenes.load import load_scene
 from surgical_marl.scenes.scene import Scene
 from surgical_marl.scenes.timing import DECIMATION
 
@@ -21,8 +27,6 @@ HOLD = DECIMATION
 """Physics steps for which an action is held: a control step of training, whatever is timed."""
 LAPS = 4
 """Actions after which a course begins again. The second half reverses the first, so that no joint drifts away."""
-DISTINCT = 256
-"""Number of different environments. A larger batch repeats them, a smaller one is the first of them."""
 _AWAY = {"random": 50, "rough": 25, "grasp": 25}
 """Control steps before the start, 1 and 0.5 s. random: a new action every control step, as when training begins. rough:
 one action all the time, so that arms cross their ranges, and each other's way. grasp: jaws close on objects and carry
@@ -32,11 +36,12 @@ GENTLE = 0.05
 
 
 class Course(NamedTuple):
-    """Random actions and the states that they lead to, for n = DISTINCT environments."""
+    """Random actions and the states that they lead to, for n different environments."""
 
     qpos: np.ndarray
-    """[n, nq], in the middle of a motion; `qvel` [n, nv] beside it."""
+    """[n, nq], in the middle of a motion; `qvel` [n, nv] and `ctrl` [n, nu] beside it."""
     qvel: np.ndarray
+    ctrl: np.ndarray
     commands: np.ndarray
     """What the actions command, [LAPS, n, nu]."""
     actions: list[dict[str, np.ndarray]]
@@ -48,17 +53,16 @@ class Course(NamedTuple):
 
     @property
     def parts(self) -> dict[str, np.ndarray]:
-        """The arrays of `objects` by their path in it, as in ".bodies.position"."""
-        import jax
+        """The arrays of the start by their path in an environment's carry, as in ".physics.qpos"."""
+        start = {name: getattr(self, name) for name in ("qpos", "qvel", "ctrl", "objects")}
+        return {f".physics.{name}{path}": v for name, tree in start.items() for path, v in _leaves(tree).items()}
 
-        return {jax.tree_util.keystr(k): v for k, v in jax.tree_util.tree_flatten_with_path(self.objects)[0]}
 
-
-def make_course(scene: Scene, motion: str = "random", seed: int = 0) -> Course:
+def make_course(workload: Workload, seed: int = 0) -> Course:
     """Draw a course: every environment moves from home by random actions of its own, then to and fro.
 
     C MuJoCo moves the arms. The states therefore come from none of this package's own engines. Only where there are
-    objects the reference physics moves all.
+    objects an engine moves all.
 
     Raises:
         ValueError: motion `grasp` in a scene without anything to grasp.
@@ -67,15 +71,16 @@ def make_course(scene: Scene, motion: str = "random", seed: int = 0) -> Course:
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     import jax
 
-    rng, n = np.random.default_rng(seed), DISTINCT
-    simulator, model = Simulator(scene, HOLD), scene.model
+    scene, motion = load_scene(workload.scene, workload.control), workload.motion
+    rng, n = np.random.default_rng(seed), min(workload.distinct, max(workload.count, DISTINCT))
+    simulator = Simulator(scene, HOLD)
     command = jax.jit(jax.vmap(simulator.command))
-    advance = jax.jit(jax.vmap(lambda physics: simulator.advance(physics)[0]))
-    roll = (lambda now: jax.tree.map(np.asarray, advance(now))) if scene.objects else partial(_roll, model)
+    roll = _by_engine(workload, n) if scene.objects else partial(_by_mujoco, scene.model)
     now = jax.tree.map(lambda x: np.repeat(np.asarray(x)[None], n, 0), simulator.home)
     closed, share = [], np.ones((n, 1), np.float32)
     if motion == "grasp":
-        closed, starts = graspers(scene), grasps(scene, n, rng)
+        closed, starts = graspers(scene), grasps(scene, min(n, DISTINCT), rng)
+        starts = Starts(*(tile(values, n) for values in starts))
         now = _grasping(now, starts, jax.vmap(simulator.at))
         share = np.where(starts.arms[:, None] > 1, GENTLE, share)
 
@@ -91,15 +96,14 @@ def make_course(scene: Scene, motion: str = "random", seed: int = 0) -> Course:
     for _ in range(_AWAY[motion]):
         now = roll(command(now, away))
         away = draw() if motion != "rough" else away
-    start, commands = now, []
+    start, commands = jax.tree.map(np.asarray, now), []
     for action in actions:
         now = command(now, action)
         commands.append(np.asarray(now.ctrl))
         now = roll(now)
-    qpos, qvel = np.asarray(start.qpos), np.asarray(start.qvel)
-    objects = jax.tree.map(np.asarray, start.objects)
-    touching = float((objects.grips.force > 0).any((1, 2)).mean()) if scene.objects else _touching(model, qpos)
-    return Course(qpos, qvel, np.array(commands), actions, touching, objects)
+    held = start.objects.grips.force > 0 if scene.objects else None
+    touching = float(held.any((1, 2)).mean()) if held is not None else _touching(scene.model, start.qpos)
+    return Course(start.qpos, start.qvel, start.ctrl, np.array(commands), actions, touching, start.objects)
 
 
 def _back(drawn: dict[str, np.ndarray], closed: list[str]) -> dict[str, np.ndarray]:
@@ -138,7 +142,32 @@ def full_state(qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
     return np.concatenate([np.zeros((len(qpos), 1)), qpos, qvel], 1)
 
 
-def _roll(model: Any, now: Any) -> Any:
+def _leaves(tree: Any) -> dict[str, Any]:
+    """Return the arrays of a tree by their path in it, as in ".bodies.position"."""
+    import jax
+
+    return {jax.tree_util.keystr(path): leaf for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]}
+
+
+def _by_engine(workload: Workload, count: int) -> Callable[[Any], Any]:
+    """Return a function that makes HOLD physics steps of `count` environments, by the fastest engine that can."""
+    import jax
+
+    engine = make_engine(PhysicsAlone(Env(**workload.of_environment())), count, "auto", workload.where)
+    engine.reset(0)
+
+    def roll(now: Any) -> Any:
+        paths = [f".physics{path}" for path in _leaves(now)]
+        for path, values in zip(paths, jax.tree.leaves(now), strict=True):
+            engine.write(path, np.asarray(values))
+        for _ in range(HOLD):
+            engine.step({})
+        return jax.tree.unflatten(jax.tree.structure(now), [engine.read(path, "numpy") for path in paths])
+
+    return roll
+
+
+def _by_mujoco(model: Any, now: Any) -> Any:
     """HOLD physics steps of C MuJoCo."""
     state = full_state(now.qpos, now.qvel)
     data = mujoco.MjData(model)

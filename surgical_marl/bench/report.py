@@ -14,7 +14,6 @@ from surgical_marl.bench.text import aligned, describe_machine
 from surgical_marl.bench.workload import Workload
 from surgical_marl.files import write_atomic
 from surgical_marl.machine import machine
-from surgical_marl.scenes.load import load_scene
 
 QUOTED = {
     "SurRoL": 4_124,
@@ -48,7 +47,7 @@ def run(
         if not points:
             raise ValueError(f"nothing to show: {', '.join(engines)} can't run here")
         return json.dumps(sweep_summary(workload, points)) if as_json else sweep_table(points)
-    course = make_course(load_scene(workload.scene, workload.control), workload.motion)
+    course = make_course(workload)
     speeds, left_out = measure(workload, engines, course)
     if as_json and len(engines) == 1:
         return json.dumps(asdict(speeds[engines[0]]))

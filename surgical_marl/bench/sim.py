@@ -20,7 +20,6 @@ from surgical_marl.bench.course import Course, make_course
 from surgical_marl.bench.rivals import MOST_ROLLED, Contender
 from surgical_marl.bench.workload import Workload
 from surgical_marl.engines.choose import DeviceName
-from surgical_marl.scenes.load import load_scene
 from surgical_marl.scenes.timing import TIMESTEP
 
 SWEEP = tuple(4**k for k in range(12))
@@ -64,9 +63,7 @@ def measure(
     Raises:
         ValueError: the one engine asked for can't run here, or has no room.
     """
-    contenders, left_out = _contenders(
-        workload, engines, course or make_course(load_scene(workload.scene, workload.control), workload.motion)
-    )
+    contenders, left_out = _contenders(workload, engines, course or make_course(workload))
     if not contenders:
         raise ValueError("; ".join(left_out.values()))
     for name, why in left_out.items():
@@ -127,7 +124,7 @@ def sweep(
 
     An engine ends where the next number has no room or would take too long a step, and says so.
     """
-    course = make_course(load_scene(workload.scene, workload.control), workload.motion)
+    course = make_course(workload)
     devices: list[DeviceName] = [workload.where]
     if workload.device == "auto" and workload.where == "cuda":
         devices.append("cpu")

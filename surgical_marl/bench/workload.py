@@ -13,6 +13,8 @@ from surgical_marl.tasks.base.options import Options, choice, choices, number
 
 NUM_ENVS = {"cpu": 4096, "cuda": 131072}
 """Default number of environments on each device."""
+DISTINCT = 256
+"""Default number of environments that differ."""
 BENCHED = ("all", "fused", "mjx", "mujoco", "mujoco_warp")
 """What `bench sim` can time: this package's engines, C MuJoCo and MuJoCo Warp."""
 
@@ -33,6 +35,8 @@ class Workload(Options):
         "random",
         "random: a new action every control step; rough: arms cross each other's way; grasp: jaws hold objects",
     )
+
+    distinct: int = number(DISTINCT, 1, 2**24, "environments that differ; a larger batch repeats them")
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -66,6 +66,12 @@ def one_of(good: Sequence[str]) -> Callable[[str], str]:
     return check
 
 
+def some_of(good: Sequence[str]) -> Callable[[str], tuple[str, ...]]:
+    """Return a reader, for `add_argument(type=...)`, of one or more of some names, with commas between them."""
+    check = one_of(good)
+    return lambda text: tuple(dict.fromkeys(check(name) for name in text.split(",")))
+
+
 def whole(least: int, most: int | None = None) -> Callable[[str], int]:
     """Return a reader, for `add_argument(type=...)`, of a whole number from `least` to `most`."""
     good = f"of {least} or more" if most is None else f"from {least} to {most}"

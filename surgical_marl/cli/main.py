@@ -15,7 +15,7 @@ from typing import Any, NoReturn
 
 from surgical_marl.bench.workload import BENCHED, Workload
 from surgical_marl.cli.evaluating import add_crossplay, add_eval, add_report
-from surgical_marl.cli.flags import add_flags, flagged, given, one_of, whole
+from surgical_marl.cli.flags import add_flags, flagged, given, one_of, some_of, whole
 from surgical_marl.cli.viewing import add_play, add_replay, add_view
 from surgical_marl.content import find, list_arms, list_objects, list_policies, list_scenes, unknown
 from surgical_marl.engines.stages import told
@@ -165,7 +165,8 @@ def _parser() -> argparse.ArgumentParser:
     bench = commands.add_parser("bench", help="measure how fast this machine simulates, learns and draws")
     kinds = bench.add_subparsers(required=True, metavar="{sim,train,solve,render,face}")
     sim = _bench_parser(kinds, "sim", "steps/s of the engines, C MuJoCo and MuJoCo Warp", Workload)
-    sim.add_argument("--engine", type=one_of(BENCHED), default=BENCHED[0], metavar="|".join(BENCHED))
+    several = f"of {', '.join(BENCHED)}; several with commas between them"
+    sim.add_argument("--engine", type=some_of(BENCHED), default=BENCHED[:1], metavar="NAME", help=several)
     sim.add_argument("--sweep", action="store_true", help="from 1 to 4 million environments, as far as memory goes")
     sim.add_argument("--out", type=Path, metavar="FILE.png", help="picture of a sweep")
     for kind, what in (("train", "steps/s with learning"), ("solve", "seconds until a policy is good")):

@@ -14,6 +14,7 @@ import numpy as np
 
 from surgical_marl.engines.fused.emit_arrays import TYPES, ArrayEmitter
 from surgical_marl.engines.fused.graph import Branch, Graph, Loop, Value
+from surgical_marl.engines.fused.preludes import BRANCHES
 from surgical_marl.engines.fused.schedule import Scheduler
 
 LARGE = 500
@@ -188,6 +189,7 @@ class Emitter(ArrayEmitter):
         if tested and self.vector:
             self.lines.append(f"B m{number}={'&'.join(self.active) or 'SPLATB(1)'};")
         self.lines.append(self._head(number, loop))
+        top = len(self.lines)
 
         def result(k: int) -> None:
             if tested and k == 0:
@@ -203,6 +205,9 @@ class Emitter(ArrayEmitter):
             self._count(self.schedule.inside[number][0])
         self._region(self.schedule.inside[number][0], result)
         self.active = active
+        whole = self.schedule.regions[self.schedule.inside[number][0]].parent == 0 and not tested
+        if whole and sum(line.startswith("WORK(") for line in self.lines[top:]) >= BRANCHES:
+            self.lines.insert(top, "TOGETHER")
         self._next(number, loop)
         self.lines.append("}")
         self.kept = kept

@@ -21,9 +21,9 @@ import numpy as np
 
 from surgical_marl.engines.fused.arrays import make_arrays
 from surgical_marl.engines.fused.guard import Guard
-from surgical_marl.engines.fused.kernel import BRANCHES, compile_kernels, has_cuda, large_branches
+from surgical_marl.engines.fused.kernel import compile_kernels, has_cuda, large_branches
 from surgical_marl.engines.fused.load import load_source
-from surgical_marl.engines.fused.preludes import LANES
+from surgical_marl.engines.fused.preludes import BRANCHES, LANES
 from surgical_marl.engines.fused.program import Source
 from surgical_marl.engines.fused.threefry import episode_keys
 from surgical_marl.engines.stages import compiling

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from surgical_marl.cache import locked
-from surgical_marl.engines.fused.preludes import CPU, CUDA, LANES, UNDEFINE
+from surgical_marl.engines.fused.preludes import BRANCHES, CPU, CUDA, LANES, UNDEFINE
 from surgical_marl.engines.stages import Stage, unsaid
 from surgical_marl.engines.stepper import MOST_KEPT
 from surgical_marl.files import write_atomic
@@ -29,9 +29,8 @@ wp = prepare_warp()
 
 BLOCK = 32
 """Threads in a CUDA block: so few that few environments are spread over all multiprocessors."""
-WIDE, MANY, BRANCHES = 256, 32768, 8
-"""Threads in a block for many environments and at least so many large branches, in long code. Threads of a block are
-near each other in it, and so find its instructions in the cache."""
+WIDE, MANY = 256, 32768
+"""Threads in a block for so many environments, in long code: they find each other's instructions in the cache."""
 
 _reals: Any = wp.array(dtype=wp.float32)
 _wholes: Any = wp.array(dtype=wp.int32)

@@ -5,12 +5,15 @@ Division and square root are CUDA's approximate ones, right to two units in the 
 0 for a divisor above 2^126.
 
 `WORKED` is how much there was to do. On a GPU it fits 16 bits, to 1 %: the exponent and seven more bits of a float.
+`TOGETHER` lets the threads of a block wait for each other, so that they find each other's instructions in the cache.
 """
 
 from __future__ import annotations
 
 LANES = 8
 """Environments in a vector on a CPU: 32 bytes of float32, an AVX register."""
+BRANCHES = 8
+"""So many large branches make code long: all threads of a block should be at the same place of it."""
 
 CUDA = """
 typedef float F; typedef int I; typedef unsigned int U; typedef bool B;
@@ -74,6 +77,7 @@ typedef float F; typedef int I; typedef unsigned int U; typedef bool B;
 #define HIDEI(x) asm volatile("":"+r"(x));
 #define HIDEU(x) asm volatile("":"+r"(x));
 #define WORK(n,c) work_+=n;
+#define TOGETHER __syncthreads();
 #define WORKED (max((int)(__float_as_uint((F)work_)>>16)-16256,0))
 #define BITS(x) __float_as_uint(x)
 #define FLOAT(x) __uint_as_float(x)
@@ -153,6 +157,7 @@ typedef unsigned char C __attribute__((ext_vector_type(SM_W)));
 #define FLOAT(x) ((F)(x))
 #define WORK(n,c) work_+=(c)&SPLATI(n);
 #define WORKED work_
+#define TOGETHER
 """
 )
 
