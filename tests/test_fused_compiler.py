@@ -143,7 +143,7 @@ def changed(count: int, x: Any, which: Any) -> Any:
     return lax.scan(sweep, rows, jnp.arange(3))[0]
 
 
-def test_threads_wait_for_each_other_in_long_loops_that_all_of_them_go_through(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_threads_wait_for_each_other_only_where_all_come_by(monkeypatch: pytest.MonkeyPatch) -> None:
     """A thread that waits in a branch, or in a round that others don't make, would wait for ever."""
     monkeypatch.setattr("surgical_marl.engines.fused.emit.BRANCHES", 2)
 
@@ -153,15 +153,25 @@ def test_threads_wait_for_each_other_in_long_loops_that_all_of_them_go_through(m
     def loop(x: Any, branches: int) -> Any:
         return lax.fori_loop(0, 3, lambda _, y: sum(long(y + k) for k in range(branches)), x)
 
-    def waits(function: Callable[[Any], Any]) -> int:
-        return body(function, np.ones(3, np.float32), vector=False).count("TOGETHER")
+    def waits(function: Callable[[Any], Any]) -> list[int]:
+        """How many loops are around each place where threads wait."""
+        around, found = [], []
+        for line in body(function, np.ones(3, np.float32), vector=False).splitlines():
+            if line == "TOGETHER":
+                assert all(re.match(r"for\(int r\d+=0;r\d+<3;", head) for head in around)
+                found.append(len(around))
+            if line.startswith("}"):
+                around.pop()
+            if line.endswith("{"):
+                around.append(line)
+        return found
 
-    assert waits(lambda x: loop(x, 2)) == 1
-    assert waits(lambda x: loop(loop(x, 2), 2)) == 2
-    assert waits(lambda x: loop(x, 1)) == waits(lambda x: long(x) + long(x + 1)) == 0
-    assert waits(lambda x: lax.cond(x > 1, lambda: loop(x, 2), lambda: x)) == 0
-    assert waits(lambda x: lax.while_loop(lambda y: y < 9, lambda y: loop(y, 2) + 1, x)) == 0
-    assert waits(lambda x: lax.while_loop(lambda y: y < 9, lambda y: long(y) + long(-y) + 1, x)) == 0
+    assert waits(lambda x: long(x) + long(x + 1)) == [0, 0]
+    assert waits(lambda x: loop(x, 2)) == [1, 1, 1, 0], "at its top, behind two branches, and behind it"
+    assert waits(lambda x: loop(loop(x, 2), 2)) == [1, 1, 1, 0] * 2
+    assert waits(lambda x: loop(x, 1)) == []
+    assert waits(lambda x: lax.cond(x > 1, lambda: loop(x, 2), lambda: x)) == [0]
+    assert waits(lambda x: lax.while_loop(lambda y: y < 9, lambda y: loop(y, 2) + 1, x)) == [0]
 
 
 def test_loops_and_branches_change_arrays_in_place() -> None:

@@ -60,7 +60,7 @@ class Emitter(ArrayEmitter):
 
     def body(self) -> str:
         self._postpone_stores()
-        self._region(0, self._store)
+        self._wait(0, self._region(0, self._store))
         if self.watch:
             # Adding 0 times each number leaves 0, or NaN if one of them was NaN or infinite.
             field = self.watch.flag
@@ -87,7 +87,9 @@ class Emitter(ArrayEmitter):
                 for item in self.schedule.regions[region].items:
                     yield from self._loads(*item)
 
-    def _region(self, number: int, result: Any) -> None:
+    def _region(self, number: int, result: Any) -> list[int]:
+        """Write a region. Return where its long branches and loops end, as numbers of lines."""
+        ends = []
         for kind, index in self.schedule.regions[number].items:
             if kind == "node":
                 self._node(index)
@@ -95,8 +97,11 @@ class Emitter(ArrayEmitter):
             elif kind == "result":
                 result(index)
             else:
-                group = self.graph.groups[index]
+                group, start = self.graph.groups[index], len(self.lines)
                 (self._branch if isinstance(group, Branch) else self._loop)(index, group)  # type: ignore[arg-type]
+                if len(self.lines) - start >= LARGE:
+                    ends.append(len(self.lines))
+        return ends
 
     def _store(self, k: int) -> None:
         buffer, field, value = self.stores[k]
@@ -149,6 +154,12 @@ class Emitter(ArrayEmitter):
         if size >= LARGE:
             self.lines.append(f"WORK({size},{'&'.join(self.active) or 'SPLATB(1)'})")
 
+    def _wait(self, top: int, places: list[int]) -> None:
+        """Let the threads of a block wait for each other before some lines, if there is much to do from `top` on."""
+        if sum(line.startswith("WORK(") for line in self.lines[top:]) >= BRANCHES:
+            for place in reversed(places):
+                self.lines.insert(place, "TOGETHER")
+
     @contextmanager
     def _kept(self, arrays: Iterable[str], condition: str) -> Iterator[None]:
         """Let a side of a branch change arrays for those environments of a vector alone that take it."""
@@ -189,7 +200,7 @@ class Emitter(ArrayEmitter):
         if tested and self.vector:
             self.lines.append(f"B m{number}={'&'.join(self.active) or 'SPLATB(1)'};")
         self.lines.append(self._head(number, loop))
-        top = len(self.lines)
+        body, top = self.schedule.inside[number][0], len(self.lines)
 
         def result(k: int) -> None:
             if tested and k == 0:
@@ -202,12 +213,11 @@ class Emitter(ArrayEmitter):
         active = self.active
         self.active = [f"m{number}"] if tested else active
         if tested:
-            self._count(self.schedule.inside[number][0])
-        self._region(self.schedule.inside[number][0], result)
+            self._count(body)
+        ends = self._region(body, result)
         self.active = active
-        whole = self.schedule.regions[self.schedule.inside[number][0]].parent == 0 and not tested
-        if whole and sum(line.startswith("WORK(") for line in self.lines[top:]) >= BRANCHES:
-            self.lines.insert(top, "TOGETHER")
+        if self.schedule.regions[body].parent == 0 and not tested:
+            self._wait(top, [top, *ends])
         self._next(number, loop)
         self.lines.append("}")
         self.kept = kept

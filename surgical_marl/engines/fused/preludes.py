@@ -5,7 +5,8 @@ Division and square root are CUDA's approximate ones, right to two units in the 
 0 for a divisor above 2^126.
 
 `WORKED` is how much there was to do. On a GPU it fits 16 bits, to 1 %: the exponent and seven more bits of a float.
-`TOGETHER` lets the threads of a block wait for each other, so that they find each other's instructions in the cache.
+`TOGETHER` lets the threads of a block wait for each other, so that they find each other's instructions in the cache. It
+stands where all of them come by, behind long branches and loops, and at the top of a loop that all go through.
 """
 
 from __future__ import annotations
