@@ -98,3 +98,17 @@ def test_threads_of_a_cpu_get_as_much_to_do(both: list[BatchedEnv]) -> None:
     first, second = new[:24], new[24:40]  # three vectors and two, and what is left over
     assert sorted(new) == list(range(N)) and new[-1] == 0
     assert abs(np.mean(first) - np.mean(second)) < 8 < np.ptp(np.arange(N))
+
+
+def test_what_is_recorded_begins_with_sorting() -> None:
+    """A recording is replayed from any time on: if it did not sort itself, environments would never be sorted again."""
+    sorted_at, recorded, step = [], {5, 6, 20, 21, 22}, 0
+
+    def argsort() -> Any:
+        sorted_at.append(step)
+        return np.arange(3)
+
+    columns = order.Order(np.arange(3), [], argsort, order.EVERY // 8, lambda: step in recorded)
+    for step in range(40):  # noqa: B007
+        columns.renew()
+    assert sorted_at == [1, 5, 13, 20, 28, 36]

@@ -47,6 +47,11 @@ def _batched(name: str, workload: Workload, course: Course) -> Contender:
     library = "jax" if name == "mjx" else "torch" if cuda else "numpy"
     give = {"jax": _jax if cuda else np.asarray, "torch": _torch, "numpy": np.asarray}[library]
     actions = [{agent: give(tile(rows, count)) for agent, rows in lap.items()} for lap in course.actions]
+    first = {part: give(tile(values, count)) for part, values in course.parts.items()}
+
+    def begin(engine: Engine) -> None:
+        for part, values in first.items():
+            engine.write(part, values)
 
     start = time.perf_counter()
     batch = BatchedEnv(**workload.of_environment(), num_envs=count, engine=name, device=workload.where, arrays=library)
@@ -54,35 +59,31 @@ def _batched(name: str, workload: Workload, course: Course) -> Contender:
     batch.step(actions[0])
     _wait(batch.engine)
     compile_s = time.perf_counter() - start
-    _start(batch.engine, course, count, give)
+    begin(batch.engine)
     # otherwise all episodes would end in the same step
     batch.steps = give(np.random.default_rng(0).integers(0, batch.max_steps, count, dtype=np.int32))
 
     hold, turn = max(1, HOLD // workload.decimation), itertools.count()
+    # long enough that environments are sorted as often as in any long run
+    physics_cycle, env_cycle = math.lcm(HOLD * LAPS, launches(1)), math.lcm(hold * LAPS, launches(workload.decimation))
 
     def step_env() -> None:
-        batch.step(actions[next(turn) // hold % LAPS])
+        now = next(turn)
+        if workload.motion == "grasp" and now % env_cycle == 0:  # new episodes have nothing in their jaws
+            begin(batch.engine)
+        batch.step(actions[now // hold % LAPS])
 
     physics = make_engine(PhysicsAlone(batch.env), count, name, workload.where)
     physics.reset(0)
-    _start(physics, course, count, give)
+    begin(physics)
     step_physics = _along(physics, [give(tile(rows, count)) for rows in course.commands])
     step_physics()  # compiles
     _wait(physics)
     if cuda and name == "fused":
-        # long enough that environments are sorted as often as in any long run
-        physics_cycle = math.lcm(HOLD * LAPS, launches(1))
-        env_cycle = math.lcm(hold * LAPS, launches(workload.decimation))
         clocks = cuda_clock(step_physics, physics_cycle), cuda_clock(step_env, env_cycle)
     else:
         clocks = cpu_clock(step_physics, lambda: _wait(physics)), cpu_clock(step_env, lambda: _wait(batch.engine))
     return Contender(count, workload.where, compile_s, *clocks, bytes_per_env=_bytes_per_env(batch.engine))
-
-
-def _start(engine: Engine, course: Course, count: int, give: Callable[[np.ndarray], Any]) -> None:
-    """Put arms and objects of all environments where a course starts."""
-    for part, values in course.parts.items():
-        engine.write(part, give(tile(values, count)))
 
 
 def _along(physics: Engine, commands: list[Any]) -> Callable[[], None]:

@@ -95,7 +95,12 @@ class Arrays(ABC):
             shares: threads of a CPU, each of which takes a part of the columns.
         """
         numbers = self.constant(np.arange(self.num_envs, dtype=np.int32))
-        self.order = Order(numbers, [self.fields(name) for name in _KEPT], partial(self._argsort, shares), decimation)
+        kept = [self.fields(name) for name in _KEPT]
+        self.order = Order(numbers, kept, partial(self._argsort, shares), decimation, self._recording)
+
+    def _recording(self) -> bool:
+        """Whether steps are recorded into a CUDA graph now."""
+        return False
 
     @abstractmethod
     def _zeros(self, fields: int, stride: int, dtype: Any) -> Any: ...
@@ -268,6 +273,11 @@ class CudaArrays(Arrays):
 
         # Those with the most to do come first: others run beside them, where they would be waited for at the end.
         return torch.argsort(self.work[: self.num_envs].to(torch.int16), descending=True, stable=True)
+
+    def _recording(self) -> bool:
+        import torch
+
+        return torch.cuda.is_current_stream_capturing()
 
     def renew(self) -> None:
         pass  # a CUDA graph writes to the same place at every replay, so what is read is copied

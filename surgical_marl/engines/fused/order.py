@@ -13,7 +13,7 @@ from collections.abc import Callable
 from typing import Any
 
 EVERY = 128
-"""Physics steps after which environments are sorted. Work that is captured in a CUDA graph must be as long at least."""
+"""Physics steps after which environments are sorted."""
 
 
 def launches(decimation: int) -> int:
@@ -29,19 +29,28 @@ class Order:
         kept: arrays [fields, N] whose columns kernels read again in the next step.
         argsort: returns how columns are to be arranged by what they had to do, [N].
         decimation: physics steps of a control step.
+        recording: whether steps are recorded now, into a CUDA graph. A recording begins with sorting, as it will be
+            replayed from any time on.
 
     Attributes:
         envs: the environment in each column, [N] int32.
         columns: the column of each environment, [N] int32.
     """
 
-    def __init__(self, numbers: Any, kept: list[Any], argsort: Callable[[], Any], decimation: int) -> None:
+    def __init__(
+        self, numbers: Any, kept: list[Any], argsort: Callable[[], Any], decimation: int,
+        recording: Callable[[], bool] = lambda: False,
+    ) -> None:  # fmt: skip
         self._numbers, self._kept, self._argsort = numbers, kept, argsort
         self._every, self._steps = launches(decimation), 0
+        self._recording, self._recorded = recording, False
         self.envs, self.columns = numbers + 0, numbers + 0
 
     def renew(self) -> None:
-        """Sort the columns if it is time, before a control step."""
+        """Sort the columns if it is time, before a control step. The first one has nothing to sort by."""
+        before, self._recorded = self._recorded, self._recording()
+        if self._recorded and not before:
+            self._steps = 1
         if self._steps % self._every == 1 % self._every:
             self.sort()
         self._steps += 1
