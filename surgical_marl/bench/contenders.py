@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from surgical_marl.bench.clock import cpu_clock, cuda_clock
+from surgical_marl.bench.clock import Clock, cpu_clock, cuda_clock
 from surgical_marl.bench.course import HOLD, LAPS, Course, tile
 from surgical_marl.bench.physics import PhysicsAlone
 from surgical_marl.bench.rivals import RIVALS, Contender
@@ -57,11 +57,7 @@ def _batched(name: str, workload: Workload, course: Course) -> Contender:
     # otherwise all episodes would end in the same step
     batch.steps = give(np.random.default_rng(0).integers(0, batch.max_steps, count, dtype=np.int32))
 
-    hold, turn = max(1, HOLD // workload.decimation), itertools.count()
-
-    def step_env() -> None:
-        batch.step(actions[next(turn) // hold % LAPS])
-
+    hold = max(1, HOLD // workload.decimation)
     physics = make_engine(PhysicsAlone(batch.env), count, name, workload.where)
     physics.reset(0)
     physics.write(".physics.qpos", give(tile(course.qpos, count)))
@@ -71,14 +67,27 @@ def _batched(name: str, workload: Workload, course: Course) -> Contender:
     step_physics = _along(physics, [give(tile(rows, count)) for rows in course.commands])
     step_physics()  # compiles
     _wait(physics)
-    if cuda and name == "fused":
-        # long enough that environments are sorted as often as in any long run
-        physics_cycle = math.lcm(HOLD * LAPS, launches(1))
-        env_cycle = math.lcm(hold * LAPS, launches(workload.decimation))
-        clocks = cuda_clock(step_physics, physics_cycle), cuda_clock(step_env, env_cycle)
-    else:
-        clocks = cpu_clock(step_physics, lambda: _wait(physics)), cpu_clock(step_env, lambda: _wait(batch.engine))
+    clocks = _clock(step_physics, physics, HOLD * LAPS, 1, cuda), clock_of(batch, actions, hold)
     return Contender(count, workload.where, compile_s, *clocks, bytes_per_env=_bytes_per_env(batch.engine))
+
+
+def clock_of(batch: BatchedEnv, actions: list[Any], hold: int = 1) -> Clock:
+    """Return the clock of a batch that is stepped by some actions in turn, each for `hold` steps."""
+    turn = itertools.count()
+
+    def step() -> None:
+        batch.step(actions[next(turn) // hold % len(actions)])
+
+    cuda = str(batch.device).startswith("cuda")
+    return _clock(step, batch.engine, hold * len(actions), batch.env.decimation, cuda)
+
+
+def _clock(step: Callable[[], None], engine: Engine, lap: int, decimation: int, cuda: bool) -> Clock:
+    """Return the clock of a step that repeats itself after a lap."""
+    if cuda and engine.name == "fused":
+        # long enough that environments are sorted as often as in any long run
+        return cuda_clock(step, math.lcm(lap, launches(decimation)))
+    return cpu_clock(step, lambda: _wait(engine))
 
 
 def _along(physics: Engine, commands: list[Any]) -> Callable[[], None]:
