@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from functools import partial
 from itertools import count
 from types import SimpleNamespace
@@ -12,14 +13,15 @@ from typing import Any
 import pytest
 
 from surgical_marl import machine
+from surgical_marl.bench import course, solve, stopwatch
 from surgical_marl.bench import learning as train
-from surgical_marl.bench import solve, stopwatch
 from surgical_marl.bench.solve import Exam, Goal, Looks
 from surgical_marl.bench.stopwatch import STARTING
 from surgical_marl.cli.main import main
 from surgical_marl.learning import train as learning_train
+from surgical_marl.learning.imitation import Imitation
 from surgical_marl.learning.trainer import Trainer
-from surgical_marl.runs.settings import NetworkSettings, PPOSettings, Settings
+from surgical_marl.runs.settings import ImitationSettings, NetworkSettings, PPOSettings, Settings
 from tests.helpers.fake_env import FakeEnv
 
 CONTRACT = [
@@ -61,6 +63,20 @@ def test_training_as_json_has_the_keys_of_the_contract_and_the_split(
     assert (found["engine"], found["device"], found["num_envs"], found["decimation"]) == ("fused", "cpu", 8, 8)
     iteration = found["rollout_s"] + found["update_s"] + found["rest_s"]
     assert found["train_env_steps_per_s"] == pytest.approx(8 * 4 / iteration)
+
+
+def test_nothing_comes_before_learning_that_changes_no_speed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No imitation, and no course of `bench sim`, which take minutes with objects."""
+
+    def refuse(*_: Any, **__: Any) -> None:
+        raise AssertionError
+
+    monkeypatch.setattr(Imitation, "run", refuse)
+    monkeypatch.setattr(course, "make_course", refuse)
+    settings = replace(SETTINGS, imitation=ImitationSettings(steps=100, batch_size=8), oracle_episodes=8)
+    speed = train.measure(settings, seconds=0.0, repeats=1)
+    assert speed.physics_steps_per_s == speed.decimation * (speed.env_steps_per_s or 0)
+    assert speed.simulated_s_per_s == pytest.approx(speed.dt * speed.physics_steps_per_s)
 
 
 def test_training_stands_beside_what_is_quoted() -> None:

@@ -37,7 +37,7 @@ TRAIN = ["train", "reach", "--scene", "psm"]
 @pytest.mark.parametrize(
     "argv, words",
     [
-        ([], ["required", "surgical-marl --help"]),
+        ([], ["name a command", "surgical-marl list", "surgical-marl --help"]),
         (["trian"], ["'trian'", "train", "eval", "list", "doctor"]),
         (["list", "sceens"], ["'sceens'", "did you mean 'scenes'"]),
         (["list", "--all"], ["'--all'"]),

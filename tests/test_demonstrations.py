@@ -249,6 +249,7 @@ def test_the_critic_learns_alone_after_imitation() -> None:
     def weights(model: Any) -> torch.Tensor:
         return torch.cat([weight.detach().ravel() for weight in model.parameters()])
 
+    trainer.imitate()
     trainer.iterate()
     actor, critic = weights(algorithm.actor), weights(algorithm.critic)
     assert float(algorithm._rate) == pytest.approx(RATE)
@@ -269,6 +270,7 @@ def test_the_actors_first_steps_are_as_short_as_later_ones() -> None:
     settings = replace(SETTINGS, imitation=ImitationSettings(steps=5, hold=3), iterations=8)
     settings = replace(settings, ppo=replace(settings.ppo, schedule="fixed", epochs=4, mini_batches=4))
     trainer = Trainer(settings, make_env(settings))
+    trainer.imitate()
     for _ in range(3):
         trainer.iterate()
     before = [weight.detach().clone() for weight in trainer.algorithm.actor.parameters()]

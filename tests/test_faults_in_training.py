@@ -16,6 +16,7 @@ from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.learning import train, trainer
 from surgical_marl.learning.algorithm import Algorithm
 from surgical_marl.learning.faults import MOST, SHARE, too_many
+from surgical_marl.learning.reporter import Report
 from surgical_marl.runs.fault import read_fault
 from surgical_marl.runs.folder import read_checkpoint, read_metrics, write_checkpoint
 from surgical_marl.runs.settings import NetworkSettings, PPOSettings, Settings
@@ -33,7 +34,7 @@ def hurt(monkeypatch: pytest.MonkeyPatch, chosen: slice, iteration: int) -> None
     """Let joints of some environments be that fast before an iteration."""
     original = trainer.Trainer.iterate
 
-    def iterate(self: trainer.Trainer) -> trainer.Report:
+    def iterate(self: trainer.Trainer) -> Report:
         if self.iteration == iteration - 1:
             carry = self.env.env.carry()
             carry[".physics.qvel"][chosen] = FAST

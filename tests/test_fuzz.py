@@ -9,7 +9,6 @@ import contextlib
 import io
 import os
 import tempfile
-import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -36,6 +35,8 @@ from surgical_marl.scenes.objects import load_object
 from surgical_marl.untrusted.arrays import read_npz
 from surgical_marl.untrusted.values import as_number, shown
 from surgical_marl.yaml_file import parse_yaml
+from tests.helpers.loaders import one_sentence
+from tests.helpers.samples import SCENE, SETTINGS
 from tests.test_untrusted import OBJECT
 from tests.test_urdf import URDF, YAML
 
@@ -43,23 +44,6 @@ COUNT = int(os.environ.get("FUZZ", 15))
 fuzz = settings(max_examples=COUNT, deadline=None, derandomize=COUNT <= 15, suppress_health_check=list(HealthCheck))
 
 SIMPLE = URDF.replace('<mesh filename="part.stl"/>', '<sphere radius="0.05"/>')
-SCENE = """arms: {two_0: {arm: two, position: [0, 0, 0], turn: 10, tilt: [0, 0, 0], workspace: [0, 0, 0.5]}}
-view: {position: [0, 1, 0.4], target: [0, 0, 0.1]}
-tissue: {liver: {shape: box, size: [0.1, 0.1, 0.1], position: [0, 0, 0], tilt: [0, 0, 0], colour: [1, 0, 0]}}
-objects: {ball: {object: ball.yaml, position: [3, 0, 1], tilt: [0, 0, 0], colour: [0, 0, 1]}}
-randomisation: {payload: 0.1, latency: 2, object_size: 0.1}
-observe: {two_0: [qpos]}
-"""
-CONFIG = """task: reach
-scene: psm
-num_envs: 8
-observe: {psm_0: [qpos]}
-reward: {collision: -1}
-ppo: {gamma: 0.9}
-network: {hidden: [8, 8], recurrent: none}
-versions: {torch: '1'}
-"""
-
 edges = st.sampled_from(
     [0, -1, 10**400, -(10**400), 10**4000, 1e300, -1e300, 1e-300, float("nan"), float("inf"), True, None, "", "1e5",
      "~x", "a" * 300, "\0", "\n", "..", "/dev/zero", "psm", [], {}, [[]], [1, 2, 3], {"a": 1}]
@@ -69,17 +53,6 @@ values = st.recursive(
     lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=8), inner, max_size=4),
     max_leaves=8,
 )
-
-
-@contextlib.contextmanager
-def one_sentence() -> Iterator[None]:
-    """Take a ValueError of one sentence for an answer, and warnings of other libraries for none."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        try:
-            yield
-        except ValueError as error:
-            assert len(str(error)) < 3000, "a value is repeated in full"
 
 
 def text_of(value: Any) -> str:
@@ -214,7 +187,7 @@ def test_damaged_urdfs(folder: Path, data: bytes) -> None:
 
 
 @fuzz
-@given(changed(CONFIG))
+@given(changed(SETTINGS))
 def test_configs(folder: Path, text: str) -> None:
     (folder / "config.yaml").write_text(text)
     for read in (read_config, lambda path: read_run(path.parent)):
@@ -267,7 +240,7 @@ FILES: dict[str, tuple[bytes, Callable[[Path], Any]]] = {
 @pytest.mark.parametrize("name", FILES)
 def test_damaged_files(name: str, tmp_path: Path) -> None:
     data, read = FILES[name]
-    (tmp_path / "config.yaml").write_text(CONFIG)
+    (tmp_path / "config.yaml").write_text(SETTINGS)
 
     @fuzz
     @given(damaged(data))

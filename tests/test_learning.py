@@ -18,6 +18,7 @@ from surgical_marl.files import write_atomic
 from surgical_marl.learning import train, trainer
 from surgical_marl.learning.algorithm import Algorithm
 from surgical_marl.learning.episodes import Episodes
+from surgical_marl.learning.reporter import Report
 from surgical_marl.plugins.algorithms import ALGORITHMS, list_algorithms
 from surgical_marl.policies.policy import (
     load_policy,
@@ -219,7 +220,7 @@ def test_nan_stops_and_keeps_the_last_checkpoint(
 ) -> None:
     original = trainer.Trainer.iterate
 
-    def iterate(self: trainer.Trainer) -> trainer.Report:
+    def iterate(self: trainer.Trainer) -> Report:
         fakes[0].poison = self.iteration == 3
         return original(self)
 
@@ -270,7 +271,7 @@ def test_a_signal_ends_the_iteration_and_saves(
 ) -> None:
     original = trainer.Trainer.iterate
 
-    def iterate(self: trainer.Trainer) -> trainer.Report:
+    def iterate(self: trainer.Trainer) -> Report:
         if self.iteration == 2:
             os.kill(os.getpid(), number)
         return original(self)

@@ -9,7 +9,8 @@ import re
 import sys
 import termios
 import time
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 
 import pytest
 
@@ -71,19 +72,27 @@ def test_a_bar_in_a_terminal_of_80_columns_has_room_for_what_evaluation_and_film
 
 def drawn(monkeypatch: pytest.MonkeyPatch, columns: int, what: str, figures: str) -> list[str]:
     """Return all states of a bar in a terminal of so many columns, after what stands above it."""
-    reader, terminal = os.openpty()
-    termios.tcsetwinsize(terminal, (24, columns))
-    with open(terminal, "w", encoding="utf-8") as stream:
-        monkeypatch.setattr(sys, "stderr", stream)
-        with progress(160, "it", what) as bar:
-            bar.set_postfix_str(figures, refresh=False)
-            bar.update(160)
+    with terminal(monkeypatch, columns) as text, progress(160, "it", what) as bar:
+        bar.set_postfix_str(figures, refresh=False)
+        bar.update(160)
+    return [line.rstrip(" ") for line in re.split(r"[\r\n]+", text[0]) if line.strip()]
+
+
+@contextmanager
+def terminal(monkeypatch: pytest.MonkeyPatch, columns: int) -> Iterator[list[str]]:
+    """Let stderr be a terminal of so many columns; yield a list that gets what was written to it."""
+    reader, writer = os.openpty()
+    termios.tcsetwinsize(writer, (24, columns))
+    found: list[str] = []
+    with monkeypatch.context() as patched, open(writer, "w", encoding="utf-8") as stream:
+        patched.setattr(sys, "stderr", stream)
+        yield found
     text = b""
     with suppress(OSError):  # where Linux says that the other end is closed
         while part := os.read(reader, 4096):
             text += part
     os.close(reader)
-    return [line.rstrip(" ") for line in re.split(r"[\r\n]+", text.decode()) if line.strip()]
+    found.append(text.decode())
 
 
 def test_a_file_gets_a_line_for_each_state_that_is_old_enough(
@@ -135,12 +144,18 @@ def test_a_terminal_gets_one_line_on_a_compilation_that_changes(monkeypatch: pyt
 
 
 def test_a_narrow_terminal_gets_no_second_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "stderr", stream := Terminal())
-    monkeypatch.setenv("COLUMNS", "40")
-    with pytest.raises(RuntimeError), told(Compilations()), compiling("reach on " + 100 * "x") as stage:
+    """Narrow is the terminal on stderr, whatever stdout and the environment say."""
+    monkeypatch.setenv("COLUMNS", "200")
+    title = "reach on " + 100 * "x"
+    with (
+        terminal(monkeypatch, 40) as text,
+        pytest.raises(RuntimeError),
+        told(Compilations()),
+        compiling(title) as stage,
+    ):
         stage("tracing the step")
         raise RuntimeError
-    *lines, last = stream.getvalue().split("\r\x1b[K")
+    *lines, last = text[0].split("\r\x1b[K")
     assert lines[1].endswith("...") and all(len(line) < 40 for line in lines)
     assert last == ""  # nothing is left of what failed
 

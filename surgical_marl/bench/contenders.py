@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from surgical_marl.bench.clock import cpu_clock, cuda_clock
+from surgical_marl.bench.clock import Clock, cpu_clock, cuda_clock
 from surgical_marl.bench.course import HOLD, LAPS, Course, tile
 from surgical_marl.bench.physics import PhysicsAlone
 from surgical_marl.bench.rivals import RIVALS, Contender
@@ -63,27 +63,46 @@ def _batched(name: str, workload: Workload, course: Course) -> Contender:
     # otherwise all episodes would end in the same step
     batch.steps = give(np.random.default_rng(0).integers(0, batch.max_steps, count, dtype=np.int32))
 
-    hold, turn = max(1, HOLD // workload.decimation), itertools.count()
-    # long enough that environments are sorted as often as in any long run
-    physics_cycle, env_cycle = math.lcm(HOLD * LAPS, launches(1)), math.lcm(hold * LAPS, launches(workload.decimation))
-
-    def step_env() -> None:
-        now = next(turn)
-        if workload.motion == "grasp" and now % env_cycle == 0:  # new episodes have nothing in their jaws
-            begin(batch.engine)
-        batch.step(actions[now // hold % LAPS])
-
+    hold = max(1, HOLD // workload.decimation)
     physics = make_engine(PhysicsAlone(batch.env), count, name, workload.where)
     physics.reset(0)
     begin(physics)
     step_physics = _along(physics, [give(tile(rows, count)) for rows in course.commands])
     step_physics()  # compiles
     _wait(physics)
-    if cuda and name == "fused":
-        clocks = cuda_clock(step_physics, physics_cycle), cuda_clock(step_env, env_cycle)
-    else:
-        clocks = cpu_clock(step_physics, lambda: _wait(physics)), cpu_clock(step_env, lambda: _wait(batch.engine))
+    again = begin if workload.motion == "grasp" else None  # new episodes have nothing in their jaws
+    clocks = _clock(step_physics, physics, HOLD * LAPS, 1, cuda), clock_of(batch, actions, hold, again)
     return Contender(count, workload.where, compile_s, *clocks, bytes_per_env=_bytes_per_env(batch.engine))
+
+
+def clock_of(
+    batch: BatchedEnv, actions: list[Any], hold: int = 1, begin: Callable[[Engine], None] | None = None
+) -> Clock:
+    """Return the clock of a batch that is stepped by some actions in turn, each for `hold` steps.
+
+    If there is a `begin`, it puts the environments where they started, whenever as much was done as a clock repeats.
+    """
+    turn, lap, decimation = itertools.count(), hold * len(actions), batch.env.decimation
+
+    def step() -> None:
+        now = next(turn)
+        if begin and now % _cycle(lap, decimation) == 0:
+            begin(batch.engine)
+        batch.step(actions[now // hold % len(actions)])
+
+    return _clock(step, batch.engine, lap, decimation, str(batch.device).startswith("cuda"))
+
+
+def _clock(step: Callable[[], None], engine: Engine, lap: int, decimation: int, cuda: bool) -> Clock:
+    """Return the clock of a step that repeats itself after a lap."""
+    if cuda and engine.name == "fused":
+        return cuda_clock(step, _cycle(lap, decimation))
+    return cpu_clock(step, lambda: _wait(engine))
+
+
+def _cycle(lap: int, decimation: int) -> int:
+    """Return after how many steps all begins anew: so many that environments are sorted as often as in any long run."""
+    return math.lcm(lap, launches(decimation))
 
 
 def _along(physics: Engine, commands: list[Any]) -> Callable[[], None]:

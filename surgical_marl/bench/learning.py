@@ -13,16 +13,19 @@ import statistics
 import sys
 import time
 from dataclasses import asdict, dataclass
-from typing import Any
 
-from surgical_marl import machine
+import torch
+
 from surgical_marl.bench import clock, sim
+from surgical_marl.bench.contenders import clock_of
+from surgical_marl.bench.course import LAPS
 from surgical_marl.bench.stopwatch import STARTING, Stopwatch, rows
 from surgical_marl.bench.text import aligned, describe_machine
-from surgical_marl.bench.workload import Workload
+from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.learning.room import in_memory
 from surgical_marl.learning.train import make_training
 from surgical_marl.runs.settings import Settings
+from surgical_marl.scenes.timing import TIMESTEP
 
 QUOTED = {
     "SurRoL": 1_634,
@@ -59,26 +62,44 @@ def run(settings: Settings, as_json: bool = False) -> str:
 
 
 def measure(settings: Settings, seconds: float = clock.SECONDS, repeats: int = clock.REPEATS) -> Speed:
-    """Trains for `repeats` times `seconds` at least, of which the best counts; then steps the simulator alone.
+    """Trains for `repeats` times `seconds` at least, of which the best counts; then steps the same environments alone.
+
+    The actor imitates nobody before, however the settings are: that takes minutes, and changes no speed.
 
     Raises:
         ValueError: there is no room for so many environments.
         FloatingPointError: training diverged.
     """
     with in_memory(settings.num_envs):
-        learning = _learn(settings, seconds, repeats)
-    machine.restart_peak()  # frees the training's memory
-    workload = Workload(**settings.of_environment(), num_envs=settings.num_envs, device=learning["device"])
-    found, _ = sim.measure(workload, (learning.pop("engine"),), seconds=seconds, repeats=repeats)
-    (alone,) = found.values()
-    return Speed(**{**asdict(alone), **learning})
+        env, learning = _learn(settings, seconds, repeats)
+        steps = settings.num_envs / _alone(env, seconds, repeats)
+    decimation = env.env.decimation
+    return Speed(
+        physics_steps_per_s=decimation * steps,
+        env_steps_per_s=steps,
+        simulated_s_per_s=TIMESTEP * decimation * steps,
+        num_envs=settings.num_envs,
+        engine=env.engine.name,
+        device=str(env.device),
+        dt=TIMESTEP,
+        decimation=decimation,
+        **learning,
+    )
 
 
-def _learn(settings: Settings, seconds: float, repeats: int) -> dict[str, Any]:
-    """Train, and return the fields of `Speed` that describe the training."""
+def _alone(env: BatchedEnv, seconds: float, repeats: int) -> float:
+    """Return the seconds of a step without learning, from where the environments are, by random actions to and fro."""
+    shapes = {agent: (env.num_envs, *(env.action_space(agent).shape or ())) for agent in env.agents}
+    draw = lambda shape: 2 * torch.rand(shape, device=env.device) - 1  # noqa: E731
+    half = [{agent: draw(shape) for agent, shape in shapes.items()} for _ in range(LAPS // 2)]
+    back = [{agent: -action for agent, action in actions.items()} for actions in half[::-1]]
+    return clock.race({"env": clock_of(env, half + back)}, seconds, repeats)["env"]
+
+
+def _learn(settings: Settings, seconds: float, repeats: int) -> tuple[BatchedEnv, dict[str, float]]:
+    """Train; return the environments as they are then, and the fields of `Speed` that describe learning."""
     start = time.perf_counter()
     training = make_training(settings)
-    env = training.env.env
     watch, going, laps = Stopwatch(training), rows(training), []
     for _ in range(STARTING):
         next(going)
@@ -93,10 +114,7 @@ def _learn(settings: Settings, seconds: float, repeats: int) -> dict[str, Any]:
         print(f"surgical-marl: timed {repeat + 1} of {repeats}", file=sys.stderr, flush=True)
     iteration, span = min(laps, key=lambda lap: lap[0])
     rollout, update = (statistics.fmean(watch.seconds(name)[span]) for name in ("rollout", "update"))
-    return {
-        "engine": env.engine.name,
-        "device": str(env.device),
-        "decimation": env.env.decimation,
+    return training.env.env, {
         "compile_s": max(0.0, started - STARTING * iteration),
         "train_env_steps_per_s": settings.num_envs * settings.steps_per_iteration / iteration,
         "rollout_s": rollout,

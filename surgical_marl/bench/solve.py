@@ -128,6 +128,7 @@ def solve(
     env = training.env.env
     watch, looks = Stopwatch(training), Looks(goal)
     made = time.perf_counter()
+    training.imitate()
     exams, examining = [], 0.0
     for row in rows(training):
         now = time.perf_counter()

@@ -94,6 +94,8 @@ class _Parser(argparse.ArgumentParser):
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     # argparse can't take `key=value` after a flag as a positional argument, so collect its leftovers.
     arguments, rest = _parser().parse_known_args(argv)
+    if "command" not in arguments:
+        raise ValueError("name a command, such as `surgical-marl list`; `surgical-marl --help` shows all")
     if arguments.command is _train and "=" in (arguments.task or ""):
         arguments.task, rest = None, [arguments.task, *rest]
     arguments.overrides = [text for text in rest if "=" in text and not text.startswith("-")]
@@ -106,7 +108,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(prog="surgical-marl", description="Surgical robot arms that learn together.")
     parser.add_argument("--version", action="version", version=f"%(prog)s {_version()}")
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    commands = parser.add_subparsers(metavar="COMMAND")
 
     train = commands.add_parser(
         "train",

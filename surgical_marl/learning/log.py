@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from surgical_marl.learning.faults import Fault
-from surgical_marl.learning.trainer import Report, Trainer
+from surgical_marl.learning.reporter import Report
+from surgical_marl.learning.trainer import Trainer
 from surgical_marl.runs.folder import METRICS, format_row
 from surgical_marl.runs.progress import progress
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import sys
 import threading
@@ -131,8 +132,16 @@ class Compilations:
     def _draw(self) -> None:
         # the title last: it is what a narrow terminal cuts off
         line = f"surgical-marl: compiling, {time.monotonic() - self._begun:.0f} s, {self._stage}: {self._title}"
-        room = max(shutil.get_terminal_size().columns - 1, 10)
+        room = max(_columns() - 1, 10)
         _write(f"\r\x1b[K{line if len(line) <= room else line[: room - 3] + '...'}")
+
+
+def _columns() -> int:
+    """Return the width of the terminal on stderr; stdout may go elsewhere."""
+    try:
+        return os.get_terminal_size(sys.stderr.fileno()).columns
+    except (OSError, ValueError):  # it has no file, or the file no size
+        return shutil.get_terminal_size().columns
 
 
 def _write(text: str) -> None:

@@ -73,13 +73,7 @@ class Arms:
     def _menu(self, agent: str) -> Any:
         options = self._session.choices
         menu = self._server.gui.add_dropdown("moved by", options, initial_value=self._session.movers.who[agent])
-
-        @menu.on_update
-        async def _(event: Any) -> None:
-            if event.client is not None:
-                wanted = str(menu.value)
-                self._ask(lambda: self._session.set_mover(agent, wanted))
-
+        _let(menu, self._ask, lambda who: self._session.set_mover(agent, str(who)))
         return menu
 
     def _add_run(self) -> None:
@@ -173,25 +167,23 @@ class Controls:
         value = round(float(np.clip(self._hand.q[index], lower, upper)), _DIGITS)
         step = 10.0**-_DIGITS
         slider = server.gui.add_slider(name, min=lower, max=upper, step=step, initial_value=value)
-
-        @slider.on_update
-        async def _(event: Any) -> None:
-            if event.client is not None:
-                wanted = float(slider.value)
-                self._use(lambda: self._hand.set_joint(index, wanted))
-
+        _let(slider, self._use, lambda wanted: self._hand.set_joint(index, float(wanted)))
         return slider
 
     def _jaw_box(self, server: Any) -> Any:
         box = server.gui.add_checkbox("jaw open", initial_value=self._hand.jaw_open, hint=f"key {JAW_KEY}")
-
-        @box.on_update
-        async def _(event: Any) -> None:
-            if event.client is not None:
-                wanted = bool(box.value)
-                self._ask(lambda: setattr(self._hand, "jaw_open", wanted))
-
+        _let(box, self._ask, lambda wanted: setattr(self._hand, "jaw_open", bool(wanted)))
         return box
+
+
+def _let(control: Any, ask: Ask, act: Callable[[Any], None]) -> None:
+    """Let a control, whenever a person uses it, ask to act on the value that it then has."""
+
+    @control.on_update
+    async def _(event: Any) -> None:
+        if event.client is not None:
+            value = control.value
+            ask(lambda: act(value))
 
 
 def _turn_jaw(hand: Hand) -> None:
