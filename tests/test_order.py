@@ -22,9 +22,9 @@ def both(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> lis
     monkeypatch.setattr(engine, "cores", lambda: int(request.param[0]))
     monkeypatch.setattr(engine, "LEAST_SHARE", 8)
     made = []
-    for least, every in ((10**6, order.EVERY), (1, 1)):
+    for least, every in ((10**6, order.SELDOM), (1, 1)):
         monkeypatch.setitem(engine.LEAST_BRANCHES, "cpu", least)
-        monkeypatch.setattr(order, "EVERY", every)
+        monkeypatch.setattr(engine, "SELDOM", every)
         made.append(BatchedEnv("reach", "bimanual_psm", num_envs=N, engine="fused", device="cpu", start="random"))
         made[-1].reset(seed=0)
     return made
@@ -108,7 +108,7 @@ def test_what_is_recorded_begins_with_sorting() -> None:
         sorted_at.append(step)
         return np.arange(3)
 
-    columns = order.Order(np.arange(3), [], argsort, order.EVERY // 8, lambda: step in recorded)
+    columns = order.Order(np.arange(3), [], argsort, 8, lambda: step in recorded)
     for step in range(40):  # noqa: B007
         columns.renew()
     assert sorted_at == [1, 5, 13, 20, 28, 36]

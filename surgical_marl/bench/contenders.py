@@ -17,7 +17,7 @@ from surgical_marl.bench.rivals import RIVALS, Contender
 from surgical_marl.bench.workload import Workload
 from surgical_marl.content import unknown
 from surgical_marl.engines.choose import Engine, make_engine
-from surgical_marl.engines.fused.order import launches
+from surgical_marl.engines.fused.order import control_steps
 from surgical_marl.envs.batch import BatchedEnv
 
 ENGINES = ("fused", "mjx", *RIVALS)
@@ -102,7 +102,7 @@ def _clock(step: Callable[[], None], engine: Engine, lap: int, decimation: int, 
 
 def _cycle(lap: int, decimation: int) -> int:
     """Return after how many steps all begins anew: so many that environments are sorted as often as in any long run."""
-    return math.lcm(lap, launches(decimation))
+    return math.lcm(lap, control_steps(decimation))
 
 
 def _along(physics: Engine, commands: list[Any]) -> Callable[[], None]:

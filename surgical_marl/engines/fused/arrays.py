@@ -87,16 +87,16 @@ class Arrays(ABC):
     def _argsort(self, shares: int) -> Any:
         """Return the columns in the order of how much they had to do, most first, for so many threads of a CPU."""
 
-    def sort_columns(self, decimation: int, shares: int) -> None:
+    def sort_columns(self, every: int, shares: int) -> None:
         """Sort columns from time to time (`order.py`).
 
         Args:
-            decimation: physics steps of a control step.
+            every: control steps after which they are sorted.
             shares: threads of a CPU, each of which takes a part of the columns.
         """
         numbers = self.constant(np.arange(self.num_envs, dtype=np.int32))
         kept = [self.fields(name) for name in _KEPT]
-        self.order = Order(numbers, kept, partial(self._argsort, shares), decimation, self._recording)
+        self.order = Order(numbers, kept, partial(self._argsort, shares), every, self._recording)
 
     def _recording(self) -> bool:
         """Whether steps are recorded into a CUDA graph now."""

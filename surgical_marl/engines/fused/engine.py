@@ -23,6 +23,7 @@ from surgical_marl.engines.fused.arrays import make_arrays
 from surgical_marl.engines.fused.guard import Guard
 from surgical_marl.engines.fused.kernel import compile_kernels, has_cuda, large_branches
 from surgical_marl.engines.fused.load import load_source
+from surgical_marl.engines.fused.order import OFTEN, SELDOM, control_steps
 from surgical_marl.engines.fused.preludes import BRANCHES, LANES
 from surgical_marl.engines.fused.program import Source
 from surgical_marl.engines.fused.threefry import episode_keys
@@ -66,8 +67,10 @@ class FusedEngine:
         self._shares = [(a, b - a) for a, b in pairwise(edges)]
         if shares == 1:
             self._shares = [(0, num_envs if self.device == "cuda" else self._stride)]
-        if num_envs > LANES and large_branches(self.source.bodies) >= LEAST_BRANCHES[self.device]:
-            self._arrays.sort_columns(env.decimation, shares)
+        branches = large_branches(self.source.bodies)
+        if num_envs > LANES and branches >= LEAST_BRANCHES[self.device]:
+            every = control_steps(env.decimation, OFTEN if branches >= BRANCHES else SELDOM)
+            self._arrays.sort_columns(every, shares)
         self._pool: ThreadPoolExecutor | None = None
         self._process = 0
         self._stepped = False

@@ -12,13 +12,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-EVERY = 128
-"""Physics steps after which environments are sorted."""
+SELDOM, OFTEN = 128, 32
+"""Physics steps after which environments are sorted: often where code is long. An environment that begins an
+episode, or loses what it held, has other things to do than its neighbours from then on. In long code that costs more
+than sorting."""
 
 
-def launches(decimation: int) -> int:
-    """Return after how many control steps of so many physics steps each environments are sorted."""
-    return max(1, EVERY // decimation)
+def control_steps(decimation: int, every: int = SELDOM) -> int:
+    """Return how many control steps of so many physics steps each take `every` physics steps."""
+    return max(1, every // decimation)
 
 
 class Order:
@@ -28,7 +30,7 @@ class Order:
         numbers: 0, 1, ... [N] int32, of the library that the arrays are of.
         kept: arrays [fields, N] whose columns kernels read again in the next step.
         argsort: returns how columns are to be arranged by what they had to do, [N].
-        decimation: physics steps of a control step.
+        every: control steps after which columns are sorted.
         recording: whether steps are recorded now, into a CUDA graph. A recording begins with sorting, as it will be
             replayed from any time on.
 
@@ -38,11 +40,11 @@ class Order:
     """
 
     def __init__(
-        self, numbers: Any, kept: list[Any], argsort: Callable[[], Any], decimation: int,
+        self, numbers: Any, kept: list[Any], argsort: Callable[[], Any], every: int,
         recording: Callable[[], bool] = lambda: False,
     ) -> None:  # fmt: skip
         self._numbers, self._kept, self._argsort = numbers, kept, argsort
-        self._every, self._steps = launches(decimation), 0
+        self._every, self._steps = every, 0
         self._recording, self._recorded = recording, False
         self.envs, self.columns = numbers + 0, numbers + 0
 
