@@ -10,6 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from jax import lax
@@ -109,6 +110,31 @@ def test_what_no_result_needs_is_left_out() -> None:
     assert {len(wanted) for wanted in plan.alive.values()} == {1}
 
 
+@pytest.mark.parametrize("side", ["same", "put", "loop", "other"])
+@pytest.mark.parametrize("condition", [-1.0, 1.0])
+def test_a_branch_changes_an_array_where_it_is(side: str, condition: float) -> None:
+    """One side puts two values into it, and the other leaves it alone or changes it, too; but not if it is another."""
+
+    def function(x: Any, i: Any, y: Any, values: Any, more: Any) -> Any:
+        array, other = values.at[i].set(y), more.at[i].set(x)
+        sides = {
+            "same": lambda a: a,
+            "put": lambda a: a.at[i + 1].set(2 * y),
+            "loop": lambda a: lax.fori_loop(0, 3, lambda k, b: b.at[k].set(b[k] + y), a),
+            "other": lambda a: other,
+        }
+        return lax.cond(x > 0, lambda a: a.at[i].set(x).at[i + 2].add(y), sides[side], array)
+
+    rng = np.random.default_rng(0)
+    columns = (
+        np.array([condition], np.float32), np.array([1], np.int32), np.array([3.0], np.float32),
+        *rng.normal(size=(2, 1, 5)).astype(np.float32),
+    )  # fmt: skip
+    _, plan = schedule(function, *columns)
+    assert len(plan.kept) == (side != "other")
+    assert_schedule_is_right(function, *columns)
+
+
 class Direct:
     """Values of a graph for one environment, each computed when it is asked for: what the schedule has to amount to."""
 
@@ -184,7 +210,8 @@ def compute(g: Graph, node: Value, read: Callable[[Value], Any], loads: Mapping[
 class Scheduled:
     """Values of a graph for one environment, computed as a schedule has them. KeyError for one that comes too late.
 
-    What takes over the memory of an array changes it there: whatever reads the array afterwards reads something else.
+    What takes over the memory of an array changes it there: whatever reads the array afterwards reads something else,
+    and what a branch leaves where it is has whatever its sides have put there.
     """
 
     def __init__(self, graph: Graph, plan: Schedule, loads: Mapping[tuple[str, int], Any]) -> None:
@@ -220,7 +247,9 @@ class Scheduled:
         values, found = (branch.chosen if taken else branch.others), {}
         region = self.plan.inside[number][0 if taken else 1]
         self._region(region, known.new_child(), lambda k, read: found.__setitem__(k, read(values[wanted[k]])))
-        known.update({branch.outs[j]: found[k] for k, j in enumerate(wanted)})
+        found = {branch.outs[j]: found[k] for k, j in enumerate(wanted)}
+        # what is left where it is, is what the array's memory now holds
+        known.update({out: read(self.plan.kept[out]) if out in self.plan.kept else new for out, new in found.items()})
 
     def _loop(self, number: int, loop: Loop, known: Any, read: Callable[[Value], Any]) -> None:
         wanted, tested, count = self.plan.alive[number], loop.condition is not None, 0

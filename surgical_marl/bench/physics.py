@@ -7,7 +7,8 @@ from typing import Any
 import jax.numpy as jnp
 from jax import Array
 
-from surgical_marl.envs.env import Carry, Env, State
+from surgical_marl.envs.env import Env
+from surgical_marl.envs.state import Carry, State
 from surgical_marl.physics.views import Contacts
 
 

@@ -19,7 +19,8 @@ import numpy as np
 from surgical_marl.content import unknown
 from surgical_marl.engines.stepper import MOST_KEPT, Stepper, representative
 from surgical_marl.envs.actions import check_agents, shown
-from surgical_marl.envs.env import Carry, Env
+from surgical_marl.envs.env import Env
+from surgical_marl.envs.state import Carry
 from surgical_marl.runtime import jax, jnp
 
 if TYPE_CHECKING:

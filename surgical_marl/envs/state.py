@@ -1,0 +1,69 @@
+"""What a step of one environment takes and returns: trees of arrays, which JAX passes on from step to step."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+if TYPE_CHECKING:
+    from jax import Array
+
+    from surgical_marl.physics.dynamics import Physics
+    from surgical_marl.physics.plant import Hidden
+    from surgical_marl.physics.views import ArmView, Contacts
+
+
+class Carry(NamedTuple):
+    """The state that is carried to the next step. Random numbers depend on `key` and the `episode` counter alone."""
+
+    physics: Physics
+    goal: Any
+    key: Array
+    episode: Array
+    steps: Array
+    tips: Any = ()
+    """Tool tips [arms, 3], each in its arm's base frame, m: the next step computes their speed from it."""
+    hidden: Hidden | None = None
+    """Values that were drawn for the arms in this episode (`surgical_marl/physics/plant.py`)."""
+    messages: Any = ()
+    """What each arm said in the last step, [arms, K]; () without messages."""
+    actions: Any = ()
+    """What the joints of all arms were commanded in the last step, in [-1, 1]; zeros at the start of an episode."""
+
+
+class State(NamedTuple):
+    """The outcome of a reset or a step. Dicts are keyed by agent."""
+
+    carry: Carry
+    observations: dict[str, Array]
+    """[d] each, of the new episode where one ended."""
+    state: Array
+    """The global state for a centralised critic, the same whoever knows what: all that the task shows agents, all that
+    a scene or a call shows them of their own in addition, `Task.privileged`, and all messages."""
+    rewards: dict[str, Array]
+    terminated: Array
+    truncated: Array
+    """The time limit was reached and the episode did not terminate."""
+    final_observations: dict[str, Array]
+    """That of this step's episode, even if the episode ended."""
+    final_state: Array
+    infos: dict[str, dict[str, Array]]
+    """success, collision, min_distance (m), contact_force (N), contact_overflow (how many
+    contacts of arms in the scene were left out; 0 unless very many touch); with free objects `holding` any of them, and
+    of each `<object>_force` (N), `<object>_holding` and `<object>_slip` (m); `stage_<name>` and the task's own metrics,
+    such as tip_error (m); `reward_<term>`, the weighted terms that the reward is the sum of; `cost_<name>`, the limits
+    broken (`surgical_marl/envs/costs.py`), and their number `cost`. Of this step's episode, even if it ended."""
+    contacts: Contacts
+    """Every pair of geoms that can touch, likewise."""
+
+
+class Moved(NamedTuple):
+    """The result of `Env.move`, which `Env.finish` continues from."""
+
+    carry: Carry
+    """After the step, before a reset."""
+    tips: Array
+    """Tool tips before it, as in `Carry`."""
+    contacts: Contacts
+    arms: dict[str, ArmView]
+    changes: Array
+    """How the actions of all arms differ from the last ones."""
