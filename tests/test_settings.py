@@ -83,9 +83,14 @@ def test_a_difficulty_has_settings_of_its_own(reach: Callable[[str], None]) -> N
     reach("difficulty: hard\ndifficulties: {hard: {num_envs: 16}}\n")
     assert asked("psm") == (16, 0.99)
     assert asked("psm", "difficulty=easy") == (4096, 0.99)
-    reach("difficulties: {hard: {speed: 1}}\n")
-    with pytest.raises(ValueError, match="unknown setting 'speed'"):
-        asked("psm", "difficulty=hard")
+    reach("difficulties: {hard: {num_envs: 32}}\nscenes: {ecm: {num_envs: 16, difficulties: {hard: {num_envs: 8}}}}\n")
+    assert asked("ecm", "difficulty=hard") == (8, 0.99)
+    assert asked("ecm") == (16, 0.99)
+    assert asked("psm", "difficulty=hard") == (32, 0.99)
+    for text in ("difficulties: {hard: {speed: 1}}\n", "scenes: {psm: {difficulties: {hard: {speed: 1}}}}\n"):
+        reach(text)
+        with pytest.raises(ValueError, match="unknown setting 'speed'"):
+            asked("psm", "difficulty=hard")
 
 
 def test_a_start_has_settings_of_its_own(reach: Callable[[str], None]) -> None:
