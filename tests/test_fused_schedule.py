@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import ChainMap, Counter
 from collections.abc import Callable, Mapping
 from functools import partial
+from itertools import product
 from typing import Any
 
 import jax
@@ -133,6 +134,56 @@ def test_a_branch_changes_an_array_where_it_is(side: str, condition: float) -> N
     _, plan = schedule(function, *columns)
     assert len(plan.kept) == (side != "other")
     assert_schedule_is_right(function, *columns)
+
+
+COLUMNS = (
+    np.ones(1, np.float32), np.ones(1, np.int32), np.full(1, 3.0, np.float32),
+    np.random.default_rng(0).normal(size=(1, 5)).astype(np.float32),
+)  # fmt: skip
+
+
+def test_what_was_read_of_an_array_is_read_before_it_changes() -> None:
+    """Before a branch and within one of its sides, also in a loop there. What is read later finds it unchanged."""
+
+    def function(x: Any, i: Any, y: Any, values: Any, late: bool = False) -> Any:
+        array = values.at[i].set(y)
+        early = array[i + 1]
+
+        def changed(a: Any) -> Any:
+            old = a[i] + lax.fori_loop(0, 3, lambda k, s: s + a[k] * a[i + 2], x)
+            return a.at[i].set(x).at[i + 1].set(y), old
+
+        after, old = lax.cond(x > 0, changed, lambda a: (a, a[i + 2]), array)
+        return after, early + old, array[i] if late else y
+
+    for sign, late in product((1.0, -1.0), (False, True)):
+        columns = np.full(1, sign, np.float32), *COLUMNS[1:]
+        _, plan = schedule(partial(function, late=late), *columns)
+        assert len(plan.kept) != late
+        assert_schedule_is_right(partial(function, late=late), *columns)
+
+
+def test_a_loop_begins_with_an_array_that_nobody_reads_any_more() -> None:
+    def function(x: Any, i: Any, y: Any, values: Any, late: bool = False) -> Any:
+        array = values.at[i].set(y)
+        early = array[i]
+        out = lax.fori_loop(0, 4, lambda k, a: a.at[k].set(a[k + 1] + x), array)
+        return out, early, array[i + 1] if late else y
+
+    for late in (False, True):
+        graph, plan = schedule(partial(function, late=late), *COLUMNS)
+        assert any(graph.ops[value] == "out" for value in plan.takers) != late
+        assert_schedule_is_right(partial(function, late=late), *COLUMNS)
+
+
+def test_the_sides_of_a_branch_fill_its_result() -> None:
+    def function(x: Any, i: Any, y: Any, values: Any) -> Any:
+        return lax.cond(x > 0, lambda: lax.map(lambda v: v * x, values), lambda: lax.map(lambda v: v - y, values))[i]
+
+    graph, plan = schedule(function, *COLUMNS)
+    (branch,) = (group for group in graph.groups if isinstance(group, Branch))
+    assert list(plan.given.values()) == 2 * [branch.outs[0]]
+    assert_schedule_is_right(function, *COLUMNS)
 
 
 class Direct:
