@@ -145,8 +145,8 @@ class Trainer:
 
     def iterate(self) -> Report:
         """Do one rollout and one update; return the report, which `row` reads."""
-        started = time.perf_counter()
         self.imitate()
+        started = time.perf_counter() - (self._imitation.seconds if self._imitation and not self.iteration else 0.0)
         self._hold_actor()
         self._place()
         marks = [mark(self._cuda)]
