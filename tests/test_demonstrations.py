@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import time
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,7 +22,7 @@ from surgical_marl.learning.trainer import Trainer
 from surgical_marl.policies.networks import MultiAgentActor, actor_config
 from surgical_marl.policies.scripted import Scripted
 from surgical_marl.runs.environment import make_env
-from surgical_marl.runs.folder import read_checkpoint
+from surgical_marl.runs.folder import read_checkpoint, read_metrics
 from surgical_marl.runs.settings import ImitationSettings, NetworkSettings, OracleStatesSettings, Settings
 from surgical_marl.tasks.base.script import Step, Wish
 
@@ -164,6 +165,8 @@ def test_a_signal_ends_imitation_within_a_step_and_it_goes_on_bit_for_bit(
     descend = Imitation._descend
 
     def interrupted(self: Imitation) -> None:
+        if self.done == 3:
+            time.sleep(0.5)
         if self.done == 7:
             os.kill(os.getpid(), number)
         descend(self)
@@ -179,6 +182,7 @@ def test_a_signal_ends_imitation_within_a_step_and_it_goes_on_bit_for_bit(
     train.train(settings, out=stopped, resume=stopped)
     ends = [read_checkpoint(run)["algorithm"]["actor_state_dict"] for run in (whole, stopped)]
     assert all(torch.equal(weight, ends[1][name]) for name, weight in ends[0].items())
+    assert read_metrics(stopped)[0]["seconds"] > kept["imitation"]["seconds"] > 0.5  # its time counts
 
 
 def test_imitation_of_another_actor_is_refused(trainer: Trainer) -> None:

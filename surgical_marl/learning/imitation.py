@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from typing import Any
@@ -33,10 +34,11 @@ class Imitation:
 
     Attributes:
         done: how many steps are done.
+        seconds: how long they took.
     """
 
     def __init__(self, actor: MultiAgentActor, demonstrations: Demonstrations, steps: int, batch_size: int) -> None:
-        self.steps, self.done = steps, 0
+        self.steps, self.done, self.seconds = steps, 0, 0.0
         self._actor, self._shown, self._actions = actor, demonstrations.shown, demonstrations.actions
         self._batch_size, device = batch_size, self._actions.device
         self._step, self._loss = torch.zeros((), device=device), torch.zeros((), device=device)
@@ -59,6 +61,7 @@ class Imitation:
             stopped: asked before each step.
             show: whether to show a progress bar on stderr.
         """
+        started = time.perf_counter()
         with progress(self.steps, "step", "imitating", self.done) if show else nullcontext() as bar:
             while self.done < self.steps and not stopped():
                 if not self.done:
@@ -71,17 +74,18 @@ class Imitation:
                     bar.update()
         self._graph.release()
         self._optimizer.zero_grad()
+        self.seconds += time.perf_counter() - started
         return self.done == self.steps
 
     def state(self) -> dict[str, Any]:
         """Return what `load` needs to go on, beside the actor's weights and random numbers."""
-        return {"done": self.done, "moments": self._moments}
+        return {"done": self.done, "seconds": self.seconds, "moments": self._moments}
 
     def load(self, state: Mapping[str, Any]) -> None:
         """Go on from what `state` returned. ValueError, RuntimeError or TypeError if it is of another actor."""
         if not 0 <= state["done"] <= self.steps:
             raise ValueError(f"{state['done']} of {self.steps} steps can't be done")
-        self.done = state["done"]
+        self.done, self.seconds = state["done"], state.get("seconds", 0.0)
         self._step.fill_(self.done)
         for own, kept in zip(self._moments, state["moments"], strict=True):
             for name, moment in own.items():

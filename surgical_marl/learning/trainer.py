@@ -100,7 +100,7 @@ class Trainer:
 
         `imitate` comes before the first one, if the actor is to imitate the oracle.
         """
-        started = time.perf_counter()
+        started = time.perf_counter() - (self._imitation.seconds if self._imitation and not self.iteration else 0.0)
         self._hold_actor()
         self._place()
         marks = [mark(self._cuda)]
