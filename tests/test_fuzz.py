@@ -170,6 +170,7 @@ ATTRIBUTES = [part for part in SIMPLE.split('"')[1::2] if part not in ("1.0", "t
     st.text(max_size=10) | values.map(shown) | st.sampled_from(["1e300", "0 0 1e-300", "0 0 0", "-1", "world", "base"]),
     st.integers(1, 3),
 )
+@example("first", "\x7f", 1)
 def test_urdfs(folder: Path, old: str, new: str, count: int) -> None:
     new = new.replace("&", "&amp;").replace('"', "&quot;").replace("<", "&lt;")
     write_arm(folder, YAML, SIMPLE.replace(f'"{old}"', f'"{new}"', count))

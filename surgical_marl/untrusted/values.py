@@ -53,7 +53,7 @@ def one_line(value: Any, most: int = _TEXT) -> str:
 def listed(names: Iterable[Any], most: int = 40) -> str:
     """Return names with commas between them, the first `most` of them, and then how many more there are."""
     left = iter(names)
-    first = [str(name) for name in islice(left, most)]
+    first = [one_line(name) for name in islice(left, most)]
     more = sum(1 for _ in left)
     return ", ".join(first) + (f" and {more:,} more" if more else "")
 

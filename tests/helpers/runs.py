@@ -128,7 +128,7 @@ MOMENTS: dict[str, Callable[[], None]] = {
     "in a checkpoint": lambda: _at(torch, "save", _half_a_file),
     "before a checkpoint has its name": lambda: _at(os, "replace", _is("checkpoint.pt")),
     "after a checkpoint has its name": lambda: _at(os, "replace", _is("checkpoint.pt"), after=True),
-    "in an iteration": lambda: _at(train.Trainer, "_gather_values", lambda training: training.iteration == 2),
+    "in an iteration": lambda: _at(train.Trainer, "update", lambda training: training.iteration == 2),
     "after an iteration": lambda: _at(train.Log, "write", lambda log, row: row["iteration"] == 3, after=True),
 }
 
