@@ -61,8 +61,8 @@ class Found:
     overflows: int = 0
     """Steps of an environment in which contacts were left out, which the infos say."""
     unfelt: int = 0
-    """Pairs that overlap by more than 0.5 mm before and after a step without a force in it, though no contact was said
-    to be left out."""
+    """Pairs that overlap by more than 0.5 mm before a step and no less after it without a force in it, though no
+    contact was said to be left out. Those that part fast enough need no force."""
     deepest: float = 0.0
     """Largest overlap of any pair, m."""
     seconds: float = 0.0
@@ -169,7 +169,8 @@ class Watch:
 
     def __init__(self, env: BatchedEnv) -> None:
         self._env, self._floors = env, Floors(env.scene)
-        self._overlap: Any = False
+        self._before: Any = np.inf
+        """Distances at the end of the last step, m."""
 
     def look(self, found: Found, step: BatchStep) -> None:
         """Count what must not be after a step."""
@@ -180,9 +181,10 @@ class Watch:
         found.overflows += int((overflow > 0).sum())
         distance, depth, force = (np.asarray(getattr(step.contacts, of)) for of in ("distance", "penetration", "force"))
         found.deepest = max(found.deepest, float(np.max(depth, initial=0.0)))
-        overlap = distance < -5e-4  # at the end of the step: a force can only be in the next one
-        found.unfelt += int((self._overlap & overlap & (force == 0) & (overflow == 0)[:, None]).sum())
-        self._overlap = overlap & ~ended[:, None]
+        # distances are of the end of a step: a force can only be in the next one
+        held = (self._before < -5e-4) & (distance <= self._before)
+        found.unfelt += int((held & (force == 0) & (overflow == 0)[:, None]).sum())
+        self._before = np.where(ended[:, None], np.inf, distance)
         found.tunnels += self._floors.passed(self._env.object_poses, ended)
 
 
