@@ -133,11 +133,11 @@ def test_mujoco_warp_steps_as_c_mujoco_does(scene: str, motion: Any, near: float
     model, states = rivals._exported(workload, course)
     controls = rivals._controls(course)[:3]
     contacts, rows = rivals._most(model, states[:3], controls)
-    _, data, short = rivals._warp_lap(prepare_warp(), workload, course, model, states, contacts, rows)
+    _, _, data, short = rivals._warp_lap(prepare_warp(), workload, course, model, states, contacts, rows)
     found, _ = rollout.rollout(model, mujoco.MjData(model), states[:3], controls)
     assert not short
     np.testing.assert_allclose(data.qpos.numpy(), found[:, -1, 1 : 1 + model.nq], atol=near)
-    _, _, short = rivals._warp_lap(prepare_warp(), workload, course, model, states, 0, -6)
+    *_, short = rivals._warp_lap(prepare_warp(), workload, course, model, states, 0, -6)
     assert short, "one row is not enough, and it did not say so"
 
 
