@@ -167,9 +167,8 @@ def _parser() -> argparse.ArgumentParser:
     bench = commands.add_parser("bench", help="measure how fast this machine simulates, learns and draws")
     kinds = bench.add_subparsers(required=True, metavar="{sim,train,solve,render,face}")
     sim = _bench_parser(kinds, "sim", "steps/s of the engines, C MuJoCo and MuJoCo Warp", Workload)
-    several = "several with commas between them"
-    names = "|".join(BENCHED)
-    sim.add_argument("--engine", type=some_of(BENCHED), default=BENCHED[:1], metavar=names, help=several)
+    several, shape = "several with commas between them", "|".join(BENCHED)
+    sim.add_argument("--engine", type=some_of(BENCHED), default=BENCHED[:1], metavar=shape, help=several)
     sim.add_argument("--sweep", action="store_true", help="from 1 to 4 million environments, as far as memory goes")
     sim.add_argument("--out", type=Path, metavar="FILE.png", help="picture of a sweep")
     for kind, what in (("train", "steps/s with learning"), ("solve", "seconds until a policy is good")):
