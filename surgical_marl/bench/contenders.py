@@ -71,7 +71,7 @@ def _batched(name: str, workload: Workload, course: Course) -> Contender:
     step_physics()  # compiles
     _wait(physics)
     again = begin if workload.motion == "grasp" else None  # new episodes have nothing in their jaws
-    clocks = _clock(step_physics, physics, HOLD * LAPS, 1, cuda), clock_of(batch, actions, hold, again)
+    clocks = _clock(step_physics, physics, _cycle(HOLD * LAPS, 1)), clock_of(batch, actions, hold, again)
     return Contender(count, workload.where, compile_s, *clocks, bytes_per_env=_bytes_per_env(batch.engine))
 
 
@@ -82,26 +82,26 @@ def clock_of(
 
     If there is a `begin`, it puts the environments where they started, whenever as much was done as a clock repeats.
     """
-    turn, lap, decimation = itertools.count(), hold * len(actions), batch.env.decimation
+    turn, cycle = itertools.count(), _cycle(hold * len(actions), batch.env.decimation)
 
     def step() -> None:
         now = next(turn)
-        if begin and now % _cycle(lap, decimation) == 0:
+        if begin and now % cycle == 0:
             begin(batch.engine)
         batch.step(actions[now // hold % len(actions)])
 
-    return _clock(step, batch.engine, lap, decimation, str(batch.device).startswith("cuda"))
+    return _clock(step, batch.engine, cycle)
 
 
-def _clock(step: Callable[[], None], engine: Engine, lap: int, decimation: int, cuda: bool) -> Clock:
-    """Return the clock of a step that repeats itself after a lap."""
-    if cuda and engine.name == "fused":
-        return cuda_clock(step, _cycle(lap, decimation))
+def _clock(step: Callable[[], None], engine: Engine, cycle: int) -> Clock:
+    """Return the clock of a step that repeats itself after so many."""
+    if engine.device == "cuda" and engine.name == "fused":
+        return cuda_clock(step, cycle)
     return cpu_clock(step, lambda: _wait(engine))
 
 
 def _cycle(lap: int, decimation: int) -> int:
-    """Return after how many steps all begins anew: so many that environments are sorted as often as in any long run."""
+    """Return after how many steps, of some laps, environments have been sorted as often as in any long run."""
     return math.lcm(lap, control_steps(decimation))
 
 
