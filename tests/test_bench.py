@@ -110,6 +110,8 @@ def test_some_engines_stand_beside_each_other(made_up: None, capsys: pytest.Capt
     assert list(found["ratios"]["physics"]) == ["mujoco"]
     assert main([*argv, "mujoco,all"]) == 0
     assert len(json.loads(capsys.readouterr().out)["engines"]) == 3
+    assert main([*argv, "all,mujoco_warp"]) == 0
+    assert len(json.loads(capsys.readouterr().out)["engines"]) == 4, "on a CPU MuJoCo Warp runs where it is named"
 
 
 def test_on_a_gpu_mujoco_warp_stands_beside_c_mujoco(

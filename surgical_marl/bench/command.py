@@ -58,7 +58,8 @@ def _sim(arguments: Namespace) -> int:
 
     workload = Workload(task=arguments.task, scene=arguments.scene, **arguments.given)
     if "all" in engines:  # MuJoCo Warp is made for GPUs; on a CPU it has to be named
-        engines = tuple(name for name in ENGINES if name != "mujoco_warp" or workload.where == "cuda")
+        fit = workload.where == "cuda" or "mujoco_warp" in engines
+        engines = tuple(name for name in ENGINES if name != "mujoco_warp" or fit)
     print(run(workload, engines, arguments.sweep, arguments.json, arguments.out))
     return 0
 
