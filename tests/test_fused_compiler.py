@@ -145,7 +145,7 @@ def changed(count: int, x: Any, which: Any) -> Any:
 
 def test_threads_wait_for_each_other_only_where_all_come_by(monkeypatch: pytest.MonkeyPatch) -> None:
     """A thread that waits in a branch, or in a round that others don't make, would wait for ever."""
-    monkeypatch.setattr("surgical_marl.engines.fused.emit.BRANCHES", 2)
+    monkeypatch.setattr("surgical_marl.engines.fused.preludes.BRANCHES", 2)
 
     def long(x: Any) -> Any:
         return lax.cond(x > 0, lambda: sum(jnp.sin(k * x) for k in range(1, 40)), lambda: x)
@@ -200,7 +200,7 @@ def test_a_scan_that_is_to_be_unrolled_is() -> None:
 
 def test_code_for_cuda_compiles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every macro of the prelude, by NVRTC, which needs no GPU."""
-    monkeypatch.setattr("surgical_marl.engines.fused.emit.BRANCHES", 0)
+    monkeypatch.setattr("surgical_marl.engines.fused.preludes.BRANCHES", 0)
     code = body(everything, random_arrays(0), vector=False)
     used = set(re.findall(r"\w+", code))
     assert not [name for name in re.findall("^#define (\\w+)", CUDA, re.M) if name not in used]

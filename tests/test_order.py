@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from surgical_marl.engines.fused import engine, order
+from surgical_marl.engines.fused.preludes import BRANCHES
 from surgical_marl.envs.batch import BatchedEnv
 from tests.helpers.actions import random_actions
 
@@ -22,9 +23,8 @@ def both(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> lis
     monkeypatch.setattr(engine, "cores", lambda: int(request.param[0]))
     monkeypatch.setattr(engine, "LEAST_SHARE", 8)
     made = []
-    for least, every in ((10**6, order.SELDOM), (1, 1)):
-        monkeypatch.setitem(engine.LEAST_BRANCHES, "cpu", least)
-        monkeypatch.setattr(engine, "SELDOM", every)
+    for every in (0, 1):
+        monkeypatch.setattr(engine, "sorted_every", lambda *_, every=every: every)
         made.append(BatchedEnv("reach", "bimanual_psm", num_envs=N, engine="fused", device="cpu", start="random"))
         made[-1].reset(seed=0)
     return made
@@ -112,3 +112,16 @@ def test_what_is_recorded_begins_with_sorting() -> None:
     for step in range(40):  # noqa: B007
         columns.renew()
     assert sorted_at == [1, 5, 13, 20, 28, 36]
+
+
+def test_environments_are_sorted_where_neighbours_wait_for_each_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(order, "multiprocessors", lambda: 132)
+    none, short, long = [""], ["WORK(9)"], ["WORK(9)"] * BRANCHES
+    few, many = 4096, 8192  # of 32 a group
+
+    def every(code: list[str], device: str, num_envs: int) -> int:
+        return order.sorted_every(code, device, num_envs, decimation=8)
+
+    assert [every(none, "cuda", many), every(short, "cuda", few), every(short, "cuda", many)] == [0, 0, 16]
+    assert [every(long, "cuda", few), every(long, "cuda", many), every(long, "cuda", 8)] == [4, 4, 0]
+    assert [every(short, "cpu", many), every(long, "cpu", few), every(long, "cpu", 8)] == [0, 4, 0]

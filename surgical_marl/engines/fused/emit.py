@@ -14,7 +14,7 @@ import numpy as np
 
 from surgical_marl.engines.fused.emit_arrays import TYPES, ArrayEmitter
 from surgical_marl.engines.fused.graph import Branch, Graph, Loop, Value
-from surgical_marl.engines.fused.preludes import BRANCHES
+from surgical_marl.engines.fused.preludes import is_long, large_branches
 from surgical_marl.engines.fused.schedule import Scheduler
 
 LARGE = 500
@@ -66,7 +66,7 @@ class Emitter(ArrayEmitter):
             field = self.watch.flag
             self.lines = ["F watch_=SPLAT(0.0f);", *self.lines]
             self.lines.append(f"B bad_=watch_!=SPLAT(0.0f);if(ANY(bad_)){{STB(flags,{field},LDB(flags,{field})|bad_)}}")
-        if any(line.startswith("WORK(") for line in self.lines):
+        if large_branches(self.lines):
             self.lines = ["I work_=SPLATI(0);", *self.lines, "STI(work,0,WORKED)"]
         return "\n".join(self.lines)
 
@@ -156,7 +156,7 @@ class Emitter(ArrayEmitter):
 
     def _wait(self, top: int, places: list[int]) -> None:
         """Let the threads of a block wait for each other before some lines, if there is much to do from `top` on."""
-        if sum(line.startswith("WORK(") for line in self.lines[top:]) >= BRANCHES:
+        if is_long(self.lines[top:]):
             for place in reversed(places):
                 self.lines.insert(place, "TOGETHER")
 

@@ -21,10 +21,10 @@ import numpy as np
 
 from surgical_marl.engines.fused.arrays import make_arrays
 from surgical_marl.engines.fused.guard import Guard
-from surgical_marl.engines.fused.kernel import compile_kernels, has_cuda, large_branches
+from surgical_marl.engines.fused.kernel import compile_kernels, has_cuda
 from surgical_marl.engines.fused.load import load_source
-from surgical_marl.engines.fused.order import OFTEN, SELDOM, control_steps
-from surgical_marl.engines.fused.preludes import BRANCHES, LANES
+from surgical_marl.engines.fused.order import sorted_every
+from surgical_marl.engines.fused.preludes import LANES
 from surgical_marl.engines.fused.program import Source
 from surgical_marl.engines.fused.threefry import episode_keys
 from surgical_marl.engines.stages import compiling
@@ -33,8 +33,6 @@ from surgical_marl.machine import cores
 
 LEAST_SHARE = 32
 """Least number of environments per thread."""
-LEAST_BRANCHES = {"cuda": 1, "cpu": BRANCHES}
-"""Least number of large branches for which environments are sorted. A CPU's results have to be copied then."""
 
 
 class FusedEngine:
@@ -67,9 +65,7 @@ class FusedEngine:
         self._shares = [(a, b - a) for a, b in pairwise(edges)]
         if shares == 1:
             self._shares = [(0, num_envs if self.device == "cuda" else self._stride)]
-        branches = large_branches(self.source.bodies)
-        if num_envs > LANES and branches >= LEAST_BRANCHES[self.device]:
-            every = control_steps(env.decimation, OFTEN if branches >= BRANCHES else SELDOM)
+        if every := sorted_every(self.source.bodies.values(), self.device, num_envs, env.decimation):
             self._arrays.sort_columns(every, shares)
         self._pool: ThreadPoolExecutor | None = None
         self._process = 0

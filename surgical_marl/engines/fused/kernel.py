@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from surgical_marl.cache import locked
-from surgical_marl.engines.fused.preludes import BRANCHES, CPU, CUDA, LANES, UNDEFINE
+from surgical_marl.engines.fused.preludes import CPU, CUDA, LANES, UNDEFINE, is_long
 from surgical_marl.engines.stages import Stage, unsaid
 from surgical_marl.engines.stepper import MOST_KEPT
 from surgical_marl.files import write_atomic
@@ -37,11 +37,6 @@ _wholes: Any = wp.array(dtype=wp.int32)
 _bytes: Any = wp.array(dtype=wp.uint8)
 
 
-def large_branches(bodies: dict[str, str]) -> int:
-    """Return in how many places environments differ in how much they have to do."""
-    return sum(body.count("WORK(") for body in bodies.values())
-
-
 def compile_kernels(
     bodies: dict[str, str],
     device: str,
@@ -53,8 +48,8 @@ def compile_kernels(
 
     Warp keeps compiled modules in its cache on disk. `stage` is told if there is none of these bodies.
     """
-    cuda, branches = device == "cuda", large_branches(bodies)
-    block = WIDE if cuda and branches >= BRANCHES and num_envs >= MANY else BLOCK if cuda else 1
+    cuda = device == "cuda"
+    block = WIDE if cuda and is_long(bodies.values()) and num_envs >= MANY else BLOCK if cuda else 1
     prelude = CUDA if cuda else CPU
     sources = tuple((name, f"{prelude}\n{body}\n{UNDEFINE}\n") for name, body in bodies.items())
     digest = hashlib.sha256("\0".join(source for _, source in sources).encode()).hexdigest()[:16]
@@ -166,6 +161,11 @@ def torch_stream() -> Any:
     import torch
 
     return wp.stream_from_torch(torch.cuda.current_stream())
+
+
+def multiprocessors() -> int:
+    """Return how many the GPU has."""
+    return int(wp.get_device("cuda").sm_count)
 
 
 def has_cuda() -> bool:

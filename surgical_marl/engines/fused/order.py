@@ -9,8 +9,11 @@ An environment's results do not depend on its column.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any
+
+from surgical_marl.engines.fused.kernel import BLOCK, multiprocessors
+from surgical_marl.engines.fused.preludes import LANES, is_long, large_branches
 
 SELDOM, OFTEN = 128, 32
 """Physics steps after which environments are sorted: often where code is long. An environment that begins an
@@ -21,6 +24,19 @@ than sorting."""
 def control_steps(decimation: int, every: int = SELDOM) -> int:
     """Return how many control steps of so many physics steps each take `every` physics steps."""
     return max(1, every // decimation)
+
+
+def sorted_every(code: Collection[str], device: str, num_envs: int, decimation: int) -> int:
+    """Return after how many control steps environments are sorted; 0 for never.
+
+    Only long code is worth it on a CPU, whose results then have to be copied, and on a GPU on which each group has a
+    multiprocessor of its own: what is beside the slowest group slows it no more.
+    """
+    if not is_long(code) and (device == "cpu" or num_envs <= BLOCK * multiprocessors()):
+        return 0
+    if num_envs <= LANES or not large_branches(code):
+        return 0
+    return control_steps(decimation, OFTEN if is_long(code) else SELDOM)
 
 
 class Order:

@@ -11,10 +11,23 @@ stands where all of them come by, behind long branches and loops, and at the top
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 LANES = 8
 """Environments in a vector on a CPU: 32 bytes of float32, an AVX register."""
 BRANCHES = 8
 """So many large branches make code long: all threads of a block should be at the same place of it."""
+
+
+def large_branches(code: Iterable[str]) -> int:
+    """Return in how many places of some code environments differ in how much they have to do."""
+    return sum(part.count("WORK(") for part in code)
+
+
+def is_long(code: Iterable[str]) -> bool:
+    """Whether code is so long that it matters which of it neighbours need at the same time."""
+    return large_branches(code) >= BRANCHES
+
 
 CUDA = """
 typedef float F; typedef int I; typedef unsigned int U; typedef bool B;
