@@ -26,13 +26,8 @@ from surgical_marl.policies.policy import (
     untrained_policy,
     zero_policy,
 )
-from surgical_marl.runs.folder import (
-    CONFIG,
-    read_checkpoint,
-    read_metrics,
-    read_settings,
-    write_metrics,
-)
+from surgical_marl.runs.checkpoint import read_checkpoint
+from surgical_marl.runs.folder import CONFIG, read_metrics, read_settings, write_metrics
 from surgical_marl.runs.settings import NetworkSettings, PPOSettings, Settings
 from tests.helpers.fake_env import FakeEnv
 from tests.helpers.runs import ALL, COUNTS, OPTIONS, SIZES, SMALL

@@ -24,7 +24,8 @@ from surgical_marl.policies.networks import MultiAgentActor, actor_config, make_
 from surgical_marl.policies.oracle import oracle
 from surgical_marl.policies.recurrent import cleared
 from surgical_marl.policies.weights import read_weights
-from surgical_marl.runs.folder import CHECKPOINT, CONFIG, holds_weights, read_checkpoint, read_settings
+from surgical_marl.runs.checkpoint import read_checkpoint
+from surgical_marl.runs.folder import CHECKPOINT, CONFIG, holds_weights, read_settings
 from surgical_marl.runs.settings import Settings
 from surgical_marl.untrusted.files import is_file
 from surgical_marl.untrusted.values import shown
