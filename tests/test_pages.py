@@ -194,7 +194,7 @@ def check_command(words: list[str], is_mention: bool = False) -> None:
         CHECKS[program](rest)
 
 
-BENCHES = (f"bench.{kind}.run" for kind in ("report", "learning", "solve", "face", "render"))
+BENCHES = (f"bench.{kind}.run" for kind in ("report", "learning", "solve", "face", "render", "page"))
 WORK = ("cli.doctor.report", "evaluation.export.export_policy", "report.command.report",
         "view.take.replay", *BENCHES)  # fmt: skip
 """Where the work of commands begins."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import http.client
 import io
+import json
 import shutil
 import time
 from collections.abc import Iterator
@@ -25,6 +26,7 @@ import websockets.asyncio.server
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
+from surgical_marl.bench.page import measure_page
 from surgical_marl.cli.main import main
 from surgical_marl.content import find
 from surgical_marl.engines.stages import compiling
@@ -366,3 +368,24 @@ def test_a_run_without_a_checkpoint_can_not_move_an_arm(viewer: Viewer, tmp_path
     (tmp_path / "config.yaml").write_text((find("policies", "reach-bimanual_psm") / "config.yaml").read_text())
     with pytest.raises(ValueError, match=r"it has no checkpoint\.pt"):
         viewer.session.set_mover(viewer.session.env.agents[0], str(tmp_path))
+
+
+def test_what_a_drawing_costs_as_json_and_as_a_sentence(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(measure_page, "__defaults__", (0.3, 0.1))
+    joined: list[int] = []
+    turn = Viewer.turn
+
+    def counted(self: Viewer, now: float) -> None:
+        joined.append(len(self.server.get_clients()))
+        turn(self, now)
+
+    monkeypatch.setattr(Viewer, "turn", counted)
+    assert main(["bench", "view", "--scene", "psm", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert list(found) == ["ms_per_drawing", "drawings_per_s", "mover"]
+    assert found["ms_per_drawing"] > 0 and found["drawings_per_s"] > 0 and found["mover"] == "reach-psm"
+    assert joined[-1] == 1
+    assert main(["bench", "view", "--task", "reach", "--scene", "psm"]) == 0
+    assert "reach on psm, moved by reach-psm: " in capsys.readouterr().out

@@ -1,0 +1,105 @@
+"""What a drawing of the viewer costs: one environment with its policy, and a client that takes all that is sent.
+
+measure_page("reach", "bimanual_psm").ms_per_drawing
+"""
+
+from __future__ import annotations
+
+# Only light imports up here: the client's process imports this module too.
+import json
+import multiprocessing
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from threading import Event, Timer
+
+SECONDS = 20.0
+"""How long the page is drawn."""
+WARM = 3.0
+"""Before that: a client first gets all meshes, and a policy's first action takes longer, s."""
+
+
+@dataclass(frozen=True)
+class Page:
+    """The cost of the viewer's page, without the browser that shows it."""
+
+    ms_per_drawing: float
+    """Milliseconds of a core of the process that steps, draws and sends."""
+    drawings_per_s: float
+    """`surgical-marl view` wants 30; the clock on the wall tells, so other programs matter."""
+    mover: str
+    """Who moves the arms."""
+
+
+def measure_page(task: str, scene: str, seconds: float = SECONDS, warm: float = WARM) -> Page:
+    """Run the viewer for so many seconds after a warm-up, as `surgical-marl view` does, on this process's clock.
+
+    Raises:
+        ValueError: viser is not installed, or task and scene do not fit together.
+    """
+    from surgical_marl.runs.settings import Settings
+    from surgical_marl.view.browser.viewer import Viewer
+
+    viewer = Viewer(Settings(task=task, scene=scene), port=0)
+    marks: list[tuple[float, float, int]] = []
+    end = Event()
+
+    def mark() -> None:
+        marks.append((time.process_time(), time.monotonic(), viewer.drawn))
+        if len(marks) == 2:
+            end.set()
+
+    mover = ", ".join(dict.fromkeys(viewer.session.movers.who.values()))
+    with _client(viewer.address):
+        timers = [Timer(warm, mark), Timer(warm + seconds, mark)]
+        for timer in timers:
+            timer.start()
+        viewer.run(end)
+    (spent, began, first), (after, ended, last) = marks
+    return Page(1e3 * (after - spent) / (last - first), (last - first) / (ended - began), mover)
+
+
+def run(task: str, scene: str, as_json: bool) -> str:
+    """All of `surgical-marl bench view`: a sentence, or JSON."""
+    found = measure_page(task, scene)
+    if as_json:
+        return json.dumps(asdict(found))
+    return (
+        f"{task} on {scene}, moved by {found.mover}: {found.ms_per_drawing:.1f} ms of one core a drawing, "
+        f"{found.drawings_per_s:.1f} drawings/s"
+    )
+
+
+@contextmanager
+def _client(address: str) -> Iterator[None]:
+    """Let another process open the page meanwhile."""
+    context = multiprocessing.get_context("spawn")
+    joined = context.Event()
+    client = context.Process(target=_watch, args=(address, joined), daemon=True)
+    client.start()
+    try:
+        if not joined.wait(60):
+            raise RuntimeError("no client could open the page within 60 s")
+        yield
+    finally:
+        client.terminate()
+        client.join()
+
+
+def _watch(address: str, joined: Event) -> None:
+    """Take what a page's server sends, as a browser would that draws nothing."""
+    from importlib.metadata import version
+
+    from websockets.exceptions import ConnectionClosed
+    from websockets.sync.client import connect
+    from websockets.typing import Subprotocol
+
+    protocol = Subprotocol(f"viser-v{version('viser')}")
+    with connect(address.replace("http", "ws").rstrip("/"), subprotocols=[protocol], max_size=None) as socket:
+        joined.set()
+        try:
+            for _ in socket:
+                pass
+        except ConnectionClosed:  # the measurement is over
+            pass
