@@ -5,6 +5,7 @@ from __future__ import annotations
 # Only light imports here, as in main.py.
 import argparse
 import importlib.util
+import os
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -91,14 +92,11 @@ def _open(arguments: argparse.Namespace) -> Any:
         raise ValueError(NEEDED)
     check_port(arguments.port)
 
-    import torch
-
     from surgical_marl.runs.folder import check_writable
     from surgical_marl.view.browser.viewer import Viewer
 
     if arguments.record is not None:
         check_writable(arguments.record)
-    torch.set_num_threads(1)  # for a few environments, threads of torch wait for each other longer than they compute
     return Viewer(settings, who, arguments.num_envs, arguments.port, arguments.record)
 
 
@@ -115,13 +113,10 @@ def _film(arguments: argparse.Namespace) -> Path:
             f"cannot write --out {arguments.out}: name an .mp4, .gif or .webp file in a folder that exists"
         )
 
-    import torch
-
     from surgical_marl.runs.environment import make_env
     from surgical_marl.view.film import Look, camera_of, film
     from surgical_marl.view.movers import Movers, first
 
-    torch.set_num_threads(1)  # the cores draw meanwhile
     look = Look(arguments.grid, arguments.slow, words=not arguments.plain, size=arguments.size)
     env = make_env(settings, look.grid[0] * look.grid[1], "numpy")
     look = replace(look, camera=camera_of(arguments.camera, env))
@@ -189,6 +184,8 @@ def _reproduce(file: Path, about: Any, arrays: Any) -> int:
 
 def _settings(arguments: argparse.Namespace) -> tuple[Any, str | None]:
     """Return the settings of what is shown, and who moves the arms; ValueError if it does not exist or fit together."""
+    # for policies that need torch: with few environments its threads wait for each other longer than they compute
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
     if arguments.task not in list_tasks():
         raise unknown("task", arguments.task, list_tasks())
     if arguments.scene is None:
@@ -202,7 +199,7 @@ def _settings(arguments: argparse.Namespace) -> tuple[Any, str | None]:
     if who is not None and who not in (*BASELINES, *list_policies()) and not is_folder(who):
         raise unknown("run or policy", who, [*list_policies(), *BASELINES])
 
-    from surgical_marl.evaluation.command import common_settings
+    from surgical_marl.evaluation.asked import common_settings
 
     asked = {key: getattr(arguments, key) for key in ("task", "scene", *_OWN)}
     settings = common_settings([who or "zero"], {**asked, "goals": asked["goals"] or "training"})

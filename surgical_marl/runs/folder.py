@@ -26,9 +26,11 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from surgical_marl.content import find, list_policies
 from surgical_marl.files import write_atomic
 from surgical_marl.runs.settings import Settings, config_text, read_config
 from surgical_marl.untrusted.files import MB, check_file, is_file
+from surgical_marl.untrusted.values import shown
 from surgical_marl.yaml_file import read_yaml
 
 CONFIG, CHECKPOINT, METRICS, CURVE = "config.yaml", "checkpoint.pt", "metrics.csv", "curve.png"
@@ -38,6 +40,21 @@ WEIGHTS = ".safetensors"
 MAX_METRICS = 100 * MB
 """Bytes of `metrics.csv`, a quarter of a million iterations."""
 PACKAGES = ("surgical-marl", "torch", "rsl-rl-lib", "jax", "mujoco", "mujoco-mjx", "numpy")
+
+
+def find_run(run: str | Path) -> Path:
+    """Find the folder of a run, by its path, or of a policy that ships, by its name.
+
+    ValueError if there is none.
+    """
+    if is_file(Path(run) / CONFIG):
+        return Path(run)
+    if str(run) in list_policies():
+        return find("policies", str(run))
+    shipped = ", ".join(list_policies()) or "none yet"
+    raise ValueError(
+        f"{shown(str(run))} is not a run folder, nor zero, random, oracle or a policy that ships ({shipped})"
+    )
 
 
 def claim_folder(out: Path) -> None:
