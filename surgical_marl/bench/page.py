@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from threading import Event, Timer
+from typing import Any
 
 SECONDS = 20.0
 """How long the page is drawn."""
@@ -28,6 +29,8 @@ class Page:
     """Milliseconds of a core of the process that steps, draws and sends."""
     drawings_per_s: float
     """`surgical-marl view` wants 30; the clock on the wall tells, so other programs matter."""
+    kilobytes_per_drawing: float
+    """What the client takes."""
     mover: str
     """Who moves the arms."""
 
@@ -42,22 +45,22 @@ def measure_page(task: str, scene: str, seconds: float = SECONDS, warm: float = 
     from surgical_marl.view.browser.viewer import Viewer
 
     viewer = Viewer(Settings(task=task, scene=scene), port=0)
-    marks: list[tuple[float, float, int]] = []
+    marks: list[tuple[float, float, int, int]] = []
     end = Event()
-
-    def mark() -> None:
-        marks.append((time.process_time(), time.monotonic(), viewer.drawn))
-        if len(marks) == 2:
-            end.set()
-
     mover = ", ".join(dict.fromkeys(viewer.session.movers.who.values()))
-    with _client(viewer.address):
+    with _client(viewer.address) as taken:
+
+        def mark() -> None:
+            marks.append((time.process_time(), time.monotonic(), viewer.drawn, taken.value))
+            if len(marks) == 2:
+                end.set()
+
         timers = [Timer(warm, mark), Timer(warm + seconds, mark)]
         for timer in timers:
             timer.start()
         viewer.run(end)
-    (spent, began, first), (after, ended, last) = marks
-    return Page(1e3 * (after - spent) / (last - first), (last - first) / (ended - began), mover)
+    spent, lasted, drawn, sent = (after - before for before, after in zip(*marks, strict=True))
+    return Page(1e3 * spent / drawn, drawn / lasted, sent / 1024 / drawn, mover)
 
 
 def run(task: str, scene: str, as_json: bool) -> str:
@@ -67,27 +70,27 @@ def run(task: str, scene: str, as_json: bool) -> str:
         return json.dumps(asdict(found))
     return (
         f"{task} on {scene}, moved by {found.mover}: {found.ms_per_drawing:.1f} ms of one core a drawing, "
-        f"{found.drawings_per_s:.1f} drawings/s"
+        f"{found.drawings_per_s:.1f} drawings/s of {found.kilobytes_per_drawing:.1f} KB"
     )
 
 
 @contextmanager
-def _client(address: str) -> Iterator[None]:
-    """Let another process open the page meanwhile."""
+def _client(address: str) -> Iterator[Any]:
+    """Let another process open the page meanwhile; yield how many bytes it has taken."""
     context = multiprocessing.get_context("spawn")
-    joined = context.Event()
-    client = context.Process(target=_watch, args=(address, joined), daemon=True)
+    joined, taken = context.Event(), context.Value("Q", lock=False)
+    client = context.Process(target=_watch, args=(address, joined, taken), daemon=True)
     client.start()
     try:
         if not joined.wait(60):
             raise RuntimeError("no client could open the page within 60 s")
-        yield
+        yield taken
     finally:
         client.terminate()
         client.join()
 
 
-def _watch(address: str, joined: Event) -> None:
+def _watch(address: str, joined: Event, taken: Any) -> None:
     """Take what a page's server sends, as a browser would that draws nothing."""
     from importlib.metadata import version
 
@@ -99,7 +102,7 @@ def _watch(address: str, joined: Event) -> None:
     with connect(address.replace("http", "ws").rstrip("/"), subprotocols=[protocol], max_size=None) as socket:
         joined.set()
         try:
-            for _ in socket:
-                pass
+            for message in socket:
+                taken.value += len(message)
         except ConnectionClosed:  # the measurement is over
             pass
