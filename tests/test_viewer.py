@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shutil
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,7 +14,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from surgical_marl.cli.main import main
+from surgical_marl.cli import viewing
+from surgical_marl.cli.main import _parser, main
+from surgical_marl.content import find
 from surgical_marl.robots.rotation import turned
 from surgical_marl.runs.settings import Settings
 from surgical_marl.view.browser.gate import open_server
@@ -293,7 +296,8 @@ VIEW = ["view", "reach", "--scene", "psm"]
         (["view", "reach", "--scene", "psmm"], ["'psmm'", "did you mean 'psm'"]),
         ([*VIEW, "--policy", "nobody"], ["'nobody'", "oracle"]),
         ([*VIEW, "--policy", "."], ["config.yaml"]),
-        ([*VIEW, "--policy", "reach-star"], ["reach-star", "'star'", "not 'psm'"]),
+        ([*VIEW, "--policy", "reach-star"], ["'star'", "`surgical-marl view reach --scene star --policy reach-star`"]),
+        ([*VIEW, "--policy", "track-psm"], ["'track'", "`surgical-marl view track --scene psm --policy track-psm`"]),
         ([*VIEW, "--num-envs", "5"], ["--num-envs", "from 1 to 4"]),
         ([*VIEW, "--port", "70000"], ["--port", "'70000'"]),
         (["replay", "none.npz"], ["none.npz"]),
@@ -316,3 +320,19 @@ def test_bad_input(argv: list[str], words: list[str], capsys: pytest.CaptureFixt
     assert not out and len(said) == 1
     for word in words:
         assert word in said[0]
+
+
+@pytest.mark.parametrize("command", ["view", "play"])
+def test_a_run_before_its_first_checkpoint_is_bad_input(
+    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copy(find("policies", "reach-psm") / "config.yaml", tmp_path)
+    out = ["--out", str(tmp_path / "film.gif")] if command == "play" else []
+    assert main([command, "reach", "--policy", str(tmp_path), *out]) == 2
+    assert f"{tmp_path} has no checkpoint.pt yet" in capsys.readouterr().err
+
+
+def test_a_policy_brings_its_scene() -> None:
+    arguments = _parser().parse_args(["play", "reach", "--policy", "reach-star", "--out", "film.gif"])
+    settings, who = viewing._settings(arguments)
+    assert (settings.task, settings.scene, who) == ("reach", "star", "reach-star")

@@ -366,7 +366,7 @@ def test_a_run_is_named_in_the_menu(viewer: Viewer, tmp_path: Path) -> None:
 
 def test_a_run_without_a_checkpoint_can_not_move_an_arm(viewer: Viewer, tmp_path: Path) -> None:
     (tmp_path / "config.yaml").write_text((find("policies", "reach-bimanual_psm") / "config.yaml").read_text())
-    with pytest.raises(ValueError, match=r"it has no checkpoint\.pt"):
+    with pytest.raises(ValueError, match=r"has no checkpoint\.pt yet"):
         viewer.session.set_mover(viewer.session.env.agents[0], str(tmp_path))
 
 

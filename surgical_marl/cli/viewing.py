@@ -59,7 +59,7 @@ def _add_what(parser: argparse.ArgumentParser) -> None:
     """Add the flags that say what is shown."""
     parser.add_argument("task", metavar="TASK", help=f"one of: {', '.join(list_tasks())}")
     parser.add_argument(
-        "--scene", help="a name (see `list scenes`) or a .yaml file (default: the task's own, if it has one)"
+        "--scene", help="a name (see `list scenes`) or a .yaml file (default: the policy's, or else the task's own)"
     )
     what = f"a run folder, a policy's name, {', '.join(BASELINES)} (default: the policy that ships, or oracle)"
     parser.add_argument("--policy", metavar="RUN_OR_POLICY", help=what)
@@ -188,16 +188,17 @@ def _settings(arguments: argparse.Namespace) -> tuple[Any, str | None]:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     if arguments.task not in list_tasks():
         raise unknown("task", arguments.task, list_tasks())
+    if arguments.scene is not None:
+        find("scenes", arguments.scene)
+    who = arguments.policy
+    if who is not None and who not in BASELINES:
+        arguments.scene = _scene_of(arguments, who)
     if arguments.scene is None:
         from surgical_marl.plugins.tasks import TASKS
 
         arguments.scene = TASKS.load(arguments.task).default_scene
     if arguments.scene is None:
         raise ValueError(f"{arguments.name} {arguments.task} needs --scene ({', '.join(list_scenes())})")
-    find("scenes", arguments.scene)
-    who = arguments.policy
-    if who is not None and who not in (*BASELINES, *list_policies()) and not is_folder(who):
-        raise unknown("run or policy", who, [*list_policies(), *BASELINES])
 
     from surgical_marl.evaluation.asked import common_settings
 
@@ -205,3 +206,19 @@ def _settings(arguments: argparse.Namespace) -> tuple[Any, str | None]:
     settings = common_settings([who or "zero"], {**asked, "goals": asked["goals"] or "training"})
 
     return replace(settings, seed=arguments.seed), who
+
+
+def _scene_of(arguments: argparse.Namespace, who: str) -> str:
+    """Return the scene of a run or policy; ValueError if it is of another task or scene than the arguments say."""
+    if who not in list_policies() and not is_folder(who):
+        raise unknown("run or policy", who, [*list_policies(), *BASELINES])
+
+    from surgical_marl.runs.folder import read_settings
+
+    own = read_settings(find("policies", who))
+    if own.task != arguments.task or arguments.scene not in (None, own.scene):
+        raise ValueError(
+            f"{who} is of task {own.task!r} and scene {own.scene!r}: look at it with `surgical-marl {arguments.name} "
+            f"{own.task} --scene {own.scene} --policy {who}`"
+        )
+    return own.scene

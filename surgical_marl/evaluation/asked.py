@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from surgical_marl.content import BASELINES, find
-from surgical_marl.runs.folder import read_settings
+from surgical_marl.runs.folder import check_trained, read_settings
 from surgical_marl.runs.settings import Settings
 
 OWN = ("task", "scene", "control", "knowledge", "messages")
@@ -30,7 +30,9 @@ def common_settings(policies: Sequence[str], asked: Mapping[str, str | None]) ->
     for policy, other in settings.items():
         for key in (*OWN, *CHOSEN, "max_steps"):
             if (theirs := getattr(other, key)) != (ours := getattr(first, key)):
-                raise ValueError(f"{policy} has {key} {theirs!r} and {name} has {ours!r}: evaluate them one at a time")
+                raise ValueError(f"{policy} has {key} {theirs!r} and {name} has {ours!r}: they can't be compared")
+    for policy in trained:
+        check_trained(find("policies", policy))
     return first
 
 

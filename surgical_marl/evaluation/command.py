@@ -126,10 +126,7 @@ def read_result(path: Path) -> dict[str, Any]:
 
     ValueError if the file is no such result, or a metric in it is no number.
     """
-    try:
-        check_file(path, MAX_JSON)
-    except ValueError as error:
-        raise ValueError(f"cannot read {path}: {error}") from None
+    check_file(path, MAX_JSON)
     try:
         result = read_json(path)
         result = result.get("aggregate", result)

@@ -13,7 +13,7 @@ from typing import Any, BinaryIO, cast
 import torch
 
 from surgical_marl.files import write_atomic
-from surgical_marl.runs.folder import CHECKPOINT, holds_weights
+from surgical_marl.runs.folder import CHECKPOINT, check_trained, holds_weights
 from surgical_marl.untrusted.arrays import check_checkpoint
 from surgical_marl.untrusted.values import listed
 
@@ -62,8 +62,7 @@ def read_checkpoint(run: str | Path) -> dict[str, Any]:
     path = Path(run) / CHECKPOINT
     if not path.is_file() and holds_weights(Path(run)):
         raise ValueError(f"{run} holds an exported policy, which can be evaluated but not resumed")
-    if not path.is_file():
-        raise ValueError(f"{run} is not a run folder: it has no {CHECKPOINT}")
+    check_trained(Path(run))
     try:
         check_checkpoint(path)
         with warnings.catch_warnings(action="ignore"):  # torch's error for a file of another format

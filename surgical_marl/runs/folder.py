@@ -119,6 +119,15 @@ def holds_weights(folder: Path) -> bool:
     return any(folder.glob(f"[!.]*{WEIGHTS}"))
 
 
+def check_trained(run: Path) -> None:
+    """Raise ValueError if a folder holds no networks: a run before its first checkpoint, or what is no run."""
+    if not (run / CHECKPOINT).is_file() and not holds_weights(run):
+        raise ValueError(
+            f"{run} has no {CHECKPOINT} yet: a run has one after its first iterations, and `surgical-marl train "
+            f"--resume {run}` goes on with it"
+        )
+
+
 def write_divergence(run: Path, divergence: Mapping[str, Any]) -> None:
     """Write `diverged.json`."""
     write_atomic(run / DIVERGED, lambda path: path.write_text(json.dumps(divergence, indent=2) + "\n"))

@@ -36,6 +36,10 @@ WALL = 1280
 """Pixels along the width of a film of several environments, about."""
 SMALLEST, LARGEST = 16, 4096
 """Pixels of a side of a picture."""
+TURNS = 3600.0
+"""Angles of a camera at most, degrees."""
+CLOSEST, FARTHEST = 0.001, 100.0
+"""Distances of a camera, m."""
 MOST = 8
 """Rows and columns of a grid at most."""
 
@@ -140,6 +144,11 @@ def camera_of(text: str | None, env: BatchedEnv) -> str | View | None:
         azimuth, elevation, distance = map(float, text.split(","))
     except ValueError:
         raise unknown("camera", text, [*names, "AZIMUTH,ELEVATION,DISTANCE"]) from None
+    if not (abs(azimuth) <= TURNS and abs(elevation) <= TURNS and CLOSEST <= distance <= FARTHEST):
+        raise ValueError(
+            f"a camera's angles are from {-TURNS:g} to {TURNS:g} degrees and its distance from {CLOSEST:g} to "
+            f"{FARTHEST:g} m, not {text!r}"
+        )
     env.reset(0)
     middle = Observer(env.scene).look(env).tips[0].mean(0)
     return View(middle, distance, azimuth, elevation)
