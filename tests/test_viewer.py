@@ -285,6 +285,7 @@ def test_without_viser_a_sentence_says_what_to_install(
 
 
 VIEW = ["view", "reach", "--scene", "psm"]
+PLAY = ["play", "reach", "--scene", "psm", "--out", "f.gif"]
 
 
 @pytest.mark.parametrize(
@@ -304,13 +305,15 @@ VIEW = ["view", "reach", "--scene", "psm"]
         (["replay", "pyproject.toml"], ["pyproject.toml", "not a take"]),
         (["play", "reach", "--scene", "psm"], ["--out"]),
         (["play", "reach", "--scene", "psm", "--out", "film.avi"], [".mp4, .gif or .webp"]),
-        (["play", "reach", "--scene", "psm", "--out", "f.gif", "--size", "9"], ["640x480", "'9'"]),
-        (["play", "reach", "--scene", "psm", "--out", "f.gif", "--size", "9x99"], ["16 to 4096", "9x99"]),
-        (["play", "reach", "--scene", "psm", "--out", "f.gif", "--grid", "4"], ["4x4", "'4'"]),
-        (["play", "reach", "--scene", "psm", "--out", "f.gif", "--grid", "9x1"], ["1 to 8", "9x1"]),
-        (["play", "reach", "--scene", "psm", "--out", "f.gif", "--slow", "0"], ["0.1 to 100", "not 0"]),
-        (["play", "reach", "--scene", "psm", "--out", "f.gif", "--slow", "much"], ["'much'"]),
-        (["play", "reach", "--scene", "psm", "--out", "f.gif", "--camera", "side"], ["'side'", "overview"]),
+        ([*PLAY, "--size", "9"], ["640x480", "'9'"]),
+        ([*PLAY, "--size", "9x99"], ["16 to 4096", "9x99"]),
+        ([*PLAY, "--grid", "4"], ["4x4", "'4'"]),
+        ([*PLAY, "--grid", "9x1"], ["1 to 8", "9x1"]),
+        ([*PLAY, "--grid", "4x8", "--size", "4096x4096"], ["32768x16384", "8192 pixels"]),
+        ([*PLAY, "--camera", "0,0,-1"], ["distance", "'0,0,-1'"]),
+        ([*PLAY, "--slow", "0"], ["0.1 to 100", "not 0"]),
+        ([*PLAY, "--slow", "much"], ["'much'"]),
+        ([*PLAY, "--camera", "side"], ["'side'", "overview"]),
     ],
 )
 def test_bad_input(argv: list[str], words: list[str], capsys: pytest.CaptureFixture[str]) -> None:

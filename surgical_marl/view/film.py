@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 WALL = 1280
 """Pixels along the width of a film of several environments, about."""
 SMALLEST, LARGEST = 16, 4096
-"""Pixels of a side of a picture."""
+"""Pixels of a side of a picture. A grid is at most twice as wide and high: a frame of 64 of the largest has 3 GB."""
 TURNS = 3600.0
 """Angles of a camera at most, degrees."""
 CLOSEST, FARTHEST = 0.001, 100.0
@@ -77,6 +77,13 @@ class Look:
         if self.size is not None and not all(SMALLEST <= side <= LARGEST for side in self.size):
             width, height = self.size
             raise ValueError(f"a film is {SMALLEST} to {LARGEST} pixels wide and high, not {width}x{height}")
+        rows, columns = self.grid
+        width, height = self.tile[0] * columns, self.tile[1] * rows
+        if max(width, height) > 2 * LARGEST:
+            raise ValueError(
+                f"a grid of {rows}x{columns} makes a film of {width}x{height} pixels: ask for a smaller size, so that "
+                f"it is at most {2 * LARGEST} pixels wide and high"
+            )
 
     @property
     def tile(self) -> tuple[int, int]:
