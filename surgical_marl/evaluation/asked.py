@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from surgical_marl.content import BASELINES, find
+from surgical_marl.policies.oracle import check_control
 from surgical_marl.runs.folder import check_trained, read_settings
 from surgical_marl.runs.settings import Settings
 
@@ -33,6 +34,8 @@ def common_settings(policies: Sequence[str], asked: Mapping[str, str | None]) ->
                 raise ValueError(f"{policy} has {key} {theirs!r} and {name} has {ours!r}: they can't be compared")
     for policy in trained:
         check_trained(find("policies", policy))
+    if "oracle" in policies:
+        check_control(first.control)
     return first
 
 
