@@ -14,11 +14,12 @@ from tensordict import TensorDict
 
 from surgical_marl import BatchedEnv
 from surgical_marl.learning import train
+from surgical_marl.policies.actor import load_actor
 from surgical_marl.policies.attention import AttentionModel, find_entities
 from surgical_marl.policies.layout import Layout
 from surgical_marl.policies.networks import make_model
 from surgical_marl.policies.onnx_file import write_onnx
-from surgical_marl.policies.policy import load_actor, load_policy
+from surgical_marl.policies.policy import load_policy
 from surgical_marl.runs.folder import read_settings
 from surgical_marl.runs.settings import NetworkSettings, PPOSettings, Settings
 

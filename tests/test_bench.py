@@ -360,6 +360,8 @@ def test_what_the_face_adds_as_json_and_as_a_sentence(
         (["render", "--of", "room"], ["'room'", "endoscope", "scene"]),
         (["render", "--of", "scene", "--device", "cpu"], ["--device"]),
         (["render", "--scene", "ecm", "--sweep"], ["'--sweep'", "bench render"]),
+        (["view", "--task", "reech"], ["'reech'", "did you mean 'reach'"]),
+        (["view", "--num-envs", "4"], ["'--num-envs'", "bench view"]),
     ],
 )
 def test_bad_input(argv: list[str], words: list[str], capsys: pytest.CaptureFixture[str]) -> None:

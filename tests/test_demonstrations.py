@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import time
@@ -21,8 +22,9 @@ from surgical_marl.learning.imitation import RATE, Imitation, ImitationLoss
 from surgical_marl.learning.trainer import Trainer
 from surgical_marl.policies.networks import MultiAgentActor, actor_config
 from surgical_marl.policies.scripted import Scripted
+from surgical_marl.runs.checkpoint import read_checkpoint
 from surgical_marl.runs.environment import make_env
-from surgical_marl.runs.folder import read_checkpoint, read_metrics
+from surgical_marl.runs.folder import read_metrics
 from surgical_marl.runs.settings import ImitationSettings, NetworkSettings, OracleStatesSettings, Settings
 from surgical_marl.tasks.base.script import Step, Wish
 
@@ -189,8 +191,13 @@ def test_imitation_of_another_actor_is_refused(trainer: Trainer) -> None:
     found = Demonstrations(SETTINGS, trainer.env.layout, "cpu")
     imitation = Imitation(trainer.algorithm.actor, found, steps=5, batch_size=8)
     good = imitation.state()
-    with pytest.raises(ValueError, match="6 of 5 steps"):
-        imitation.load({**good, "done": 6})
+    for done in (6, -1, 2.5, True, "2"):
+        with pytest.raises(ValueError, match="of 5 steps can't be done"):
+            imitation.load({**good, "done": done})
+    for seconds in ("1", None, -1.0, math.nan, math.inf, 10**400, [1.0], torch.zeros(2)):
+        with pytest.raises(ValueError, match="can't have taken"):
+            imitation.load({**good, "seconds": seconds})
+    assert (imitation.done, imitation.seconds) == (0, 0.0)
     with pytest.raises(ValueError):
         imitation.load({**good, "moments": good["moments"][:-1]})
     wrong = [{name: torch.zeros(3, 3, 3) for name in moment} for moment in good["moments"]]

@@ -21,7 +21,8 @@ from surgical_marl.learning.algorithm import Algorithm
 from surgical_marl.learning.configuration import rsl_rl_config
 from surgical_marl.learning.trainer import Trainer
 from surgical_marl.plugins.algorithms import ALGORITHMS
-from surgical_marl.runs.folder import read_checkpoint, read_metrics
+from surgical_marl.runs.checkpoint import read_checkpoint
+from surgical_marl.runs.folder import read_metrics
 from surgical_marl.runs.settings import ConstraintSettings, PPOSettings, Settings
 from tests.helpers.fake_env import FakeEnv
 from tests.helpers.processes import end, start_together

@@ -18,6 +18,7 @@ from surgical_marl.cli.main import main
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.envs.env import Env
 from surgical_marl.evaluation import command
+from surgical_marl.evaluation.asked import common_settings
 from surgical_marl.evaluation.goal_set import (
     describe_goals,
     episode_seed,
@@ -180,7 +181,7 @@ def test_runs_that_do_not_go_together(runs: list[str], capsys: pytest.CaptureFix
     Path("torque").mkdir()
     write_config(Path("torque"), replace(SMALL, control="torque"))
     for argv, sentence in (
-        ((runs[0], "torque"), "torque has control 'torque' and seed0 has 'position': evaluate them one at a time"),
+        ((runs[0], "torque"), "torque has control 'torque' and seed0 has 'position': they can't be compared"),
         ((runs[0], runs[0]), "'seed0' is named twice"),
         ((runs[0], "--scene", "psm"), "seed0 is of scene 'bimanual_psm', not 'psm': leave --scene out"),
         ((runs[0], "--control", "torque"), "seed0 is of control 'position', not 'torque': leave --control out"),
@@ -190,7 +191,7 @@ def test_runs_that_do_not_go_together(runs: list[str], capsys: pytest.CaptureFix
         assert not out and err == f"surgical-marl: {sentence}\n"
     assert main(run(runs[0], "--task", "reach", "--scene", "bimanual_psm")) == 0
     asked = {"difficulty": "hard", "start": "random", "goals": "held_out"}
-    found = command._settings(runs[0], asked)
+    found = common_settings([runs[0]], asked)
     assert {key: getattr(found, key) for key in asked} == asked, "other than it was trained for"
 
 

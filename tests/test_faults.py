@@ -17,7 +17,8 @@ from pathlib import Path
 
 import pytest
 
-from surgical_marl.runs.folder import has_begun, read_checkpoint, read_metrics, read_settings
+from surgical_marl.runs.checkpoint import read_checkpoint
+from surgical_marl.runs.folder import has_begun, read_metrics, read_settings
 from tests.helpers.processes import end, start
 from tests.helpers.runs import LONG, run, run_or_resume, same_state
 from tests.test_reliability import limited

@@ -17,8 +17,9 @@ from surgical_marl.learning import train, trainer
 from surgical_marl.learning.algorithm import Algorithm
 from surgical_marl.learning.faults import MOST, SHARE, too_many
 from surgical_marl.learning.reporter import Report
+from surgical_marl.runs.checkpoint import read_checkpoint, write_checkpoint
 from surgical_marl.runs.fault import read_fault
-from surgical_marl.runs.folder import read_checkpoint, read_metrics, write_checkpoint
+from surgical_marl.runs.folder import read_metrics
 from surgical_marl.runs.settings import NetworkSettings, PPOSettings, Settings
 from surgical_marl.studies.numbers import fuzz
 

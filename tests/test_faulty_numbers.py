@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from surgical_marl.engines.fused.guard import Guard
-from surgical_marl.envs.batch import BatchedEnv, BatchStep
+from surgical_marl.envs.batch import BatchedEnv
+from surgical_marl.envs.batch_step import BatchStep
 
 N = 70  # more than one sum takes together
 BAD = {3: np.nan, 41: np.inf, 69: -np.inf}

@@ -77,6 +77,9 @@ def test_cameras_have_names_or_angles() -> None:
     assert camera_of("overview", env) == "overview"
     free = camera_of("90,-20,0.4", env)
     assert isinstance(free, View) and (free.azimuth, free.elevation, free.distance) == (90, -20, 0.4)
+    for far in ("1,2,nan", "1,2,-5", "1,2,0", "1,inf,1", "1e300,2,1e300"):
+        with pytest.raises(ValueError, match=f"distance from 0.001 to 100 m, not '{far}'"):
+            camera_of(far, env)
     with pytest.raises(ValueError, match="unknown camera 'left'"):
         camera_of("left", env)
 

@@ -17,9 +17,11 @@ from torch import Tensor, nn
 from surgical_marl.learning import train
 from surgical_marl.learning.algorithm import clip_gradient
 from surgical_marl.learning.algorithms.happo import HAPPO
-from surgical_marl.policies.policy import load_actor, load_policy
+from surgical_marl.policies.actor import load_actor
+from surgical_marl.policies.policy import load_policy
 from surgical_marl.policies.weights import write_weights
-from surgical_marl.runs.folder import CONFIG, read_checkpoint
+from surgical_marl.runs.checkpoint import read_checkpoint
+from surgical_marl.runs.folder import CONFIG
 from surgical_marl.runs.settings import ConstraintSettings, Settings
 from tests.helpers.fake_env import FakeEnv
 from tests.helpers.runs import COUNTS, SIZES, SMALL, run, same_state

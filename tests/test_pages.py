@@ -27,7 +27,7 @@ from surgical_marl.envs.env import Env
 from surgical_marl.learning.trainer import OWN
 from surgical_marl.plugins.algorithms import ALGORITHMS
 from surgical_marl.plugins.tasks import TASKS, scenes_for
-from surgical_marl.runs.folder import write_checkpoint
+from surgical_marl.runs.checkpoint import write_checkpoint
 from surgical_marl.scenes.load import load_scene
 from surgical_marl.tasks.base.options import Options, make_options
 from surgical_marl.view.browser import gate
@@ -194,7 +194,7 @@ def check_command(words: list[str], is_mention: bool = False) -> None:
         CHECKS[program](rest)
 
 
-BENCHES = (f"bench.{kind}.run" for kind in ("report", "learning", "solve", "face", "render"))
+BENCHES = (f"bench.{kind}.run" for kind in ("report", "learning", "solve", "face", "render", "page"))
 WORK = ("cli.doctor.report", "evaluation.export.export_policy", "report.command.report",
         "view.take.replay", *BENCHES)  # fmt: skip
 """Where the work of commands begins."""

@@ -23,7 +23,7 @@ from surgical_marl import content
 from surgical_marl.evaluation import card, command, export
 from surgical_marl.learning import train
 from surgical_marl.plugins.algorithms import ALGORITHMS
-from surgical_marl.policies import policy
+from surgical_marl.policies import actor as networks
 from surgical_marl.policies.layout import Layout
 from surgical_marl.policies.onnx_file import write_onnx
 from surgical_marl.policies.policy import load_policy
@@ -238,7 +238,7 @@ def test_onnx_acts_as_torch_does(env: Any, algo: Any, recurrent: Any, tmp_path: 
     torch.manual_seed(0)
     network = NetworkSettings(hidden=(16,), recurrent=recurrent)
     layout = Layout(env, ALGORITHMS.load(algo).grouping)
-    actor = policy._actor(replace(SMALL, algo=algo, network=network), env, layout)
+    actor = networks._actor(replace(SMALL, algo=algo, network=network), env, layout)
     with torch.no_grad():
         for model in actor.models.values():  # fresh networks hardly act: so that some actions are beyond 1
             model.mlp[-1].weight.mul_(300)
@@ -280,7 +280,7 @@ def test_the_example_acts_without_torch(tmp_path: Path) -> None:
     from surgical_marl.envs.batch import BatchedEnv
 
     env = BatchedEnv("reach", "bimanual_psm", num_envs=1)
-    actor = policy._actor(replace(SMALL, scene="bimanual_psm"), env, Layout(env))
+    actor = networks._actor(replace(SMALL, scene="bimanual_psm"), env, Layout(env))
     folder = tmp_path / "policies" / "reach-bimanual_psm"
     folder.mkdir(parents=True)
     write_onnx(folder / "psm.onnx", actor.models["psm"], {})

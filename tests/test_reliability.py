@@ -20,8 +20,9 @@ from filelock import FileLock
 from surgical_marl.cli.main import main
 from surgical_marl.files import remove_temporaries
 from surgical_marl.learning import train
-from surgical_marl.runs import folder
-from surgical_marl.runs.folder import read_checkpoint, read_metrics
+from surgical_marl.runs import checkpoint
+from surgical_marl.runs.checkpoint import read_checkpoint
+from surgical_marl.runs.folder import read_metrics
 from surgical_marl.runs.lock import LOCK, owned
 from tests.helpers.processes import end, start, start_together
 from tests.helpers.runs import LONG, SMALL, run, run_or_resume, same_state
@@ -98,7 +99,7 @@ def test_torch_says_that_a_disk_is_full(room: int, monkeypatch: pytest.MonkeyPat
     with monkeypatch.context() as patch:
         patch.setattr(Path, "open", opened)
         with pytest.raises(OSError, match="No space left"):
-            folder._save({"weights": torch.zeros(1000)}, tmp_path / "file")
+            checkpoint._save({"weights": torch.zeros(1000)}, tmp_path / "file")
 
 
 def test_a_second_process_is_refused_while_one_trains(tmp_path: Path) -> None:

@@ -18,7 +18,8 @@ import torch
 
 from surgical_marl.cli.main import main
 from surgical_marl.files import write_atomic
-from surgical_marl.runs.folder import read_checkpoint, read_metrics
+from surgical_marl.runs.checkpoint import read_checkpoint
+from surgical_marl.runs.folder import read_metrics
 from tests.helpers.processes import end, start
 from tests.helpers.runs import LONG, MOMENTS, SMALL, run, run_or_resume, run_until, same_state
 

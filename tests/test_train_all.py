@@ -15,7 +15,8 @@ from typing import Any
 import pytest
 
 from surgical_marl.plugins.tasks import list_tasks, scenes_for
-from surgical_marl.runs.folder import CHECKPOINT, CONFIG, read_checkpoint, read_metrics
+from surgical_marl.runs.checkpoint import read_checkpoint
+from surgical_marl.runs.folder import CHECKPOINT, CONFIG, read_metrics
 
 ROOT = Path(__file__).parents[1]
 

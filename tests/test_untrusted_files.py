@@ -22,11 +22,12 @@ import torch
 from surgical_marl.content import find
 from surgical_marl.evaluation.command import read_result
 from surgical_marl.evaluation.episodes import read_played
-from surgical_marl.policies.policy import _read
+from surgical_marl.policies.actor import _read
 from surgical_marl.policies.weights import read_weights
 from surgical_marl.report.run import read_run
 from surgical_marl.robots.mesh import read_mesh
-from surgical_marl.runs.folder import read_checkpoint, read_environments, read_metrics, write_environments
+from surgical_marl.runs.checkpoint import read_checkpoint, read_environments, write_environments
+from surgical_marl.runs.folder import read_metrics
 from surgical_marl.untrusted.arrays import read_npz
 from surgical_marl.view.take import read_take
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shutil
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,7 +14,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from surgical_marl.cli.main import main
+from surgical_marl.cli import viewing
+from surgical_marl.cli.main import _parser, main
+from surgical_marl.content import find
 from surgical_marl.robots.rotation import turned
 from surgical_marl.runs.settings import Settings
 from surgical_marl.view.browser.gate import open_server
@@ -282,6 +285,7 @@ def test_without_viser_a_sentence_says_what_to_install(
 
 
 VIEW = ["view", "reach", "--scene", "psm"]
+PLAY = ["play", "reach", "--scene", "psm", "--out", "f.gif"]
 
 
 @pytest.mark.parametrize(
@@ -293,26 +297,47 @@ VIEW = ["view", "reach", "--scene", "psm"]
         (["view", "reach", "--scene", "psmm"], ["'psmm'", "did you mean 'psm'"]),
         ([*VIEW, "--policy", "nobody"], ["'nobody'", "oracle"]),
         ([*VIEW, "--policy", "."], ["config.yaml"]),
-        ([*VIEW, "--policy", "reach-star"], ["reach-star", "'star'", "not 'psm'"]),
+        ([*VIEW, "--policy", "reach-star"], ["'star'", "`surgical-marl view reach --scene star --policy reach-star`"]),
+        ([*VIEW, "--policy", "track-psm"], ["'track'", "`surgical-marl view track --scene psm --policy track-psm`"]),
         ([*VIEW, "--num-envs", "5"], ["--num-envs", "from 1 to 4"]),
         ([*VIEW, "--port", "70000"], ["--port", "'70000'"]),
         (["replay", "none.npz"], ["none.npz"]),
         (["replay", "pyproject.toml"], ["pyproject.toml", "not a take"]),
         (["play", "reach", "--scene", "psm"], ["--out"]),
         (["play", "reach", "--scene", "psm", "--out", "film.avi"], [".mp4, .gif or .webp"]),
-        (["play", "reach", "--scene", "psm", "--out", "f.gif", "--size", "9"], ["640x480", "'9'"]),
-        (["play", "reach", "--scene", "psm", "--out", "f.gif", "--size", "9x99"], ["16 to 4096", "9x99"]),
-        (["play", "reach", "--scene", "psm", "--out", "f.gif", "--grid", "4"], ["4x4", "'4'"]),
-        (["play", "reach", "--scene", "psm", "--out", "f.gif", "--grid", "9x1"], ["1 to 8", "9x1"]),
-        (["play", "reach", "--scene", "psm", "--out", "f.gif", "--slow", "0"], ["0.1 to 100", "not 0"]),
-        (["play", "reach", "--scene", "psm", "--out", "f.gif", "--slow", "much"], ["'much'"]),
-        (["play", "reach", "--scene", "psm", "--out", "f.gif", "--camera", "side"], ["'side'", "overview"]),
+        ([*PLAY, "--size", "9"], ["640x480", "'9'"]),
+        ([*PLAY, "--size", "9x99"], ["16 to 4096", "9x99"]),
+        ([*PLAY, "--grid", "4"], ["4x4", "'4'"]),
+        ([*PLAY, "--grid", "9x1"], ["1 to 8", "9x1"]),
+        ([*PLAY, "--grid", "4x8", "--size", "4096x4096"], ["32768x16384", "8192 pixels"]),
+        ([*PLAY, "--policy", "oracle", "--control", "torque"], ["oracle", "'position', not 'torque'"]),
+        ([*PLAY, "--camera", "0,0,-1"], ["distance", "'0,0,-1'"]),
+        ([*PLAY, "--slow", "0"], ["0.1 to 100", "not 0"]),
+        ([*PLAY, "--slow", "much"], ["'much'"]),
+        ([*PLAY, "--camera", "side"], ["'side'", "overview"]),
     ],
 )
 def test_bad_input(argv: list[str], words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(argv) == 2
     out, err = capsys.readouterr()
-    said = [line for line in err.splitlines() if not line.startswith("surgical-marl: compiling")]
+    progress = "surgical-marl: compil", "surgical-marl: preparing"  # said where that takes a while
+    said = [line for line in err.splitlines() if not line.startswith(progress)]
     assert not out and len(said) == 1
     for word in words:
         assert word in said[0]
+
+
+@pytest.mark.parametrize("command", ["view", "play"])
+def test_a_run_before_its_first_checkpoint_is_bad_input(
+    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copy(find("policies", "reach-psm") / "config.yaml", tmp_path)
+    out = ["--out", str(tmp_path / "film.gif")] if command == "play" else []
+    assert main([command, "reach", "--policy", str(tmp_path), *out]) == 2
+    assert f"{tmp_path} has no checkpoint.pt yet" in capsys.readouterr().err
+
+
+def test_a_policy_brings_its_scene() -> None:
+    arguments = _parser().parse_args(["play", "reach", "--policy", "reach-star", "--out", "film.gif"])
+    settings, who = viewing._settings(arguments)
+    assert (settings.task, settings.scene, who) == ("reach", "star", "reach-star")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import http.client
 import io
+import json
 import shutil
 import time
 from collections.abc import Iterator
@@ -25,6 +26,7 @@ import websockets.asyncio.server
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
+from surgical_marl.bench.page import measure_page
 from surgical_marl.cli.main import main
 from surgical_marl.content import find
 from surgical_marl.engines.stages import compiling
@@ -364,5 +366,17 @@ def test_a_run_is_named_in_the_menu(viewer: Viewer, tmp_path: Path) -> None:
 
 def test_a_run_without_a_checkpoint_can_not_move_an_arm(viewer: Viewer, tmp_path: Path) -> None:
     (tmp_path / "config.yaml").write_text((find("policies", "reach-bimanual_psm") / "config.yaml").read_text())
-    with pytest.raises(ValueError, match=r"it has no checkpoint\.pt"):
+    with pytest.raises(ValueError, match=r"has no checkpoint\.pt yet"):
         viewer.session.set_mover(viewer.session.env.agents[0], str(tmp_path))
+
+
+def test_what_a_drawing_costs_as_json_and_as_a_sentence(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(measure_page, "__defaults__", (0.5, 0.1))
+    assert main(["bench", "view", "--scene", "psm", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert list(found) == ["ms_per_drawing", "drawings_per_s", "kilobytes_per_drawing", "mover"]
+    assert found.pop("mover") == "reach-psm" and all(value > 0 for value in found.values())
+    assert main(["bench", "view", "--task", "reach", "--scene", "psm"]) == 0
+    assert "reach on psm, moved by reach-psm: " in capsys.readouterr().out

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 # Only light imports up here: caches are looked up when what uses them is imported.
 import contextlib
+import importlib.util
 import math
 import os
 import tempfile
@@ -39,7 +40,7 @@ def run(arguments: Namespace) -> int:
     with _no_caches() if arguments.cold else contextlib.nullcontext():
         if arguments.scene is None:
             arguments.scene = scene_of(arguments.task)
-        return {"sim": _sim, "train": _train, "solve": _solve, "face": _face}[arguments.kind](arguments)
+        return {"sim": _sim, "train": _train, "solve": _solve, "face": _face, "view": _view}[arguments.kind](arguments)
 
 
 def _sim(arguments: Namespace) -> int:
@@ -90,6 +91,17 @@ def _face(arguments: Namespace) -> int:
     from surgical_marl.bench.face import run
 
     print(run(arguments.task, arguments.scene, arguments.num_envs, arguments.json))
+    return 0
+
+
+def _view(arguments: Namespace) -> int:
+    if importlib.util.find_spec("viser") is None:
+        from surgical_marl.view.browser.gate import NEEDED
+
+        raise ValueError(NEEDED)
+    from surgical_marl.bench.page import run
+
+    print(run(arguments.task, arguments.scene, arguments.json))
     return 0
 
 

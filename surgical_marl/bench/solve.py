@@ -25,7 +25,7 @@ from surgical_marl.evaluation.metrics import SUCCESS_MM, metrics
 from surgical_marl.learning.room import in_memory
 from surgical_marl.learning.train import make_training
 from surgical_marl.learning.trainer import Trainer
-from surgical_marl.policies.policy import acting_policy
+from surgical_marl.policies.actor import acting_policy
 from surgical_marl.runs.environment import make_env
 from surgical_marl.runs.settings import Settings
 

@@ -74,7 +74,8 @@ def _eval(arguments: argparse.Namespace) -> None:
     _check_files(("--csv", arguments.csv, ".csv"), ("--figure", arguments.figure, ".png"))
 
     with preparing(f"the episodes of {', '.join(policies)}"):
-        from surgical_marl.evaluation.command import CHOSEN, OWN, play_all, read_result, report
+        from surgical_marl.evaluation.asked import CHOSEN, OWN
+        from surgical_marl.evaluation.command import play_all, read_result, report
 
         older = None if arguments.against is None else (str(arguments.against), read_result(arguments.against))
         asked = {key: getattr(arguments, key) for key in (*OWN, *CHOSEN)}
@@ -87,7 +88,7 @@ def _crossplay(arguments: argparse.Namespace) -> None:
     _check_files(("--figure", arguments.figure, ".png"))
 
     with preparing(f"the episodes of {', '.join(arguments.teams)}"):
-        from surgical_marl.evaluation.command import CHOSEN, OWN
+        from surgical_marl.evaluation.asked import CHOSEN, OWN
         from surgical_marl.evaluation.crossplay import crossplay, report
 
         asked = {key: getattr(arguments, key) for key in (*OWN, *CHOSEN)}

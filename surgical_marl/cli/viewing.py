@@ -5,6 +5,7 @@ from __future__ import annotations
 # Only light imports here, as in main.py.
 import argparse
 import importlib.util
+import os
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -58,7 +59,7 @@ def _add_what(parser: argparse.ArgumentParser) -> None:
     """Add the flags that say what is shown."""
     parser.add_argument("task", metavar="TASK", help=f"one of: {', '.join(list_tasks())}")
     parser.add_argument(
-        "--scene", help="a name (see `list scenes`) or a .yaml file (default: the task's own, if it has one)"
+        "--scene", help="a name (see `list scenes`) or a .yaml file (default: the policy's, or else the task's own)"
     )
     what = f"a run folder, a policy's name, {', '.join(BASELINES)} (default: the policy that ships, or oracle)"
     parser.add_argument("--policy", metavar="RUN_OR_POLICY", help=what)
@@ -91,14 +92,11 @@ def _open(arguments: argparse.Namespace) -> Any:
         raise ValueError(NEEDED)
     check_port(arguments.port)
 
-    import torch
-
     from surgical_marl.runs.folder import check_writable
     from surgical_marl.view.browser.viewer import Viewer
 
     if arguments.record is not None:
         check_writable(arguments.record)
-    torch.set_num_threads(1)  # for a few environments, threads of torch wait for each other longer than they compute
     return Viewer(settings, who, arguments.num_envs, arguments.port, arguments.record)
 
 
@@ -115,13 +113,10 @@ def _film(arguments: argparse.Namespace) -> Path:
             f"cannot write --out {arguments.out}: name an .mp4, .gif or .webp file in a folder that exists"
         )
 
-    import torch
-
     from surgical_marl.runs.environment import make_env
     from surgical_marl.view.film import Look, camera_of, film
     from surgical_marl.view.movers import Movers, first
 
-    torch.set_num_threads(1)  # the cores draw meanwhile
     look = Look(arguments.grid, arguments.slow, words=not arguments.plain, size=arguments.size)
     env = make_env(settings, look.grid[0] * look.grid[1], "numpy")
     look = replace(look, camera=camera_of(arguments.camera, env))
@@ -189,22 +184,41 @@ def _reproduce(file: Path, about: Any, arrays: Any) -> int:
 
 def _settings(arguments: argparse.Namespace) -> tuple[Any, str | None]:
     """Return the settings of what is shown, and who moves the arms; ValueError if it does not exist or fit together."""
+    # for policies that need torch: with few environments its threads wait for each other longer than they compute
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
     if arguments.task not in list_tasks():
         raise unknown("task", arguments.task, list_tasks())
+    if arguments.scene is not None:
+        find("scenes", arguments.scene)
+    who = arguments.policy
+    if who is not None and who not in BASELINES:
+        arguments.scene = _scene_of(arguments, who)
     if arguments.scene is None:
         from surgical_marl.plugins.tasks import TASKS
 
         arguments.scene = TASKS.load(arguments.task).default_scene
     if arguments.scene is None:
         raise ValueError(f"{arguments.name} {arguments.task} needs --scene ({', '.join(list_scenes())})")
-    find("scenes", arguments.scene)
-    who = arguments.policy
-    if who is not None and who not in (*BASELINES, *list_policies()) and not is_folder(who):
-        raise unknown("run or policy", who, [*list_policies(), *BASELINES])
 
-    from surgical_marl.evaluation.command import common_settings
+    from surgical_marl.evaluation.asked import common_settings
 
     asked = {key: getattr(arguments, key) for key in ("task", "scene", *_OWN)}
     settings = common_settings([who or "zero"], {**asked, "goals": asked["goals"] or "training"})
 
     return replace(settings, seed=arguments.seed), who
+
+
+def _scene_of(arguments: argparse.Namespace, who: str) -> str:
+    """Return the scene of a run or policy; ValueError if it is of another task or scene than the arguments say."""
+    if who not in list_policies() and not is_folder(who):
+        raise unknown("run or policy", who, [*list_policies(), *BASELINES])
+
+    from surgical_marl.runs.folder import read_settings
+
+    own = read_settings(find("policies", who))
+    if own.task != arguments.task or arguments.scene not in (None, own.scene):
+        raise ValueError(
+            f"{who} is of task {own.task!r} and scene {own.scene!r}: look at it with `surgical-marl {arguments.name} "
+            f"{own.task} --scene {own.scene} --policy {who}`"
+        )
+    return own.scene

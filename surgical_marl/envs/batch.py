@@ -12,21 +12,22 @@ from __future__ import annotations
 import secrets
 from collections.abc import Mapping, Sequence
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from gymnasium import spaces
 
 from surgical_marl.content import unknown
 from surgical_marl.engines.choose import ENGINES, make_engine
-from surgical_marl.engines.fused.threefry import episode_keys
 from surgical_marl.envs.actions import check_actions
+from surgical_marl.envs.agent_types import alike
+from surgical_marl.envs.batch_step import BatchStep
 from surgical_marl.envs.env import Env
 from surgical_marl.envs.fault_place import FaultPlace, fault_place
 from surgical_marl.envs.free_objects import FreeObjects
 from surgical_marl.envs.meant_for import meant_for
 from surgical_marl.envs.observations import each, with_vector
-from surgical_marl.envs.seeds import check_seed, is_whole
+from surgical_marl.envs.seeds import check_seed, is_whole, keys_of
 from surgical_marl.physics.views import Contacts
 from surgical_marl.scenes.poses import Poses
 
@@ -35,36 +36,6 @@ if TYPE_CHECKING:
     from surgical_marl.envs.sight import Sight
 
 ARRAYS = ("numpy", "torch", "jax")
-
-
-class BatchStep(NamedTuple):
-    """What a step returns. Shapes start with N, the number of environments; dicts are keyed by agent."""
-
-    observations: dict[str, Any]
-    """[N, d]; of the next episode where one ended. For an agent that sees pictures a dict of it, as "proprioception",
-    and of the pictures, [N, H, W, C] each."""
-    state: Any
-    """[N, S], for a centralised critic, likewise of the next episode, the same whoever knows what: all observations
-    but pictures, what agents were not shown of them, `Task.privileged` and messages."""
-    rewards: dict[str, Any]
-    terminated: Any
-    """[N] bool"""
-    truncated: Any
-    """[N] bool: the time limit."""
-    final_observations: dict[str, Any]
-    """[N, d], of this step's episode even where it ended."""
-    final_state: Any
-    infos: dict[str, dict[str, Any]]
-    """agent -> success, collision (bool), min_distance (m), contact_force (N), contact_overflow (a count), stage_<name>
-    (bool), reward_<term> (weighted), cost, cost_<name> (bool), [N] each, and a task's own metrics such as tip_error
-    (m); of this step's episode."""
-    contacts: Contacts
-    """Distance and penetration (m) and force (N) of every pair in `scene.pairs`, [N, P] each; likewise."""
-    faults: Any
-    """[N] int32: where a number was NaN or infinite, the code of the first one, which `fault_place` names; else -1.
-
-    Such an episode is terminated, its reward is 0, and observations that were not finite are 0 too. If its state was at
-    fault, the next step begins a new episode, whatever the action."""
 
 
 class BatchedEnv:
@@ -115,7 +86,7 @@ class BatchedEnv:
         self.num_envs, self.arrays = num_envs, arrays
         self.agents = list(self.env.agents)
         self.scene = self.env.scene
-        self.types = self._types()
+        self.types = alike(self.env)
         self.task, self.task_name = self.env.task, task
         self.control = self.scene.control
         self.max_steps, self.control_dt = self.env.max_steps, self.env.control_dt
@@ -163,23 +134,6 @@ class BatchedEnv:
             self.set_carry(state["carry"])
         if state["closed"]:
             self.close()
-
-    def _types(self) -> dict[str, list[str]]:
-        """Agents whose arms are alike and that observe alike, by the name of their arms' type."""
-        found: dict[str, list[str]] = {}
-        for name, agents in self.env.scene.types.items():
-            kinds: dict[Any, list[str]] = {}
-            for agent in agents:
-                seen = self.env.observed[agent]
-                names = tuple(self._of_type(name) for name in seen.names)
-                kinds.setdefault((names, tuple(seen.pictures)), []).append(agent)
-            found |= {name if k == 0 else f"{name}-seeing-{k + 1}": list(own) for k, own in enumerate(kinds.values())}
-        return found
-
-    def _of_type(self, term: str) -> str:
-        """Return the name of a term; if it is a teammate's, with the type of its arm for the teammate's name."""
-        mate, stroke, name = term.partition("/")
-        return f"{self.scene.mounts[mate].arm.name}/{name}" if stroke else term
 
     def observation_terms(self, agent: str) -> dict[str, slice]:
         """Return the names of what an agent observes, and where each stands in its vector.
@@ -255,7 +209,7 @@ class BatchedEnv:
         """Begin the first episode of the environments of a mask that have a seed, and the next one of the others."""
         if mask.shape != (self.num_envs,) or mask.dtype != bool:
             raise ValueError(f"mask of shape {mask.shape} and type {mask.dtype} must be [{self.num_envs}] bool")
-        seeded, keys = self._keys(seed, first)
+        seeded, keys = keys_of(seed, self.num_envs, first)
         if not self._started:
             if not mask.all():
                 raise ValueError("mask before the first reset: call reset() for all environments first")
@@ -270,19 +224,6 @@ class BatchedEnv:
         self.engine.expect_end(np.zeros(self.num_envs, bool))
         if before is not None:
             self.set_carry(before, ~mask)
-
-    def _keys(self, seed: Any, first: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return which environments get a seed, [N] bool, and the keys that the seeds lead to, [N, 2]."""
-        if not isinstance(seed, Sequence | np.ndarray):
-            one = check_seed(seed)
-            return np.full(self.num_envs, one is not None), episode_keys(one or 0, self.num_envs, first)
-        if len(seed) != self.num_envs:
-            raise ValueError(
-                f"a list of {len(seed)} seeds does not fit {self.num_envs} environments: give one for each"
-            )
-        seeds = [check_seed(own) for own in seed]
-        keys = np.concatenate([episode_keys(own or 0, 1) for own in seeds])
-        return np.array([own is not None for own in seeds]), keys
 
     def step(self, actions: dict[str, Any]) -> BatchStep:
         """One control step of all environments.

@@ -5,11 +5,10 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from surgical_marl.content import BASELINES, find
+from surgical_marl.evaluation.asked import common_settings, find_policy
 from surgical_marl.evaluation.episodes import EPISODES, write_played
 from surgical_marl.evaluation.evaluate import MAX_BATCH, Played, difference, play, summarise
 from surgical_marl.evaluation.report import ABOUT, format_table, write_csv
@@ -18,7 +17,6 @@ from surgical_marl.policies.policy import load_policy
 from surgical_marl.policies.team import Team
 from surgical_marl.runs.environment import make_env
 from surgical_marl.runs.folder import read_metrics, read_settings
-from surgical_marl.runs.settings import Settings
 from surgical_marl.untrusted.files import MAX_JSON, check_file, read_json
 from surgical_marl.untrusted.values import as_number
 
@@ -28,9 +26,6 @@ if TYPE_CHECKING:
 
 RESULT, FILM = "eval.json", "video.mp4"
 """Files that `judge` adds to a run."""
-OWN = ("task", "scene", "control", "knowledge", "messages")
-CHOSEN = ("difficulty", "start", "goals")
-"""Options that a trained policy determines, and options that can be chosen for any policy."""
 
 
 def play_all(
@@ -44,8 +39,9 @@ def play_all(
 
     Args:
         policies: runs or shipped policies of one task and scene, or one of `BASELINES` alone.
-        asked: options of `OWN` and `CHOSEN`; None leaves an option out. Goals are held-out ones by default; all other
-            defaults are those of the trained policy, which also refuses other values of `OWN`.
+        asked: options of `OWN` and `CHOSEN` (`evaluation/asked.py`); None leaves an option out. Goals are held-out
+            ones by default; all other defaults are those of the trained policy, which also refuses other values of
+            `OWN`.
         partners: agent -> who moves it instead, see `surgical_marl.policies.team.Team`.
 
     Raises:
@@ -58,29 +54,6 @@ def play_all(
         run = play(env, acting, episodes, seed, f"evaluating {Path(policy).name}")
         played[policy] = run._replace(about={**run.about, "partners": dict(partners)}) if partners else run
     return played
-
-
-def common_settings(policies: Sequence[str], asked: Mapping[str, str | None]) -> Settings:
-    """Return the settings of the environment that policies of one task and scene are evaluated in.
-
-    Raises ValueError as `play_all` does.
-    """
-    if len(set(policies)) < len(policies):
-        raise ValueError(f"{max(policies, key=policies.count)!r} is named twice")
-    given = {"goals": "held_out", **{key: value for key, value in asked.items() if value is not None}}
-    trained = [policy for policy in policies if policy not in BASELINES]
-    settings = {policy: _settings(policy, given) for policy in trained or policies}
-    name, first = next(iter(settings.items()))
-    for policy, other in settings.items():
-        for key in (*OWN, *CHOSEN, "max_steps"):
-            if (theirs := getattr(other, key)) != (ours := getattr(first, key)):
-                raise ValueError(f"{policy} has {key} {theirs!r} and {name} has {ours!r}: evaluate them one at a time")
-    return first
-
-
-def find_policy(name: str) -> str | Path:
-    """Return the folder of a run or policy; a name of `BASELINES` stays as it is."""
-    return name if name in BASELINES else find("policies", name)
 
 
 def report(
@@ -153,10 +126,7 @@ def read_result(path: Path) -> dict[str, Any]:
 
     ValueError if the file is no such result, or a metric in it is no number.
     """
-    try:
-        check_file(path, MAX_JSON)
-    except ValueError as error:
-        raise ValueError(f"cannot read {path}: {error}") from None
+    check_file(path, MAX_JSON)
     try:
         result = read_json(path)
         result = result.get("aggregate", result)
@@ -187,14 +157,3 @@ def _has_numbers(part: Mapping[str, Any]) -> bool:
 
 def _is_number(value: Any) -> bool:
     return value is None or math.isfinite(as_number(value))
-
-
-def _settings(policy: str, asked: Mapping[str, str]) -> Settings:
-    if policy in BASELINES:
-        return Settings(**asked)  # type: ignore[arg-type]
-    settings = read_settings(find("policies", policy))
-    for key in OWN:
-        if asked.get(key, own := getattr(settings, key)) != own:
-            raise ValueError(f"{policy} is of {key} {own!r}, not {asked[key]!r}: leave --{key} out")
-    chosen: Any = {key: asked[key] for key in CHOSEN if key in asked}
-    return replace(settings, engine="auto", device="auto", **chosen)

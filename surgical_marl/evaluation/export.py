@@ -18,8 +18,9 @@ from surgical_marl.evaluation.command import play_all
 from surgical_marl.evaluation.evaluate import summarise
 from surgical_marl.files import write_atomic
 from surgical_marl.plugins.tasks import TASKS
+from surgical_marl.policies.actor import load_actor
 from surgical_marl.policies.onnx_file import SUFFIX, write_onnx
-from surgical_marl.policies.policy import load_actor, load_policy
+from surgical_marl.policies.policy import load_policy
 from surgical_marl.policies.weights import write_weights
 from surgical_marl.runs.curve import draw_curve
 from surgical_marl.runs.environment import make_env

@@ -24,7 +24,8 @@ from surgical_marl.interfaces.rendering import MODES, Rendering, check_mode, che
 from surgical_marl.plugins.tasks import module_name
 
 if TYPE_CHECKING:
-    from surgical_marl.envs.batch import BatchedEnv, BatchStep
+    from surgical_marl.envs.batch import BatchedEnv
+    from surgical_marl.envs.batch_step import BatchStep
 
 
 class _Face:

@@ -18,7 +18,8 @@ from gymnasium import spaces
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from surgical_marl.envs.batch import BatchedEnv, BatchStep
+from surgical_marl.envs.batch import BatchedEnv
+from surgical_marl.envs.batch_step import BatchStep
 
 try:
     from torchrl.data import Binary, Bounded, Composite, Unbounded

@@ -14,6 +14,7 @@ from surgical_marl.learning.demonstrations import Demonstrations
 from surgical_marl.learning.graphs import Replayed
 from surgical_marl.policies.networks import MultiAgentActor
 from surgical_marl.runs.progress import progress
+from surgical_marl.untrusted.values import LARGEST, as_number, shown
 
 RATE = 1e-3
 """Learning rate at the start; it falls to nothing in the form of a cosine."""
@@ -83,9 +84,12 @@ class Imitation:
 
     def load(self, state: Mapping[str, Any]) -> None:
         """Go on from what `state` returned. ValueError, RuntimeError or TypeError if it is of another actor."""
-        if not 0 <= state["done"] <= self.steps:
-            raise ValueError(f"{state['done']} of {self.steps} steps can't be done")
-        self.done, self.seconds = state["done"], state.get("seconds", 0.0)
+        done, seconds = state["done"], as_number(state.get("seconds", 0.0))
+        if type(done) is not int or not 0 <= done <= self.steps:
+            raise ValueError(f"{shown(done)} of {self.steps} steps can't be done")
+        if not 0 <= seconds < LARGEST:
+            raise ValueError(f"they can't have taken {shown(state['seconds'])} s")
+        self.done, self.seconds = done, seconds
         self._step.fill_(self.done)
         for own, kept in zip(self._moments, state["moments"], strict=True):
             for name, moment in own.items():

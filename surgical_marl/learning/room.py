@@ -6,10 +6,12 @@ import contextlib
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
+import torch
+
+from surgical_marl.envs.observations import each
 from surgical_marl.machine import free_memory, lacks_memory
 from surgical_marl.plugins.algorithms import ALGORITHMS
-from surgical_marl.policies.layout import Layout
-from surgical_marl.policies.policy import zeros
+from surgical_marl.policies.layout import Layout, zeros
 from surgical_marl.runs.settings import Settings
 
 if TYPE_CHECKING:
@@ -24,11 +26,10 @@ def rollout_bytes(settings: Settings, env: BatchedEnv) -> int:
     also stores the cost of each agent with its value and return.
     """
     layout = Layout(env, ALGORITHMS.load(settings.algo).grouping)
-    seen = layout.stack({agent: zeros(env.observation_space(agent)) for agent in layout.agents})
-    parts = [*seen.values(), zeros(env.state_space)]
-    observed = sum(part.numel() * part.element_size() for part in parts)
-    each = 5 if settings.constraint.cost == "none" else 8
-    return settings.steps_per_iteration * (observed + 4 * (3 * layout.num_actions + each * layout.num_agents) + 1)
+    seen = layout.stack({a: each(zeros(env.observation_space(a)), torch.from_numpy) for a in layout.agents})
+    observed = sum(part.nbytes for part in (*seen.values(), zeros(env.state_space)))
+    kept = 5 if settings.constraint.cost == "none" else 8
+    return settings.steps_per_iteration * (observed + 4 * (3 * layout.num_actions + kept * layout.num_agents) + 1)
 
 
 def check_room(settings: Settings, env: BatchedEnv) -> None:

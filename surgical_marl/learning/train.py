@@ -23,6 +23,14 @@ from surgical_marl.learning.faults import Diverged, Fault
 from surgical_marl.learning.log import Log, Reports
 from surgical_marl.learning.room import check_room, in_memory
 from surgical_marl.learning.trainer import OWN, Trainer
+from surgical_marl.runs.checkpoint import (
+    not_finite,
+    read_checkpoint,
+    read_environments,
+    remove_environments,
+    write_checkpoint,
+    write_environments,
+)
 from surgical_marl.runs.environment import make_env
 from surgical_marl.runs.fault import write_fault
 from surgical_marl.runs.folder import (
@@ -33,16 +41,10 @@ from surgical_marl.runs.folder import (
     claim_folder,
     has_begun,
     holds_weights,
-    not_finite,
-    read_checkpoint,
-    read_environments,
     read_metrics,
     read_settings,
-    remove_environments,
-    write_checkpoint,
     write_config,
     write_divergence,
-    write_environments,
     write_metrics,
 )
 from surgical_marl.runs.lock import LOCK, owned

@@ -1,22 +1,18 @@
-"""Stacks the agents' arrays for networks that several agents share."""
+"""Stacks the agents' arrays, of numpy or torch, for networks that several agents share."""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from surgical_marl.envs.observations import proprioception
 
 if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv
 
-
-FURTHEST = 0.3
-"""Depth is clipped to this for networks, m; endoscopes are nearer to what they look at."""
 Grouping = Literal["type", "agent", "joint"]
 GROUPINGS: tuple[Grouping, ...] = ("type", "agent", "joint")
 
@@ -70,7 +66,12 @@ class Layout:
         """Width of the flat joint action."""
         return sum(self._widths)
 
-    def stack(self, observations: Mapping[str, Any]) -> dict[str, Tensor]:
+    def widths(self, env: BatchedEnv) -> dict[str, list[int]]:
+        """Return of each group how many agents act, and the widths of an agent's observation and of its action."""
+        seen = self.stack({agent: proprioception(zeros(env.observation_space(agent))) for agent in self.agents})
+        return {name: [count, seen[name].shape[-1], self.action_sizes[name]] for name, count in self.counts.items()}
+
+    def stack(self, observations: Mapping[str, Any]) -> dict[str, Any]:
         """Stack the observations of agents `[..., d]` into groups `[..., n, d]`.
 
         If agents of a group see pictures, there is also a group "<name>_pictures" `[..., n, C, H, W]`. It holds all
@@ -78,37 +79,77 @@ class Layout:
 
         The result is always a copy, because an engine may reuse its buffers.
         """
-        groups = {}
+        groups, joint = {}, self.grouping == "joint"
         for name, members in self.groups.items():
             felt = [proprioception(observations[agent]) for agent in members]
-            groups[name] = torch.cat(felt, -1).unsqueeze(-2) if self.grouping == "joint" else self._stack_group(felt)
+            groups[name] = _library(felt[0]).concatenate(felt, -1)[..., None, :] if joint else self._stack_group(felt)
             seen = [
-                stack_pictures([observations[agent][term] for term in _terms(observations[agent])])
+                [observations[agent][term] for term in _terms(observations[agent])]
                 for agent in members
                 if isinstance(observations[agent], Mapping)
             ]
             if seen:
-                pictures = torch.cat(seen, -3).unsqueeze(-4) if self.grouping == "joint" else torch.stack(seen, -4)
-                groups[f"{name}_pictures"] = pictures.contiguous()
+                from surgical_marl.policies.encoder import stack_pictures
+
+                groups[f"{name}_pictures"] = stack_pictures(seen, joint)
         return groups
 
     @staticmethod
-    def _stack_group(members: list[Tensor]) -> Tensor:
-        stacked = torch.stack(members, -2)
-        count = len(members)
+    def _stack_group(members: list[Any]) -> Any:
+        library, count = _library(members[0]), len(members)
+        stacked = library.stack(members, -2)
         if count == 1:
             return stacked
-        identity = torch.eye(count, dtype=stacked.dtype, device=stacked.device)
-        return torch.cat([stacked, identity.expand(*stacked.shape[:-1], count)], -1)
+        identity = library.eye(count, dtype=stacked.dtype, device=stacked.device)
+        return library.concatenate([stacked, library.broadcast_to(identity, (*stacked.shape[:-1], count))], -1)
 
-    def split(self, actions: Tensor) -> dict[str, Tensor]:
+    def split(self, actions: Any) -> dict[str, Any]:
         """Flat joint action `[..., sum]` -> action of each arm `[..., a]`."""
-        return dict(zip(self.agents, actions.split(self._widths, -1), strict=True))
+        spans = zip(self.agents, np.cumsum(self._widths).tolist(), self._widths, strict=True)
+        return {agent: actions[..., end - width : end] for agent, end, width in spans}
 
-    def rewards(self, rewards: Mapping[str, Tensor]) -> Tensor:
+    def rewards(self, rewards: Mapping[str, Any]) -> Any:
         """Rewards of arms `[N]` -> of acting agents `[N, A]`; a joint agent gets the sum."""
-        stacked = torch.stack([rewards[agent] for agent in self.agents], -1)
-        return stacked.sum(-1, keepdim=True) if self.grouping == "joint" else stacked
+        each = [rewards[agent] for agent in self.agents]
+        stacked = _library(each[0]).stack(each, -1)
+        return stacked.sum(-1)[..., None] if self.grouping == "joint" else stacked
+
+
+def fitting_layout(env: BatchedEnv, trained: Mapping[str, list[int]], run: object, scene: str) -> Layout:
+    """Return the layout of an environment whose groups are those that a policy was trained with.
+
+    Args:
+        env: the environment that the policy will act in.
+        trained: what `Layout.widths` said of the environment of the training.
+        run, scene: for the error: where the policy is, and where it was trained.
+
+    Raises:
+        ValueError: it was trained on other agents.
+    """
+    layouts = {layout: layout.widths(env) for layout in (Layout(env, grouping) for grouping in GROUPINGS)}
+    nearest = max(layouts, key=lambda layout: (layouts[layout] == trained, len(layout.groups.keys() & trained)))
+    if layouts[nearest] != trained:
+        raise ValueError(
+            f"the policy in {run} was trained in scene {scene!r}, whose agents ({_describe(trained)}) are not those "
+            f"of this environment ({_describe(layouts[nearest])})"
+        )
+    return nearest
+
+
+def zeros(space: Any) -> Any:
+    """Return one observation, of a Box or of a Dict with pictures."""
+    if hasattr(space, "spaces"):
+        return {name: zeros(part) for name, part in space.spaces.items()}
+    return np.zeros((1, *space.shape), space.dtype)
+
+
+def _describe(groups: Mapping[str, list[int]]) -> str:
+    return ", ".join(f"{n} {name} of {d} observations and {a} actions" for name, (n, d, a) in groups.items())
+
+
+def _library(array: Any) -> Any:
+    """Return the library of an array, numpy or torch, which whoever made the array has imported."""
+    return sys.modules[type(array).__module__.partition(".")[0]]
 
 
 def _terms(observation: Mapping[str, Any]) -> list[str]:
@@ -124,13 +165,3 @@ def _seen(env: BatchedEnv, agents: Sequence[str]) -> dict[str, Any]:
     spaces = {agent: getattr(env.observation_space(agent), "spaces", {}) for agent in agents}
     several = sum(map(bool, spaces.values())) > 1
     return {f"{agent}/{term}" if several else term: own[term] for agent, own in spaces.items() for term in _terms(own)}
-
-
-def stack_pictures(parts: Sequence[Tensor]) -> Tensor:
-    """Stack pictures [..., H, W, c] along channels, channels first: [..., C, H, W].
-
-    Colours stay uint8. If there is depth, it is scaled to 0 to 255 at `FURTHEST`, and all pictures become float32.
-    """
-    scaled = [part if part.dtype == torch.uint8 else part.clamp(max=FURTHEST) * (255 / FURTHEST) for part in parts]
-    alike = scaled if len({part.dtype for part in scaled}) == 1 else [part.float() for part in scaled]
-    return torch.cat(alike, -1).movedim(-1, -3)

@@ -5,9 +5,7 @@ from __future__ import annotations
 from rsl_rl.modules import EmpiricalNormalization
 from torch import Tensor
 
-FURTHEST = 10.0
-"""Standard deviations to which normalised observations are limited. A needle that is flung away spins at a thousand of
-them: a network's answer to that would outweigh all it should learn."""
+from surgical_marl.policies.plain import FURTHEST
 
 
 class LimitedNormaliser(EmpiricalNormalization):

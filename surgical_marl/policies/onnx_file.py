@@ -26,7 +26,7 @@ import torch
 from torch import Tensor, nn
 
 from surgical_marl.files import write_atomic
-from surgical_marl.policies.layout import stack_pictures
+from surgical_marl.policies.encoder import stack_pictures
 from surgical_marl.untrusted.arrays import MAX_WEIGHTS
 from surgical_marl.untrusted.files import read_bytes
 
@@ -54,8 +54,7 @@ class Graph(nn.Module):
         (name,) = self.model.obs_groups
         groups = {name: given["observation"]}
         if self.pictures:
-            pictures = stack_pictures([given[name] for name in self.pictures])
-            groups[self.model.obs_groups_2d[0]] = pictures.unsqueeze(1)
+            groups[self.model.obs_groups_2d[0]] = stack_pictures([[given[name] for name in self.pictures]])
         action = self.model(groups, None, given.get("memory")).clamp(-1.0, 1.0)
         return (action, self.model.get_hidden_state()) if self.model.is_recurrent else (action,)
 

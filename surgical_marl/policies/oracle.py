@@ -56,13 +56,18 @@ def oracle(env: BatchedEnv, agents: Sequence[str] | None = None) -> Oracle:
     Raises:
         ValueError: the environment has another control mode.
     """
-    if env.control != "position":
-        raise ValueError(f"the oracle moves position targets: control must be 'position', not {env.control!r}")
+    check_control(env.control)
     steps = env.task.script()
     if not env.task.has_targets and not steps:
         raise ValueError(f"the task {env.task_name!r} has no target for tool tips that an oracle could move to")
     agents = env.agents if agents is None else agents
     return Scripted(env, steps, agents) if steps else _Oracle(env, agents)
+
+
+def check_control(control: str) -> None:
+    """Raise ValueError if the oracle can't move arms with such a control mode."""
+    if control != "position":
+        raise ValueError(f"the oracle moves position targets: control must be 'position', not {control!r}")
 
 
 class _Oracle:

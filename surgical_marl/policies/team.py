@@ -16,9 +16,9 @@ from surgical_marl.content import BASELINES, PARTNERS, unknown
 from surgical_marl.policies.acting import forget
 from surgical_marl.policies.convert import like, to_numpy
 from surgical_marl.policies.oracle import oracle
-from surgical_marl.policies.policy import find_run, load_policy
+from surgical_marl.policies.policy import load_policy
 from surgical_marl.policies.teammates import Teammates
-from surgical_marl.runs.folder import read_settings
+from surgical_marl.runs.folder import find_run, read_settings
 
 if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv

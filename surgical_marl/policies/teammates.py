@@ -17,6 +17,8 @@ import numpy as np
 from surgical_marl.content import BASELINES, unknown
 from surgical_marl.envs.observations import each
 from surgical_marl.policies.acting import Policy, forget
+from surgical_marl.policies.oracle import oracle
+from surgical_marl.policies.policy import load_policy
 
 if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv
@@ -93,9 +95,6 @@ class Teammates:
 
 
 def _load(name: str, env: BatchedEnv, agents: list[str]) -> Policy:
-    from surgical_marl.policies.oracle import oracle  # these import torch, which an arm alone does not need
-    from surgical_marl.policies.policy import load_policy
-
     if name == "oracle":
         return oracle(env, agents)
     try:

@@ -6,19 +6,20 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
+from safetensors.numpy import save
 
 from surgical_marl.files import write_atomic
-from surgical_marl.runs.folder import WEIGHTS
+from surgical_marl.runs.folder import CONFIG, WEIGHTS
 from surgical_marl.untrusted.arrays import MAX_WEIGHTS, check_safetensors
 from surgical_marl.untrusted.files import check_file
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from surgical_marl.policies.networks import MultiAgentActor
 
+NOT_OF_THIS_NETWORK = f"the weights in {{}} are not of the network in its {CONFIG}: restore both"
+"""The error about weights that a network can't have; it names the run."""
 WIDTHS = ("agents", "observation", "action")
 """Metadata of a file: number of agents of the type, and widths of an agent's observation and action."""
 
@@ -28,23 +29,23 @@ def write_weights(folder: Path, actor: MultiAgentActor) -> None:
     for name, model in actor.models.items():
         widths = (actor.counts[name], model.obs_dim, actor.outputs[name])
         about = dict(zip(WIDTHS, map(str, widths), strict=True))
-        tensors = {key: value.detach().cpu().contiguous() for key, value in model.state_dict().items()}
+        tensors = {key: value.detach().cpu().contiguous().numpy() for key, value in model.state_dict().items()}
         write_atomic(folder / f"{name}{WEIGHTS}", partial(Path.write_bytes, data=save(tensors, metadata=about)))
 
 
-def read_weights(folder: Path) -> tuple[dict[str, list[int]], dict[str, Tensor]]:
-    """Read the widths of each type of arm (see `WIDTHS`) and the state of a `MultiAgentActor`, on the CPU.
+def read_weights(folder: Path) -> tuple[dict[str, list[int]], dict[str, np.ndarray]]:
+    """Read the widths of each type of arm (see `WIDTHS`) and the state of a `MultiAgentActor`.
 
     ValueError if a file is truncated, a pickle, a link out of the folder, or anything else that `write_weights` did
     not write.
     """
     groups: dict[str, list[int]] = {}
-    state: dict[str, Tensor] = {}
+    state: dict[str, np.ndarray] = {}
     for path in sorted(folder.glob(f"[!.]*{WEIGHTS}")):
         check_file(path, MAX_WEIGHTS, within=folder)
         try:
             check_safetensors(path)
-            with safe_open(path, framework="pt", device="cpu") as file:
+            with safe_open(path, framework="np") as file:
                 groups[path.stem] = [int(file.metadata()[key]) for key in WIDTHS]
                 state |= {f"models.{path.stem}.{key}": file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
         except (SafetensorError, OSError, TypeError, KeyError, ValueError):

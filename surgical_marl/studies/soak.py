@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from surgical_marl.cli.main import whole
+from surgical_marl.cli.flags import whole
 from surgical_marl.studies.command import make_parser, run
 from surgical_marl.studies.soak_faces import ALL, counted
 

@@ -18,7 +18,7 @@ import sys
 from functools import partial
 from pathlib import Path
 
-from surgical_marl.cli.main import whole
+from surgical_marl.cli.flags import whole
 from surgical_marl.studies.command import make_parser, parse_with_settings, run
 from surgical_marl.studies.study_cells import CELLS, find_cell
 from surgical_marl.studies.study_runs import PLAYED, Job, work

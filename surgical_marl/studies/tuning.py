@@ -33,7 +33,7 @@ from optuna.trial import FrozenTrial, TrialState
 from surgical_marl import machine
 from surgical_marl.bench.solve import Goal, Solution, solve
 from surgical_marl.bench.workload import Workload
-from surgical_marl.cli.main import whole
+from surgical_marl.cli.flags import whole
 from surgical_marl.files import write_atomic
 from surgical_marl.learning.room import in_memory
 from surgical_marl.runs.environment import make_env

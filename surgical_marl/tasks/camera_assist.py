@@ -38,6 +38,7 @@ from surgical_marl.cache import cached
 from surgical_marl.robots.inverse_kinematics import inverse_kinematics
 from surgical_marl.runtime import jax, jnp
 from surgical_marl.tasks import reach
+from surgical_marl.tasks.base.assist_terms import GOAL, Shown
 from surgical_marl.tasks.base.assisting import ROWS, draw_postures, find_roles, later, of_work, visible_targets, work_in
 from surgical_marl.tasks.base.grips import bars
 from surgical_marl.tasks.base.object_task import FAR, ObjectTask
@@ -46,7 +47,7 @@ from surgical_marl.tasks.base.script import Snapshot, Step, Wish
 from surgical_marl.tasks.base.task import Start
 from surgical_marl.tasks.base.task import Task as BaseTask
 from surgical_marl.tasks.base.terms import Picture, Term
-from surgical_marl.tasks.base.viewing import Eye, Sights, hidden, seen_places
+from surgical_marl.tasks.base.viewing import Eye, Sights
 from surgical_marl.tasks.base.workspace import TIME
 
 if TYPE_CHECKING:
@@ -63,8 +64,6 @@ FOLLOWING = 6
 """Steps of `Eye.look_at` from the last posture."""
 FURTHEST_OFF, WORST_DEPTH = 3.0, 1.0
 """Greatest values of the terms `centring` and `depth`."""
-GOAL = "goal"
-"""Name of the place where an object should be."""
 VIEW = {"in_view": 1.0, "centring": -0.5, "depth": -0.5, "travel": -10.0}
 """Weights of the terms of the view beside those of `reach`, which like them count in each step."""
 BESIDE_OBJECTS = 0.1
@@ -274,59 +273,21 @@ class Task(BaseTask):
 
     # -- what agents observe
 
+    @property
+    def _shown(self) -> Shown:
+        """What agents are shown, of this task's tables."""
+        return Shown(self.scene, self.camera, self.tools, self.object, self._eye, self.sights)
+
     def terms(self, agent: str) -> dict[str, Term | Picture]:
         """Return the terms of the work, hidden from tools out of view, and those of the view."""
-        return self._tool_terms(agent) if agent in self.tools else {**self._work_terms(agent), **self._views()}
-
-    def _work_terms(self, agent: str) -> dict[str, Term | Picture]:
-        """Return the terms of the work, of a world of this task."""
         inside = lambda read: lambda world: read(self._inside(world))  # noqa: E731
         terms = self.work.terms(agent)
-        return {n: t._replace(read=inside(t.read)) if isinstance(t, Term) else t for n, t in terms.items()}
+        work = {n: t._replace(read=inside(t.read)) if isinstance(t, Term) else t for n, t in terms.items()}
+        return self._shown.to_tool(agent, work) if agent in self.tools else {**work, **self._views()}
 
-    def _tool_terms(self, agent: str) -> dict[str, Term | Picture]:
-        """Return all that a tool may observe."""
-        terms, needs = self._work_terms(agent), self._needs(agent)
-        for name, term in terms.items():
-            if name in needs and isinstance(term, Term):
-                terms[name] = hidden(term, self.sights, needs[name])
-        mount, others = self.scene.mounts[agent], [tool for tool in self.tools if tool != agent]
-
-        def axes(world: World) -> Array:
-            found, _ = self._eye.pose(world.arms[self.camera].qpos)
-            return (mount.rotation.T.astype(np.float32) @ found)[:, :2].T.ravel()
-
-        target = GOAL if self.object else f"{agent}/target"
-        things = {f"{self.object}_seen": seen_places(self.sights, self.object)} if self.object else {}
-        return {
-            **terms,
-            "tip_seen": seen_places(self.sights, agent),
-            "other_tips_seen": seen_places(self.sights, *others),
-            "target_seen": seen_places(self.sights, target, about="team_goal" if self.object else "goal"),
-            **things,
-            "endoscope_axes": Term(axes, -np.ones(6), np.ones(6), "object"),
-        }
-
-    def _needs(self, agent: str) -> dict[str, tuple[str, ...]]:
-        """Return the terms of a tool's work that depend on places, and these."""
-        if self.object is None:
-            target = f"{agent}/target"
-            return {"target": (target,), "to_target": (agent, target)}
-        found = {f"{n}_{p}": (n,) for n in self.scene.free_objects for p in ("position", "rotation", "velocity")}
-        touch = dict.fromkeys(("to_object", "to_useful"), (agent, self.object))
-        goal = dict.fromkeys(("target", "target_rotation"), (GOAL,))
-        return {**found, **touch, **goal, "to_target": (self.object, GOAL), "others_hold": (self.object,)}
-
-    def _views(self) -> dict[str, Term | Picture]:
-        """Return the terms of the camera: it has to know where to look.
-
-        Without `tools_hold` it would follow an object to its goal only once it moves there, and wait for a tool that
-        does not move it before it sees the goal.
-        """
-        things = (self.object, GOAL) if self.object else tuple(f"{agent}/target" for agent in self.tools)
-        held = {"tools_hold": Term(self._tools_hold, np.zeros(2), np.ones(2), "others")} if self.object else {}
-        tips, work = (seen_places(self.sights, *names, always=True) for names in (self.tools, things))
-        return {"tips_in_view": tips, "work_in_view": work._replace(about="goal"), **held}
+    def _views(self) -> dict[str, Term]:
+        """Return the terms of the camera beside those of the work."""
+        return self._shown.to_camera(self._tools_hold)
 
     def _tools_hold(self, world: World) -> Array:
         """Return whether each tool holds the object of the work, [tools]."""

@@ -38,16 +38,16 @@ import numpy as np
 from surgical_marl.cache import cached
 from surgical_marl.runtime import jax, jnp
 from surgical_marl.scenes.poses import Pose
-from surgical_marl.tasks.base.blocks import OUT, as_numbers, find_pegs, upright
+from surgical_marl.tasks.base.blocks import OUT, find_pegs, side_pegs
 from surgical_marl.tasks.base.grasp_terms import grasp_terms
 from surgical_marl.tasks.base.grips import frames
 from surgical_marl.tasks.base.object_task import NEAR, Best, Now, ObjectTask
 from surgical_marl.tasks.base.object_terms import AT_HAND, PARTS, object_terms
+from surgical_marl.tasks.base.peg_places import draw_moves, draw_turns, goals_in_turn
 from surgical_marl.tasks.base.peg_script import SETTINGS, Transfer
-from surgical_marl.tasks.base.peg_trial import APART, POOL, Trial, Turns, draw_trials, in_turn
+from surgical_marl.tasks.base.peg_trial import APART, POOL, Trial, Turns
 from surgical_marl.tasks.base.script import Snapshot, Step
 from surgical_marl.tasks.base.task import Start
-from surgical_marl.tasks.base.workspace import choose
 
 if TYPE_CHECKING:
     from jax import Array
@@ -151,9 +151,7 @@ class Task(ObjectTask):
         turns, rows = self.turns, np.arange(len(places))
         assert turns is not None
         each = places.reshape(len(rows), -1, 7)
-        end = each[turns.following(rows), turns.number(rows), :3]
-        pegs = self._pegs[np.linalg.norm(end[:, None, :2] - self._pegs[:, :2], axis=-1).argmin(1)]
-        goals = upright(pegs - self._item.sites[self.point][0], np.zeros(len(rows)))
+        goals = goals_in_turn(each, turns, self._pegs, self._item.sites[self.point][0])
         self._set_tables(each[rows, turns.number(rows)], goals)
         first = rows if options.goals == "training" else rows - rows % turns.count
         self.tables |= {"places": places, "first": first}
@@ -356,45 +354,16 @@ class Task(ObjectTask):
     # -- where blocks and goals are
 
     def _draw(self) -> np.ndarray:
-        """Return starts [ROWS, 7] and goals [ROWS, 7] of the block."""
-        rng, way = np.random.default_rng(self.seed), self._transfers[0]
-        from_pegs, to_pegs = (self._side(agent) for agent in (self.picker, self.presenter))
+        """Return starts and goals of the block, [ROWS, 14]."""
+        sides = self._side(self.picker), self._side(self.presenter)
         base = self._item.sites[self.point][0]
-
-        def batch(_: bool) -> tuple[np.ndarray, np.ndarray]:
-            one = from_pegs[rng.integers(len(from_pegs), size=ROWS)]
-            other = to_pegs[rng.integers(len(to_pegs), size=ROWS)]
-            far = np.linalg.norm(one - other, axis=-1)
-            good = (far > 0) & (far < self.level.distance)
-            shift, yaw = SHIFT * np.sqrt(rng.random(ROWS)), rng.uniform(-180.0, 180.0, ROWS)
-            bearing = rng.uniform(-np.pi, np.pi, ROWS)
-            place = one - base + np.stack([shift * np.cos(bearing), shift * np.sin(bearing), 0 * yaw], -1)
-            starts, goals = upright(place, yaw), upright(other - base, yaw)
-            if self.level.handover:
-                good &= way.possible(starts)
-            else:
-                number = way.aligned(starts)
-                good &= way.reaches(self.picker, starts, number) & way.reaches(self.picker, goals, number)
-            rows = np.concatenate([as_numbers(starts), as_numbers(goals)], -1)[good]
-            return rows, np.zeros(len(rows), bool)
-
-        return choose(self.scene, batch, ROWS, 0.0)
+        return draw_moves(self._transfers[0], ROWS, self.seed, sides, base, SHIFT, self.level.distance)
 
     def _draw_trials(self) -> np.ndarray:
         """Return where all blocks stand at the beginning of each turn, [TRIALS * turns, blocks * 7]."""
-        rng, sides = np.random.default_rng(self.seed), (self._side(self.picker), self._side(self.presenter))
-        blocks = len(self._transfers) // 2
-        there, back = self._transfers[0], self._transfers[blocks]
-        base = self._item.sites[self.point][0]
-        poses = draw_trials(rng, TRIALS, blocks, sides, (there.possible, back.possible), self._shift, base)
-        return as_numbers(in_turn(poses)).reshape(-1, blocks * 7)
+        sides, base = (self._side(self.picker), self._side(self.presenter)), self._item.sites[self.point][0]
+        return draw_turns(self._transfers, TRIALS, self.seed, sides, base, self._shift)
 
     def _side(self, agent: str) -> np.ndarray:
-        """Return the pegs [n, 3] that are nearer to an arm than to others with a jaw, and free of blocks that stay."""
-        pegs, mounts = find_pegs(self.scene, "peg_transfer"), self.scene.mounts
-        away = lambda place: np.linalg.norm((pegs - place)[:, :2], axis=-1)  # noqa: E731
-        jaws = [own for name, own in mounts.items() if name != agent and own.arm.jaw]
-        moved = (self.object,) if self.turns is None else self.turns.blocks
-        taken = [place.position for name, place in self.scene.free_objects.items() if name not in moved]
-        good = [away(mounts[agent].position) < away(other.position) for other in jaws]
-        return pegs[np.all([*good, *(away(place) > 0.01 for place in taken)], axis=0)]
+        """Return the pegs [n, 3] of an arm's side that are free of blocks that stay."""
+        return side_pegs(self.scene, agent, (self.object,) if self.turns is None else self.turns.blocks)

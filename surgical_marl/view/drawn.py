@@ -87,8 +87,8 @@ class Drawn:
             if mesh >= 0:
                 row["mesh"], row["first_face"] = self._meshes[mesh].id, model.mesh_faceadr[mesh]
         self._shapes = shapes
-        self._arrays = [wp.array(_grain(), dtype=wp.vec4, device="cpu")]
-        self._arrays.append(wp.array(corner_normals(model), dtype=wp.vec3, device="cpu"))
+        self._grain = wp.array(_grain(), dtype=wp.vec4, device="cpu")
+        self._face_normals = wp.array(corner_normals(model), dtype=wp.vec3, device="cpu")
         self._fade = 3.2 * float(model.stat.extent)
 
     @property
@@ -96,10 +96,8 @@ class Drawn:
         """How many shapes there are without balls."""
         return len(self._shapes)
 
-    def at(
-        self, data: mujoco.MjData, eye: Array, pixel: float, spheres: Sequence[Sphere], through: float
-    ) -> tuple[Any, list[Any]]:
-        """Return what the kernels need of a pose: what all shapes share, and arrays of shapes, noise and normals.
+    def at(self, data: mujoco.MjData, eye: Array, pixel: float, spheres: Sequence[Sphere], through: float) -> Any:
+        """Return a `World` of a pose, without eyes.
 
         Args:
             data: poses of the model's geoms.
@@ -128,9 +126,10 @@ class Drawn:
         away = np.linalg.norm(shapes["place"][thin] - eye, axis=1)
         shapes["size"][thin, 0] = np.maximum(shapes["size"][thin, 0], _LINE * pixel * away)
         world = World()
+        world.shapes = wp.array(shapes, dtype=Shape, device="cpu")
         world.balls, world.through, world.fade = self.count, through, self._fade
-        arrays = [wp.array(shapes, dtype=Shape, device="cpu"), *self._arrays]
-        return world, arrays
+        world.grain, world.face_normals = self._grain, self._face_normals
+        return world
 
 
 def _size(model: mujoco.MjModel, geom: int) -> Array:

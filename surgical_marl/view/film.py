@@ -35,7 +35,11 @@ if TYPE_CHECKING:
 WALL = 1280
 """Pixels along the width of a film of several environments, about."""
 SMALLEST, LARGEST = 16, 4096
-"""Pixels of a side of a picture."""
+"""Pixels of a side of a picture. A grid is at most twice as wide and high: a frame of 64 of the largest has 3 GB."""
+TURNS = 3600.0
+"""Angles of a camera at most, degrees."""
+CLOSEST, FARTHEST = 0.001, 100.0
+"""Distances of a camera, m."""
 MOST = 8
 """Rows and columns of a grid at most."""
 
@@ -73,6 +77,13 @@ class Look:
         if self.size is not None and not all(SMALLEST <= side <= LARGEST for side in self.size):
             width, height = self.size
             raise ValueError(f"a film is {SMALLEST} to {LARGEST} pixels wide and high, not {width}x{height}")
+        rows, columns = self.grid
+        width, height = self.tile[0] * columns, self.tile[1] * rows
+        if max(width, height) > 2 * LARGEST:
+            raise ValueError(
+                f"a grid of {rows}x{columns} makes a film of {width}x{height} pixels: ask for a smaller size, so that "
+                f"it is at most {2 * LARGEST} pixels wide and high"
+            )
 
     @property
     def tile(self) -> tuple[int, int]:
@@ -140,6 +151,11 @@ def camera_of(text: str | None, env: BatchedEnv) -> str | View | None:
         azimuth, elevation, distance = map(float, text.split(","))
     except ValueError:
         raise unknown("camera", text, [*names, "AZIMUTH,ELEVATION,DISTANCE"]) from None
+    if not (abs(azimuth) <= TURNS and abs(elevation) <= TURNS and CLOSEST <= distance <= FARTHEST):
+        raise ValueError(
+            f"a camera's angles are from {-TURNS:g} to {TURNS:g} degrees and its distance from {CLOSEST:g} to "
+            f"{FARTHEST:g} m, not {text!r}"
+        )
     env.reset(0)
     middle = Observer(env.scene).look(env).tips[0].mean(0)
     return View(middle, distance, azimuth, elevation)

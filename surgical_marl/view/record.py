@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import mujoco
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from surgical_marl.machine import cores
@@ -64,6 +63,8 @@ def record(
 @contextmanager
 def _one_thread() -> Iterator[None]:
     """Let torch compute in one thread, in this block: while all cores draw, its threads wait for each other."""
+    import torch  # here, because pictures alone need none
+
     usual = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

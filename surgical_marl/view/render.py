@@ -109,18 +109,19 @@ class Renderer:
         place, axes, fovy = self._camera(data, camera)
         wp, size = self._wp, (self.height, self.width)
         pixel = 2 * np.tan(np.deg2rad(fovy) / 2) / self.height
-        world, (shapes, *patterns) = self._drawn.at(data, place, pixel, spheres, through)
-        lists = self._lists(shapes, self._eye(place, axes, pixel, self.width, self.height), self._lamps(axes))
+        world = self._drawn.at(data, place, pixel, spheres, through)
+        self._list(world, [self._eye(place, axes, pixel, self.width, self.height), *self._lamps(axes)])
         coarse = tuple(-(-side // int(painter.COARSE)) for side in size)
-        depths, sides, orbs = (wp.empty(size, dtype=dtype, device="cpu") for dtype in (float, int, int))
-        normals, lights = (wp.empty(size, dtype=wp.vec3, device="cpu"), wp.zeros(coarse, dtype=wp.vec2, device="cpu"))
-        found, (grain, faces) = [depths, normals, sides], patterns
-        wp.launch(painter.cast, size, [world, shapes, *lists, faces, *found, orbs], device="cpu")
-        wp.launch(painter.light_up, coarse, [shapes, *lists, *found, lights], device="cpu")
+        pixels = painter.Pixels()
+        pixels.depths = wp.empty(size, dtype=float, device="cpu")
+        pixels.normals = wp.empty(size, dtype=wp.vec3, device="cpu")
+        pixels.sides, pixels.orbs = (wp.empty(size, dtype=int, device="cpu") for _ in range(2))
+        pixels.lights = wp.zeros(coarse, dtype=wp.vec2, device="cpu")
+        wp.launch(painter.cast, size, [world, pixels], device="cpu")
+        wp.launch(painter.light_up, coarse, [world, pixels], device="cpu")
         picture = np.empty((*size, 3), np.uint8)
         written = wp.array(picture, dtype=wp.vec3ub, copy=False, device="cpu")
-        inputs = [world, shapes, *lists, grain, faces, *found, orbs, lights, written]
-        wp.launch(painter.paint, size, inputs, device="cpu")
+        wp.launch(painter.paint, size, [world, pixels, written], device="cpu")
         return picture
 
     def lamp(self, axes: Array) -> Array:
@@ -166,23 +167,22 @@ class Renderer:
         pixels = tiles * int(tracer.TILE)
         return self._eye(place, axes, 2 * _LIT * self.model.stat.extent / distance / pixels, pixels, pixels)
 
-    def _lists(self, shapes: Any, eye: Any, lamps: list[Any]) -> list[Any]:
-        """Return all eyes, and which shapes each tile of theirs may show, and how many they are."""
-        wp, eyes, drawn = self._wp, [eye, *lamps], shapes.numpy()
+    def _list(self, world: Any, eyes: list[Any]) -> None:
+        """Set the eyes of a picture, and which shapes each tile of theirs may show: of a camera, a lamp and the sky."""
+        wp, drawn = self._wp, world.shapes.numpy()
         for one, after in pairwise(eyes):
             after.first = one.first + one.columns * one.rows
         tiles = eyes[-1].first + eyes[-1].columns * eyes[-1].rows
-        lists = [wp.array(eyes, dtype=tracer.Eye, device="cpu")]
-        lists.append(wp.empty((tiles, max(len(drawn), 1)), dtype=wp.uint16, device="cpu"))
-        lists.append(wp.zeros(tiles, dtype=int, device="cpu"))
+        world.eyes = wp.array(eyes, dtype=tracer.Eye, device="cpu")
+        world.listed = wp.empty((tiles, max(len(drawn), 1)), dtype=wp.uint16, device="cpu")
+        world.counts = wp.zeros(tiles, dtype=int, device="cpu")
         # For the eye the nearest first: if one begins behind what a ray has met, so do all after it. For the lamp the
         # largest first: they may hide all of it. For the sky from below: if one is too high, so are all after it.
         nearest = np.argsort(drawn["near"][: self._drawn.count])
         orders = [nearest, np.argsort(-drawn["radius"]), np.argsort(drawn["bottom"])]
         for number, order in enumerate(orders):
             numbers = wp.array(order.astype(np.int32), dtype=int, device="cpu")
-            wp.launch(tracer.list_shapes, 1, [shapes, *lists, numbers, number], device="cpu")
-        return lists
+            wp.launch(tracer.list_shapes, 1, [world, numbers, number], device="cpu")
 
     def _eye(self, place: Array, axes: Array, pixel: float, width: int, height: int) -> Any:
         eye, tile, wp = tracer.Eye(), int(tracer.TILE), self._wp

@@ -31,7 +31,8 @@ from surgical_marl.untrusted.arrays import read_npz
 from surgical_marl.untrusted.values import check_count, shown
 
 if TYPE_CHECKING:
-    from surgical_marl.envs.batch import BatchedEnv, BatchStep
+    from surgical_marl.envs.batch import BatchedEnv
+    from surgical_marl.envs.batch_step import BatchStep
 
 LAYOUT = 1
 MOST_STEPS = 10_000

@@ -86,32 +86,40 @@ class Shape:
 
 @wp.struct
 class World:
-    """What is the same for all shapes of a picture."""
+    """All that a picture is drawn of, and which of it each tile of an eye may show."""
 
+    shapes: wp.array[Shape]
     balls: wp.int32
     """Number of the first ball that is no part of the model; balls come last, the farthest first."""
     through: wp.float32
     """Share of a ball's colour that is seen through what hides it."""
     fade: wp.float32
     """Distance at which planes have faded, m."""
+    grain: wp.array3d[wp.vec4]
+    """Noise that patterns are made of."""
+    face_normals: wp.array2d[wp.vec3]
+    """At the corners of all faces of meshes."""
+    eyes: wp.array[Eye]
+    """The camera, the lamp, and the sky as a lamp overhead."""
+    listed: wp.array2d[wp.uint16]
+    """Shapes that rays through a tile may meet [tiles, shapes], of all eyes."""
+    counts: wp.array[int]
+    """How many they are [tiles]."""
 
 
 @wp.func
-def meets(eye: Eye, shapes: wp.array[Shape], shape: int, n: wp.vec3):
+def meets(world: World, eye: Eye, shape: int, n: wp.vec3):
     """Return whether a shape reaches beyond a plane through the eye; n is normal to it, in the eye's frame."""
-    if shapes[shape].kind == PLANE:
+    if world.shapes[shape].kind == PLANE:
         return True
-    local = shapes[shape].back @ (eye.axes @ n)
-    away = wp.dot(local, shapes[shape].back @ (eye.place - shapes[shape].place))
-    return reach(shapes[shape].kind, shapes[shape].size, local) + eye.margin * wp.length(n) >= away
+    local = world.shapes[shape].back @ (eye.axes @ n)
+    away = wp.dot(local, world.shapes[shape].back @ (eye.place - world.shapes[shape].place))
+    return reach(world.shapes[shape].kind, world.shapes[shape].size, local) + eye.margin * wp.length(n) >= away
 
 
 @wp.kernel
 def list_shapes(
-    shapes: wp.array[Shape],
-    eyes: wp.array[Eye],
-    listed: wp.array2d[wp.uint16],
-    counts: wp.array[int],
+    world: World,
     order: wp.array[int],
     number: int,
 ):
@@ -119,14 +127,13 @@ def list_shapes(
 
     Args:
         order: numbers of the shapes to list, in this order.
-        listed, counts: shapes that rays through a tile may meet [tiles, shapes], and how many they are [tiles].
         number: of the eye. A lamp lists what throws shadows.
     """
-    eye = eyes[number]
+    eye = world.eyes[number]
     for place in range(order.shape[0]):
         shape = order[place]
-        at = wp.transpose(eye.axes) @ (shapes[shape].place - eye.place)
-        radius = shapes[shape].radius + eye.margin
+        at = wp.transpose(eye.axes) @ (world.shapes[shape].place - eye.place)
+        radius = world.shapes[shape].radius + eye.margin
         near, far = -at[2] - radius, -at[2] + radius
         first_column, last_column, first_row, last_row = int(0), int(eye.columns) - 1, int(0), int(eye.rows) - 1
         if near > 1e-3:
@@ -138,27 +145,25 @@ def list_shapes(
             last_column = wp.min(int(wp.floor((right - eye.left) / eye.tile)), eye.columns - 1)
             first_row = wp.max(int(wp.floor((eye.top - high) / eye.tile)), 0)
             last_row = wp.min(int(wp.floor((eye.top - low) / eye.tile)), eye.rows - 1)
-        if far <= 0.0 or (eye.spread > 0.0 and shapes[shape].shadow_kind < 0):
+        if far <= 0.0 or (eye.spread > 0.0 and world.shapes[shape].shadow_kind < 0):
             last_row = -1
         for row in range(first_row, last_row + 1):
             top = eye.top - float(row) * eye.tile
-            seen = meets(eye, shapes, shape, wp.vec3(0.0, 1.0, top - eye.tile))
-            if seen and meets(eye, shapes, shape, wp.vec3(0.0, -1.0, -top)):
+            seen = meets(world, eye, shape, wp.vec3(0.0, 1.0, top - eye.tile))
+            if seen and meets(world, eye, shape, wp.vec3(0.0, -1.0, -top)):
                 for column in range(first_column, last_column + 1):
                     edge = eye.left + float(column) * eye.tile
-                    seen = meets(eye, shapes, shape, wp.vec3(1.0, 0.0, edge))
-                    if seen and meets(eye, shapes, shape, wp.vec3(-1.0, 0.0, -edge - eye.tile)):
+                    seen = meets(world, eye, shape, wp.vec3(1.0, 0.0, edge))
+                    if seen and meets(world, eye, shape, wp.vec3(-1.0, 0.0, -edge - eye.tile)):
                         tile = eye.first + row * eye.columns + column
-                        listed[tile, counts[tile]] = wp.uint16(shape)
-                        counts[tile] += 1
+                        world.listed[tile, world.counts[tile]] = wp.uint16(shape)
+                        world.counts[tile] += 1
 
 
 @wp.func
 def lit(
-    shapes: wp.array[Shape],
+    world: World,
     lamp: Eye,
-    listed: wp.array2d[wp.uint16],
-    counts: wp.array[int],
     point: wp.vec3,
     own: int,
     joint: float,
@@ -180,32 +185,37 @@ def lit(
     way = way / distance
     light, each = float(1.0), float(1.0)
     tile = lamp.first + row * lamp.columns + column
-    for i in range(counts[tile]):
-        shape = int(listed[tile, i])
-        if shapes[shape].bottom > point[2] + lamp.far or light + joint * (each - light) < DARK:
+    for i in range(world.counts[tile]):
+        shape = int(world.listed[tile, i])
+        if world.shapes[shape].bottom > point[2] + lamp.far or light + joint * (each - light) < DARK:
             break
-        towards = shapes[shape].place - point
+        towards = world.shapes[shape].place - point
         along = wp.dot(towards, way)
-        radius = shapes[shape].radius
+        radius = world.shapes[shape].radius
         wide = radius + lamp.spread * wp.max(along + radius, 0.0)
         near = (
-            shapes[shape].top > point[2]
+            world.shapes[shape].top > point[2]
             and along > -radius
             and along - radius < lamp.far
             and wp.dot(towards, towards) - along * along < wide * wide
         )
-        if near and (shape != own or shapes[shape].kind == MESH):
+        if near and (shape != own or world.shapes[shape].kind == MESH):
             cover = float(0.0)
-            p, v = -(shapes[shape].back @ towards), shapes[shape].back @ way
-            if shapes[shape].kind == MESH:
-                query = wp.mesh_query_ray(shapes[shape].mesh, p, v, distance)
+            p, v = -(world.shapes[shape].back @ towards), world.shapes[shape].back @ way
+            if world.shapes[shape].kind == MESH:
+                query = wp.mesh_query_ray(world.shapes[shape].mesh, p, v, distance)
                 if query.result:
                     cover = 1.0
             else:
                 cover = hidden(
-                    shapes[shape].shadow_kind, shapes[shape].shadow_size, shapes[shape].breadth, p, v, lamp.spread
+                    world.shapes[shape].shadow_kind,
+                    world.shapes[shape].shadow_size,
+                    world.shapes[shape].breadth,
+                    p,
+                    v,
+                    lamp.spread,
                 )
-            cover = cover * shapes[shape].alpha * (1.0 - ramp(0.0, 1.0, (along - radius) / lamp.far))
+            cover = cover * world.shapes[shape].alpha * (1.0 - ramp(0.0, 1.0, (along - radius) / lamp.far))
             light = wp.min(light, 1.0 - cover)
             each = each * (1.0 - cover)
     return light + joint * (each - light)
@@ -213,10 +223,7 @@ def lit(
 
 @wp.func
 def lamps(
-    shapes: wp.array[Shape],
-    eyes: wp.array[Eye],
-    listed: wp.array2d[wp.uint16],
-    counts: wp.array[int],
+    world: World,
     shape: int,
     point: wp.vec3,
     normal: wp.vec3,
@@ -224,11 +231,11 @@ def lamps(
     """Return the shares of the lamp and of the sky that a point of a shape sees."""
     raised = point + 2e-5 * normal
     light, open = float(0.0), float(HALF_OPEN)
-    if wp.dot(normal, eyes[1].place - point) > -0.2 * wp.length(eyes[1].place - point):
-        light = lit(shapes, eyes[1], listed, counts, raised, shape, 0.0)
+    if wp.dot(normal, world.eyes[1].place - point) > -0.2 * wp.length(world.eyes[1].place - point):
+        light = lit(world, world.eyes[1], raised, shape, 0.0)
     upwards = ramp(-0.3, 0.2, normal[2])
     if upwards > 0.0:
-        open += upwards * (lit(shapes, eyes[2], listed, counts, raised, shape, 1.0) - open)
+        open += upwards * (lit(world, world.eyes[2], raised, shape, 1.0) - open)
     return wp.vec2(light, open)
 
 
@@ -241,33 +248,30 @@ def ray_of(eye: Eye, column: float, row: float):
 
 @wp.func
 def meet(
-    shapes: wp.array[Shape],
-    eye: Eye,
-    listed: wp.array2d[wp.uint16],
-    counts: wp.array[int],
-    face_normals: wp.array2d[wp.vec3],
+    world: World,
     column: float,
     row: float,
 ):
     """Return how far a ray goes, the normal of what it meets, and the side of which shape that is; 0 for nothing."""
+    eye = world.eyes[0]
     ray = ray_of(eye, column, row)
     tile = int(row) // TILE * eye.columns + int(column) // TILE
     best, hit, face = float(FAR), int(-1), int(-1)
     u, w = float(0.0), float(0.0)
-    for i in range(counts[tile]):
-        shape = int(listed[tile, i])
-        if shapes[shape].near > best:  # so are all that follow
+    for i in range(world.counts[tile]):
+        shape = int(world.listed[tile, i])
+        if world.shapes[shape].near > best:  # so are all that follow
             break
-        kind, p, v = shapes[shape].kind, shapes[shape].viewer, shapes[shape].back @ ray
+        kind, p, v = world.shapes[shape].kind, world.shapes[shape].viewer, world.shapes[shape].back @ ray
         t = float(-1.0)
         if kind == MESH:
-            query = wp.mesh_query_ray(shapes[shape].mesh, p, v, best)
+            query = wp.mesh_query_ray(world.shapes[shape].mesh, p, v, best)
             if query.result:
                 t, u, w, face = float(query.t), float(query.u), float(query.v), int(query.face)
         elif kind == PLANE:
             t = -p[2] / wp.where(wp.abs(v[2]) > 1e-9, v[2], 1e-9)
         else:
-            depths = span(kind, shapes[shape].size, p, v)
+            depths = span(kind, world.shapes[shape].size, p, v)
             if depths[0] <= depths[1]:
                 t = depths[0]  # below 0 if the eye is inside, as a scope's is in its sleeve: then it looks out
         # of two in one place the later one of the model is seen
@@ -275,12 +279,14 @@ def meet(
             best, hit = t, shape
     normal, side = wp.vec3(0.0, 0.0, 1.0), int(0)
     if hit >= 0:
-        turn, made = shapes[hit].back, shapes[hit].kind
+        turn, made = world.shapes[hit].back, world.shapes[hit].kind
         if made == MESH:
-            f = shapes[hit].first_face + face
-            normal = u * face_normals[f, 0] + w * face_normals[f, 1] + (1.0 - u - w) * face_normals[f, 2]
+            f = world.shapes[hit].first_face + face
+            normal = (
+                u * world.face_normals[f, 0] + w * world.face_normals[f, 1] + (1.0 - u - w) * world.face_normals[f, 2]
+            )
         elif made != PLANE:
-            normal = outwards(made, shapes[hit].size, turn @ (eye.place + best * ray - shapes[hit].place))
+            normal = outwards(made, world.shapes[hit].size, turn @ (eye.place + best * ray - world.shapes[hit].place))
             if made == BOX or made == CYLINDER:
                 side = wp.where(normal[2] != 0.0, 1, wp.where(normal[1] != 0.0, 2, 3))
         normal = wp.normalize(wp.transpose(turn) @ normal)

@@ -22,7 +22,8 @@ from typing import Any
 import imageio.v3 as iio
 from PIL import Image
 
-from surgical_marl.runs.folder import has_begun, read_checkpoint, read_metrics, read_settings
+from surgical_marl.runs.checkpoint import read_checkpoint
+from surgical_marl.runs.folder import has_begun, read_metrics, read_settings
 from tests.helpers.clock import JUMPS, can_jump, jump, own_clock
 from tests.helpers.runs import same_state
 

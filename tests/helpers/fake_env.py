@@ -32,6 +32,7 @@ class FakeEnv:
         self.types = {name: [f"{name}_{i}" for i in range(count)] for name, count in counts.items()}
         self.agents = [agent for members in self.types.values() for agent in members]
         self.sizes = {a: sizes[name] for name, members in self.types.items() for a in members}
+        self.arrays = "torch"
         self.num_envs, self.max_steps, self.control_dt, self.device = (
             num_envs,
             max_steps,

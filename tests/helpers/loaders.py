@@ -37,17 +37,8 @@ from surgical_marl.report.run import read_run
 from surgical_marl.robots.mesh import read_mesh
 from surgical_marl.robots.spec import build_spec
 from surgical_marl.runs import fault
-from surgical_marl.runs.folder import (
-    CHECKPOINT,
-    CONFIG,
-    METRICS,
-    read_environments,
-    read_metrics,
-    read_origin,
-    read_settings,
-    write_checkpoint,
-    write_environments,
-)
+from surgical_marl.runs.checkpoint import read_environments, write_checkpoint, write_environments
+from surgical_marl.runs.folder import CHECKPOINT, CONFIG, METRICS, read_metrics, read_origin, read_settings
 from surgical_marl.runs.settings import Settings, load_config, read_config
 from surgical_marl.scenes.check import check
 from surgical_marl.scenes.load import load_scene

@@ -12,7 +12,8 @@ from typing import Any
 import torch
 
 from surgical_marl.learning import train
-from surgical_marl.runs.folder import read_checkpoint, read_metrics
+from surgical_marl.runs.checkpoint import read_checkpoint
+from surgical_marl.runs.folder import read_metrics
 from surgical_marl.runs.settings import ConstraintSettings, NetworkSettings, PPOSettings, Settings
 from tests.helpers.fake_env import FakeEnv
 

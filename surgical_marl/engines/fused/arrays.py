@@ -56,6 +56,7 @@ class Arrays(ABC):
             )
         self._buffers = {name: self._zeros(max(source.sizes[name], 1), stride, dtype) for name, dtype in _TYPES.items()}
         self.work = self._zeros(1, stride, np.int32)[0]
+        self._numbers = self.constant(np.arange(num_envs, dtype=np.int32))
         constants = [self.constant(table) for table in tables.values()]
         self.all = [
             *(self.warp(buffer) for buffer in self._buffers.values()),
@@ -94,9 +95,13 @@ class Arrays(ABC):
             every: control steps after which they are sorted.
             shares: threads of a CPU, each of which takes a part of the columns.
         """
-        numbers = self.constant(np.arange(self.num_envs, dtype=np.int32))
         kept = [self.fields(name) for name in _KEPT]
-        self.order = Order(numbers, kept, partial(self._argsort, shares), every, self._recording)
+        self.order = Order(self._numbers, kept, partial(self._argsort, shares), every, self._recording)
+
+    @property
+    def envs(self) -> Any:
+        """The number of the environment in each column, [N] int32; the same array each time."""
+        return self.order.envs if self.order else self._numbers
 
     def _recording(self) -> bool:
         """Whether steps are recorded into a CUDA graph now."""

@@ -56,7 +56,6 @@ class Guard:
         # Where the next step will end an episode that was told to end: its numbers are no new fault.
         self._leaving, self._waiting = np.zeros(arrays.num_envs, np.int32), False
         self._fine = np.full(arrays.num_envs, FINE, np.int32)
-        self._envs = arrays.order.envs if arrays.order else arrays.constant(np.arange(arrays.num_envs, dtype=np.int32))
         self._none = np.zeros(0, np.int64)
         if arrays.device == "cuda":
             self._own = self.on_device()
@@ -98,7 +97,7 @@ class Guard:
         wp.launch(
             _check,
             dim=arrays.num_envs,
-            inputs=[state, counts, outs, flags, *map(arrays.warp, own), arrays.warp(self._envs), *numbers],
+            inputs=[state, counts, outs, flags, *map(arrays.warp, own), arrays.warp(arrays.envs), *numbers],
             device=arrays.device,
             stream=torch_stream() if arrays.device == "cuda" else None,
         )
@@ -125,7 +124,7 @@ class Guard:
             flags[row, suspects[faulty]] = value
         flags[self._flag, suspects] = 0
         counts[self._steps, suspects[broken]] = limit
-        codes, envs = self._fine.copy(), self._envs[suspects]
+        codes, envs = self._fine.copy(), self._arrays.envs[suspects]
         codes[envs] = np.where(faulty & ~broken & (self._leaving[envs] > 0), FINE, first)
         self._leaving[:] = 0
         self._leaving[envs] = broken

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import numpy as np
 
 from surgical_marl.robots.rotation import quaternion
@@ -52,3 +54,16 @@ def find_pegs(scene: Scene, task: str) -> np.ndarray:
     if not found:
         raise ValueError(f"{task} needs a scene with a board that has sites peg_0, peg_1, ...; {scene.name!r} has none")
     return np.array(found)
+
+
+def side_pegs(scene: Scene, agent: str, moved: Collection[str]) -> np.ndarray:
+    """Return the pegs [n, 3] that are nearer to an arm than to others with a jaw, and free of blocks that stay.
+
+    `moved` are the blocks that do not stay.
+    """
+    pegs, mounts = find_pegs(scene, "peg_transfer"), scene.mounts
+    away = lambda place: np.linalg.norm((pegs - place)[:, :2], axis=-1)  # noqa: E731
+    jaws = [own for name, own in mounts.items() if name != agent and own.arm.jaw]
+    taken = [place.position for name, place in scene.free_objects.items() if name not in moved]
+    good = [away(mounts[agent].position) < away(other.position) for other in jaws]
+    return pegs[np.all([*good, *(away(place) > 0.01 for place in taken)], axis=0)]

@@ -1,0 +1,55 @@
+"""The environment that is asked for: by policies, which were trained in one, and by options that can be chosen."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from surgical_marl.content import BASELINES, find
+from surgical_marl.policies.oracle import check_control
+from surgical_marl.runs.folder import check_trained, read_settings
+from surgical_marl.runs.settings import Settings
+
+OWN = ("task", "scene", "control", "knowledge", "messages")
+CHOSEN = ("difficulty", "start", "goals")
+"""Options that a trained policy determines, and options that can be chosen for any policy."""
+
+
+def common_settings(policies: Sequence[str], asked: Mapping[str, str | None]) -> Settings:
+    """Return the settings of the environment that policies of one task and scene are evaluated in.
+
+    Raises ValueError as `play_all` does.
+    """
+    if len(set(policies)) < len(policies):
+        raise ValueError(f"{max(policies, key=policies.count)!r} is named twice")
+    given = {"goals": "held_out", **{key: value for key, value in asked.items() if value is not None}}
+    trained = [policy for policy in policies if policy not in BASELINES]
+    settings = {policy: _settings(policy, given) for policy in trained or policies}
+    name, first = next(iter(settings.items()))
+    for policy, other in settings.items():
+        for key in (*OWN, *CHOSEN, "max_steps"):
+            if (theirs := getattr(other, key)) != (ours := getattr(first, key)):
+                raise ValueError(f"{policy} has {key} {theirs!r} and {name} has {ours!r}: they can't be compared")
+    for policy in trained:
+        check_trained(find("policies", policy))
+    if "oracle" in policies:
+        check_control(first.control)
+    return first
+
+
+def find_policy(name: str) -> str | Path:
+    """Return the folder of a run or policy; a name of `BASELINES` stays as it is."""
+    return name if name in BASELINES else find("policies", name)
+
+
+def _settings(policy: str, asked: Mapping[str, str]) -> Settings:
+    if policy in BASELINES:
+        return Settings(**asked)  # type: ignore[arg-type]
+    settings = read_settings(find("policies", policy))
+    for key in OWN:
+        if asked.get(key, own := getattr(settings, key)) != own:
+            raise ValueError(f"{policy} is of {key} {own!r}, not {asked[key]!r}: leave --{key} out")
+    chosen: Any = {key: asked[key] for key in CHOSEN if key in asked}
+    return replace(settings, engine="auto", device="auto", **chosen)

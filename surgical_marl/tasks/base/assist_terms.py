@@ -1,0 +1,82 @@
+"""What agents observe where an endoscope assists two tools: these only what it shows, and it where to look."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from surgical_marl.tasks.base.terms import Picture, Term
+from surgical_marl.tasks.base.viewing import Eye, Sights, hidden, seen_places
+
+if TYPE_CHECKING:
+    from jax import Array
+
+    from surgical_marl.scenes.scene import Scene
+    from surgical_marl.tasks.base.world import World
+
+GOAL = "goal"
+"""Name of the place where an object should be."""
+
+
+class Shown(NamedTuple):
+    """What the endoscope shows of the tools' work, as terms."""
+
+    scene: Scene
+    camera: str
+    """Its agent."""
+    tools: tuple[str, ...]
+    object: str | None
+    """What the tools move; None if each has a target for its tip."""
+    eye: Eye
+    sights: Callable[[World], Sights]
+    """Of tips by agent, objects by name, and of `GOAL`, or the target of a tool as `<agent>/target`."""
+
+    def to_tool(self, agent: str, work: Mapping[str, Term | Picture]) -> dict[str, Term | Picture]:
+        """Return all that a tool may observe: the terms of its work, 0 out of view, and what it sees."""
+        terms, needs = dict(work), self._needs(agent)
+        for name, term in terms.items():
+            if name in needs and isinstance(term, Term):
+                terms[name] = hidden(term, self.sights, needs[name])
+        target = GOAL if self.object else f"{agent}/target"
+        things = {f"{self.object}_seen": seen_places(self.sights, self.object)} if self.object else {}
+        return {
+            **terms,
+            "tip_seen": seen_places(self.sights, agent),
+            "other_tips_seen": seen_places(self.sights, *(tool for tool in self.tools if tool != agent)),
+            "target_seen": seen_places(self.sights, target, about="team_goal" if self.object else "goal"),
+            **things,
+            "endoscope_axes": Term(self._axes(agent), -np.ones(6), np.ones(6), "object"),
+        }
+
+    def to_camera(self, tools_hold: Callable[[World], Array]) -> dict[str, Term]:
+        """Return what the camera observes beside its joints: it has to know where to look.
+
+        Without `tools_hold`, whether each tool holds the object, it would follow an object to its goal only once it
+        moves there, and wait for a tool that does not move it before it sees the goal.
+        """
+        things = (self.object, GOAL) if self.object else tuple(f"{agent}/target" for agent in self.tools)
+        held = {"tools_hold": Term(tools_hold, np.zeros(2), np.ones(2), "others")} if self.object else {}
+        tips, work = (seen_places(self.sights, *names, always=True) for names in (self.tools, things))
+        return {"tips_in_view": tips, "work_in_view": work._replace(about="goal"), **held}
+
+    def _axes(self, agent: str) -> Callable[[World], Array]:
+        """Return what reads the endoscope's axes right and up in an arm's base frame, [6]."""
+        mount = self.scene.mounts[agent]
+
+        def read(world: World) -> Array:
+            found, _ = self.eye.pose(world.arms[self.camera].qpos)
+            return (mount.rotation.T.astype(np.float32) @ found)[:, :2].T.ravel()
+
+        return read
+
+    def _needs(self, agent: str) -> dict[str, tuple[str, ...]]:
+        """Return the terms of a tool's work that depend on places, and these."""
+        if self.object is None:
+            target = f"{agent}/target"
+            return {"target": (target,), "to_target": (agent, target)}
+        found = {f"{n}_{p}": (n,) for n in self.scene.free_objects for p in ("position", "rotation", "velocity")}
+        touch = dict.fromkeys(("to_object", "to_useful"), (agent, self.object))
+        goal = dict.fromkeys(("target", "target_rotation"), (GOAL,))
+        return {**found, **touch, **goal, "to_target": (self.object, GOAL), "others_hold": (self.object,)}
