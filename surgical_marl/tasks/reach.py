@@ -33,7 +33,7 @@ from surgical_marl.tasks.base.crossing import crossing_table
 from surgical_marl.tasks.base.options import Options
 from surgical_marl.tasks.base.script import Snapshot, Step, Wish
 from surgical_marl.tasks.base.task import Goal, Level, Start, TipTask
-from surgical_marl.tasks.base.workspace import start_table, target_table
+from surgical_marl.tasks.base.workspace import MANY_STARTS, TABLE_SIZE, start_table, target_table
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -85,7 +85,8 @@ class Task(TipTask):
         elif self.starts_at == "home":
             self.tables["targets"] = target_table(scene, self.level.extent, self.level.crossing, self.seed)
         else:
-            self._set_ways(*start_table(scene, self.level.extent, self.seed))
+            rows = MANY_STARTS if options.goals == "training" else TABLE_SIZE
+            self._set_ways(*start_table(scene, self.level.extent, self.seed, rows))
 
     def _set_ways(self, ways: Mapping[str, np.ndarray], targets: np.ndarray) -> None:
         begin = {agent: way[0] for agent, way in ways.items()}

@@ -9,7 +9,7 @@ import numpy as np
 from surgical_marl.runtime import jax, jnp
 from surgical_marl.tasks.base import spline
 from surgical_marl.tasks.base.options import Options
-from surgical_marl.tasks.base.paths import KNOT, SEGMENTS, path_table
+from surgical_marl.tasks.base.paths import KNOT, MANY_STARTS, ROWS, SEGMENTS, path_table
 from surgical_marl.tasks.base.task import Level, Start, TipTask
 
 if TYPE_CHECKING:
@@ -44,7 +44,10 @@ class PathTask(TipTask):
 
     def __init__(self, scene: Scene, options: Options) -> None:
         super().__init__(scene, options)
-        self.tables |= path_table(scene, self.draw, self.level, self.seed, self.starts_at)
+        many = self.starts_at == "random" and options.goals == "training"
+        self.tables |= path_table(
+            scene, self.draw, self.level, self.seed, self.starts_at, MANY_STARTS if many else ROWS
+        )
         paths = self.tables["paths"]
         closed = np.isclose(paths[:, :3], paths[:, -3:], rtol=0, atol=1e-7).all(axis=(1, 2, 3))
         self.tables |= {"paths": paths.astype(np.float32), "closed": closed}

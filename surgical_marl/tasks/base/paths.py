@@ -22,6 +22,8 @@ from surgical_marl.tasks.base.task import Level
 from surgical_marl.tasks.base.workspace import CLEARANCE, TOLERANCE, choose
 
 ROWS = 1024
+MANY_STARTS = 4096
+"""Rows of a table with random starts to learn from: of `ROWS` a policy learns to know the rows instead of the way."""
 DURATION = 5.0
 """Duration of a path, s."""
 SEGMENTS = 50
@@ -131,7 +133,9 @@ def _onwards(rng: np.random.Generator, count: int) -> np.ndarray:
     return np.concatenate([np.zeros((1, count, 3)), way]).swapaxes(0, 1)
 
 
-def path_table(scene: Scene, draw: Draw, level: Level, seed: int = 0, start: str = "home") -> dict[str, np.ndarray]:
+def path_table(
+    scene: Scene, draw: Draw, level: Level, seed: int = 0, start: str = "home", rows: int = ROWS
+) -> dict[str, np.ndarray]:
     """Return paths that all arms of a scene can follow at once.
 
     Args:
@@ -139,25 +143,26 @@ def path_table(scene: Scene, draw: Draw, level: Level, seed: int = 0, start: str
         level: extent, greatest speed, and the share of rows in which two paths cross.
         seed: of the draws; the same seed gives the same table.
         start: "home", or "random" for postures in which each joint but the jaw is up to `AWAY` of its range from home.
+        rows: how many.
 
     Returns:
-        `paths`, control points [ROWS, SEGMENTS + 3, arms, 3] in each arm's base frame, m; with random starts also
-        `postures` [ROWS, nq], `qpos` of the scene. Kept on disk by content.
+        `paths`, control points [rows, SEGMENTS + 3, arms, 3] in each arm's base frame, m; with random starts also
+        `postures` [rows, nq], `qpos` of the scene. Kept on disk by content.
 
     Raises:
         ValueError: if fewer than one draw in a hundred can be kept.
     """
-    numbers = (ROWS, DURATION, SEGMENTS, CHECKS, HEADROOM, CROSSING, WAYPOINTS, WILD, TURNING, SLOWEST, CLEARANCE, AWAY)
+    numbers = (rows, DURATION, SEGMENTS, CHECKS, HEADROOM, CROSSING, WAYPOINTS, WILD, TURNING, SLOWEST, CLEARANCE, AWAY)
     settings = repr((draw.__name__, level, seed, numbers, start))
     speeds = repr([mount.arm.speed.tolist() for mount in scene.mounts.values()])
-    table = cached("paths", lambda: _draw(scene, draw, level, seed, start), settings, speeds, scene.fingerprint)
+    table = cached("paths", lambda: _draw(scene, draw, level, seed, start, rows), settings, speeds, scene.fingerprint)
     nq = scene.model.nq
     paths = table[:, nq:].reshape(len(table), SEGMENTS + 3, -1, 3)
     return {"paths": paths} if start == "home" else {"paths": paths, "postures": table[:, :nq]}
 
 
-def _draw(scene: Scene, draw: Draw, level: Level, seed: int, start: str) -> np.ndarray:
-    """Return postures and paths of `path_table` side by side, [ROWS, nq + control points]."""
+def _draw(scene: Scene, draw: Draw, level: Level, seed: int, start: str, rows: int) -> np.ndarray:
+    """Return postures and paths of `path_table` side by side, [rows, nq + control points]."""
     rng, mounts = np.random.default_rng(seed), scene.mounts
 
     def batch(only_crossing: bool) -> tuple[np.ndarray, np.ndarray]:
@@ -171,7 +176,7 @@ def _draw(scene: Scene, draw: Draw, level: Level, seed: int, start: str) -> np.n
         flat = table.reshape(len(table), (SEGMENTS + 3) * len(mounts) * 3)  # there may be no row
         return np.concatenate([scene.full_qpos(begin), flat], -1)[fine], cross[fine]
 
-    return choose(scene, batch, ROWS, level.crossing if len(mounts) > 1 else 0.0)
+    return choose(scene, batch, rows, level.crossing if len(mounts) > 1 else 0.0)
 
 
 def _begin(rng: np.random.Generator, arm: Arm, count: int, start: str) -> np.ndarray:

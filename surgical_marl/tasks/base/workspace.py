@@ -18,6 +18,8 @@ from surgical_marl.robots.inverse_kinematics import inverse_kinematics
 from surgical_marl.scenes.scene import Scene
 
 TABLE_SIZE = 4096
+MANY_STARTS = 32768
+"""Rows of a table of starts to learn from: of `TABLE_SIZE` a policy learns to know the rows instead of the way."""
 CLEARANCE = 0.01
 """Least distance between arms on the way to their targets, m."""
 PATH_POINTS = 8
@@ -55,7 +57,9 @@ def target_table(scene: Scene, spread: float, crossing: float = 0.0, seed: int =
     return cached("targets", lambda: _draw(scene, spread, crossing, seed), settings, scene.fingerprint)
 
 
-def start_table(scene: Scene, spread: float, seed: int = 0) -> tuple[dict[str, np.ndarray], np.ndarray]:
+def start_table(
+    scene: Scene, spread: float, seed: int = 0, rows: int = TABLE_SIZE
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Return postures to start from, and targets that all arms of a scene can reach from there.
 
     Targets are drawn as for `target_table`. From the posture at the targets every joint except the jaw is moved away by
@@ -65,16 +69,17 @@ def start_table(scene: Scene, spread: float, seed: int = 0) -> tuple[dict[str, n
     Args:
         spread: standard deviation of the targets in m, the same along each axis.
         seed: of the draws; the same seed gives the same table.
+        rows: how many; a longer table begins with the rows of a shorter one.
 
     Returns:
-        Joint positions of each agent at the start and at its target, [2, TABLE_SIZE, n], and targets [TABLE_SIZE, arms,
-        3] in each arm's base frame, m. Kept on disk by content.
+        Joint positions of each agent at the start and at its target, [2, rows, n], and targets [rows, arms, 3] in each
+        arm's base frame, m. Kept on disk by content.
 
     Raises:
         ValueError: fewer than one draw in a hundred can be kept.
     """
-    settings = repr([spread, seed, *(mount.arm.speed.tolist() for mount in scene.mounts.values())])
-    table = cached("starts", lambda: _draw_starts(scene, spread, seed), settings, scene.fingerprint)
+    settings = repr([rows, spread, seed, *(mount.arm.speed.tolist() for mount in scene.mounts.values())])
+    table = cached("starts", lambda: _draw_starts(scene, spread, seed, rows), settings, scene.fingerprint)
     nq = scene.model.nq
     ends = np.stack([table[:, :nq], table[:, nq : 2 * nq]])
     ways = {agent: ends[..., scene.qpos_index(agent)] for agent in scene.agents}
@@ -136,8 +141,8 @@ def _draw(scene: Scene, spread: float, crossing: float, seed: int) -> np.ndarray
     return choose(scene, batch, TABLE_SIZE, crossing)
 
 
-def _draw_starts(scene: Scene, spread: float, seed: int) -> np.ndarray:
-    """Return postures and targets of `start_table` side by side, [TABLE_SIZE, 2 nq + 3 arms]."""
+def _draw_starts(scene: Scene, spread: float, seed: int, rows: int) -> np.ndarray:
+    """Return postures and targets of `start_table` side by side, [rows, 2 nq + 3 arms]."""
     rng = np.random.default_rng(seed)
 
     def batch(_: bool) -> tuple[np.ndarray, np.ndarray]:
@@ -145,14 +150,15 @@ def _draw_starts(scene: Scene, spread: float, seed: int) -> np.ndarray:
         targets += [mount.workspace for mount in scene.mounts.values()]
         goals, good = _reach(scene, targets, np.inf)
         starts = {agent: _away(rng, mount.arm, goals[agent]) for agent, mount in scene.mounts.items()}
+        left = np.flatnonzero(good)
         for share in np.linspace(0.0, 1.0, PATH_POINTS + 1):
-            way = {agent: (1 - share) * starts[agent] + share * q for agent, q in goals.items()}
-            good &= (scene.clearance(way) > CLEARANCE) & (scene.clearance(way, within=True) > 0)
+            way = {agent: (1 - share) * starts[agent][left] + share * q[left] for agent, q in goals.items()}
+            left = left[(scene.clearance(way) > CLEARANCE) & (scene.clearance(way, within=True) > 0)]
         ends = scene.full_qpos(starts), scene.full_qpos(goals)
-        rows = np.concatenate([*ends, targets.reshape(len(targets), -1)], -1)[good]
-        return rows, np.zeros(len(rows), bool)
+        found = np.concatenate([*ends, targets.reshape(len(targets), -1)], -1)[left]
+        return found, np.zeros(len(found), bool)
 
-    return choose(scene, batch, TABLE_SIZE, 0.0)
+    return choose(scene, batch, rows, 0.0)
 
 
 def _away(rng: np.random.Generator, arm: Arm, q: np.ndarray) -> np.ndarray:
