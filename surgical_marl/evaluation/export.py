@@ -127,7 +127,8 @@ def _fill(folder: Path, run: Path, settings: Settings, evaluation: dict[str, Any
         write_onnx(folder / f"{name}{SUFFIX}", model, layout.pictures[name])
     for name in (CONFIG, METRICS):
         shutil.copyfile(run / name, folder / name)
-    (folder / EVALUATION).write_text(json.dumps(evaluation, indent=1) + "\n")
+    # Without spaces: most of it is numbers of each episode, and spaces and line breaks would be a third of it.
+    (folder / EVALUATION).write_text(json.dumps(evaluation, separators=(",", ":")) + "\n")
     draw_curve(folder, f"{settings.task} in {settings.scene}, {settings.algo}, seed {settings.seed}")
     print("recording a clip", file=sys.stderr)
     try:
