@@ -4,7 +4,6 @@ from __future__ import annotations
 
 # Only light imports up here: caches are looked up when what uses them is imported.
 import contextlib
-import importlib.util
 import math
 import os
 import tempfile
@@ -95,12 +94,10 @@ def _face(arguments: Namespace) -> int:
 
 
 def _view(arguments: Namespace) -> int:
-    if importlib.util.find_spec("viser") is None:
-        from surgical_marl.view.browser.gate import NEEDED
-
-        raise ValueError(NEEDED)
     from surgical_marl.bench.page import run
+    from surgical_marl.view.browser.gate import check_viser
 
+    check_viser()
     print(run(arguments.task, arguments.scene, arguments.json))
     return 0
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 # Only light imports here, as in main.py.
 import argparse
-import importlib.util
 import os
 import sys
 from dataclasses import replace
@@ -86,10 +85,9 @@ def _view(arguments: argparse.Namespace) -> None:
 def _open(arguments: argparse.Namespace) -> Any:
     """Return the viewer that is asked for."""
     settings, who = _settings(arguments)
-    from surgical_marl.view.browser.gate import NEEDED, check_port
+    from surgical_marl.view.browser.gate import check_port, check_viser
 
-    if importlib.util.find_spec("viser") is None:  # this and the port are looked at before anything is compiled
-        raise ValueError(NEEDED)
+    check_viser()  # this and the port are looked at before anything is compiled
     check_port(arguments.port)
 
     from surgical_marl.runs.folder import check_writable

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import contextlib
 import hmac
+import importlib.util
 import inspect
 import io
 import secrets
@@ -22,7 +23,12 @@ from collections.abc import Iterator
 from typing import Any
 
 HOST = "127.0.0.1"
-NEEDED = "the viewer needs the package viser: pip install 'surgical-marl[view]'"
+
+
+def check_viser() -> None:
+    """Raise ValueError if viser is not installed."""
+    if importlib.util.find_spec("viser") is None:
+        raise ValueError("the viewer needs the package viser: pip install 'surgical-marl[view]'")
 
 
 def open_server(port: int) -> tuple[Any, str]:
@@ -31,10 +37,9 @@ def open_server(port: int) -> tuple[Any, str]:
     Raises:
         ValueError: viser is not installed, or the port is taken.
     """
-    try:
-        import viser
-    except ImportError:
-        raise ValueError(NEEDED) from None
+    check_viser()
+    import viser
+
     token = secrets.token_urlsafe(24)
     listener = _bind(port)
     try:
