@@ -31,9 +31,9 @@ class Left(NamedTuple):
     half: Array
     """Forces left over on objects, divided by the Cholesky factor of how these fall, [k, 6]."""
     wide: Array
-    """How forces on objects fall with the acceleration of joints, likewise, [k, a, 6, m]."""
+    """How forces on objects fall with the acceleration of joints, likewise: see `Eliminated`. Only read where touched."""
     touched: Array
-    """Which objects touch which arms, [k, a]."""
+    """Which objects touch which arms, or move them by other objects, [k, a]."""
 
 
 class Arms:
@@ -60,9 +60,10 @@ class Arms:
             return (total[0] + whole[:, None] * jacobian, total[1] + pressed * jacobian), None
 
         def subtract(total: tuple[Array, Array], row: Any) -> tuple[tuple[Array, Array], None]:
-            half, each, touched = row
+            i, half, touched = row
 
             def less(total: tuple[Array, Array]) -> tuple[Array, Array]:
+                each = jnp.where(touched[:, None, None], left.wide[len(there) * i + np.arange(len(there))], 0.0)
                 wide = jnp.concatenate([of_arm[:, own] for of_arm, own in zip(each, there, strict=True)], 1)
                 return total[0] - wide.T @ wide, total[1] - wide.T @ half
 
@@ -72,7 +73,7 @@ class Arms:
         if len(problem.between.low):
             with_rows = lambda total: jax.lax.scan(press, total, problem.between)[0]  # noqa: E731
             total = jax.lax.cond(problem.overlap, with_rows, lambda total: total, total)
-        (stiff, force), _ = jax.lax.scan(subtract, total, (left.half, left.wide, left.touched))
+        (stiff, force), _ = jax.lax.scan(subtract, total, (jnp.arange(len(left.half)), left.half, left.touched))
         found, rows = _way(stiff, force, rows_of(JointRows(*map(flat, problem.joints))), start), np.cumsum(there.sum(1))
         ways = [
             jnp.zeros(len(own)).at[own].set(way) for own, way in zip(there, jnp.split(found, rows[:-1]), strict=True)
@@ -86,12 +87,16 @@ class Arms:
             arm, mass, smooth, joints, start, stiff, force = row
 
             def subtract(total: tuple[Array, Array], of_object: Any) -> tuple[tuple[Array, Array], None]:
-                half, wide, touched = of_object
-                less = lambda total: (total[0] - wide[arm].T @ wide[arm], total[1] - wide[arm].T @ half)  # noqa: E731
+                i, half, touched = of_object
+
+                def less(total: tuple[Array, Array]) -> tuple[Array, Array]:
+                    wide = left.wide[len(self._there) * i + arm]
+                    return total[0] - wide.T @ wide, total[1] - wide.T @ half
+
                 return jax.lax.cond(touched[arm], less, lambda total: total, total), None
 
             total = (mass + stiff)[self._places], smooth + force - mass[self._places] @ start
-            (stiff, force), _ = jax.lax.scan(subtract, total, (left.half, left.wide, left.touched))
+            (stiff, force), _ = jax.lax.scan(subtract, total, (jnp.arange(len(left.half)), left.half, left.touched))
             return _way(stiff, force, rows_of(joints), start)
 
         arms = jnp.arange(len(self._there))

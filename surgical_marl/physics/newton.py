@@ -57,7 +57,9 @@ class _Local(NamedTuple):
     cross: Array
     """Of objects with each other: see `elimination.Blocks`."""
     coupling: Array
-    """[k, a, 6, m]"""
+    """Of object o and arm i in row a o + i, [(k + 1) a, 6, m]; nothing where they were not met."""
+    met: Array
+    """Which of them were met, [(k + 1) a] bool."""
 
 
 _WHOLE = packed(6)
@@ -162,7 +164,8 @@ class Newton:
             _with_none(inertia),
             _with_none(problem.masses[:, *np.tril_indices(6)]),
             jax.lax.cond(self._linked(problem), jnp.zeros_like, absent, jnp.zeros(36 * k * k if k > 1 else 0)),
-            jnp.zeros((k + 1, a, 6, m)),
+            absent(jax.ShapeDtypeStruct(((k + 1) * a, 6, m), jnp.float32)),
+            jnp.zeros((k + 1) * a, bool),
         )
 
         def one(n: Array, sums: tuple[_Local, Pressed]) -> tuple[_Local, Pressed]:
@@ -172,7 +175,7 @@ class Newton:
 
         local, pressed = jax.lax.fori_loop(0, problem.total, one, (none, pressed))
         cut = lambda each: each[:k]  # noqa: E731
-        local = local._replace(force=cut(local.force), object=cut(local.object), coupling=cut(local.coupling))
+        local = local._replace(force=cut(local.force), object=cut(local.object))
         return local, pressed
 
     def _add(self, local: _Local, contact: Contact, felt: Forces) -> _Local:
@@ -200,10 +203,13 @@ class Newton:
             arm, jacobian = contact.arm, contact.jacobian
             half = stiff[_WHOLE] @ jacobian
             first_joint, second_joint = np.tril_indices(jacobian.shape[1])
+            pair = len(self._dofs) * first + arm
+            more = lambda: local.coupling[pair] + half  # noqa: E731
             return local._replace(
                 arm_force=add(local.arm_force, arm, jacobian.T @ pull),
                 arm=add(local.arm, arm, jnp.sum(jacobian[:, first_joint] * half[:, second_joint], 0)),
-                coupling=add(local.coupling, (first, arm), half),
+                coupling=put(local.coupling, pair, jax.lax.cond(local.met[pair], more, lambda: half)),
+                met=put(local.met, pair, True),
             )
 
         return jax.lax.cond(contact.arm < len(self._dofs), on_arm, lambda local: local, local)
@@ -218,7 +224,7 @@ class Newton:
         touched, pressing = self._touched(problem), pressed.normal > 0
         linked = self._linked(problem, pressing)
         blocks = elimination.Blocks(local.object, local.cross)
-        gone = elimination.eliminate(blocks, local.force, local.coupling, touched.any(1), linked)
+        gone = elimination.eliminate(blocks, local.force, local.coupling, touched, linked)
         found = here.arms
         if len(self._dofs):
             on = touched | (linked & touched.any(0))  # what an object touches moves those that it touches
@@ -227,7 +233,7 @@ class Newton:
             each = lambda left: self._arms.each(problem, here.arms, left)  # noqa: E731
             together = lambda left: self._arms.together(problem, here.arms, left)  # noqa: E731
             found = jax.lax.cond(joined, together, each, left) if len(self._dofs) > 1 else each(left)
-        return Point(found, elimination.ways(gone, found, touched.any(1), linked))
+        return Point(found, elimination.ways(gone, found, touched, linked))
 
     def _linked(self, problem: Problem, pressing: Any = True) -> Array:
         """Return whether any contact joins two objects, [], of those that are `pressing`, [s]."""
