@@ -26,6 +26,8 @@ class Left(NamedTuple):
 
     stiff: Array
     """How forces of contacts fall with the acceleration of joints, lower halves, [a, m (m + 1) / 2]."""
+    on_arm: Array
+    """Which arms have contacts, [a]: `stiff` is nothing for others."""
     force: Array
     """Forces of contacts, [a, m]."""
     half: Array
@@ -50,7 +52,8 @@ class Arms:
         def flat(each: Array) -> Array:
             return jnp.concatenate([row[own] for row, own in zip(each, there, strict=True)])
 
-        stiff, force = self._dense(problem.mass + left.stiff), flat(problem.smooth + left.force)
+        stiff = self._dense(problem.mass + jnp.where(left.on_arm[:, None], left.stiff, 0.0))
+        force = flat(problem.smooth + left.force)
         start, mass = flat(here), self._dense(problem.mass)
 
         def press(total: tuple[Array, Array], row: Rows) -> tuple[tuple[Array, Array], None]:
@@ -84,7 +87,7 @@ class Arms:
         """Return the ways [a, m] of arms of which no two are joined: one problem after the other."""
 
         def one(row: Any) -> Array:
-            arm, mass, smooth, joints, start, stiff, force = row
+            arm, mass, smooth, joints, start, on_arm, stiff, force = row
 
             def subtract(total: tuple[Array, Array], of_object: Any) -> tuple[tuple[Array, Array], None]:
                 i, half, touched = of_object
@@ -95,12 +98,13 @@ class Arms:
 
                 return jax.lax.cond(touched[arm], less, lambda total: total, total), None
 
-            total = (mass + stiff)[self._places], smooth + force - mass[self._places] @ start
+            whole = jax.lax.cond(on_arm, lambda: mass + stiff, lambda: mass)
+            total = whole[self._places], smooth + force - mass[self._places] @ start
             (stiff, force), _ = jax.lax.scan(subtract, total, (jnp.arange(len(left.half)), left.half, left.touched))
             return _way(stiff, force, rows_of(joints), start)
 
         arms = jnp.arange(len(self._there))
-        rows = arms, problem.mass, problem.smooth, problem.joints, here, left.stiff, left.force
+        rows = arms, problem.mass, problem.smooth, problem.joints, here, left.on_arm, left.stiff, left.force
         found: Array = jax.lax.map(one, rows)
         return found
 
