@@ -120,3 +120,11 @@ def test_what_is_refused(runs: list[str], capsys: pytest.CaptureFixture[str]) ->
         out, err = capsys.readouterr()
         lines = [line for line in err.splitlines() if line.startswith("surgical-marl: ")]
         assert not out and len(lines) == 1 and sentence in lines[0]
+
+
+def test_a_partner_is_refused_before_anything_is_compiled(runs: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """For a handover that took minutes, after which one sentence said that the partner was of another task."""
+    monkeypatch.setattr(command, "make_env", lambda *_: pytest.fail("an environment was made"))
+    for partner, words in (({"psm_7": "frozen"}, "unknown role 'psm_7'"), ({"psm_1": "track-bimanual_psm"}, "of task")):
+        with pytest.raises(ValueError, match=words):
+            command.play_all([runs[0]], {}, 4, 0, partner)

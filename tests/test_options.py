@@ -15,7 +15,7 @@ from surgical_marl import BatchedEnv
 from surgical_marl.envs.env import Env
 from surgical_marl.scenes.load import load_scene
 from surgical_marl.tasks.base.options import Options, make_options
-from surgical_marl.tasks.base.workspace import start_table
+from surgical_marl.tasks.base.workspace import PATH_POINTS, _stay_apart, start_table
 from surgical_marl.vision.endoscope import Endoscope
 
 
@@ -110,6 +110,25 @@ def test_more_starts_are_drawn_to_learn_from_and_those_of_evaluations_stay() -> 
     assert np.allclose(tables["training"]["targets"][:100], targets, atol=1e-6)
     away = np.concatenate([way[0] - way[1] for way in ways.values()], -1)
     assert len(np.unique(away.round(6), axis=0)) == 100
+
+
+def test_arms_that_meet_between_two_points_of_a_path_are_seen_to_meet() -> None:
+    """Of 4,096 random starts of two STARs 27 had a straight way on which they met, by up to 46 mm."""
+    scene = load_scene("bimanual_star")
+    starts, goals = (
+        {agent: np.tile(mount.arm.home, (2, 1)) for agent, mount in scene.mounts.items()} for _ in range(2)
+    )
+    for ends, second in ((starts, 0.8), (goals, -1.4)):
+        ends["star_0"][0, 0], ends["star_1"][0, 1] = -0.1, second
+    goals["star_0"][1, 4] += 0.2
+
+    def least(points: int) -> np.ndarray:
+        ways = [{a: (1 - s) * q + s * goals[a] for a, q in starts.items()} for s in np.linspace(0, 1, points + 1)]
+        found: np.ndarray = np.min([scene.clearance(way) for way in ways], 0)
+        return found
+
+    assert (least(PATH_POINTS) > 0.01).all() and least(80)[0] < 0 < least(80)[1]
+    assert _stay_apart(scene, starts, goals, np.arange(2)).tolist() == [1]
 
 
 def test_both_engines_begin_at_the_same_postures() -> None:

@@ -107,6 +107,12 @@ def test_a_start_has_settings_of_its_own(reach: Callable[[str], None]) -> None:
     assert asked("start=random") == (64, 3, 0.9)
     assert asked("start=random", "device=cuda") == (256, 3, 0.9)
     assert asked("start=random", "num_envs=5") == (5, 3, 0.9)
+    reach("starts: {random: {num_envs: 64}}\nscenes: {psm: {num_envs: 16, starts: {random: {iterations: 5}}}}\n")
+    assert asked() == (16, 500, 0.99)
+    assert asked("start=random") == (64, 5, 0.99)
+    reach("scenes: {psm: {starts: {random: {speed: 1}}}}\n")
+    with pytest.raises(ValueError, match="unknown setting 'speed'"):
+        asked("start=random")
 
 
 def test_episodes_of_training_may_be_shorter(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -132,7 +132,7 @@ def results() -> str:
         times = [card.seconds for card in usual]
         yield [
             f"{len(usual)} policies, one for each task without objects on each scene",
-            f"{min(times):.0f} to {max(times):.0f} s each on an H200 that up to 15 others share",
+            f"{min(times):.0f} to {max(times):.0f} s each on an H200 or H100 that up to 15 others share",
             f"median error of the worst arm at most {worst:.2f} mm; {pictures} mm where pictures are matched",
         ]
         for card in without:

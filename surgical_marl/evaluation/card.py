@@ -72,7 +72,8 @@ def table() -> str:
 def _row(folder: Path) -> tuple[str, ...]:
     result = read_json(folder / EVALUATION)
     also = result.get("also", {})
-    seen, elsewhere = also.get("training goals"), also.get("random starts", {})
+    seen = also.get("training goals")
+    elsewhere = result if result["start"] == "random" else also.get("random starts", {})
     last, origin = _training(folder), read_origin(folder)["origin"]
     return (
         as_link(folder.name),

@@ -14,7 +14,7 @@ from surgical_marl.evaluation.evaluate import MAX_BATCH, Played, difference, pla
 from surgical_marl.evaluation.report import ABOUT, format_table, write_csv
 from surgical_marl.files import write_atomic
 from surgical_marl.policies.policy import load_policy
-from surgical_marl.policies.team import Team
+from surgical_marl.policies.team import Team, check_partners
 from surgical_marl.runs.environment import make_env
 from surgical_marl.runs.folder import read_metrics, read_settings
 from surgical_marl.untrusted.files import MAX_JSON, check_file, read_json
@@ -47,7 +47,9 @@ def play_all(
     Raises:
         ValueError: something is unknown, or does not fit together.
     """
-    env = make_env(common_settings(policies, asked), min(episodes, MAX_BATCH))
+    settings = common_settings(policies, asked)
+    check_partners(partners or {}, settings)
+    env = make_env(settings, min(episodes, MAX_BATCH))
     played = {}
     for policy in policies:
         acting = Team(env, find_policy(policy), partners or {})

@@ -96,20 +96,26 @@ def evaluate_again(folder: Path) -> None:
     before = read_json(path)
     (played,) = play_all([str(folder)], {}, EPISODES, SEED).values()
     found = {"policy": folder.name, **summarise([played]), "seeds": before["seeds"], "also": _also(str(folder))}
-    write_atomic(path, lambda part: part.write_text(json.dumps(found, indent=1) + "\n"))
+    write_atomic(path, lambda part: part.write_text(_compact(found)))
     write_atomic(folder / CARD, lambda part: part.write_text(card(folder, folder.name)))
+
+
+def _compact(evaluation: dict[str, Any]) -> str:
+    """Return it as JSON without spaces: they and line breaks would be a third of it."""
+    return json.dumps(evaluation, separators=(",", ":")) + "\n"
 
 
 def _also(run: str) -> dict[str, Any]:
     """Evaluate the same weights on other goals and starts than those of the standard set.
 
-    The results are named after what differs: "training goals", and "random starts" where the task has them.
+    The results are named after what differs: "training goals", and "random starts" or "home starts" where the task has
+    starts that are not those of the run.
     """
     asked = {"training goals": {"goals": "training"}}
     settings = read_settings(find("policies", run))
     task = TASKS.load(settings.task)
-    if "random" in task.starts and not getattr(task.levels[settings.difficulty], "own_starts", False):
-        asked["random starts"] = {"start": "random"}
+    if not getattr(task.levels[settings.difficulty], "own_starts", False):
+        asked |= {f"{start} starts": {"start": start} for start in task.starts if start != settings.start}
     return {name: summarise([play_all([run], other, EPISODES, SEED)[run]]) for name, other in asked.items()}
 
 
@@ -127,8 +133,7 @@ def _fill(folder: Path, run: Path, settings: Settings, evaluation: dict[str, Any
         write_onnx(folder / f"{name}{SUFFIX}", model, layout.pictures[name])
     for name in (CONFIG, METRICS):
         shutil.copyfile(run / name, folder / name)
-    # Without spaces: most of it is numbers of each episode, and spaces and line breaks would be a third of it.
-    (folder / EVALUATION).write_text(json.dumps(evaluation, separators=(",", ":")) + "\n")
+    (folder / EVALUATION).write_text(_compact(evaluation))
     draw_curve(folder, f"{settings.task} in {settings.scene}, {settings.algo}, seed {settings.seed}")
     print("recording a clip", file=sys.stderr)
     try:

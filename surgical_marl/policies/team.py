@@ -6,7 +6,7 @@ actions = policy(observations)
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,10 +19,14 @@ from surgical_marl.policies.oracle import oracle
 from surgical_marl.policies.policy import load_policy
 from surgical_marl.policies.teammates import Teammates
 from surgical_marl.runs.folder import find_run, read_settings
+from surgical_marl.scenes.load import load_scene
 
 if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv
+    from surgical_marl.runs.settings import Settings
 
+SAME = ("task", "scene", "control", "knowledge", "messages")
+"""Settings that a partner has in common with the environment that it acts in."""
 DELAY = 0.5
 """Time for which a "delayed" partner keeps still at the start of an episode, s."""
 
@@ -41,9 +45,8 @@ class Team:
     """
 
     def __init__(self, env: BatchedEnv, name: str | Path, partners: Mapping[str, str]) -> None:
-        for agent, who in partners.items():
-            if agent not in env.agents:
-                raise unknown("role", agent, env.agents)
+        _check_roles(partners, env.agents)
+        for who in partners.values():
             check_fits(who, env)
         self._env = env
         self._late = [agent for agent, who in partners.items() if who == "delayed"]
@@ -64,19 +67,36 @@ class Team:
         self._mates.forget(ended)
 
 
+def check_partners(partners: Mapping[str, str], settings: Settings) -> None:
+    """Raise ValueError as `Team` does, before an environment of these settings is made, which takes minutes."""
+    _check_roles(partners, load_scene(settings.scene).agents)
+    for who in partners.values():
+        _check_same(who, {key: getattr(settings, key) for key in SAME})
+
+
 def check_fits(who: str, env: BatchedEnv) -> None:
     """Raise ValueError if a policy was trained for another environment than this one.
 
     Task, scene, control, knowledge and the length of messages must be the same.
     """
+    asked = env.env.options
+    own = env.task_name, env.scene.name, env.control, asked.knowledge, asked.messages
+    _check_same(who, dict(zip(SAME, own, strict=True)))
+
+
+def _check_roles(partners: Mapping[str, str], agents: Sequence[str]) -> None:
+    for agent in partners:
+        if agent not in agents:
+            raise unknown("role", agent, agents)
+
+
+def _check_same(who: str, own: Mapping[str, Any]) -> None:
     if who in (*PARTNERS, *BASELINES):
         return
     settings = read_settings(find_run(who))
-    asked = env.env.options
-    own = {"task": env.task_name, "scene": env.scene.name, "control": env.control,
-           "knowledge": asked.knowledge, "messages": asked.messages}  # fmt: skip
-    theirs = {"task": settings.task, "scene": Path(settings.scene).stem, "control": settings.control,
-              "knowledge": settings.knowledge, "messages": settings.messages}  # fmt: skip
     for key, value in own.items():
-        if theirs[key] != value:
-            raise ValueError(f"{who} is of {key} {theirs[key]!r}, not {value!r}: a partner must be of the same")
+        theirs = getattr(settings, key)
+        if key == "scene":  # one by its file is known by its name
+            theirs, value = Path(theirs).stem, Path(value).stem
+        if theirs != value:
+            raise ValueError(f"{who} is of {key} {theirs!r}, not {value!r}: a partner must be of the same")

@@ -191,9 +191,10 @@ def load_config(task: str, scene: str, overrides: Iterable[str] = ()) -> Setting
     3. the section of the scene under `scenes` in that file
     4. the section of the difficulty under `difficulties` in the scene's section
     5. the section of where episodes start under `starts` in that file
-    6. the overrides
+    6. the section of where they start under `starts` in the scene's section
+    7. the overrides
 
-    On a GPU each of the first five is followed by the section `cuda` in it.
+    On a GPU each of the first six is followed by the section `cuda` in it.
 
     Args:
         task: a name of `list_tasks()`. Its file is the one of that name in `configs/`, if there is one.
@@ -210,15 +211,16 @@ def load_config(task: str, scene: str, overrides: Iterable[str] = ()) -> Setting
     scenes, difficulties, starts = (as_mapping(name, values.pop(name, None) or {}) for name in kinds)
     asked = _override(values, overrides)
     difficulty, start = str(asked.get("difficulty", "default")), str(asked.get("start", "home"))
-    level, here = f"difficulties.{difficulty}", f"scenes.{scene}"
+    level, place, here = f"difficulties.{difficulty}", f"starts.{start}", f"scenes.{scene}"
     own = dict(as_mapping(here, scenes.get(scene) or {}))
-    levels = as_mapping(f"{here}.difficulties", own.pop("difficulties", None) or {})
+    levels, places = (as_mapping(f"{here}.{name}", own.pop(name, None) or {}) for name in kinds[1:])
     parts = {
         "": values,
         level: difficulties.get(difficulty) or {},
         here: own,
         f"{here}.{level}": levels.get(difficulty) or {},
-        f"starts.{start}": starts.get(start) or {},
+        place: starts.get(start) or {},
+        f"{here}.{place}": places.get(start) or {},
     }
     layers, on_gpu = [], []
     for name, part in parts.items():

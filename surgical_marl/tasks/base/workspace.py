@@ -63,8 +63,8 @@ def start_table(
     """Return postures to start from, and targets that all arms of a scene can reach from there.
 
     Targets are drawn as for `target_table`. From the posture at the targets every joint except the jaw is moved away by
-    a uniform random distance, as far as its range and its speed in `TIME` allow. A draw is kept if the arms are apart,
-    and no arm touches itself, on the straight joint-space path between both.
+    a uniform random distance, as far as its range and its speed in `TIME` allow. A draw is kept if the arms are apart
+    all the way on the straight joint-space path between both, and no arm touches itself there.
 
     Args:
         spread: standard deviation of the targets in m, the same along each axis.
@@ -150,15 +150,60 @@ def _draw_starts(scene: Scene, spread: float, seed: int, rows: int) -> np.ndarra
         targets += [mount.workspace for mount in scene.mounts.values()]
         goals, good = _reach(scene, targets, np.inf)
         starts = {agent: _away(rng, mount.arm, goals[agent]) for agent, mount in scene.mounts.items()}
-        left = np.flatnonzero(good)
-        for share in np.linspace(0.0, 1.0, PATH_POINTS + 1):
-            way = {agent: (1 - share) * starts[agent][left] + share * q[left] for agent, q in goals.items()}
-            left = left[(scene.clearance(way) > CLEARANCE) & (scene.clearance(way, within=True) > 0)]
+        left = _stay_apart(scene, starts, goals, np.flatnonzero(good))
         ends = scene.full_qpos(starts), scene.full_qpos(goals)
         found = np.concatenate([*ends, targets.reshape(len(targets), -1)], -1)[left]
         return found, np.zeros(len(found), bool)
 
     return choose(scene, batch, rows, 0.0)
+
+
+def _stay_apart(
+    scene: Scene, starts: dict[str, np.ndarray], goals: dict[str, np.ndarray], rows: np.ndarray
+) -> np.ndarray:
+    """Return those of some rows in which arms stay apart, and do not touch themselves, on straight paths of joints.
+
+    Paths are looked at in ever smaller steps, until no two tips come as near to each other between two points as the
+    arms have been: with `PATH_POINTS` alone, arms as large as STARs move by 0.2 m in between and may meet there.
+
+    Args:
+        scene: the scene.
+        starts: joint positions [N, n] of each agent.
+        goals: likewise, at the paths' ends.
+        rows: which of N to look at.
+    """
+    least = np.full(len(next(iter(goals.values()))), np.inf)
+    shares, pieces = np.linspace(0.0, 1.0, PATH_POINTS + 1), PATH_POINTS
+    kept, step = [], _farthest(scene, starts, goals, shares)
+    while len(rows):
+        for share in shares:
+            way = _part_way(starts, goals, share, rows)
+            least[rows] = np.minimum(least[rows], scene.clearance(way))
+            rows = rows[(least[rows] > CLEARANCE) & (scene.clearance(way, within=True) > 0)]
+        sure = least[rows] >= step[rows] / 2  # between two points an arm is at most half a step from one of them
+        kept.append(rows[sure])
+        rows, step, shares, pieces = rows[~sure], step / 2, (np.arange(pieces) + 0.5) / pieces, 2 * pieces
+    return np.sort(np.concatenate(kept)) if kept else rows
+
+
+def _farthest(
+    scene: Scene, starts: dict[str, np.ndarray], goals: dict[str, np.ndarray], shares: np.ndarray
+) -> np.ndarray:
+    """Return the farthest ways of all tips from one point of the paths to the next, added up, [N], m."""
+    total = np.zeros(len(next(iter(goals.values()))))
+    for agent, mount in scene.mounts.items():
+        ends = {agent: starts[agent]}, {agent: goals[agent]}
+        ways = np.stack([_part_way(*ends, share, np.arange(len(total)))[agent] for share in shares])
+        tips = mount.arm.forward_kinematics(ways)[..., :3, 3]
+        total += np.linalg.norm(np.diff(tips, axis=0), axis=-1).max(0)
+    return total
+
+
+def _part_way(
+    starts: dict[str, np.ndarray], goals: dict[str, np.ndarray], share: float, rows: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Return joint positions [rows, n] of each agent where it has gone a share of its path."""
+    return {agent: (1 - share) * starts[agent][rows] + share * goal[rows] for agent, goal in goals.items()}
 
 
 def _away(rng: np.random.Generator, arm: Arm, q: np.ndarray) -> np.ndarray:
