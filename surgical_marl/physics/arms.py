@@ -189,9 +189,5 @@ def _added(sums: tuple[Array, Array], rows: Rows, here: Array, way: Array, lengt
 
 
 def _way(stiff: Array, force: Array, rows: Rows, start: Array) -> Array:
-    """Return the way from an acceleration to the one at which these forces balance with those of joints.
-
-    `force` is what is left over at the start, but for those of joints.
-    """
-    ahead = rows._replace(reference=rows.reference - rows.jacobian @ start)
-    return solve(stiff, force, ahead, jnp.zeros_like(start), *ITERATIONS, steady=1)[0]
+    """Return the way from an acceleration to the one at which these forces balance with those of joints."""
+    return solve(stiff, stiff @ start + force, rows, start, *ITERATIONS, steady=1)[0] - start
