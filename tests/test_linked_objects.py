@@ -51,8 +51,9 @@ def test_objects_are_eliminated_as_from_a_dense_matrix(linked: list[tuple[int, i
         for (one, its), (other, others) in product(zip(pair, (left, -right), strict=True), repeat=2):
             blocks[one, other] += its @ others.T
     force, coupling = rng.standard_normal((OBJECTS, 6)), rng.standard_normal((OBJECTS, ARMS, 6, JOINTS))
-    coupled = np.array([True, False, True, True])
-    coupling[~coupled] = 0
+    touched = rng.random((OBJECTS, ARMS)) < 0.6
+    touched[0], touched[1] = True, False
+    coupling[~touched] = 0
     arms = rng.standard_normal((ARMS, JOINTS))
 
     dense = blocks.transpose(0, 2, 1, 3).reshape(size, size)
@@ -60,18 +61,23 @@ def test_objects_are_eliminated_as_from_a_dense_matrix(linked: list[tuple[int, i
     ways = np.linalg.solve(dense, force.ravel() - wide @ arms.ravel()).reshape(OBJECTS, 6)
     single = lambda array: jnp.asarray(array, jnp.float32)  # noqa: E731
 
-    def compared(found: elimination.Eliminated, back: Array) -> None:
+    def compared(found: elimination.Eliminated, back: Array, joined: bool) -> None:
         np.testing.assert_allclose(back, ways, rtol=2e-3, atol=2e-3)
-        half, divided = np.asarray(found.half).ravel(), np.moveaxis(np.asarray(found.wide), 2, 1).reshape(size, -1)
+        left = np.asarray(found.wide)[: OBJECTS * ARMS].reshape(OBJECTS, ARMS, 6, JOINTS)
+        if not joined:
+            left = np.where(touched[..., None, None], left, 0.0)
+        half, divided = np.asarray(found.half).ravel(), np.moveaxis(left, 2, 1).reshape(size, -1)
         np.testing.assert_allclose(divided.T @ half, wide.T @ np.linalg.solve(dense, force.ravel()), atol=5e-3)
         np.testing.assert_allclose(divided.T @ divided, wide.T @ np.linalg.solve(dense, wide), atol=5e-3)
 
     own = single(blocks[np.arange(OBJECTS), np.arange(OBJECTS)][:, *np.tril_indices(6)])
     cross = np.where(np.triu(np.ones((OBJECTS, OBJECTS)), 1)[..., None, None], blocks, np.nan)
-    given = elimination.Blocks(own, single(cross.ravel())), single(force), single(coupling), jnp.asarray(coupled)
+    met = np.full(((OBJECTS + 1) * ARMS, 6, JOINTS), np.nan)
+    met[: OBJECTS * ARMS][touched.ravel()] = coupling[touched]
+    given = elimination.Blocks(own, single(cross.ravel())), single(force), single(met), jnp.asarray(touched)
     for joined in {True, bool(linked)}:
         found = elimination.eliminate(*given, jnp.bool_(joined))
-        compared(found, elimination.ways(found, single(arms), given[3], jnp.bool_(joined)))
+        compared(found, elimination.ways(found, single(arms), given[3], jnp.bool_(joined)), joined)
 
 
 def test_the_curvature_between_two_bodies_is_how_the_force_on_one_falls_with_the_other_s_acceleration() -> None:

@@ -26,14 +26,16 @@ class Left(NamedTuple):
 
     stiff: Array
     """How forces of contacts fall with the acceleration of joints, lower halves, [a, m (m + 1) / 2]."""
+    on_arm: Array
+    """Which arms have contacts, [a]: `stiff` is nothing for others."""
     force: Array
     """Forces of contacts, [a, m]."""
     half: Array
     """Forces left over on objects, divided by the Cholesky factor of how these fall, [k, 6]."""
     wide: Array
-    """How forces on objects fall with the acceleration of joints, likewise, [k, a, 6, m]."""
+    """How forces on objects fall with the acceleration of joints, as in `Eliminated`. Only read where touched."""
     touched: Array
-    """Which objects touch which arms, [k, a]."""
+    """Which objects touch which arms, or move them by other objects, [k, a]."""
 
 
 class Arms:
@@ -41,30 +43,33 @@ class Arms:
 
     def __init__(self, dofs: np.ndarray, joints: int) -> None:
         self._there = dofs < joints
-        self._places = packed(dofs.shape[1])
+        self._places, self._all = packed(dofs.shape[1]), packed((dofs < joints).sum())
 
     def together(self, problem: Problem, here: Array, left: Left) -> Array:
         """Return the ways [a, m] from an acceleration [a, m] of arms that objects, or contacts of arms, join."""
-        there = self._there
+        there, (first, second) = self._there, np.tril_indices(len(self._all))
 
         def flat(each: Array) -> Array:
             return jnp.concatenate([row[own] for row, own in zip(each, there, strict=True)])
 
-        stiff, force = self._dense(problem.mass + left.stiff), flat(problem.smooth + left.force)
-        start, mass = flat(here), self._dense(problem.mass)
+        # lower halves: what a loop carries for both halves it would carry, and compute, twice
+        stiff = self._lower(problem.mass + jnp.where(left.on_arm[:, None], left.stiff, 0.0))
+        force = flat(problem.smooth + left.force)
+        start, mass = flat(here), self._lower(problem.mass)[self._all]
 
         def press(total: tuple[Array, Array], row: Rows) -> tuple[tuple[Array, Array], None]:
             jacobian = flat(row.jacobian)
             pressed = jnp.maximum(row.impedance * (row.reference - jacobian @ start), 0.0)
             whole = jnp.where(pressed > 0, row.impedance, 0.0) * jacobian
-            return (total[0] + whole[:, None] * jacobian, total[1] + pressed * jacobian), None
+            return (total[0] + whole[first] * jacobian[second], total[1] + pressed * jacobian), None
 
         def subtract(total: tuple[Array, Array], row: Any) -> tuple[tuple[Array, Array], None]:
-            half, each, touched = row
+            i, half, touched = row
 
             def less(total: tuple[Array, Array]) -> tuple[Array, Array]:
+                each = jnp.where(touched[:, None, None], left.wide[len(there) * i + np.arange(len(there))], 0.0)
                 wide = jnp.concatenate([of_arm[:, own] for of_arm, own in zip(each, there, strict=True)], 1)
-                return total[0] - wide.T @ wide, total[1] - wide.T @ half
+                return total[0] - jnp.sum(wide[:, first] * wide[:, second], 0), total[1] - wide.T @ half
 
             return jax.lax.cond(touched.any(), less, lambda total: total, total), None
 
@@ -72,8 +77,9 @@ class Arms:
         if len(problem.between.low):
             with_rows = lambda total: jax.lax.scan(press, total, problem.between)[0]  # noqa: E731
             total = jax.lax.cond(problem.overlap, with_rows, lambda total: total, total)
-        (stiff, force), _ = jax.lax.scan(subtract, total, (left.half, left.wide, left.touched))
-        found, rows = _way(stiff, force, rows_of(JointRows(*map(flat, problem.joints))), start), np.cumsum(there.sum(1))
+        (stiff, force), _ = jax.lax.scan(subtract, total, (jnp.arange(len(left.half)), left.half, left.touched))
+        joints = rows_of(JointRows(*map(flat, problem.joints)))
+        found, rows = _way(stiff[self._all], force, joints, start), np.cumsum(there.sum(1))
         ways = [
             jnp.zeros(len(own)).at[own].set(way) for own, way in zip(there, jnp.split(found, rows[:-1]), strict=True)
         ]
@@ -81,21 +87,27 @@ class Arms:
 
     def each(self, problem: Problem, here: Array, left: Left) -> Array:
         """Return the ways [a, m] of arms of which no two are joined: one problem after the other."""
+        first, second = np.tril_indices(len(self._places))
 
         def one(row: Any) -> Array:
-            arm, mass, smooth, joints, start, stiff, force = row
+            arm, mass, smooth, joints, start, on_arm, stiff, force = row
 
             def subtract(total: tuple[Array, Array], of_object: Any) -> tuple[tuple[Array, Array], None]:
-                half, wide, touched = of_object
-                less = lambda total: (total[0] - wide[arm].T @ wide[arm], total[1] - wide[arm].T @ half)  # noqa: E731
+                i, half, touched = of_object
+
+                def less(total: tuple[Array, Array]) -> tuple[Array, Array]:
+                    wide = left.wide[len(self._there) * i + arm]
+                    return total[0] - jnp.sum(wide[:, first] * wide[:, second], 0), total[1] - wide.T @ half
+
                 return jax.lax.cond(touched[arm], less, lambda total: total, total), None
 
-            total = (mass + stiff)[self._places], smooth + force - mass[self._places] @ start
-            (stiff, force), _ = jax.lax.scan(subtract, total, (left.half, left.wide, left.touched))
-            return _way(stiff, force, rows_of(joints), start)
+            whole = jax.lax.cond(on_arm, lambda: mass + stiff, lambda: mass)
+            total = whole, smooth + force - mass[self._places] @ start
+            (stiff, force), _ = jax.lax.scan(subtract, total, (jnp.arange(len(left.half)), left.half, left.touched))
+            return _way(stiff[self._places], force, rows_of(joints), start)
 
         arms = jnp.arange(len(self._there))
-        rows = arms, problem.mass, problem.smooth, problem.joints, here, left.stiff, left.force
+        rows = arms, problem.mass, problem.smooth, problem.joints, here, left.on_arm, left.stiff, left.force
         found: Array = jax.lax.map(one, rows)
         return found
 
@@ -153,13 +165,13 @@ class Arms:
         rows = _flat(problem.between)
         return row_forces(rows, here.ravel()) @ (rows.jacobian @ way.ravel())
 
-    def _dense(self, lower: Array) -> Array:
-        """Return one matrix [n, n] for all n joints that are there, of the lower halves of each arm's."""
+    def _lower(self, halves: Array) -> Array:
+        """Return the lower half of one matrix for all joints that are there, of the lower halves of each arm's."""
         sizes = self._there.sum(1)
-        whole, starts = jnp.zeros((sizes.sum(),) * 2), np.cumsum(sizes) - sizes
+        whole, starts = jnp.zeros(sizes.sum() * (sizes.sum() + 1) // 2), np.cumsum(sizes) - sizes
         for arm, own in enumerate(self._there):
-            places = starts[arm] + np.arange(sizes[arm])
-            whole = whole.at[np.ix_(places, places)].set(lower[arm][self._places[np.ix_(own, own)]])
+            (i, j), places = np.tril_indices(sizes[arm]), self._places[np.ix_(own, own)]
+            whole = whole.at[self._all[starts[arm] + i, starts[arm] + j]].set(halves[arm][places[i, j]])
         return whole
 
 

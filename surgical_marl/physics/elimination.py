@@ -10,7 +10,7 @@ from jax import Array
 from jax.lax.linalg import triangular_solve
 
 from surgical_marl.physics.factor import cholesky, packed
-from surgical_marl.physics.rows import absent
+from surgical_marl.physics.rows import absent, put
 
 
 class Eliminated(NamedTuple):
@@ -19,7 +19,8 @@ class Eliminated(NamedTuple):
     half: Array
     """Forces on objects, divided by the Cholesky factor of the objects' matrix, [k, 6]."""
     wide: Array
-    """How they fall with the acceleration of arms, likewise, [k, a, 6, m]."""
+    """How they fall with the acceleration of arms, likewise: that of object o with arm i is row a o + i,
+    [(k + 1) a, 6, m]. Nothing where they don't touch, unless objects touch each other, and for the object k."""
     factor: Array
     """Blocks on the factor's diagonal, lower, [k, 6, 6]: of objects that touch no other."""
     rows: Array
@@ -36,78 +37,84 @@ class Blocks(NamedTuple):
     """The block of objects i and j of each pair `i < j`, from 36 (k i + j) on; only read of objects that touch."""
 
 
-def eliminate(blocks: Blocks, force: Array, coupling: Array, coupled: Array, linked: Array) -> Eliminated:
+def eliminate(blocks: Blocks, force: Array, coupling: Array, touched: Array, linked: Array) -> Eliminated:
     """Return what is left of objects.
 
     Args:
         blocks: how forces fall with accelerations.
         force: forces on the objects, [k, 6].
-        coupling: how they fall with the acceleration of arms, [k, a, 6, m].
-        coupled: which objects touch an arm, [k].
+        coupling: how they fall with the acceleration of arms, [(k + 1) a, 6, m]: see `Eliminated.wide`. Only read where
+            an object touches an arm.
+        touched: which objects touch which arms, [k, a].
         linked: whether any objects touch each other, [].
     """
-    alone = lambda: apart(blocks.own, force, coupling, coupled)  # noqa: E731
+    alone = lambda coupling: apart(blocks.own, force, coupling, touched)  # noqa: E731
     if len(force) < 2:
-        return alone()
-    return jax.lax.cond(linked, lambda: touching(blocks, force, coupling), alone)
+        return alone(coupling)
+    return jax.lax.cond(linked, lambda coupling: touching(blocks, force, coupling, touched), alone, coupling)
 
 
-def ways(found: Eliminated, arms: Array, coupled: Array, linked: Array) -> Array:
+def ways(found: Eliminated, arms: Array, touched: Array, linked: Array) -> Array:
     """Return the ways [k, 6] of objects, by those of the arms' joints [a, m]; the rest as for `eliminate`."""
-    alone = lambda: ways_apart(found, arms, coupled)  # noqa: E731
-    if len(coupled) < 2:
+    alone = lambda: ways_apart(found, arms, touched)  # noqa: E731
+    if len(touched) < 2:
         return alone()
     return jax.lax.cond(linked, lambda: ways_touching(found, arms), alone)
 
 
-def apart(own: Array, force: Array, coupling: Array, coupled: Array) -> Eliminated:
-    """Return what is left of objects of which no two touch.
+def apart(own: Array, force: Array, coupling: Array, touched: Array) -> Eliminated:
+    """Return what is left of objects of which no two touch; arguments as for `eliminate`.
 
-    Args:
-        own: the lower half of each object's block, [k, 21].
-        force: forces on the objects, [k, 6].
-        coupling: how they fall with the acceleration of arms, [k, a, 6, m].
-        coupled: which objects touch an arm, [k].
+    `own` [k, 21] is the lower half of each object's block.
     """
+    (k, a), m = touched.shape, coupling.shape[2]
 
-    def one(row: Any) -> Any:
-        own, force, coupling, coupled = row
+    def one(wide: Array, row: Any) -> tuple[Array, tuple[Array, Array]]:
+        i, own, force, touched = row
         factor = cholesky(own[packed(6)])
-        wide = coupling
-        if coupling.size:
-            divided = lambda coupling: _on_arms(factor, coupling)  # noqa: E731
-            wide = jax.lax.cond(coupled, divided, jnp.zeros_like, coupling)
-        return _divided(factor, force), wide, factor
 
-    rows = absent(jax.ShapeDtypeStruct((_size(coupling) if len(own) > 1 else 0,), force.dtype))
-    half, wide, factor = jax.lax.map(one, (own, force, coupling, coupled))
+        def of_arm(wide: Array, arm: Array) -> tuple[Array, None]:
+            divided = lambda wide: put(wide, a * i + arm, _lower(factor, wide[a * i + arm]))  # noqa: E731
+            return jax.lax.cond(touched[arm], divided, lambda wide: wide, wide), None
+
+        if coupling.size:
+            wide = jax.lax.scan(of_arm, wide, jnp.arange(a))[0]
+        return wide, (_divided(factor, force), factor)
+
+    rows = absent(jax.ShapeDtypeStruct((_size(k, a, m) if k > 1 else 0,), force.dtype))
+    wide, (half, factor) = jax.lax.scan(one, coupling, (jnp.arange(k), own, force, touched))
     return Eliminated(half, wide, factor, rows)
 
 
-def ways_apart(found: Eliminated, arms: Array, coupled: Array) -> Array:
+def ways_apart(found: Eliminated, arms: Array, touched: Array) -> Array:
     """Return the ways [k, 6] of objects of which no two touch, by those of the arms' joints [a, m]."""
 
     def one(row: Any) -> Array:
-        half, wide, factor, coupled = row
-        less = lambda half: half - jnp.einsum("acm,am->c", wide, arms)  # noqa: E731
-        left = jax.lax.cond(coupled, less, lambda half: half, half) if len(arms) else half
+        i, half, factor, touched = row
+
+        def of_arm(left: Array, arm: Array) -> tuple[Array, None]:
+            less = lambda left: left - found.wide[len(arms) * i + arm] @ arms[arm]  # noqa: E731
+            return jax.lax.cond(touched[arm], less, lambda left: left, left), None
+
+        left = jax.lax.scan(of_arm, half, jnp.arange(len(arms)))[0] if len(arms) else half
         return _back(factor, left)
 
-    found_ways: Array = jax.lax.map(one, (found.half, found.wide, found.factor, coupled))
+    found_ways: Array = jax.lax.map(one, (jnp.arange(len(touched)), found.half, found.factor, touched))
     return found_ways
 
 
-def touching(blocks: Blocks, force: Array, coupling: Array) -> Eliminated:
+def touching(blocks: Blocks, force: Array, coupling: Array, touched: Array) -> Eliminated:
     """Return what is left of objects of which some touch each other. What is 0 costs little.
 
     A row of blocks is kept as columns of six: those of all objects, the force, and those of all arms. All rows are one
     array, [k * columns * 6], and what works on a column is in a loop: so the code is the same for any number of them.
     """
-    k, a, _, m = coupling.shape
-    count, width = jnp.arange(k), _size(coupling) // (6 * k)
+    (k, a), m = touched.shape, coupling.shape[2]
+    count, size = jnp.arange(k), _size(k, a, m)
+    width = size // (6 * k)
 
     def note(rows: Array, row: Any) -> tuple[Array, None]:
-        j, own, force, coupling = row
+        j, own, force, touched = row
 
         def other(rows: Array, i: Array) -> tuple[Array, None]:
             at = 36 * (k * jnp.minimum(i, j) + jnp.maximum(i, j))
@@ -116,8 +123,13 @@ def touching(blocks: Blocks, force: Array, coupling: Array) -> Eliminated:
             return _put(rows, j * width + 6 * i, block), None
 
         rows = jax.lax.scan(other, rows, count)[0]
-        columns = jnp.concatenate([force, jnp.moveaxis(coupling, 1, 2).ravel()])
-        return _put(rows, j * width + 6 * k, columns), None
+        rows = _put(rows, j * width + 6 * k, force)
+
+        def of_arm(rows: Array, arm: Array) -> tuple[Array, None]:
+            columns = jax.lax.cond(touched[arm], lambda: coupling[a * j + arm].T, lambda: jnp.zeros((m, 6)))
+            return _put(rows, j * width + 6 * k + 1 + arm * m, columns), None
+
+        return (jax.lax.scan(of_arm, rows, jnp.arange(a))[0] if a else rows), None
 
     def eliminate(rows: Array, j: Array) -> tuple[Array, None]:
         diagonal = j * (width + 6)
@@ -143,12 +155,16 @@ def touching(blocks: Blocks, force: Array, coupling: Array) -> Eliminated:
         rows = _put(rows, diagonal, factor)
         return jax.lax.scan(subtract, rows, count)[0], None
 
-    start = absent(jax.ShapeDtypeStruct((_size(coupling),), force.dtype))
-    rows = jax.lax.scan(note, start, (count, blocks.own, force, coupling))[0]
+    def leave(wide: Array, pair: Array) -> tuple[Array, None]:
+        at = pair // a * width + 6 * k + 1 + pair % a * m
+        return put(wide, pair, _columns(rows, at, m).T), None
+
+    start = absent(jax.ShapeDtypeStruct((size,), force.dtype))
+    rows = jax.lax.scan(note, start, (count, blocks.own, force, touched))[0]
     rows = jax.lax.scan(eliminate, rows, count)[0]
-    parts = rows.reshape(k, width, 6)
-    wide = jnp.moveaxis(parts[:, 6 * k + 1 :].reshape(k, a, m, 6), 2, 3)
-    return Eliminated(parts[:, 6 * k], wide, absent(jax.ShapeDtypeStruct((k, 6, 6), force.dtype)), rows)
+    wide = jax.lax.scan(leave, coupling, jnp.arange(k * a))[0] if a else coupling
+    half = jax.lax.map(lambda j: _columns(rows, j * width + 6 * k, 1)[0], count)
+    return Eliminated(half, wide, absent(jax.ShapeDtypeStruct((k, 6, 6), force.dtype)), rows)
 
 
 def ways_touching(found: Eliminated, arms: Array) -> Array:
@@ -168,9 +184,8 @@ def ways_touching(found: Eliminated, arms: Array) -> Array:
     return jax.lax.scan(one, all_, jnp.arange(k), reverse=True)[0][: 6 * k].reshape(k, 6)
 
 
-def _size(coupling: Array) -> int:
+def _size(k: int, a: int, m: int) -> int:
     """Return how many numbers the rows of `touching` are."""
-    k, a, _, m = coupling.shape
     return k * (6 * k + 1 + a * m) * 6
 
 
@@ -183,17 +198,13 @@ def _put(rows: Array, at: Array, columns: Array) -> Array:
     return jax.lax.dynamic_update_slice(rows, columns.ravel(), (6 * at,))
 
 
+def _lower(factor: Array, right: Array) -> Array:
+    return triangular_solve(factor, right, left_side=True, lower=True)
+
+
 def _divided(factor: Array, right: Array) -> Array:
-    return triangular_solve(factor, right[:, None], left_side=True, lower=True)[:, 0]
+    return _lower(factor, right[:, None])[:, 0]
 
 
 def _back(factor: Array, left: Array) -> Array:
     return triangular_solve(factor, left[:, None], left_side=True, lower=True, transpose_a=True)[:, 0]
-
-
-def _on_arms(factor: Array, coupling: Array) -> Array:
-    """Return what couples an object to arms [a, 6, m], divided by its factor."""
-    a, _, m = coupling.shape
-    wide = jnp.moveaxis(coupling, 0, 1).reshape(6, a * m)
-    wide = triangular_solve(factor, wide, left_side=True, lower=True)
-    return jnp.moveaxis(wide.reshape(6, a, m), 1, 0)

@@ -15,7 +15,7 @@ from surgical_marl.physics.newton import Newton
 from surgical_marl.physics.patches import AWAY, Patch
 from surgical_marl.physics.placed import Joints
 from surgical_marl.physics.problem import SLIPS, Contact, Pressed
-from surgical_marl.physics.rows import filled, put, row_of
+from surgical_marl.physics.rows import filled, picked, put, row_of
 from surgical_marl.physics.tables import Tables
 from surgical_marl.physics.touching import AHEAD, MARGIN, Slots
 
@@ -208,8 +208,7 @@ class Handling:
 
         def moved(_: None) -> Array:
             o = jnp.asarray(self.tables.first_object.astype(np.int32))[number]
-            frame = row_of(fingers, f)
-            position, quaternion, force = (x[o, f] for x in grips[:3])
+            frame, (position, quaternion, force, _) = picked(fingers, f), _of_finger(grips, o, f)
             was = frame.position + frame.axes @ position
             turned = product(at[1][o], conjugate(product(frame.quaternion, quaternion)))
             angle = 2 * turned[1:] * jnp.where(turned[0] < 0, -1.0, 1.0)
@@ -245,9 +244,9 @@ class Handling:
                 patch, contact, slip, forces = row_of((slots.patch, felt.contacts, felt.slip, pressed), n)
                 after = slip + contact.cone.along @ self._newton.twist(contact, *moves)
                 place = contact.first, f
-                own = grips._replace(**{name: getattr(grips, name)[place] for name in OF_FINGERS})
                 pose = at[0][contact.first], at[1][contact.first]
-                new = self._kept(patch, number, forces, after, row_of(fingers, f), pose, own)
+                own = _of_finger(grips, *place)
+                new = self._kept(patch, number, forces, after, picked(fingers, f), pose, own)
                 found = put(tuple(getattr(kept[0], name) for name in OF_FINGERS), place, new)
                 return kept[0]._replace(**dict(zip(OF_FINGERS, found, strict=True))), put(
                     kept[1], place, patch.frame[0]
@@ -260,26 +259,26 @@ class Handling:
 
     def _kept(
         self, patch: Patch, number: Array, forces: Pressed, after: Array, finger: Fingers, at: tuple[Array, Array],
-        grip: Grips,
+        grip: tuple[Array, Array, Array, Array],
     ) -> tuple[Array, Array, Array, Array]:  # fmt: skip
-        """Return what is kept for one finger and one object."""
-        place, axes, faces = finger
+        """Return what is kept for one finger and one object: `OF_FINGERS`, as in `grip`."""
+        (place, axes, faces), (position, quaternion, force, slid) = finger, grip
         slips = forces.sides >= SLIPS
         stretched = jnp.where(slips, -forces.friction / (SHEAR * jnp.asarray(self.tables.stiffness)[number]), after)
         excess = after - stretched
         # Kept as it is while nothing slips: rounding errors of a pose made anew in each step would add up.
         along, about = excess[:2] @ patch.frame[1:], turn(excess[2] / patch.radius * patch.frame[0])
-        was, faced = place + axes @ grip.position, product(faces, grip.quaternion)
+        was, faced = place + axes @ position, product(faces, quaternion)
         was, faced = patch.centre + rotation(about) @ (was - patch.centre) + along, product(about, faced)
-        new = grip.force <= 0
+        new = force <= 0
         was, faced = jnp.where(new, at[0] + along, was), jnp.where(new, at[1], faced)
         facing = product(conjugate(faces), faced)
         moves, way = new | slips, jnp.sqrt(jnp.sum(excess[:2] ** 2))
         return (
-            jnp.where(moves, axes.T @ (was - place), grip.position),
-            jnp.where(moves, facing / jnp.linalg.norm(facing), grip.quaternion),
+            jnp.where(moves, axes.T @ (was - place), position),
+            jnp.where(moves, facing / jnp.linalg.norm(facing), quaternion),
             forces.normal,
-            jnp.where(new, 0.0, grip.slid + jnp.where(slips, way, 0.0)),
+            jnp.where(new, 0.0, slid + jnp.where(slips, way, 0.0)),
         )
 
     def _held(self, normal: Array, force: Array, held: Array, dt: Any) -> Array:
@@ -309,6 +308,14 @@ def _bends(columns: Array, places: Array) -> Array:
         lift, spin = lift + move, spin + turn_
     straight = straight + jnp.cross(spin, lift)
     return straight + jnp.cross(curved, places) + jnp.cross(spin, jnp.cross(spin, places))
+
+
+def _of_finger(grips: Grips, o: Array, f: Array) -> tuple[Array, Array, Array, Array]:
+    """Return what is kept for a finger f and an object o: `OF_FINGERS`."""
+    k, fingers = grips.force.shape
+    rows = tuple(getattr(grips, name).reshape(k * fingers, *getattr(grips, name).shape[2:]) for name in OF_FINGERS)
+    found: tuple[Array, Array, Array, Array] = picked(rows, fingers * o + f)
+    return found
 
 
 def fingers_of(position: Array, axes: Array) -> Fingers:

@@ -49,7 +49,7 @@ class _Local(NamedTuple):
     arm_force: Array
     """[a, m]"""
     arm: Array
-    """Lower halves, [a, m (m + 1) / 2]."""
+    """Lower halves, [a, m (m + 1) / 2]; nothing for an arm without contacts."""
     force: Array
     """With the rest of what an object's acceleration takes, [k, 6]."""
     object: Array
@@ -57,7 +57,11 @@ class _Local(NamedTuple):
     cross: Array
     """Of objects with each other: see `elimination.Blocks`."""
     coupling: Array
-    """[k, a, 6, m]"""
+    """Of object o and arm i in row a o + i, [(k + 1) a, 6, m]; nothing where they were not met."""
+    met: Array
+    """Which of them were met, [(k + 1) a] bool."""
+    on_arm: Array
+    """Which arms have contacts, [a] bool."""
 
 
 _WHOLE = packed(6)
@@ -74,14 +78,22 @@ class Newton:
 
     def twist(self, contact: Contact, arms: Array, objects: Array) -> Array:
         """Return the twist [6] of a contact by motions of arms (`by_arm`) and of objects (`by_object`)."""
-        twist = objects[contact.first]
+        return self.twists(contact, (arms, objects))[0]
+
+    def twists(self, contact: Contact, *motions: tuple[Array, Array]) -> list[Array]:
+        """Return the twist [6] of a contact by each of several motions, as `twist` does."""
+        found = [objects[contact.first] for _, objects in motions]
         if self._objects > 1:
-            twist -= _moved_to(objects[contact.second], contact.offset)
-        if len(self._dofs):
-            still = lambda twist: twist  # noqa: E731
-            with_arm = lambda twist: twist + contact.jacobian @ arms[contact.arm]  # noqa: E731
-            twist = jax.lax.cond(contact.arm < len(self._dofs), with_arm, still, twist)
-        return twist
+            others = [_moved_to(objects[contact.second], contact.offset) for _, objects in motions]
+            found = [twist - other for twist, other in zip(found, others, strict=True)]
+        if not len(self._dofs):
+            return found
+
+        def with_arm(found: list[Array]) -> list[Array]:
+            moved = [contact.jacobian @ arms[contact.arm] for arms, _ in motions]
+            return [twist + more for twist, more in zip(found, moved, strict=True)]
+
+        return jax.lax.cond(contact.arm < len(self._dofs), with_arm, lambda found: found, found)
 
     def by_arm(self, joints: Array) -> Array:
         """Return what belongs to the joints [n] of all arms by arm, [a, m]; 0 for joints that are not."""
@@ -128,14 +140,13 @@ class Newton:
         It also notes the forces of contacts there. `slope` and `growth` are those at the beginning, without contacts,
         friction and limits.
         """
-        arms, objects = here.arms, self.by_object(here.objects)
-        arms_way, objects_way = way.arms, self.by_object(way.objects)
+        motions = [(point.arms, self.by_object(point.objects)) for point in (here, way)]
 
         def measure(length: Array, seen: _Seen) -> tuple[Array, Array, _Seen]:
             def look(n: Array, state: tuple[Array, Array, _Seen]) -> tuple[Array, Array, _Seen]:
                 contact, before = row_of((problem.contacts, state[2].pressed), n)
-                cone, by = contact.cone, self.twist(contact, arms_way, objects_way)
-                felt = forces(cone, self.twist(contact, arms, objects) + length * by)
+                cone, (at, by) = contact.cone, self.twists(contact, *motions)
+                felt = forces(cone, at + length * by)
                 own, normal, along = _pressed(felt), cone.normal @ by, cone.along @ by
                 slope = state[0] - felt.normal @ normal - felt.friction @ along
                 change = jnp.sum((own.friction - before.friction) ** 2) > TOLERANCE**2 * own.normal**2
@@ -143,7 +154,7 @@ class Newton:
                 seen = _Seen(put(state[2].pressed, n, own), same, state[2].turned | (change & felt.slips))
                 return slope, state[1] + fall(cone, felt, normal, along), seen
 
-            resists, gives = self._arms.resisted(problem, arms, arms_way, length)
+            resists, gives = self._arms.resisted(problem, here.arms, way.arms, length)
             start = slope + length * growth + resists, growth + gives, seen
             return jax.lax.fori_loop(0, problem.total, look, start)
 
@@ -158,11 +169,13 @@ class Newton:
         inertia = (problem.masses @ (problem.free - point.objects)[..., None])[..., 0]
         none = _Local(
             jnp.zeros((a, m)),
-            jnp.zeros((a, m * (m + 1) // 2)),
-            _with_none(inertia),
-            _with_none(problem.masses[:, *np.tril_indices(6)]),
+            absent(jax.ShapeDtypeStruct((a, m * (m + 1) // 2), jnp.float32)),
+            _with_room(inertia),
+            _with_room(problem.masses[:, *np.tril_indices(6)]),
             jax.lax.cond(self._linked(problem), jnp.zeros_like, absent, jnp.zeros(36 * k * k if k > 1 else 0)),
-            jnp.zeros((k + 1, a, 6, m)),
+            absent(jax.ShapeDtypeStruct(((k + 1) * a, 6, m), jnp.float32)),
+            jnp.zeros((k + 1) * a, bool),
+            jnp.zeros(a, bool),
         )
 
         def one(n: Array, sums: tuple[_Local, Pressed]) -> tuple[_Local, Pressed]:
@@ -172,7 +185,7 @@ class Newton:
 
         local, pressed = jax.lax.fori_loop(0, problem.total, one, (none, pressed))
         cut = lambda each: each[:k]  # noqa: E731
-        local = local._replace(force=cut(local.force), object=cut(local.object), coupling=cut(local.coupling))
+        local = local._replace(force=cut(local.force), object=cut(local.object))
         return local, pressed
 
     def _add(self, local: _Local, contact: Contact, felt: Forces) -> _Local:
@@ -200,10 +213,13 @@ class Newton:
             arm, jacobian = contact.arm, contact.jacobian
             half = stiff[_WHOLE] @ jacobian
             first_joint, second_joint = np.tril_indices(jacobian.shape[1])
+            own, pair = jnp.sum(jacobian[:, first_joint] * half[:, second_joint], 0), len(self._dofs) * first + arm
             return local._replace(
                 arm_force=add(local.arm_force, arm, jacobian.T @ pull),
-                arm=add(local.arm, arm, jnp.sum(jacobian[:, first_joint] * half[:, second_joint], 0)),
-                coupling=add(local.coupling, (first, arm), half),
+                arm=_begun(local.arm, arm, own, local.on_arm),
+                coupling=_begun(local.coupling, pair, half, local.met),
+                met=put(local.met, pair, True),
+                on_arm=put(local.on_arm, arm, True),
             )
 
         return jax.lax.cond(contact.arm < len(self._dofs), on_arm, lambda local: local, local)
@@ -218,16 +234,16 @@ class Newton:
         touched, pressing = self._touched(problem), pressed.normal > 0
         linked = self._linked(problem, pressing)
         blocks = elimination.Blocks(local.object, local.cross)
-        gone = elimination.eliminate(blocks, local.force, local.coupling, touched.any(1), linked)
+        gone = elimination.eliminate(blocks, local.force, local.coupling, touched, linked)
         found = here.arms
         if len(self._dofs):
             on = touched | (linked & touched.any(0))  # what an object touches moves those that it touches
-            left = Left(local.arm, local.arm_force, gone.half, gone.wide, on)
+            left = Left(local.arm, local.on_arm, local.arm_force, gone.half, gone.wide, on)
             joined = (on.sum(1) > 1).any() | self._sides(problem, here.arms).any()
             each = lambda left: self._arms.each(problem, here.arms, left)  # noqa: E731
             together = lambda left: self._arms.together(problem, here.arms, left)  # noqa: E731
             found = jax.lax.cond(joined, together, each, left) if len(self._dofs) > 1 else each(left)
-        return Point(found, elimination.ways(gone, found, touched.any(1), linked))
+        return Point(found, elimination.ways(gone, found, touched, linked))
 
     def _linked(self, problem: Problem, pressing: Any = True) -> Array:
         """Return whether any contact joins two objects, [], of those that are `pressing`, [s]."""
@@ -252,6 +268,16 @@ class Newton:
 def _with_none(each: Array) -> Array:
     """Return what belongs to objects [k, ...], and 0 for the one that stands for none, [k + 1, ...]."""
     return jnp.concatenate([each, jnp.zeros((1, *each.shape[1:]))])
+
+
+def _with_room(each: Array) -> Array:
+    """Return what belongs to objects [k, ...], and room for the one that stands for none, [k + 1, ...]."""
+    return jnp.concatenate([each, absent(jax.ShapeDtypeStruct((1, *each.shape[1:]), each.dtype))])
+
+
+def _begun(sums: Array, i: Array, row: Array, begun: Array) -> Array:
+    """Return sums with more in one row, which begins with it if it was not `begun`."""
+    return put(sums, i, jax.lax.cond(begun[i], lambda: sums[i] + row, lambda: row))
 
 
 def _pressed(felt: Forces) -> Pressed:

@@ -7,12 +7,27 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 
 def row_of(tree: Any, i: Array | int) -> Any:
     """Return one row of all arrays of a tree."""
     return jax.tree.map(lambda x: x[i], tree)
+
+
+def picked(tree: Any, i: Array) -> Any:
+    """Return one row of all arrays of a tree, as `row_of` does, out of one flat array.
+
+    Of an array with few rows the fused engine would have all rows in registers, to select one of them. A long array it
+    has in memory, and loads one row of it.
+    """
+    arrays, structure = jax.tree.flatten(tree)
+    flat = jnp.concatenate([x.reshape(len(x), -1) for x in arrays], 1)
+    width, ends = flat.shape[1], np.cumsum([x[0].size for x in arrays])
+    row = jax.lax.dynamic_slice(flat.ravel(), (width * i,), (width,))
+    parts = jnp.split(row, ends[:-1])
+    return jax.tree.unflatten(structure, [part.reshape(x.shape[1:]) for part, x in zip(parts, arrays, strict=True)])
 
 
 def put(tree: Any, i: Any, row: Any) -> Any:

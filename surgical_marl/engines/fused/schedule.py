@@ -66,6 +66,7 @@ class Scheduler:
         self.group_place: dict[int, int] = {}
         self.alive = self._find_alive()
         self._depend()
+        self._begins = self._find_begins()
 
     def run(self) -> Schedule:
         self._place_all()
@@ -156,6 +157,12 @@ class Scheduler:
                 bits |= self.loops[read]
             self.loops[value] = bits
 
+    def _find_begins(self) -> set[Value]:
+        """Return the arrays in memory that a loop begins with."""
+        g, loops = self.graph, [(number, group) for number, group in enumerate(self.graph.groups) if isinstance(group, Loop)]
+        starts = {group.starts[k] for number, group in loops for k in self.alive.get(number, ())}
+        return {value for value in starts if value >= 0 and len(g.kinds[value]) > 1}
+
     # -- where
 
     def _place_all(self) -> None:
@@ -185,7 +192,9 @@ class Scheduler:
         region = self.place[outs[0]]
         for out in outs[1:]:
             region = self._common(region, self.place[out])
-        region = self._hoist(region, self.group_loops[number])
+        # an array that a loop will change is made near that loop: one from outside would be copied again and again
+        if not (isinstance(group, Branch) and self._begins.intersection(outs)):
+            region = self._hoist(region, self.group_loops[number])
         self.group_place[number] = region
         for k in self.alive[number]:
             self.place[group.outs[k]] = region
