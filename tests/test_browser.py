@@ -1,4 +1,4 @@
-"""The viewer in a real browser: Debian's chromium without a window, driven by playwright."""
+"""The viewer in a real browser."""
 
 from __future__ import annotations
 
@@ -17,22 +17,10 @@ from surgical_marl.robots.rotation import matrix_of
 from surgical_marl.runs.settings import Settings
 from surgical_marl.view.browser.viewer import Viewer
 from surgical_marl.view.take import read_take, replay
+from tests.helpers.chromium import NEEDS_CHROMIUM, listen
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium on this machine")]
-SOFTWARE = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
-PATIENCE = 60.0
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    # Where there is a browser, a missing package is an error: what is left out without a word is soon broken.
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as playwright:
-        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=SOFTWARE)
-        yield chromium
-        chromium.close()
+pytestmark = NEEDS_CHROMIUM
+PATIENCE = 180.0
 
 
 class Running:
@@ -40,27 +28,30 @@ class Running:
 
     def __init__(self, browser: Any, settings: Settings, who: str, record: Path | None = None) -> None:
         self.viewer = Viewer(settings, who, port=0, record=record)
-        self.complaints: list[str] = []
+        self._complaints: list[list[str]] = []
+        self._pages: list[Any] = []
         self._browser, self._end = browser, threading.Event()
         self._thread = threading.Thread(target=self.viewer.run, args=(self._end,), daemon=True)
         self._thread.start()
 
     def open(self) -> Any:
         page = self._browser.new_page(viewport={"width": 1000, "height": 900})
-        page.on("console", lambda message: message.type == "error" and self.complaints.append(message.text))
-        page.on("pageerror", lambda error: self.complaints.append(str(error)))
-        page.on("request", self._ask)
+        self._pages.append(page)
+        self._complaints.append(listen(page, (self.viewer.address,)))
         page.set_default_timeout(1000 * PATIENCE)
         page.goto(self.viewer.address)
         page.get_by_role("tab", name="Scene").wait_for()
         page.wait_for_timeout(1500)  # a choice is lost while the page is still being made
         return page
 
-    def _ask(self, request: Any) -> None:
-        if not request.url.startswith((self.viewer.address, "data:", "blob:")):
-            self.complaints.append(f"it asks for {request.url}")
+    @property
+    def complaints(self) -> list[str]:
+        return [each for own in self._complaints for each in own]
 
     def close(self) -> None:
+        """End the viewer, and close pages that a failed test has left open: they would slow the next one."""
+        for page in self._pages:
+            page.close()
         self._end.set()
         self._thread.join()
 
