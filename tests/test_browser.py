@@ -15,6 +15,7 @@ import pytest
 from surgical_marl.content import find
 from surgical_marl.robots.rotation import matrix_of
 from surgical_marl.runs.settings import Settings
+from surgical_marl.view.browser.nodes import PARTS
 from surgical_marl.view.browser.viewer import Viewer
 from surgical_marl.view.take import read_take, replay
 from tests.helpers.chromium import NEEDS_CHROMIUM, listen
@@ -88,6 +89,13 @@ def choose(page: Any, label: str, option: str, number: int = 0) -> None:
     page.get_by_role("option", name=option, exact=True).click()
 
 
+def to_scene(page: Any) -> Any:
+    """Open the tab Scene; what is chosen there makes the page anew, which then shows its first tab."""
+    page.wait_for_timeout(1500)
+    page.get_by_role("tab", name="Scene").click()
+    return page
+
+
 def test_the_controls_do_what_they_say(running: Running) -> None:
     viewer, page = running.viewer, running.open()
     page.get_by_role("button", name="Pause / go on").click()
@@ -119,6 +127,51 @@ def test_the_controls_do_what_they_say(running: Running) -> None:
     assert viewer.session.movers.who["psm_1"] == "frozen"
     assert not running.complaints
     page.close()
+
+
+def test_what_is_looked_at_is_chosen_from_menus(running: Running) -> None:
+    viewer, page = running.viewer, running.open()
+    page.get_by_role("tab", name="Show").click()
+    for part in PARTS:
+        page.get_by_label(part, exact=True).click()
+        comes(lambda part=part: not any(handle.visible for handle in viewer._nodes._parts[part]), page)
+    choose(to_scene(page), "difficulty", "hard")
+    comes(lambda: viewer.session.settings.difficulty == "hard", page)
+    to_scene(page).get_by_label("seconds an episode", exact=True).fill("3")
+    page.keyboard.press("Enter")
+    comes(lambda: viewer.session.env.max_steps == 150, page)
+    choose(to_scene(page), "scene", "ecm")
+    comes(lambda: viewer.session.env.agents == ["ecm_0"], page)
+    page.get_by_role("tab", name="Pictures").click()
+    page.get_by_text("endoscope of ecm_0").first.wait_for()
+    page.locator("img:visible").first.wait_for()
+    choose(to_scene(page), "task", "track")
+    comes(lambda: viewer.session.env.task_name == "track", page)
+    assert not running.complaints
+
+
+def test_sliders_and_keys_move_an_arm(running: Running) -> None:
+    viewer, page = running.viewer, running.open()
+    choose(page, "moved by", "you", 0)
+    comes(lambda: "psm_0" in viewer.session.movers.hands, page)
+    hand = viewer.session.movers.hands["psm_0"]
+    roll = hand.joints.index("roll")
+    slider = page.get_by_role("slider").nth(roll)
+    slider.focus()
+    before = hand.q[roll]
+    for _ in range(5):
+        slider.press("ArrowRight")
+    comes(lambda: hand.q[roll] > before, page)
+    page.get_by_label("jaw open", exact=True).click()
+    comes(lambda: hand.jaw_open, page)
+    page.evaluate("document.activeElement.blur()")
+    page.keyboard.press("j")
+    comes(lambda: not hand.jaw_open, page)
+    page.keyboard.press("Space")
+    comes(lambda: viewer.pace.paused, page)
+    page.keyboard.press("r")
+    comes(lambda: viewer.session.steps == 0, page)
+    assert not running.complaints
 
 
 def test_a_closed_tab_ends_nothing_and_a_second_one_works(running: Running) -> None:
