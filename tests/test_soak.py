@@ -39,6 +39,8 @@ def test_what_slows_all_faces_is_no_ones_fault(tmp_path: Path) -> None:
     assert all("0.00 ± 0.00 | flat |" in line and "| 4 to 4 | 1 to 1 |" in line for line in lines)
     lines = soak.table(found, at_once=True).splitlines()[2:]
     assert ["falls" in line for line in lines] == [True] * 4, "faces that ran at once are not excused by each other"
+    (line,) = soak.table({"d": found["d"]}, at_once=False).splitlines()[2:]
+    assert "falls" in line, "a face alone is not excused by itself"
     soak.draw(found, tmp_path / soak.FIGURE, at_once=False)
     assert (tmp_path / soak.FIGURE).stat().st_size > 0
 

@@ -202,11 +202,11 @@ def rated(samples: dict[str, Any], at_once: bool) -> Iterator[tuple[str, Any, np
 
     Where faces took turns, seconds are those of processor, and programs beside these take cache, memory's bandwidth and
     half of a core from all faces alike: speeds are then divided by the median, over all faces, of what a second of
-    processor was worth in that round.
+    processor was worth in that round. One or two faces can't tell themselves from the machine: theirs are as they are.
     """
     ran = {face: own.wall_s if at_once else own.cpu_s for face, own in samples.items()}
     rates = {face: np.diff(own.steps) / np.maximum(np.diff(ran[face]), 1e-2) for face, own in samples.items()}
-    if not at_once:
+    if not at_once and len(samples) > 2:
         rounds = min(map(len, rates.values()))
         worth = np.maximum(np.median([_usual(rate)[:rounds] for rate in rates.values()], 0), 1e-2)
         rates = {face: rate[:rounds] / worth for face, rate in rates.items()}
