@@ -191,8 +191,10 @@ def test_what_can_not_be_done_changes_nothing(viewer: Viewer) -> None:
 def test_other_environments_are_looked_at(viewer: Viewer) -> None:
     agents = viewer.session.env.agents
     viewer.ask(lambda: viewer.session.set_mover(agents[1], "frozen"))
+    viewer.pace.speed, viewer.pace.paused = 0.25, True
     viewer.ask(lambda: viewer.choose(Choice("reach", "bimanual_psm", "default", 3, 40)))
     turn(viewer, 2)
+    assert (viewer.pace.speed, viewer.pace.paused) == (0.25, True)
     env = viewer.session.env
     assert (env.num_envs, env.max_steps, viewer.session.settings.difficulty) == (3, 40, "default")
     assert viewer.session.movers.who == {agents[0]: "oracle", agents[1]: "frozen"}
