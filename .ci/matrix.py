@@ -4,9 +4,10 @@ One environment for each Python from 3.11 to 3.13 that is found on PATH, with th
 gymnasium that pyproject.toml allows, and with the newest. Prints a table for docs/reliability.md.
 
 On Linux PyPI's torch brings gigabytes of CUDA libraries. Where pip would install those, the environment is made without
-torch: then an environment alone is tried, with the numbers that a seed leads to.
+torch: then an environment alone is tried, with the numbers that a seed leads to. `--cuda-builds` installs them, for one
+environment at a time: they run on a CPU, too.
 
-    python .ci/matrix.py [--python 3.13] [--versions oldest] [--keep FOLDER]
+    python .ci/matrix.py [--python 3.13] [--versions oldest] [--cuda-builds] [--keep FOLDER]
 """
 
 from __future__ import annotations
@@ -66,25 +67,26 @@ def torch_for_cpus(python: Path, wanted: str) -> str | None:
     return None
 
 
-def try_one(python: str, versions: str, folder: Path) -> tuple[dict[str, str], str]:
+def try_one(python: str, versions: str, folder: Path, cuda_builds: bool) -> tuple[dict[str, str], str]:
     """Make an environment and run its tests; return what was installed and what came of it."""
     uv, own = Path(sys.executable).with_name("uv"), folder / "bin/python"
     run(python, "-m", "venv", folder)
-    run(own, "-m", "pip", "install", "-q", "-U", "pip")
-    torch = torch_for_cpus(own, asked("torch", versions))
-    if torch:
-        run(own, "-m", "pip", "install", "-q", f"torch=={torch}")
-    override = folder / "override.txt"  # torch is there already, or not to be had: uv leaves it alone
-    override.write_text("torch; python_version < '3'\ntorchvision; python_version < '3'\n")
-    wanted = [asked(name, versions) for name in NAMES if name != "torch"]
-    done = run(
-        uv, "pip", "install", "-q", "--python", own, "--override", override, ROOT, "pytest>=9", "hatchling", *wanted
-    )
+    wanted, override, with_torch = {name: asked(name, versions) for name in NAMES}, folder / "override.txt", cuda_builds
+    override.write_text("")
+    if not cuda_builds:
+        run(own, "-m", "pip", "install", "-q", "-U", "pip")
+        if torch := torch_for_cpus(own, wanted.pop("torch")):
+            with_torch = True
+            run(own, "-m", "pip", "install", "-q", f"torch=={torch}")
+        # torch is there already, or not to be had: uv leaves it alone
+        override.write_text("torch; python_version < '3'\ntorchvision; python_version < '3'\n")
+    packages = [ROOT, "pytest>=9", "hatchling", *wanted.values()]
+    done = run(uv, "pip", "install", "-q", "--python", own, "--override", override, *packages)
     if done.returncode:
         return {}, "does not resolve: " + " ".join(done.stderr.split())[:300]
     listed = json.loads(run(uv, "pip", "list", "--python", own, "--format", "json").stdout)
     found = {item["name"]: item["version"] for item in listed if item["name"] in NAMES}
-    tests = [f"{ROOT}/{name}" for name in (WITH_TORCH if torch else WITHOUT_TORCH)]
+    tests = [f"{ROOT}/{name}" for name in (WITH_TORCH if with_torch else WITHOUT_TORCH)]
     done = run(own, "-m", "pytest", "-q", "-p", "no:cacheprovider", *tests, XDG_CACHE_HOME=str(folder / "cache"))
     (folder / "pytest.log").write_text(done.stdout + done.stderr)
     return found, re.sub(r" in [\d.]+s.*| \(.*|=", "", done.stdout.strip().splitlines()[-1]).strip()
@@ -94,6 +96,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--python", action="append", choices=PYTHONS)
     parser.add_argument("--versions", action="append", choices=("oldest", "newest"))
+    parser.add_argument("--cuda-builds", action="store_true", help="take torch with CUDA libraries, some gigabytes")
     parser.add_argument("--keep", type=Path, help="folder for the environments and the output of their tests")
     arguments = parser.parse_args()
     print("| Python | versions |", *(f"{name} |" for name in NAMES), "result |", flush=True)
@@ -108,7 +111,7 @@ def main() -> int:
                 continue
             with tempfile.TemporaryDirectory() as folder:
                 kept = arguments.keep / f"{version}-{versions}" if arguments.keep else Path(folder) / "environment"
-                found, result = try_one(python, versions, kept.resolve())
+                found, result = try_one(python, versions, kept.resolve(), arguments.cuda_builds)
             failed |= "failed" in result or "error" in result or "does not" in result
             shown = [found.get(name, "without") for name in NAMES]
             print(f"| {here[-1]} | {versions} |", *(f"{text} |" for text in shown), f"{result} |", flush=True)

@@ -76,6 +76,11 @@ def peak() -> float:
     return _bytes("/proc/self/status", "VmHWM", 0.0)
 
 
+def used() -> float:
+    """Return the memory that this process has now, in bytes."""
+    return _bytes("/proc/self/status", "VmRSS", 0.0)
+
+
 def free() -> float:
     """Return the memory that this machine has left, in bytes."""
     return _bytes("/proc/meminfo", "MemAvailable", math.inf)

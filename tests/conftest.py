@@ -4,6 +4,7 @@ import gc
 import os
 
 from surgical_marl.runtime import prepare_jax
+from tests.helpers.chromium import browser  # noqa: F401  # a fixture
 
 # XLA takes half of the time for code that it does not optimise. That code is about as fast for a few environments, and
 # computes the same: the MJX engine is the reference here, not the fast one.

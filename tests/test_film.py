@@ -8,6 +8,7 @@ import imageio.v3 as imageio
 import numpy as np
 import pytest
 
+from surgical_marl.cli.main import main
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.view.film import Look, camera_of, film, wall, written
 from surgical_marl.view.movers import Movers, first
@@ -55,6 +56,17 @@ def test_a_film_is_as_long_as_its_episode_and_slow_ones_are_longer(tmp_path: Pat
     assert len(imageio.imread(slow)) == 4
     assert imageio.immeta(slow)["duration"] == 80  # ms: 4 steps of 20 ms take 320 ms
     assert (frames[0] != frames[1]).any()
+
+
+def test_a_film_that_becomes_a_gif_says_why(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("surgical_marl.view.video.ffmpeg_runs", lambda: False)
+    asked = ["play", "reach", "--scene", "psm", "--policy", "zero", "--size", "64x48", "--out", str(tmp_path / "a.mp4")]
+    assert main(asked) == 0
+    found = capsys.readouterr()
+    assert found.out == f"{tmp_path / 'a.gif'}\n" and len(imageio.imread(tmp_path / "a.gif")) > 10
+    assert "written as a gif, because ffmpeg can't run here" in found.err
 
 
 @pytest.mark.usefixtures("small")

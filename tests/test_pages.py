@@ -294,11 +294,11 @@ def check_make(argv: list[str]) -> None:
     target, *variables = argv
     assert re.search(rf"^{target}:", (ROOT / "Makefile").read_text(), re.MULTILINE), target
     for name, _, value in (variable.partition("=") for variable in variables):
-        assert name == "ARGS" and target in ("train", "test", "mutants")
+        assert name == "ARGS" and target in ("train", "test", "mutants", "matrix")
         if target == "train":
             check_surgical_marl(["train", "reach", "--scene", "bimanual_psm", *shlex.split(value)])
-        elif target == "mutants":
-            check_python([".ci/mutants.py", *shlex.split(value)])
+        elif target in ("mutants", "matrix"):
+            check_python([f".ci/{target}.py", *shlex.split(value)])
         else:
             check_pytest(shlex.split(value))
 

@@ -26,7 +26,7 @@ import websockets.asyncio.server
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
-from surgical_marl.bench.page import measure_page
+from surgical_marl.bench import page
 from surgical_marl.cli.main import main
 from surgical_marl.content import find
 from surgical_marl.engines.stages import compiling
@@ -191,8 +191,10 @@ def test_what_can_not_be_done_changes_nothing(viewer: Viewer) -> None:
 def test_other_environments_are_looked_at(viewer: Viewer) -> None:
     agents = viewer.session.env.agents
     viewer.ask(lambda: viewer.session.set_mover(agents[1], "frozen"))
+    viewer.pace.speed, viewer.pace.paused = 0.25, True
     viewer.ask(lambda: viewer.choose(Choice("reach", "bimanual_psm", "default", 3, 40)))
     turn(viewer, 2)
+    assert (viewer.pace.speed, viewer.pace.paused) == (0.25, True)
     env = viewer.session.env
     assert (env.num_envs, env.max_steps, viewer.session.settings.difficulty) == (3, 40, "default")
     assert viewer.session.movers.who == {agents[0]: "oracle", agents[1]: "frozen"}
@@ -373,10 +375,12 @@ def test_a_run_without_a_checkpoint_can_not_move_an_arm(viewer: Viewer, tmp_path
 def test_what_a_drawing_costs_as_json_and_as_a_sentence(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(measure_page, "__defaults__", (0.5, 0.1))
-    assert main(["bench", "view", "--scene", "psm", "--json"]) == 0
+    monkeypatch.setattr(page, "WARM", 0.1)
+    assert main(["bench", "view", "--scene", "psm", "--seconds", "1", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
-    assert list(found) == ["ms_per_drawing", "drawings_per_s", "kilobytes_per_drawing", "mover"]
-    assert found.pop("mover") == "reach-psm" and all(value > 0 for value in found.values())
-    assert main(["bench", "view", "--task", "reach", "--scene", "psm"]) == 0
-    assert "reach on psm, moved by reach-psm: " in capsys.readouterr().out
+    assert list(found) == ["ms_per_drawing", "drawings_per_s", "kilobytes_per_drawing", "grown_mb", "mover"]
+    assert found.pop("mover") == "reach-psm" and found.pop("grown_mb") < 1000
+    assert all(value > 0 for value in found.values())
+    assert main(["bench", "view", "--task", "reach", "--scene", "psm", "--seconds", "1"]) == 0
+    said = capsys.readouterr().out
+    assert "reach on psm, moved by reach-psm: " in said and said.endswith("MB of memory in 1 s\n")

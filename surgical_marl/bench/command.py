@@ -98,7 +98,7 @@ def _view(arguments: Namespace) -> int:
     from surgical_marl.view.browser.gate import check_viser
 
     check_viser()
-    print(run(arguments.task, arguments.scene, arguments.json))
+    print(run(arguments.task, arguments.scene, arguments.seconds, arguments.json))
     return 0
 
 

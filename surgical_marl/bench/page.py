@@ -1,6 +1,6 @@
 """What a drawing of the viewer costs: one environment with its policy, and a client that takes all that is sent.
 
-measure_page("reach", "bimanual_psm").ms_per_drawing
+measure_page("reach", "bimanual_psm", 20.0).ms_per_drawing
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from dataclasses import asdict, dataclass
 from threading import Event, Timer
 from typing import Any
 
-SECONDS = 20.0
-"""How long the page is drawn."""
+from surgical_marl.machine import used
+
 WARM = 3.0
 """Before that: a client first gets all meshes, and a policy's first action takes longer, s."""
 
@@ -31,11 +31,13 @@ class Page:
     """`surgical-marl view` wants 30; the clock on the wall tells, so other programs matter."""
     kilobytes_per_drawing: float
     """What the client takes."""
+    grown_mb: float
+    """Memory that the process took on meanwhile, MB."""
     mover: str
     """Who moves the arms."""
 
 
-def measure_page(task: str, scene: str, seconds: float = SECONDS, warm: float = WARM) -> Page:
+def measure_page(task: str, scene: str, seconds: float) -> Page:
     """Run the viewer for so many seconds after a warm-up, as `surgical-marl view` does, on this process's clock.
 
     Raises:
@@ -45,32 +47,33 @@ def measure_page(task: str, scene: str, seconds: float = SECONDS, warm: float = 
     from surgical_marl.view.browser.viewer import Viewer
 
     viewer = Viewer(Settings(task=task, scene=scene), port=0)
-    marks: list[tuple[float, float, int, int]] = []
+    marks: list[tuple[float, float, int, int, float]] = []
     end = Event()
     mover = ", ".join(dict.fromkeys(viewer.session.movers.who.values()))
     with _client(viewer.address) as taken:
 
         def mark() -> None:
-            marks.append((time.process_time(), time.monotonic(), viewer.drawn, taken.value))
+            marks.append((time.process_time(), time.monotonic(), viewer.drawn, taken.value, used()))
             if len(marks) == 2:
                 end.set()
 
-        timers = [Timer(warm, mark), Timer(warm + seconds, mark)]
+        timers = [Timer(WARM, mark), Timer(WARM + seconds, mark)]
         for timer in timers:
             timer.start()
         viewer.run(end)
-    spent, lasted, drawn, sent = (after - before for before, after in zip(*marks, strict=True))
-    return Page(1e3 * spent / drawn, drawn / lasted, sent / 1024 / drawn, mover)
+    spent, lasted, drawn, sent, grown = (after - before for before, after in zip(*marks, strict=True))
+    return Page(1e3 * spent / drawn, drawn / lasted, sent / 1024 / drawn, grown / 2**20, mover)
 
 
-def run(task: str, scene: str, as_json: bool) -> str:
+def run(task: str, scene: str, seconds: float, as_json: bool) -> str:
     """All of `surgical-marl bench view`: a sentence, or JSON."""
-    found = measure_page(task, scene)
+    found = measure_page(task, scene, seconds)
     if as_json:
         return json.dumps(asdict(found))
     return (
         f"{task} on {scene}, moved by {found.mover}: {found.ms_per_drawing:.1f} ms of one core a drawing, "
-        f"{found.drawings_per_s:.1f} drawings/s of {found.kilobytes_per_drawing:.1f} KB"
+        f"{found.drawings_per_s:.1f} drawings/s of {found.kilobytes_per_drawing:.1f} KB, "
+        f"{found.grown_mb:+.1f} MB of memory in {seconds:.0f} s"
     )
 
 

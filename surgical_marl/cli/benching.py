@@ -34,7 +34,9 @@ def add_bench(commands: Any) -> None:
     _add_small(kinds, "face", "what the PettingZoo face adds to a step of the engine, on a CPU").add_argument(
         "--num-envs", type=whole(1), metavar="N", help="default: one environment, not batched"
     )
-    _add_small(kinds, "view", "ms of a drawing of the viewer with its policy and a client, in half a minute")
+    _add_small(kinds, "view", "ms of a drawing of the viewer with its policy and a client").add_argument(
+        "--seconds", type=whole(1), default=20, metavar="N", help="after a warm-up (%(default)s)"
+    )
 
 
 def _bench_parser(kinds: Any, kind: str, what: str, of: type) -> argparse.ArgumentParser:

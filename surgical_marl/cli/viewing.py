@@ -100,7 +100,11 @@ def _open(arguments: argparse.Namespace) -> Any:
 
 def _play(arguments: argparse.Namespace) -> None:
     with preparing(f"a film of {arguments.task}"):
-        print(_film(arguments))
+        path = _film(arguments)
+    print(path)
+    if path.suffix != arguments.out.suffix:
+        said = f"written as a {path.suffix[1:]}, because ffmpeg can't run here; `pip install imageio-ffmpeg` brings one"
+        print(f"surgical-marl: {said}", file=sys.stderr)
 
 
 def _film(arguments: argparse.Namespace) -> Path:

@@ -25,18 +25,18 @@ from surgical_marl.runtime import jax, jnp
 
 TASK, SCENE = "reach", "psm"
 ID = "surgical_marl:surgical_marl/Reach-v0"
-COUNT = 64
-"""Environments side by side, of faces that have many."""
+COUNT = {"cpu": 64, "cuda": 4096}
+"""Environments side by side on each device, of faces that have many."""
 DRAWN = 97
 """Steps until the same random actions come again."""
 _PR_SET_PDEATHSIG = 1
 
 
-def parallel() -> Iterator[int]:
+def parallel(device: str) -> Iterator[int]:
     """PettingZoo, one environment."""
     import surgical_marl as sm
 
-    with closing(sm.parallel_env(TASK, scene=SCENE, device="cpu")) as env:
+    with closing(sm.parallel_env(TASK, scene=SCENE, device=device)) as env:
         given = cycle([{agent: own[0] for agent, own in each.items()} for each in _actions(env.batch, 1)])
         env.reset(seed=0)
         while True:
@@ -46,11 +46,11 @@ def parallel() -> Iterator[int]:
                 env.reset()
 
 
-def gymnasium() -> Iterator[int]:
+def gymnasium(device: str) -> Iterator[int]:
     """Gymnasium, one environment."""
     import gymnasium as gym
 
-    with closing(gym.make(ID, scene=SCENE, device="cpu")) as env:
+    with closing(gym.make(ID, scene=SCENE, device=device)) as env:
         given = cycle(_drawn(*(env.action_space.shape or ())))
         env.reset(seed=0)
         while True:
@@ -60,89 +60,90 @@ def gymnasium() -> Iterator[int]:
                 env.reset()
 
 
-def gymnasium_vector() -> Iterator[int]:
+def gymnasium_vector(device: str) -> Iterator[int]:
     """Gymnasium, many environments."""
     import gymnasium as gym
 
-    with closing(gym.make_vec(ID, scene=SCENE, num_envs=COUNT, device="cpu")) as env:
+    with closing(gym.make_vec(ID, scene=SCENE, num_envs=COUNT[device], device=device)) as env:
         given = cycle(_drawn(*(env.action_space.shape or ())))
         env.reset(seed=0)
         while True:
             env.step(next(given))
-            yield COUNT
+            yield COUNT[device]
 
 
-def rsl_rl() -> Iterator[int]:
+def rsl_rl(device: str) -> Iterator[int]:
     """rsl_rl, whose face training uses."""
     import torch
 
     from surgical_marl.interfaces.rsl_rl import RslRlVecEnv
 
-    with closing(RslRlVecEnv(_batched("torch"), seed=0)) as env:
-        given = cycle(torch.from_numpy(_drawn(COUNT, env.num_actions)))
+    with closing(RslRlVecEnv(_batched("torch", device), seed=0)) as env:
+        given = cycle(torch.from_numpy(_drawn(env.num_envs, env.num_actions)).to(device))
         while True:
             env.step(next(given))
-            yield COUNT
+            yield COUNT[device]
 
 
-def torchrl() -> Iterator[int]:
+def torchrl(device: str) -> Iterator[int]:
     """TorchRL, stepped as its collectors do."""
     import torch
 
     from surgical_marl.interfaces.torchrl import TorchRLEnv
 
-    with closing(TorchRLEnv(_batched("torch"))) as env, torch.no_grad():
+    with closing(TorchRLEnv(_batched("torch", device))) as env, torch.no_grad():
         env.set_seed(0)
         data = env.reset()
         while True:
             _, data = env.step_and_maybe_reset(env.rand_action(data))
-            yield COUNT
+            yield COUNT[device]
 
 
-def jax_functions() -> Iterator[int]:
+def jax_functions(device: str) -> Iterator[int]:
     """JAX, many environments by `jit` and `vmap`."""
     from surgical_marl.interfaces.jax_env import jax_env
 
-    env = jax_env(TASK, SCENE)
-    _, state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), COUNT))
-    sizes = {agent: env.action_space(agent).shape for agent in env.agents}
-    given = cycle([{agent: jnp.asarray(_drawn(COUNT, *size)[0]) for agent, size in sizes.items()}])
-    step = jax.jit(jax.vmap(env.step, in_axes=(None, 0, 0)))
-    while True:
-        _, state, rewards, _, _ = step(None, state, next(given))
-        jax.block_until_ready(rewards)
-        yield COUNT
+    env, count = jax_env(TASK, SCENE), COUNT[device]
+    with jax.default_device(jax.devices(device)[0]):
+        _, state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), count))
+        sizes = {agent: env.action_space(agent).shape for agent in env.agents}
+        given = cycle([{agent: jnp.asarray(_drawn(count, *size)[0]) for agent, size in sizes.items()}])
+        step = jax.jit(jax.vmap(env.step, in_axes=(None, 0, 0)))
+        while True:
+            _, state, rewards, _, _ = step(None, state, next(given))
+            jax.block_until_ready(rewards)
+            yield count
 
 
-def batched() -> Iterator[int]:
+def batched(device: str) -> Iterator[int]:
     """`BatchedEnv`, which is below all faces but that of JAX."""
-    with closing(_batched("numpy")) as env:
-        given = cycle(_actions(env, COUNT))
+    with closing(_batched("numpy", device)) as env:
+        given = cycle(_actions(env, COUNT[device]))
         env.reset(0)
         while True:
             env.step(next(given))
-            yield COUNT
+            yield COUNT[device]
 
 
-def made() -> Iterator[int]:
+def made(device: str) -> Iterator[int]:
     """Environments that are made, stepped three times and closed, of one face after the other; these are counted."""
     for face in cycle([parallel, gymnasium, gymnasium_vector, rsl_rl, batched]):
-        steps = face()
+        steps = face(device)
         for _ in range(3):
             next(steps)
         steps.close()  # type: ignore[attr-defined]  # generators
         yield 1
 
 
-FACES: dict[str, Callable[[], Iterator[int]]] = {
+FACES: dict[str, Callable[[str], Iterator[int]]] = {
     "parallel": parallel, "gymnasium": gymnasium, "gymnasium_vector": gymnasium_vector, "rsl_rl": rsl_rl,
     "torchrl": torchrl, "jax": jax_functions, "batched": batched, "made": made,
 }  # fmt: skip
 ALL = ("train", *FACES)
 
 
-def _batched(arrays: str) -> BatchedEnv:
-    return BatchedEnv(TASK, SCENE, num_envs=COUNT, device="cpu", arrays=arrays)
+def _batched(arrays: str, device: str) -> BatchedEnv:
+    return BatchedEnv(TASK, SCENE, num_envs=COUNT[device], device=device, arrays=arrays)
 
 
 def _drawn(*shape: int) -> np.ndarray:
@@ -181,17 +182,17 @@ def counted(out: Path, name: str) -> int:
     return int(float(rows[-1].split(",")[names.index("env_steps")])) if rows else 0
 
 
-def step_forever(name: str, out: Path) -> int:
-    """Step one of `ALL` until the process is ended; with its parent at the latest."""
+def step_forever(name: str, out: Path, device: str) -> int:
+    """Step one of `ALL` on "cpu" or "cuda" until the process is ended; with its parent at the latest."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if name == "train":
         from surgical_marl.cli.main import main
 
-        size = ["--num-envs", str(COUNT), "--iterations", "10000000", "--device", "cpu"]
+        size = ["--num-envs", str(COUNT[device]), "--iterations", "10000000", "--device", device]
         return main(["train", TASK, "--scene", SCENE, *size, "--out", str(out / name)])
     memory, total = counter(out, name), 0
-    for steps in FACES[name]():
+    for steps in FACES[name](device):
         total += steps
         memory[:] = total.to_bytes(8, "little")
     return 0
@@ -200,7 +201,8 @@ def step_forever(name: str, out: Path) -> int:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("name", choices=ALL)
+    parser.add_argument("--device", choices=tuple(COUNT), default="cpu")
     parser.add_argument("--out", type=Path, default=Path("runs/soak"), metavar="DIR")
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
-    sys.exit(step_forever(arguments.name, arguments.out))
+    sys.exit(step_forever(arguments.name, arguments.out, arguments.device))

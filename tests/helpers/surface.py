@@ -155,9 +155,9 @@ def settings(of: type, prefix: str = "") -> Iterator[tuple[str, str]]:
 
 def benches() -> dict[str, list[str]]:
     """The keys of what each benchmark prints."""
-    from surgical_marl.bench import face, learning, render, sim  # with torch, which `environment` does without
+    from surgical_marl.bench import face, learning, page, render, sim  # with torch, which `environment` does without
 
-    kinds = (sim.Speed, learning.Speed, render.Rendering, render.Pictures, face.Face)
+    kinds = (sim.Speed, learning.Speed, render.Rendering, render.Pictures, face.Face, page.Page)
     return {f"{of.__module__}.{of.__name__}": [item.name for item in dataclasses.fields(of)] for of in kinds}
 
 

@@ -159,8 +159,10 @@ class Scheduler:
 
     def _find_begins(self) -> set[Value]:
         """Return the arrays in memory that a loop begins with."""
-        g, loops = self.graph, [(number, group) for number, group in enumerate(self.graph.groups) if isinstance(group, Loop)]
-        starts = {group.starts[k] for number, group in loops for k in self.alive.get(number, ())}
+        g, starts = self.graph, set()
+        for number, group in enumerate(g.groups):
+            if isinstance(group, Loop):
+                starts.update(group.starts[k] for k in self.alive.get(number, ()))
         return {value for value in starts if value >= 0 and len(g.kinds[value]) > 1}
 
     # -- where

@@ -63,6 +63,7 @@ class Viewer:
         self.server, self.address = open_server(port)
         try:
             self.session = Session(settings, who, num_envs, record, self._further)
+            self.pace = Pace(self.session.env.control_dt)
             self._show()
         except BaseException:
             close_server(self.server)
@@ -137,7 +138,8 @@ class Viewer:
         server.gui.reset()
         _light(server)
         _aim(server.initial_camera, session)
-        self.pace = Pace(session.env.control_dt)
+        before, self.pace = self.pace, Pace(session.env.control_dt)
+        self.pace.speed, self.pace.paused = before.speed, before.paused  # whoever chose them may look at something else
         self._nodes = Nodes(server, session)
         panel = Panel(server, session, self.pace, self.ask)
         group = server.gui.add_tab_group()
