@@ -208,7 +208,7 @@ class Handling:
 
         def moved(_: None) -> Array:
             o = jnp.asarray(self.tables.first_object.astype(np.int32))[number]
-            frame, (position, quaternion, force, _) = picked(fingers, f), _of_finger(grips, o, f)
+            frame, (position, quaternion, force, _slid) = picked(fingers, f), _of_finger(grips, o, f)
             was = frame.position + frame.axes @ position
             turned = product(at[1][o], conjugate(product(frame.quaternion, quaternion)))
             angle = 2 * turned[1:] * jnp.where(turned[0] < 0, -1.0, 1.0)

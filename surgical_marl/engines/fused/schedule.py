@@ -159,7 +159,8 @@ class Scheduler:
 
     def _find_begins(self) -> set[Value]:
         """Return the arrays in memory that a loop begins with."""
-        g, starts = self.graph, set()
+        g = self.graph
+        starts: set[Value] = set()
         for number, group in enumerate(g.groups):
             if isinstance(group, Loop):
                 starts.update(group.starts[k] for k in self.alive.get(number, ()))
