@@ -186,6 +186,25 @@ def test_the_sides_of_a_branch_fill_its_result() -> None:
     assert_schedule_is_right(function, *COLUMNS)
 
 
+def test_an_array_that_an_inner_loop_changes_is_made_near_it() -> None:
+    """Made before the outer loop it would be copied in each round, though no round makes another."""
+
+    def function(x: Any, i: Any, y: Any, values: Any, changes: bool) -> Any:
+        def outer(_: Any, total: Any) -> Any:
+            made = lax.cond(x > 0, lambda: lax.map(lambda v: v * x, values), lambda: lax.map(lambda v: v - y, values))
+            inner = lambda k, a: a.at[k].add(total)  # noqa: E731
+            return total + (lax.fori_loop(0, 3, inner, made) if changes else made)[i]
+
+        return lax.fori_loop(0, 2, outer, y)
+
+    for changes in (False, True):
+        graph, plan = schedule(partial(function, changes=changes), *COLUMNS)
+        (branch,) = (number for number in plan.inside if isinstance(graph.groups[number], Branch))
+        (region,) = (k for k, each in enumerate(plan.regions) if ("group", branch) in each.items)
+        assert (plan.regions[region].loop >= 0) == changes
+        assert_schedule_is_right(partial(function, changes=changes), *COLUMNS)
+
+
 class Direct:
     """Values of a graph for one environment, each computed when it is asked for: what the schedule has to amount to."""
 
@@ -299,8 +318,10 @@ class Scheduled:
         region = self.plan.inside[number][0 if taken else 1]
         self._region(region, known.new_child(), lambda k, read: found.__setitem__(k, read(values[wanted[k]])))
         found = {branch.outs[j]: found[k] for k, j in enumerate(wanted)}
-        # what is left where it is, is what the array's memory now holds
-        known.update({out: read(self.plan.kept[out]) if out in self.plan.kept else new for out, new in found.items()})
+        # what is left where it is, is what the array's memory now holds; all else is in memory of the branch
+        known.update(
+            {out: read(self.plan.kept[out]) if out in self.plan.kept else np.array(new) for out, new in found.items()}
+        )
 
     def _loop(self, number: int, loop: Loop, known: Any, read: Callable[[Value], Any]) -> None:
         wanted, tested, count = self.plan.alive[number], loop.condition is not None, 0
