@@ -14,7 +14,7 @@ from jax import lax
 
 from tests.helpers.fused_blocks import all_blocks, random_arrays
 from tests.helpers.fused_kernels import make_stores
-from tests.test_fused_schedule import Direct
+from tests.helpers.fused_schedules import Direct
 
 
 @cache
