@@ -20,6 +20,7 @@ from surgical_marl.policies.layout import Layout
 from surgical_marl.policies.networks import make_model
 from surgical_marl.policies.onnx_file import write_onnx
 from surgical_marl.policies.policy import load_policy
+from surgical_marl.policies.weights import write_weights
 from surgical_marl.runs.folder import read_settings
 from surgical_marl.runs.settings import NetworkSettings, PPOSettings, Settings
 
@@ -107,6 +108,7 @@ def test_a_policy_with_attention_is_saved_loaded_and_written_as_onnx(run: Path, 
     expected = load_policy(run, env)(observations)
     actor, _ = load_actor(run, env)
     assert isinstance(actor.models["psm"], AttentionModel)
+    write_weights(tmp_path, actor)
     write_onnx(tmp_path / "psm.onnx", actor.models["psm"], {})
     session = onnxruntime.InferenceSession(tmp_path / "psm.onnx")
     for number, agent in enumerate(env.agents):

@@ -25,6 +25,7 @@ from surgical_marl.policies.onnx_file import write_onnx
 from surgical_marl.policies.oracle import oracle
 from surgical_marl.policies.policy import load_policy
 from surgical_marl.policies.team import check_fits
+from surgical_marl.policies.weights import write_weights
 from surgical_marl.runs.folder import read_settings
 from surgical_marl.runs.settings import ImitationSettings, NetworkSettings, PPOSettings, Settings
 
@@ -187,6 +188,7 @@ def test_onnx_speaks_too(run: Path, tmp_path: Path) -> None:
     actor, layout = load_actor(run, env)
     observations = env.reset(seed=0)[0]
     expected = load_policy(run, env)(observations)
+    write_weights(tmp_path, actor)
     for name, model in actor.models.items():
         write_onnx(tmp_path / f"{name}.onnx", model, layout.pictures[name])
         session = onnxruntime.InferenceSession(tmp_path / f"{name}.onnx")

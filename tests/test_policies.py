@@ -27,6 +27,7 @@ from surgical_marl.policies import actor as networks
 from surgical_marl.policies.layout import Layout
 from surgical_marl.policies.onnx_file import write_onnx
 from surgical_marl.policies.policy import load_policy
+from surgical_marl.policies.weights import write_weights
 from surgical_marl.runs.folder import read_origin
 from surgical_marl.runs.settings import NetworkSettings, PPOSettings, Settings
 from tests.helpers.fake_env import FakeEnv
@@ -242,9 +243,10 @@ def test_onnx_acts_as_torch_does(env: Any, algo: Any, recurrent: Any, tmp_path: 
     with torch.no_grad():
         for model in actor.models.values():  # fresh networks hardly act: so that some actions are beyond 1
             model.mlp[-1].weight.mul_(300)
+    write_weights(tmp_path, actor)
     for name, model in actor.models.items():
         write_onnx(tmp_path / f"{name}.onnx", model, layout.pictures[name])
-    assert len(list(tmp_path.iterdir())) == len(layout.counts)
+    assert len(list(tmp_path.glob("*.onnx"))) == len(layout.counts)
     for number in (1, 7):
         seen = {agent: _random(env.observation_space(agent), number) for agent in env.agents}
         groups = layout.stack(seen)
@@ -283,6 +285,7 @@ def test_the_example_acts_without_torch(tmp_path: Path) -> None:
     actor = networks._actor(replace(SMALL, scene="bimanual_psm"), env, Layout(env))
     folder = tmp_path / "policies" / "reach-bimanual_psm"
     folder.mkdir(parents=True)
+    write_weights(folder, actor)
     write_onnx(folder / "psm.onnx", actor.models["psm"], {})
     code = (
         f"import runpy, sys; runpy.run_path({str(ROOT / 'docs' / 'onnx_policy.py')!r}); print('torch' in sys.modules)"

@@ -37,6 +37,8 @@ def test_a_folder_is_whole(name: str) -> None:
     weights = {path.stem for path in folder.glob("*.safetensors")}
     assert weights and weights == {path.stem for path in folder.glob("*.onnx")}
     assert not [path for path in folder.iterdir() if path.suffix in (".pt", ".pkl", ".tmp")]
+    for path in folder.glob("*.onnx"):  # weights are not stored twice, nor folders of the machine that wrote it
+        assert path.stat().st_size < 20_000 and b"site-packages" not in path.read_bytes()
     level = "" if result["difficulty"] == "default" else f"-{result['difficulty']}"
     assert name == f"{result['task']}-{result['scene']}{level}" and is_standard(result)
     page = (folder / "README.md").read_text()

@@ -263,6 +263,6 @@ def _files(folder: Path) -> str:
     return f"""## Files
 
 {text}
-- The `.safetensors` files hold the same weights, for `surgical-marl eval`.
+- The `.safetensors` files hold the weights, for `surgical-marl eval` and for the ONNX files beside them.
 - [How to run the ONNX files](../README.md#running-a-policy-without-torch).
 """

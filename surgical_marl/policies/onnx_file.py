@@ -10,23 +10,31 @@ The inputs of such a file, for N agents of its type at once:
 and gives `action` [N, a] float32 in [-1, 1], without exploration noise, and `next_memory` if it is recurrent. With the
 setting `messages` the last K numbers of an action are for the term `messages` of its teammates' next observations.
 Observations are normalised inside.
+
+Such a file is small: it reads its weights from `<type>.safetensors`, which must lie beside it. They are ONNX's external
+data, at the places where safetensors keeps them, so that no weight is stored twice.
 """
 
 from __future__ import annotations
 
+import json
 import logging
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
 import torch
+from onnx.external_data_helper import set_external_data
 from torch import Tensor, nn
 
 from surgical_marl.files import write_atomic
 from surgical_marl.policies.encoder import stack_pictures
+from surgical_marl.policies.weights import WEIGHTS
 from surgical_marl.untrusted.arrays import MAX_WEIGHTS
 from surgical_marl.untrusted.files import read_bytes
 
@@ -69,7 +77,7 @@ class Graph(nn.Module):
 
 
 def write_onnx(path: Path, model: Any, pictures: Mapping[str, Any]) -> None:
-    """Write the network of one group of a `MultiAgentActor` on the CPU.
+    """Write the network of one group of a `MultiAgentActor` on the CPU, beside what `write_weights` wrote of it.
 
     Args:
         pictures: what the group sees, of `Layout.pictures`.
@@ -88,13 +96,33 @@ def write_onnx(path: Path, model: Any, pictures: Mapping[str, Any]) -> None:
             verbose=False,
         )
     assert program is not None
-    write_atomic(path, lambda temporary: program.save(str(temporary)))
+    file = program.model_proto
+    forget_paths(file)
+    refer(file, path.with_suffix(WEIGHTS))
+    write_atomic(path, partial(Path.write_bytes, data=file.SerializeToString()))
+
+
+def forget_paths(file: onnx.ModelProto) -> None:
+    """Remove what the exporter notes of each node: paths of the machine that it ran on, and thrice the node's size."""
+    for node in file.graph.node:
+        node.ClearField("metadata_props")
+
+
+def refer(file: onnx.ModelProto, weights: Path) -> None:
+    """Let the constants that stand in a file of safetensors, bit for bit, be read from there."""
+    data = weights.read_bytes()
+    begin = 8 + int.from_bytes(data[:8], "little")  # a header of JSON, after its length
+    places = json.loads(data[8:begin])
+    for tensor in file.graph.initializer:
+        if place := places.get(tensor.name.removeprefix("model.")):  # it is an attribute of Graph
+            first, end = (begin + offset for offset in place["data_offsets"])
+            if data[first:end] == tensor.raw_data:
+                set_external_data(tensor, weights.name, first, end - first)
+                tensor.ClearField("raw_data")
 
 
 def read_pictures(path: Path) -> dict[str, str]:
     """Return the pictures that the network in a file takes: name -> shape and type, in words."""
-    import onnx
-
     found = {}
     for each in onnx.load_model_from_string(read_bytes(path, MAX_WEIGHTS)).graph.input:
         tensor = each.type.tensor_type
