@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 from jax import lax
 
-from surgical_marl.engines.fused import kernel
+from surgical_marl.engines.fused import emit, kernel
 from surgical_marl.engines.fused.emit import Emitter
 from surgical_marl.engines.fused.preludes import CUDA, UNDEFINE
 from surgical_marl.engines.fused.traced import Unsupported
 from tests.helpers.fused_blocks import all_blocks, random_arrays
-from tests.helpers.fused_kernels import gpu_code, make_stores, run
+from tests.helpers.fused_kernels import gpu_code, make_stores, run, worked
 from tests.helpers.fused_programs import several
 
 RNG = np.random.default_rng(2)
@@ -184,6 +184,36 @@ def test_loops_and_branches_change_arrays_in_place() -> None:
         np.testing.assert_allclose(run(partial(changed, 24), *columns), expected, rtol=1e-5)
 
 
+def test_environments_that_take_one_way_come_before_those_that_take_another(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And then by how much they had to do. Only sides of branches that are long, with all in them, are ways."""
+    monkeypatch.setattr(emit, "LARGE", 8)
+    monkeypatch.setattr(emit, "APART", 60)
+
+    def long(x: Any) -> Any:
+        inner = lambda y: lax.cond(y > 0.5, lambda y: rounds(y, 3, 30), lambda y: rounds(y, 3, 31), y)  # noqa: E731
+        return inner(x) + 1
+
+    def rounds(x: Any, count: Any, length: int = 12) -> Any:
+        def body(_: Any, y: Any) -> Any:
+            for k in range(length):
+                y = jnp.sin(y) * (k + 2)
+            return y
+
+        return lax.fori_loop(0, count, body, x)
+
+    def function(way: Any, count: Any, x: Any) -> Any:
+        return rounds(lax.cond(way, lambda: long(x), lambda: x * 2), count)
+
+    way, count = np.array([True, False] * 12), RNG.permutation(np.arange(24, dtype=np.int32))
+    columns = way, count, RNG.uniform(0, 1, 24).astype(np.float32)
+    noted = worked(function, *columns)
+    with gpu_code():
+        assert np.array_equal(worked(function, *columns), noted)
+    assert noted[way].min() > noted[~way].max()
+    for each in (way & (columns[2] > 0.5), way & (columns[2] <= 0.5), ~way):
+        assert np.array_equal(np.argsort(noted[each]), np.argsort(count[each]))
+
+
 def test_a_scan_that_is_to_be_unrolled_is() -> None:
     """Then it needs no memory."""
 
@@ -201,6 +231,7 @@ def test_a_scan_that_is_to_be_unrolled_is() -> None:
 def test_code_for_cuda_compiles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every macro of the prelude, by NVRTC, which needs no GPU."""
     monkeypatch.setattr("surgical_marl.engines.fused.preludes.BRANCHES", 0)
+    monkeypatch.setattr(emit, "APART", 0)
     code = body(everything, random_arrays(0), vector=False)
     used = set(re.findall(r"\w+", code))
     assert not [name for name in re.findall("^#define (\\w+)", CUDA, re.M) if name not in used]

@@ -10,6 +10,7 @@ from typing import Any
 from unittest.mock import patch
 
 import jax
+import numpy as np
 
 from surgical_marl.engines.fused import engine, kernel
 from surgical_marl.engines.fused.arrays import make_arrays
@@ -30,7 +31,6 @@ _ON_A_CPU = {
        for name, sign in (("MAX", ">"), ("MIN", "<")) for kind in "IU"},
     "MAXF(a,b)": "__builtin_fmaxf(a,b)",
     "MINF(a,b)": "__builtin_fminf(a,b)",
-    "WORKED": "work_",
     "TOGETHER": "",
     "FINITE(x)": "(fabsf(x)<SM_INF)",
     "HIDEF(x)": 'asm volatile("":"+x"(x));',
@@ -76,6 +76,17 @@ def gpu_code() -> Iterator[None]:
 
 def run(function: Callable[..., Any], *columns: Any, in_place: bool = False) -> Any:
     """What a kernel of `function`, which is of one environment's arrays, makes of columns [N, ...]."""
+    arrays, outputs = _launched(function, columns, in_place)
+    return jax.tree.map(lambda leaf: arrays.read(leaf, "numpy"), outputs)
+
+
+def worked(function: Callable[..., Any], *columns: Any) -> np.ndarray:
+    """What a kernel notes of how much it had to do for each of columns [N, ...], [N]: the order of environments."""
+    noted: np.ndarray = _launched(function, columns, False)[0].work[: len(jax.tree.leaves(columns)[0])]
+    return noted
+
+
+def _launched(function: Callable[..., Any], columns: Any, in_place: bool) -> tuple[Any, Any]:
     graph, stores, layout, inputs, outputs = make_stores(function, columns, in_place)
     body = Emitter(graph, stores, vector=kernel.LANES > 1).body()
     compiled = kernel.compile_kernels({"run": body}, "cpu")["run"]
@@ -85,4 +96,4 @@ def run(function: Callable[..., Any], *columns: Any, in_place: bool = False) -> 
     for leaf, column in zip(jax.tree.leaves(inputs), jax.tree.leaves(columns), strict=True):
         arrays.write(leaf, column)
     compiled.launch(arrays.all, stride, 0, stride)
-    return jax.tree.map(lambda leaf: arrays.read(leaf, "numpy"), outputs)
+    return arrays, outputs

@@ -86,7 +86,7 @@ class Arrays(ABC):
 
     @abstractmethod
     def _argsort(self, shares: int) -> Any:
-        """Return the columns in the order of how much they had to do, most first, for so many threads of a CPU."""
+        """Return the columns in the order of what they had to do, most first, for so many threads of a CPU."""
 
     def sort_columns(self, every: int, shares: int) -> None:
         """Sort columns from time to time (`order.py`).
@@ -277,7 +277,7 @@ class CudaArrays(Arrays):
         import torch
 
         # Those with the most to do come first: others run beside them, where they would be waited for at the end.
-        return torch.argsort(self.work[: self.num_envs].to(torch.int16), descending=True, stable=True)
+        return torch.argsort(self.work[: self.num_envs], descending=True, stable=True)
 
     def _recording(self) -> bool:
         import torch

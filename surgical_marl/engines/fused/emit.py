@@ -14,12 +14,15 @@ import numpy as np
 
 from surgical_marl.engines.fused.emit_arrays import TYPES, ArrayEmitter
 from surgical_marl.engines.fused.graph import Branch, Graph, Loop, Value
-from surgical_marl.engines.fused.preludes import is_long, large_branches
+from surgical_marl.engines.fused.preludes import WAYS, is_long, large_branches
 from surgical_marl.engines.fused.schedule import Scheduler
 
 LARGE = 500
 """Least number of operations in a branch whose inputs are hidden from the compiler (`HIDEF`), or in a branch or a round
 of a loop that counts as work."""
+APART = 4000
+"""Least number of operations in a side of a branch, all that is in it included, for environments that take it to be
+kept apart from those that don't."""
 
 _CODE = {
     "add": "{}+{}", "sub": "{}-{}", "mul": "{}*{}", "neg": "-{}", "lt": "{}<{}", "le": "{}<={}", "gt": "{}>{}",
@@ -57,6 +60,8 @@ class Emitter(ArrayEmitter):
         self.stores, self.offsets, self.watch = stores, table_offsets(graph), watch
         self.active: list[str] = []
         """Conditions of the code's branch: it applies to the environments of a vector for which all of them hold."""
+        self.ways = 0
+        """Branches so far whose sides keep environments apart."""
 
     def body(self) -> str:
         self._postpone_stores()
@@ -67,7 +72,7 @@ class Emitter(ArrayEmitter):
             self.lines = ["F watch_=SPLAT(0.0f);", *self.lines]
             self.lines.append(f"B bad_=watch_!=SPLAT(0.0f);if(ANY(bad_)){{STB(flags,{field},LDB(flags,{field})|bad_)}}")
         if large_branches(self.lines):
-            self.lines = ["I work_=SPLATI(0);", *self.lines, "STI(work,0,WORKED)"]
+            self.lines = ["I work_=SPLATI(0),ways_=SPLATI(0);", *self.lines, "STI(work,0,WORKED)"]
         return "\n".join(self.lines)
 
     def _postpone_stores(self) -> None:
@@ -125,6 +130,9 @@ class Emitter(ArrayEmitter):
             kind = TYPES[self.graph.kind(out)]
             self.lines.append(f"{kind} v{out}={kind}{{}};" if self.vector else f"{kind} v{out};")
         chosen, other = self.schedule.inside[number]
+        apart = next((side for side in (chosen, other) if self._size(side) >= APART and self.ways < WAYS), None)
+        way = WAYS - self.ways - 1
+        self.ways += apart is not None
 
         def take(values: list[Value], first: bool) -> Any:
             def result(k: int) -> None:
@@ -139,20 +147,28 @@ class Emitter(ArrayEmitter):
 
         self.lines.append(f"if(ANY({condition})){{")
         with self._side(number, condition), self._kept(kept, f"NOT({condition})"):
-            self._count(chosen)
+            self._count(chosen, way if apart == chosen else None)
             self._region(chosen, take(branch.chosen, True))
         self.lines.append(f"}}\nif(ANY(NOT({condition}))){{" if self.vector else "}else{")
         arrays = [self.names[out] for out in outs if self._is_array(out)]
         with self._side(number, f"NOT({condition})"), self._kept(arrays, condition):
-            self._count(other)
+            self._count(other, way if apart == other else None)
             self._region(other, take(branch.others, False))
         self.lines.append("}")
 
-    def _count(self, region: int) -> None:
-        """Add the operations of a part that not all environments go through to how much this one had to do."""
-        size = len(self.schedule.regions[region].items)
+    def _count(self, region: int, way: int | None = None) -> None:
+        """Note that an environment goes through a part that not all do: how long it is, and which of the `WAYS`."""
+        size, all_ = len(self.schedule.regions[region].items), "&".join(self.active) or "SPLATB(1)"
         if size >= LARGE:
-            self.lines.append(f"WORK({size},{'&'.join(self.active) or 'SPLATB(1)'})")
+            self.lines.append(f"WORK({size},{all_})")
+        if way is not None:
+            self.lines.append(f"WAY({way},{all_})")
+
+    def _size(self, region: int) -> int:
+        """Return how many operations a region has, all that is in it included."""
+        items = self.schedule.regions[region].items
+        groups = [index for kind, index in items if kind == "group"]
+        return len(items) + sum(self._size(inner) for group in groups for inner in self.schedule.inside[group])
 
     def _wait(self, top: int, places: list[int]) -> None:
         """Let the threads of a block wait for each other before some lines, if there is much to do from `top` on."""

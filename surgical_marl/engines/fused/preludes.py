@@ -4,7 +4,8 @@ Division and square root are CUDA's approximate ones, right to two units in the 
 2^-126 for 0, which saves the scaling of such numbers: one instruction in twenty of a physics step. That division gives
 0 for a divisor above 2^126.
 
-`WORKED` is how much there was to do. On a GPU it fits 16 bits, to 1 %: the exponent and seven more bits of a float.
+`WORKED` is what there was to do: in its first bits which of the longest branches an environment took, then how much it
+was, as the exponent and twelve more bits of a float. Neighbours in this order go through the same code.
 `TOGETHER` lets the threads of a block wait for each other, so that they find each other's instructions in the cache. It
 stands where all of them come by, behind long branches and loops, and at the top of a loop that all go through.
 """
@@ -17,6 +18,8 @@ LANES = 8
 """Environments in a vector on a CPU: 32 bytes of float32, an AVX register."""
 BRANCHES = 8
 """So many large branches make code long: all threads of a block should be at the same place of it."""
+WAYS = 14
+"""Most branches that are told apart. With 17 bits for how much there was to do, they fill an int32."""
 
 
 def large_branches(code: Iterable[str]) -> int:
@@ -29,7 +32,11 @@ def is_long(code: Iterable[str]) -> bool:
     return large_branches(code) >= BRANCHES
 
 
-CUDA = """
+_WORKED = """
+#define WORKED ((ways_<<SPLATI(17))|MAXI(U2I(BITS(I2F(work_))>>SPLATU(11))-SPLATI(520192),SPLATI(0)))
+"""  # 520192 is what it would be for a work of 1
+CUDA = (
+    """
 typedef float F; typedef int I; typedef unsigned int U; typedef bool B;
 #define SM_INF __int_as_float(0x7f800000)
 #define SM_NAN __int_as_float(0x7fffffff)
@@ -91,11 +98,13 @@ typedef float F; typedef int I; typedef unsigned int U; typedef bool B;
 #define HIDEI(x) asm volatile("":"+r"(x));
 #define HIDEU(x) asm volatile("":"+r"(x));
 #define WORK(n,c) work_+=n;
+#define WAY(n,c) ways_|=1<<n;
 #define TOGETHER __syncthreads();
-#define WORKED (max((int)(__float_as_uint((F)work_)>>16)-16256,0))
 #define BITS(x) __float_as_uint(x)
 #define FLOAT(x) __uint_as_float(x)
 """
+    + _WORKED
+)
 
 CPU = (
     f"""
@@ -170,9 +179,10 @@ typedef unsigned char C __attribute__((ext_vector_type(SM_W)));
 #define BITS(x) ((U)(x))
 #define FLOAT(x) ((F)(x))
 #define WORK(n,c) work_+=(c)&SPLATI(n);
-#define WORKED work_
+#define WAY(n,c) ways_|=(c)&SPLATI(1<<n);
 #define TOGETHER
 """
+    + _WORKED
 )
 
 MACROS = sorted(
