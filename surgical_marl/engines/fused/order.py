@@ -2,8 +2,9 @@
 
 Threads of a GPU go through the code in groups of 32, and a CPU's vectors hold 8 environments. Such a group goes through
 every branch, and every round of a loop, that one of them needs. What an environment has to do is about the same for
-many steps: an arm that holds something goes on to hold it. So those that had as much to do are put next to each other:
-the columns of the arrays change places, as neighbours are read together fastest from where they lie together in memory.
+many steps: an arm that holds something goes on to hold it. So those that took the same of the longest branches, and had
+as much to do in them, are put next to each other: the columns of the arrays change places, as neighbours are read
+together fastest from where they lie together in memory.
 An environment's results do not depend on its column.
 """
 
