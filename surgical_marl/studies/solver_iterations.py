@@ -93,9 +93,9 @@ def speeds(scene: Scene) -> np.ndarray:
 def step(scene: Scene, states: Physics, touching: bool) -> tuple[np.ndarray, np.ndarray]:
     """Velocity [S, nv] and contact forces [S, P] after one physics step here."""
     simulated = Simulator(scene)
-    advance = simulated._touching_step if touching else simulated._apart
-    after, force = jax.jit(jax.vmap(advance))(states)
-    return np.asarray(after.qvel), np.asarray(force)
+    advance, untouched = simulated._touching_step if touching else simulated._apart, simulated.untouched
+    after, touch = jax.jit(jax.vmap(lambda state: advance(state, untouched)))(states)
+    return np.asarray(after.qvel), np.asarray(touch.force)
 
 
 def shares(off: np.ndarray) -> str:
