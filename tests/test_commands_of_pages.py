@@ -106,6 +106,46 @@ def run_all(found: list[list[str]], folder: Path, trained: Callable[[str], Path]
             print(f"{time.monotonic() - began:.0f} s  {shlex.join(words)}")
 
 
+@pytest.mark.parametrize(
+    ("command", "added"),
+    [
+        ("surgical-marl eval reach-psm --episodes 1000", "--episodes 8"),
+        ("surgical-marl bench view --scene psm", "--seconds 1"),
+        ("surgical-marl view reach --scene psm", "--port 0"),
+        ("python -m surgical_marl.studies.grasping --arms 1", "--seconds 1 --grasps 1"),
+        ("python policies/train_all.py --evaluate", "--seeds 1 --jobs 1 --only reach-psm"),
+        ("python docs/examples/random_agents.py", ""),
+        ("pytest tests/test_cli.py -k list", "--collect-only --quiet"),
+        ("SEED=3 make gallery", "ARGS='--only psm'"),
+        ("make docs", ""),
+    ],
+)
+def test_a_command_is_made_small_by_its_own_options(command: str, added: str) -> None:
+    assert least(shlex.split(command)) == [*shlex.split(command), *shlex.split(added)]
+
+
+def test_a_training_is_made_small_and_imitates_only_if_it_did() -> None:
+    reach, pick = (least(["surgical-marl", "train", *task]) for task in (["reach", "--scene", "psm"], ["needle_pick"]))
+    assert {"--iterations", "num_envs=4", "steps_per_iteration=2"} <= {*reach} and "imitation.steps=1" not in reach
+    assert pick[-1] == "imitation.steps=1"
+    several = "torchrun --nproc-per-node 4{} -m surgical_marl train reach --scene psm"
+    found = least(shlex.split(several.format("")))
+    assert found == [*shlex.split(several.format(" --nnodes 1 --nproc-per-node 2")), *reach[5:]]
+
+
+@pytest.mark.parametrize(
+    ("command", "word"),
+    [
+        ("pip install onnxruntime", "network"),
+        ("make lock", "make lock" if not (Path(sys.prefix) / ".ready-for-supply").exists() else "servers"),
+        ("python -m surgical_marl.studies.stability", None),
+    ],
+)
+def test_what_cannot_run_here_is_said(command: str, word: str | None) -> None:
+    found = lacking(shlex.split(command))
+    assert found is None if word is None else word in str(found)
+
+
 def commands_of(page: Path, folder: Path, kinds: Sequence[str] = ("sh", "inline")) -> list[list[str]]:
     """Return the words of each command of a page, after everything that the page has its reader save."""
     found, classes = [], []

@@ -19,6 +19,9 @@ from typing import Any
 import pytest
 
 from surgical_marl.cli import main as cli
+from surgical_marl.cli.flags import given
+from surgical_marl.plugins.tasks import scene_of
+from surgical_marl.runs.settings import Settings, load_config
 
 from .pages import ROOT
 
@@ -32,8 +35,8 @@ GOALS = {"--success": "0", "--collisions": "1", "--port": "0"}
 """What is met at once: by any policy, and by any machine."""
 ONE_OF = {"SCENE": "psm", "POLICY": "reach-psm", "NAME": "psm", "LOADER": "YAML"}
 """`--only` this one, by what the option calls its values. Where they are choices, all of them are short."""
-SETTINGS = ("num_envs=4", "steps_per_iteration=2", "oracle_episodes=16", "imitation.steps=1", "imitation.batch_size=8",
-            "ppo.epochs=1", "ppo.mini_batches=1")  # fmt: skip
+SETTINGS = ("num_envs=4", "steps_per_iteration=2", "oracle_episodes=16", "imitation.batch_size=8", "ppo.epochs=1",
+            "ppo.mini_batches=1")  # fmt: skip
 """What takes `key=value` is given these."""
 
 
@@ -55,8 +58,10 @@ def least(words: list[str]) -> list[str]:
 
         own = list(takewhile(lambda word: word != "-m", rest))
         return [program, *own, *_added(get_args_parser()), "-m", *least(["python", *rest[len(own) :]])[2:]]
+    if rest[:2] == ["-m", "surgical_marl"]:
+        program, rest = "surgical-marl", rest[2:]
     parser = _surgical_marl(rest) if program == "surgical-marl" else _python(rest) if "python" in program else None
-    return [*words, *(_added(parser) if parser else [])]
+    return [*words, *(_added(parser) if parser else []), *(_imitation(rest) if program == "surgical-marl" else [])]
 
 
 def command_alone(words: list[str]) -> list[str]:
@@ -85,6 +90,20 @@ def _added(parser: argparse.ArgumentParser) -> list[str]:
     return added
 
 
+def _imitation(words: list[str]) -> list[str]:
+    """Return the setting of a training that imitates for one step only; none if it does not imitate at all."""
+    arguments = cli._parse(words)
+    if arguments.name not in cli._TAKE_SETTINGS or not arguments.task:
+        return []
+    flags = [f"{name}={value}" for name, value in given(arguments, Settings).items()]
+    try:
+        scene = arguments.scene or scene_of(arguments.task)
+        settings = load_config(arguments.task, scene, [*flags, *arguments.overrides])
+    except ValueError:  # a task or an algorithm that the page adds, and nobody has here
+        return []
+    return ["imitation.steps=1"] if settings.imitation.steps else []
+
+
 def _surgical_marl(words: list[str]) -> argparse.ArgumentParser:
     """Return the parser of a command of `surgical-marl`, such as that of `bench sim`."""
     parser: Any = cli._parser()
@@ -100,8 +119,6 @@ def _python(words: list[str]) -> argparse.ArgumentParser | None:
     """Return the parser of a Python program of this project; None if it has none, or is another's."""
     while words[0] == "-X":
         words = words[2:]
-    if words[:2] == ["-m", "surgical_marl"]:
-        return _surgical_marl(words[2:])
     if words[0] == "-m" and words[1].partition(".")[0] in ("surgical_marl", "tests"):
         spec = importlib.util.find_spec(words[1])
         assert spec and spec.origin, words[1]
@@ -139,7 +156,7 @@ def _with_arguments(variables: list[str], added: list[str]) -> list[str]:
     """Return variables of `make` with more in ARGS."""
     given = next((value[5:] for value in variables if value.startswith("ARGS=")), "")
     others = [value for value in variables if not value.startswith("ARGS=")]
-    return [*others, f"ARGS={given} {shlex.join(added)}".strip()] if added else variables
+    return [*others, "ARGS=" + f"{given} {shlex.join(added)}".strip()] if added else variables
 
 
 def all_set_up() -> list[str]:
