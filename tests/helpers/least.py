@@ -33,7 +33,7 @@ AMOUNTS = {
 """The least that an option which says how much is given."""
 GOALS = {"--success": "0", "--collisions": "1", "--port": "0"}
 """What is met at once: by any policy, and by any machine."""
-ONE_OF = {"SCENE": "psm", "POLICY": "reach-psm", "NAME": "psm", "LOADER": "YAML"}
+ONE_OF = {"SCENE": "psm", "POLICY": "reach-psm", "NAME": "psm", "LOADER": "yaml"}
 """`--only` this one, by what the option calls its values. Where they are choices, all of them are short."""
 SETTINGS = ("num_envs=4", "steps_per_iteration=2", "oracle_episodes=16", "imitation.batch_size=8", "ppo.epochs=1",
             "ppo.mini_batches=1")  # fmt: skip
