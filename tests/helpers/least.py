@@ -61,7 +61,7 @@ def least(words: list[str]) -> list[str]:
     if rest[:2] == ["-m", "surgical_marl"]:
         program, rest = "surgical-marl", rest[2:]
     parser = _surgical_marl(rest) if program == "surgical-marl" else _python(rest) if "python" in program else None
-    return [*words, *(_added(parser) if parser else []), *(_imitation(rest) if program == "surgical-marl" else [])]
+    return [*words, *(_added(parser) if parser else []), *(_shortened(rest) if program == "surgical-marl" else [])]
 
 
 def command_alone(words: list[str]) -> list[str]:
@@ -90,8 +90,8 @@ def _added(parser: argparse.ArgumentParser) -> list[str]:
     return added
 
 
-def _imitation(words: list[str]) -> list[str]:
-    """Return the setting of a training that imitates for one step only; none if it does not imitate at all."""
+def _shortened(words: list[str]) -> list[str]:
+    """Return the settings of a training that imitates for one step, or whose episodes have eight if no oracle acts."""
     arguments = cli._parse(words)
     if arguments.name not in cli._TAKE_SETTINGS or not arguments.task:
         return []
@@ -101,7 +101,9 @@ def _imitation(words: list[str]) -> list[str]:
         settings = load_config(arguments.task, scene, [*flags, *arguments.overrides])
     except ValueError:  # a task or an algorithm that the page adds, and nobody has here
         return []
-    return ["imitation.steps=1"] if settings.imitation.steps else []
+    if settings.imitation.steps:
+        return ["imitation.steps=1"]
+    return [] if settings.imitation.weight or settings.oracle_states.rate else ["max_steps=8"]
 
 
 def _surgical_marl(words: list[str]) -> argparse.ArgumentParser:
