@@ -260,6 +260,11 @@ def run(words: list[str], folder: Path, source: Path) -> str:
         out, err = process.communicate(timeout=LONGEST)
     finally:
         end(process)
+    if (refused := re.search(r"leave (--[a-z-]+)", err)) and refused[
+        1
+    ] in words:  # an amount that this one does not take
+        at = words.index(refused[1])
+        return run([*words[:at], *words[at + 2 :]], folder, source)
     if process.returncode:
         for said, word in LACKING.items():
             if found := re.search(said, err):
