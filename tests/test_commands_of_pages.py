@@ -260,9 +260,8 @@ def run(words: list[str], folder: Path, source: Path) -> str:
         out, err = process.communicate(timeout=LONGEST)
     finally:
         end(process)
-    if (refused := re.search(r"leave (--[a-z-]+)", err)) and refused[
-        1
-    ] in words:  # an amount that this one does not take
+    refused = re.search(r"leave (--[a-z-]+)", err) if process.returncode == 2 else None
+    if refused and refused[1] in words:  # an amount that does not go with the command's other options
         at = words.index(refused[1])
         return run([*words[:at], *words[at + 2 :]], folder, source)
     if process.returncode:
