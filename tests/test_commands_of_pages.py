@@ -75,7 +75,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
     def train(scene: str) -> Path:
         folder = tmp_path_factory.mktemp("trained") / scene
         words = least(shlex.split(f"surgical-marl train reach --scene {scene}"))
-        run([*words, "--iterations", "1", "--out", str(folder)], ROOT, ROOT)
+        run([*words, "iterations=1", "--out", str(folder)], ROOT, ROOT)
         return folder
 
     return train
@@ -126,7 +126,7 @@ def test_a_command_is_made_small_by_its_own_options(command: str, added: str) ->
 
 def test_a_training_is_made_small_and_imitates_only_if_it_did() -> None:
     reach, pick = (least(["surgical-marl", "train", *task]) for task in (["reach", "--scene", "psm"], ["needle_pick"]))
-    assert {"--iterations", "num_envs=4", "steps_per_iteration=2"} <= {*reach}
+    assert {"iterations=2", "num_envs=4", "steps_per_iteration=2"} <= {*reach}
     assert (reach[-1], pick[-1]) == ("max_steps=8", "imitation.steps=1")
     several = "torchrun --nproc-per-node 4{} -m surgical_marl train reach --scene psm"
     found = least(shlex.split(several.format("")))
@@ -202,6 +202,8 @@ def lay_out(words: list[str], all_words: list[list[str]], folder: Path, trained:
     for flag, word in pairwise(["", *words]):
         name = word.partition("=")[2] if flag == "--partner" else word
         path = folder / name
+        if flag == "--resume":  # each goes on with a run as the reader has it
+            shutil.rmtree(path, ignore_errors=True)
         if flag in ("--out", "--figure"):
             path.parent.mkdir(parents=True, exist_ok=True)
         elif ("--out", word) in pairwise(words) or path.exists():
