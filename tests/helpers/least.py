@@ -26,8 +26,8 @@ from surgical_marl.runs.settings import Settings, load_config
 from .pages import ROOT
 
 AMOUNTS = {
-    "--num-envs": "4", "--episodes": "8", "--steps": "2000", "--seconds": "1", "--minutes": "0.1",
-    "--turn": "1", "--trials": "1", "--confirm": "1", "--seeds": "1", "--jobs": "1", "--grasps": "1", "--sample": "1",
+    "--num-envs": "4", "--episodes": "8", "--steps": "2000", "--seconds": "1", "--minutes": "0.1", "--turn": "1",
+    "--trials": "1", "--confirm": "1", "--seeds": "1", "--jobs": "1", "--grasps": "1", "--sample": "1",
     "--size": "160x120", "--nnodes": "1", "--nproc-per-node": "2",
 }  # fmt: skip
 """The least that an option which says how much is given."""
@@ -35,8 +35,10 @@ GOALS = {"--success": "0", "--collisions": "1", "--port": "0"}
 """What is met at once: by any policy, and by any machine."""
 ONE_OF = {"SCENE": "psm", "POLICY": "reach-psm", "NAME": "psm", "LOADER": "yaml"}
 """`--only` this one, by what the option calls its values. Where they are choices, all of them are short."""
-SETTINGS = ("iterations=2", "num_envs=4", "steps_per_iteration=2", "oracle_episodes=16", "imitation.batch_size=8", "ppo.epochs=1",
-            "ppo.mini_batches=1")  # fmt: skip
+SETTINGS = (
+    "iterations=2", "num_envs=4", "steps_per_iteration=2", "oracle_episodes=16", "imitation.batch_size=8",
+    "ppo.epochs=1", "ppo.mini_batches=1",
+)  # fmt: skip
 """What takes `key=value` is given these."""
 
 
