@@ -268,7 +268,7 @@ def run(words: list[str], folder: Path, source: Path) -> str:
         return run([*words[:at], *words[at + 2 :]], folder, source)
     if process.returncode:
         for said, word in LACKING.items():
-            if found := re.search(said, err):
+            if found := re.search(said, out + err):
                 pytest.skip(word.format(found[1]))
         said = f"{shlex.join(words)} ended with {process.returncode}:\n{out[-2000:]}\n{err[-4000:]}"
         pytest.fail(said, pytrace=False)
