@@ -112,7 +112,7 @@ def run_all(found: list[list[str]], folder: Path, trained: Callable[[str], Path]
         ("surgical-marl eval reach-psm --episodes 1000", "--episodes 8"),
         ("surgical-marl bench view --scene psm", "--seconds 1"),
         ("surgical-marl view reach --scene psm", "--port 0"),
-        ("python -m surgical_marl.studies.grasping --arms 1", "--seconds 1 --grasps 1"),
+        ("python -m surgical_marl.studies.grasping --arms 1", "--seconds 1 --grasps 1 --objects needle_sh"),
         ("python policies/train_all.py --evaluate", "--seeds 1 --jobs 1 --only reach-psm"),
         ("python docs/examples/random_agents.py", ""),
         ("pytest tests/test_cli.py -k list", "--collect-only --quiet"),

@@ -59,11 +59,15 @@ def least(words: list[str]) -> list[str]:
         from torch.distributed.run import get_args_parser
 
         own = list(takewhile(lambda word: word != "-m", rest))
-        return [program, *own, *_added(get_args_parser()), "-m", *least(["python", *rest[len(own) :]])[2:]]
+        return [program, *own, *_added(get_args_parser(), own), "-m", *least(["python", *rest[len(own) :]])[2:]]
     if rest[:2] == ["-m", "surgical_marl"]:
         program, rest = "surgical-marl", rest[2:]
     parser = _surgical_marl(rest) if program == "surgical-marl" else _python(rest) if "python" in program else None
-    return [*words, *(_added(parser) if parser else []), *(_shortened(rest) if program == "surgical-marl" else [])]
+    return [
+        *words,
+        *(_added(parser, words) if parser else []),
+        *(_shortened(rest) if program == "surgical-marl" else []),
+    ]
 
 
 def command_alone(words: list[str]) -> list[str]:
@@ -76,12 +80,15 @@ def serves(words: list[str]) -> bool:
     return words[0] == "surgical-marl" and "--port" in _surgical_marl(words[1:])._option_string_actions
 
 
-def _added(parser: argparse.ArgumentParser) -> list[str]:
+def _added(parser: argparse.ArgumentParser, words: list[str]) -> list[str]:
     options = parser._option_string_actions
     added: list[str] = []
     for name, value in (AMOUNTS | GOALS).items():
         if name in options and not (name in AMOUNTS and options[name].default == 1):
             added += [name, value]
+    for name, option in options.items():  # of names that nobody gave, the first
+        if isinstance(option.default, list) and len(option.default) > 1 and name not in (*words, *added, "--only"):
+            added += [name, str(option.default[0])]
     only = options.get("--only")
     if only and not only.choices:
         added += ["--only", ONE_OF[str(only.metavar)]]
