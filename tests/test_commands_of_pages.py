@@ -33,7 +33,7 @@ from surgical_marl.runs.fault import write_fault
 from surgical_marl.runs.settings import Settings
 
 from .helpers.least import all_set_up, command_alone, least, serves, stamps_of_make
-from .helpers.pages import PAGES, ROOT, commands, is_name_only, pieces, stand_in
+from .helpers.pages import PAGES, ROOT, commands, free_names, is_name_only, pieces, stand_in
 
 LONGEST = 1800
 """Seconds that a command may take, with caches that are empty."""
@@ -155,6 +155,10 @@ def commands_of(page: Path, folder: Path, kinds: Sequence[str] = ("sh", "inline"
             (folder / name).write_text(text, encoding="utf-8")
         elif kind == "python":
             classes.append(text)
+            if "surgical_marl" not in text and not free_names(
+                text
+            ):  # it makes files that commands read, such as meshes
+                subprocess.run([sys.executable, "-c", text], cwd=folder, check=True)
         elif kind == "toml":
             install(tomllib.loads(text)["project"]["entry-points"], classes, folder)
         elif kind in kinds:
