@@ -195,6 +195,8 @@ def test_a_sweep_as_table_json_and_picture(made_up: None, tmp_path: Path, capsys
     assert len(points) == 12
     assert list(points[0]) == [*CONTRACT, "bytes_per_env"]
     assert out.read_bytes().startswith(b"\x89PNG")
+    assert main(["bench", "sim", "--sweep", "--device", "cpu", "--json", "--num-envs", "20"]) == 0
+    assert [point["num_envs"] for point in json.loads(capsys.readouterr().out)["points"][:3]] == [1, 4, 16]
     assert "4,000,000" in sweep_table([Point(FUSED, 567), Point(MUJOCO, None)])
 
 
@@ -353,7 +355,6 @@ def test_what_the_face_adds_as_json_and_as_a_sentence(
         (["sim", "--device", "gpu"], ["'gpu'", "auto, cpu, cuda"]),
         (["sim", "--engine", "mujoco", "--device", "cuda"], ["'mujoco'", "'cuda'", "CPU"]),
         (["sim", "--out", "a.png"], ["a.png", "--sweep"]),
-        (["sim", "--sweep", "--num-envs", "4"], ["--sweep", "--num-envs 4"]),
         (["sim", "--sweep", "--out", "a.pdf"], ["a.pdf", ".png"]),
         (["sim", "--sweep", "--out", "none/a.png"], ["none/a.png", "folder"]),
         (["render", "--scene", "psm"], ["'psm'", "no endoscope"]),

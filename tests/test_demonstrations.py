@@ -306,3 +306,9 @@ def test_pictures_are_refused() -> None:
         match=r"oracle_states.rate, imitation.steps and imitation.weight must be 0 where agents observe pictures",
     ):
         Demonstrations(SETTINGS, seeing, "cpu")
+
+
+def test_an_oracle_that_has_no_time_is_refused(trainer: Trainer) -> None:
+    """No state is kept of episodes of so few steps."""
+    with pytest.raises(ValueError, match=f"{NEITHER}for reach: its oracle never succeeded"):
+        Demonstrations(replace(SETTINGS, max_steps=3, oracle_episodes=2), trainer.env.layout, "cpu")

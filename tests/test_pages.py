@@ -12,7 +12,7 @@ import re
 import shlex
 import shutil
 import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import nullcontext, suppress
 from itertools import dropwhile, pairwise
 from pathlib import Path
@@ -32,11 +32,8 @@ from surgical_marl.scenes.load import load_scene
 from surgical_marl.tasks.base.options import Options, make_options
 from surgical_marl.view.browser import gate
 
-from .helpers.pages import PAGES, ROOT, commands, free_names, pieces
+from .helpers.pages import PAGES, ROOT, commands, free_names, is_name_only, pieces, stand_in
 
-STANDS_FOR = {"SCENE": "psm", "TASK": "reach", "LEVEL": "hard", "POLICY": "oracle", "RUN": "runs/run", "SEED": "0",
-              "NAME": "reach-psm", "N": "2", "K": "4", "W": "0.1", "HOST": "localhost", "WAY": "si"}  # fmt: skip
-"""What words in capitals stand for in a command."""
 QUICK = {("reach", "psm"), ("reach", "bimanual_psm")}
 """Environments that Python in pages really makes. Most other tests use them, too."""
 
@@ -188,8 +185,7 @@ def run_python(code: str, names: dict[str, Any]) -> None:
 def check_command(words: list[str], is_mention: bool = False) -> None:
     """Raise AssertionError unless a command can be typed as it stands, or is nothing but a command's name."""
     program, *rest = dropwhile(re.compile("[A-Z_]+=").match, words)  # without variables of the environment
-    name = " ".join(rest).removeprefix("-m surgical_marl ")
-    if not (is_mention and (not rest or name in COMMANDS)):
+    if not (is_mention and is_name_only([program, *rest])):
         assert program in CHECKS, f"no test knows the program {program!r}"
         CHECKS[program](rest)
 
@@ -213,14 +209,6 @@ def check_surgical_marl(argv: list[str]) -> None:
         patch.setattr("surgical_marl.bench.command._no_caches", nullcontext)  # it would outlast the command
         assert cli.main(argv) == 0, argv
     shutil.rmtree("runs", ignore_errors=True)
-
-
-def stand_in(word: str, argv: list[str]) -> str:
-    """Return a word with what its capitals and angle brackets stand for."""
-    if word == "SCENE" and "--task" in argv and argv[argv.index("--task") + 1] in TASKS.names():
-        return scenes_for(argv[argv.index("--task") + 1])[0]
-    word = re.sub(r"<(\w+)>", r"\1", word).removeprefix("/")  # nothing is written outside of the working folder
-    return re.sub(r"(?<![a-zA-Z_])[A-Z]{1,6}(?![a-zA-Z_])", lambda match: STANDS_FOR[match[0]], word)
 
 
 def lay_out(argv: list[str]) -> None:
@@ -332,15 +320,3 @@ CHECKS: dict[str, Callable[[list[str]], None]] = {
     "torchrun": check_torchrun,
     ".": lambda argv: None if argv == [".venv/bin/activate"] else pytest.fail(str(argv)),
 }
-
-
-def names_of_commands(parser: argparse.ArgumentParser, before: str = "") -> Iterator[str]:
-    for action in parser._actions:
-        if isinstance(action, argparse._SubParsersAction):
-            for name, inner in action.choices.items():
-                yield before + name
-                yield from names_of_commands(inner, f"{before}{name} ")
-
-
-COMMANDS = set(names_of_commands(cli._parser()))
-"""A page may name a command without saying what it should work on."""

@@ -43,8 +43,6 @@ def run(arguments: Namespace) -> int:
 
 
 def _sim(arguments: Namespace) -> int:
-    if arguments.sweep and arguments.num_envs:
-        raise ValueError(f"--sweep takes every number of environments: leave --num-envs {arguments.num_envs} out")
     if arguments.out and not arguments.sweep:
         raise ValueError(f"--out {arguments.out} is for the picture of a sweep: add --sweep")
     if arguments.out and not (arguments.out.suffix == ".png" and is_folder(arguments.out.parent)):

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from surgical_marl.bench.course import Course, make_course
-from surgical_marl.bench.sim import Point, Speed, measure, sweep
+from surgical_marl.bench.sim import SWEEP, Point, Speed, measure, sweep
 from surgical_marl.bench.text import aligned, describe_machine
 from surgical_marl.bench.workload import Workload
 from surgical_marl.files import write_atomic
@@ -39,8 +39,9 @@ def run(
 ) -> str:
     """All of `surgical-marl bench sim`: the text of its table or JSON."""
     if sweeping:
+        counts = [count for count in SWEEP if count <= (workload.num_envs or SWEEP[-1])]
         points, title = [], f"{workload.task} on {workload.scene}; {describe_machine()}"
-        for point in sweep(workload, engines):
+        for point in sweep(workload, engines, counts):
             points.append(point)
             if out:  # anew with each: a sweep takes minutes, and may be stopped
                 draw(points, title, out)

@@ -22,7 +22,8 @@ def add_bench(commands: Any) -> None:
     sim = _bench_parser(kinds, "sim", "steps/s of the engines, C MuJoCo and MuJoCo Warp", Workload)
     several, shape = "several with commas between them", "|".join(BENCHED)
     sim.add_argument("--engine", type=some_of(BENCHED), default=BENCHED[:1], metavar=shape, help=several)
-    sim.add_argument("--sweep", action="store_true", help="from 1 to 4 million environments, as far as memory goes")
+    counts = "from 1 to 4 million environments, or to --num-envs, as far as memory goes"
+    sim.add_argument("--sweep", action="store_true", help=counts)
     sim.add_argument("--out", type=Path, metavar="FILE.png", help="picture of a sweep")
     for kind, what in (("train", "steps/s with learning"), ("solve", "seconds until a policy is good")):
         learns = _bench_parser(kinds, kind, what, Settings)

@@ -135,6 +135,7 @@ def _record(env: BatchedEnv) -> dict[str, np.ndarray]:
             break
     bar.close()
     found = {}
+    keep("states", 0, np.zeros(env.num_envs, bool), {**env.carry(), **observations, "state": state})  # if none is
     for kind, (numbers, steps) in ((kind, np.concatenate(places[kind], 1)) for kind in shapes):
         useful = np.flatnonzero((solved[numbers] >= 0) & (steps <= solved[numbers] + beyond))
         chosen = rng.choice(useful, STATES) if kind == "states" and len(useful) else useful

@@ -1,6 +1,7 @@
 """Measure the policies that need no learning on every scene, for the tables in docs/evaluation.md.
 
-    python -m surgical_marl.studies.baselines [TASK ...]
+    python -m surgical_marl.studies.baselines                           # all of them
+    python -m surgical_marl.studies.baselines reach track --only psm    # some tasks, some scenes
 
 It prints a table for each task and writes the hashes of the goals to `surgical_marl/evaluation/goal_sets.yaml`, so what
 is committed must not change without a reason.
@@ -15,10 +16,12 @@ from typing import Any
 import yaml
 
 import surgical_marl.evaluation.goal_set
-from surgical_marl.content import BASELINES
+from surgical_marl.cli.flags import one_of
+from surgical_marl.content import BASELINES, list_scenes
 from surgical_marl.evaluation.command import play_all
 from surgical_marl.evaluation.evaluate import summarise
 from surgical_marl.plugins.tasks import TASKS, list_tasks, scenes_for
+from surgical_marl.studies.command import make_parser, run
 
 HASHES = Path(surgical_marl.evaluation.goal_set.__file__).with_name("goal_sets.yaml")
 ERRORS = {"median_error_mm": "median error (mm)", "p95_error_mm": "95th percentile (mm)"}
@@ -32,21 +35,32 @@ VIEWS = {"in_view_rate": "tools in view", "centre_error": "centre error (half fi
 PICTURES = {"image_error": "image error (grey levels)", "angle_error_deg": "angle error (degrees)"}
 
 
-def main(tasks: list[str]) -> None:
+def main(argv: list[str] | None = None) -> int:
+    parser = make_parser(__doc__)
+    parser.add_argument("tasks", nargs="*", type=one_of(list_tasks()), metavar="TASK", help="all if none is named")
+    parser.add_argument("--only", nargs="+", type=one_of(list_scenes()), metavar="SCENE", help="these scenes alone")
+    arguments = parser.parse_args(argv)
     before = HASHES.read_text()
     comments = [line for line in before.splitlines() if line.startswith("#")]
     hashes = yaml.safe_load(before)
-    for task in tasks:
+    for task in arguments.tasks or list_tasks():
         for start in TASKS.load(task).starts:
             rows = []
-            for scene in sorted(scenes_for(task), key=lambda name: (name.count("_"), name)):
+            for scene in [name for name in simple_first(task) if name in (arguments.only or list_scenes())]:
                 for policy in BASELINES:
                     asked = {"task": task, "scene": scene, "start": start}
                     result = summarise([play_all([policy], asked, episodes=200, seed=0)[policy]])
                     rows.append([scene, policy, result])
                 hashes.setdefault(start, {}).setdefault(task, {})[scene] = result["goal_set"]
-            print(f"{task} from {start}:\n\n{table(rows)}", flush=True)
+            if rows:
+                print(f"{task} from {start}:\n\n{table(rows)}", flush=True)
     HASHES.write_text("\n".join([*comments, yaml.safe_dump(hashes)]))
+    return 0
+
+
+def simple_first(task: str) -> list[str]:
+    """Return a task's scenes, those of one arm first."""
+    return sorted(scenes_for(task), key=lambda name: (name.count("_"), name))
 
 
 def table(rows: list[list[Any]]) -> str:
@@ -71,4 +85,4 @@ def cell(name: str, value: float | None, bounds: list[float] | None) -> str:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:] or list_tasks())
+    sys.exit(run("baselines", main))

@@ -26,6 +26,7 @@ from surgical_marl.robots.spec import build_spec
 from surgical_marl.runs.settings import read_config
 from surgical_marl.scenes.load import load_scene
 from surgical_marl.scenes.objects import load_object
+from surgical_marl.studies.command import make_parser
 from surgical_marl.untrusted.arrays import read_npz
 from surgical_marl.yaml_file import MAX_YAML, read_yaml
 
@@ -44,8 +45,9 @@ source="#s"/></vertices><triangles count="{count}"><input semantic="VERTEX" sour
 <scene><instance_visual_scene url="#w"/></scene></COLLADA>"""
 
 
-def main() -> None:
+def main(argv: list[str] | None = None) -> None:
     """Print a table: what is read, the seconds of a core, the memory in MB, and how it ends."""
+    make_parser(__doc__).parse_args(argv)
     print(f"{'file':40} {'s':>5} {'MB':>5}  outcome")
     with tempfile.TemporaryDirectory() as name:
         for what, read in cases(Path(name)).items():

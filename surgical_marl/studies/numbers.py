@@ -239,13 +239,14 @@ def _write_wild(folder: Path, scene: str) -> Path:
     return path
 
 
-def cost() -> None:
+def cost(only: Sequence[str] | None) -> None:
     """Print what the check of every step takes: steps with and without it take turns.
 
     Without it the kernels don't look at what they store, and nothing looks at the environments after a step.
     """
     print("| environments | us without | us with | |\n|---|---|---|---|", flush=True)
-    for scene, count in (("psm", 1), ("psm", COUNT), ("bimanual_psm", COUNT), ("bimanual_psm_needle", COUNT)):
+    measured = (("psm", 1), ("psm", COUNT), ("bimanual_psm", COUNT), ("bimanual_psm_needle", COUNT))
+    for scene, count in [case for case in measured if only is None or case[0] in only]:
         env, bare = (BatchedEnv("reach", scene, num_envs=count, engine="fused", device="cpu") for _ in range(2))
         engine: Any = bare.engine
         bodies = {
@@ -286,7 +287,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--cost", action="store_true", help="say what the check of every step takes instead")
     arguments = parser.parse_args(argv)
     if arguments.cost:
-        cost()
+        cost(arguments.only)
         return
     print("| scene | steps | faults | tunnels | steps with contacts left out | unfelt | deepest, mm | steps/s |")
     print("|---|---|---|---|---|---|---|---|", flush=True)

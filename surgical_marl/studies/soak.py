@@ -23,6 +23,7 @@ import sys
 import time
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -302,7 +303,10 @@ def _parse(argv: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--turn", type=whole(1), default=20, metavar="SECONDS", help="(%(default)s)")
     parser.add_argument("--at-once", action="store_true", help="all run all the time, and are looked at every --turn")
     parser.add_argument("--device", choices=tuple(COUNT), default="cpu", help="(%(default)s)")
-    parser.add_argument("--only", nargs="+", choices=ALL, default=ALL, help="some faces")
+    there = tuple(name for name in ALL if name != "torchrl" or find_spec("torchrl"))
+    parser.add_argument(
+        "--only", nargs="+", choices=ALL, default=there, help="some faces (all whose packages are there)"
+    )
     parser.add_argument("--out", type=Path, default=Path("runs/soak"), metavar="DIR", help="(%(default)s)")
     parser.add_argument("--report", action="store_true", help="table and figure of what there is")
     return parser.parse_args(argv)

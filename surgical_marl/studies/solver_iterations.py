@@ -17,6 +17,7 @@ from surgical_marl.physics.dynamics import Physics
 from surgical_marl.physics.simulator import Simulator
 from surgical_marl.scenes.scene import Scene
 from surgical_marl.scenes.timing import DECIMATION
+from surgical_marl.studies.command import make_parser
 
 STEPS, SAMPLES = 5000, 2000
 TOUCHING = ((2, 6), (3, 6), (4, 6), (6, 4), (6, 6), (10, 20))
@@ -93,9 +94,9 @@ def speeds(scene: Scene) -> np.ndarray:
 def step(scene: Scene, states: Physics, touching: bool) -> tuple[np.ndarray, np.ndarray]:
     """Velocity [S, nv] and contact forces [S, P] after one physics step here."""
     simulated = Simulator(scene)
-    advance = simulated._touching_step if touching else simulated._apart
-    after, force = jax.jit(jax.vmap(advance))(states)
-    return np.asarray(after.qvel), np.asarray(force)
+    advance, untouched = simulated._touching_step if touching else simulated._apart, simulated.untouched
+    after, touch = jax.jit(jax.vmap(lambda state: advance(state, untouched)))(states)
+    return np.asarray(after.qvel), np.asarray(touch.force)
 
 
 def shares(off: np.ndarray) -> str:
@@ -128,7 +129,8 @@ def apart() -> None:
             print(f"| {name} | {sweeps} | {iterations} | {line_search} | {shares(off)} |")
 
 
-def main() -> None:
+def main(argv: list[str] | None = None) -> None:
+    make_parser(__doc__).parse_args(argv)
     touching()
     print()
     apart()

@@ -10,6 +10,7 @@ import numpy as np
 
 from surgical_marl import load_scene
 from surgical_marl.scenes.scene import Scene
+from surgical_marl.studies.command import make_parser
 
 CONTROL = 0.02
 SECONDS = 10.0
@@ -61,7 +62,8 @@ def rollout(model: mujoco.MjModel, scene: Scene, ctrl: np.ndarray) -> tuple[np.n
     return np.array(found), passed
 
 
-def main() -> None:
+def main(argv: list[str] | None = None) -> None:
+    make_parser(__doc__).parse_args(argv)
     scene = load_scene("bimanual_psm")
     ctrl = targets(scene)
     reference, _ = rollout(prepared(scene, 0.0005), scene, ctrl)
