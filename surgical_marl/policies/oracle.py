@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 
 ITERATIONS = 8
 """Steps of inverse kinematics from the last joint positions."""
-AHEAD = 4
-"""Its steps to where a moving target will be a control step later."""
+NEAR, AHEAD = 4, 2
+"""Its steps to a moving target, which is never far, and to where that will be a control step later."""
 CATCH_UP = 0.025
 """Time in which a tip that is off a moving target comes three times as near to it, s: hardly more than a control step.
 With a position command alone it would take damping over stiffness of the drives, four times as long for a STAR."""
@@ -136,6 +136,6 @@ class _Guide:
         """
         step = np.where(began[:, None], 0.0, targets - self.targets)
         self.targets = targets
-        q = inverse_kinematics(self.arm, targets, qpos, starts=1, iterations=ITERATIONS)
+        q = inverse_kinematics(self.arm, targets, qpos, starts=1, iterations=NEAR)
         velocity = (inverse_kinematics(self.arm, targets + step, q, starts=1, iterations=AHEAD) - q) / self.dt
         return np.asarray(q + (self.dt + self.lag) * velocity + np.maximum(self.lag / CATCH_UP - 1, 0.0) * (q - qpos))
