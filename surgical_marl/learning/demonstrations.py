@@ -64,7 +64,7 @@ class Demonstrations:
 
     Raises:
         ValueError: the control is not "position", the task has no oracle, its oracle never succeeds, or an agent
-            observes pictures.
+            observes pictures; or there are rounds of imitation, and the oracle follows a script of several steps.
     """
 
     def __init__(self, settings: Settings, layout: Layout, device: str) -> None:
@@ -75,6 +75,11 @@ class Demonstrations:
             raise ValueError(f"{neither} where agents observe pictures")
         env = make_env(settings, settings.oracle_episodes, "numpy")
         try:
+            if settings.imitation.rounds and len(env.task.script()) > 1:
+                raise ValueError(
+                    f"imitation.rounds must be 0 for this task, not {settings.imitation.rounds}: its oracle goes step "
+                    "by step, and can't say what to do where another one came"
+                )
             tables = (np.asarray(table).tobytes() for _, table in sorted(env.task.tables.items()))
             about = env.env.content, describe(env.env.parameters).encode(), f"{env.max_steps} {env.num_envs}".encode()
             rows = cached_arrays("demonstrations", lambda: _record(env), *about, *tables, roots=env.env.roots)
@@ -101,19 +106,10 @@ class Demonstrations:
         return {name: part[chosen] for name, part in self.carry.items()}, self.observations[chosen]
 
     def ask(self, actor: MultiAgentActor) -> None:
-        """Add what the oracle would do in every step of `oracle_episodes` other episodes, which an actor plays.
-
-        Raises:
-            ValueError: the oracle follows a script of several steps, of which it knows only where it is itself.
-        """
+        """Add what the oracle would do in every step of `oracle_episodes` other episodes, which an actor plays."""
         self._asked += 1
         env = make_env(self._settings, self._settings.oracle_episodes, "numpy")
         try:
-            if len(env.task.script()) > 1:
-                raise ValueError(
-                    f"imitation.rounds must be 0 for {self._settings.task}, not {self._settings.imitation.rounds}: its "
-                    "oracle goes step by step, and can't say what to do where another one came"
-                )
             seen, actions = _answers(env, actor, self._layout, self._asked)
         finally:
             env.close()
@@ -136,12 +132,15 @@ def _answers(
     observations, *_ = env.reset(seed=seed)
     seen: dict[str, list[np.ndarray]] = {}
     actions = []
-    for _ in progress(env.max_steps, "step", "asking the oracle", leave=False):
+    bar = progress(env.max_steps, "step", "asking the oracle", leave=False)
+    for _ in range(env.max_steps):
         for name, part in layout.stack(observations).items():
             seen.setdefault(name, []).append(np.float32(part))
         answers = asked(observations)
         actions.append(np.concatenate([np.clip(answers[agent], -1.0, 1.0) for agent in layout.agents], -1))
         observations = env.step(policy(observations)).observations
+        bar.update()
+    bar.close()
     return {name: np.concatenate(parts) for name, parts in seen.items()}, np.float32(np.concatenate(actions))
 
 

@@ -107,7 +107,7 @@ class _Guide:
         self.lag = np.array([joint.drive.damping / joint.drive.stiffness for joint in joints])
         self.moves = ~self.arm.moves_jaw
         self.q = np.tile(self.arm.home, (env.num_envs, 1))
-        self.targets = np.zeros((env.num_envs, 3))
+        self.targets = np.full((env.num_envs, 3), np.nan)  # of the last step; unknown at first
         self.wanted = self._on_target if env.task.follows else self._at_target
         self.terms = env.observation_terms(agent)
         if missing := {"qpos", "command"} - self.terms.keys():
@@ -134,7 +134,7 @@ class _Guide:
         They depend on nothing that an agent does not observe, so that it can imitate them: an arm that was pushed goes
         on from where it is, and not back to where it would have been.
         """
-        step = np.where(began[:, None], 0.0, targets - self.targets)
+        step = np.where(began[:, None], 0.0, np.nan_to_num(targets - self.targets))
         self.targets = targets
         q = inverse_kinematics(self.arm, targets, qpos, starts=1, iterations=NEAR)
         velocity = (inverse_kinematics(self.arm, targets + step, q, starts=1, iterations=AHEAD) - q) / self.dt
