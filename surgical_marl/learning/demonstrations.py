@@ -114,9 +114,9 @@ class Demonstrations:
         finally:
             env.close()
         device = self.actions.device
-        more = {name: torch.from_numpy(part).to(device) for name, part in seen.items()}
-        self.shown = torch.cat([self.shown, TensorDict(more, batch_size=[len(actions)])])
         self.actions = torch.cat([self.actions, torch.from_numpy(actions).to(device)])
+        every = {n: torch.cat([self.shown[n], torch.from_numpy(part).to(device)]) for n, part in seen.items()}
+        self.shown = TensorDict(every, batch_size=[len(self.actions)])
 
 
 def _answers(
@@ -135,13 +135,13 @@ def _answers(
     bar = progress(env.max_steps, "step", "asking the oracle", leave=False)
     for _ in range(env.max_steps):
         for name, part in layout.stack(observations).items():
-            seen.setdefault(name, []).append(np.float32(part))
+            seen.setdefault(name, []).append(part.astype(np.float32))
         answers = asked(observations)
         actions.append(np.concatenate([np.clip(answers[agent], -1.0, 1.0) for agent in layout.agents], -1))
         observations = env.step(policy(observations)).observations
         bar.update()
     bar.close()
-    return {name: np.concatenate(parts) for name, parts in seen.items()}, np.float32(np.concatenate(actions))
+    return {name: np.concatenate(parts) for name, parts in seen.items()}, np.concatenate(actions, dtype=np.float32)
 
 
 def _record(env: BatchedEnv) -> dict[str, np.ndarray]:

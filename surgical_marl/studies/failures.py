@@ -2,8 +2,9 @@
 
     python -m surgical_marl.studies.failures RUN_OR_POLICY [--start random] [--episodes 4000]
 
-It plays held-out episodes of `reach`, `track` or `follow_path` and prints a table. Each row of the table of goals counts
-once, however often it is drawn. Where targets move, postures up to the first miss are looked at, otherwise the last.
+It plays held-out episodes of `reach`, `track` or `follow_path` and prints a table. Each row of the table of goals
+counts once, however often it is drawn. Where targets move, postures up to the first miss are looked at, otherwise the
+last.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from surgical_marl.cli.flags import whole
 from surgical_marl.evaluation.asked import common_settings, find_policy
 from surgical_marl.evaluation.evaluate import MAX_BATCH
 from surgical_marl.evaluation.goal_set import episode_seed
@@ -49,10 +51,12 @@ def main(argv: list[str] | None = None) -> int:
     parser = make_parser(__doc__)
     parser.add_argument("policy", metavar="RUN_OR_POLICY")
     parser.add_argument("--start", help="default: the policy's own")
-    parser.add_argument("--episodes", type=int, default=4000, metavar="N", help="to draw (%(default)s)")
+    parser.add_argument(
+        "--episodes", type=whole(1, 1_000_000), default=4000, metavar="N", help="to draw (default: 4000)"
+    )
     asked = parser.parse_args(argv)
     settings = common_settings([asked.policy], {"start": asked.start, "goals": "held_out"})
-    env = make_env(settings, min(max(asked.episodes, 1), MAX_BATCH))
+    env = make_env(settings, min(asked.episodes, MAX_BATCH))
     print(table(look(env, load_policy(find_policy(asked.policy), env), asked.episodes)))
     return 0
 
