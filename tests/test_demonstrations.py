@@ -156,6 +156,47 @@ def test_imitation_fits_the_actions_and_leaves_the_deviation(trainer: Trainer) -
         assert name not in deviation or torch.equal(weight, deviation[name])
 
 
+def test_the_oracle_is_asked_where_the_actor_came(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = replace(SETTINGS, task="track", start="random", oracle_episodes=4)
+    trainer = Trainer(asked, make_env(asked))
+    actor, found = trainer.algorithm.actor, Demonstrations(asked, trainer.env.layout, "cpu")
+    before, terms = len(found.actions), trainer.env.env.observation_terms("psm_0")
+    Imitation(actor, found, steps=4, batch_size=8, rounds=2).run()
+    assert found.actions.shape == (before + 2 * 4 * 250, 7)
+    assert len(found.shown) == len(found.actions)
+    seen, done = found.shown["psm"][before:, 0].numpy().astype(float), found.actions[before:].numpy()
+    off = np.linalg.norm(seen[:, terms["to_target"]], axis=-1)
+    assert (off > 0.005).mean() > 0.5  # an actor that has learned nothing falls behind, and the oracle does not
+    arm, q = trainer.env.env.scene.mounts["psm_0"].arm, seen[:, terms["qpos"]]
+    ends = seen[:, terms["command"]] + 0.02 * done * arm.speed
+    moved = (arm.forward_kinematics(np.clip(ends, arm.lower, arm.upper)) - arm.forward_kinematics(q))[:, :3, 3]
+    assert ((moved * seen[:, terms["to_target"]]).sum(-1) > 0)[off > 0.005].mean() > 0.95  # towards the target
+    starts = found.shown["psm"][before :: 4 * 250, 0, terms["qpos"]]
+    assert not torch.equal(starts[0], starts[1])  # other episodes in each round
+
+
+def test_pairs_that_the_actor_is_far_off_are_drawn_more_often(trainer: Trainer) -> None:
+    actor = trainer.algorithm.actor
+    shown = TensorDict({"psm": torch.zeros(1000, 1, trainer.env.get_observations()["psm"].shape[-1])}, [1000])
+    with torch.no_grad():
+        actions = actor(shown).clone()
+    actions[7] += 1.0
+    told: Any = SimpleNamespace(shown=shown, actions=actions, ask=lambda actor: None)
+    imitation = Imitation(actor, told, steps=2, batch_size=400, rounds=1)
+    assert (imitation._draw() == 7).float().mean() < 0.1
+    imitation.done = 1
+    imitation._ask()
+    assert 0.5 <= (imitation._draw() == 7).float().mean() < 0.6
+
+
+def test_rounds_are_refused_where_the_oracle_goes_step_by_step() -> None:
+    settings = replace(
+        SETTINGS, scene="bimanual_psm", difficulty="crossing", imitation=ImitationSettings(steps=4, rounds=1)
+    )
+    with pytest.raises(ValueError, match=r"imitation.rounds must be 0 for this task, not 1: its oracle goes step by"):
+        Trainer(settings, make_env(settings))
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_imitation_within_a_step_and_it_goes_on_bit_for_bit(
     number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

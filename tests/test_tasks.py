@@ -100,6 +100,18 @@ def test_the_oracle_shows_that_a_task_is_fair(task: str, scene: str) -> None:
         assert np.sqrt(np.mean(played.errors**2, axis=0)).max() < 0.002
 
 
+def test_an_oracle_that_is_pushed_stays_on_a_moving_target() -> None:
+    """Every joint's command is pushed to and fro by a tenth of what an action can do."""
+    env, rng = batched("track", "star"), np.random.default_rng(0)
+    follow = load_policy("oracle", env)
+
+    def pushed(observations: Any) -> dict[str, Any]:
+        return {agent: move + 0.1 * rng.normal(size=move.shape) for agent, move in follow(observations).items()}
+
+    errors = play(env, pushed).errors
+    assert (errors.max(0) < 0.002).mean() > 0.95 and np.sqrt(np.mean(errors**2)) < 0.0005
+
+
 def test_the_oracle_is_not_what_any_policy_gets() -> None:
     env = batched("track", "psm")
     assert np.sqrt(np.mean(play(env, load_policy("zero", env)).errors ** 2)) > 0.005

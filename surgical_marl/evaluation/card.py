@@ -209,8 +209,9 @@ def _imitation(settings: Settings, iterations: float) -> str:
         return ""
     alone = "all" if asked.hold >= iterations else f"the first {asked.hold:,}"
     beside = f" Imitation went on beside learning, with weight {asked.weight:g}." if asked.weight else ""
+    rounds = f" and, in {asked.rounds:,} rounds, of what it would do in as many of the actor's own" * bool(asked.rounds)
     return (
-        f"- Imitation of {settings.oracle_episodes:,} episodes of the oracle first, {asked.steps:,} steps of "
+        f"- Imitation of {settings.oracle_episodes:,} episodes of the oracle first{rounds}, {asked.steps:,} steps of "
         f"{asked.batch_size:,} pairs. In {alone} iterations only the critic learned then.{beside}\n"
     )
 

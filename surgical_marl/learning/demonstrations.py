@@ -8,6 +8,9 @@ bootstrapped there anyway, so that this cuts nothing off.
 Imitation of the oracle's actions before reinforcement learning is behaviour cloning, as in A. Rajeswaran et al., 2018,
 arXiv 1709.10087. While the oracle acts its arms are disturbed, so that its actions show how to come back to its way (M.
 Laskey et al., 2017, arXiv 1703.09327).
+
+What an actor has not learned it shows where it acts itself: there the oracle can say what it would do (S. Ross et al.,
+2011, arXiv 1011.0686).
 """
 
 from __future__ import annotations
@@ -22,6 +25,7 @@ from torch import Tensor
 
 from surgical_marl.cache import cached_arrays
 from surgical_marl.engines.stepper import describe
+from surgical_marl.policies.actor import acting_policy
 from surgical_marl.policies.layout import Layout
 from surgical_marl.policies.oracle import oracle
 from surgical_marl.runs.environment import make_env
@@ -30,6 +34,7 @@ from surgical_marl.runs.settings import Settings
 
 if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv
+    from surgical_marl.policies.networks import MultiAgentActor
 
 STATES = 8192
 """States that are kept of them."""
@@ -59,7 +64,7 @@ class Demonstrations:
 
     Raises:
         ValueError: the control is not "position", the task has no oracle, its oracle never succeeds, or an agent
-            observes pictures.
+            observes pictures; or there are rounds of imitation, and the oracle follows a script of several steps.
     """
 
     def __init__(self, settings: Settings, layout: Layout, device: str) -> None:
@@ -70,6 +75,11 @@ class Demonstrations:
             raise ValueError(f"{neither} where agents observe pictures")
         env = make_env(settings, settings.oracle_episodes, "numpy")
         try:
+            if settings.imitation.rounds and len(env.task.script()) > 1:
+                raise ValueError(
+                    f"imitation.rounds must be 0 for this task, not {settings.imitation.rounds}: its oracle goes step "
+                    "by step, and can't say what to do where another one came"
+                )
             tables = (np.asarray(table).tobytes() for _, table in sorted(env.task.tables.items()))
             about = env.env.content, describe(env.env.parameters).encode(), f"{env.max_steps} {env.num_envs}".encode()
             rows = cached_arrays("demonstrations", lambda: _record(env), *about, *tables, roots=env.env.roots)
@@ -83,6 +93,7 @@ class Demonstrations:
         if not len(rows["states"]):
             raise ValueError(f"{neither} for {settings.task}: its oracle never succeeded")
         groups = {**layout.stack({agent: states.pop(agent) for agent in agents}), "state": states.pop("state")}
+        self._settings, self._layout, self._asked = settings, layout, 0
         self.carry: dict[str, Tensor] = states
         self.observations = TensorDict(groups, batch_size=[len(rows["states"])])
         shown = layout.stack({agent: pairs[agent] for agent in agents})
@@ -93,6 +104,44 @@ class Demonstrations:
         """Draw `count` states: their carry, and what is observed in them."""
         chosen = torch.randint(len(self.observations), (count,), device=self.actions.device)
         return {name: part[chosen] for name, part in self.carry.items()}, self.observations[chosen]
+
+    def ask(self, actor: MultiAgentActor) -> None:
+        """Add what the oracle would do in every step of `oracle_episodes` other episodes, which an actor plays."""
+        self._asked += 1
+        env = make_env(self._settings, self._settings.oracle_episodes, "numpy")
+        try:
+            seen, actions = _answers(env, actor, self._layout, self._asked)
+        finally:
+            env.close()
+        device = self.actions.device
+        self.actions = torch.cat([self.actions, torch.from_numpy(actions).to(device)])
+        every = {n: torch.cat([self.shown[n], torch.from_numpy(part).to(device)]) for n, part in seen.items()}
+        self.shown = TensorDict(every, batch_size=[len(self.actions)])
+
+
+def _answers(
+    env: BatchedEnv, actor: MultiAgentActor, layout: Layout, seed: int
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Let an actor play one episode in each environment, and ask the oracle.
+
+    Returns:
+        What groups observe in all steps, [n, ...] each, and what the oracle would do there, flat joint actions
+        [n, sum].
+    """
+    asked, policy = oracle(env), acting_policy(actor, layout, str(next(actor.parameters()).device))
+    observations, *_ = env.reset(seed=seed)
+    seen: dict[str, list[np.ndarray]] = {}
+    actions = []
+    bar = progress(env.max_steps, "step", "asking the oracle", leave=False)
+    for _ in range(env.max_steps):
+        for name, part in layout.stack(observations).items():
+            seen.setdefault(name, []).append(part.astype(np.float32))
+        answers = asked(observations)
+        actions.append(np.concatenate([np.clip(answers[agent], -1.0, 1.0) for agent in layout.agents], -1))
+        observations = env.step(policy(observations)).observations
+        bar.update()
+    bar.close()
+    return {name: np.concatenate(parts) for name, parts in seen.items()}, np.concatenate(actions, dtype=np.float32)
 
 
 def _record(env: BatchedEnv) -> dict[str, np.ndarray]:

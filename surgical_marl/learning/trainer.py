@@ -81,7 +81,7 @@ class Trainer:
         if self._demonstrations is not None:
             pairs = self.algorithm.actor, self._demonstrations
             if imitation.steps > 0:
-                self._imitation = Imitation(*pairs, imitation.steps, imitation.batch_size)
+                self._imitation = Imitation(*pairs, imitation.steps, imitation.batch_size, imitation.rounds)
             if imitation.weight > 0:
                 self.algorithm.imitation = ImitationLoss(*pairs, imitation.batch_size, imitation.weight)
         self._samples = steps * env.num_envs * distributed.size()

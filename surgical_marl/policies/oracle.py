@@ -24,6 +24,11 @@ if TYPE_CHECKING:
 
 ITERATIONS = 8
 """Steps of inverse kinematics from the last joint positions."""
+NEAR, AHEAD = 4, 2
+"""Its steps to a moving target, which is never far, and to where that will be a control step later."""
+CATCH_UP = 0.025
+"""Time in which a tip that is off a moving target comes three times as near to it, s: hardly more than a control step.
+With a position command alone it would take damping over stiffness of the drives, four times as long for a STAR."""
 FIRST, STARTS = 20, 8
 """Its steps in the first of an episode, and from how many postures: from a random one alone it may end at a limit."""
 
@@ -44,7 +49,8 @@ def oracle(env: BatchedEnv, agents: Sequence[str] | None = None) -> Oracle:
 
     If the task has a script, the arms follow it. Otherwise joints follow straight lines in joint space, all arms at the
     same pace; `tasks/base/workspace.py` has checked these paths. For moving targets, commands lead by the joints' lag:
-    a control step, plus damping over stiffness of their drives.
+    a control step, plus damping over stiffness of their drives; and what a tip is off makes up for itself in
+    `CATCH_UP`.
 
     Args:
         agents: the agents that the oracle moves, if others have another policy. Only these are kept at the same pace.
@@ -98,21 +104,38 @@ class _Guide:
         self.index, self.arm, joints = index, env.scene.mounts[agent].arm, env.scene.mounts[agent].arm.actuated
         self.dt = env.control_dt
         self.reach = self.dt * self.arm.speed
-        self.lead = self.dt + np.array([joint.drive.damping / joint.drive.stiffness for joint in joints])
+        self.lag = np.array([joint.drive.damping / joint.drive.stiffness for joint in joints])
         self.moves = ~self.arm.moves_jaw
         self.q = np.tile(self.arm.home, (env.num_envs, 1))
+        self.targets = np.full((env.num_envs, 3), np.nan)  # of the last step; unknown at first
+        self.wanted = self._on_target if env.task.follows else self._at_target
         self.terms = env.observation_terms(agent)
         if missing := {"qpos", "command"} - self.terms.keys():
             raise ValueError(f"the oracle needs to observe {' and '.join(sorted(missing))} of {agent!r}")
 
     def move(self, targets: np.ndarray, began: np.ndarray, observation: np.ndarray) -> np.ndarray:
         """Return how far the commands have to move to targets [N, arms, 3], in units of an action of 1, [N, n]."""
-        before = np.where(began[:, None], observation[:, self.terms["qpos"]], self.q)
-        aims, rows = targets[:, self.index], np.flatnonzero(began)
-        self.q = inverse_kinematics(self.arm, aims, before, starts=1, iterations=ITERATIONS)
-        if len(rows):
-            self.q[rows] = inverse_kinematics(self.arm, aims[rows], before[rows], starts=STARTS, iterations=FIRST)
-        velocity = np.where(began[:, None], 0.0, (self.q - before) / self.dt)
-        wanted = np.clip(self.q + self.lead * velocity, self.arm.lower, self.arm.upper)
+        wanted = self.wanted(targets[:, self.index], observation[:, self.terms["qpos"]], began)
         command = observation[:, self.terms["command"]]
-        return np.asarray((wanted - command) / self.reach * self.moves)
+        return np.asarray((np.clip(wanted, self.arm.lower, self.arm.upper) - command) / self.reach * self.moves)
+
+    def _at_target(self, targets: np.ndarray, qpos: np.ndarray, began: np.ndarray) -> np.ndarray:
+        """Return the commands [N, n] that hold tips at targets [N, 3], near to where joints `qpos` began."""
+        rows = np.flatnonzero(began)
+        self.q[rows] = qpos[rows]
+        if len(rows):
+            self.q[rows] = inverse_kinematics(self.arm, targets[rows], qpos[rows], starts=STARTS, iterations=FIRST)
+        self.q = inverse_kinematics(self.arm, targets, self.q, starts=1, iterations=ITERATIONS)
+        return self.q
+
+    def _on_target(self, targets: np.ndarray, qpos: np.ndarray, began: np.ndarray) -> np.ndarray:
+        """Return the commands [N, n] that keep tips on targets [N, 3] that move.
+
+        They depend on nothing that an agent does not observe, so that it can imitate them: an arm that was pushed goes
+        on from where it is, and not back to where it would have been.
+        """
+        step = np.where(began[:, None], 0.0, np.nan_to_num(targets - self.targets))
+        self.targets = targets
+        q = inverse_kinematics(self.arm, targets, qpos, starts=1, iterations=NEAR)
+        velocity = (inverse_kinematics(self.arm, targets + step, q, starts=1, iterations=AHEAD) - q) / self.dt
+        return np.asarray(q + (self.dt + self.lag) * velocity + np.maximum(self.lag / CATCH_UP - 1, 0.0) * (q - qpos))

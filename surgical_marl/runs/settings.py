@@ -78,14 +78,16 @@ class ImitationSettings(Checked):
     """Imitation of the oracle's actions, before the first iteration and beside learning (see `learning/imitation.py`).
 
     steps: gradient steps before the first iteration; 0 for none. batch_size: pairs of observation and action in each of
-    them. hold: iterations in which only the critic learns then, because what it says before would spoil what was
-    imitated. weight: of the imitation's loss in the loss of every mini-batch after that.
+    them. rounds: how often the oracle is asked in between what it would do in episodes that the actor plays. hold:
+    iterations in which only the critic learns then, because what it says before would spoil what was imitated. weight:
+    of the imitation's loss in the loss of every mini-batch after that.
     """
 
     prefix: ClassVar[str] = "imitation."
 
     steps: int = number(0, 0, 1_000_000)
     batch_size: int = number(1024, 1, 1_000_000)
+    rounds: int = number(0, 0, 1000)
     hold: int = number(10, 0, 1_000_000)
     weight: float = number(0.0, 0.0, 1000.0)
 

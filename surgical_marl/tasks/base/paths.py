@@ -22,7 +22,7 @@ from surgical_marl.tasks.base.task import Level
 from surgical_marl.tasks.base.workspace import CLEARANCE, TOLERANCE, choose
 
 ROWS = 1024
-MANY_STARTS = 4096
+MANY_STARTS = 16384
 """Rows of a table with random starts to learn from: of `ROWS` a policy learns to know the rows instead of the way."""
 DURATION = 5.0
 """Duration of a path, s."""
