@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
 import pytest
 
 from surgical_marl.content import content_dir, list_policies
@@ -39,12 +41,29 @@ def test_a_folder_is_whole(name: str) -> None:
     assert not [path for path in folder.iterdir() if path.suffix in (".pt", ".pkl", ".tmp")]
     for path in folder.glob("*.onnx"):  # weights are not stored twice, nor folders of the machine that wrote it
         assert path.stat().st_size < 20_000 and b"site-packages" not in path.read_bytes()
+        assert not missing_weights(path)
     level = "" if result["difficulty"] == "default" else f"-{result['difficulty']}"
     assert name == f"{result['task']}-{result['scene']}{level}" and is_standard(result)
     page = (folder / "README.md").read_text()
     assert bool(level) == ("--difficulty" in page) and result["difficulty"] in page
     assert len(result["seeds"]["runs"]) >= 3
     assert all(read_origin(folder)["origin"].values())
+
+
+def missing_weights(path: Path) -> set[str]:
+    """Return the weights of a policy that its ONNX file does not read from where they stand in its safetensors."""
+    data = path.with_suffix(".safetensors").read_bytes()
+    begin = 8 + int.from_bytes(data[:8], "little")
+    places = {
+        f"model.{name}": (place["shape"], begin + place["data_offsets"][0])
+        for name, place in json.loads(data[8:begin]).items()
+        if name.endswith((".weight", ".bias"))
+    }
+    for tensor in onnx.load(path, load_external_data=False).graph.initializer:
+        about = {entry.key: entry.value for entry in tensor.external_data}
+        if about and (list(tensor.dims), int(about["offset"])) == places.get(tensor.name):
+            del places[tensor.name]
+    return set(places)
 
 
 def test_all_of_them_are_small_and_in_the_table() -> None:
