@@ -16,6 +16,7 @@ from surgical_marl.evaluation.command import play_all
 from surgical_marl.evaluation.evaluate import summarise
 from surgical_marl.evaluation.goal_set import is_standard
 from surgical_marl.runs.folder import read_origin
+from surgical_marl.untrusted.arrays import read_header
 
 POLICIES = content_dir("policies")
 MOVED_MM = 1e-3
@@ -52,11 +53,10 @@ def test_a_folder_is_whole(name: str) -> None:
 
 def missing_weights(path: Path) -> set[str]:
     """Return the weights of a policy that its ONNX file does not read from where they stand in its safetensors."""
-    data = path.with_suffix(".safetensors").read_bytes()
-    begin = 8 + int.from_bytes(data[:8], "little")
+    tensors, begin = read_header(path.with_suffix(".safetensors"))
     places = {
         f"model.{name}": (place["shape"], begin + place["data_offsets"][0])
-        for name, place in json.loads(data[8:begin]).items()
+        for name, place in tensors.items()
         if name.endswith((".weight", ".bias"))
     }
     for tensor in onnx.load(path, load_external_data=False).graph.initializer:

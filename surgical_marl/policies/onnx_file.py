@@ -17,7 +17,6 @@ data, at the places where safetensors keeps them, so that no weight is stored tw
 
 from __future__ import annotations
 
-import json
 import logging
 import warnings
 from collections.abc import Iterator, Mapping
@@ -35,7 +34,7 @@ from torch import Tensor, nn
 from surgical_marl.files import write_atomic
 from surgical_marl.policies.encoder import stack_pictures
 from surgical_marl.policies.weights import WEIGHTS
-from surgical_marl.untrusted.arrays import MAX_WEIGHTS
+from surgical_marl.untrusted.arrays import MAX_WEIGHTS, read_header
 from surgical_marl.untrusted.files import read_bytes
 
 SUFFIX = ".onnx"
@@ -110,9 +109,7 @@ def forget_paths(file: onnx.ModelProto) -> None:
 
 def refer(file: onnx.ModelProto, weights: Path) -> None:
     """Let the constants that stand in a file of safetensors, bit for bit, be read from there."""
-    data = weights.read_bytes()
-    begin = 8 + int.from_bytes(data[:8], "little")  # a header of JSON, after its length
-    places = json.loads(data[8:begin])
+    data, (places, begin) = weights.read_bytes(), read_header(weights)
     for tensor in file.graph.initializer:
         if place := places.get(tensor.name.removeprefix("model.")):  # it is an attribute of Graph
             first, end = (begin + offset for offset in place["data_offsets"])

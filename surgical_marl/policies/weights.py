@@ -12,7 +12,7 @@ from safetensors.numpy import save
 
 from surgical_marl.files import write_atomic
 from surgical_marl.runs.folder import CONFIG, WEIGHTS
-from surgical_marl.untrusted.arrays import MAX_WEIGHTS, check_safetensors
+from surgical_marl.untrusted.arrays import MAX_WEIGHTS, read_header
 from surgical_marl.untrusted.files import check_file
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ def read_weights(folder: Path) -> tuple[dict[str, list[int]], dict[str, np.ndarr
     for path in sorted(folder.glob(f"[!.]*{WEIGHTS}")):
         check_file(path, MAX_WEIGHTS, within=folder)
         try:
-            check_safetensors(path)
+            read_header(path)
             with safe_open(path, framework="np") as file:
                 groups[path.stem] = [int(file.metadata()[key]) for key in WIDTHS]
                 state |= {f"models.{path.stem}.{key}": file.get_tensor(key) for key in file.keys()}  # noqa: SIM118

@@ -54,8 +54,11 @@ def check_checkpoint(path: Path) -> None:
         raise ValueError(f"{path} is no archive of torch: its parts are compressed")
 
 
-def check_safetensors(path: Path) -> None:
-    """Raise ValueError if a file of weights is too large, or says too much about them."""
+def read_header(path: Path) -> tuple[dict[str, Any], int]:
+    """Return what a file of safetensors says of its tensors, and where their bytes begin.
+
+    ValueError if the file is too large, or says too much about them.
+    """
     size = check_file(path, MAX_WEIGHTS)
     with path.open("rb") as file:
         length = int.from_bytes(file.read(8), "little")
@@ -68,6 +71,7 @@ def check_safetensors(path: Path) -> None:
     if not isinstance(header, dict):
         raise ValueError(f"{path} has a header that is no mapping")
     check_count(len(header), MAX_MEMBERS, "tensors", path)
+    return header, 8 + length
 
 
 def _check_members(archive: zipfile.ZipFile, most: int, path: Path) -> None:
