@@ -23,12 +23,10 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import onnx
 import torch
-from onnx.external_data_helper import set_external_data
 from torch import Tensor, nn
 
 from surgical_marl.files import write_atomic
@@ -36,6 +34,9 @@ from surgical_marl.policies.encoder import stack_pictures
 from surgical_marl.policies.weights import WEIGHTS
 from surgical_marl.untrusted.arrays import MAX_WEIGHTS, read_header
 from surgical_marl.untrusted.files import read_bytes
+
+if TYPE_CHECKING:
+    import onnx  # its import takes 0.2 s: cards and reports, which need names from here alone, are spared it
 
 SUFFIX = ".onnx"
 OPSET = 20
@@ -109,6 +110,8 @@ def forget_paths(file: onnx.ModelProto) -> None:
 
 def refer(file: onnx.ModelProto, weights: Path) -> None:
     """Let the constants that stand in a file of safetensors, bit for bit, be read from there."""
+    from onnx.external_data_helper import set_external_data
+
     data, (places, begin) = weights.read_bytes(), read_header(weights)
     for tensor in file.graph.initializer:
         if place := places.get(tensor.name.removeprefix("model.")):  # it is an attribute of Graph
@@ -120,6 +123,8 @@ def refer(file: onnx.ModelProto, weights: Path) -> None:
 
 def read_pictures(path: Path) -> dict[str, str]:
     """Return the pictures that the network in a file takes: name -> shape and type, in words."""
+    import onnx
+
     found = {}
     for each in onnx.load_model_from_string(read_bytes(path, MAX_WEIGHTS)).graph.input:
         tensor = each.type.tensor_type
