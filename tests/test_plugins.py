@@ -224,3 +224,10 @@ def test_a_program_registers_its_own(registry: Registry) -> None:
         algorithms.register_algorithm("mine", type("Other", (Algorithm,), {}))
     with pytest.raises(ValueError, match="must be a subclass of surgical_marl"):
         algorithms.register_algorithm("number", int)
+
+
+def test_a_class_that_its_package_declares_may_register_itself_too(install: Install, registry: Registry) -> None:
+    again = "from surgical_marl.plugins import algorithms\nalgorithms.register_algorithm('mine', Mine)\n"
+    install("mine-plugin", "mine_too", GOOD + again, mine="mine_too:Mine")
+    assert registry.load("mine").__module__ == "mine_too"
+    assert algorithms.list_algorithms().count("mine") == 1

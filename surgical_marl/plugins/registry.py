@@ -66,11 +66,15 @@ class Registry:
     def register(self, name: str, cls: type) -> None:
         """Add a class of this program. Defining it again, as in a notebook, replaces it.
 
+        A class that its package declares by an entry point, too, is there already.
+
         Raises:
             ValueError: the name belongs to another class, or the class is not a subclass of `base`.
         """
         where = _where(cls)
         self._check_class(name, where, cls)
+        if (name, f"{cls.__module__}:{cls.__qualname__}") in ((point.name, point.value) for point in self._points):
+            return
         taken = [source.where for source in self._sources().get(name, []) if source.where != where]
         if taken:
             raise ValueError(f"the {self.noun} {name!r} of {where} exists already, of {taken[0]}: choose another name")
