@@ -64,6 +64,7 @@ def clone() -> Iterator[Path]:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "clone"
         shutil.copytree(ROOT, path, ignore=lambda at, _: BESIDE if Path(at) == ROOT else {"__pycache__"})
+        subprocess.run(["git", "init", "--quiet", path], check=True)  # as a reader's, for what asks git for its files
         yield path
 
 
