@@ -118,6 +118,7 @@ def run_all(found: list[list[str]], folder: Path, trained: Callable[[str], Path]
         ("python docs/examples/random_agents.py", ""),
         ("pytest tests/test_cli.py -k list", "--collect-only --quiet"),
         ("SEED=3 make gallery", "ARGS='--only psm'"),
+        ("make coverage", "ARGS='--collect-only --quiet'"),
         ("make docs", ""),
     ],
 )
