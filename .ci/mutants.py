@@ -261,9 +261,11 @@ def row(area: str, everything: int, tried: Sequence[Mutant]) -> str:
     killed = sum(mutant.outcome != "survived" for mutant in tried)
     from scipy.stats import binomtest
 
-    found = binomtest(killed, len(tried) - same)
-    low, high = found.proportion_ci(method="wilson")
-    share = f"{found.statistic:.0%} ({low:.0%} to {high:.0%})"
+    share = "-"
+    if same < len(tried):
+        found = binomtest(killed, len(tried) - same)
+        low, high = found.proportion_ci(method="wilson")
+        share = f"{found.statistic:.0%} ({low:.0%} to {high:.0%})"
     return f"| {area} | {everything} | {len(tried)} | {killed} | {same} | {len(tried) - killed - same} | {share} |"
 
 
