@@ -31,7 +31,7 @@ def test_the_page_shows_all_content_and_its_pictures_exist() -> None:
 
 def test_a_task_is_played_by_its_policy_or_by_the_oracle(monkeypatch: pytest.MonkeyPatch) -> None:
     assert gallery.player("reach") == ("reach-trimanual_psm_ecm", "trimanual_psm_ecm")
-    assert gallery.player("peg_transfer") == ("peg_transfer-bimanual_psm_pegs", "bimanual_psm_pegs")
+    assert gallery.player("peg_transfer") == ("peg_transfer-trimanual_psm_ecm_pegs", "trimanual_psm_ecm_pegs")
     monkeypatch.setattr(gallery, "list_policies", lambda: ["reach-psm"])
     assert gallery.player("reach") == ("reach-psm", "psm")
     assert gallery.player("camera_assist") == ("oracle", "trimanual_psm_ecm")
