@@ -73,7 +73,8 @@ class Registry:
         """
         where = _where(cls)
         self._check_class(name, where, cls)
-        if (name, f"{cls.__module__}:{cls.__qualname__}") in ((point.name, point.value) for point in self._points):
+        own = name, cls.__module__, cls.__qualname__
+        if own in ((point.name, point.module, point.attr) for point in self._points):
             return
         taken = [source.where for source in self._sources().get(name, []) if source.where != where]
         if taken:
