@@ -64,7 +64,8 @@ def clone() -> Iterator[Path]:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "clone"
         shutil.copytree(ROOT, path, ignore=lambda at, _: BESIDE if Path(at) == ROOT else {"__pycache__"})
-        subprocess.run(["git", "init", "--quiet", path], check=True)  # as a reader's, for what asks git for its files
+        if shutil.which("git"):  # a reader's copy is a repository, which `make mutants` asks for its files
+            subprocess.run(["git", "init", "--quiet", path], check=True)
         yield path
 
 
