@@ -53,7 +53,8 @@ CELLS = {
                 ("algo=mappo",), ("algo=ippo",), ("algo=joint",)),
         *_cells("messages", "one", "reach", "bimanual_psm", _ONE,
                 ("messages=0", "algo=mappo"), ("messages=4", "algo=mappo"), ("messages=4", "algo=ippo")),
-        *_cells("critic", "handover", "needle_handover", "bimanual_psm_needle", (), ("algo=mappo",), ("algo=ippo",)),
+        *_cells("critic", "handover", "needle_handover", "bimanual_psm_needle", (),
+                ("algo=mappo",), ("algo=ippo",), ("algo=joint",), ("algo=happo",)),
         *_cells("memory", "own", "reach", "bimanual_psm", ("knowledge=own",),
                 ("network.recurrent=none",), ("network.recurrent=gru",)),
     ]
