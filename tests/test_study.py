@@ -134,7 +134,7 @@ def test_bad_input_ends_in_one_sentence(script: str, argv: list[str], words: str
     assert done.returncode == 2 and words in done.stderr and "Traceback" not in done.stderr
 
 
-def test_sizes_are_told_by_scene() -> None:
+def test_sizes_and_devices_are_told_by_scene_or_settings() -> None:
     where = {
         "steps_per_iteration": 32,
         "iterations": 9,
@@ -144,15 +144,16 @@ def test_sizes_are_told_by_scene() -> None:
         "gpu": None,
         "cpu": "a CPU",
     }
-    found = [{**where, "scene": s, "num_envs": n} for s, n in (("a", 8), ("b", 8), ("a", 8), ("c", 16))]
+    of = (("a", 8, "mappo"), ("b", 8, "mappo"), ("a", 8, "joint"), ("c", 16, "mappo"))
+    found = [{**where, "scene": s, "num_envs": n, "cell": f"handover-{algo}"} for s, n, algo in of]
     both = "8 environments, 32 steps an iteration, 9 iterations on `a` and `b`"
     assert study_report.about(found[:3]) == (
         f"`reach`, 1 seeds each, {both.removesuffix(' on `a` and `b`')}; trained on a GPU, played on a CPU."
     )
     assert f"{both}; 16 environments, 32 steps an iteration, 9 iterations on `c`; trained" in study_report.about(found)
     found[2] |= {"trained_on": "another", "gpu": "another"}
-    where = "trained on a GPU, played on a CPU on `a` and `b`; trained on another, played on another on `a`."
-    assert study_report.about(found[:3]).endswith(where)
+    told = "trained on a GPU, played on a CPU with `algo=mappo` and on `b`; trained on another, played on another with"
+    assert study_report.about(found[:3]).endswith(f"{told} `algo=joint`.")  # scene `a` does not tell them apart
 
 
 @pytest.mark.parametrize("cell", study_cells.CELLS.values(), ids=list(study_cells.CELLS))

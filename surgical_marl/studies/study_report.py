@@ -159,11 +159,26 @@ def _devices(row: dict[str, Any]) -> str:
 
 
 def _by_scene(found: Sequence[dict[str, Any]], say: Callable[[dict[str, Any]], str]) -> str:
-    """Return what is said of rows; what differs between them with the scenes that it is about."""
-    scenes: dict[str, dict[str, None]] = {}  # of each text, in order
+    """Return what is said of rows; what differs between them with the scenes that it is about.
+
+    Where not all rows of a scene agree, it is about their settings instead.
+    """
+    said: dict[str, set[str]] = {}
     for each in found:
-        scenes.setdefault(say(each), {})[f"`{each['scene']}`"] = None
-    return "; ".join(text + (f" on {' and '.join(names)}" if len(scenes) > 1 else "") for text, names in scenes.items())
+        said.setdefault(each["scene"], set()).add(say(each))
+    places: dict[str, dict[str, None]] = {}  # of each text, in order
+    for each in found:
+        alike = len(said[each["scene"]]) == 1
+        where = f"on `{each['scene']}`" if alike else f"with `{CELLS[each['cell']].label()}`"
+        places.setdefault(say(each), {})[where] = None
+    return "; ".join(text + (f" {_joined(list(names))}" if len(places) > 1 else "") for text, names in places.items())
+
+
+def _joined(places: Sequence[str]) -> str:
+    """Return places, or settings, as a phrase that has "on" and "with" only where they begin or change."""
+    words = [(place.partition(" ")[0], place.partition(" ")[2]) for place in places]
+    kept = [name if at and words[at - 1][0] == how else f"{how} {name}" for at, (how, name) in enumerate(words)]
+    return " and ".join(kept)
 
 
 def final_table(found: Sequence[dict[str, Any]]) -> str:
