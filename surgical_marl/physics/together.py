@@ -24,6 +24,7 @@ from surgical_marl.physics.kind import Kind
 from surgical_marl.physics.newton import Newton
 from surgical_marl.physics.placed import Joints
 from surgical_marl.physics.problem import Contact, Pressed, Problem
+from surgical_marl.physics.rest import settled
 from surgical_marl.physics.rows import absent
 from surgical_marl.physics.solver import JointRows, Rows
 from surgical_marl.physics.tables import Tables
@@ -90,6 +91,7 @@ class Together:
         centres = np.array([place.position + place.rotation @ place.object.center for place in places])
         turns = np.array([quaternion(place.rotation) for place in places])
         still = jnp.zeros((k, 6), jnp.float32)
+        falls = still + jnp.append(GRAVITY, jnp.zeros(3, jnp.float32))  # until a step has found what bears them
         single = lambda x, *shape: jnp.asarray(x, jnp.float32).reshape(shape)  # noqa: E731
         facing = jnp.zeros((k, f, 4), jnp.float32).at[..., 0].set(1.0)
         zero = lambda *shape: jnp.zeros(shape, jnp.float32)  # noqa: E731
@@ -101,7 +103,7 @@ class Together:
             position, turned = position.at[o].set(centre), turned.at[o].set(pose.quaternion)
         if self._factors is not None:
             position += grown(tables, self._factors, rotation(turned))
-        return Objects(Bodies(position, turned, still, still), grips)
+        return Objects(Bodies(position, turned, still, falls), grips)
 
     def views(self, objects: Objects) -> dict[str, ObjectView]:
         """Return the view of every free object, by name."""
@@ -170,16 +172,22 @@ class Together:
         if not self.names:
             return objects
         bodies, dt, none = objects.bodies, self._dynamics.dt, jnp.zeros(0)
-        masses, free = self._free(bodies)
+        masses, free = self._free(bodies, slots.awake)
         felt = Handling(self.tables, self._objects_alone).feel(slots, None, None, none, bodies, objects.grips, dt)
-        found = self._solve_objects(masses, free, felt.contacts, slots.found, bodies.acceleration)
+        found = self._solve_objects(masses, free, felt.contacts, slots, bodies.acceleration)
         grips = objects.grips
         loose = grips._replace(force=0 * grips.force, slid=0 * grips.slid, held=0 * grips.held)
-        return Objects(moved(bodies, found, dt), loose)
+        return Objects(self._moved(bodies, found, slots), loose)
 
-    def _solve_objects(self, masses: Array, free: Array, contacts: Contact, total: Array, start: Array) -> Array:
+    def _moved(self, bodies: Bodies, acceleration: Array, slots: Slots) -> Bodies:
+        """Return the objects after a step with accelerations [k, 6]; those at rest stay where they are."""
+        after = moved(bodies, acceleration, self._dynamics.dt)
+        after = Bodies(*(jnp.where(slots.awake[:, None], new, old) for new, old in zip(after, bodies, strict=True)))
+        return settled(after, self.tables.bound, slots.company)
+
+    def _solve_objects(self, masses: Array, free: Array, contacts: Contact, slots: Slots, start: Array) -> Array:
         """Return the accelerations [k, 6] of objects that touch no arm: one by one, if none touches another."""
-        none, k = jnp.zeros((0, 0)), len(free)
+        none, k, total = jnp.zeros((0, 0)), len(free), slots.found
         rows = Rows(jnp.zeros((0, 0, 0)), *[jnp.zeros(0)] * 4)
         arms = none, none, JointRows(*[none] * len(JointRows._fields)), rows, jnp.bool_(False)
 
@@ -190,7 +198,8 @@ class Together:
             number, mass, free, start = row
             own = contacts._replace(first=jnp.where(contacts.first == number, 0, 1))
             problem = Problem(*arms, mass[None], free[None], own, total)
-            return self._object_alone.solve(problem, none, start[None]).objects[0]
+            solve = lambda: self._object_alone.solve(problem, none, start[None]).objects[0]  # noqa: E731
+            return jax.lax.cond(slots.awake[number], solve, lambda: start)
 
         def each(_: Contact) -> Array:
             return jax.lax.map(single, (jnp.arange(k), masses, free, start))
@@ -210,14 +219,14 @@ class Together:
         """
         dt, (bodies, grips), handling = self._dynamics.dt, physics.objects, Handling(self.tables, self._newton)
         felt = handling.feel(slots, joints, fingers, physics.qvel, bodies, grips, dt)
-        masses, free = self._free(bodies)
+        masses, free = self._free(bodies, slots.awake)
         between = self._between(physics, overlap)
         mass, smooth, rows = self._forces(physics, fields)
         problem = Problem(mass, smooth, rows, between.rows, overlap, masses, free, felt.contacts, slots.found)
         found = self._newton.solve(problem, self._newton.by_arm(physics.qacc_warmstart), bodies.acceleration)
         qacc = jnp.zeros(len(physics.qvel) + 1).at[self.tables.dofs].set(found.arms)[:-1]
         qvel = physics.qvel + dt * qacc
-        objects = moved(bodies, found.objects, dt)
+        objects = self._moved(bodies, found.objects, slots)
         shift = dt * qvel, dt * objects.velocity
         grips = handling.remember(felt, slots, found.pressed, fingers, bodies, shift, grips, dt)
         after = Physics(physics.qpos + shift[0], qvel, qacc, physics.ctrl, Objects(objects, grips))
@@ -286,8 +295,8 @@ class Together:
         force = jnp.stack([pressed.normal, jnp.where(bumps, pressed.normal, 0.0)])
         return jnp.max(jnp.where(mine, force[..., None], 0.0), 1, initial=0.0)
 
-    def _free(self, bodies: Bodies) -> tuple[Array, Array]:
-        """Return the mass matrices [k, 6, 6] of the objects, and their accelerations [k, 6] without contacts."""
+    def _free(self, bodies: Bodies, awake: Array) -> tuple[Array, Array]:
+        """Return the mass matrices [k, 6, 6] of the objects, and their accelerations [k, 6] without contacts; 0 at rest."""
         frames, masses = rotation(bodies.quaternion), self.tables.masses
         free = free_acceleration(bodies, masses, frames, jnp.asarray(GRAVITY), self._dynamics.dt)
-        return inertias(masses, frames), free
+        return inertias(masses, frames), jnp.where(awake[:, None], free, 0.0)

@@ -17,6 +17,7 @@ from jax import Array
 from surgical_marl.physics.bodies import Bodies
 from surgical_marl.physics.patches import BLEND, TILT, TILT_IN_JAW, Patch, find_patch, no_patch
 from surgical_marl.physics.placed import Ball, Joints, Placed, Places, Way, size
+from surgical_marl.physics.rest import Company, company, moving
 from surgical_marl.physics.rows import put, room, row_of
 from surgical_marl.physics.shapes import Points, Segments, between_segments, on_plate
 from surgical_marl.physics.tables import Meeting, Tables
@@ -43,6 +44,10 @@ class Slots(NamedTuple):
     """Of each patch in `Tables`, [s]."""
     total: Array
     """How many there are, []; more than there are slots if some found no room."""
+    company: Company
+    """What is near the objects."""
+    awake: Array
+    """Which objects are not at rest, [k] bool: those at rest have no patches."""
 
     @property
     def found(self) -> Array:
@@ -72,13 +77,15 @@ class Finder:
             dt: time over which motions are looked ahead, s.
         """
         placed = self._places.place(data, joints, qvel, bodies, dt)
-        none, number, rows = jnp.int32(0), 0, self.slots + 1  # what finds no room goes to the last one
-        slots = Slots(room(jax.eval_shape(no_patch), rows), jnp.zeros(rows, jnp.int32), none)
+        near = company(placed.balls, _reach)
+        awake, none = near.spread(moving(bodies)), jnp.int32(0)
+        number, rows = 0, self.slots + 1  # what finds no room goes to the last one
+        slots = Slots(room(jax.eval_shape(no_patch), rows), jnp.zeros(rows, jnp.int32), none, near, awake)
         for meeting in self._tables.meetings:
             slots = self._meet(placed, meeting, number, slots)
             number += len(meeting.one)
         patch, numbers = jax.tree.map(lambda x: x[:-1], (slots.patch, slots.number))
-        return Slots(patch, numbers, slots.total)
+        return slots._replace(patch=patch, number=numbers)
 
     def _meet(self, placed: Placed, meeting: Meeting, start: int, slots: Slots) -> Slots:
         """Return the slots with the patches of a meeting, whose numbers begin at `start`.
@@ -87,23 +94,25 @@ class Finder:
         the one of them with most, and not at all that are near in any of them.
         """
         most = min(NEAREST, len(meeting.one))
-        pairs, count = self._near_pairs(placed, meeting, most)
+        pairs, count = self._near_pairs(placed, meeting, slots.awake, most)
 
         def meet(n: Array, slots: Slots) -> Slots:
             patch, touches = self._patch(placed, meeting, start, pairs[n])
             place = jnp.where(touches, jnp.minimum(slots.total, self.slots), self.slots)
             kept = put((slots.patch, slots.number), place, (patch, start + pairs[n]))
-            return Slots(kept[0], kept[1], slots.total + touches.astype(jnp.int32))
+            total = slots.total + touches.astype(jnp.int32)
+            return slots._replace(patch=kept[0], number=kept[1], total=total)
 
         if most == 1:
             return jax.lax.cond(count > 0, lambda slots: meet(jnp.int32(0), slots), lambda slots: slots, slots)
         slots = jax.lax.fori_loop(0, jnp.minimum(count, most), meet, slots)
         return slots._replace(total=slots.total + jnp.maximum(count - most, 0))
 
-    def _near_pairs(self, placed: Placed, meeting: Meeting, most: int) -> tuple[Array, Array]:
+    def _near_pairs(self, placed: Placed, meeting: Meeting, awake: Array, most: int) -> tuple[Array, Array]:
         """Return the numbers of pairs that may touch in the next step, at most so many, and how many they are.
 
-        What the first bodies may meet is gone through for each of them, but not for one that is far from all of it.
+        What the first bodies may meet is gone through for each of them, but not for one that is far from all of it, and
+        not for an object at rest.
         """
         numbers = jnp.arange(len(meeting.one), dtype=jnp.int32).reshape(-1, meeting.partners)
 
@@ -114,9 +123,11 @@ class Finder:
             def look(found: tuple[Array, Array], pair: Array) -> tuple[tuple[Array, Array], None]:
                 return _listed(found, pair, self._is_near(placed, meeting, i, one, pair)), None
 
-            if meeting.partners < MANY or meeting.second not in self._tables.boxes:
+            near = awake[i] if meeting.first == "objects" else jnp.bool_(True)
+            if meeting.partners >= MANY and meeting.second in self._tables.boxes:
+                near &= self._places.gap(placed, meeting.first, i, self._tables.boxes[meeting.second]) < _reach(one)
+            elif meeting.first != "objects":
                 return jax.lax.scan(look, found, pairs)
-            near = self._places.gap(placed, meeting.first, i, self._tables.boxes[meeting.second]) < _reach(one)
             return jax.lax.cond(near, lambda f: jax.lax.scan(look, f, pairs)[0], lambda f: f, found), None
 
         none = jnp.zeros(most, jnp.int32), jnp.int32(0)

@@ -12,7 +12,7 @@ import numpy as np
 import yaml
 
 import surgical_marl as sm
-from surgical_marl.physics import together
+from surgical_marl.physics import rest, together
 from surgical_marl.physics.bodies import Bodies, rotation
 from surgical_marl.physics.collision import Pairs
 from surgical_marl.physics.dynamics import Dynamics
@@ -45,7 +45,7 @@ class Falling:
         self.together = Together(self.scene, Dynamics(self.scene.model), Pairs(self.scene.model), ())
         self.masses, self.names = self.together.tables.masses, self.together.names
         self._arms = Simulator(self.scene).home
-        self._play = jax.jit(jax.vmap(self._advance, in_axes=(0, 0, None)), static_argnums=2)
+        self._play = jax.jit(jax.vmap(self._advance, in_axes=(0, 0, None, None)), static_argnums=3)
         self.depths = jax.jit(jax.vmap(self.depth))
         """`depth` in many environments [E]. Without `jit` each call would compile each of its loops once more, and some
         hundred calls take all the memory maps that Linux gives to a process."""
@@ -55,19 +55,22 @@ class Falling:
         start = self.together.start(self.scene, {})
         return jax.tree.map(lambda x: jnp.repeat(x[None], count, 0), start)
 
-    def play(self, objects: Objects, seconds: float, gravity: np.ndarray = DOWN) -> tuple[Objects, Trace]:
+    def play(
+        self, objects: Objects, seconds: float, gravity: np.ndarray = DOWN, slow: float = rest.SLOW
+    ) -> tuple[Objects, Trace]:
+        """Return the objects after a time, and what they did. With `slow` 0 m/s nothing counts as at rest."""
         each = jnp.broadcast_to(jnp.asarray(gravity, jnp.float32), (len(objects.bodies.position), 3))
-        objects, path = self._play(objects, each, round(seconds / DT))
+        objects, path = self._play(objects, each, slow, round(seconds / DT))
         return objects, Trace(*(np.asarray(part, float) for part in path))
 
-    def _advance(self, objects: Objects, gravity: Any, steps: int) -> tuple[Objects, Trace]:
+    def _advance(self, objects: Objects, gravity: Any, slow: Any, steps: int) -> tuple[Objects, Trace]:
         def step(objects: Objects, _: None) -> tuple[Objects, Trace]:
             slots = self.together.find(self._arms._replace(objects=objects))
             objects = self.together._step_objects(objects, slots)
             bodies, depth = objects.bodies, self.depth(objects)
             return objects, Trace(bodies.position, bodies.quaternion, bodies.velocity, depth)
 
-        with patch.object(together, "GRAVITY", gravity):
+        with patch.object(together, "GRAVITY", gravity), patch.object(rest, "SLOW", slow):
             return jax.lax.scan(step, objects, None, length=steps)
 
     def depth(self, objects: Objects) -> Any:

@@ -1,0 +1,76 @@
+"""Objects at rest: what lies still, and has nothing that moves near it, stays as it is until something comes.
+
+An object whose velocity and acceleration are zero, all six numbers of both, is at rest. Objects begin with the
+acceleration of gravity, so none is at rest before a step has found what bears it. MuJoCo calls this sleeping.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jax import Array
+
+from surgical_marl.physics.bodies import Bodies
+from surgical_marl.physics.placed import Ball, size
+
+SLOW = 1e-4
+"""Speed below which each point of an object has to be to come to rest, m/s. Objects that lie on a pad or on pegs have less
+than a hundredth of it, from rounding errors."""
+UNFORCED = 0.01
+"""Acceleration likewise, m/s2: a thousandth of gravity's. What tips over, or turns back as it rocks, has more."""
+
+
+class Company(NamedTuple):
+    """What keeps objects from being at rest."""
+
+    arms: Array
+    """Which objects an arm is near, [k] bool."""
+    objects: Array
+    """Which objects are near each other, [k, k] bool."""
+
+    def spread(self, awake: Array) -> Array:
+        """Return which objects are not at rest, [k] bool, if these are not: those too that lie against one of them."""
+        awake |= self.arms
+        for _ in range(len(awake) - 1):
+            awake |= (self.objects & awake).any(1)
+        return awake
+
+
+def company(balls: dict[str, Ball], reach: Any) -> Company:
+    """Return what is near objects.
+
+    Args:
+        balls: around all bodies, by their kind.
+        reach: of two balls or rows of balls, the distance below which their bodies may touch in the next step, m.
+    """
+    own = Ball(*(x[:, None] for x in balls["objects"]))
+
+    def near(kind: str) -> Array:
+        others = balls[kind]
+        apart = size(own.centre - others.centre) - own.radius - others.radius
+        return apart < reach(own, others)
+
+    by_arm = [near(kind).any(1) for kind in ("pads", "links")]
+    return Company(by_arm[0] | by_arm[1], near("objects"))
+
+
+def moving(bodies: Bodies) -> Array:
+    """Return which objects are not at rest by themselves, [k] bool."""
+    return (jnp.concatenate([bodies.velocity, bodies.acceleration], -1) != 0).any(-1)
+
+
+def settled(bodies: Bodies, bound: Any, near: Company) -> Bodies:
+    """Return the objects after a step, with those at rest that have come to it.
+
+    Args:
+        bodies: after the step.
+        bound: radius of a ball about the centre of mass that holds the object, m, [k].
+        near: what is near the objects.
+    """
+    fast = jnp.zeros(len(bodies.position), bool)
+    for rate, most in ((bodies.velocity, SLOW), (bodies.acceleration, UNFORCED)):
+        fast |= size(rate[:, :3]) + bound * size(rate[:, 3:]) >= most
+    awake = near.spread(fast)[:, None]
+    still = (jnp.where(awake, rate, 0.0) for rate in (bodies.velocity, bodies.acceleration))
+    return Bodies(bodies.position, bodies.quaternion, *still)

@@ -1,0 +1,108 @@
+"""Objects that have come to rest stay as they are, and wake as soon as anything comes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import yaml
+
+import surgical_marl as sm
+from surgical_marl.physics import rest
+from surgical_marl.physics.placed import Ball
+from surgical_marl.physics.rest import Company, company
+from tests.helpers.falling import Falling, Trace, random_turns, thrown
+
+BLOCKS = ("a", "b", "c")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Holds a pad so wide that nothing rolls off it."""
+    folder = tmp_path_factory.mktemp("rest")
+    pad = yaml.safe_load((Path(sm.__file__).parents[1] / "scenes/objects/pad.yaml").read_text())
+    pad["shapes"][0]["box"]["size"][:2] = [1.0, 1.0]
+    (folder / "wide.yaml").write_text(yaml.safe_dump(pad))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def blocks(folder: Path) -> Falling:
+    """Three blocks 20 mm above the pad, 30 mm from each other."""
+    places = {name: {"object": "block", "position": [0.03 * k, 0.0, 0.02]} for k, name in enumerate(BLOCKS)}
+    return Falling(folder, {"pad": {"object": str(folder / "wide.yaml")}, **places})
+
+
+def second(blocks: Falling, objects: Any, slow: float = rest.SLOW) -> tuple[Any, Trace]:
+    """What eight environments do in a second: one number and one time, so that one step is compiled."""
+    return blocks.play(objects, 1.0, slow=slow)
+
+
+def at_rest(objects: Any) -> np.ndarray:
+    bodies = objects.bodies
+    return np.asarray((bodies.velocity == 0).all(-1) & (bodies.acceleration == 0).all(-1))
+
+
+def test_what_was_thrown_comes_to_rest_and_stays_there_to_the_bit(blocks: Falling) -> None:
+    """And lies where it would lie if nothing were ever at rest."""
+    start = blocks.begin(8)
+    start = thrown(start, quaternion=random_turns(np.random.default_rng(3), 8, 3))
+    assert not at_rest(start).any()
+    (after, path), (other, moved) = second(blocks, start), second(blocks, start, slow=0.0)
+    assert at_rest(after).all() and not at_rest(other).any()
+    assert np.abs(path.position - moved.position).max() < 1e-4
+    later, _ = second(blocks, after)
+    for name in after.bodies._fields:
+        assert np.array_equal(getattr(later.bodies, name), getattr(after.bodies, name)), name
+
+
+def test_a_struck_object_moves_and_so_does_what_lies_behind_it(blocks: Falling) -> None:
+    """Blocks a, b and c lie in a row, b and c against each other: what slides against b moves both."""
+    rested, _ = second(blocks, blocks.begin(8))
+    assert at_rest(rested).all()
+    velocity, place = np.zeros((8, 3, 6)), np.array(rested.bodies.position)
+    place[:, 1, 0] = place[:, 2, 0] - 2 * blocks.together.tables.bound[0]
+    place[:, 0, 0] = place[:, 1, 0] - 2 * blocks.together.tables.bound[0] - 0.001
+    velocity[:, 0, 0] = np.linspace(0.6, 1.3, 8)
+    struck = thrown(rested, velocity=velocity, position=place)
+    (_, path), (_, moved) = second(blocks, struck), second(blocks, struck, slow=0.0)
+    ways = np.ptp(path.position[..., 0], 1)  # [E, k]
+    assert (ways[:, :2] > 1e-3).all() and (ways[-1] > 1e-3).all(), ways
+    assert np.abs(path.position - moved.position).max() < 2e-4
+
+
+def test_what_turns_back_or_tips_over_is_not_at_rest(blocks: Falling) -> None:
+    """A block that flies up slowly has no speed at its highest place, and one that stands on an edge tips slowly."""
+    start = blocks.begin(8)
+    velocity, turns = np.zeros((8, 3, 6)), np.tile([1.0, 0.0, 0.0, 0.0], (8, 3, 1))
+    velocity[:4, :, 2] = np.array([0.00002, 0.0001, 0.0245, 0.1])[:, None]
+    for k, angle in enumerate([0.5, 0.7, 0.785, 0.79]):  # about an edge: near where it would stand
+        turns[4 + k, :] = [np.cos(angle / 2), np.sin(angle / 2), 0.0, 0.0]
+    start = thrown(start, velocity=velocity, quaternion=turns)
+    (after, path), (_, moved) = second(blocks, start), second(blocks, start, slow=0.0)
+    assert at_rest(after).all()
+    assert np.abs(path.position[:, -1] - moved.position[:, -1]).max() < 2e-4
+    assert (path.position[:4, 0, :, 2] - path.position[:4, -1, :, 2] > 0.01).all()
+
+
+def test_an_arm_that_comes_near_wakes_an_object_and_its_neighbours() -> None:
+    """By balls around bodies: two objects side by side and one apart, an arm's pad at a distance, and coming fast."""
+    centres = np.array([[0.0, 0, 0], [0.015, 0, 0], [0.1, 0, 0]], np.float32)
+    reach = lambda *balls: 3e-4 + sum(ball.moves for ball in balls)  # noqa: E731
+
+    def near(pad: float, moves: float = 0.0) -> Company:
+        none = np.zeros(3, np.float32)
+        balls = {"objects": Ball(jnp.asarray(centres), jnp.full(3, 0.008), jnp.asarray(none))}
+        arm = Ball(jnp.array([[pad, 0.0, 0.0]]), jnp.array([0.004]), jnp.array([moves]))
+        balls |= {"pads": arm, "links": Ball(*(x[:0] for x in arm))}
+        return company(balls, reach)
+
+    still = jnp.zeros(3, bool)
+    assert not np.asarray(near(-0.02).spread(still)).any()
+    assert np.asarray(near(-0.011).spread(still)).tolist() == [True, True, False]
+    assert np.asarray(near(-0.02, 0.009).spread(still)).tolist() == [True, True, False]
+    assert np.asarray(near(0.1).spread(still)).tolist() == [False, False, True]
+    assert np.asarray(near(0.5).spread(jnp.array([False, True, False]))).tolist() == [True, True, False]
