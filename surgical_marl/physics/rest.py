@@ -15,8 +15,8 @@ from surgical_marl.physics.bodies import Bodies
 from surgical_marl.physics.placed import Ball, size
 
 SLOW = 1e-4
-"""Speed below which each point of an object has to be to come to rest, m/s. Objects that lie on a pad or on pegs have less
-than a hundredth of it, from rounding errors."""
+"""Speed below which each point of an object has to be to come to rest, m/s. What lies still has less than a hundredth
+of it, from rounding errors."""
 UNFORCED = 0.01
 """Acceleration likewise, m/s2: a thousandth of gravity's. What tips over, or turns back as it rocks, has more."""
 

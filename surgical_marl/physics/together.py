@@ -296,7 +296,10 @@ class Together:
         return jnp.max(jnp.where(mine, force[..., None], 0.0), 1, initial=0.0)
 
     def _free(self, bodies: Bodies, awake: Array) -> tuple[Array, Array]:
-        """Return the mass matrices [k, 6, 6] of the objects, and their accelerations [k, 6] without contacts; 0 at rest."""
+        """Return the mass matrices [k, 6, 6] of the objects, and their accelerations [k, 6] without contacts.
+
+        Those at rest have none.
+        """
         frames, masses = rotation(bodies.quaternion), self.tables.masses
         free = free_acceleration(bodies, masses, frames, jnp.asarray(GRAVITY), self._dynamics.dt)
         return inertias(masses, frames), jnp.where(awake[:, None], free, 0.0)
