@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 import yaml
 
-import surgical_marl as sm
 from surgical_marl.physics.handling import FASTEST
 from surgical_marl.physics.together import Objects
 from surgical_marl.robots.rotation import quaternion, turned
 from surgical_marl.studies.grasping import Held, judge
 from surgical_marl.studies.shaking import CHUNK, OBJECTS, Grasps
-from tests.helpers.falling import Falling, Trace, random_turns, thrown
+from tests.helpers.falling import Falling, Trace, random_turns, thrown, wide_pad
 
 # -- what a jaw holds
 
@@ -67,12 +66,9 @@ def test_an_object_is_held_from_when_the_jaw_has_closed_until_it_opens(grasps: G
 def falling(tmp_path_factory: pytest.TempPathFactory) -> Falling:
     """A needle, a block and a ring 50 mm above a pad so wide that nothing rolls off it."""
     folder = tmp_path_factory.mktemp("falling")
-    pad = yaml.safe_load((Path(sm.__file__).parents[1] / "scenes/objects/pad.yaml").read_text())
-    pad["shapes"][0]["box"]["size"][:2] = [1.0, 1.0]
-    (folder / "wide.yaml").write_text(yaml.safe_dump(pad))
     places = {name: {"object": name, "position": [0, y, 0.05]} for name, y in
               (("needle_sh", -0.2), ("block", 0.0), ("ring", 0.2))}  # fmt: skip
-    return Falling(folder, {"pad": {"object": str(folder / "wide.yaml")}, **places})
+    return Falling(folder, {"pad": wide_pad(folder), **places})
 
 
 @pytest.mark.parametrize("speed", [*(pytest.param(speed, marks=pytest.mark.slow) for speed in (0.0, 1.0)), 3.0])

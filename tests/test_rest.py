@@ -2,38 +2,24 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import yaml
 
-import surgical_marl as sm
 from surgical_marl.physics import rest
 from surgical_marl.physics.placed import Ball
 from surgical_marl.physics.rest import Company, company
-from tests.helpers.falling import Falling, Trace, random_turns, thrown
-
-BLOCKS = ("a", "b", "c")
+from tests.helpers.falling import Falling, Trace, random_turns, thrown, wide_pad
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Holds a pad so wide that nothing rolls off it."""
+def blocks(tmp_path_factory: pytest.TempPathFactory) -> Falling:
+    """Three blocks 20 mm above a pad so wide that nothing rolls off it, 30 mm from each other."""
     folder = tmp_path_factory.mktemp("rest")
-    pad = yaml.safe_load((Path(sm.__file__).parents[1] / "scenes/objects/pad.yaml").read_text())
-    pad["shapes"][0]["box"]["size"][:2] = [1.0, 1.0]
-    (folder / "wide.yaml").write_text(yaml.safe_dump(pad))
-    return folder
-
-
-@pytest.fixture(scope="module")
-def blocks(folder: Path) -> Falling:
-    """Three blocks 20 mm above the pad, 30 mm from each other."""
-    places = {name: {"object": "block", "position": [0.03 * k, 0.0, 0.02]} for k, name in enumerate(BLOCKS)}
-    return Falling(folder, {"pad": {"object": str(folder / "wide.yaml")}, **places})
+    places = {name: {"object": "block", "position": [0.03 * k, 0.0, 0.02]} for k, name in enumerate("abc")}
+    return Falling(folder, {"pad": wide_pad(folder), **places})
 
 
 def second(blocks: Falling, objects: Any, slow: float = rest.SLOW) -> tuple[Any, Trace]:

@@ -166,6 +166,11 @@ def size(vector: Array) -> Array:
     return jnp.sqrt(jnp.sum(vector * vector, -1))
 
 
+def between_balls(one: Ball, other: Ball) -> Array:
+    """Return the distances of balls, m; negative where they overlap. Shapes of the two broadcast."""
+    return size(one.centre - other.centre) - one.radius - other.radius
+
+
 def _around(shapes: Plate | Segments) -> tuple[Array, Array]:
     """Return centres [n, 3] and radii [n] of balls that hold shapes."""
     if isinstance(shapes, Plate):

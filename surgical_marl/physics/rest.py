@@ -6,13 +6,14 @@ acceleration of gravity, so none is at rest before a step has found what bears i
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
 
 from surgical_marl.physics.bodies import Bodies
-from surgical_marl.physics.placed import Ball, size
+from surgical_marl.physics.placed import Ball, between_balls, size
 
 SLOW = 1e-4
 """Speed below which each point of an object has to be to come to rest, m/s. What lies still has less than a hundredth
@@ -37,7 +38,7 @@ class Company(NamedTuple):
         return awake
 
 
-def company(balls: dict[str, Ball], reach: Any) -> Company:
+def company(balls: dict[str, Ball], reach: Callable[..., Array]) -> Company:
     """Return what is near objects.
 
     Args:
@@ -47,12 +48,9 @@ def company(balls: dict[str, Ball], reach: Any) -> Company:
     own = Ball(*(x[:, None] for x in balls["objects"]))
 
     def near(kind: str) -> Array:
-        others = balls[kind]
-        apart = size(own.centre - others.centre) - own.radius - others.radius
-        return apart < reach(own, others)
+        return between_balls(own, balls[kind]) < reach(own, balls[kind])
 
-    by_arm = [near(kind).any(1) for kind in ("pads", "links")]
-    return Company(by_arm[0] | by_arm[1], near("objects"))
+    return Company(near("pads").any(1) | near("links").any(1), near("objects"))
 
 
 def moving(bodies: Bodies) -> Array:

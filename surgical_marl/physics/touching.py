@@ -16,7 +16,7 @@ from jax import Array
 
 from surgical_marl.physics.bodies import Bodies
 from surgical_marl.physics.patches import BLEND, TILT, TILT_IN_JAW, Patch, find_patch, no_patch
-from surgical_marl.physics.placed import Ball, Joints, Placed, Places, Way, size
+from surgical_marl.physics.placed import Ball, Joints, Placed, Places, Way, between_balls
 from surgical_marl.physics.rest import Company, company, moving
 from surgical_marl.physics.rows import put, room, row_of
 from surgical_marl.physics.shapes import Points, Segments, between_segments, on_plate
@@ -146,8 +146,7 @@ class Finder:
             link = self._places.capsule(placed, "links", i, jnp.int32(0))
             return self._places.link_distance(placed, meeting.second, j, link) < reach
 
-        apart = size(one.centre - other.centre) - one.radius - other.radius
-        return jax.lax.cond(apart < reach, looked_at, lambda _: jnp.bool_(False), None)
+        return jax.lax.cond(between_balls(one, other) < reach, looked_at, lambda _: jnp.bool_(False), None)
 
     def _ways(self, placed: Placed, meeting: Meeting, i: Array, j: Array) -> tuple[Way, Way | None]:
         its = placed.ways.get(meeting.second)

@@ -166,18 +166,17 @@ def _by_scene(found: Sequence[dict[str, Any]], say: Callable[[dict[str, Any]], s
     said: dict[str, set[str]] = {}
     for each in found:
         said.setdefault(each["scene"], set()).add(say(each))
-    places: dict[str, dict[str, None]] = {}  # of each text, in order
+    places: dict[str, dict[tuple[str, str], None]] = {}  # of each text, in order
     for each in found:
         alike = len(said[each["scene"]]) == 1
-        where = f"on `{each['scene']}`" if alike else f"with `{CELLS[each['cell']].label()}`"
+        where = ("on", f"`{each['scene']}`") if alike else ("with", f"`{CELLS[each['cell']].label()}`")
         places.setdefault(say(each), {})[where] = None
     return "; ".join(text + (f" {_joined(list(names))}" if len(places) > 1 else "") for text, names in places.items())
 
 
-def _joined(places: Sequence[str]) -> str:
-    """Return places, or settings, as a phrase that has "on" and "with" only where they begin or change."""
-    words = [(place.partition(" ")[0], place.partition(" ")[2]) for place in places]
-    kept = [name if at and words[at - 1][0] == how else f"{how} {name}" for at, (how, name) in enumerate(words)]
+def _joined(places: Sequence[tuple[str, str]]) -> str:
+    """Return places and settings as a phrase that has each one's "on" or "with" only where that begins or changes."""
+    kept = [name if at and places[at - 1][0] == how else f"{how} {name}" for at, (how, name) in enumerate(places)]
     return " and ".join(kept)
 
 

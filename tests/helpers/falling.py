@@ -92,6 +92,15 @@ class Falling:
         return np.einsum("...ij,...jk,...lk->...il", frames, self.masses.inertia.astype(float), frames)
 
 
+def wide_pad(folder: Path) -> dict[str, str]:
+    """Write a pad into a folder that is so wide that nothing rolls off it, and return where a scene has it."""
+    path = folder / "wide.yaml"
+    pad = yaml.safe_load((Path(sm.__file__).parents[1] / "scenes/objects/pad.yaml").read_text())
+    pad["shapes"][0]["box"]["size"][:2] = [1.0, 1.0]
+    path.write_text(yaml.safe_dump(pad))
+    return {"object": str(path)}
+
+
 def thrown(objects: Objects, **changes: Any) -> Objects:
     """Return objects with other fields of their bodies."""
     values = {name: jnp.asarray(value, jnp.float32) for name, value in changes.items()}
