@@ -11,6 +11,9 @@ from surgical_marl.report.run import Run, flatten
 from surgical_marl.runs.folder import read_settings
 from surgical_marl.runs.settings import config_text, load_config
 
+# What a command need not say of the settings that choose which defaults hold.
+_USUAL = {"device": "auto", "difficulty": "default", "start": "home"}
+
 
 def train_command(run: Run) -> str:
     """Return the `surgical-marl train` that has exactly the settings of a run.
@@ -19,17 +22,18 @@ def train_command(run: Run) -> str:
     """
     task, scene, settings = str(run.config["task"]), str(run.config["scene"]), _settings(run)
     try:
-        level = [f"difficulty={settings['difficulty']}"]
+        sections = [f"{name}={settings[name]}" for name in ("difficulty", "start")]
         both = [
-            _flat(config_text(load_config(task, scene, [*level, f"device={device}"]), {})) for device in ("cpu", "cuda")
+            _flat(config_text(load_config(task, scene, [*sections, f"device={device}"]), {}))
+            for device in ("cpu", "cuda")
         ]
     except (ValueError, KeyError):  # a task, or settings, that are not of this installation
         both = []
     command = ["surgical-marl", "train", task, "--scene", scene, "--seed", run.seed]
     for name, value in settings.items():
         usual = bool(both) and all(name in defaults and defaults[name] == value for defaults in both)
-        if name in ("device", "difficulty"):  # the defaults above are those of the run's own level, on two devices
-            usual = value in ("auto", "default")
+        if name in _USUAL:  # the defaults above are those of the run's own level and start, on two devices
+            usual = value == _USUAL[name]
         if not usual and name not in ("task", "scene", "seed"):
             command.append(f"{name}={_flow(value)}")
     return shlex.join(command)
