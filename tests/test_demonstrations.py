@@ -189,12 +189,14 @@ def test_pairs_that_the_actor_is_far_off_are_drawn_more_often(trainer: Trainer) 
     assert 0.5 <= (imitation._draw() == 7).float().mean() < 0.6
 
 
-def test_rounds_are_refused_where_the_oracle_goes_step_by_step() -> None:
+def test_rounds_are_refused_where_the_oracle_goes_step_by_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before anything is compiled, which takes minutes where there are objects."""
+    monkeypatch.setattr("surgical_marl.engines.fused.engine.load_source", lambda *_, **__: pytest.fail("compiles"))
     settings = replace(
         SETTINGS, scene="bimanual_psm", difficulty="crossing", imitation=ImitationSettings(steps=4, rounds=1)
     )
     with pytest.raises(ValueError, match=r"imitation.rounds must be 0 for this task, not 1: its oracle goes step by"):
-        Trainer(settings, make_env(settings))
+        train.make_training(settings)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -341,12 +343,12 @@ def test_another_control_is_refused(trainer: Trainer) -> None:
 
 
 def test_pictures_are_refused() -> None:
-    seeing: Any = SimpleNamespace(pictures={"ecm": {"image": None}})
+    settings = replace(SETTINGS, task="match_image", scene="ecm")
     with pytest.raises(
         ValueError,
         match=r"oracle_states.rate, imitation.steps and imitation.weight must be 0 where agents observe pictures",
     ):
-        Demonstrations(SETTINGS, seeing, "cpu")
+        train.make_training(settings)
 
 
 def test_an_oracle_that_has_no_time_is_refused(trainer: Trainer) -> None:

@@ -54,7 +54,7 @@ def heard(env: BatchedEnv, observations: dict[str, Any], agent: str) -> np.ndarr
 
 def test_teammates_hear_after_the_step_what_an_agent_said_in_it() -> None:
     """Over the end of an episode: its last observation still has the messages, the first of the next one zeros."""
-    env, rng = made(messages=K), np.random.default_rng(0)
+    env, rng = made(knowledge="one", messages=K), np.random.default_rng(0)
     observations, state, _ = env.reset(seed=0)
     assert not any(heard(env, observations, agent).any() for agent in env.agents)
     for number in range(1, 10):

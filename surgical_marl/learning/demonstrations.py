@@ -25,6 +25,7 @@ from torch import Tensor
 
 from surgical_marl.cache import cached_arrays
 from surgical_marl.engines.stepper import describe
+from surgical_marl.envs.env import Env
 from surgical_marl.policies.actor import acting_policy
 from surgical_marl.policies.layout import Layout
 from surgical_marl.policies.oracle import oracle
@@ -47,6 +48,26 @@ OWN = (".key", ".episode")
 DISTURBED, LASTS = 0.1, 0.8
 """Standard deviation of what is added to the actions of all joints but jaws, and how much of it lasts to the next step.
 With 0.3 an arm that holds a needle misses most handovers."""
+_NEITHER = "oracle_states.rate, imitation.steps and imitation.weight must be 0"
+
+
+def check_demonstrations(settings: Settings) -> None:
+    """Refuse a run whose task the oracle can't demonstrate, before anything is compiled for it.
+
+    Raises:
+        ValueError: the control is not "position", or an agent observes pictures; or there are rounds of imitation, and
+            the oracle follows a script of several steps.
+    """
+    if settings.control != "position":
+        raise ValueError(f"{_NEITHER} with control {settings.control!r}: the oracle needs position")
+    env = Env(**settings.of_environment())
+    if any(seen.pictures for seen in env.observed.values()):
+        raise ValueError(f"{_NEITHER} where agents observe pictures")
+    if settings.imitation.rounds and len(env.task.script()) > 1:
+        raise ValueError(
+            f"imitation.rounds must be 0 for this task, not {settings.imitation.rounds}: its oracle goes step "
+            "by step, and can't say what to do where another one came"
+        )
 
 
 class Demonstrations:
@@ -63,23 +84,13 @@ class Demonstrations:
         actions: what the oracle does then, flat joint actions [n, sum] in [-1, 1].
 
     Raises:
-        ValueError: the control is not "position", the task has no oracle, its oracle never succeeds, or an agent
-            observes pictures; or there are rounds of imitation, and the oracle follows a script of several steps.
+        ValueError: the task has no oracle, or it never succeeds; or what `check_demonstrations` refuses.
     """
 
     def __init__(self, settings: Settings, layout: Layout, device: str) -> None:
-        neither = "oracle_states.rate, imitation.steps and imitation.weight must be 0"
-        if settings.control != "position":
-            raise ValueError(f"{neither} with control {settings.control!r}: the oracle needs position")
-        if any(layout.pictures.values()):
-            raise ValueError(f"{neither} where agents observe pictures")
+        check_demonstrations(settings)
         env = make_env(settings, settings.oracle_episodes, "numpy")
         try:
-            if settings.imitation.rounds and len(env.task.script()) > 1:
-                raise ValueError(
-                    f"imitation.rounds must be 0 for this task, not {settings.imitation.rounds}: its oracle goes step "
-                    "by step, and can't say what to do where another one came"
-                )
             tables = (np.asarray(table).tobytes() for _, table in sorted(env.task.tables.items()))
             about = env.env.content, describe(env.env.parameters).encode(), f"{env.max_steps} {env.num_envs}".encode()
             rows = cached_arrays("demonstrations", lambda: _record(env), *about, *tables, roots=env.env.roots)
@@ -91,7 +102,7 @@ class Demonstrations:
         finally:
             env.close()
         if not len(rows["states"]):
-            raise ValueError(f"{neither} for {settings.task}: its oracle never succeeded")
+            raise ValueError(f"{_NEITHER} for {settings.task}: its oracle never succeeded")
         groups = {**layout.stack({agent: states.pop(agent) for agent in agents}), "state": states.pop("state")}
         self._settings, self._layout, self._asked = settings, layout, 0
         self.carry: dict[str, Tensor] = states

@@ -19,6 +19,7 @@ from tqdm import tqdm
 
 from surgical_marl.files import remove_temporaries
 from surgical_marl.learning import distributed
+from surgical_marl.learning.demonstrations import check_demonstrations
 from surgical_marl.learning.faults import Diverged, Fault
 from surgical_marl.learning.log import Log, Reports
 from surgical_marl.learning.room import check_room, in_memory
@@ -72,8 +73,10 @@ MOST_FAULTS = 10
 
 
 def make_training(settings: Settings) -> Trainer:
-    """Make a run in memory. ValueError if there is not enough memory for it."""
+    """Make a run in memory. ValueError if there is not enough memory, or no oracle, for it."""
     settings = settings.in_training()
+    if settings.shown_by_oracle:
+        check_demonstrations(settings)
     with distributed.in_turn():
         env = make_env(settings)
     check_room(settings, env)

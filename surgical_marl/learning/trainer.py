@@ -73,9 +73,8 @@ class Trainer:
         self._reporter = Reporter(self.algorithm, self.env, self._observations, self.episodes, steps)
         # All environments start together: let the first episodes end at different times.
         self.env.episode_length_buf = torch.randint(0, max(env.max_steps, 1), (env.num_envs,)).to(device)
-        imitation = settings.imitation
-        wanted = settings.oracle_states.rate > 0 or imitation.steps > 0 or imitation.weight > 0
-        self._demonstrations = Demonstrations(settings, self.env.layout, device) if wanted else None
+        imitation, shown = settings.imitation, settings.shown_by_oracle
+        self._demonstrations = Demonstrations(settings, self.env.layout, device) if shown else None
         self.algorithm.imitates = imitation.steps > 0
         self._imitation: Imitation | None = None
         if self._demonstrations is not None:

@@ -178,6 +178,11 @@ class Settings(Options):
                 f"not {self.ppo.mini_batches}"
             )
 
+    @property
+    def shown_by_oracle(self) -> bool:
+        """Whether the oracle's episodes have a part in learning: as starts, or to be imitated."""
+        return self.oracle_states.rate > 0 or self.imitation.steps > 0 or self.imitation.weight > 0
+
     def in_training(self) -> Settings:
         """Return these settings with the episodes of training."""
         return replace(self, max_steps=self.train_max_steps or self.max_steps)
