@@ -73,7 +73,7 @@ MOST_FAULTS = 10
 
 
 def make_training(settings: Settings) -> Trainer:
-    """Make a run in memory. ValueError if there is not enough memory, or no oracle, for it."""
+    """Make a run in memory. ValueError if memory is short, or the oracle can't demonstrate what it should."""
     settings = settings.in_training()
     if settings.shown_by_oracle:
         check_demonstrations(settings)
