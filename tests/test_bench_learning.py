@@ -36,7 +36,7 @@ ANY = Goal(0.0, 1.0)
 
 
 def exam(success: float, collisions: float = 0.0) -> Exam:
-    return Exam(success, collisions, 1.0, "hash", True)
+    return Exam("success_2mm", success, 0.0, collisions, 1.0, "hash", True)
 
 
 @pytest.fixture
@@ -155,6 +155,19 @@ def test_looks_are_worth_their_time() -> None:
 def test_a_goal_is_success_without_collisions() -> None:
     assert exam(0.95).passes(Goal()) and not exam(0.949).passes(Goal())
     assert not exam(1.0, collisions=0.01).passes(Goal())
+
+
+def test_tasks_without_targets_of_tips_are_judged_by_their_own_success(fakes: None) -> None:
+    env = solve.make_env(SETTINGS, solve.EPISODES)
+    found = {}
+    for task in ("reach", "needle_pick"):
+        training = Trainer(SETTINGS, solve.make_env(SETTINGS))
+        training.settings = replace(SETTINGS, task=task)
+        found[task] = solve.examine(training, env)
+    assert found["reach"].judged_by == "success_2mm" and found["needle_pick"].judged_by == "success_rate"
+    judged = replace(found["needle_pick"], success_2mm=0.0, success_rate=1.0)
+    assert judged.passes(ANY) and judged.success == 1.0 and judged.what == "successful"
+    assert not replace(judged, judged_by="success_2mm").passes(Goal(0.5, 1.0))
 
 
 def test_a_process_has_an_age() -> None:

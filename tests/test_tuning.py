@@ -14,9 +14,18 @@ from surgical_marl.runs.settings import Settings, load_config
 from surgical_marl.studies import tuning
 
 
-def test_shipped_settings_are_a_point_of_the_space() -> None:
-    settings = load_config("reach", "psm")
-    for name, knob in tuning.knobs("cpu").items():
+@pytest.mark.parametrize(
+    ("task", "scene", "where", "imitates"),
+    [
+        ("reach", "psm", "cpu", False),
+        ("needle_pick", "psm_needle", "cuda", True),
+        ("needle_handover", "bimanual_psm_needle", "cuda", True),
+    ],
+)
+def test_shipped_settings_are_a_point_of_the_space(task: str, scene: str, where: str, imitates: bool) -> None:
+    settings = load_config(task, scene, [f"device={where}"])
+    assert (settings.imitation.steps > 0) == imitates
+    for name, knob in tuning.knobs(where, imitates).items():
         point = knob.point(tuning._setting(settings, knob.setting))
         assert knob.range._contains(point), name
         value = tuning._setting(settings, knob.setting)
@@ -24,7 +33,7 @@ def test_shipped_settings_are_a_point_of_the_space() -> None:
 
 
 def test_what_is_fixed_is_not_searched() -> None:
-    found = tuning.knobs("cuda", ["num_envs=64", "network.hidden=[8]"])
+    found = tuning.knobs("cuda", fixed=["num_envs=64", "network.hidden=[8]"])
     assert "log2_num_envs" not in found and len(found) == len(tuning.knobs("cuda")) - 1
 
 
@@ -34,9 +43,7 @@ def test_slower_trials_are_pruned_and_the_best_is_confirmed(tmp_path: Path, monk
     def solve(settings: Settings, goal: Any, give_up: Any) -> Any:
         give_up(0.0, 0.0)
         solved = not give_up(0.0, float(settings.ppo.epochs))
-        return SimpleNamespace(
-            solved=solved, learning_s=float(settings.ppo.epochs), exam=SimpleNamespace(success_2mm=0.5)
-        )
+        return SimpleNamespace(solved=solved, learning_s=float(settings.ppo.epochs), exam=SimpleNamespace(success=0.5))
 
     monkeypatch.setattr(tuning, "solve", solve)
     monkeypatch.setattr(machine, "restart_peak", lambda: 0.0)  # it collects all garbage, 27 times

@@ -28,7 +28,7 @@ def add_bench(commands: Any) -> None:
     for kind, what in (("train", "steps/s with learning"), ("solve", "seconds until a policy is good")):
         learns = _bench_parser(kinds, kind, what, Settings)
         learns.usage = "%(prog)s [options] [key=value ...]"
-    learns.add_argument("--success", type=float, default=0.95, metavar="SHARE", help="wanted within 2 mm")
+    learns.add_argument("--success", type=float, default=0.95, metavar="SHARE", help="of arms that succeed")
     learns.add_argument("--collisions", type=float, default=0.01, metavar="SHARE", help="of episodes, to stay below")
     learns.add_argument("--limit", type=float, default=600.0, metavar="SECONDS", help="then it is given up")
     _add_render(kinds)

@@ -55,11 +55,17 @@ class Knob(NamedTuple):
     """Point of the range for a value of the setting."""
 
 
-def knobs(where: str, fixed: Sequence[str] = ()) -> dict[str, Knob]:
-    """Return the settings to search on a "cpu" or "cuda", without those that are fixed, `key=value`."""
+def knobs(where: str, imitates: bool = False, fixed: Sequence[str] = ()) -> dict[str, Knob]:
+    """Return the settings to search.
+
+    Args:
+        where: "cpu" or "cuda".
+        imitates: whether actors imitate the oracle first. How long they do so is searched, too.
+        fixed: `key=value` that are not searched.
+    """
     power: dict[str, Any] = {"value": lambda power: 2**power, "point": lambda value: value.bit_length() - 1}
     found = {
-        "learning_rate": Knob("ppo.learning_rate", FloatDistribution(1e-4, 1e-2, log=True)),
+        "learning_rate": Knob("ppo.learning_rate", FloatDistribution(1e-5, 1e-2, log=True)),
         "desired_kl": Knob("ppo.desired_kl", FloatDistribution(0.003, 0.1, log=True)),
         # in control steps
         "horizon": Knob("ppo.gamma", FloatDistribution(2, 200, log=True), lambda h: 1 - 1 / h, lambda g: 1 / (1 - g)),
@@ -68,11 +74,20 @@ def knobs(where: str, fixed: Sequence[str] = ()) -> dict[str, Knob]:
         "log2_mini_batches": Knob("ppo.mini_batches", IntDistribution(0, 5), **power),
         "steps_per_iteration": Knob("steps_per_iteration", IntDistribution(8, 64, step=4)),
         "log2_num_envs": Knob("num_envs", IntDistribution(*((10, 17) if where == "cuda" else (7, 12))), **power),
-        "init_std": Knob("network.init_std", FloatDistribution(0.1, 1.0, log=True)),
+        "init_std": Knob("network.init_std", FloatDistribution(0.05, 1.0, log=True)),
         "entropy": Knob(
             "ppo.entropy_coefficient", FloatDistribution(1e-6, 1e-2, log=True), point=lambda value: max(value, 1e-6)
         ),
     }
+    if imitates:
+        found |= {
+            "imitation_steps": Knob("imitation.steps", IntDistribution(1000, 100_000, log=True)),
+            "log2_imitation_batch": Knob("imitation.batch_size", IntDistribution(8, 14), **power),
+            "imitation_hold": Knob("imitation.hold", IntDistribution(0, 20)),
+            # its square root, because small weights differ most, and 0 is one of them
+            "imitation_weight": Knob("imitation.weight", FloatDistribution(0.0, 1.0), lambda p: p**2, lambda w: w**0.5),
+            "oracle_states": Knob("oracle_states.rate", FloatDistribution(0.0, 2.0)),
+        }
     keys = [text.partition("=")[0] for text in fixed]
     return {name: knob for name, knob in found.items() if knob.setting not in keys}
 
@@ -90,7 +105,7 @@ class Search:
         self.name = f"{arguments.task}-{arguments.scene}-{arguments.algo}-{self.where}"
         self.shipped = self.settings([])
         make_env(self.shipped, 1)  # settings that only an environment refuses would otherwise look like failed trials
-        self.knobs = knobs(self.where, arguments.settings)
+        self.knobs = knobs(self.where, self.shipped.imitation.steps > 0, arguments.settings)
         self.results = arguments.results or arguments.out
         for folder in (arguments.out, self.results):
             folder.mkdir(parents=True, exist_ok=True)
@@ -150,7 +165,7 @@ class Search:
                 return spent, self.goal.success
             spent += found.learning_s
             if not found.solved:
-                return spent, max(0.0, self.goal.success - found.exam.success_2mm)
+                return spent, max(0.0, self.goal.success - found.exam.success)
         return spent / len(each), None
 
     def learn(self, settings: Settings, limit: float) -> Solution | None:
@@ -269,7 +284,7 @@ def _parse(argv: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--scene", default="psm")
     parser.add_argument("--algo", default="mappo")
     parser.add_argument("--device", default="auto")
-    parser.add_argument("--success", type=float, default=Goal.success, metavar="SHARE", help="wanted within 2 mm")
+    parser.add_argument("--success", type=float, default=Goal.success, metavar="SHARE", help="of arms that succeed")
     parser.add_argument("--trials", type=whole(1), default=100, metavar="N", help="in all calls together")
     parser.add_argument(
         "--timeout", type=_positive, default=float("inf"), metavar="SECONDS", help="no new trial after it"
