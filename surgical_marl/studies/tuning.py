@@ -3,11 +3,13 @@
     pip install -c constraints.txt -e '.[tune]'
     python -m surgical_marl.studies.tuning --scene psm --trials 100     # a second call goes on where the first stopped
     python -m surgical_marl.studies.tuning --scene psm --timeout 480 --out runs/small network.hidden=[128,128]
+    python -m surgical_marl.studies.tuning --task needle_pick --scene psm_needle --success 0.97 --seeds 1
 
 What is tuned are seconds of learning as `surgical-marl bench solve` counts them, without imports and compilation. All
-trials run in one process, one after the other, so that engines compile once and trials don't share the device. A trial
-that is slower than the best so far is pruned. In the end the best settings and those of configs/ learn anew from seeds
-that the search has not seen, because the best of many trials was also lucky.
+trials run in one process, one after the other, so that engines compile once and trials don't share the device. Several
+processes, each on a GPU of its own, may share a search: start the command once for each, with --confirm 0 for all but
+one. A trial that is slower than the best so far is pruned. In the end the best settings and those of configs/ learn
+anew from seeds that the search has not seen, because the best of many trials was also lucky.
 """
 
 from __future__ import annotations
@@ -112,10 +114,11 @@ class Search:
         self.study = optuna.create_study(
             storage=JournalStorage(JournalFileBackend(str(arguments.out / f"{self.name}.log"))),
             study_name=self.name,
-            sampler=optuna.samplers.TPESampler(seed=0, multivariate=True),
+            # without a seed: a second call, or a second process beside this one, would draw the same points again
+            sampler=optuna.samplers.TPESampler(multivariate=True),
             load_if_exists=True,
         )
-        if not self.study.trials:
+        if not self.done():
             self.study.enqueue_trial(
                 {name: knob.point(_setting(self.shipped, knob.setting)) for name, knob in self.knobs.items()}
             )
