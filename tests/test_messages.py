@@ -82,7 +82,7 @@ def test_three_agents_hear_each_other_in_their_order() -> None:
 
 
 def test_words_move_nothing() -> None:
-    talking, silent = made(messages=K), made()
+    talking, silent = made(knowledge="one", messages=K), made(knowledge="one")
     rng, paths = np.random.default_rng(0), []
     for env in (talking, silent):
         env.reset(seed=0)

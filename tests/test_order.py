@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from surgical_marl.engines.fused import engine, order
+from surgical_marl.engines.fused import engine, kernel, order
 from surgical_marl.engines.fused.preludes import BRANCHES
 from surgical_marl.envs.batch import BatchedEnv
 from tests.helpers.actions import random_actions
@@ -125,3 +125,9 @@ def test_environments_are_sorted_where_neighbours_wait_for_each_other(monkeypatc
     assert [every(none, "cuda", many), every(short, "cuda", few), every(short, "cuda", many)] == [0, 0, 16]
     assert [every(long, "cuda", few), every(long, "cuda", many), every(long, "cuda", 8)] == [4, 4, 0]
     assert [every(short, "cpu", many), every(long, "cpu", few), every(long, "cpu", 8)] == [0, 4, 0]
+
+
+def test_every_multiprocessor_has_a_block_of_long_code() -> None:
+    sizes = [kernel.block_of(count, 132) for count in (1, 4096, 8192, 16384, 32768, 2**22)]
+    assert sizes == [32, 32, 64, 128, 256, 256], "an H100, timed with 4,096 and 16,384 (docs/fused_engine.md)"
+    assert kernel.block_of(4096, 16) == 256

@@ -58,6 +58,7 @@ def test_a_struck_object_moves_and_so_does_what_lies_behind_it(blocks: Falling) 
     ways = np.ptp(path.position[..., 0], 1)  # [E, k]
     assert (ways[:, :2] > 1e-3).all() and (ways[-1] > 1e-3).all(), ways
     assert np.abs(path.position - moved.position).max() < 2e-4
+    assert (np.diff(ways.sum(1)) > 0).all(), "the faster the first one, the farther all slide: no impact is cut short"
 
 
 def test_what_turns_back_or_tips_over_is_not_at_rest(blocks: Falling) -> None:

@@ -23,8 +23,9 @@ from surgical_marl.physics.problem import SLIPS, Contact, Point, Pressed, Proble
 from surgical_marl.physics.rows import absent, add, put, room, row_of
 from surgical_marl.physics.search import search
 
-PASSES = 12
-"""Newton steps at most. A GPU waits for the last one of its environments (docs/physics.md)."""
+PASSES, ALONE = 12, 24
+"""Newton steps at most, with arms and of objects alone, whose steps are short. A GPU waits for the last one of its
+environments (docs/physics.md)."""
 LEAST = 1e-7
 """Fall of the cost in a Newton step, N m/s2, after which none follows: that of a needle of 0.03 g whose acceleration
 changes by 0.06 m/s2."""
@@ -75,6 +76,7 @@ class Newton:
 
     def __init__(self, dofs: np.ndarray, joints: int, objects: int) -> None:
         self._dofs, self._objects, self._arms = dofs, objects, Arms(dofs, joints)
+        self._passes = PASSES if len(dofs) else ALONE
 
     def twist(self, contact: Contact, arms: Array, objects: Array) -> Array:
         """Return the twist [6] of a contact by motions of arms (`by_arm`) and of objects (`by_object`)."""
@@ -110,7 +112,7 @@ class Newton:
 
         def going(state: Any) -> Array:
             settled, count = state[-2:]
-            return ~settled & (count < PASSES)
+            return ~settled & (count < self._passes)
 
         def iterate(state: Any) -> Any:
             here, pressed, _, count = state

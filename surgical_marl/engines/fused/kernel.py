@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import math
 import re
 import shutil
 from collections.abc import Iterator
@@ -27,10 +28,8 @@ from surgical_marl.runtime import cache_dir, prepare_warp
 
 wp = prepare_warp()
 
-BLOCK = 32
-"""Threads in a CUDA block: so few that few environments are spread over all multiprocessors."""
-WIDE, MANY = 256, 32768
-"""Threads in a block for so many environments, in long code: they find each other's instructions in the cache."""
+BLOCK, WIDE = 32, 256
+"""Fewest and most threads in a CUDA block."""
 
 _reals: Any = wp.array(dtype=wp.float32)
 _wholes: Any = wp.array(dtype=wp.int32)
@@ -49,7 +48,7 @@ def compile_kernels(
     Warp keeps compiled modules in its cache on disk. `stage` is told if there is none of these bodies.
     """
     cuda = device == "cuda"
-    block = WIDE if cuda and is_long(bodies.values()) and num_envs >= MANY else BLOCK if cuda else 1
+    block = (block_of(num_envs, multiprocessors()) if is_long(bodies.values()) else BLOCK) if cuda else 1
     prelude = CUDA if cuda else CPU
     sources = tuple((name, f"{prelude}\n{body}\n{UNDEFINE}\n") for name, body in bodies.items())
     digest = hashlib.sha256("\0".join(source for _, source in sources).encode()).hexdigest()[:16]
@@ -61,8 +60,16 @@ def compile_kernels(
     with locked(cache_dir() / "kernels" / module.name), _checked(module.name):
         if not _folders(module.name):
             stage("compiling the C code")
-        module.load(wp.get_device(device), block_dim=block)
+        module.load(wp.get_device(device), block_dim=WIDE if cuda else 1)
     return {name: Kernel(kernel, device, block) for name, kernel in made.items()}
+
+
+def block_of(num_envs: int, multiprocessors: int) -> int:
+    """Return how many threads of long code a CUDA block has: so many that each multiprocessor has one block.
+
+    Threads of a block find each other's instructions in the cache, and with fewer blocks multiprocessors would be idle.
+    """
+    return min(WIDE, max(BLOCK, 2 ** round(math.log2(max(num_envs / multiprocessors, 1)))))
 
 
 @lru_cache(MOST_KEPT)
@@ -144,16 +151,14 @@ class Kernel:
 
         On a GPU the work goes to torch's current stream, and can be captured in a CUDA graph.
         """
-        cuda = self._device == "cuda"
-        lanes = 1 if cuda else LANES
-        wp.launch(
-            self._kernel,
-            dim=-(-count // lanes),
-            inputs=[*arrays, stride, start, lanes],
-            device=self._device,
-            block_dim=self._block,
-            stream=torch_stream() if cuda else None,
-        )
+        inputs, cuda = [*arrays, stride, start], self._device == "cuda"
+        if not cuda:
+            wp.launch(self._kernel, -(-count // LANES), [*inputs, LANES], device=self._device, block_dim=1)
+            return
+        # compiled code is the same for blocks of all sizes, but Warp would compile it for each
+        command = wp.launch(self._kernel, count, [*inputs, 1], device="cuda", block_dim=WIDE, record_cmd=True)
+        command.block_dim = self._block
+        command.launch(torch_stream())
 
 
 def torch_stream() -> Any:
