@@ -151,8 +151,8 @@ class Kernel:
 
         On a GPU the work goes to torch's current stream, and can be captured in a CUDA graph.
         """
-        inputs, cuda = [*arrays, stride, start], self._device == "cuda"
-        if not cuda:
+        inputs = [*arrays, stride, start]
+        if self._device == "cpu":
             wp.launch(self._kernel, -(-count // LANES), [*inputs, LANES], device=self._device, block_dim=1)
             return
         # compiled code is the same for blocks of all sizes, but Warp would compile it for each
