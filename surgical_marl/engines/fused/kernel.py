@@ -48,7 +48,7 @@ def compile_kernels(
     Warp keeps compiled modules in its cache on disk. `stage` is told if there is none of these bodies.
     """
     cuda = device == "cuda"
-    block = (block_of(num_envs, multiprocessors()) if is_long(bodies.values()) else BLOCK) if cuda else 1
+    block = block_of(num_envs, multiprocessors()) if cuda and is_long(bodies.values()) else BLOCK
     prelude = CUDA if cuda else CPU
     sources = tuple((name, f"{prelude}\n{body}\n{UNDEFINE}\n") for name, body in bodies.items())
     digest = hashlib.sha256("\0".join(source for _, source in sources).encode()).hexdigest()[:16]
