@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
@@ -141,6 +142,17 @@ def test_a_film_shows_what_pictures_of_each_step_show(monkeypatch: pytest.Monkey
         observations = env.step(still(observations)).observations
     np.testing.assert_array_equal(film, one_by_one)
     assert all((first != second).any() for first, second in pairwise(film))  # the goal moves
+
+
+def test_threads_that_draw_parse_no_code(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Python 3.11 fails now and then when two threads parse code, and NumPy parses the text of a layout as code."""
+    env = BatchedEnv("track", "ecm", num_envs=1)
+    env.reset(0)
+    picture, parsed, parse = record.ScenePicture(env), [], ast.literal_eval
+    with monkeypatch.context() as patch:
+        patch.setattr(ast, "literal_eval", lambda text: parsed.append(text) or parse(text))
+        picture.draw()
+    assert not parsed
 
 
 @pytest.mark.parametrize("suffix", [".mp4", ".gif", ".webp"])

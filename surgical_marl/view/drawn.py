@@ -23,7 +23,9 @@ Array = NDArray[np.float64]
 # A ball that is drawn but is no part of the model: position, radius, rgba.
 Sphere = tuple[Sequence[float], float, Sequence[float]]
 
-_LAYOUT: Any = Shape.numpy_dtype()  # type: ignore[attr-defined]  # a struct of Warp
+# Made once, because NumPy parses its text as Python code each time, which two threads cannot do at the same time in
+# Python 3.11.
+_LAYOUT: Any = np.dtype(Shape.numpy_dtype())  # type: ignore[attr-defined]  # a struct of Warp
 _LINE = 0.6
 """Radius of a capsule in the picture at least, pixels."""
 _KINDS = {mujoco.mjtGeom.mjGEOM_PLANE: PLANE, **KINDS}
@@ -96,8 +98,10 @@ class Drawn:
         """How many shapes there are without balls."""
         return len(self._shapes)
 
-    def at(self, data: mujoco.MjData, eye: Array, pixel: float, spheres: Sequence[Sphere], through: float) -> Any:
-        """Return a `World` of a pose, without eyes.
+    def at(
+        self, data: mujoco.MjData, eye: Array, pixel: float, spheres: Sequence[Sphere], through: float
+    ) -> tuple[Any, NDArray[np.void]]:
+        """Return a `World` of a pose, without eyes, and its shapes, to be kept as long as the world is.
 
         Args:
             data: poses of the model's geoms.
@@ -126,10 +130,11 @@ class Drawn:
         away = np.linalg.norm(shapes["place"][thin] - eye, axis=1)
         shapes["size"][thin, 0] = np.maximum(shapes["size"][thin, 0], _LINE * pixel * away)
         world = World()
-        world.shapes = wp.array(shapes, dtype=Shape, device="cpu")
+        # By its address, because Warp would make the layout anew to compare it.
+        world.shapes = wp.array(ptr=shapes.ctypes.data, dtype=Shape, shape=shapes.shape, device="cpu")
         world.balls, world.through, world.fade = self.count, through, self._fade
         world.grain, world.face_normals = self._grain, self._face_normals
-        return world
+        return world, shapes
 
 
 def _size(model: mujoco.MjModel, geom: int) -> Array:

@@ -109,8 +109,8 @@ class Renderer:
         place, axes, fovy = self._camera(data, camera)
         wp, size = self._wp, (self.height, self.width)
         pixel = 2 * np.tan(np.deg2rad(fovy) / 2) / self.height
-        world = self._drawn.at(data, place, pixel, spheres, through)
-        self._list(world, [self._eye(place, axes, pixel, self.width, self.height), *self._lamps(axes)])
+        world, shapes = self._drawn.at(data, place, pixel, spheres, through)
+        self._list(world, shapes, [self._eye(place, axes, pixel, self.width, self.height), *self._lamps(axes)])
         coarse = tuple(-(-side // int(painter.COARSE)) for side in size)
         pixels = painter.Pixels()
         pixels.depths = wp.empty(size, dtype=float, device="cpu")
@@ -167,9 +167,9 @@ class Renderer:
         pixels = tiles * int(tracer.TILE)
         return self._eye(place, axes, 2 * _LIT * self.model.stat.extent / distance / pixels, pixels, pixels)
 
-    def _list(self, world: Any, eyes: list[Any]) -> None:
+    def _list(self, world: Any, drawn: NDArray[np.void], eyes: list[Any]) -> None:
         """Set the eyes of a picture, and which shapes each tile of theirs may show: of a camera, a lamp and the sky."""
-        wp, drawn = self._wp, world.shapes.numpy()
+        wp = self._wp
         for one, after in pairwise(eyes):
             after.first = one.first + one.columns * one.rows
         tiles = eyes[-1].first + eyes[-1].columns * eyes[-1].rows
