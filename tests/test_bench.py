@@ -20,13 +20,15 @@ from surgical_marl.bench.course import HOLD, LAPS, full_state, make_course
 from surgical_marl.bench.face import measure_face
 from surgical_marl.bench.grasping import grasps
 from surgical_marl.bench.physics import PhysicsAlone
+from surgical_marl.bench.playing import NOISE, played
 from surgical_marl.bench.render import measure_rendering
 from surgical_marl.bench.report import QUOTED, draw, ratios, sweep_table
 from surgical_marl.bench.rivals import Contender
 from surgical_marl.bench.sim import Point, Speed, measure, sweep
-from surgical_marl.bench.workload import DISTINCT, MOTIONS, Workload
+from surgical_marl.bench.workload import DISTINCT, Workload
 from surgical_marl.cli.main import main
 from surgical_marl.engines.choose import make_engine
+from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.envs.env import Env
 from surgical_marl.robots.rotation import matrix_of
 from surgical_marl.runtime import prepare_mjx, prepare_warp
@@ -241,7 +243,7 @@ def test_what_is_timed_is_what_c_mujoco_steps() -> None:
     assert np.abs(found[:, -1, 1 : 1 + scene.model.nq] - course.qpos[:rows]).max() > 1e-2, "nothing moved"
 
 
-@pytest.mark.parametrize("motion", [motion for motion in MOTIONS if motion != "grasp"])
+@pytest.mark.parametrize("motion", ["random", "rough"])
 def test_a_course_takes_back_what_it_did(motion: str) -> None:
     course = make_course(Workload(scene="ecm", motion=motion))
     total = sum(actions["ecm_0"] for actions in course.actions)
@@ -253,6 +255,27 @@ def test_as_many_environments_differ_as_are_asked_for() -> None:
     qpos = make_course(Workload(scene="ecm", num_envs=300, distinct=280)).qpos
     assert len(np.unique(qpos, axis=0)) == len(qpos) == 280
     assert len(make_course(Workload(scene="ecm", num_envs=8, distinct=10**6)).qpos) == DISTINCT
+
+
+def test_where_a_policy_plays_environments_are_anywhere_in_their_episodes() -> None:
+    """The later in its episode, the nearer is a tip to its goal; and the policy goes on from there."""
+    workload, count = Workload(scene="ecm", motion="policy", device="cpu"), 64
+    paths = [".steps", ".physics.qpos", ".goal.targets"]
+    (steps, qpos, goals), actions = played(workload, count, LAPS, paths, np.random.default_rng(0))
+    most = BatchedEnv("reach", "ecm", num_envs=1, device="cpu").max_steps
+    assert steps.min() < 0.1 * most and steps.max() > 0.8 * most and len(np.unique(steps)) > 20
+    scene = load_scene("ecm")
+    model, mount = scene.model, scene.mounts["ecm_0"]
+    data, tips = mujoco.MjData(model), []
+    for data.qpos[:] in qpos:
+        mujoco.mj_kinematics(model, data)
+        tips.append(data.site("ecm_0/tool_tip").xpos.copy())
+    far = np.linalg.norm((np.array(tips) - mount.position) @ mount.rotation - goals[:, 0], axis=1)
+    assert np.median(far[steps > most / 2]) < 0.005 < np.median(far[steps < 5])
+    assert len(actions) == LAPS and all(lap["ecm_0"].shape == (count, 4) for lap in actions)
+    assert np.std(actions[0]["ecm_0"][steps > most / 2] - actions[1]["ecm_0"][steps > most / 2]) > NOISE / 2
+    course = make_course(workload)
+    assert course.qpos.shape == (DISTINCT, 4) and course.commands.shape[:2] == (LAPS, DISTINCT)
 
 
 @pytest.mark.slow
@@ -350,7 +373,9 @@ def test_what_the_face_adds_as_json_and_as_a_sentence(
         (["sim", "--scene", "psmm"], ["'psmm'", "did you mean 'psm'", "bimanual_psm"]),
         (["sim", "--task", "reech"], ["'reech'", "did you mean 'reach'"]),
         (["sim", "--num-envs", "0"], ["--num-envs", "'0'"]),
-        (["sim", "--motion", "wild"], ["'wild'", "random, rough, grasp"]),
+        (["sim", "--motion", "wild"], ["'wild'", "random, rough, grasp, policy"]),
+        (["sim", "--scene", "psm_needle", "--motion", "policy"], ["'reach-psm_needle'", "reach-psm"]),
+        (["sim", "--scene", "psm", "--control", "velocity", "--motion", "policy"], ["reach-psm", "'velocity'"]),
         (["sim", "--decimation", "0"], ["--decimation", "'0'"]),
         (["sim", "--device", "gpu"], ["'gpu'", "auto, cpu, cuda"]),
         (["sim", "--engine", "mujoco", "--device", "cuda"], ["'mujoco'", "'cuda'", "CPU"]),

@@ -109,7 +109,7 @@ def test_what_is_refused(runs: list[str], capsys: pytest.CaptureFixture[str]) ->
         ([*eval_with, "psm_1"], "--partner must be ROLE=POLICY such as psm_0=frozen, not 'psm_1'"),
         ([*eval_with, "psm_1=frozen", "--partner", "psm_1=random"], "--partner names 'psm_1' twice"),
         ([*eval_with, "psm_1=nobody"], "unknown partner 'nobody'"),
-        ([*eval_with, "psm_1=other"], "other is of task 'track', not 'reach': a partner must be of the same"),
+        ([*eval_with, "psm_1=other"], "other is of task 'track', not 'reach': a policy acts where it was trained"),
         ([*eval_with, "psm_1=place"], "place is of scene 'bimanual_star', not 'bimanual_psm'"),
         (["crossplay", runs[0], "other"], "other has task 'track' and seed0 has 'reach'"),
         (["crossplay", "reach-psm"], "needs a scene with several agents, and 'psm' has one"),

@@ -21,6 +21,7 @@ from surgical_marl.tasks.base.options import Options, choices
 from surgical_marl.tasks.base.task import TipTask
 from surgical_marl.tasks.base.terms import Term
 from surgical_marl.tasks.base.world import World
+from tests.helpers.scenes import PAIR
 
 PAGE = Path(__file__).parents[1] / "docs" / "tasks.md"
 ABOUT = {"arm": "the arm itself", "others": "other arms", "object": "objects and pictures", "goal": "its own goal",
@@ -107,21 +108,21 @@ def test_at_own_nothing_depends_on_other_arms(task: str, scene: str) -> None:
 
 def test_two_goals_look_alike_to_an_arm_that_knows_neither() -> None:
     """A whole episode, in which the arms do the same in both environments, bit for bit."""
-    env = BatchedEnv("reach", "bimanual_psm", num_envs=2, knowledge="one", engine="fused", device="cpu", max_steps=40)
+    env = BatchedEnv("reach", PAIR, num_envs=2, knowledge="one", engine="fused", device="cpu", max_steps=40)
     env.reset(seed=0)
     carry = env.carry()
     env.set_carry({name: values if name == ".goal.targets" else values[[0, 0]] for name, values in carry.items()})
     assert not np.array_equal(*env.goal.targets)
     rng = np.random.default_rng(0)
     for number in range(40):
-        step = env.step({a: np.repeat(rng.uniform(-1, 1, (1, 7)), 2, 0).astype(np.float32) for a in env.agents})
-        np.testing.assert_array_equal(*step.final_observations["psm_1"])
-        assert not np.array_equal(*step.final_observations["psm_0"])
+        step = env.step({a: np.repeat(rng.uniform(-1, 1, (1, 4)), 2, 0).astype(np.float32) for a in env.agents})
+        np.testing.assert_array_equal(*step.final_observations["ecm_1"])
+        assert not np.array_equal(*step.final_observations["ecm_0"])
         assert step.truncated.all() == (number == 39)
-    knows = env.observation_terms("psm_0")
+    knows = env.observation_terms("ecm_0")
     carry = env.carry()[".goal.targets"]
-    for agent, name in (("psm_0", "target"), ("psm_1", "psm_1/target")):
-        np.testing.assert_allclose(step.observations["psm_0"][:, knows[name]], carry[:, env.agents.index(agent)])
+    for agent, name in (("ecm_0", "target"), ("ecm_1", "ecm_1/target")):
+        np.testing.assert_allclose(step.observations["ecm_0"][:, knows[name]], carry[:, env.agents.index(agent)])
 
 
 def test_what_arms_know_of_each_other_is_what_each_measures() -> None:
@@ -216,5 +217,5 @@ def test_shipped_policies_play_what_the_task_shows() -> None:
     with pytest.raises(ValueError, match="whose agents"):
         load_policy("reach-bimanual_psm", other)
     check_fits("reach-bimanual_psm", usual)
-    with pytest.raises(ValueError, match="is of knowledge 'task', not 'own': a partner must be of the same"):
+    with pytest.raises(ValueError, match="is of knowledge 'task', not 'own': a policy acts where it was trained"):
         check_fits("reach-bimanual_psm", other)

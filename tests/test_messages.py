@@ -28,8 +28,9 @@ from surgical_marl.policies.team import check_fits
 from surgical_marl.policies.weights import write_weights
 from surgical_marl.runs.folder import read_settings
 from surgical_marl.runs.settings import ImitationSettings, NetworkSettings, PPOSettings, Settings
+from tests.helpers.scenes import PAIR
 
-SCENE, K, JOINTS = "bimanual_psm", 2, 7
+SCENE, K, JOINTS = PAIR, 2, 4
 SMALL = Settings(
     scene=SCENE, knowledge="one", messages=K, num_envs=8, iterations=1, steps_per_iteration=4, device="cpu",
     engine="fused", network=NetworkSettings(hidden=(16,)), ppo=PPOSettings(epochs=1, mini_batches=1),
@@ -61,7 +62,7 @@ def test_teammates_hear_after_the_step_what_an_agent_said_in_it() -> None:
         actions = drawn(env, rng, share=1.5)  # more than 1 is cut off
         step = env.step(actions)
         said = {agent: np.clip(action[:, JOINTS:], -1, 1) for agent, action in actions.items()}
-        for agent, mate in (("psm_0", "psm_1"), ("psm_1", "psm_0")):
+        for agent, mate in (("ecm_0", "ecm_1"), ("ecm_1", "ecm_0")):
             np.testing.assert_array_equal(heard(env, step.final_observations, agent), said[mate])
             ended = number % 4 == 0
             np.testing.assert_array_equal(heard(env, step.observations, agent), 0 if ended else said[mate])
@@ -101,17 +102,18 @@ def test_words_move_nothing() -> None:
 def test_every_face_has_them() -> None:
     options = {"scene": SCENE, "messages": K, "engine": "fused", "device": "cpu", "max_steps": 4}
     env = sm.parallel_env("reach", **options)
-    assert env.action_space("psm_0") == gymnasium.spaces.Box(-1, 1, (JOINTS + K,))
-    assert env.observation_space("psm_0").shape == (34 + K,)
+    assert env.action_space("ecm_0") == gymnasium.spaces.Box(-1, 1, (JOINTS + K,))
+    seen = sm.parallel_env("reach", **{**options, "messages": 0}).observation_space("ecm_0").shape[0]
+    assert env.observation_space("ecm_0").shape == (seen + K,)
     parallel_api_test(env, num_cycles=10)
     single, vector = (make("surgical_marl/Reach-v0", **options) for make in (gymnasium.make, make_vec))
     assert single.action_space.shape == (2 * (JOINTS + K),) and vector.action_space.shape == (2, 2 * (JOINTS + K))
     said = np.arange(1, 2 * (JOINTS + K) + 1, dtype=np.float32) / 100
-    alone = gymnasium.make("surgical_marl/Reach-v0", agent="psm_1", teammates={"psm_0": mute}, **options)
+    alone = gymnasium.make("surgical_marl/Reach-v0", agent="ecm_1", teammates={"ecm_0": mute}, **options)
     for face in (single, vector, alone):
         face.reset(seed=0)
     found, many = single.step(said)[0], vector.step(np.stack([said, said]))[0][0]
-    np.testing.assert_array_equal(found[34 : 34 + K], said[-K:])  # psm_0 hears psm_1
+    np.testing.assert_array_equal(found[seen : seen + K], said[-K:])  # ecm_0 hears ecm_1
     np.testing.assert_array_equal(many[-K:], said[JOINTS : JOINTS + K])
     np.testing.assert_allclose(alone.step(said[: JOINTS + K])[0][-K:], MUTE)
 
@@ -133,7 +135,7 @@ def test_pure_functions_have_them() -> None:
     _, state = env.reset(jax.random.key(0))
     actions = {agent: env.action_space(agent).sample(jax.random.key(1)) for agent in env.agents}
     observations, *_ = env.step(None, state, actions)
-    np.testing.assert_array_equal(observations["psm_0"][-K:], actions["psm_1"][-K:])
+    np.testing.assert_array_equal(observations["ecm_0"][-K:], actions["ecm_1"][-K:])
 
 
 def test_torchrl_has_them() -> None:
@@ -141,17 +143,17 @@ def test_torchrl_has_them() -> None:
     from surgical_marl.interfaces.torchrl import TorchRLEnv
 
     env = TorchRLEnv(BatchedEnv("reach", SCENE, num_envs=2, messages=K, engine="fused", device="cpu", arrays="torch"))
-    found = env.rollout(2)["psm"]
+    found = env.rollout(2)["ecm"]
     heard = found["observation"][:, 1, :, -K:]
     torch.testing.assert_close(heard, found["action"][:, 0, :, JOINTS:].flip(-2).clamp(-1, 1))
 
 
 def test_the_oracle_says_nothing_and_needs_no_words() -> None:
-    for scene, task in ((SCENE, "reach"), ("bimanual_psm_needle", "needle_handover")):
+    for scene, task, joints in ((SCENE, "reach", JOINTS), ("bimanual_psm_needle", "needle_handover", 7)):
         env = BatchedEnv(task, scene, num_envs=2, messages=K, engine="mjx", device="cpu")
         actions = oracle(env)(env.reset(seed=0)[0])
         for action in actions.values():
-            assert action.shape == (2, JOINTS + K) and action[:, :JOINTS].any() and not action[:, JOINTS:].any()
+            assert action.shape == (2, joints + K) and action[:, :joints].any() and not action[:, joints:].any()
 
 
 @pytest.fixture(scope="module")
@@ -169,7 +171,7 @@ def test_a_run_remembers_them_and_its_policy_speaks(run: Path) -> None:
     for other, message in (({"knowledge": "one"}, "of messages 2, not 0"), ({"messages": K}, "of knowledge 'one'")):
         with pytest.raises(ValueError, match=message):
             check_fits(str(run), made(**other))
-    with pytest.raises(ValueError, match="of 42 observations and 9 actions"):
+    with pytest.raises(ValueError, match="of 33 observations and 6 actions"):
         load_policy(run, made(knowledge="one"))
 
 
@@ -179,7 +181,7 @@ def test_words_mean_something_before_anything_is_learned() -> None:
     actions = untrained_policy(env, SMALL)(env.reset(seed=0)[0])
     for action in actions.values():
         assert np.abs(action[:, :JOINTS]).max() < 0.1 * np.abs(action[:, JOINTS:]).max()
-    assert not np.isclose(actions["psm_0"][0, JOINTS:], actions["psm_0"][1, JOINTS:]).any()
+    assert not np.isclose(actions["ecm_0"][0, JOINTS:], actions["ecm_0"][1, JOINTS:]).any()
 
 
 @pytest.mark.slow
@@ -213,7 +215,7 @@ def test_imitation_learns_silence() -> None:
         ({"messages": -1}, "messages must be a whole number from 0 to 64, not -1"),
         ({"messages": 1.5}, "messages must be a whole number"),
         ({"messages": 2, "scene": "psm"}, "messages must be 0 in a scene of one arm such as 'psm', not 2"),
-        ({"observe": {"psm_0": ["qpos", "messages"]}}, "unknown observation term of 'psm_0' 'messages'"),
+        ({"observe": {"ecm_0": ["qpos", "messages"]}}, "unknown observation term of 'ecm_0' 'messages'"),
     ],
 )
 def test_bad_messages_are_one_sentence(options: dict[str, Any], message: str) -> None:
@@ -223,5 +225,5 @@ def test_bad_messages_are_one_sentence(options: dict[str, Any], message: str) ->
 
 
 def test_an_agent_can_be_deaf() -> None:
-    env = BatchedEnv("reach", SCENE, num_envs=1, messages=K, observe={"psm_0": ["qpos"]}, engine="mjx", device="cpu")
-    assert "messages" not in env.observation_terms("psm_0") and "messages" in env.observation_terms("psm_1")
+    env = BatchedEnv("reach", SCENE, num_envs=1, messages=K, observe={"ecm_0": ["qpos"]}, engine="mjx", device="cpu")
+    assert "messages" not in env.observation_terms("ecm_0") and "messages" in env.observation_terms("ecm_1")

@@ -204,7 +204,8 @@ def check_surgical_marl(argv: list[str]) -> None:
     with pytest.MonkeyPatch.context() as patch, suppress(Ready):
         for work in WORK:
             patch.setattr(f"surgical_marl.{work}", no_work)
-        patch.setattr("surgical_marl.envs.batch.Env", no_env)
+        for module in ("envs.batch", "learning.demonstrations"):
+            patch.setattr(f"surgical_marl.{module}.Env", no_env)
         patch.setattr("surgical_marl.view.browser.gate._bind", lambda _: BIND(0))  # another test may serve on it now
         patch.setattr("surgical_marl.bench.command._no_caches", nullcontext)  # it would outlast the command
         assert cli.main(argv) == 0, argv

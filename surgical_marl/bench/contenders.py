@@ -67,26 +67,34 @@ def _batched(name: str, workload: Workload, course: Course) -> Contender:
     physics = make_engine(PhysicsAlone(batch.env), count, name, workload.where)
     physics.reset(0)
     begin(physics)
-    step_physics = _along(physics, [give(tile(rows, count)) for rows in course.commands])
+    played = begin if workload.motion == "policy" else None  # what a policy does is not to and fro
+    step_physics = _along(physics, [give(tile(rows, count)) for rows in course.commands], played)
     step_physics()  # compiles
     _wait(physics)
-    again = begin if workload.motion == "grasp" else None  # new episodes have nothing in their jaws
-    clocks = _clock(step_physics, physics, _cycle(HOLD * LAPS, 1)), clock_of(batch, actions, hold, again)
+    again = begin if workload.motion == "grasp" else played  # new episodes have nothing in their jaws
+    lap = hold * LAPS if played else None
+    clocks = _clock(step_physics, physics, _cycle(HOLD * LAPS, 1)), clock_of(batch, actions, hold, again, lap)
     return Contender(count, workload.where, compile_s, *clocks, bytes_per_env=_bytes_per_env(batch.engine))
 
 
 def clock_of(
-    batch: BatchedEnv, actions: list[Any], hold: int = 1, begin: Callable[[Engine], None] | None = None
+    batch: BatchedEnv,
+    actions: list[Any],
+    hold: int = 1,
+    begin: Callable[[Engine], None] | None = None,
+    every: int | None = None,
 ) -> Clock:
     """Return the clock of a batch that is stepped by some actions in turn, each for `hold` steps.
 
-    If there is a `begin`, it puts the environments where they started, whenever as much was done as a clock repeats.
+    If there is a `begin`, it puts the environments where they started: `every` so many steps, or whenever as much was
+    done as a clock repeats.
     """
     turn, cycle = itertools.count(), _cycle(hold * len(actions), batch.env.decimation)
+    every = every or cycle
 
     def step() -> None:
         now = next(turn)
-        if begin and now % cycle == 0:
+        if begin and now % every == 0:
             begin(batch.engine)
         batch.step(actions[now // hold % len(actions)])
 
@@ -105,12 +113,17 @@ def _cycle(lap: int, decimation: int) -> int:
     return math.lcm(lap, control_steps(decimation))
 
 
-def _along(physics: Engine, commands: list[Any]) -> Callable[[], None]:
-    """Return a function that makes a physics step under the commands of a course, one step further at each call."""
+def _along(physics: Engine, commands: list[Any], begin: Callable[[Engine], None] | None = None) -> Callable[[], None]:
+    """Return a function that makes a physics step under the commands of a course, one step further at each call.
+
+    If there is a `begin`, it puts the environments where they started, whenever the course begins again.
+    """
     turn = itertools.count()
 
     def step() -> None:
         now = next(turn)
+        if begin and now % (HOLD * LAPS) == 0:
+            begin(physics)
         if now % HOLD == 0:
             physics.write(".physics.ctrl", commands[now // HOLD % LAPS])
         physics.step({})

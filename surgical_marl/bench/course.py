@@ -13,6 +13,7 @@ from mujoco import rollout
 
 from surgical_marl.bench.grasping import Starts, grasps
 from surgical_marl.bench.physics import PhysicsAlone
+from surgical_marl.bench.playing import played, policy_of
 from surgical_marl.bench.workload import DISTINCT, Workload
 from surgical_marl.engines.choose import make_engine
 from surgical_marl.envs.env import Env
@@ -30,7 +31,7 @@ LAPS = 4
 _AWAY = {"random": 50, "rough": 25, "grasp": 25}
 """Control steps before the start, 1 and 0.5 s. random: a new action every control step, as when training begins. rough:
 one action all the time, so that arms cross their ranges, and each other's way. grasp: jaws close on objects and carry
-them."""
+them. Where a policy plays, `bench/playing.py` says when it stops."""
 GENTLE = 0.05
 """Share of their speed at which two arms move that hold one object: faster, one would tear it from the other."""
 
@@ -62,26 +63,54 @@ def make_course(workload: Workload, seed: int = 0) -> Course:
     """Draw a course: every environment moves from home by random actions of its own, then to and fro.
 
     C MuJoCo moves the arms. The states therefore come from none of this package's own engines. Only where there are
-    objects an engine moves all.
+    objects an engine moves all. With motion `policy` environments are where the policy that ships has come to, and go
+    on as it does.
 
     Raises:
-        ValueError: motion `grasp` in a scene without anything to grasp.
+        ValueError: motion `grasp` in a scene without anything to grasp, or motion `policy` where no policy ships.
     """
     # otherwise JAX would reserve most of a GPU's memory, and leave too little for the fused engine
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     import jax
 
-    scene, motion = load_scene(workload.scene, workload.control), workload.motion
+    if workload.motion == "policy":
+        policy_of(workload)  # before anything is compiled
+    scene = load_scene(workload.scene, workload.control)
     rng, n = np.random.default_rng(seed), min(workload.distinct, max(workload.count, DISTINCT))
     simulator = Simulator(scene, HOLD)
     command = jax.jit(jax.vmap(simulator.command))
     roll = _by_engine(workload, n) if scene.objects else partial(_by_mujoco, scene.model)
     now = jax.tree.map(lambda x: np.repeat(np.asarray(x)[None], n, 0), simulator.home)
+    if workload.motion == "policy":
+        paths = [f".physics{path}" for path in _leaves(now)]
+        parts, actions = played(workload, n, LAPS, paths, rng)
+        now = jax.tree.unflatten(jax.tree.structure(now), parts)
+    else:
+        move = lambda now, action: roll(command(now, action))  # noqa: E731
+        now, actions = _drawn(scene, workload.motion, now, rng, jax.vmap(simulator.at), move)
+    start, commands = jax.tree.map(np.asarray, now), []
+    for action in actions:
+        now = command(now, action)
+        commands.append(np.asarray(now.ctrl))
+        now = roll(now)
+    held = start.objects.grips.force > 0 if scene.objects else None
+    touching = float(held.any((1, 2)).mean()) if held is not None else _touching(scene.model, start.qpos)
+    return Course(start.qpos, start.qvel, start.ctrl, np.array(commands), actions, touching, start.objects)
+
+
+def _drawn(
+    scene: Scene, motion: str, now: Any, rng: np.random.Generator, at: Any, move: Callable[[Any, Any], Any]
+) -> tuple[Any, list[dict[str, np.ndarray]]]:
+    """Return the states [n, ...] to which random actions lead from `now`, and the actions of a course from there.
+
+    `at` returns the states of arms at rest at some qpos; `move` makes a control step.
+    """
+    n = len(now.qpos)
     closed, share = [], np.ones((n, 1), np.float32)
     if motion == "grasp":
         closed, starts = graspers(scene), grasps(scene, min(n, DISTINCT), rng)
         starts = Starts(*(tile(values, n) for values in starts))
-        now = _grasping(now, starts, jax.vmap(simulator.at))
+        now = _grasping(now, starts, at)
         share = np.where(starts.arms[:, None] > 1, GENTLE, share)
 
     def draw() -> dict[str, np.ndarray]:
@@ -94,16 +123,9 @@ def make_course(workload: Workload, seed: int = 0) -> Course:
     actions = [*half, *(_back(drawn, closed) for drawn in half[::-1])]
     away = draw()
     for _ in range(_AWAY[motion]):
-        now = roll(command(now, away))
+        now = move(now, away)
         away = draw() if motion != "rough" else away
-    start, commands = jax.tree.map(np.asarray, now), []
-    for action in actions:
-        now = command(now, action)
-        commands.append(np.asarray(now.ctrl))
-        now = roll(now)
-    held = start.objects.grips.force > 0 if scene.objects else None
-    touching = float(held.any((1, 2)).mean()) if held is not None else _touching(scene.model, start.qpos)
-    return Course(start.qpos, start.qvel, start.ctrl, np.array(commands), actions, touching, start.objects)
+    return now, actions
 
 
 def _back(drawn: dict[str, np.ndarray], closed: list[str]) -> dict[str, np.ndarray]:

@@ -9,7 +9,7 @@ from surgical_marl.content import find
 from surgical_marl.engines.choose import DeviceName
 from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.runtime import has_cuda
-from surgical_marl.tasks.base.options import Options, choice, choices, number
+from surgical_marl.tasks.base.options import Options, choice, number
 
 NUM_ENVS = {"cpu": 4096, "cuda": 131072}
 """Default number of environments on each device."""
@@ -31,9 +31,10 @@ class Workload(Options):
     decimation: int = number(1, 1, 1_000_000, "physics steps an environment step")
     num_envs: int | None = number(None, 1, 2**24, "environments that run side by side (default: by the device)")
     device: DeviceName = choice("auto", "where it runs")
-    motion: Literal["random", "rough", "grasp"] = choice(
+    motion: Literal["random", "rough", "grasp", "policy"] = choice(
         "random",
-        "random: a new action every control step; rough: arms cross each other's way; grasp: jaws hold objects",
+        "random: a new action every control step; rough: arms cross each other's way; grasp: jaws hold objects; "
+        "policy: arms do what the policy that ships does",
     )
 
     distinct: int = number(DISTINCT, 1, 2**24, "environments that differ; a larger batch repeats them")
@@ -54,7 +55,3 @@ class Workload(Options):
     def count(self) -> int:
         """Environments."""
         return self.num_envs or NUM_ENVS[self.where]
-
-
-MOTIONS = choices("motion", Workload)
-"""What came before the start of a course (`surgical_marl/bench/course.py`)."""

@@ -71,7 +71,7 @@ def check_partners(partners: Mapping[str, str], settings: Settings) -> None:
     """Raise ValueError as `Team` does, before an environment of these settings is made, which takes minutes."""
     _check_roles(partners, load_scene(settings.scene).agents)
     for who in partners.values():
-        _check_same(who, {key: getattr(settings, key) for key in SAME})
+        check_same(who, {key: getattr(settings, key) for key in SAME})
 
 
 def check_fits(who: str, env: BatchedEnv) -> None:
@@ -81,7 +81,7 @@ def check_fits(who: str, env: BatchedEnv) -> None:
     """
     asked = env.env.options
     own = env.task_name, env.scene.name, env.control, asked.knowledge, asked.messages
-    _check_same(who, dict(zip(SAME, own, strict=True)))
+    check_same(who, dict(zip(SAME, own, strict=True)))
 
 
 def _check_roles(partners: Mapping[str, str], agents: Sequence[str]) -> None:
@@ -90,7 +90,8 @@ def _check_roles(partners: Mapping[str, str], agents: Sequence[str]) -> None:
             raise unknown("role", agent, agents)
 
 
-def _check_same(who: str, own: Mapping[str, Any]) -> None:
+def check_same(who: str, own: Mapping[str, Any]) -> None:
+    """Raise ValueError if a policy was trained with other settings than these, of `SAME`."""
     if who in (*PARTNERS, *BASELINES):
         return
     settings = read_settings(find_run(who))
@@ -99,4 +100,4 @@ def _check_same(who: str, own: Mapping[str, Any]) -> None:
         if key == "scene":  # one by its file is known by its name
             theirs, value = Path(theirs).stem, Path(value).stem
         if theirs != value:
-            raise ValueError(f"{who} is of {key} {theirs!r}, not {value!r}: a partner must be of the same")
+            raise ValueError(f"{who} is of {key} {theirs!r}, not {value!r}: a policy acts where it was trained")
