@@ -157,21 +157,21 @@ def test_imitation_fits_the_actions_and_leaves_the_deviation(trainer: Trainer) -
 
 
 def test_the_oracle_is_asked_where_the_actor_came(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = replace(SETTINGS, task="track", start="random", oracle_episodes=4)
+    asked = replace(SETTINGS, task="track", scene="ecm", start="random", oracle_episodes=4)
     trainer = Trainer(asked, make_env(asked))
     actor, found = trainer.algorithm.actor, Demonstrations(asked, trainer.env.layout, "cpu")
-    before, terms = len(found.actions), trainer.env.env.observation_terms("psm_0")
+    before, terms = len(found.actions), trainer.env.env.observation_terms("ecm_0")
     Imitation(actor, found, steps=4, batch_size=8, rounds=2).run()
-    assert found.actions.shape == (before + 2 * 4 * 250, 7)
+    assert found.actions.shape == (before + 2 * 4 * 250, 4)
     assert len(found.shown) == len(found.actions)
-    seen, done = found.shown["psm"][before:, 0].numpy().astype(float), found.actions[before:].numpy()
+    seen, done = found.shown["ecm"][before:, 0].numpy().astype(float), found.actions[before:].numpy()
     off = np.linalg.norm(seen[:, terms["to_target"]], axis=-1)
     assert (off > 0.005).mean() > 0.5  # an actor that has learned nothing falls behind, and the oracle does not
-    arm, q = trainer.env.env.scene.mounts["psm_0"].arm, seen[:, terms["qpos"]]
+    arm, q = trainer.env.env.scene.mounts["ecm_0"].arm, seen[:, terms["qpos"]]
     ends = seen[:, terms["command"]] + 0.02 * done * arm.speed
     moved = (arm.forward_kinematics(np.clip(ends, arm.lower, arm.upper)) - arm.forward_kinematics(q))[:, :3, 3]
     assert ((moved * seen[:, terms["to_target"]]).sum(-1) > 0)[off > 0.005].mean() > 0.95  # towards the target
-    starts = found.shown["psm"][before :: 4 * 250, 0, terms["qpos"]]
+    starts = found.shown["ecm"][before :: 4 * 250, 0, terms["qpos"]]
     assert not torch.equal(starts[0], starts[1])  # other episodes in each round
 
 
@@ -289,7 +289,7 @@ def test_imitation_goes_on_beside_learning(trainer: Trainer, algo: str) -> None:
 
 
 def test_of_moving_targets_the_whole_way_is_shown() -> None:
-    settings = replace(SETTINGS, task="track", oracle_episodes=8)
+    settings = replace(SETTINGS, task="track", scene="ecm", start="random", oracle_episodes=8)
     env = make_env(settings, 8, "numpy")
     rows = _record(env)
     assert len(rows["pairs"]) == 8 * env.max_steps

@@ -13,14 +13,14 @@ from surgical_marl.studies.failures import Found, _places, look, main, table
 
 
 def test_a_policy_that_never_moves_fails_and_the_oracle_does_not() -> None:
-    env = BatchedEnv("track", "psm", num_envs=16, start="random", goals="held_out")
+    env = BatchedEnv("track", "ecm", num_envs=16, start="random", goals="held_out")
     still, followed = (look(env, load_policy(name, env), 32) for name in ("zero", "oracle"))
     assert still.off.shape == followed.off.shape and 17 <= len(still.off) <= 32  # drawn from 1,024 rows
     assert (still.off > 0.005).all() and (followed.off < 0.002).all()
 
 
 def test_postures_are_told_apart() -> None:
-    env, arm = BatchedEnv("track", "star", num_envs=1), sm.load_arm("star")
+    env, arm = BatchedEnv("track", "star", num_envs=1, engine="mjx", device="cpu"), sm.load_arm("star")
     at_limit, straight = arm.home.copy(), arm.home.copy()
     at_limit[5] = arm.lower[5]
     straight[3] = 0.02  # an elbow nearly straight, with the wrist bent back onto the axis of the shoulder
