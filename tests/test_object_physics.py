@@ -9,47 +9,74 @@ import numpy as np
 import pytest
 import yaml
 
+from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.physics.handling import FASTEST
 from surgical_marl.physics.together import Objects
+from surgical_marl.policies.oracle import oracle
 from surgical_marl.robots.rotation import quaternion, turned
 from surgical_marl.studies.grasping import Held, judge
 from surgical_marl.studies.shaking import CHUNK, OBJECTS, Grasps
 from tests.helpers.falling import Falling, Trace, random_turns, thrown, wide_pad
 
+INSERTION = 2
+"""Number of that joint of a PSM."""
+
 # -- what a jaw holds
 
 
-@pytest.fixture(scope="module", params=[["needle_sh"], pytest.param(list(OBJECTS), marks=pytest.mark.slow)], ids=len)
-def names(request: pytest.FixtureRequest) -> list[str]:
-    found: list[str] = request.param
-    return found
+def test_a_needle_that_was_picked_stays_in_the_jaw_until_that_opens() -> None:
+    """Through 1.2 s of motion at full speed, up from where the oracle has carried it and back."""
+    env, rng = (
+        BatchedEnv("needle_pick", "psm_needle", num_envs=32, engine="fused", device="cpu"),
+        np.random.default_rng(0),
+    )
+    observations, *_ = env.reset(seed=0)
+    act = oracle(env)
+    for _ in range(150):
+        step = env.step(act(observations))
+        observations = step.observations
+    for number in range(60):
+        if number % 20 == 0:
+            up = rng.uniform(-1, 1, (32, 7)).astype(np.float32)
+            up[:, INSERTION] = -np.abs(up[:, INSERTION])
+        action = up if number % 20 < 10 else -up
+        action[:, -1] = -1  # closed
+        step = env.step({"psm_0": action})
+        found = step.infos["psm_0"]
+        assert found["needle_holding"].all() and found["needle_slip"].max() < 2e-4 and found["needle_force"].min() > 10
+    held = env.object_poses.origin[:, 0, 2].copy()
+    for _ in range(12):
+        step = env.step({"psm_0": np.eye(7, dtype=np.float32)[[-1] * 32]})  # opens
+    found = step.infos["psm_0"]
+    assert not found["needle_holding"].any() and not found["needle_force"].any()
+    assert (held - env.object_poses.origin[:, 0, 2] > 0.005).all()
 
 
 @pytest.fixture(scope="module")
-def grasps(names: list[str]) -> Grasps:
+def grasps() -> Grasps:
     """One scene with all objects: most of the time goes into tracing and compiling its step."""
-    return Grasps(names)
+    return Grasps(list(OBJECTS))
 
 
-@pytest.fixture(scope="module")
-def each(names: list[str]) -> np.ndarray:
-    """Four grasps of each object."""
-    return np.repeat(np.arange(len(names)), 4)
+EACH = np.repeat(np.arange(len(OBJECTS)), 4)
+"""Four grasps of each object."""
 
 
-def test_a_jaw_holds_objects_through_motion_at_full_speed(grasps: Grasps, each: np.ndarray) -> None:
-    held: Held = judge(grasps.shake(each, 1.0, seed=0))
+@pytest.mark.slow
+def test_a_jaw_holds_objects_through_motion_at_full_speed(grasps: Grasps) -> None:
+    held: Held = judge(grasps.shake(EACH, 1.0, seed=0))
     assert not held.dropped.any()
     assert held.slip.max() < 2e-4 and np.degrees(held.turn.max()) < 1
     assert held.overlap.max() < 1.5e-4
 
 
-def test_an_object_is_held_from_when_the_jaw_has_closed_until_it_opens(grasps: Grasps, each: np.ndarray) -> None:
-    physics, found = grasps.begin(each, seed=5), []
+@pytest.mark.slow
+def test_an_object_is_held_from_when_the_jaw_has_closed_until_it_opens(grasps: Grasps) -> None:
+    physics, found = grasps.begin(EACH, seed=5), []
     for jaw in (-1, 1):
-        actions = np.zeros((len(each), CHUNK, 1, 7), np.float32)
+        actions = np.zeros((len(EACH), CHUNK, 1, 7), np.float32)
         actions[..., -1] = jaw
-        physics, seen = grasps.play(physics, actions, each)
+        physics, seen = grasps.play(physics, actions, EACH)
         found.append(seen)
     closed, opened = found
     assert not closed.holding[:, 0].any() and closed.holding[:, -1].all() and (closed.force[:, -1] > 10).all()
