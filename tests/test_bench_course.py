@@ -35,7 +35,6 @@ def test_what_is_timed_is_what_c_mujoco_steps() -> None:
         step()
     control = course.commands[:, :rows].astype(float).repeat(HOLD, 0).swapaxes(0, 1)[:, :steps]
     state = full_state(course.qpos[:rows], course.qvel[:rows])
-
     found, _ = rollout.rollout(scene.model, mujoco.MjData(scene.model), state, control)
     np.testing.assert_allclose(engine.read(".physics.qpos", "numpy"), found[:, -1, 1 : 1 + scene.model.nq], atol=1e-5)
     assert np.abs(found[:, -1, 1 : 1 + scene.model.nq] - course.qpos[:rows]).max() > 1e-2, "nothing moved"
@@ -59,7 +58,7 @@ def test_where_a_policy_plays_environments_are_anywhere_in_their_episodes() -> N
     """The later in its episode, the nearer is a tip to its goal; and the policy goes on from there."""
     workload, count = Workload(scene="ecm", motion="policy", device="cpu"), 64
     paths = [".steps", ".physics.qpos", ".goal.targets"]
-    (steps, qpos, goals), actions = played(workload, count, LAPS, paths, np.random.default_rng(0))
+    (steps, qpos, goals), actions = played("reach-ecm", workload, count, LAPS, paths, np.random.default_rng(0))
     most = BatchedEnv("reach", "ecm", num_envs=1, device="cpu").max_steps
     assert steps.min() < 0.1 * most and steps.max() > 0.8 * most and len(np.unique(steps)) > 20
     scene = load_scene("ecm")

@@ -26,12 +26,9 @@ INSERTION = 2
 
 def test_a_needle_that_was_picked_stays_in_the_jaw_until_that_opens() -> None:
     """Through 1.2 s of motion at full speed, up from where the oracle has carried it and back."""
-    env, rng = (
-        BatchedEnv("needle_pick", "psm_needle", num_envs=32, engine="fused", device="cpu"),
-        np.random.default_rng(0),
-    )
+    env = BatchedEnv("needle_pick", "psm_needle", num_envs=32, engine="fused", device="cpu")
     observations, *_ = env.reset(seed=0)
-    act = oracle(env)
+    act, rng = oracle(env), np.random.default_rng(0)
     for _ in range(150):
         step = env.step(act(observations))
         observations = step.observations

@@ -6,6 +6,7 @@ import itertools
 import math
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -63,42 +64,39 @@ def _batched(name: str, workload: Workload, course: Course) -> Contender:
     # otherwise all episodes would end in the same step
     batch.steps = give(np.random.default_rng(0).integers(0, batch.max_steps, count, dtype=np.int32))
 
-    hold = max(1, HOLD // workload.decimation)
     physics = make_engine(PhysicsAlone(batch.env), count, name, workload.where)
     physics.reset(0)
     begin(physics)
-    played = begin if workload.motion == "policy" else None  # what a policy does is not to and fro
-    step_physics = _along(physics, [give(tile(rows, count)) for rows in course.commands], played)
+    step_physics = _along(physics, [give(tile(rows, count)) for rows in course.commands])
+    hold = max(1, HOLD // workload.decimation)
+    step_env = _through(batch, actions, hold)
+    cycles = _cycle(HOLD * LAPS, 1), _cycle(hold * LAPS, workload.decimation)
+    if workload.motion == "grasp":  # new episodes have nothing in their jaws
+        step_env = _beginning(step_env, partial(begin, batch.engine), cycles[1])
+    if workload.motion == "policy":  # what a policy does is not to and fro
+        step_physics = _beginning(step_physics, partial(begin, physics), HOLD * LAPS)
+        step_env = _beginning(step_env, partial(begin, batch.engine), hold * LAPS)
     step_physics()  # compiles
     _wait(physics)
-    again = begin if workload.motion == "grasp" else played  # new episodes have nothing in their jaws
-    lap = hold * LAPS if played else None
-    clocks = _clock(step_physics, physics, _cycle(HOLD * LAPS, 1)), clock_of(batch, actions, hold, again, lap)
+    clocks = _clock(step_physics, physics, cycles[0]), _clock(step_env, batch.engine, cycles[1])
     return Contender(count, workload.where, compile_s, *clocks, bytes_per_env=_bytes_per_env(batch.engine))
 
 
-def clock_of(
-    batch: BatchedEnv,
-    actions: list[Any],
-    hold: int = 1,
-    begin: Callable[[Engine], None] | None = None,
-    every: int | None = None,
-) -> Clock:
-    """Return the clock of a batch that is stepped by some actions in turn, each for `hold` steps.
+def clock_of(batch: BatchedEnv, actions: list[Any]) -> Clock:
+    """Return the clock of a batch that is stepped by some actions in turn."""
+    return _clock(_through(batch, actions), batch.engine, _cycle(len(actions), batch.env.decimation))
 
-    If there is a `begin`, it puts the environments where they started: `every` so many steps, or whenever as much was
-    done as a clock repeats.
-    """
-    turn, cycle = itertools.count(), _cycle(hold * len(actions), batch.env.decimation)
-    every = every or cycle
 
-    def step() -> None:
-        now = next(turn)
-        if begin and now % every == 0:
-            begin(batch.engine)
-        batch.step(actions[now // hold % len(actions)])
+def _beginning(step: Callable[[], None], begin: Callable[[], None], every: int) -> Callable[[], None]:
+    """Return a step before which environments are put where they started, each time after `every` so many."""
+    turn = itertools.count()
 
-    return _clock(step, batch.engine, cycle)
+    def begun() -> None:
+        if next(turn) % every == 0:
+            begin()
+        step()
+
+    return begun
 
 
 def _clock(step: Callable[[], None], engine: Engine, cycle: int) -> Clock:
@@ -113,17 +111,22 @@ def _cycle(lap: int, decimation: int) -> int:
     return math.lcm(lap, control_steps(decimation))
 
 
-def _along(physics: Engine, commands: list[Any], begin: Callable[[Engine], None] | None = None) -> Callable[[], None]:
-    """Return a function that makes a physics step under the commands of a course, one step further at each call.
+def _through(batch: BatchedEnv, actions: list[Any], hold: int = 1) -> Callable[[], None]:
+    """Return a function that steps a batch by some actions in turn, each for `hold` steps."""
+    turn = itertools.count()
 
-    If there is a `begin`, it puts the environments where they started, whenever the course begins again.
-    """
+    def step() -> None:
+        batch.step(actions[next(turn) // hold % len(actions)])
+
+    return step
+
+
+def _along(physics: Engine, commands: list[Any]) -> Callable[[], None]:
+    """Return a function that makes a physics step under the commands of a course, one step further at each call."""
     turn = itertools.count()
 
     def step() -> None:
         now = next(turn)
-        if begin and now % (HOLD * LAPS) == 0:
-            begin(physics)
         if now % HOLD == 0:
             physics.write(".physics.ctrl", commands[now // HOLD % LAPS])
         physics.step({})

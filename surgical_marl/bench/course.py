@@ -73,17 +73,16 @@ def make_course(workload: Workload, seed: int = 0) -> Course:
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     import jax
 
-    if workload.motion == "policy":
-        policy_of(workload)  # before anything is compiled
+    player = policy_of(workload) if workload.motion == "policy" else None  # refused before anything is compiled
     scene = load_scene(workload.scene, workload.control)
     rng, n = np.random.default_rng(seed), min(workload.distinct, max(workload.count, DISTINCT))
     simulator = Simulator(scene, HOLD)
     command = jax.jit(jax.vmap(simulator.command))
     roll = _by_engine(workload, n) if scene.objects else partial(_by_mujoco, scene.model)
     now = jax.tree.map(lambda x: np.repeat(np.asarray(x)[None], n, 0), simulator.home)
-    if workload.motion == "policy":
+    if player:
         paths = [f".physics{path}" for path in _leaves(now)]
-        parts, actions = played(workload, n, LAPS, paths, rng)
+        parts, actions = played(player, workload, n, LAPS, paths, rng)
         now = jax.tree.unflatten(jax.tree.structure(now), parts)
     else:
         move = lambda now, action: roll(command(now, action))  # noqa: E731

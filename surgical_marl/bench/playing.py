@@ -30,11 +30,12 @@ def policy_of(workload: Workload) -> str:
 
 
 def played(
-    workload: Workload, count: int, laps: int, paths: list[str], rng: np.random.Generator
+    player: str, workload: Workload, count: int, laps: int, paths: list[str], rng: np.random.Generator
 ) -> tuple[list[np.ndarray], list[dict[str, np.ndarray]]]:
-    """Let the policy that ships play, with noise, and stop each environment anywhere in its episode.
+    """Let a policy play, with noise, and stop each environment anywhere in its episode.
 
     Args:
+        player: the policy's name, as `policy_of` gives it.
         workload: which task, and which scene.
         count: how many environments play, n.
         laps: for how many control steps actions are noted.
@@ -47,7 +48,7 @@ def played(
     """
     options = replace(workload, decimation=DECIMATION).of_environment()
     env = BatchedEnv(**options, num_envs=count, device=workload.where)
-    policy = load_policy(policy_of(workload), env)
+    policy = load_policy(player, env)
     stops = rng.integers(0, max(1, env.max_steps - laps), count)
     observations, *_ = env.reset(seed=0)
     forget(policy)
