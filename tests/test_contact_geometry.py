@@ -194,7 +194,7 @@ def test_a_patch_has_the_deepest_point_and_those_that_a_tilt_brings_in() -> None
         spread = np.sqrt(weight @ np.sum((places[which] - centre) ** 2, 1))
         np.testing.assert_allclose(patch.centre, centre, atol=1e-6)
         assert float(patch.radius) == pytest.approx(0.002 + spread, abs=1e-6)
-        np.testing.assert_allclose(patch.frame[0], [0, 0, 1], atol=1e-6)
+        np.testing.assert_allclose(patch.normal, [0, 0, 1], atol=1e-6)
 
 
 CORNERS = np.array([[0.01, 0.0, 0.0], [-0.005, 0.00866, 0.0], [-0.005, -0.00866, 0.0]])
@@ -217,13 +217,13 @@ def test_a_weight_beyond_the_rim_leans_to_its_side() -> None:
 
 def test_a_fork_is_led_by_its_first_point_and_nothing_is_no_patch() -> None:
     fork = patch_of([1e-3, 1e-3], [[-0.01, 0, 0], [0.01, 0, 0]], normals=[[1, 0, 0], [-1, 0, 0]])
-    assert abs(abs(float(fork.frame[0, 0])) - 1) < 1e-3
+    assert abs(abs(float(fork.normal[0])) - 1) < 1e-3
     few = patch_of([1e-3, 2e-3], [[-0.01, 0, 0], [0.01, 0, 0]], count=1)
     np.testing.assert_allclose(few.points.place, np.tile([-0.01, 0, 0], (POINTS, 1)), atol=1e-7)
     assert float(patch_of([1e-3], [[0, 0, 0]], count=0).reach) == 2 * AWAY
     none = no_patch()
     assert none.points.depth.tolist() == [AWAY] * POINTS and float(none.reach) == AWAY and float(none.radius) == 1
-    assert not none.frame.any() and none.centre.tolist() == [0, 0, 0] and not none.points.normal.any()
+    assert not none.normal.any() and none.centre.tolist() == [0, 0, 0] and not none.points.normal.any()
 
 
 def cone(rng: np.random.Generator, points: int = 4) -> Cone:

@@ -170,12 +170,13 @@ def test_patches_are_those_of_all_capsules_of_all_pairs(world: str, request: pyt
     e, s = np.nonzero(np.arange(slots.number.shape[1]) < slots.total[:, None])
     number = slots.number[e, s]
     one, all_ = jax.tree.map(lambda x: x[e, s], slots.patch), jax.tree.map(lambda x: x[e, number], every)
-    for name, most in (("depth", 1e-6), ("place", 3e-5), ("normal", 2e-3)):
+    # of two points that are as deep, rounding decides how much each counts: `BLEND`
+    for name, most in (("depth", 3e-6), ("place", 3e-5), ("normal", 2e-3)):
         np.testing.assert_allclose(getattr(one.points, name), getattr(all_.points, name), atol=most)
     for name, most in (("centre", 1e-5), ("radius", 1e-6), ("reach", 2e-6)):
         np.testing.assert_allclose(getattr(one, name), getattr(all_, name), atol=most)
     # tangents may turn where a normal is level
-    np.testing.assert_allclose(one.frame[:, 0], all_.frame[:, 0], atol=2e-3)
+    np.testing.assert_allclose(one.normal, all_.normal, atol=2e-3)
     met = np.bincount(there.kinds[number], minlength=len(meetings))
     assert met.max() > 300
     if world == "thrown":

@@ -14,7 +14,7 @@ from surgical_marl.physics.cone import Cone
 from surgical_marl.physics.newton import Newton
 from surgical_marl.physics.patches import AWAY, Patch
 from surgical_marl.physics.placed import Joints
-from surgical_marl.physics.problem import SLIPS, Contact, Pressed
+from surgical_marl.physics.problem import SLIPS, Contact, Contacts, Pressed
 from surgical_marl.physics.rows import filled, picked, put, row_of
 from surgical_marl.physics.tables import Tables
 from surgical_marl.physics.touching import AHEAD, MARGIN, Slots
@@ -81,8 +81,25 @@ class Fingers(NamedTuple):
 class Felt(NamedTuple):
     """Contacts, and how far friction's springs are stretched, m, [s, 3]."""
 
-    contacts: Contact
+    contacts: Contacts
     slip: Array
+
+
+class _Kept(NamedTuple):
+    """What is kept of a contact: all that its patch and the poses of arms and objects do not say."""
+
+    first: Array
+    """As in `Contact`."""
+    second: Array
+    arm: Array
+    stiff: Array
+    """As in `Cone`."""
+    push: Array
+    rub: Array
+    pull: Array
+    coefficient: Array
+    slip: Array
+    """As in `Felt`."""
 
 
 class _Speeds(NamedTuple):
@@ -122,45 +139,60 @@ class Handling:
         speeds = _Speeds(self._newton.by_arm(qvel), self._newton.by_object(bodies.velocity))
         at = self._newton.by_object(bodies.position), self._newton.by_object(bodies.quaternion)
 
-        def felt(n: Array) -> Felt:
-            patch, number = row_of(slots.patch, n), slots.number[n]
-            contact, origin = self._contact(patch, number, joints, at[0])
+        columns = self._columns(joints)
+
+        def bare(n: Array) -> Contact:
+            return self._contact(row_of(slots.patch, n), slots.number[n], columns, at[0])
+
+        def one(n: Array) -> _Kept:
+            patch, number, contact = row_of(slots.patch, n), slots.number[n], bare(n)
             slip = self._slip(patch, number, fingers, at, grips)
-            motion = self._motion(contact, patch, number, speeds, origin)
-            return Felt(self._resisting(contact, patch, number, slip, motion, dt), slip)
+            motion = self._motion(contact, patch, number, speeds)
+            cone = self._resisting(contact.cone, patch, number, slip, motion, dt)
+            resists = cone.stiff, cone.push, cone.rub, cone.pull, cone.coefficient
+            return _Kept(contact.first, contact.second, contact.arm, *resists, slip)
 
-        found: Felt = filled(felt, slots.found, len(slots.number))
-        return found
+        kept: _Kept = filled(one, slots.found, len(slots.number))
 
-    def _contact(self, patch: Patch, number: Array, joints: Joints | None, position: Array) -> tuple[Contact, Array]:
-        """Return a contact that does not resist yet: what it is between, and its directions; and its twists' origin."""
+        def whole(n: Array) -> Contact:
+            contact, own = bare(n), row_of(kept, n)
+            cone = contact.cone._replace(**{name: getattr(own, name) for name in _Kept._fields if name in Cone._fields})
+            return contact._replace(cone=cone, first=own.first, second=own.second, arm=own.arm)
+
+        return Felt(Contacts(kept.first, kept.second, kept.arm, whole), kept.slip)
+
+    def _columns(self, joints: Joints | None) -> Array:
+        """Return what joints give their links, as in `Contact`: one number after the other, [6 a m]."""
+        if joints is None:
+            return jnp.zeros(0)
+        each = joints.columns(jnp.asarray(self.tables.slides), jnp.zeros(3))
+        return jnp.concatenate([x.reshape(len(x), -1) for x in each], 1).ravel()
+
+    def _contact(self, patch: Patch, number: Array, columns: Array, position: Array) -> Contact:
+        """Return a contact that does not resist yet: what it is between, and its directions."""
         t = self.tables
         first, second, arm = (
             jnp.asarray(x.astype(np.int32))[number] for x in (t.first_object, t.second_object, t.owner)
         )
         origin = jnp.where(first < t.count, position[first], patch.centre)
-        offset, jacobian = jnp.zeros(3), jnp.zeros((6, t.most))
+        offset, pulls, none = jnp.zeros(3), jnp.zeros(t.most), jnp.float32(0.0)
+        moving = turning = jnp.zeros((t.most, 3))
         if t.count > 1:
             offset = jnp.where(second < t.count, position[second] - origin, 0.0)
-        if joints is not None:
-            own = jax.tree.map(lambda x: x.at[arm].get(mode="clip"), joints)
-            slides = jnp.asarray(t.slides).at[arm].get(mode="clip")
-            moving, turning = own.columns(slides, origin)
-            jacobian = (jnp.asarray(t.pulls)[number][:, None] * jnp.concatenate([moving, turning], -1)).T
+        if len(columns):
+            pulls, size = jnp.asarray(t.pulls)[number], 6 * t.most
+            moving, turning = jax.lax.dynamic_slice(columns, (size * arm,), (size,)).reshape(2, t.most, 3)
         points, (ahead, *across) = patch.points, patch.frame
         normal = jnp.concatenate([points.normal, jnp.cross(points.place - origin, points.normal)], -1)
-        lever = patch.centre - origin
+        lever, each = patch.centre - origin, jnp.zeros(len(normal))
         along = [jnp.concatenate([way, jnp.cross(lever, way)]) for way in across]
         about = jnp.concatenate([jnp.zeros(3), patch.radius * ahead])
-        none, each = jnp.float32(0.0), jnp.zeros(len(normal))
         cone = Cone(normal, each, each, jnp.stack([*along, about]), none, jnp.zeros(3), none)
-        return Contact(cone, first, second, offset, arm, jacobian), origin
+        return Contact(cone, first, second, offset, arm, origin, pulls, moving, turning)
 
-    def _resisting(
-        self, contact: Contact, patch: Patch, number: Array, slip: Array, motion: _Motion, dt: Any
-    ) -> Contact:
-        """Return the contact with the forces of its springs and dampers at a motion of now."""
-        t, cone, points = self.tables, contact.cone, patch.points
+    def _resisting(self, cone: Cone, patch: Patch, number: Array, slip: Array, motion: _Motion, dt: Any) -> Cone:
+        """Return the cone with the forces of its springs and dampers at a motion of now."""
+        t, points = self.tables, patch.points
         speed = cone.normal @ motion.twist + dt / 2 * jnp.sum(points.normal * motion.bends[:-1], -1)
         reach = points.depth + jnp.clip(-dt * speed, 0.0, AHEAD)
         near = jnp.clip(1 + reach / MARGIN, 0.0, 1.0)
@@ -179,12 +211,11 @@ class Handling:
         springs = jnp.where(remembers, k, 0.0)
         drag = jnp.where(remembers, k * (dt + DAMPING), k * CREEP)
         pull = -springs * slip - drag * rubbed
-        resisting = Cone(cone.normal, dt * rate, push, cone.along, dt * drag, pull, coefficient)
-        return contact._replace(cone=resisting)
+        return Cone(cone.normal, dt * rate, push, cone.along, dt * drag, pull, coefficient)
 
-    def _motion(self, contact: Contact, patch: Patch, number: Array, speeds: _Speeds, origin: Array) -> _Motion:
+    def _motion(self, contact: Contact, patch: Patch, number: Array, speeds: _Speeds) -> _Motion:
         """Return how the two bodies of a contact move relative to each other now."""
-        t, places = self.tables, jnp.concatenate([patch.points.place, patch.centre[None]]) - origin
+        t, places = self.tables, jnp.concatenate([patch.points.place, patch.centre[None]]) - contact.origin
         twist = self._newton.twist(contact, speeds.joints, speeds.objects)
         spin = speeds.objects[contact.first][3:]
         bends = jnp.cross(spin, jnp.cross(spin, places))
@@ -204,16 +235,16 @@ class Handling:
         """Return how far the object has moved along the finger since friction was relaxed, m, [3]; 0 elsewhere."""
         if fingers is None or not self.tables.grip:
             return jnp.zeros(3)
-        f = self._finger(number)
+        f, o = self._finger(number), jnp.asarray(self.tables.first_object.astype(np.int32))[number]
+        # outside of the branch, so that the fused engine has one array of them for all that asks for a row
+        frame, (position, quaternion, force, _slid) = picked(fingers, f), _of_finger(grips, o, f)
 
         def moved(_: None) -> Array:
-            o = jnp.asarray(self.tables.first_object.astype(np.int32))[number]
-            frame, (position, quaternion, force, _slid) = picked(fingers, f), _of_finger(grips, o, f)
             was = frame.position + frame.axes @ position
             turned = product(at[1][o], conjugate(product(frame.quaternion, quaternion)))
             angle = 2 * turned[1:] * jnp.where(turned[0] < 0, -1.0, 1.0)
             shift = at[0][o] - was + jnp.cross(angle, patch.centre - at[0][o])
-            slip = jnp.concatenate([patch.frame[1:] @ shift, (patch.radius * (patch.frame[0] @ angle))[None]])
+            slip = jnp.concatenate([patch.frame[1:] @ shift, (patch.radius * (patch.normal @ angle))[None]])
             return jnp.where(force > 0, slip, 0.0)
 
         return jax.lax.cond(f < len(self.tables.fingers), moved, lambda _: jnp.zeros(3), None)
@@ -238,19 +269,17 @@ class Handling:
         fresh = grips._replace(force=jnp.zeros_like(grips.force), slid=jnp.zeros_like(grips.slid))
 
         def one(n: Array, kept: tuple[Grips, Array]) -> tuple[Grips, Array]:
-            number, f = slots.number[n], self._finger(slots.number[n])
+            number, f, contact = slots.number[n], self._finger(slots.number[n]), felt.contacts.at(n)
+            place = contact.first, f
+            finger, own = picked(fingers, f), _of_finger(grips, *place)  # as in `_slip`
 
             def note(kept: tuple[Grips, Array]) -> tuple[Grips, Array]:
-                patch, contact, slip, forces = row_of((slots.patch, felt.contacts, felt.slip, pressed), n)
+                patch, slip, forces = row_of((slots.patch, felt.slip, pressed), n)
                 after = slip + contact.cone.along @ self._newton.twist(contact, *moves)
-                place = contact.first, f
                 pose = at[0][contact.first], at[1][contact.first]
-                own = _of_finger(grips, *place)
-                new = self._kept(patch, number, forces, after, picked(fingers, f), pose, own)
+                new = self._kept(patch, number, forces, after, finger, pose, own)
                 found = put(tuple(getattr(kept[0], name) for name in OF_FINGERS), place, new)
-                return kept[0]._replace(**dict(zip(OF_FINGERS, found, strict=True))), put(
-                    kept[1], place, patch.frame[0]
-                )
+                return kept[0]._replace(**dict(zip(OF_FINGERS, found, strict=True))), put(kept[1], place, patch.normal)
 
             return jax.lax.cond(f < len(t.fingers), note, lambda kept: kept, kept)
 
@@ -267,7 +296,7 @@ class Handling:
         stretched = jnp.where(slips, -forces.friction / (SHEAR * jnp.asarray(self.tables.stiffness)[number]), after)
         excess = after - stretched
         # Kept as it is while nothing slips: rounding errors of a pose made anew in each step would add up.
-        along, about = excess[:2] @ patch.frame[1:], turn(excess[2] / patch.radius * patch.frame[0])
+        along, about = excess[:2] @ patch.frame[1:], turn(excess[2] / patch.radius * patch.normal)
         was, faced = place + axes @ position, product(faces, quaternion)
         was, faced = patch.centre + rotation(about) @ (was - patch.centre) + along, product(about, faced)
         new = force <= 0

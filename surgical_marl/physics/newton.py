@@ -92,7 +92,7 @@ class Newton:
             return found
 
         def with_arm(found: list[Array]) -> list[Array]:
-            moved = [contact.jacobian @ arms[contact.arm] for arms, _ in motions]
+            moved = [contact.by_joints(arms[contact.arm]) for arms, _ in motions]
             return [twist + more for twist, more in zip(found, moved, strict=True)]
 
         return jax.lax.cond(contact.arm < len(self._dofs), with_arm, lambda found: found, found)
@@ -146,7 +146,7 @@ class Newton:
 
         def measure(length: Array, seen: _Seen) -> tuple[Array, Array, _Seen]:
             def look(n: Array, state: tuple[Array, Array, _Seen]) -> tuple[Array, Array, _Seen]:
-                contact, before = row_of((problem.contacts, state[2].pressed), n)
+                contact, before = problem.contacts.at(n), row_of(state[2].pressed, n)
                 cone, (at, by) = contact.cone, self.twists(contact, *motions)
                 felt = forces(cone, at + length * by)
                 own, normal, along = _pressed(felt), cone.normal @ by, cone.along @ by
@@ -181,7 +181,7 @@ class Newton:
         )
 
         def one(n: Array, sums: tuple[_Local, Pressed]) -> tuple[_Local, Pressed]:
-            contact = row_of(problem.contacts, n)
+            contact = problem.contacts.at(n)
             found = forces(contact.cone, self.twist(contact, point.arms, objects))
             return self._add(sums[0], contact, found), put(sums[1], n, _pressed(found))
 

@@ -57,12 +57,17 @@ class Patch(NamedTuple):
     """[..., POINTS]"""
     centre: Array
     """Where friction acts: the mean of the points, weighted by depth, [..., 3]."""
-    frame: Array
-    """Rows: the normal and two directions along the surface, [..., 3, 3]."""
+    normal: Array
+    """[..., 3]"""
     radius: Array
     """Torque about the normal that counts as much as a force of 1 N along the surface, m, [...]."""
     reach: Array
     """Depth of the deepest point now or after the step, m, [...]."""
+
+    @property
+    def frame(self) -> Array:
+        """Rows: the normal and two directions along the surface, [..., 3, 3]."""
+        return tangents(self.normal)
 
 
 def find_patch(
@@ -88,7 +93,7 @@ def find_patch(
     if centre is None:
         tilts = _Tilts(jnp.pad(rims.by, ((1, 0), (0, 0))), np.append(np.float32(-AWAY), rims.limits), middle)
         points, most, reach = _seen(look, count, rows, tilts)
-        return _with_frame(_supports(points, count, tilts, most), torsion, reach)
+        return _patch(_supports(points, count, tilts, most), torsion, reach)
     points, most, reach = _seen(look, count, rows, rims)
     rim = _supports(points, count, rims, most)
     lean = LEAN * _beyond(axes @ centre, rim.place @ axes.T) @ axes
@@ -96,7 +101,7 @@ def find_patch(
     find = lambda n, most: jnp.maximum(most, leant.deepest(*row_of(points, n)))  # noqa: E731
     deepest = _supports(points, count, leant, jax.lax.fori_loop(0, count, find, jnp.full(1, 2 * AWAY)))
     chosen = Points(*(jnp.concatenate(parts) for parts in zip(deepest, rim, strict=True)))
-    return _with_frame(chosen, torsion, reach)
+    return _patch(chosen, torsion, reach)
 
 
 class _Tilts(NamedTuple):
@@ -167,14 +172,14 @@ def _supports(points: tuple[Points, Array], count: Any, tilts: _Tilts, most: Arr
     return Points(found.depth / weight, tilts.middle + place, _unit(normal))
 
 
-def _with_frame(points: Points, torsion: Array, reach: Array) -> Patch:
+def _patch(points: Points, torsion: Array, reach: Array) -> Patch:
+    """Return the patch of points. The first of them decides where bodies press from opposite sides, as in a fork."""
     weight = jnp.maximum(points.depth, 1e-9)
     weight = weight / jnp.sum(weight)
     centre = weight @ points.place
     spread = jnp.sqrt(jnp.maximum(weight @ jnp.sum((points.place - centre) ** 2, -1), 1e-18))
-    # The first point decides where bodies press from opposite sides, as in a fork.
     normal = _unit(weight @ points.normal + 1e-3 * points.normal[0])
-    return Patch(points, centre, tangents(normal), torsion + spread, reach)
+    return Patch(points, centre, normal, torsion + spread, reach)
 
 
 def _unit(vector: Array) -> Array:
@@ -196,4 +201,4 @@ def no_patch() -> Patch:
     """Return a patch that is not there."""
     none = jnp.zeros(3)
     points = Points(jnp.full(POINTS, AWAY), jnp.zeros((POINTS, 3)), jnp.zeros((POINTS, 3)))
-    return Patch(points, none, jnp.zeros((3, 3)), jnp.float32(1.0), jnp.float32(AWAY))
+    return Patch(points, none, none, jnp.float32(1.0), jnp.float32(AWAY))

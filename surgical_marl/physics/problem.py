@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
+import jax.numpy as jnp
 from jax import Array
 
 from surgical_marl.physics.cone import Cone
@@ -11,7 +13,7 @@ from surgical_marl.physics.solver import JointRows, Rows
 
 
 class Contact(NamedTuple):
-    """A patch between bodies: what resists their relative acceleration. Batches [s]."""
+    """A patch between bodies: what resists their relative acceleration."""
 
     cone: Cone
     first: Array
@@ -22,8 +24,37 @@ class Contact(NamedTuple):
     """From the origin of the twist to the centre of mass of the other object, m, [3]."""
     arm: Array
     """Number of the arm that it is on, []."""
-    jacobian: Array
-    """Twist by velocity of that arm's joints, [6, m]."""
+    origin: Array
+    """Of the twist, in the world, m, [3]."""
+    pulls: Array
+    """The sign with which it moves with each of that arm's joints, [m]; 0 for joints that do not move it."""
+    moving: Array
+    """Velocity of what is at the world's origin by velocity of each of these joints, [m, 3]."""
+    turning: Array
+    """Angular velocity likewise, [m, 3]."""
+
+    def by_joints(self, motion: Array) -> Array:
+        """Return the twist [6] by a motion of the arm's joints [m]."""
+        own = self.pulls * motion
+        spin = own @ self.turning
+        return jnp.concatenate([own @ self.moving + jnp.cross(spin, self.origin), spin])
+
+    @property
+    def jacobian(self) -> Array:
+        """Twist by velocity of the arm's joints, [6, m]."""
+        moving = self.moving + jnp.cross(self.turning, self.origin)
+        return (self.pulls[:, None] * jnp.concatenate([moving, self.turning], -1)).T
+
+
+class Contacts(NamedTuple):
+    """Contacts, [s]."""
+
+    first: Array
+    """As in `Contact`, [s]."""
+    second: Array
+    arm: Array
+    at: Callable[[Array], Contact]
+    """Makes one of them by its number, wherever it is needed: that takes less time than to load it from memory."""
 
 
 class Problem(NamedTuple):
@@ -43,7 +74,7 @@ class Problem(NamedTuple):
     """Mass matrices of the objects, [k, 6, 6]."""
     free: Array
     """Accelerations of the objects without contacts, [k, 6]."""
-    contacts: Contact
+    contacts: Contacts
     total: Array
     """How many contacts there are, []; no more than there is room for."""
 

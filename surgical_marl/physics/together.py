@@ -23,7 +23,7 @@ from surgical_marl.physics.handling import DWELL, Fingers, Grips, Handling, fing
 from surgical_marl.physics.kind import Kind
 from surgical_marl.physics.newton import Newton
 from surgical_marl.physics.placed import Joints
-from surgical_marl.physics.problem import Contact, Pressed, Problem
+from surgical_marl.physics.problem import Contacts, Pressed, Problem
 from surgical_marl.physics.rest import settled
 from surgical_marl.physics.rows import absent
 from surgical_marl.physics.solver import JointRows, Rows
@@ -185,29 +185,31 @@ class Together:
         after = Bodies(*(jnp.where(slots.awake[:, None], new, old) for new, old in zip(after, bodies, strict=True)))
         return settled(after, self.tables.bound, slots.company)
 
-    def _solve_objects(self, masses: Array, free: Array, contacts: Contact, slots: Slots, start: Array) -> Array:
+    def _solve_objects(self, masses: Array, free: Array, contacts: Contacts, slots: Slots, start: Array) -> Array:
         """Return the accelerations [k, 6] of objects that touch no arm: one by one, if none touches another."""
         none, k, total = jnp.zeros((0, 0)), len(free), slots.found
         rows = Rows(jnp.zeros((0, 0, 0)), *[jnp.zeros(0)] * 4)
         arms = none, none, JointRows(*[none] * len(JointRows._fields)), rows, jnp.bool_(False)
 
-        def whole(contacts: Contact) -> Array:
+        def whole() -> Array:
             return self._objects_alone.solve(Problem(*arms, masses, free, contacts, total), none, start).objects
 
         def single(row: tuple[Array, ...]) -> Array:
             number, mass, free, start = row
-            own = contacts._replace(first=jnp.where(contacts.first == number, 0, 1))
+            mine = lambda first: jnp.where(first == number, 0, 1)  # noqa: E731
+            at = lambda n: (one := contacts.at(n))._replace(first=mine(one.first))  # noqa: E731
+            own = contacts._replace(first=mine(contacts.first), at=at)
             problem = Problem(*arms, mass[None], free[None], own, total)
             solve = lambda: self._object_alone.solve(problem, none, start[None]).objects[0]  # noqa: E731
             return jax.lax.cond(slots.awake[number], solve, lambda: start)
 
-        def each(_: Contact) -> Array:
+        def each() -> Array:
             return jax.lax.map(single, (jnp.arange(k), masses, free, start))
 
         if k < 2:
-            return whole(contacts)
+            return whole()
         joined = (contacts.second < k) & (np.arange(len(contacts.second)) < total)
-        return jax.lax.cond(joined.any(), whole, each, contacts)
+        return jax.lax.cond(joined.any(), whole, each)
 
     def _step(
         self, physics: Physics, touch: Touch, fields: dict[str, Array], slots: Slots, joints: Joints, fingers: Fingers,
