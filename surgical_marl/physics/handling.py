@@ -73,8 +73,6 @@ class Fingers(NamedTuple):
     """The frames of all fingers in the world, [f]."""
 
     position: Array
-    axes: Array
-    """[f, 3, 3]"""
     quaternion: Array
 
 
@@ -88,10 +86,8 @@ class Felt(NamedTuple):
 class _Kept(NamedTuple):
     """What is kept of a contact: all that its patch and the poses of arms and objects do not say."""
 
-    first: Array
-    """As in `Contact`."""
     second: Array
-    arm: Array
+    """As in `Contact`."""
     stiff: Array
     """As in `Cone`."""
     push: Array
@@ -150,16 +146,16 @@ class Handling:
             motion = self._motion(contact, patch, number, speeds)
             cone = self._resisting(contact.cone, patch, number, slip, motion, dt)
             resists = cone.stiff, cone.push, cone.rub, cone.pull, cone.coefficient
-            return _Kept(contact.first, contact.second, contact.arm, *resists, slip)
+            return _Kept(contact.second, *resists, slip)
 
         kept: _Kept = filled(one, slots.found, len(slots.number))
 
         def whole(n: Array) -> Contact:
             contact, own = bare(n), row_of(kept, n)
             cone = contact.cone._replace(**{name: getattr(own, name) for name in _Kept._fields if name in Cone._fields})
-            return contact._replace(cone=cone, first=own.first, second=own.second, arm=own.arm)
+            return contact._replace(cone=cone)
 
-        return Felt(Contacts(kept.first, kept.second, kept.arm, whole), kept.slip)
+        return Felt(Contacts(kept.second, whole), kept.slip)
 
     def _columns(self, joints: Joints | None) -> Array:
         """Return what joints give their links, as in `Contact`: one number after the other, [6 a m]."""
@@ -240,7 +236,7 @@ class Handling:
         frame, (position, quaternion, force, _slid) = picked(fingers, f), _of_finger(grips, o, f)
 
         def moved(_: None) -> Array:
-            was = frame.position + frame.axes @ position
+            was = frame.position + rotation(frame.quaternion) @ position
             turned = product(at[1][o], conjugate(product(frame.quaternion, quaternion)))
             angle = 2 * turned[1:] * jnp.where(turned[0] < 0, -1.0, 1.0)
             shift = at[0][o] - was + jnp.cross(angle, patch.centre - at[0][o])
@@ -291,7 +287,7 @@ class Handling:
         grip: tuple[Array, Array, Array, Array],
     ) -> tuple[Array, Array, Array, Array]:  # fmt: skip
         """Return what is kept for one finger and one object: `OF_FINGERS`, as in `grip`."""
-        (place, axes, faces), (position, quaternion, force, slid) = finger, grip
+        (place, faces), (position, quaternion, force, slid), axes = finger, grip, rotation(finger.quaternion)
         slips = forces.sides >= SLIPS
         stretched = jnp.where(slips, -forces.friction / (SHEAR * jnp.asarray(self.tables.stiffness)[number]), after)
         excess = after - stretched
@@ -349,7 +345,7 @@ def _of_finger(grips: Grips, o: Array, f: Array) -> tuple[Array, Array, Array, A
 
 def fingers_of(position: Array, axes: Array) -> Fingers:
     """Return the frames of fingers by their positions [f, 3] and axes [f, 3, 3]."""
-    return Fingers(position, axes, jax.lax.map(_quaternion, axes))
+    return Fingers(position, jax.lax.map(_quaternion, axes))
 
 
 def _quaternion(m: Array) -> Array:

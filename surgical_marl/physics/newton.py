@@ -60,7 +60,7 @@ class _Local(NamedTuple):
     coupling: Array
     """Of object o and arm i in row a o + i, [(k + 1) a, 6, m]; nothing where they were not met."""
     met: Array
-    """Which of them were met, [(k + 1) a] bool."""
+    """Which objects touch which arms, [k, a] bool."""
     on_arm: Array
     """Which arms have contacts, [a] bool."""
 
@@ -108,7 +108,7 @@ class Newton:
     def solve(self, problem: Problem, arms: Array, objects: Array) -> Solution:
         """Return the accelerations and forces, beginning with accelerations of arms [a, m] and objects [k, 6]."""
         shape = jax.eval_shape(lambda: Pressed(jnp.float32(0.0), jnp.zeros(3), jnp.int32(0)))
-        state = Point(arms, objects), room(shape, len(problem.contacts.arm)), jnp.bool_(False), jnp.int32(0)
+        state = Point(arms, objects), room(shape, len(problem.contacts.second)), jnp.bool_(False), jnp.int32(0)
 
         def going(state: Any) -> Array:
             settled, count = state[-2:]
@@ -187,7 +187,8 @@ class Newton:
 
         local, pressed = jax.lax.fori_loop(0, problem.total, one, (none, pressed))
         cut = lambda each: each[:k]  # noqa: E731
-        local = local._replace(force=cut(local.force), object=cut(local.object))
+        met = cut(local.met.reshape(k + 1, a))
+        local = local._replace(force=cut(local.force), object=cut(local.object), met=met)
         return local, pressed
 
     def _add(self, local: _Local, contact: Contact, felt: Forces) -> _Local:
@@ -233,7 +234,7 @@ class Newton:
 
         Objects are eliminated, arms solved, each alone if nothing joins them, and objects found from them.
         """
-        touched, pressing = self._touched(problem), pressed.normal > 0
+        touched, pressing = local.met, pressed.normal > 0
         linked = self._linked(problem, pressing)
         blocks = elimination.Blocks(local.object, local.cross)
         gone = elimination.eliminate(blocks, local.force, local.coupling, touched, linked)
@@ -252,19 +253,12 @@ class Newton:
         if self._objects < 2:
             return jnp.bool_(False)
         contacts = problem.contacts
-        there = np.arange(len(contacts.arm)) < problem.total
+        there = np.arange(len(contacts.second)) < problem.total
         return (there & (contacts.second < self._objects) & pressing).any()
 
     def _sides(self, problem: Problem, arms: Array) -> Array:
         """Return which contacts of arms with arms press, [r] bool."""
         return self._arms.between(problem, arms) > 0
-
-    def _touched(self, problem: Problem) -> Array:
-        """Return which objects touch which arms, [k, a]."""
-        contacts = problem.contacts
-        there = jnp.arange(len(contacts.arm)) < problem.total
-        first = there & (contacts.first == np.arange(self._objects)[:, None])
-        return (first[:, None] & (contacts.arm == np.arange(len(self._dofs))[:, None])).any(-1)
 
 
 def _with_none(each: Array) -> Array:

@@ -49,10 +49,8 @@ class Contact(NamedTuple):
 class Contacts(NamedTuple):
     """Contacts, [s]."""
 
-    first: Array
-    """As in `Contact`, [s]."""
     second: Array
-    arm: Array
+    """As in `Contact`, [s]."""
     at: Callable[[Array], Contact]
     """Makes one of them by its number, wherever it is needed: that takes less time than to load it from memory."""
 

@@ -154,7 +154,7 @@ class Together:
         slots, joints = self._find(data, physics)
         near = overlap | (self._on_arm(slots) < self._arms).any()
         bodies = self.tables.bodies["pads"]
-        frames = (data.xpos[bodies], data.xmat[bodies])
+        frames = data.xpos[bodies], data.xmat[bodies]
 
         def alone(physics: Physics, touch: Touch) -> tuple[Physics, Touch]:
             objects = self._step_objects(physics.objects, slots)
@@ -196,10 +196,8 @@ class Together:
 
         def single(row: tuple[Array, ...]) -> Array:
             number, mass, free, start = row
-            mine = lambda first: jnp.where(first == number, 0, 1)  # noqa: E731
-            at = lambda n: (one := contacts.at(n))._replace(first=mine(one.first))  # noqa: E731
-            own = contacts._replace(first=mine(contacts.first), at=at)
-            problem = Problem(*arms, mass[None], free[None], own, total)
+            at = lambda n: (one := contacts.at(n))._replace(first=jnp.where(one.first == number, 0, 1))  # noqa: E731
+            problem = Problem(*arms, mass[None], free[None], contacts._replace(at=at), total)
             solve = lambda: self._object_alone.solve(problem, none, start[None]).objects[0]  # noqa: E731
             return jax.lax.cond(slots.awake[number], solve, lambda: start)
 
