@@ -341,26 +341,3 @@ def _of_finger(grips: Grips, o: Array, f: Array) -> tuple[Array, Array, Array, A
     rows = tuple(getattr(grips, name).reshape(k * fingers, *getattr(grips, name).shape[2:]) for name in OF_FINGERS)
     found: tuple[Array, Array, Array, Array] = picked(rows, fingers * o + f)
     return found
-
-
-def fingers_of(position: Array, axes: Array) -> Fingers:
-    """Return the frames of fingers by their positions [f, 3] and axes [f, 3, 3]."""
-    return Fingers(position, jax.lax.map(_quaternion, axes))
-
-
-def _quaternion(m: Array) -> Array:
-    """Return the quaternion of a rotation matrix [3, 3]."""
-    trace = m[0, 0] + m[1, 1] + m[2, 2]
-    sizes = jnp.stack([trace, m[0, 0], m[1, 1], m[2, 2]])
-    a, b, c = m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]
-    d, e, f = m[0, 1] + m[1, 0], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1]
-    rows = jnp.stack(
-        [
-            jnp.stack([1 + trace, a, b, c]),
-            jnp.stack([a, 1 + 2 * m[0, 0] - trace, d, e]),
-            jnp.stack([b, d, 1 + 2 * m[1, 1] - trace, f]),
-            jnp.stack([c, e, f, 1 + 2 * m[2, 2] - trace]),
-        ]
-    )
-    row = rows[jnp.argmax(sizes)]
-    return row / jnp.sqrt(jnp.sum(row * row))

@@ -19,7 +19,7 @@ from surgical_marl.physics.bodies import Bodies, free_acceleration, inertias, mo
 from surgical_marl.physics.collision import Pairs
 from surgical_marl.physics.dynamics import Dynamics, Physics
 from surgical_marl.physics.factor import packed
-from surgical_marl.physics.handling import DWELL, Fingers, Grips, Handling, fingers_of
+from surgical_marl.physics.handling import DWELL, Fingers, Grips, Handling
 from surgical_marl.physics.kind import Kind
 from surgical_marl.physics.newton import Newton
 from surgical_marl.physics.placed import Joints
@@ -154,7 +154,7 @@ class Together:
         slots, joints = self._find(data, physics)
         near = overlap | (self._on_arm(slots) < self._arms).any()
         bodies = self.tables.bodies["pads"]
-        frames = data.xpos[bodies], data.xmat[bodies]
+        fingers = Fingers(data.xpos[bodies], data.xquat[bodies])
 
         def alone(physics: Physics, touch: Touch) -> tuple[Physics, Touch]:
             objects = self._step_objects(physics.objects, slots)
@@ -163,7 +163,7 @@ class Together:
             return physics._replace(objects=objects), touch._replace(overflow=left_out)
 
         def together(physics: Physics, touch: Touch) -> tuple[Physics, Touch]:
-            return self._step(physics, touch, fields, slots, joints, fingers_of(*frames), overlap)
+            return self._step(physics, touch, fields, slots, joints, fingers, overlap)
 
         return jax.lax.cond(near, together, alone, physics, touch)
 
