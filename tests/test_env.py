@@ -194,11 +194,16 @@ def settle(env: Any, data: mujoco.MjData, start: dict[str, np.ndarray]) -> Any:
     return Physics(*(np.float32(a) for a in (data.qpos, data.qvel, data.qacc_warmstart, data.ctrl)))
 
 
+@cache
+def compiled(scene: str) -> tuple[Any, Any, Any]:
+    """An `Env`, and commands and a control step of its physics by MJX, which take up to a minute to compile."""
+    env = batched(scene).env
+    return env, jax.jit(env.simulator.command), jax.jit(env.simulator.advance)
+
+
 def rollout(scene: str, steps: int, model: Any = None, start: dict[str, np.ndarray] | None = None) -> tuple[Any, ...]:
     """The same random commands through `Env` (MJX, float32) and C MuJoCo: qpos of both after each control step."""
-    env = batched(scene).env
-    advance = jax.jit(env.simulator.advance)
-    command = jax.jit(env.simulator.command)
+    env, command, advance = compiled(scene)
     rng = np.random.default_rng(0)
     physics = env.reset(jax.random.PRNGKey(0)).carry.physics
     data = mujoco.MjData(env.scene.model)
@@ -245,10 +250,10 @@ def test_mjx_agrees_with_c_mujoco_in_contact() -> None:
 
 def test_every_pair_shows_its_distance_penetration_and_force() -> None:
     """Against C MuJoCo: forces and depths of its physics steps, distances where the control step ends."""
-    env = batched().env
+    env, _, advance = compiled("bimanual_psm")
     start = {"psm_0": np.array([0.03, 0.02, 0.16, 0, 0, 0, 0.0]), "psm_1": np.array([-0.03, 0.0, 0.16, 0, 0, 0, 0.0])}
     model, data = env.scene.model, mujoco.MjData(env.scene.model)
-    physics, contacts, views = jax.jit(env.simulator.advance)(settle(env, data, start))
+    physics, contacts, views = advance(settle(env, data, start))
     ids = [set(pair) for pair in zip(model.pair_geom1, model.pair_geom2, strict=True)]
     assert [{model.geom(n).id for n in pair} for pair in env.scene.pairs] == ids
     depth, force, wrench = np.zeros(len(ids)), np.zeros(len(ids)), np.zeros(6)

@@ -17,6 +17,7 @@ from surgical_marl.scenes.load import load_scene
 from surgical_marl.tasks.base.options import Options, make_options
 from surgical_marl.tasks.base.workspace import PATH_POINTS, _stay_apart, start_table
 from surgical_marl.vision.endoscope import Endoscope
+from tests.helpers.scenes import PAIR
 
 
 def play(env: Any, steps: int = 5, seed: int = 0) -> list[Any]:
@@ -132,7 +133,7 @@ def test_arms_that_meet_between_two_points_of_a_path_are_seen_to_meet() -> None:
 
 
 def test_both_engines_begin_at_the_same_postures() -> None:
-    envs = [BatchedEnv("reach", "bimanual_psm", num_envs=4, engine=e, start="random") for e in ("fused", "mjx")]
+    envs = [BatchedEnv("reach", PAIR, num_envs=4, engine=e, start="random") for e in ("fused", "mjx")]
     found = [env.reset(seed=3)[0] for env in envs]
     for agent in envs[0].agents:
         assert np.allclose(found[0][agent], found[1][agent], atol=1e-5)
