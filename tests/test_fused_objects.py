@@ -36,8 +36,8 @@ def follow_grasps(both: Beside) -> None:
     now = now._replace(ctrl=np.array(now.ctrl) - 0.03)  # jaws close, and wrists move
     held = 0.0
     for k in range(STEPS):
-        # in the first step nothing is known of accelerations: one of 16 takes as many Newton steps as there are at most,
-        # and how near that comes depends on rounding
+        # Nothing is known of accelerations in the first step: one state of 16 takes all Newton steps that there may be,
+        # and how near that comes depends on rounding.
         now = both.step(now, compared=k % EVERY == EVERY - 1)
         held = max(held, float(now.objects.grips.force.max()))
     assert held > 1.0
