@@ -134,8 +134,7 @@ class Handling:
         """Return how the patches that were found resist. There are neither joints nor fingers without arms."""
         speeds = _Speeds(self._newton.by_arm(qvel), self._newton.by_object(bodies.velocity))
         at = self._newton.by_object(bodies.position), self._newton.by_object(bodies.quaternion)
-
-        columns = self._columns(joints)
+        columns = None if joints is None else joints.columns(jnp.asarray(self.tables.slides), jnp.zeros(3))
 
         def bare(n: Array) -> Contact:
             return self._contact(row_of(slots.patch, n), slots.number[n], columns, at[0])
@@ -152,20 +151,18 @@ class Handling:
 
         def whole(n: Array) -> Contact:
             contact, own = bare(n), row_of(kept, n)
-            cone = contact.cone._replace(**{name: getattr(own, name) for name in _Kept._fields if name in Cone._fields})
+            cone = Cone(
+                contact.cone.normal, own.stiff, own.push, contact.cone.along, own.rub, own.pull, own.coefficient
+            )
             return contact._replace(cone=cone)
 
         return Felt(Contacts(kept.second, whole), kept.slip)
 
-    def _columns(self, joints: Joints | None) -> Array:
-        """Return what joints give their links, as in `Contact`: one number after the other, [6 a m]."""
-        if joints is None:
-            return jnp.zeros(0)
-        each = joints.columns(jnp.asarray(self.tables.slides), jnp.zeros(3))
-        return jnp.concatenate([x.reshape(len(x), -1) for x in each], 1).ravel()
+    def _contact(self, patch: Patch, number: Array, columns: tuple[Array, Array] | None, position: Array) -> Contact:
+        """Return a contact that does not resist yet: what it is between, and its directions.
 
-    def _contact(self, patch: Patch, number: Array, columns: Array, position: Array) -> Contact:
-        """Return a contact that does not resist yet: what it is between, and its directions."""
+        `columns` are those of all joints of arms [a, m, 3], about the world's origin.
+        """
         t = self.tables
         first, second, arm = (
             jnp.asarray(x.astype(np.int32))[number] for x in (t.first_object, t.second_object, t.owner)
@@ -175,9 +172,8 @@ class Handling:
         moving = turning = jnp.zeros((t.most, 3))
         if t.count > 1:
             offset = jnp.where(second < t.count, position[second] - origin, 0.0)
-        if len(columns):
-            pulls, size = jnp.asarray(t.pulls)[number], 6 * t.most
-            moving, turning = jax.lax.dynamic_slice(columns, (size * arm,), (size,)).reshape(2, t.most, 3)
+        if columns is not None:
+            pulls, (moving, turning) = jnp.asarray(t.pulls)[number], picked(columns, arm)
         points, (ahead, *across) = patch.points, patch.frame
         normal = jnp.concatenate([points.normal, jnp.cross(points.place - origin, points.normal)], -1)
         lever, each = patch.centre - origin, jnp.zeros(len(normal))
