@@ -20,9 +20,12 @@ from surgical_marl.engines.fused.schedule import Scheduler
 LARGE = 500
 """Least number of operations in a branch whose inputs are hidden from the compiler (`HIDEF`), or in a branch or a round
 of a loop that counts as work."""
-APART = 4000
+APART = 1500
 """Least number of operations in a side of a branch, all that is in it included, for environments that take it to be
 kept apart from those that don't."""
+ROLLED = "#pragma unroll 1\n"
+"""Keeps a compiler from writing the body of a loop once for each round: code that runs once has to be fetched from far,
+as instruction caches don't hold it."""
 
 _CODE = {
     "add": "{}+{}", "sub": "{}-{}", "mul": "{}*{}", "neg": "-{}", "lt": "{}<{}", "le": "{}<={}", "gt": "{}>{}",
@@ -256,10 +259,11 @@ class Emitter(ArrayEmitter):
     def _head(self, number: int, loop: Loop) -> str:
         r, length = f"r{number}", loop.length
         if loop.condition is not None:
-            return "#pragma unroll 1\nfor(;;){"  # how many rounds there are is not known, and code is long
+            return f"{ROLLED}for(;;){{"
         if loop.counter is not None:
             self.names[loop.counter], self.wholes[loop.counter] = f"SPLATI({r})", r
-        return f"for(int {r}={length - 1};{r}>=0;--{r}){{" if loop.backwards else f"for(int {r}=0;{r}<{length};++{r}){{"
+        head = f"for(int {r}={length - 1};{r}>=0;--{r}){{" if loop.backwards else f"for(int {r}=0;{r}<{length};++{r}){{"
+        return head if self.vector else ROLLED + head
 
     def _next(self, number: int, loop: Loop) -> None:
         """Write the end of a round: first all new values get names, and then they replace the old ones."""
