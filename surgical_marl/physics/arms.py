@@ -6,6 +6,7 @@ others has joints in its row that are not there: nothing pushes them, and they s
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -13,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from surgical_marl.physics.bridge import Bridge, Own
 from surgical_marl.physics.factor import packed
 from surgical_marl.physics.problem import Problem
 from surgical_marl.physics.solver import JointRows, Rows, row_forces, rows_of, solve
@@ -36,6 +38,19 @@ class Left(NamedTuple):
     """How forces on objects fall with the acceleration of joints, as in `Eliminated`. Only read where touched."""
     touched: Array
     """Which objects touch which arms, or move them by other objects, [k, a]."""
+
+
+class _Row(NamedTuple):
+    """What is known of an arm, or of each [a, ...]: see `Problem` and `Left`, and where its acceleration begins."""
+
+    number: Array
+    mass: Array
+    smooth: Array
+    joints: JointRows
+    start: Array
+    on_arm: Array
+    stiff: Array
+    force: Array
 
 
 class Arms:
@@ -87,28 +102,55 @@ class Arms:
 
     def each(self, problem: Problem, here: Array, left: Left) -> Array:
         """Return the ways [a, m] of arms of which no two are joined: one problem after the other."""
-        first, second = np.tril_indices(len(self._places))
+        takes = np.ones(len(left.half), bool)
 
         def one(row: Any) -> Array:
-            arm, mass, smooth, joints, start, on_arm, stiff, force = row
+            stiff, force = self._alone(left, takes, row)
+            return _way(stiff[self._places], force, rows_of(row.joints), row.start)
 
-            def subtract(total: tuple[Array, Array], of_object: Any) -> tuple[tuple[Array, Array], None]:
-                i, half, touched = of_object
+        found: Array = jax.lax.map(one, self._rows(problem, here, left))
+        return found
 
-                def less(total: tuple[Array, Array]) -> tuple[Array, Array]:
-                    wide = left.wide[len(self._there) * i + arm]
-                    return total[0] - jnp.sum(wide[:, first] * wide[:, second], 0), total[1] - wide.T @ half
+    def bridged(self, problem: Problem, here: Array, left: Left) -> Array:
+        """Return the ways [a, m] of arms that one object joins and nothing else."""
+        a, k = len(self._there), len(left.half)
+        bridge = jnp.argmax(left.touched.sum(1) > 1)
+        rows = self._rows(problem, here, left)
+        stiff, force = jax.lax.map(partial(self._alone, left, np.arange(k) != bridge), rows)
 
-                return jax.lax.cond(touched[arm], less, lambda total: total, total), None
+        def wide(arm: Array) -> Array:
+            found = left.wide[a * bridge + arm]
+            return found if a == 2 else jnp.where(left.touched[bridge, arm], found, 0.0)
 
-            whole = jax.lax.cond(on_arm, lambda: mass + stiff, lambda: mass)
-            total = whole, smooth + force - mass[self._places] @ start
-            (stiff, force), _ = jax.lax.scan(subtract, total, (jnp.arange(len(left.half)), left.half, left.touched))
-            return _way(stiff[self._places], force, rows_of(joints), start)
+        own = Own(rows.number, stiff, force, problem.joints, here)
+        return Bridge(own, wide, partial(self._resisted, problem), self._places).solve(ITERATIONS[0])
 
+    def _rows(self, problem: Problem, here: Array, left: Left) -> _Row:
         arms = jnp.arange(len(self._there))
-        rows = arms, problem.mass, problem.smooth, problem.joints, here, left.on_arm, left.stiff, left.force
-        found: Array = jax.lax.map(one, rows)
+        contacts = left.on_arm, left.stiff, left.force
+        return _Row(arms, problem.mass, problem.smooth, problem.joints, here, *contacts)
+
+    def _alone(self, left: Left, takes: Any, row: _Row) -> tuple[Array, Array]:
+        """Return what is left of an arm's matrix, its lower half, and of the forces on it.
+
+        `takes` [k] are those objects that take something from the matrix.
+        """
+        first, second = np.tril_indices(len(self._places))
+
+        def subtract(total: tuple[Array, Array], of_object: Any) -> tuple[tuple[Array, Array], None]:
+            i, half, touched, takes = of_object
+
+            def less(total: tuple[Array, Array]) -> tuple[Array, Array]:
+                wide = left.wide[len(self._there) * i + row.number]
+                lower = lambda whole: whole - jnp.sum(wide[:, first] * wide[:, second], 0)  # noqa: E731
+                return jax.lax.cond(takes, lower, lambda whole: whole, total[0]), total[1] - wide.T @ half
+
+            return jax.lax.cond(touched[row.number], less, lambda total: total, total), None
+
+        whole = jax.lax.cond(row.on_arm, lambda: row.mass + row.stiff, lambda: row.mass)
+        total = whole, row.smooth + row.force - row.mass[self._places] @ row.start
+        objects = jnp.arange(len(left.half)), left.half, left.touched, jnp.asarray(takes)
+        found: tuple[Array, Array] = jax.lax.scan(subtract, total, objects)[0]
         return found
 
     def slopes(self, problem: Problem, here: Array, way: Array, force: Array) -> tuple[Array, Array, Array]:
@@ -134,12 +176,7 @@ class Arms:
 
     def resisted(self, problem: Problem, here: Array, way: Array, length: Array) -> tuple[Array, Array]:
         """Return the slope of friction and limits of joints at a length of ways, and how much it grows per length."""
-
-        def add(sums: tuple[Array, Array], row: Any) -> tuple[tuple[Array, Array], None]:
-            joints, here, way = row
-            return _added(sums, rows_of(joints), here, way, length), None
-
-        found: tuple[Array, Array] = jax.lax.scan(add, (jnp.float32(0.0),) * 2, (problem.joints, here, way))[0]
+        found = self._resisted(problem, here, way, length)
         if not len(problem.between.low):
             return found
 
@@ -159,6 +196,16 @@ class Arms:
             return none
         pressed = lambda arms: row_forces(_flat(problem.between), arms.ravel())  # noqa: E731
         return jax.lax.cond(problem.overlap, pressed, lambda _: none, arms)
+
+    def _resisted(self, problem: Problem, here: Array, way: Array, length: Array) -> tuple[Array, Array]:
+        """Return the same without contacts of arms with arms."""
+
+        def add(sums: tuple[Array, Array], row: Any) -> tuple[tuple[Array, Array], None]:
+            joints, here, way = row
+            return _added(sums, rows_of(joints), here, way, length), None
+
+        found: tuple[Array, Array] = jax.lax.scan(add, (jnp.float32(0.0),) * 2, (problem.joints, here, way))[0]
+        return found
 
     def _power(self, problem: Problem, here: Array, way: Array) -> Array:
         """Return the power along ways of contacts of arms with arms, []."""

@@ -232,7 +232,7 @@ class Newton:
     def _direction(self, problem: Problem, here: Point, pressed: Pressed, local: _Local) -> Point:
         """Return the way to the least cost if contacts are linear functions; friction and limits of joints are not.
 
-        Objects are eliminated, arms solved, each alone if nothing joins them, and objects found from them.
+        Objects are eliminated, arms solved, and objects found from them.
         """
         touched, pressing = local.met, pressed.normal > 0
         linked = self._linked(problem, pressing)
@@ -242,11 +242,20 @@ class Newton:
         if len(self._dofs):
             on = touched | (linked & touched.any(0))  # what an object touches moves those that it touches
             left = Left(local.arm, local.on_arm, local.arm_force, gone.half, gone.wide, on)
-            joined = (on.sum(1) > 1).any() | self._sides(problem, here.arms).any()
-            each = lambda left: self._arms.each(problem, here.arms, left)  # noqa: E731
-            together = lambda left: self._arms.together(problem, here.arms, left)  # noqa: E731
-            found = jax.lax.cond(joined, together, each, left) if len(self._dofs) > 1 else each(left)
+            found = self._ways(problem, here.arms, left)
         return Point(found, elimination.ways(gone, found, touched, linked))
+
+    def _ways(self, problem: Problem, here: Array, left: Left) -> Array:
+        """Return the ways [a, m] of arms: of each alone, of those that one object joins, or of all at once."""
+        each, bridged, together = (
+            lambda left, ways=ways: ways(problem, here, left)
+            for ways in (self._arms.each, self._arms.bridged, self._arms.together)
+        )
+        if len(self._dofs) < 2:
+            return each(left)
+        bridges, pressed = left.touched.sum(1) > 1, self._sides(problem, here).any()
+        joined = lambda left: jax.lax.cond(pressed | (bridges.sum() > 1), together, bridged, left)  # noqa: E731
+        return jax.lax.cond(pressed | bridges.any(), joined, each, left)
 
     def _linked(self, problem: Problem, pressing: Any = True) -> Array:
         """Return whether any contact joins two objects, [], of those that are `pressing`, [s]."""
