@@ -1,7 +1,7 @@
 """The way of arms that one object joins: each arm is factorised alone, and six numbers of the object join them.
 
-Without the object, the matrix of all arms has one block B for each arm. The object takes W.T @ W from it, where W is six
-rows. By Woodbury's identity (W. Hager, "Updating the inverse of a matrix", SIAM Review 31, 1989) the solution of
+Without the object, the matrix B of all arms has one block for each arm. The object takes W.T @ W from it, where W is
+six rows. By Woodbury's identity (W. Hager, "Updating the inverse of a matrix", SIAM Review 31, 1989) the solution x of
 (B - W.T @ W) @ x = e is that of B @ x = e + W.T @ z, where (1 - W @ inv(B) @ W.T) @ z = W @ inv(B) @ e. So no matrix is
 larger than that of an arm, and all arms share the code of one, in loops.
 """
@@ -43,7 +43,7 @@ class _State(NamedTuple):
     moved: Array
     """W times the ways, [6]."""
     settled: Array
-    count: Array
+    steps: Array
 
 
 class Bridge:
@@ -70,7 +70,7 @@ class Bridge:
         """Return the ways [a, m], by at most `iterations` Newton steps: the last one is whole and changes no side."""
 
         def unsettled(state: _State) -> Array:
-            return ~state.settled & (state.count < iterations)
+            return ~state.settled & (state.steps < iterations)
 
         none = _State(jnp.zeros_like(self._own.start), jnp.zeros(6), jnp.bool_(False), jnp.int32(0))
         return jax.lax.while_loop(unsettled, self._newton, none).ways
@@ -92,10 +92,10 @@ class Bridge:
         (moved, begin, whole), steps = jax.lax.scan(step_of, start, (self._own, state.ways, excess, factors))
         part = lambda: self._length(state, steps, moved, begin)  # noqa: E731
         length = jax.lax.cond(whole, lambda: jnp.float32(1.0), part)
-        return _State(state.ways + length * steps, state.moved + length * moved, whole, state.count + 1)
+        return _State(state.ways + length * steps, state.moved + length * moved, whole, state.steps + 1)
 
     def _factorise(self, state: _State) -> tuple[Array, Array, Array]:
-        """Return the forces that are left [a, m], the factor of each arm's matrix [a, m, m], and what joins them [6]."""
+        """Return the forces left over [a, m], the factors of the arms' matrices [a, m, m], and what joins them [6]."""
 
         def factorise(sums: tuple[Array, Array], row: Any) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
             own, way = row
