@@ -11,9 +11,10 @@ from tests.helpers.fused_kernels import gpu_code
 from tests.helpers.object_parity import Beside
 
 COUNT, STEPS, EVERY = 16, 40, 8
+LARGER = "bimanual_psm_needle", "bimanual_psm_pegs", "trimanual_psm_ecm_needle", "trimanual_psm_ecm_pegs"
 
 
-@pytest.mark.parametrize("name", ["psm_needle", pytest.param("bimanual_psm_needle", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", ["psm_needle", *(pytest.param(name, marks=pytest.mark.slow) for name in LARGER)])
 def test_a_step_with_objects_is_that_of_the_reference(name: str) -> None:
     follow_grasps(Beside(name, COUNT))
 
