@@ -60,8 +60,9 @@ class _Drawn(NamedTuple):
     here: jax.Array
     left: Left
     whole: np.ndarray
-    """The matrix of all joints, then all objects, and the forces on them."""
+    """The matrix of all joints, then all objects."""
     force: np.ndarray
+    """The forces on them, likewise."""
 
 
 def _drawn(rng: np.random.Generator, arms: int, objects: int, bridge: int) -> _Drawn:

@@ -198,7 +198,7 @@ class Arms:
         return jax.lax.cond(problem.overlap, pressed, lambda _: none, arms)
 
     def _resisted(self, problem: Problem, here: Array, way: Array, length: Array) -> tuple[Array, Array]:
-        """Return the same without contacts of arms with arms."""
+        """Return what `resisted` does, but for contacts of arms with arms."""
 
         def add(sums: tuple[Array, Array], row: Any) -> tuple[tuple[Array, Array], None]:
             joints, here, way = row

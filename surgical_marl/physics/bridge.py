@@ -15,11 +15,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.lax.linalg import triangular_solve
 
-from surgical_marl.physics.factor import cholesky
+from surgical_marl.physics.factor import back, cholesky, forward
 from surgical_marl.physics.search import search
-from surgical_marl.physics.solver import JointRows, Rows, rows_of
+from surgical_marl.physics.solver import JointRows, Rows, giving, rows_of, unbounded_forces
 
 
 class Own(NamedTuple):
@@ -81,7 +80,7 @@ class Bridge:
 
         def step_of(sums: tuple[Array, Array, Array], row: Any) -> tuple[tuple[Array, Array, Array], Array]:
             own, way, excess, factor = row
-            across, (rows, force) = self._wide(own.number), _unbounded(own, way)
+            across, (rows, force) = self._wide(own.number), _rows(own, way)  # again: quicker than to keep them
             step = _solved(factor, excess + across.T @ joined)
             end = force - rows.impedance * (rows.jacobian @ step)
             kept = ((force > rows.low) == (end > rows.low)) & ((force < rows.high) == (end < rows.high))
@@ -99,12 +98,12 @@ class Bridge:
 
         def factorise(sums: tuple[Array, Array], row: Any) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
             own, way = row
-            matrix, across, (rows, force) = own.stiff[self._places], self._wide(own.number), _unbounded(own, way)
+            matrix, across, (rows, force) = own.stiff[self._places], self._wide(own.number), _rows(own, way)
             excess = own.force + rows.jacobian.T @ jnp.clip(force, rows.low, rows.high)
             excess += across.T @ state.moved - matrix @ way
-            gives = jnp.where((force > rows.low) & (force < rows.high), rows.impedance, 0.0)
+            gives = giving(rows, force)
             factor = cholesky(matrix + rows.jacobian.T @ (gives[:, None] * rows.jacobian))
-            eased = _lower(factor, jnp.concatenate([excess[:, None], across.T], 1))
+            eased = forward(factor, jnp.concatenate([excess[:, None], across.T], 1))
             joined = sums[0] - eased[:, 1:].T @ eased[:, 1:], sums[1] + eased[:, 1:].T @ eased[:, 0]
             return joined, (excess, factor)
 
@@ -132,16 +131,12 @@ class Bridge:
         return search(begin, 0.0, measure, none).length
 
 
-def _unbounded(own: Own, way: Array) -> tuple[Rows, Array]:
+def _rows(own: Own, way: Array) -> tuple[Rows, Array]:
     """Return friction and limits of an arm's joints as rows, and their forces at a way if they had no bounds."""
     rows = rows_of(own.joints)
-    return rows, rows.impedance * (rows.reference - rows.jacobian @ (own.start + way))
-
-
-def _lower(factor: Array, right: Array) -> Array:
-    return triangular_solve(factor, right, left_side=True, lower=True)
+    return rows, unbounded_forces(rows, own.start + way)
 
 
 def _solved(factor: Array, right: Array) -> Array:
     """Return x [n] with factor @ factor.T @ x = right."""
-    return triangular_solve(factor, _lower(factor, right[:, None]), left_side=True, lower=True, transpose_a=True)[:, 0]
+    return back(factor, forward(factor, right))

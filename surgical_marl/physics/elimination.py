@@ -7,9 +7,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jax.lax.linalg import triangular_solve
 
-from surgical_marl.physics.factor import cholesky, packed
+from surgical_marl.physics.factor import back, cholesky, forward, packed
 from surgical_marl.physics.rows import absent, put
 
 
@@ -74,12 +73,12 @@ def apart(own: Array, force: Array, coupling: Array, touched: Array) -> Eliminat
         factor = cholesky(own[packed(6)])
 
         def of_arm(wide: Array, arm: Array) -> tuple[Array, None]:
-            divided = lambda wide: put(wide, a * i + arm, _lower(factor, wide[a * i + arm]))  # noqa: E731
+            divided = lambda wide: put(wide, a * i + arm, forward(factor, wide[a * i + arm]))  # noqa: E731
             return jax.lax.cond(touched[arm], divided, lambda wide: wide, wide), None
 
         if coupling.size:
             wide = jax.lax.scan(of_arm, wide, jnp.arange(a))[0]
-        return wide, (_divided(factor, force), factor)
+        return wide, (forward(factor, force), factor)
 
     rows = absent(jax.ShapeDtypeStruct((_size(k, a, m) if k > 1 else 0,), force.dtype))
     wide, (half, factor) = jax.lax.scan(one, coupling, (jnp.arange(k), own, force, touched))
@@ -97,7 +96,7 @@ def ways_apart(found: Eliminated, arms: Array, touched: Array) -> Array:
             return jax.lax.cond(touched[arm], less, lambda left: left, left), None
 
         left = jax.lax.scan(of_arm, half, jnp.arange(len(arms)))[0] if len(arms) else half
-        return _back(factor, left)
+        return back(factor, left)
 
     found_ways: Array = jax.lax.map(one, (jnp.arange(len(touched)), found.half, found.factor, touched))
     return found_ways
@@ -137,7 +136,7 @@ def touching(blocks: Blocks, force: Array, coupling: Array, touched: Array) -> E
 
         def divide(rows: Array, at: Array) -> tuple[Array, None]:
             column = _columns(rows, at, 1)[0]
-            divided = lambda rows: _put(rows, at, _divided(factor, column))  # noqa: E731
+            divided = lambda rows: _put(rows, at, forward(factor, column))  # noqa: E731
             return jax.lax.cond((column != 0).any(), divided, lambda rows: rows, rows), None
 
         def subtract(rows: Array, i: Array) -> tuple[Array, None]:
@@ -178,7 +177,7 @@ def ways_touching(found: Eliminated, arms: Array) -> Array:
 
         left = jax.lax.scan(add, jnp.zeros(6), jnp.arange(width))[0]  # those up to j are still 0
         factor = _columns(rows, j * (width + 6), 6)
-        return jax.lax.dynamic_update_slice(ways, _back(factor, left), (6 * j,)), None
+        return jax.lax.dynamic_update_slice(ways, back(factor, left), (6 * j,)), None
 
     all_ = jnp.concatenate([jnp.zeros(6 * k), -jnp.ones(1), arms.ravel()])
     return jax.lax.scan(one, all_, jnp.arange(k), reverse=True)[0][: 6 * k].reshape(k, 6)
@@ -196,15 +195,3 @@ def _columns(rows: Array, at: Array, count: int) -> Array:
 
 def _put(rows: Array, at: Array, columns: Array) -> Array:
     return jax.lax.dynamic_update_slice(rows, columns.ravel(), (6 * at,))
-
-
-def _lower(factor: Array, right: Array) -> Array:
-    return triangular_solve(factor, right, left_side=True, lower=True)
-
-
-def _divided(factor: Array, right: Array) -> Array:
-    return _lower(factor, right[:, None])[:, 0]
-
-
-def _back(factor: Array, left: Array) -> Array:
-    return triangular_solve(factor, left[:, None], left_side=True, lower=True, transpose_a=True)[:, 0]

@@ -1,10 +1,11 @@
-"""Symmetric matrices: their lower halves, and the Cholesky factor of what is positive definite but for float32."""
+"""Symmetric matrices: lower halves, Cholesky factors of what is positive definite but for float32, and their use."""
 
 from __future__ import annotations
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.lax.linalg import triangular_solve
 
 LEAST = 1e-7
 """Least pivot, as a share of the element of the diagonal that it is left of. What is smaller is rounding: of a light
@@ -32,3 +33,15 @@ def cholesky(matrix: Array) -> Array:
         columns.append(jnp.concatenate([jnp.zeros(j), pivot[None], below]))
         left = left[1:, 1:] - below[:, None] * below
     return jnp.stack(columns, 1)
+
+
+def forward(factor: Array, right: Array) -> Array:
+    """Return x [n] or [n, k] with factor @ x = right, for a lower factor [n, n]."""
+    columns = right.reshape(len(right), -1)
+    return triangular_solve(factor, columns, left_side=True, lower=True).reshape(right.shape)
+
+
+def back(factor: Array, right: Array) -> Array:
+    """Return x [n] or [n, k] with factor.T @ x = right, for a lower factor [n, n]."""
+    columns = right.reshape(len(right), -1)
+    return triangular_solve(factor, columns, left_side=True, lower=True, transpose_a=True).reshape(right.shape)

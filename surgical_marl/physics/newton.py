@@ -8,6 +8,7 @@ is left is as large as the arms, whatever the number of objects. Objects that to
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -247,10 +248,8 @@ class Newton:
 
     def _ways(self, problem: Problem, here: Array, left: Left) -> Array:
         """Return the ways [a, m] of arms: of each alone, of those that one object joins, or of all at once."""
-        each, bridged, together = (
-            lambda left, ways=ways: ways(problem, here, left)
-            for ways in (self._arms.each, self._arms.bridged, self._arms.together)
-        )
+        arms = self._arms
+        each, bridged, together = (partial(ways, problem, here) for ways in (arms.each, arms.bridged, arms.together))
         if len(self._dofs) < 2:
             return each(left)
         bridges, pressed = left.touched.sum(1) > 1, self._sides(problem, here).any()

@@ -142,7 +142,7 @@ def solve(
     """
 
     def newton(qacc: Array) -> tuple[Array, Array]:
-        unbounded = rows.impedance * (rows.reference - rows.jacobian @ qacc)
+        unbounded = unbounded_forces(rows, qacc)
         force = jnp.clip(unbounded, rows.low, rows.high)
         above, below = unbounded > rows.low, unbounded < rows.high
         rest = mass @ qacc - smooth
@@ -215,8 +215,7 @@ def _differentiate(
         return smooth + rows.jacobian.T @ row_forces(rows, qacc) - mass @ qacc
 
     _, pull = jax.jvp(excess, (mass, smooth, rows), tangents[:3])
-    unbounded = rows.impedance * (rows.reference - rows.jacobian @ qacc)
-    gives = jnp.where((unbounded > rows.low) & (unbounded < rows.high), rows.impedance, 0.0)
+    gives = giving(rows, unbounded_forces(rows, qacc))
     change = solve_positive(mass + rows.jacobian.T @ (gives[:, None] * rows.jacobian), pull)
     _, push = jax.jvp(row_forces, (rows, qacc), (tangents[2], change))
     return (qacc, force), (change, push)
@@ -224,7 +223,17 @@ def _differentiate(
 
 def row_forces(rows: Rows, qacc: Array) -> Array:
     """Return the force of each row [r] at an acceleration [n]."""
-    return jnp.clip(rows.impedance * (rows.reference - rows.jacobian @ qacc), rows.low, rows.high)
+    return jnp.clip(unbounded_forces(rows, qacc), rows.low, rows.high)
+
+
+def unbounded_forces(rows: Rows, qacc: Array) -> Array:
+    """Return the force that each row [r] would have at an acceleration [n] without bounds."""
+    return rows.impedance * (rows.reference - rows.jacobian @ qacc)
+
+
+def giving(rows: Rows, unbounded: Array) -> Array:
+    """Return by how much the force of each row [r] falls per acceleration along it, from what it is without bounds."""
+    return jnp.where((unbounded > rows.low) & (unbounded < rows.high), rows.impedance, 0.0)
 
 
 def _line_search(
