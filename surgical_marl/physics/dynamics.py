@@ -9,6 +9,7 @@ This is the only module that calls MJX. docs/physics.md says how a step is compu
 from __future__ import annotations
 
 import copy
+from functools import cache
 from typing import Any, NamedTuple
 
 import jax
@@ -56,7 +57,7 @@ class Dynamics:
     """MJX on a model of joints that have one degree of freedom each."""
 
     def __init__(self, model: mujoco.MjModel) -> None:
-        mjx = self._mjx = prepare_mjx()
+        mjx = prepare_mjx()
         smooth = copy.copy(model)
         smooth.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT  # `collision.py` detects collisions
         self.model, self._data = mjx.put_model(smooth), mjx.make_data(smooth)
@@ -72,18 +73,18 @@ class Dynamics:
 
     def pose(self, qpos: Array) -> Any:
         """Return MJX's data with the poses of all bodies, geoms and sites."""
-        return self._mjx.kinematics(self.model, self._data.replace(qpos=qpos))
+        return _stage("kinematics")(self.model, self._data.replace(qpos=qpos))
 
     def axes(self, qpos: Array) -> Any:
         """Return MJX's data with the axes of all joints, beside the poses."""
-        return self._mjx.com_pos(self.model, self.pose(qpos))
+        return _stage("com_pos")(self.model, self.pose(qpos))
 
     def forces(self, physics: Physics) -> Forces:
         """Compute all of `mjx.forward` except collision and solver."""
         qpos, qvel, warmstart, ctrl, _ = physics
         data = self._data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart, ctrl=ctrl)
         for stage in ("fwd_position", "fwd_velocity", "fwd_actuation"):
-            data = getattr(self._mjx, stage)(self.model, data)
+            data = _stage(stage)(self.model, data)
         smooth = data.qfrc_passive - data.qfrc_bias + data.qfrc_actuator
         return Forces(data, _internal(data).M, smooth, self._damping(data), self._rows(data))
 
@@ -144,6 +145,12 @@ class Dynamics:
         reference = -damping * (jacobian @ qvel) - stiffness * impedance * depth
         none = jnp.zeros_like(depth)
         return Rows(jacobian, 1 / resistance, reference, none, none + np.inf)
+
+
+@cache
+def _stage(name: str) -> Any:
+    """Return a function of MJX, which is traced once for all models of one structure."""
+    return jax.jit(getattr(prepare_mjx(), name))
 
 
 def _internal(data: Any) -> Any:

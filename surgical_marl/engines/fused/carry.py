@@ -11,15 +11,18 @@ class State:
     """The carry of a loop that is traced again and again, until it is known what a round changes.
 
     What no round changes is not carried. An array of which a round makes one in memory is carried there.
+
+    A loop within a loop is traced anew in each trial of the outer one. It begins with what its `last` trial found, and
+    the outer one has more that changes then: so trials of nested loops add up, and do not multiply.
     """
 
-    def __init__(self, g: Graph, carry: list[Traced]) -> None:
+    def __init__(self, g: Graph, carry: list[Traced], last: State | None = None) -> None:
         self._g, self._carry = g, carry
         self._dtypes = [dtype_of(g, x) for x in carry]
-        self._axes = [0] * len(carry)
+        self._axes = list(last._axes) if last else [0] * len(carry)
         """Of each array, how many axes are in memory."""
         self._starts = [self._packed(k, x) for k, x in enumerate(carry)]
-        self._varying = [[False] * len(starts) for starts in self._starts]
+        self._varying = [list(one) for one in last._varying] if last else [[False] * len(one) for one in self._starts]
         self._values: list[list[Value]] = []
 
     def _packed(self, k: int, x: Traced) -> list[Value]:

@@ -107,11 +107,11 @@ class Graph:
     def open_scope(self) -> None:
         """Share the nodes made from here on only among themselves.
 
-        What a branch computes is then computed in the branch, and need not be kept from before it. Nodes of the kinds
-        "load", "phi" and "out" from before are still shared.
+        What a branch computes is then computed in the branch, and need not be kept from before it. Inputs from before
+        are still shared.
         """
         self._scopes.append(self._known)
-        self._known = {key: value for key, value in self._known.items() if key[0] in ("load", "phi", "out")}
+        self._known = {}
 
     def close_scope(self) -> None:
         self._known = self._scopes.pop()

@@ -134,14 +134,23 @@ typedef unsigned char C __attribute__((ext_vector_type(SM_W)));
 #define STI(p,i,x) {I r_=(x);__builtin_memcpy(SM_AT(p,i),&r_,sizeof(I));}
 #define STU(p,i,x) {U r_=(x);__builtin_memcpy(SM_AT(p,i),&r_,sizeof(U));}
 #define STB(p,i,x) {C r_=__builtin_convertvector((x)&1,C);__builtin_memcpy(SM_AT(p,i),&r_,sizeof(C));}
-#define LANEWISE(T,e) ({T r_;for(int l=0;l<SM_W;++l)r_[l]=(e);r_;})
+#define LANE(k,code) {enum{l=k};code}
+#define EACH(code) LANE(0,code)LANE(1,code)LANE(2,code)LANE(3,code)LANE(4,code)LANE(5,code)LANE(6,code)LANE(7,code)
+#define LANEWISE(T,e) ({T r_;EACH(r_[l]=(e);)r_;})
+#ifdef __AVX2__
+#define GATHER(T,p,i) ((T)__builtin_ia32_gatherd_d256(I{},(const int*)(p),(i),SPLATI(-1),4))
+#define TABLEF(k,i) GATHER(F,reals.data+(k),i)
+#define TABLEI(k,i) GATHER(I,wholes.data+(k),i)
+#define AT(T,a,i) GATHER(T,a,(i)*SPLATI(SM_W)+(I{0,1,2,3,4,5,6,7}))
+#else
 #define TABLEF(k,i) ({I i_=(i);LANEWISE(F,reals.data[k+i_[l]]);})
 #define TABLEI(k,i) ({I i_=(i);LANEWISE(I,wholes.data[k+i_[l]]);})
+#define AT(T,a,i) ({I i_=(i);LANEWISE(T,a[i_[l]][l]);})
+#endif
 #define ROWF(k,i) SPLAT(reals.data[k+(i)])
 #define ROWI(k,i) SPLATI(wholes.data[k+(i)])
-#define AT(T,a,i) ({I i_=(i);LANEWISE(T,a[i_[l]][l]);})
 #define WITHIN(i,last) __builtin_elementwise_min(__builtin_elementwise_max((I)(i),SPLATI(0)),SPLATI(last))
-#define PUT(T,a,i,x) {I i_=(i);T r_=(x);for(int l=0;l<SM_W;++l)a[i_[l]][l]=r_[l];}
+#define PUT(T,a,i,x) {I i_=(i);T r_=(x);EACH(a[i_[l]][l]=r_[l];)}
 #define DIVF(a,b) ((a)/(b))
 #define DIVI(a,b) ((a)/(b))
 #define DIVU(a,b) ((a)/(b))

@@ -38,9 +38,11 @@ class Tracer:
     def __init__(self, graph: Graph) -> None:
         self.graph = graph
         self._around = 0  # the loops that are being traced, as bits
+        self._place: tuple[int, ...] = ()  # of the equation that is being traced, in the function
+        self._states: dict[tuple[int, ...], State] = {}  # of the loop at each place, when it was last traced
 
-    def run(self, closed: Any, args: Sequence[Any]) -> list[Traced]:
-        """Return the results of a closed jaxpr.
+    def run(self, closed: Any, args: Sequence[Any], part: int = 0) -> list[Traced]:
+        """Return the results of a closed jaxpr: a `part`, such as a side or a round, of the equation being traced.
 
         Raises:
             Unsupported: there is no rule for something in it. The error names the line of the source.
@@ -55,7 +57,9 @@ class Tracer:
                 return np.asarray(variable.val, aval.dtype)
             return known[variable]
 
-        for equation in jaxpr.eqns:
+        around = self._place
+        for number, equation in enumerate(jaxpr.eqns):
+            self._place = (*around, part, number)
             try:
                 results = self._equation(equation, [read(variable) for variable in equation.invars])
             except Unsupported as error:
@@ -63,6 +67,7 @@ class Tracer:
                     raise
                 raise Unsupported(error.what, source_info_util.summarize(equation.source_info)) from None
             known.update(zip(equation.outvars, results, strict=True))
+        self._place = around
         return [read(variable) for variable in jaxpr.outvars]
 
     def _equation(self, equation: Any, xs: list[Traced]) -> list[Traced]:
@@ -108,16 +113,18 @@ class Tracer:
     def _cond(self, branches: Any, which: Traced, xs: list[Traced]) -> list[Traced]:
         g = self.graph
         if not isinstance(which, Symbolic):
-            return self.run(branches[min(max(int(which), 0), len(branches) - 1)], xs)
+            return self._side(branches, min(max(int(which), 0), len(branches) - 1), xs)
         index = int(which.ids)
         if len(branches) > 2:  # one against the rest, and so on
             first = g.compare("le", index, g.constant(np.int32(0)))
             rest = Symbolic(np.array(g.sub(index, g.constant(np.int32(1))), np.int32))
-            return self._branch(first, lambda: self._cond(branches[1:], rest, xs), lambda: self.run(branches[0], xs))
-        condition = convert(g, index, "b")
-        if condition < 0:
-            return self.run(branches[int(g.constants[~condition])], xs)
-        return self._branch(condition, *(lambda b=b: self.run(b, xs) for b in branches))
+            return self._branch(first, lambda: self._cond(branches[1:], rest, xs), lambda: self._side(branches, 0, xs))
+        return self._branch(
+            convert(g, index, "b"), lambda: self._side(branches, 0, xs), lambda: self._side(branches, 1, xs)
+        )
+
+    def _side(self, branches: Any, which: int, xs: list[Traced]) -> list[Traced]:
+        return self.run(branches[which], xs, which - len(branches))
 
     def _branch(
         self, condition: Value, other: Callable[[], list[Traced]], chosen: Callable[[], list[Traced]]
@@ -172,7 +179,7 @@ class Tracer:
             return self._loop(carry, round_, length=length, rows=len(rows) + written, backwards=params["reverse"])
         collected: list[list[Traced]] = [[] for _ in range(written)]
         for i in range(length)[:: -1 if params["reverse"] else 1]:
-            out = self.run(body, [*constants, *carry, *(_row(self.graph, x, i) for x in rows)])
+            out = self.run(body, [*constants, *carry, *(_row(self.graph, x, i) for x in rows)], i)
             carry = out[:carried]
             for column, value in zip(collected, out[carried:], strict=True):
                 column.append(value)
@@ -196,7 +203,7 @@ class Tracer:
         test, body = params["cond_jaxpr"], params["body_jaxpr"]
 
         def condition(c: list[Traced]) -> Traced:
-            return self.run(test, test_constants + c)[0]
+            return self.run(test, test_constants + c, -1)[0]
 
         return self._loop(carry, lambda c, _: self.run(body, constants + c), condition)
 
@@ -213,7 +220,8 @@ class Tracer:
 
         `rows` is how many arrays have rows that the body reads or writes.
         """
-        g, state = self.graph, State(self.graph, carry)
+        g, state = self.graph, State(self.graph, carry, self._states.get(self._place))
+        self._states[self._place] = state
         while True:
             # unknown while the loop is tried: what a round changes
             loop, number, around = Loop([], length=length, around=self._around), len(g.groups), self._around
