@@ -19,10 +19,12 @@ class State:
     def __init__(self, g: Graph, carry: list[Traced], last: State | None = None) -> None:
         self._g, self._carry = g, carry
         self._dtypes = [dtype_of(g, x) for x in carry]
-        self._axes = list(last._axes) if last else [0] * len(carry)
+        self._axes: list[int] = list(last._axes) if last else [0] * len(carry)
         """Of each array, how many axes are in memory."""
         self._starts = [self._packed(k, x) for k, x in enumerate(carry)]
-        self._varying = [list(one) for one in last._varying] if last else [[False] * len(one) for one in self._starts]
+        self._varying: list[list[bool]] = (
+            [list(one) for one in last._varying] if last else [[False] * len(starts) for starts in self._starts]
+        )
         self._values: list[list[Value]] = []
 
     def _packed(self, k: int, x: Traced) -> list[Value]:
