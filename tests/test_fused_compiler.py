@@ -58,6 +58,34 @@ def test_a_field_is_not_stored_before_it_is_loaded() -> None:
     np.testing.assert_allclose(run(function, *columns, in_place=True), expected, rtol=1e-6)
 
 
+def test_nothing_is_loaded_behind_a_store() -> None:
+    """A load behind a store can't begin before it; in branches, which few take, it may have to."""
+    columns = tuple(RNG.uniform(1, 2, (3, 5)).astype(np.float32))
+
+    def function(a: Any, b: Any, c: Any) -> Any:
+        first = lax.fori_loop(0, 3, lambda k, x: x * x, a)
+        return first, lax.fori_loop(0, 3, lambda k, x: x * x, b + first), b * c
+
+    code = body(function, *columns, vector=False)
+    memory = re.findall(r"\b(LD|ST)F\((?:state|outs),", code)
+    assert memory == ["LD"] * 3 + ["ST"] * 3
+
+
+def test_loops_in_loops_are_not_traced_in_all_combinations() -> None:
+    """Each loop is traced until it is known what its rounds change, and an inner loop remembers what it changes."""
+
+    def nested(depth: int) -> Callable[[Any], Any]:
+        if not depth:
+            return lambda x: x.at[0].set(1.5 * x[0] + x[1])
+        inner = nested(depth - 1)
+        return lambda x: lax.fori_loop(0, 3, lambda _, x: inner(x).at[depth].add(x[depth - 1]), x)
+
+    tried = [len(make_stores(nested(depth), (np.ones((4, 9), np.float32),))[0].groups) for depth in (2, 4, 8)]
+    assert tried[2] < 4 * tried[1] < 16 * tried[0], "doubling the depth may square their number, and no more"
+    column = np.ones((4, 9), np.float32)
+    np.testing.assert_allclose(run(nested(4), column), jax.vmap(nested(4))(column), rtol=1e-5)
+
+
 def test_many_tables() -> None:
     """They share an array of each dtype; equal ones are there once."""
     reals = RNG.normal(size=(30, 40)).astype(np.float32)

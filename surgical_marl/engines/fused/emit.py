@@ -14,6 +14,7 @@ import numpy as np
 
 from surgical_marl.engines.fused.emit_arrays import TYPES, ArrayEmitter
 from surgical_marl.engines.fused.graph import Branch, Graph, Loop, Value
+from surgical_marl.engines.fused.memory_order import order_memory
 from surgical_marl.engines.fused.preludes import WAYS, is_long, large_branches
 from surgical_marl.engines.fused.schedule import Scheduler
 
@@ -67,7 +68,7 @@ class Emitter(ArrayEmitter):
         """Branches so far whose sides keep environments apart."""
 
     def body(self) -> str:
-        self._postpone_stores()
+        order_memory(self.graph, self.schedule, self.stores)
         self._wait(0, self._region(0, self._store))
         if self.watch:
             # Adding 0 times each number leaves 0, or NaN if one of them was NaN or infinite.
@@ -77,23 +78,6 @@ class Emitter(ArrayEmitter):
         if large_branches(self.lines):
             self.lines = ["I work_=SPLATI(0),ways_=SPLATI(0);", *self.lines, "STI(work,0,WORKED)"]
         return "\n".join(self.lines)
-
-    def _postpone_stores(self) -> None:
-        """Put each store after the last load of the same field."""
-        items = self.schedule.regions[0].items
-        after = {field: at + 0.5 for at, item in enumerate(items) for field in self._loads(*item)}
-        places = [
-            max(at, after.get(self.stores[k][:2], 0)) if kind == "result" else at for at, (kind, k) in enumerate(items)
-        ]
-        items[:] = [items[at] for at in sorted(range(len(items)), key=places.__getitem__)]
-
-    def _loads(self, kind: str, index: int) -> Iterator[tuple[str, int]]:
-        if kind == "node" and self.graph.ops[index] == "load":
-            yield self.graph.args[index]
-        elif kind == "group":
-            for region in self.schedule.inside[index]:
-                for item in self.schedule.regions[region].items:
-                    yield from self._loads(*item)
 
     def _region(self, number: int, result: Any) -> list[int]:
         """Write a region. Return where its long branches and loops end, as numbers of lines."""
