@@ -68,6 +68,7 @@ class Graph:
         self._constant_ids: dict[tuple[str, Any], Value] = {}
         self._table_numbers: dict[tuple[str, bytes], int] = {}
         self._known: dict[tuple[Any, ...], Value] = {}
+        self._loads: dict[tuple[Any, ...], Value] = {}  # in any scope
         self._scopes: list[dict[tuple[Any, ...], Value]] = []
         self._bounds: dict[Value, tuple[int, int] | None] = {}
         self.zero, self.one = self.constant(np.float32(0)), self.constant(np.float32(1))
@@ -91,10 +92,10 @@ class Graph:
 
     def node(self, op: str, *args: Any, kind: str) -> Value:
         """Return a node as it is, not simplified; equal nodes are shared."""
-        key = (op, kind, *args)
-        found = self._known.get(key)
+        key, known = (op, kind, *args), self._loads if op == "load" else self._known
+        found = known.get(key)
         if found is None:
-            found = self._known[key] = self.fresh(op, *args, kind=kind)
+            found = known[key] = self.fresh(op, *args, kind=kind)
         return found
 
     def fresh(self, op: str, *args: Any, kind: str) -> Value:
