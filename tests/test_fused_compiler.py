@@ -81,7 +81,7 @@ def test_loops_in_loops_are_not_traced_in_all_combinations() -> None:
         return lambda x: lax.fori_loop(0, 3, lambda _, x: inner(x).at[depth].add(x[depth - 1]), x)
 
     tried = [len(make_stores(nested(depth), (np.ones((4, 9), np.float32),))[0].groups) for depth in (2, 4, 8)]
-    assert tried[2] < 4 * tried[1] < 16 * tried[0], "doubling the depth may square their number, and no more"
+    assert tried[2] < 4 * tried[1] < 16 * tried[0], "twice the depth may take four times as many, and no more"
     column = np.ones((4, 9), np.float32)
     np.testing.assert_allclose(run(nested(4), column), jax.vmap(nested(4))(column), rtol=1e-5)
 

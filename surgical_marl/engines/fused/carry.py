@@ -12,8 +12,9 @@ class State:
 
     What no round changes is not carried. An array of which a round makes one in memory is carried there.
 
-    A loop within a loop is traced anew in each trial of the outer one. It begins with what its `last` trial found, and
-    the outer one has more that changes then: so trials of nested loops add up, and do not multiply.
+    A loop within a loop is traced anew in each trial of the outer one. As the outer one changes at least as much as in
+    its trial before, so does the inner one: it begins with what its `last` state found. So trials of nested loops add
+    up and do not multiply.
     """
 
     def __init__(self, g: Graph, carry: list[Traced], last: State | None = None) -> None:

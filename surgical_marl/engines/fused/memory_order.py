@@ -9,7 +9,7 @@ from surgical_marl.engines.fused.schedule import Schedule
 
 
 def order_memory(graph: Graph, schedule: Schedule, stores: list[tuple[str, int, Value]]) -> None:
-    """Put each load before the first store, unless it is in a branch or loop, and each store after its last load.
+    """Put loads before the first store, except those in branches and loops, and a store behind all loads of its field.
 
     For all that a compiler knows, a store may change what any load behind it reads. So such a load can't begin early,
     and a thread would wait for memory again and again.
@@ -20,13 +20,16 @@ def order_memory(graph: Graph, schedule: Schedule, stores: list[tuple[str, int, 
         stores: (buffer, field, value); a "result" in the first region is the number of one of them.
     """
     items = schedule.regions[0].items
+
+    def move(places: dict[int, float]) -> None:
+        """Move some items to new places, between the others."""
+        items[:] = [items[at] for at in sorted(range(len(items)), key=lambda at: places.get(at, at))]
+
     first = next((at for at, (kind, _) in enumerate(items) if kind == "result"), len(items))
     late = [at for at, (kind, k) in enumerate(items) if at > first and kind == "node" and graph.ops[k] == "load"]
-    places: dict[int, float] = dict.fromkeys(late, first - 0.5)
-    items[:] = [items[at] for at in sorted(range(len(items)), key=lambda at: places.get(at, at))]
+    move(dict.fromkeys(late, first - 0.5))
     after = {field: at + 0.5 for at, item in enumerate(items) for field in _loads(graph, schedule, *item)}
-    places = {at: max(at, after.get(stores[k][:2], 0)) for at, (kind, k) in enumerate(items) if kind == "result"}
-    items[:] = [items[at] for at in sorted(range(len(items)), key=lambda at: places.get(at, at))]
+    move({at: max(at, after.get(stores[k][:2], 0)) for at, (kind, k) in enumerate(items) if kind == "result"})
 
 
 def _loads(graph: Graph, schedule: Schedule, kind: str, index: int) -> Iterator[tuple[str, int]]:

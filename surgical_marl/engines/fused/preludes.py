@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 LANES = 8
-"""Environments in a vector on a CPU: 32 bytes of float32, an AVX register."""
+"""Environments in a vector on a CPU: 32 bytes of float32, an AVX register, and what `gatherd_d256` loads at once."""
 BRANCHES = 8
 """So many large branches make code long: all threads of a block should be at the same place of it."""
 WAYS = 14
@@ -114,6 +114,9 @@ typedef int I __attribute__((ext_vector_type(SM_W)));
 typedef unsigned int U __attribute__((ext_vector_type(SM_W)));
 typedef int B __attribute__((ext_vector_type(SM_W)));
 typedef unsigned char C __attribute__((ext_vector_type(SM_W)));
+#define LANE(k,code) {{enum{{l=k}};code}}
+#define EACH(code) {"".join(f"LANE({lane},code)" for lane in range(LANES))}
+#define LANE_NUMBERS (I{{{",".join(map(str, range(LANES)))}}})
 """
     + """
 #define SM_INF __builtin_inff()
@@ -134,14 +137,12 @@ typedef unsigned char C __attribute__((ext_vector_type(SM_W)));
 #define STI(p,i,x) {I r_=(x);__builtin_memcpy(SM_AT(p,i),&r_,sizeof(I));}
 #define STU(p,i,x) {U r_=(x);__builtin_memcpy(SM_AT(p,i),&r_,sizeof(U));}
 #define STB(p,i,x) {C r_=__builtin_convertvector((x)&1,C);__builtin_memcpy(SM_AT(p,i),&r_,sizeof(C));}
-#define LANE(k,code) {enum{l=k};code}
-#define EACH(code) LANE(0,code)LANE(1,code)LANE(2,code)LANE(3,code)LANE(4,code)LANE(5,code)LANE(6,code)LANE(7,code)
 #define LANEWISE(T,e) ({T r_;EACH(r_[l]=(e);)r_;})
 #ifdef __AVX2__
 #define GATHER(T,p,i) ((T)__builtin_ia32_gatherd_d256(I{},(const int*)(p),(i),SPLATI(-1),4))
 #define TABLEF(k,i) GATHER(F,reals.data+(k),i)
 #define TABLEI(k,i) GATHER(I,wholes.data+(k),i)
-#define AT(T,a,i) GATHER(T,a,(i)*SPLATI(SM_W)+(I{0,1,2,3,4,5,6,7}))
+#define AT(T,a,i) GATHER(T,a,(i)*SPLATI(SM_W)+LANE_NUMBERS)
 #else
 #define TABLEF(k,i) ({I i_=(i);LANEWISE(F,reals.data[k+i_[l]]);})
 #define TABLEI(k,i) ({I i_=(i);LANEWISE(I,wholes.data[k+i_[l]]);})

@@ -124,6 +124,7 @@ class Tracer:
         )
 
     def _side(self, branches: Any, which: int, xs: list[Traced]) -> list[Traced]:
+        """Return the results of one of the branches. As a part it counts from the last, as the first are split off."""
         return self.run(branches[which], xs, which - len(branches))
 
     def _branch(
