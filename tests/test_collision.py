@@ -31,7 +31,7 @@ def shapes_model() -> mujoco.MjModel:
 
 MODEL = shapes_model()
 PAIRS = Pairs(MODEL)
-compiled_closest = jax.jit(PAIRS.closest)
+compiled_closest = jax.jit(lambda xpos, xmat: PAIRS.closest(xpos, xmat, np.arange(PAIRS.count)))
 
 
 def check_closest(poses: np.ndarray, tolerance: float) -> None:
@@ -121,10 +121,11 @@ def clustered(count: int) -> tuple[mujoco.MjModel, Any]:
     pairs = Pairs(model)
 
     def deepest(xpos: Any, xmat: Any, cdof: Any, com: Any) -> Any:
-        closest = pairs.closest(xpos, xmat)
-        touching = pairs.deepest(SimpleNamespace(geom_xpos=xpos, geom_xmat=xmat, cdof=cdof, subtree_com=com), closest)
+        distance, by_arms = pairs.distance(xpos, xmat), pairs.distance_by_arms(xpos, xmat)
+        touching = pairs.deepest(SimpleNamespace(geom_xpos=xpos, geom_xmat=xmat, cdof=cdof, subtree_com=com), distance)
         forces = pairs.spread(touching.pair, np.arange(1, SLOTS + 1, dtype=np.float32))
-        return closest, touching, forces, pairs.overlap(xpos, xmat), pairs.overflow(closest)
+        closest = pairs.closest(xpos, xmat, np.arange(pairs.count))
+        return closest, by_arms, distance, touching, forces, pairs.overlap(xpos, xmat)
 
     return model, jax.jit(deepest)
 
@@ -141,17 +142,18 @@ def test_the_deepest_contacts_become_rows(count: int, seed: int) -> None:
     mujoco.mj_fwdPosition(model, data)
     arrays = data.geom_xpos, data.geom_xmat.reshape(-1, 3, 3), data.cdof, data.subtree_com
     found = compiled_deepest(*(np.float32(array) for array in arrays))
-    closest, touching, forces, overlap, overflow = jax.tree.map(np.asarray, found)
+    closest, by_arms, side_by_side, touching, forces, overlap = jax.tree.map(np.asarray, found)
     ids = zip(model.pair_geom1, model.pair_geom2, strict=True)
     distance = [mujoco.mj_geomDistance(model, data, a, b, 10.0, None) for a, b in ids]
-    np.testing.assert_allclose(closest.distance, distance, atol=1e-4)  # of parallel ones: see docs/physics.md
-    assert overlap == (closest.distance < 0).any()
+    for one in (closest.distance, by_arms, side_by_side):
+        np.testing.assert_allclose(one, distance, atol=1e-4)  # of parallel ones: see docs/physics.md
+    assert overlap == (side_by_side < 0).any()
     assert len(set(touching.pair)) == SLOTS
-    assert overflow == max(0, (closest.distance < 0).sum() - SLOTS)
+    assert touching.left_out == max(0, (side_by_side < 0).sum() - SLOTS)
     np.testing.assert_array_equal(forces[touching.pair], np.arange(1, SLOTS + 1))
     assert np.count_nonzero(forces) == SLOTS
-    np.testing.assert_array_equal(touching.distance, np.sort(closest.distance)[:SLOTS])
-    np.testing.assert_array_equal(touching.distance, closest.distance[touching.pair])
+    np.testing.assert_array_equal(touching.distance, np.sort(side_by_side)[:SLOTS])
+    np.testing.assert_array_equal(touching.distance, side_by_side[touching.pair])
     for slot, pair in enumerate(touching.pair):
         bodies = model.geom_bodyid[[model.pair_geom1[pair], model.pair_geom2[pair]]]
         assert touching.weight[slot] == pytest.approx(model.body_invweight0[bodies, 0].sum(), rel=1e-6)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -310,6 +311,8 @@ def test_few_pairs_are_never_too_many() -> None:
         )
         known = Pairs(model)
         places = single(np.zeros((count + 1, 3)) + np.linspace(0, 0.01, count + 1)[:, None])
-        closest = known.closest(places, jnp.tile(jnp.eye(3), (count + 1, 1, 1)))
-        assert (np.asarray(closest.distance) < 0).all() and int(known.overflow(closest)) == left
-        np.testing.assert_allclose(known.distance(places, jnp.tile(jnp.eye(3), (count + 1, 1, 1))), closest.distance)
+        frames, none = jnp.tile(jnp.eye(3), (count + 1, 1, 1)), np.zeros((model.nv + model.nbody, 6), np.float32)
+        distance = known.distance(places, frames)
+        poses = {"geom_xpos": places, "geom_xmat": frames, "cdof": none[: model.nv], "subtree_com": none[:, :3]}
+        found = known.deepest(SimpleNamespace(**poses), distance)
+        assert (np.asarray(distance) < 0).all() and int(found.left_out) == left

@@ -8,6 +8,7 @@ at a time: only the `SLOTS` deepest become constraint rows.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import jax
@@ -24,10 +25,10 @@ SLOTS = 6
 
 
 AT_ONCE = 128
-"""Pairs up to which all are looked at side by side. If there are more, a loop over pairs of arms keeps the fused
-engine's code as short for six arms as for two."""
-BLOCK = 36
-"""Pairs among which the deepest are found at a time, if there are more than `AT_ONCE`."""
+"""Pairs up to which all are looked at side by side while arms touch nothing, which is quicker than a loop. If there are
+more, a loop over pairs of arms keeps the fused engine's code as short for six arms as for two."""
+BLOCK = 12
+"""Pairs among which the deepest are found at a time."""
 
 
 APART = 1e-5
@@ -35,14 +36,14 @@ APART = 1e-5
 
 
 class Closest(NamedTuple):
-    """Where the geoms of each pair are closest, [P]."""
+    """Where the two geoms of pairs are closest, [...]."""
 
     distance: Array
     """Signed, m: negative where they overlap."""
     point: Array
-    """Midway between the two surfaces, in the world, [P, 3]."""
+    """Midway between the two surfaces, in the world, [..., 3]."""
     normal: Array
-    """Unit vector from the first geom to the second, [P, 3]."""
+    """Unit vector from the first geom to the second, [..., 3]."""
 
 
 class Touching(NamedTuple):
@@ -55,6 +56,8 @@ class Touching(NamedTuple):
     """Speed along the normal by joint velocity, [K, nv]; zero where nothing touches."""
     weight: Array
     """Inverse mass of the two bodies, 1/kg."""
+    left_out: Array
+    """How many more pairs overlap, []."""
 
 
 class Pairs:
@@ -67,17 +70,20 @@ class Pairs:
         capsule = mujoco.mjtGeom.mjGEOM_CAPSULE
         self._half = np.where(model.geom_type == capsule, model.geom_size[:, 1], 0).astype(single)
         self._radius = model.geom_size[:, 0].astype(single)
-        self.tiles = Tiles(model, *self._geoms) if self.count > AT_ONCE else None
+        self._model, self._at_once = model, self.count <= AT_ONCE
         bodies = [model.geom_bodyid[geoms] for geoms in self._geoms]
         self._weight = sum(model.body_invweight0[body, 0] for body in bodies).astype(single)
         moved = moved_bodies(model)
-        self._blocks = np.minimum(np.arange(-(-self.count // BLOCK) * BLOCK), self.count - 1).reshape(-1, BLOCK)
         self._sign = (moved[bodies[1]] - moved[bodies[0]]).astype(single)
         self._roots = model.body_rootid[model.dof_bodyid]
         trees = np.sort([model.body_rootid[body] for body in bodies], 0)
         self._trees = model.body_rootid[model.geom_bodyid]
         self._groups = {tuple(both): np.flatnonzero((both == trees.T).all(1)) for both in np.unique(trees, axis=1).T}
         """Pairs by the two arms that they are between."""
+
+    @cached_property
+    def _tiles(self) -> Tiles:
+        return Tiles(self._model, *self._geoms)
 
     def overlap(self, geom_xpos: Array, geom_xmat: Array) -> Array:
         """Return whether any pair overlaps, []: for less than what `distance` costs."""
@@ -86,8 +92,8 @@ class Pairs:
             gap, reach = axis_gap(one, other)[1], one.radius + other.radius
             return jnp.min(jnp.where(is_pair, jnp.sum(gap * gap, -1) - reach * reach, np.inf), initial=np.inf)
 
-        if self.tiles is not None:
-            return jnp.min(self._each(least, geom_xpos, geom_xmat)) < 0
+        if not self._at_once:
+            return jnp.min(self._by_arms(least, geom_xpos, geom_xmat)) < 0
         found = jnp.bool_(False)  # also if there are no pairs
         for arms, pairs in self._groups.items():
             ends = [self._capsules(of[pairs], geom_xpos, geom_xmat) for of in self._geoms]
@@ -101,70 +107,69 @@ class Pairs:
         return found
 
     def distance(self, geom_xpos: Array, geom_xmat: Array) -> Array:
-        """Return the signed distance of every pair, m, [P]; negative where they overlap."""
-        return self.closest(geom_xpos, geom_xmat).distance
+        """Return the signed distance of every pair, m, [P]; negative where they overlap.
 
-    def closest(self, geom_xpos: Array, geom_xmat: Array) -> Closest:
-        """Return where the pairs are closest, from positions [ngeom, 3] and frames [ngeom, 3, 3] of all geoms."""
-        found: Closest = self._each(_closest, geom_xpos, geom_xmat)
-        if self.tiles is None:
-            return found
-        place = self.tiles.place
-        return jax.tree.map(lambda x: x.reshape(-1, *x.shape[3:])[place], found)
-
-    def _each(self, of: Callable[[Capsule, Capsule, Any], Any], geom_xpos: Array, geom_xmat: Array) -> Any:
-        """Return what a function makes of the capsules of all pairs.
-
-        It is called with both capsules of all pairs, [P], and True; or, if there are many, as `Tiles.each` does.
+        They are computed from positions [ngeom, 3] and frames [ngeom, 3, 3] of all geoms.
         """
-        if self.tiles is None:
-            one, other = (self._capsules(geoms, geom_xpos, geom_xmat) for geoms in self._geoms)
-            return of(one, other, np.bool_(True))
-        return self.tiles.each(of, self._capsules(self.tiles.geoms, geom_xpos, geom_xmat))
+        if not self._at_once:
+            return self.distance_by_arms(geom_xpos, geom_xmat)
+        return _closest(*(self._capsules(geoms, geom_xpos, geom_xmat) for geoms in self._geoms)).distance
+
+    def distance_by_arms(self, geom_xpos: Array, geom_xmat: Array) -> Array:
+        """Return what `distance` does, computed in a loop over pairs of arms: shorter code, but slower on a GPU."""
+        found = self._by_arms(lambda one, other, _: _closest(one, other).distance, geom_xpos, geom_xmat)
+        return found.ravel()[self._tiles.place]
+
+    def closest(self, geom_xpos: Array, geom_xmat: Array, pair: Array) -> Closest:
+        """Return where some pairs are closest, by their numbers [...], from poses of geoms as in `distance`."""
+        return _closest(*self._tiles.ends_of(pair, self._capsules(self._tiles.geoms, geom_xpos, geom_xmat)))
+
+    def _by_arms(self, of: Callable[[Capsule, Capsule, Any], Any], geom_xpos: Array, geom_xmat: Array) -> Any:
+        """Return what a function makes of the capsules of all pairs of arms, as `Tiles.each` does."""
+        return self._tiles.each(of, self._capsules(self._tiles.geoms, geom_xpos, geom_xmat))
 
     def _capsules(self, geoms: np.ndarray, geom_xpos: Array, geom_xmat: Array) -> Capsule:
         """Return the capsules of some geoms."""
         return Capsule(geom_xpos[geoms], geom_xmat[geoms][:, :, 2], self._half[geoms], self._radius[geoms])
 
-    def overflow(self, closest: Closest) -> Array:
-        """Return how many overlapping pairs `deepest` leaves out, []."""
-        if self.count <= SLOTS:
-            return jnp.int32(0)
-        count = jnp.sum(closest.distance < 0, dtype=jnp.float32)  # the fused engine looks for bounds of whole numbers
-        return jnp.maximum(count - SLOTS, 0.0).astype(jnp.int32)
-
-    def deepest(self, data: Any, closest: Closest) -> Touching:
-        """Return the contacts of the deepest pairs, at most `SLOTS` of them.
+    def deepest(self, data: Any, distance: Array) -> Touching:
+        """Return the contacts of the deepest pairs, at most `SLOTS` of them, by the distances of all [P].
 
         `data` is MJX's data, with the poses of geoms, `cdof` and `subtree_com`. The Jacobian of a pair that does not
         overlap is zero.
         """
-        distance, pair = self._top(-closest.distance)
-        if self.tiles is None:
-            point, normal = closest.point[pair], closest.normal[pair]
-        else:  # computed again: the fused engine would look for each number among those of all pairs
-            known = self._capsules(self.tiles.geoms, data.geom_xpos, data.geom_xmat)
-            _, point, normal = _closest(*self.tiles.ends_of(pair, known), np.bool_(True))
-        offset = point[:, None] - data.subtree_com[self._roots]
-        velocity = data.cdof[:, 3:] + jnp.cross(data.cdof[:, :3], offset)
-        jacobian = jnp.asarray(self._sign)[pair] * jnp.sum(velocity * normal[:, None], -1)
-        touching = distance > 0
-        return Touching(pair, -distance, jacobian * touching[:, None], jnp.asarray(self._weight)[pair])
+        depth, pair, left_out = self._top(-distance)
 
-    def _top(self, depth: Array) -> tuple[Array, Array]:
-        """Return the `SLOTS` largest of all pairs' depths [P], and which pairs these are."""
-        if self.tiles is None:
-            return jax.lax.top_k(depth, min(SLOTS, self.count))
-        padded = jnp.where(np.arange(self._blocks.size) < self.count, depth[self._blocks.ravel()], -np.inf)
-        found, place = jax.lax.map(lambda rows: jax.lax.top_k(rows, SLOTS), padded.reshape(-1, BLOCK))
-        pairs = place + BLOCK * np.arange(len(found))[:, None]
-        best, which = jax.lax.top_k(found.ravel(), SLOTS)
-        return best, pairs.ravel()[which]
+        def parting(row: tuple[Array, Array]) -> Array:
+            depth, pair = row
+
+            def speeds() -> Array:
+                where = self.closest(data.geom_xpos, data.geom_xmat, pair)
+                velocity = data.cdof[:, 3:] + jnp.cross(data.cdof[:, :3], where.point - data.subtree_com[self._roots])
+                return jnp.asarray(self._sign)[pair] * (velocity @ where.normal)
+
+            return jax.lax.cond(depth > 0, speeds, lambda: jnp.zeros(len(self._roots)))
+
+        return Touching(pair, -depth, jax.lax.map(parting, (depth, pair)), jnp.asarray(self._weight)[pair], left_out)
+
+    def _top(self, depth: Array) -> tuple[Array, Array, Array]:
+        """Return the `SLOTS` largest of all pairs' depths [P], which pairs these are, and how many more overlap."""
+        slots = min(SLOTS, self.count)
+        blocks = jnp.pad(depth, (0, -len(depth) % BLOCK), constant_values=-np.inf).reshape(-1, BLOCK)
+
+        def best(found: tuple[Array, Array, Array], block: tuple[Array, Array]) -> tuple[tuple[Array, ...], None]:
+            depth, pair = (jnp.concatenate(both) for both in zip(found[:2], block, strict=True))
+            depth, place = jax.lax.top_k(depth, slots)
+            # a sum of real numbers: the fused engine looks for bounds of whole ones
+            return (depth, pair[place], found[2] + jnp.sum(block[0] > 0, dtype=jnp.float32)), None
+
+        none = jnp.full(slots, -np.inf), jnp.zeros(slots, jnp.int32), jnp.float32(-slots)
+        numbers = jnp.arange(blocks.size, dtype=jnp.int32).reshape(blocks.shape)
+        (depth, pair, more), _ = jax.lax.scan(best, none, (blocks, numbers))
+        return depth, pair, jnp.maximum(more, 0.0).astype(jnp.int32)
 
     def spread(self, pair: Array, values: Array) -> Array:
         """Return the sum of values [K] of each pair, [P], which they are of by its number [K]; 0 for all others."""
-        if self.tiles is None:
-            return jnp.where(pair == np.arange(self.count)[:, None], values, 0.0).sum(-1)
         return jnp.zeros(self.count, values.dtype).at[pair].add(values)
 
 
@@ -180,7 +185,7 @@ def _apart(one: Capsule, other: Capsule) -> Array:
     return reach(other)[0] - reach(one)[1] > APART * length
 
 
-def _closest(one: Capsule, other: Capsule, is_pair: Any) -> Closest:
+def _closest(one: Capsule, other: Capsule) -> Closest:
     """Return where pairs of capsules are closest."""
     where, gap = axis_gap(one, other)
     length = jnp.sqrt(jnp.maximum(jnp.sum(gap * gap, -1), 1e-18))

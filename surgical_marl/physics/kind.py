@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,22 +11,8 @@ import numpy as np
 from jax import Array
 
 from surgical_marl.physics.dynamics import Dynamics, Physics
-from surgical_marl.physics.solver import JointRows
 from surgical_marl.scenes.build import alone
 from surgical_marl.scenes.scene import Scene
-
-
-class ArmForces(NamedTuple):
-    """What moves arms of one type but for contacts: a arms of m joints each."""
-
-    dofs: np.ndarray
-    """Numbers of their joints in the scene, [a, m]."""
-    mass: Array
-    """Mass matrices with the implicit parts of other forces, m (m + 1) / 2 elements of the lower half, [a, ...]."""
-    smooth: Array
-    """Sums of all forces except constraint forces, [a, m]."""
-    joints: JointRows
-    """Friction and limits, [a, m]."""
 
 
 class Kind:
@@ -44,16 +31,17 @@ class Kind:
             np.array([owner(get(i).name) for i in range(count)])
             for get, count in ((model.joint, model.njnt), (model.body, model.nbody), (model.actuator, model.nu))
         )
-        self._dofs, self._bodies, self._actuators = (
+        self.dofs, self._bodies, self._actuators = (
             np.stack([np.flatnonzero(owners == agent) for agent in agents]) for owners in (joints, bodies, actuators)
         )
+        """The joints of each arm by their numbers in the scene, [a, m], and so its bodies and actuators."""
 
     def step(self, physics: Physics, fields: dict[str, Array]) -> Physics:
         """Return the physics of the scene after one step of these arms.
 
         `fields` replaces values of some fields of the scene's model.
         """
-        dofs, (own, others) = self._dofs, self._own(physics, fields)
+        dofs, (own, others) = self.dofs, self._own(physics, fields)
 
         def next_arm(queue: tuple[Physics, dict[str, Array]], _: None) -> tuple[tuple[Physics, dict[str, Array]], None]:
             first = jax.tree.map(lambda x: x[0], queue)
@@ -64,21 +52,16 @@ class Kind:
         qpos, qvel, qacc = (part.at[dofs].set(found) for part, found in zip(physics[:3], own[:3], strict=True))
         return physics._replace(qpos=qpos, qvel=qvel, qacc_warmstart=qacc)
 
-    def forces(self, physics: Physics, fields: dict[str, Array]) -> ArmForces:
-        """Return the forces on these arms and how their masses resist. `fields` are as in `step`."""
-        own, others = self._own(physics, fields)
+    def each(self, physics: Physics, fields: dict[str, Array], of: Callable[[Dynamics, Physics], Any]) -> Any:
+        """Return what a function makes of the dynamics and the physics of each of these arms, [a, ...].
 
-        def of_arm(row: tuple[Physics, dict[str, Array]]) -> tuple[Array, Array, JointRows]:
-            dynamics = self._dynamics.varied(row[1])
-            found = dynamics.forces(row[0])
-            mass = found.mass + dynamics.dt * found.damping
-            return mass[np.tril_indices(len(mass))], found.smooth, dynamics.joint_rows(found.rows)
-
-        return ArmForces(self._dofs, *jax.lax.map(of_arm, (own, others)))
+        `fields` are as in `step`.
+        """
+        return jax.lax.map(lambda row: of(self._dynamics.varied(row[1]), row[0]), self._own(physics, fields))
 
     def _own(self, physics: Physics, fields: dict[str, Array]) -> tuple[Physics, dict[str, Array]]:
         """Return the physics of each of these arms, and its values of fields."""
-        dofs, actuators = self._dofs, self._actuators
+        dofs, actuators = self.dofs, self._actuators
         own = Physics(physics.qpos[dofs], physics.qvel[dofs], physics.qacc_warmstart[dofs], physics.ctrl[actuators])
         where = {"actuator": actuators, "dof": dofs, "body": np.insert(self._bodies, 0, 0, axis=1)}
         return own, {name: field[where[name.split("_")[0]]] for name, field in fields.items()}

@@ -22,20 +22,14 @@ from jax import Array
 from surgical_marl.content import unknown
 from surgical_marl.physics.collision import Pairs
 from surgical_marl.physics.dynamics import Dynamics, Physics
+from surgical_marl.physics.joined import Joined
 from surgical_marl.physics.kind import Kind
-from surgical_marl.physics.solver import Rows, solve
 from surgical_marl.physics.together import Together
 from surgical_marl.physics.variation import Factors
 from surgical_marl.physics.views import ArmView, Contacts, ObjectView, Touch
 from surgical_marl.scenes.poses import Pose
 from surgical_marl.scenes.scene import PAYLOAD, Scene
 from surgical_marl.scenes.timing import DECIMATION
-
-TOUCHING_ITERATIONS = (6, 6)
-"""Most Newton steps, and line search steps in each, for arms that touch: see docs/physics.md."""
-
-MOST_JOINED = 32
-"""Joints up to which arms that touch are one dense problem: the code of a dense one grows with the cube of them."""
 
 
 class Simulator:
@@ -50,6 +44,7 @@ class Simulator:
         self._fields: dict[str, Array] = {}
         self._pairs, self._together = Pairs(scene.model), Dynamics(scene.model)
         self._kinds = [Kind(scene, agents) for agents in scene.types.values()]
+        self._joined = Joined(self._together, self._pairs, self._kinds)
         self._objects = Together(scene, self._together, self._pairs, self._kinds) if scene.objects else None
         self.decimation, self.control_dt = decimation, decimation * scene.model.opt.timestep
         self._index_joints()
@@ -204,28 +199,13 @@ class Simulator:
         overlap = self._pairs.overlap(data.geom_xpos, data.geom_xmat) if distance is None else (distance < 0).any()
         if self._objects:
             return self._objects.step(physics, touch, data, overlap, self._fields, self._apart)
-        return jax.lax.cond(overlap, self._touching_step, self._apart, physics, touch)
+        joined = lambda physics, touch: self._joined.step(physics, touch, data, self._fields)  # noqa: E731
+        return jax.lax.cond(overlap, joined, self._apart, physics, touch)
 
     def _apart(self, physics: Physics, touch: Touch) -> tuple[Physics, Touch]:
         for kind in self._kinds:
             physics = kind.step(physics, self._fields)
         return physics, touch
-
-    def _touching_step(self, physics: Physics, touch: Touch) -> tuple[Physics, Touch]:
-        dynamics = self._together.varied(self._fields)
-        forces = dynamics.forces(physics)
-        closest = self._pairs.closest(forces.data.geom_xpos, forces.data.geom_xmat)
-        touching = self._pairs.deepest(forces.data, closest)
-        contacts = dynamics.contact_rows(touching.jacobian, touching.distance, touching.weight, physics.qvel)
-        joined = Rows(*(jnp.concatenate(parts) for parts in zip(forces.rows, contacts, strict=True)))
-        start = dynamics.relaxed(forces, physics.qacc_warmstart)
-        between = len(touching.pair) if len(physics.qvel) > MOST_JOINED else 0
-        qacc, force = solve(forces.mass, forces.smooth, joined, start, *TOUCHING_ITERATIONS, between)
-        each = self._pairs.spread(touching.pair, force[len(forces.rows.low) :])
-        deepest = jnp.maximum(touch.penetration, -closest.distance)
-        overflow = jnp.maximum(touch.overflow, self._pairs.overflow(closest))
-        hardest = touch._replace(penetration=deepest, force=jnp.maximum(touch.force, each), overflow=overflow)
-        return dynamics.moved(physics, forces, qacc), hardest
 
     def _view(
         self, xp: Any, physics: Physics, tools: tuple[Any, Any], contacts: Contacts, handled: Any = None

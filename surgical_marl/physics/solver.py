@@ -13,6 +13,7 @@ stiff, and a row that changes sides changes the whole step.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -126,14 +127,15 @@ def solve(
     start: Array,
     iterations: int,
     line_search: int,
-    between: int = 0,
+    arms: Sequence[np.ndarray] = (),
     steady: int = 2,
 ) -> tuple[Array, Array]:
     """Return the acceleration [n] and the force of each row [r].
 
     They are found for a mass matrix [n, n] and the sum `smooth` [n] of all other forces, by Newton steps from `start`.
-    Each Newton step has `line_search` steps of line search. If `between` is not 0, only that many rows, the last ones,
-    concern joints of several arms: then no matrix larger than that of an arm is factorised (`_newton_step`).
+    Each Newton step has `line_search` steps of line search. If there are many arms, `arms` has the numbers of their
+    joints, [a, m] for each type, and the first 2 n rows are those of `rows_of`: then no matrix larger than that of an arm
+    is factorised (`_newton_step`), in loops over arms.
 
     There are at most `iterations` Newton steps. A step over which no row changes sides ends at the solution, and a
     second such step removes its rounding error. After `steady` of them the search stops.
@@ -147,8 +149,8 @@ def solve(
         above, below = unbounded > rows.low, unbounded < rows.high
         rest = mass @ qacc - smooth
         gives = jnp.where(above & below, rows.impedance, 0.0)
-        search = _newton_step(mass, rows.jacobian, gives, rows.jacobian.T @ force - rest, between)
-        looked = partial(_line_search, mass, rows, unbounded, rest, search, line_search)
+        search = _newton_step(mass, rows.jacobian, gives, rows.jacobian.T @ force - rest, arms)
+        looked = partial(_line_search, mass, rows, unbounded, rest, search, line_search, not arms)
         kept = lambda end: (((end > rows.low) == above) & ((end < rows.high) == below)).all()  # noqa: E731
         if iterations == 1:
             return qacc + looked()[0] * search, jnp.bool_(True)
@@ -178,19 +180,25 @@ def solve(
     return qacc, row_forces(rows, qacc)
 
 
-def _newton_step(mass: Array, jacobian: Array, gives: Array, excess: Array, between: int) -> Array:
+def _newton_step(
+    mass: Array, jacobian: Array, gives: Array, excess: Array, arms: Sequence[np.ndarray]
+) -> Array:  # fmt: skip
     """Return x [n] with (mass + jacobian.T @ diag(gives) @ jacobian) @ x = excess.
 
-    Without the last `between` rows the matrix has a block for each arm and zeros elsewhere, and so has its Cholesky
-    factor: the fused engine has no code for zeros. These rows are added by Woodbury's identity (W. Hager, "Updating the
-    inverse of a matrix", SIAM Review 31, 1989), which takes one small matrix more.
+    With `arms`, as for `solve`: without the rows after the first 2 n the matrix has a block for each arm and zeros
+    elsewhere. Those rows are added by Woodbury's identity (W. Hager, "Updating the inverse of a matrix", SIAM Review 31,
+    1989), which takes one small matrix more.
     """
-    if not between:
+    if not arms:
         return solve_positive(mass + jacobian.T @ (gives[:, None] * jacobian), excess)
-    own, root = jacobian[:-between], jnp.sqrt(gives[-between:])[:, None] * jacobian[-between:]
-    blocks = mass + own.T @ (gives[:-between, None] * own)
-    eased = solve_positive(blocks, jnp.concatenate([excess[:, None], root.T], 1))
-    share = solve_positive(jnp.eye(between) + root @ eased[:, 1:], root @ eased[:, 0])
+    own, root = 2 * len(mass), jnp.sqrt(gives[2 * len(mass) :])[:, None] * jacobian[2 * len(mass) :]
+    blocks = mass + jacobian[:own].T @ (gives[:own, None] * jacobian[:own])
+    right = jnp.concatenate([excess[:, None], root.T], 1)
+    eased = jnp.zeros_like(right)
+    for dofs in arms:
+        each = blocks[dofs[:, :, None], dofs[:, None]], right[dofs]
+        eased = eased.at[dofs].set(jax.lax.map(lambda row: solve_positive(*row), each))
+    share = solve_positive(jnp.eye(len(root)) + root @ eased[:, 1:], root @ eased[:, 0])
     return eased[:, 0] - eased[:, 1:] @ share
 
 
@@ -198,7 +206,7 @@ def _newton_step(mass: Array, jacobian: Array, gives: Array, excess: Array, betw
 def _differentiate(
     iterations: int,
     line_search: int,
-    between: int,
+    arms: Sequence[np.ndarray],
     steady: int,
     primals: tuple[Any, ...],
     tangents: tuple[Any, ...],
@@ -209,7 +217,7 @@ def _differentiate(
     system, which is never degenerate. The way to the solution is no use: at rest it divides zero by zero.
     """
     mass, smooth, rows, _ = primals
-    qacc, force = solve(*primals, iterations, line_search, between, steady)
+    qacc, force = solve(*primals, iterations, line_search, arms, steady)
 
     def excess(mass: Array, smooth: Array, rows: Rows) -> Array:
         return smooth + rows.jacobian.T @ row_forces(rows, qacc) - mass @ qacc
@@ -237,7 +245,7 @@ def giving(rows: Rows, unbounded: Array) -> Array:
 
 
 def _line_search(
-    mass: Array, rows: Rows, unbounded: Array, rest: Array, search: Array, iterations: int
+    mass: Array, rows: Rows, unbounded: Array, rest: Array, search: Array, iterations: int, unroll: bool
 ) -> tuple[Array, Array]:
     """Return how far to go along `search`, and the value of `unbounded` there.
 
@@ -260,7 +268,7 @@ def _line_search(
 
     whole, none = jnp.float32(1.0), jnp.float32(0.0)
     start = (whole, none, jnp.float32(jnp.inf))
-    (step, _, _), _ = jax.lax.scan(iterate, start, None, length=iterations, unroll=True)
+    (step, _, _), _ = jax.lax.scan(iterate, start, None, length=iterations, unroll=unroll)
     return step, unbounded - step * fall
 
 

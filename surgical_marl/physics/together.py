@@ -163,7 +163,7 @@ class Together:
             return physics._replace(objects=objects), touch._replace(overflow=left_out)
 
         def together(physics: Physics, touch: Touch) -> tuple[Physics, Touch]:
-            return self._step(physics, touch, fields, slots, joints, fingers, overlap)
+            return self._step(physics, touch, data, fields, slots, joints, fingers, overlap)
 
         return jax.lax.cond(near, together, alone, physics, touch)
 
@@ -210,8 +210,8 @@ class Together:
         return jax.lax.cond(joined.any(), whole, each)
 
     def _step(
-        self, physics: Physics, touch: Touch, fields: dict[str, Array], slots: Slots, joints: Joints, fingers: Fingers,
-        overlap: Array,
+        self, physics: Physics, touch: Touch, data: Any, fields: dict[str, Array], slots: Slots, joints: Joints,
+        fingers: Fingers, overlap: Array,
     ) -> tuple[Physics, Touch]:  # fmt: skip
         """Return the state after a step of all arms and objects together.
 
@@ -220,7 +220,7 @@ class Together:
         dt, (bodies, grips), handling = self._dynamics.dt, physics.objects, Handling(self.tables, self._newton)
         felt = handling.feel(slots, joints, fingers, physics.qvel, bodies, grips, dt)
         masses, free = self._free(bodies, slots.awake)
-        between = self._between(physics, overlap)
+        between = self._between(physics, data, overlap)
         mass, smooth, rows = self._forces(physics, fields)
         problem = Problem(mass, smooth, rows, between.rows, overlap, masses, free, felt.contacts, slots.found)
         found = self._newton.solve(problem, self._newton.by_arm(physics.qacc_warmstart), bodies.acceleration)
@@ -238,32 +238,38 @@ class Together:
 
     def _forces(self, physics: Physics, fields: dict[str, Array]) -> tuple[Array, Array, JointRows]:
         """Return the arms' mass matrices, sums of forces, and friction and limits of joints, as in `Problem`."""
-        dofs, found = self.tables.dofs, [kind.forces(physics, fields) for kind in self._kinds]
+
+        def of_arm(dynamics: Dynamics, physics: Physics) -> tuple[Array, Array, JointRows]:
+            found = dynamics.forces(physics)
+            mass = found.mass + dynamics.dt * found.damping
+            return mass[np.tril_indices(len(mass))], found.smooth, dynamics.joint_rows(found.rows)
+
+        dofs, found = self.tables.dofs, [kind.each(physics, fields, of_arm) for kind in self._kinds]
         if len(found) == 1:
-            return found[0][1:]
+            return found[0]
         (a, m), n = dofs.shape, len(physics.qvel)
         places, there = packed(m), dofs < n
         mass = jnp.zeros((a, m * (m + 1) // 2)).at[:, np.diag(places)].set(~there * np.float32(1.0))
         smooth, joints = jnp.zeros((a, m)), JointRows(*[jnp.zeros((a, m))] * len(JointRows._fields))
-        for of_kind in found:
-            arms = np.array([np.flatnonzero(dofs[:, 0] == own[0])[0] for own in of_kind.dofs])
-            m = of_kind.dofs.shape[1]
-            mass = mass.at[arms, : m * (m + 1) // 2].set(of_kind.mass)
-            smooth = smooth.at[arms, :m].set(of_kind.smooth)
-            joints = JointRows(*(all_.at[arms, :m].set(own) for all_, own in zip(joints, of_kind.joints, strict=True)))
+        for kind, own in zip(self._kinds, found, strict=True):
+            arms = np.array([np.flatnonzero(dofs[:, 0] == first)[0] for first in kind.dofs[:, 0]])
+            m = kind.dofs.shape[1]
+            mass = mass.at[arms, : m * (m + 1) // 2].set(own[0])
+            smooth = smooth.at[arms, :m].set(own[1])
+            joints = JointRows(*(all_.at[arms, :m].set(its) for all_, its in zip(joints, own[2], strict=True)))
         return mass, smooth, joints
 
-    def _between(self, physics: Physics, overlap: Array) -> _Between:
+    def _between(self, physics: Physics, poses: Any, overlap: Array) -> _Between:
         """Return the contacts of arms with arms. There is nothing in it unless any overlap."""
 
         def found(_: None) -> _Between:
-            data = self._dynamics.axes(physics.qpos)
-            closest = self._pairs.closest(data.geom_xpos, data.geom_xmat)
-            touching = self._pairs.deepest(data, closest)
+            data = self._dynamics.axes(poses)
+            distance = self._pairs.distance_by_arms(data.geom_xpos, data.geom_xmat)
+            touching = self._pairs.deepest(data, distance)
             rows = self._dynamics.contact_rows(touching.jacobian, touching.distance, touching.weight, physics.qvel)
             by_arm = jnp.pad(rows.jacobian, ((0, 0), (0, 1)))[:, self.tables.dofs]
             rows = rows._replace(jacobian=by_arm)
-            return _Between(rows, touching.pair, -closest.distance, self._pairs.overflow(closest))
+            return _Between(rows, touching.pair, -distance, touching.left_out)
 
         if not self._pairs.count:
             empty = jnp.zeros(0)

@@ -12,9 +12,10 @@ import mujoco
 import numpy as np
 
 from surgical_marl import load_scene
-from surgical_marl.physics import dynamics, simulator, solver
+from surgical_marl.physics import dynamics, joined, solver
 from surgical_marl.physics.dynamics import Physics
 from surgical_marl.physics.simulator import Simulator
+from surgical_marl.physics.views import Touch
 from surgical_marl.scenes.scene import Scene
 from surgical_marl.scenes.timing import DECIMATION
 from surgical_marl.studies.command import make_parser
@@ -94,8 +95,13 @@ def speeds(scene: Scene) -> np.ndarray:
 def step(scene: Scene, states: Physics, touching: bool) -> tuple[np.ndarray, np.ndarray]:
     """Velocity [S, nv] and contact forces [S, P] after one physics step here."""
     simulated = Simulator(scene)
-    advance, untouched = simulated._touching_step if touching else simulated._apart, simulated.untouched
-    after, touch = jax.jit(jax.vmap(lambda state: advance(state, untouched)))(states)
+
+    def advance(state: Physics) -> tuple[Physics, Touch]:
+        if not touching:
+            return simulated._apart(state, simulated.untouched)
+        return simulated._joined.step(state, simulated.untouched, simulated._together.pose(state.qpos), {})
+
+    after, touch = jax.jit(jax.vmap(advance))(states)
     return np.asarray(after.qvel), np.asarray(touch.force)
 
 
@@ -109,7 +115,7 @@ def touching() -> None:
     print("| iterations | line search | velocity off: 99 % | worst | largest force off: 99 % | worst |")
     print("|---|---|---|---|---|---|")
     for iterations, line_search in TOUCHING:
-        simulator.TOUCHING_ITERATIONS = iterations, line_search
+        joined.ITERATIONS = iterations, line_search
         velocity, force = step(scene, states, touching=True)
         off = (np.abs(velocity - velocities) / speeds(scene)).max(1)
         force_off = np.abs(force - forces).max(1) / np.maximum(forces.max(1), 1.0)

@@ -15,7 +15,7 @@ import numpy as np
 from surgical_marl.engines.fused.emit_arrays import TYPES, ArrayEmitter
 from surgical_marl.engines.fused.graph import Branch, Graph, Loop, Value
 from surgical_marl.engines.fused.memory_order import order_memory
-from surgical_marl.engines.fused.preludes import WAYS, is_long, large_branches
+from surgical_marl.engines.fused.preludes import WAYS, fenced, is_long, large_branches
 from surgical_marl.engines.fused.schedule import Scheduler
 
 LARGE = 500
@@ -77,7 +77,7 @@ class Emitter(ArrayEmitter):
             self.lines.append(f"B bad_=watch_!=SPLAT(0.0f);if(ANY(bad_)){{STB(flags,{field},LDB(flags,{field})|bad_)}}")
         if large_branches(self.lines):
             self.lines = ["I work_=SPLATI(0),ways_=SPLATI(0);", *self.lines, "STI(work,0,WORKED)"]
-        return "\n".join(self.lines)
+        return "\n".join(fenced(self.lines) if self.vector else self.lines)
 
     def _region(self, number: int, result: Any) -> list[int]:
         """Write a region. Return where its long branches and loops end, as numbers of lines."""
