@@ -134,8 +134,8 @@ def solve(
 
     They are found for a mass matrix [n, n] and the sum `smooth` [n] of all other forces, by Newton steps from `start`.
     Each Newton step has `line_search` steps of line search. If there are many arms, `arms` has the numbers of their
-    joints, [a, m] for each type, and the first 2 n rows are those of `rows_of`: then no matrix larger than that of an arm
-    is factorised (`_newton_step`), in loops over arms.
+    joints, [a, m] for each type, and the first 2 n rows are those of `rows_of`: then no matrix larger than that of an
+    arm is factorised (`_newton_step`), in loops over arms.
 
     There are at most `iterations` Newton steps. A step over which no row changes sides ends at the solution, and a
     second such step removes its rounding error. After `steady` of them the search stops.
@@ -186,8 +186,8 @@ def _newton_step(
     """Return x [n] with (mass + jacobian.T @ diag(gives) @ jacobian) @ x = excess.
 
     With `arms`, as for `solve`: without the rows after the first 2 n the matrix has a block for each arm and zeros
-    elsewhere. Those rows are added by Woodbury's identity (W. Hager, "Updating the inverse of a matrix", SIAM Review 31,
-    1989), which takes one small matrix more.
+    elsewhere. Those rows are added by Woodbury's identity (W. Hager, "Updating the inverse of a matrix", SIAM Review
+    31, 1989), which takes one small matrix more.
     """
     if not arms:
         return solve_positive(mass + jacobian.T @ (gives[:, None] * jacobian), excess)

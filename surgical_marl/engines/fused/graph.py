@@ -65,6 +65,8 @@ class Graph:
         self.tables: list[np.ndarray] = []
         self.inputs: set[int] = set()
         """Tables whose values are not known while tracing: parameters."""
+        self.views: dict[tuple[Any, ...], Any] = {}
+        """What `memory.view` has found of values."""
         self._constant_ids: dict[tuple[str, Any], Value] = {}
         self._table_numbers: dict[tuple[str, bytes], int] = {}
         self._known: dict[tuple[Any, ...], Value] = {}

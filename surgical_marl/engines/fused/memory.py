@@ -40,6 +40,14 @@ class View:
 
 def view(g: Graph, ids: np.ndarray) -> View | None:
     """Return what these values are a view of, if all of them are."""
+    key = ids.shape, ids.dtype.char, ids.tobytes()  # most are asked for again and again, while loops are tried
+    if key not in g.views:
+        g.views[key] = _view(g, ids)
+    found: View | None = g.views[key]
+    return found
+
+
+def _view(g: Graph, ids: np.ndarray) -> View | None:
     flat = ids.ravel().tolist()
     kind = g.kind(flat[0])
     inner = flat if kind in "fi" or _op(g, flat[0]) == "read" else [_converted(g, value) for value in flat]
