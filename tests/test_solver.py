@@ -278,5 +278,7 @@ def test_a_step_by_blocks_is_a_step_of_the_whole(seed: int) -> None:
     gives = rng.choice([0.0, 1.0, 100.0], len(jacobian))
     excess = rng.normal(size=n)
     whole = np.linalg.solve(mass + jacobian.T @ (gives[:, None] * jacobian), excess)
-    found = solver._newton_step(*(np.float32(x) for x in (mass, jacobian, gives, excess)), k)
+    found = solver._newton_step(
+        *(np.float32(x) for x in (mass, jacobian, gives, excess)), [np.arange(n).reshape(-1, 4)]
+    )
     np.testing.assert_allclose(found, whole, atol=1e-4 * np.abs(whole).max())

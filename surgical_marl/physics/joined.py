@@ -7,18 +7,17 @@ arms. Only what the constraint solver does concerns all arms at once.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
-import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
+from surgical_marl.physics.arm_forces import ArmForces, changes, relaxed
 from surgical_marl.physics.collision import Pairs
 from surgical_marl.physics.dynamics import Dynamics, Physics
 from surgical_marl.physics.factor import packed
 from surgical_marl.physics.kind import Kind
-from surgical_marl.physics.solver import JointRows, Rows, rows_of, solve, solve_positive
+from surgical_marl.physics.solver import JointRows, Rows, rows_of, solve
 from surgical_marl.physics.views import Touch
 
 ITERATIONS = (6, 6)
@@ -26,21 +25,6 @@ ITERATIONS = (6, 6)
 
 MOST_JOINED = 32
 """Joints up to which all arms are one dense problem: the code of a dense one grows with the cube of them."""
-
-
-class _Arms(NamedTuple):
-    """What moves arms of one type but for contacts: a arms of m joints each."""
-
-    mass: Array
-    """Mass matrices, m (m + 1) / 2 elements of the lower half, [a, ...]."""
-    damping: Array
-    """Damping matrices for the implicit part of a step, likewise."""
-    smooth: Array
-    """Sums of all forces except constraint forces, [a, m]."""
-    joints: JointRows
-    """Friction and limits, [a, m]."""
-    start: Array
-    """Accelerations to begin with, [a, m]."""
 
 
 class Joined:
@@ -62,7 +46,7 @@ class Joined:
         distance = self._pairs.distance_by_arms(data.geom_xpos, data.geom_xmat)
         touching = self._pairs.deepest(data, distance)
         contacts = self._dynamics.contact_rows(touching.jacobian, touching.distance, touching.weight, physics.qvel)
-        found = [kind.each(physics, fields, _forces) for kind in self._kinds]
+        found = [kind.forces(physics, fields) for kind in self._kinds]
         qacc, force = self._solve(found, contacts)
         hardest = touch._replace(
             penetration=jnp.maximum(touch.penetration, -distance),
@@ -71,7 +55,7 @@ class Joined:
         )
         return self._moved(physics, found, qacc), hardest
 
-    def _solve(self, found: list[_Arms], contacts: Rows) -> tuple[Array, Array]:
+    def _solve(self, found: list[ArmForces], contacts: Rows) -> tuple[Array, Array]:
         """Return the accelerations [n] of all joints, and the forces of contacts [r]."""
         n = contacts.jacobian.shape[1]
         mass, smooth, start = jnp.zeros((n, n)), jnp.zeros(n), jnp.zeros(n)
@@ -79,31 +63,16 @@ class Joined:
         for kind, own in zip(self._kinds, found, strict=True):
             dofs = kind.dofs
             mass = mass.at[dofs[:, :, None], dofs[:, None]].set(own.mass[:, packed(dofs.shape[1])])
-            smooth, start = smooth.at[dofs].set(own.smooth), start.at[dofs].set(own.start)
+            smooth, start = smooth.at[dofs].set(own.smooth), start.at[dofs].set(relaxed(own))
             joints = JointRows(*(all_.at[dofs].set(its) for all_, its in zip(joints, own.joints, strict=True)))
         rows = Rows(*(jnp.concatenate(parts) for parts in zip(rows_of(joints), contacts, strict=True)))
         arms = [kind.dofs for kind in self._kinds] if n > MOST_JOINED else []
         qacc, force = solve(mass, smooth, rows, start, *ITERATIONS, arms)
         return qacc, force[2 * n :]
 
-    def _moved(self, physics: Physics, found: list[_Arms], qacc: Array) -> Physics:
+    def _moved(self, physics: Physics, found: list[ArmForces], qacc: Array) -> Physics:
         """Return the state one step later, as `Dynamics.moved` does, for accelerations [n] of all joints."""
         dt, qvel = self._dynamics.dt, physics.qvel
         for kind, own in zip(self._kinds, found, strict=True):
-            places = packed(kind.dofs.shape[1])
-
-            def change(row: Any, places: np.ndarray = places) -> Array:
-                mass, damping, qacc = row
-                return solve_positive((mass + dt * damping)[places], mass[places] @ qacc)
-
-            changes = jax.lax.map(change, (own.mass, own.damping, qacc[kind.dofs]))
-            qvel = qvel.at[kind.dofs].add(dt * changes)
+            qvel = qvel.at[kind.dofs].add(dt * changes(own, qacc[kind.dofs]))
         return physics._replace(qpos=physics.qpos + dt * qvel, qvel=qvel, qacc_warmstart=qacc)
-
-
-def _forces(dynamics: Dynamics, physics: Physics) -> _Arms:
-    """Return what moves one arm."""
-    found = dynamics.forces(physics)
-    lower = np.tril_indices(len(found.smooth))
-    joints, start = dynamics.joint_rows(found.rows), dynamics.relaxed(found, physics.qacc_warmstart)
-    return _Arms(found.mass[lower], found.damping[lower], found.smooth, joints, start)

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from surgical_marl.physics.arm_forces import ArmForces
 from surgical_marl.physics.dynamics import Dynamics, Physics
 from surgical_marl.scenes.build import alone
 from surgical_marl.scenes.scene import Scene
@@ -52,12 +50,18 @@ class Kind:
         qpos, qvel, qacc = (part.at[dofs].set(found) for part, found in zip(physics[:3], own[:3], strict=True))
         return physics._replace(qpos=qpos, qvel=qvel, qacc_warmstart=qacc)
 
-    def each(self, physics: Physics, fields: dict[str, Array], of: Callable[[Dynamics, Physics], Any]) -> Any:
-        """Return what a function makes of the dynamics and the physics of each of these arms, [a, ...].
+    def forces(self, physics: Physics, fields: dict[str, Array]) -> ArmForces:
+        """Return what moves these arms. `fields` are as in `step`."""
 
-        `fields` are as in `step`.
-        """
-        return jax.lax.map(lambda row: of(self._dynamics.varied(row[1]), row[0]), self._own(physics, fields))
+        def of_arm(row: tuple[Physics, dict[str, Array]]) -> ArmForces:
+            dynamics, own = self._dynamics.varied(row[1]), row[0]
+            found = dynamics.forces(own)
+            lower, implicit = np.tril_indices(len(own.qpos)), found.mass + dynamics.dt * found.damping
+            joints = dynamics.joint_rows(found.rows)
+            return ArmForces(found.mass[lower], implicit[lower], found.smooth, joints, own.qacc_warmstart)
+
+        found: ArmForces = jax.lax.map(of_arm, self._own(physics, fields))
+        return found
 
     def _own(self, physics: Physics, fields: dict[str, Array]) -> tuple[Physics, dict[str, Array]]:
         """Return the physics of each of these arms, and its values of fields."""

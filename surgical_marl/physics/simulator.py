@@ -198,7 +198,7 @@ class Simulator:
         data = self._together.pose(physics.qpos)
         overlap = self._pairs.overlap(data.geom_xpos, data.geom_xmat) if distance is None else (distance < 0).any()
         if self._objects:
-            return self._objects.step(physics, touch, data, overlap, self._fields, self._apart)
+            return self._objects.step(physics, touch, data, overlap, self._fields)
         joined = lambda physics, touch: self._joined.step(physics, touch, data, self._fields)  # noqa: E731
         return jax.lax.cond(overlap, joined, self._apart, physics, touch)
 

@@ -7,7 +7,7 @@ are solved together.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
@@ -15,10 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from surgical_marl.physics.arm_forces import ArmForces, apart, padded
 from surgical_marl.physics.bodies import Bodies, free_acceleration, inertias, moved, rotation
 from surgical_marl.physics.collision import Pairs
 from surgical_marl.physics.dynamics import Dynamics, Physics
-from surgical_marl.physics.factor import packed
 from surgical_marl.physics.handling import DWELL, Fingers, Grips, Handling
 from surgical_marl.physics.kind import Kind
 from surgical_marl.physics.newton import Newton
@@ -138,9 +138,8 @@ class Together:
         return self._finder.find(data, joints, physics.qvel, physics.objects.bodies, self._dynamics.dt), joints
 
     def step(
-        self, physics: Physics, touch: Touch, data: Any, overlap: Array, fields: dict[str, Array],
-        apart: Callable[..., Any],
-    ) -> Any:  # fmt: skip
+        self, physics: Physics, touch: Touch, data: Any, overlap: Array, fields: dict[str, Array]
+    ) -> tuple[Physics, Touch]:  # fmt: skip
         """Return the state after one physics step, and the hardest touch up to the start of that step.
 
         Args:
@@ -149,21 +148,21 @@ class Together:
             data: MJX's data with the poses of the arms.
             overlap: whether any arms overlap, [].
             fields: other values of some fields of the model.
-            apart: steps arms that touch nothing.
         """
         slots, joints = self._find(data, physics)
         near = overlap | (self._on_arm(slots) < self._arms).any()
         bodies = self.tables.bodies["pads"]
-        fingers = Fingers(data.xpos[bodies], data.xquat[bodies])
+        fingers, arms = Fingers(data.xpos[bodies], data.xquat[bodies]), self._forces(physics, fields)
 
         def alone(physics: Physics, touch: Touch) -> tuple[Physics, Touch]:
-            objects = self._step_objects(physics.objects, slots)
-            physics, touch = apart(physics, touch)
+            objects, (qacc, change) = self._step_objects(physics.objects, slots), apart(arms)
+            qvel = physics.qvel + self._dynamics.dt * self._of_joints(change)
             left_out = jnp.maximum(touch.overflow, slots.total - len(slots.number))
-            return physics._replace(objects=objects), touch._replace(overflow=left_out)
+            qpos = physics.qpos + self._dynamics.dt * qvel
+            return Physics(qpos, qvel, self._of_joints(qacc), physics.ctrl, objects), touch._replace(overflow=left_out)
 
         def together(physics: Physics, touch: Touch) -> tuple[Physics, Touch]:
-            return self._step(physics, touch, data, fields, slots, joints, fingers, overlap)
+            return self._step(physics, touch, data, arms, slots, joints, fingers, overlap)
 
         return jax.lax.cond(near, together, alone, physics, touch)
 
@@ -210,7 +209,7 @@ class Together:
         return jax.lax.cond(joined.any(), whole, each)
 
     def _step(
-        self, physics: Physics, touch: Touch, data: Any, fields: dict[str, Array], slots: Slots, joints: Joints,
+        self, physics: Physics, touch: Touch, data: Any, arms: ArmForces, slots: Slots, joints: Joints,
         fingers: Fingers, overlap: Array,
     ) -> tuple[Physics, Touch]:  # fmt: skip
         """Return the state after a step of all arms and objects together.
@@ -221,10 +220,11 @@ class Together:
         felt = handling.feel(slots, joints, fingers, physics.qvel, bodies, grips, dt)
         masses, free = self._free(bodies, slots.awake)
         between = self._between(physics, data, overlap)
-        mass, smooth, rows = self._forces(physics, fields)
-        problem = Problem(mass, smooth, rows, between.rows, overlap, masses, free, felt.contacts, slots.found)
-        found = self._newton.solve(problem, self._newton.by_arm(physics.qacc_warmstart), bodies.acceleration)
-        qacc = jnp.zeros(len(physics.qvel) + 1).at[self.tables.dofs].set(found.arms)[:-1]
+        problem = Problem(
+            arms.implicit, arms.smooth, arms.joints, between.rows, overlap, masses, free, felt.contacts, slots.found
+        )
+        found = self._newton.solve(problem, arms.start, bodies.acceleration)
+        qacc = self._of_joints(found.arms)
         qvel = physics.qvel + dt * qacc
         objects = self._moved(bodies, found.objects, slots)
         shift = dt * qvel, dt * objects.velocity
@@ -236,28 +236,16 @@ class Together:
         )
         return after, self._bumped(touch, between, found.between, overlap)
 
-    def _forces(self, physics: Physics, fields: dict[str, Array]) -> tuple[Array, Array, JointRows]:
-        """Return the arms' mass matrices, sums of forces, and friction and limits of joints, as in `Problem`."""
+    def _forces(self, physics: Physics, fields: dict[str, Array]) -> ArmForces:
+        """Return what moves the arms but for contacts."""
+        dofs = self.tables.dofs
+        numbers = [np.flatnonzero(np.isin(dofs[:, 0], kind.dofs[:, 0])) for kind in self._kinds]
+        return padded([kind.forces(physics, fields) for kind in self._kinds], numbers, dofs < len(physics.qvel))
 
-        def of_arm(dynamics: Dynamics, physics: Physics) -> tuple[Array, Array, JointRows]:
-            found = dynamics.forces(physics)
-            mass = found.mass + dynamics.dt * found.damping
-            return mass[np.tril_indices(len(mass))], found.smooth, dynamics.joint_rows(found.rows)
-
-        dofs, found = self.tables.dofs, [kind.each(physics, fields, of_arm) for kind in self._kinds]
-        if len(found) == 1:
-            return found[0]
-        (a, m), n = dofs.shape, len(physics.qvel)
-        places, there = packed(m), dofs < n
-        mass = jnp.zeros((a, m * (m + 1) // 2)).at[:, np.diag(places)].set(~there * np.float32(1.0))
-        smooth, joints = jnp.zeros((a, m)), JointRows(*[jnp.zeros((a, m))] * len(JointRows._fields))
-        for kind, own in zip(self._kinds, found, strict=True):
-            arms = np.array([np.flatnonzero(dofs[:, 0] == first)[0] for first in kind.dofs[:, 0]])
-            m = kind.dofs.shape[1]
-            mass = mass.at[arms, : m * (m + 1) // 2].set(own[0])
-            smooth = smooth.at[arms, :m].set(own[1])
-            joints = JointRows(*(all_.at[arms, :m].set(its) for all_, its in zip(joints, own[2], strict=True)))
-        return mass, smooth, joints
+    def _of_joints(self, each: Array) -> Array:
+        """Return what belongs to each arm's joints [a, m] by the joints' numbers, [n]."""
+        n = self._dynamics.model.nv
+        return jnp.zeros(n + 1).at[self.tables.dofs].set(each)[:n]
 
     def _between(self, physics: Physics, poses: Any, overlap: Array) -> _Between:
         """Return the contacts of arms with arms. There is nothing in it unless any overlap."""
