@@ -234,7 +234,11 @@ class _Room:
 
 
 class CudaArrays(Arrays):
-    """torch tensors on the GPU."""
+    """torch tensors on the GPU.
+
+    Results are not copied, unless columns are sorted: each kernel writes them into new memory, of which torch keeps some
+    at hand. In a CUDA graph that is the same memory at every replay.
+    """
 
     device = "cuda"
 
@@ -267,7 +271,8 @@ class CudaArrays(Arrays):
         return self._present(leaf, self._by_environment(self.rows(leaf)), library)
 
     def read_tree(self, tree: dict[str, Any], library: str) -> dict[str, Any]:
-        return self._cut(tree, {name: self._by_environment(self.fields(name)) for name in _READ}, library)
+        found = {name: self._by_environment(self.fields(name)) for name in _READ if self.order or name != "outs"}
+        return self._cut(tree, {"outs": self.fields("outs"), **found}, library)
 
     def _by_environment(self, rows: Any) -> Any:
         """As in `CpuArrays`."""
@@ -285,7 +290,12 @@ class CudaArrays(Arrays):
         return torch.cuda.is_current_stream_capturing()
 
     def renew(self) -> None:
-        pass  # a CUDA graph writes to the same place at every replay, so what is read is copied
+        if self.order:
+            return  # what is read is copied, to sort it
+        import torch
+
+        outs = torch.empty_like(self._buffers["outs"])
+        self._buffers["outs"], self.all[list(_TYPES).index("outs")] = outs, self.warp(outs)
 
     def _cut(self, node: Any, copies: dict[str, Any], library: str) -> Any:
         """Return a tree's leaves, taken out of copies of the buffers.
