@@ -75,9 +75,9 @@ class Dynamics:
         """Return MJX's data with the poses of all bodies, geoms and sites."""
         return _stage("kinematics")(self.model, self._data.replace(qpos=qpos))
 
-    def axes(self, data: Any) -> Any:
-        """Return MJX's data with the axes of all joints, beside the poses that it has."""
-        return _stage("com_pos")(self.model, data)
+    def axes(self, qpos: Array) -> Any:
+        """Return MJX's data with the axes of all joints, beside the poses."""
+        return _stage("com_pos")(self.model, self.pose(qpos))
 
     def forces(self, physics: Physics) -> Forces:
         """Compute all of `mjx.forward` except collision and solver."""

@@ -33,16 +33,12 @@ class Joined:
     def __init__(self, dynamics: Dynamics, pairs: Pairs, kinds: Sequence[Kind]) -> None:
         self._dynamics, self._pairs, self._kinds = dynamics, pairs, kinds
 
-    def step(self, physics: Physics, touch: Touch, data: Any, fields: dict[str, Array]) -> tuple[Physics, Touch]:
+    def step(self, physics: Physics, touch: Touch, fields: dict[str, Array]) -> tuple[Physics, Touch]:
         """Return the state after one physics step, and the hardest touch up to the start of that step.
 
-        Args:
-            physics: the state.
-            touch: the hardest touch so far.
-            data: MJX's data with the poses of the arms.
-            fields: other values of some fields of the scene's model.
+        `fields` replaces values of some fields of the scene's model.
         """
-        data = self._dynamics.axes(data)
+        data = self._dynamics.axes(physics.qpos)  # again: quicker than to keep poses until here
         distance = self._pairs.distance_by_arms(data.geom_xpos, data.geom_xmat)
         touching = self._pairs.deepest(data, distance)
         contacts = self._dynamics.contact_rows(touching.jacobian, touching.distance, touching.weight, physics.qvel)

@@ -199,7 +199,7 @@ class Simulator:
         overlap = self._pairs.overlap(data.geom_xpos, data.geom_xmat) if distance is None else (distance < 0).any()
         if self._objects:
             return self._objects.step(physics, touch, data, overlap, self._fields)
-        joined = lambda physics, touch: self._joined.step(physics, touch, data, self._fields)  # noqa: E731
+        joined = lambda physics, touch: self._joined.step(physics, touch, self._fields)  # noqa: E731
         return jax.lax.cond(overlap, joined, self._apart, physics, touch)
 
     def _apart(self, physics: Physics, touch: Touch) -> tuple[Physics, Touch]:

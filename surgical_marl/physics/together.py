@@ -162,7 +162,7 @@ class Together:
             return Physics(qpos, qvel, self._of_joints(qacc), physics.ctrl, objects), touch._replace(overflow=left_out)
 
         def together(physics: Physics, touch: Touch) -> tuple[Physics, Touch]:
-            return self._step(physics, touch, data, arms, slots, joints, fingers, overlap)
+            return self._step(physics, touch, arms, slots, joints, fingers, overlap)
 
         return jax.lax.cond(near, together, alone, physics, touch)
 
@@ -209,7 +209,7 @@ class Together:
         return jax.lax.cond(joined.any(), whole, each)
 
     def _step(
-        self, physics: Physics, touch: Touch, data: Any, arms: ArmForces, slots: Slots, joints: Joints,
+        self, physics: Physics, touch: Touch, arms: ArmForces, slots: Slots, joints: Joints,
         fingers: Fingers, overlap: Array,
     ) -> tuple[Physics, Touch]:  # fmt: skip
         """Return the state after a step of all arms and objects together.
@@ -219,7 +219,7 @@ class Together:
         dt, (bodies, grips), handling = self._dynamics.dt, physics.objects, Handling(self.tables, self._newton)
         felt = handling.feel(slots, joints, fingers, physics.qvel, bodies, grips, dt)
         masses, free = self._free(bodies, slots.awake)
-        between = self._between(physics, data, overlap)
+        between = self._between(physics, overlap)
         problem = Problem(
             arms.implicit, arms.smooth, arms.joints, between.rows, overlap, masses, free, felt.contacts, slots.found
         )
@@ -247,11 +247,11 @@ class Together:
         n = self._dynamics.model.nv
         return jnp.zeros(n + 1).at[self.tables.dofs].set(each)[:n]
 
-    def _between(self, physics: Physics, poses: Any, overlap: Array) -> _Between:
+    def _between(self, physics: Physics, overlap: Array) -> _Between:
         """Return the contacts of arms with arms. There is nothing in it unless any overlap."""
 
         def found(_: None) -> _Between:
-            data = self._dynamics.axes(poses)
+            data = self._dynamics.axes(physics.qpos)  # again: quicker than to keep poses until here
             distance = self._pairs.distance_by_arms(data.geom_xpos, data.geom_xmat)
             touching = self._pairs.deepest(data, distance)
             rows = self._dynamics.contact_rows(touching.jacobian, touching.distance, touching.weight, physics.qvel)

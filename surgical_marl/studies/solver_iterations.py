@@ -99,7 +99,7 @@ def step(scene: Scene, states: Physics, touching: bool) -> tuple[np.ndarray, np.
     def advance(state: Physics) -> tuple[Physics, Touch]:
         if not touching:
             return simulated._apart(state, simulated.untouched)
-        return simulated._joined.step(state, simulated.untouched, simulated._together.pose(state.qpos), {})
+        return simulated._joined.step(state, simulated.untouched, {})
 
     after, touch = jax.jit(jax.vmap(advance))(states)
     return np.asarray(after.qvel), np.asarray(touch.force)

@@ -236,8 +236,8 @@ class _Room:
 class CudaArrays(Arrays):
     """torch tensors on the GPU.
 
-    Results are not copied, unless columns are sorted: each kernel writes them into new memory, of which torch keeps some
-    at hand. In a CUDA graph that is the same memory at every replay.
+    Results are not copied, unless columns are sorted: each kernel writes them into new memory, of which torch keeps
+    some at hand. In a CUDA graph that is the same memory at every replay.
     """
 
     device = "cuda"
