@@ -7,7 +7,6 @@ arms. Only what the constraint solver does concerns all arms at once.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import jax.numpy as jnp
 from jax import Array
