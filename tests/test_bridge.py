@@ -1,4 +1,4 @@
-"""Arms that objects, or contacts of arms, join are solved as arms and objects together are, in float64."""
+"""Arms that one object joins are solved as arms and object together are, in float64."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def _solved(matrix: np.ndarray, force: np.ndarray, rows: Rows) -> np.ndarray:
 
 
 class _Drawn(NamedTuple):
-    """Arms and objects at random, of which one or all join arms, and contacts of arms if all do."""
+    """Arms and objects at random, one of which joins two arms."""
 
     problem: SimpleNamespace
     here: jax.Array
@@ -65,17 +65,14 @@ class _Drawn(NamedTuple):
     """The forces on them, likewise."""
 
 
-def _drawn(rng: np.random.Generator, arms: int, objects: int, bridge: int | None) -> _Drawn:
+def _drawn(rng: np.random.Generator, arms: int, objects: int, bridge: int) -> _Drawn:
     single = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
     halves = lambda x: single(x[:, *np.tril_indices(JOINTS)])  # noqa: E731
     dofs, shape, n = np.arange(arms * JOINTS).reshape(arms, JOINTS), (arms, JOINTS), arms * JOINTS
     touched = np.zeros((objects, arms), bool)
-    if bridge is None:
-        touched[:] = rng.random(touched.shape) < 0.7
-    else:
-        touched[bridge, rng.permutation(arms)[:2]] = True
-        if objects > 1:
-            touched[1 - bridge, rng.integers(arms)] = True
+    touched[bridge, rng.permutation(arms)[:2]] = True
+    if objects > 1:
+        touched[1 - bridge, rng.integers(arms)] = True
     mass, smooth = np.array([_positive(rng, JOINTS) for _ in range(arms)]), rng.normal(size=shape)
     push, here = rng.normal(size=(objects, 6)), rng.normal(size=shape)
     whole, stiff = np.zeros((n + 6 * objects,) * 2), np.zeros((arms, JOINTS, JOINTS))
@@ -93,35 +90,25 @@ def _drawn(rng: np.random.Generator, arms: int, objects: int, bridge: int | None
         wide[arms * o : arms * (o + 1)] = np.linalg.solve(factor, wide[arms * o : arms * (o + 1)])
     for i in range(arms):
         whole[dofs[i][:, None], dofs[i]] = mass[i] + stiff[i]
-    count = 0 if bridge is not None else 3
-    jacobian, impedance, reference = rng.normal(size=(count, *shape)), 9 * rng.random(count), rng.normal(size=count)
-    bounds = np.zeros(count), np.full(count, np.inf)
-    force = smooth.ravel().copy()
-    for row, stiffness, aim in zip(jacobian.reshape(count, n), impedance, reference, strict=True):
-        if aim > row @ here.ravel():  # it presses: until the end of these Newton steps
-            whole[:n, :n] += stiffness * np.outer(row, row)
-            force += stiffness * aim * row
-    rows = Rows(*map(single, (jacobian, impedance, reference, *bounds)))
+    none = Rows(single(np.zeros((0, *shape))), *[single([])] * 4)
     felt = -np.einsum("ijk,ik->ij", stiff, here)
     left = Left(halves(stiff), jnp.ones(arms, bool), *map(single, (felt, half, wide)), jnp.asarray(touched))
-    problem = SimpleNamespace(mass=halves(mass), smooth=single(smooth), joints=_joints(rng, arms), between=rows)
-    problem.overlap = jnp.bool_(True)
-    return _Drawn(problem, single(here), left, whole, np.concatenate([force, push.ravel()]))
+    problem = SimpleNamespace(mass=halves(mass), smooth=single(smooth), joints=_joints(rng, arms), between=none)
+    return _Drawn(problem, single(here), left, whole, np.concatenate([smooth.ravel(), push.ravel()]))
 
 
-@pytest.mark.parametrize("way", ["bridged", "together"])
 @pytest.mark.parametrize("arms", [2, 3])
 @pytest.mark.parametrize("objects", [1, 2])
-def test_joined_arms_are_solved_as_all_at_once_in_float64(
-    way: str, arms: int, objects: int, monkeypatch: pytest.MonkeyPatch
+def test_arms_that_an_object_joins_are_solved_as_all_at_once_in_float64(
+    arms: int, objects: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("surgical_marl.physics.arms.ITERATIONS", (60, 4))  # six do not solve all of these
     rng, errors = np.random.default_rng(10 * arms + objects), []
-    ways = getattr(Arms(arms, JOINTS), way)
-    solve = jax.jit(lambda fields, here, left: here + ways(SimpleNamespace(**fields), here, left))
+    solver = Arms(np.arange(arms * JOINTS).reshape(arms, JOINTS), arms * JOINTS)
+    bridged = jax.jit(lambda fields, here, left: here + solver.bridged(SimpleNamespace(**fields), here, left))  # type: ignore[arg-type]
     for n in range(40):
-        drawn = _drawn(rng, arms, objects, n % objects if way == "bridged" else None)
-        found = solve(vars(drawn.problem), drawn.here, drawn.left)
+        drawn = _drawn(rng, arms, objects, n % objects)
+        found = bridged(vars(drawn.problem), drawn.here, drawn.left)
         flat = JointRows(*(np.asarray(column, np.float64).ravel() for column in drawn.problem.joints))
         rows = Rows(*(np.asarray(column, np.float64) for column in rows_of(flat)))  # type: ignore[arg-type]
         rows = rows._replace(jacobian=np.pad(rows.jacobian, ((0, 0), (0, 6 * objects))))

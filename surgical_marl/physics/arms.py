@@ -14,9 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from surgical_marl.physics.balance import Own, balanced
-from surgical_marl.physics.blocks import Blocks
-from surgical_marl.physics.bridge import bridged_step
+from surgical_marl.physics.bridge import Bridge, Own
 from surgical_marl.physics.factor import packed
 from surgical_marl.physics.problem import Problem
 from surgical_marl.physics.solver import JointRows, Rows, row_forces, rows_of, solve
@@ -56,54 +54,51 @@ class _Row(NamedTuple):
 
 
 class Arms:
-    """Solves for the ways of `arms` arms, with so many joints at most."""
+    """Solves for the ways of arms. `dofs` [a, m] are the numbers of their joints, as for `Newton`."""
 
-    def __init__(self, arms: int, joints: int) -> None:
-        self._places, self._blocks = packed(joints), Blocks(arms, joints)
+    def __init__(self, dofs: np.ndarray, joints: int) -> None:
+        self._there = dofs < joints
+        self._places, self._all = packed(dofs.shape[1]), packed((dofs < joints).sum())
 
     def together(self, problem: Problem, here: Array, left: Left) -> Array:
         """Return the ways [a, m] from an acceleration [a, m] of arms that objects, or contacts of arms, join."""
+        there, (first, second) = self._there, np.tril_indices(len(self._all))
 
-        def subtract(total: tuple[Array, Array], row: Any) -> tuple[tuple[Array, Array], None]:
-            less = partial(self._without_object, left, *row)
-            return jax.lax.cond(row[-1].any(), less, lambda total: total, total), None
+        def flat(each: Array) -> Array:
+            return jnp.concatenate([row[own] for row, own in zip(each, there, strict=True)])
+
+        # lower halves: what a loop carries for both halves it would carry, and compute, twice
+        stiff = self._lower(problem.mass + jnp.where(left.on_arm[:, None], left.stiff, 0.0))
+        force = flat(problem.smooth + left.force)
+        start, mass = flat(here), self._lower(problem.mass)[self._all]
 
         def press(total: tuple[Array, Array], row: Rows) -> tuple[tuple[Array, Array], None]:
-            pressed = jnp.maximum(row.impedance * (row.reference - jnp.sum(row.jacobian * here)), 0.0)
-            more = partial(self._with_contact, row, pressed)
-            return jax.lax.cond(pressed > 0, more, lambda total: total, total), None
+            jacobian = flat(row.jacobian)
+            pressed = jnp.maximum(row.impedance * (row.reference - jacobian @ start), 0.0)
+            whole = jnp.where(pressed > 0, row.impedance, 0.0) * jacobian
+            return (total[0] + whole[first] * jacobian[second], total[1] + pressed * jacobian), None
 
-        own, force = jax.lax.map(self._with_contacts, self._rows(problem, here, left))
-        total = self._blocks.of_arms(own), force
+        def subtract(total: tuple[Array, Array], row: Any) -> tuple[tuple[Array, Array], None]:
+            i, half, touched = row
+
+            def less(total: tuple[Array, Array]) -> tuple[Array, Array]:
+                each = jnp.where(touched[:, None, None], left.wide[len(there) * i + np.arange(len(there))], 0.0)
+                wide = jnp.concatenate([of_arm[:, own] for of_arm, own in zip(each, there, strict=True)], 1)
+                return total[0] - jnp.sum(wide[:, first] * wide[:, second], 0), total[1] - wide.T @ half
+
+            return jax.lax.cond(touched.any(), less, lambda total: total, total), None
+
+        total = stiff, force - mass @ start
         if len(problem.between.low):
             with_rows = lambda total: jax.lax.scan(press, total, problem.between)[0]  # noqa: E731
             total = jax.lax.cond(problem.overlap, with_rows, lambda total: total, total)
-        objects = jnp.arange(len(left.half)), left.half, left.touched
-        (matrix, force), _ = jax.lax.scan(subtract, total, objects)
-        step_of = partial(self._blocks.step, matrix)
-        return balanced(Own(force, problem.joints, here), step_of, partial(self._resisted, problem), ITERATIONS[0])
-
-    def _without_object(
-        self, left: Left, i: Array, half: Array, touched: Array, total: tuple[Array, Array]
-    ) -> tuple[Array, Array]:
-        """Return the matrix of all arms, and the forces on them, less what an object takes from those it touches."""
-        matrix, force = total
-        wide = lambda arm: left.wide[len(force) * i + arm]  # noqa: E731
-
-        def taken(arm: Array) -> Array:
-            return jax.lax.cond(touched[arm], lambda: wide(arm).T @ half, lambda: jnp.zeros_like(force[0]))
-
-        matrix = self._blocks.add(matrix, touched, lambda arm, joint: lambda other: -wide(arm)[:, joint] @ wide(other))
-        return matrix, force - jax.lax.map(taken, jnp.arange(len(force)))
-
-    def _with_contact(self, row: Rows, pressed: Array, total: tuple[Array, Array]) -> tuple[Array, Array]:
-        """Return the matrix of all arms, and the forces on them, with a contact that presses arms on each other."""
-        (matrix, force), stiff = total, row.impedance * row.jacobian
-        all_ = jnp.ones(len(force), bool)
-        matrix = self._blocks.add(
-            matrix, all_, lambda arm, joint: lambda other: stiff[arm, joint] * row.jacobian[other]
-        )
-        return matrix, force + pressed * row.jacobian
+        (stiff, force), _ = jax.lax.scan(subtract, total, (jnp.arange(len(left.half)), left.half, left.touched))
+        joints = rows_of(JointRows(*map(flat, problem.joints)))
+        found, rows = _way(stiff[self._all], force, joints, start), np.cumsum(there.sum(1))
+        ways = [
+            jnp.zeros(len(own)).at[own].set(way) for own, way in zip(there, jnp.split(found, rows[:-1]), strict=True)
+        ]
+        return jnp.stack(ways)
 
     def each(self, problem: Problem, here: Array, left: Left) -> Array:
         """Return the ways [a, m] of arms of which no two are joined: one problem after the other."""
@@ -118,7 +113,7 @@ class Arms:
 
     def bridged(self, problem: Problem, here: Array, left: Left) -> Array:
         """Return the ways [a, m] of arms that one object joins and nothing else."""
-        a, k = len(here), len(left.half)
+        a, k = len(self._there), len(left.half)
         bridge = jnp.argmax(left.touched.sum(1) > 1)
         rows = self._rows(problem, here, left)
         stiff, force = jax.lax.map(partial(self._alone, left, np.arange(k) != bridge), rows)
@@ -127,11 +122,11 @@ class Arms:
             found = left.wide[a * bridge + arm]
             return found if a == 2 else jnp.where(left.touched[bridge, arm], found, 0.0)
 
-        step_of = partial(bridged_step, stiff, wide, self._places)
-        return balanced(Own(force, problem.joints, here), step_of, partial(self._resisted, problem), ITERATIONS[0])
+        own = Own(rows.number, stiff, force, problem.joints, here)
+        return Bridge(own, wide, partial(self._resisted, problem), self._places).solve(ITERATIONS[0])
 
     def _rows(self, problem: Problem, here: Array, left: Left) -> _Row:
-        arms = jnp.arange(len(here))
+        arms = jnp.arange(len(self._there))
         contacts = left.on_arm, left.stiff, left.force
         return _Row(arms, problem.mass, problem.smooth, problem.joints, here, *contacts)
 
@@ -140,26 +135,23 @@ class Arms:
 
         `takes` [k] are those objects that take something from the matrix.
         """
-        (first, second), arms = np.tril_indices(len(self._places)), left.touched.shape[1]
+        first, second = np.tril_indices(len(self._places))
 
         def subtract(total: tuple[Array, Array], of_object: Any) -> tuple[tuple[Array, Array], None]:
             i, half, touched, takes = of_object
 
             def less(total: tuple[Array, Array]) -> tuple[Array, Array]:
-                wide = left.wide[arms * i + row.number]
+                wide = left.wide[len(self._there) * i + row.number]
                 lower = lambda whole: whole - jnp.sum(wide[:, first] * wide[:, second], 0)  # noqa: E731
                 return jax.lax.cond(takes, lower, lambda whole: whole, total[0]), total[1] - wide.T @ half
 
             return jax.lax.cond(touched[row.number], less, lambda total: total, total), None
 
-        objects = jnp.arange(len(left.half)), left.half, left.touched, jnp.asarray(takes)
-        found: tuple[Array, Array] = jax.lax.scan(subtract, self._with_contacts(row), objects)[0]
-        return found
-
-    def _with_contacts(self, row: _Row) -> tuple[Array, Array]:
-        """Return the lower half of an arm's matrix and the forces on it, with contacts, but as if objects were held."""
         whole = jax.lax.cond(row.on_arm, lambda: row.mass + row.stiff, lambda: row.mass)
-        return whole, row.smooth + row.force - row.mass[self._places] @ row.start
+        total = whole, row.smooth + row.force - row.mass[self._places] @ row.start
+        objects = jnp.arange(len(left.half)), left.half, left.touched, jnp.asarray(takes)
+        found: tuple[Array, Array] = jax.lax.scan(subtract, total, objects)[0]
+        return found
 
     def slopes(self, problem: Problem, here: Array, way: Array, force: Array) -> tuple[Array, Array, Array]:
         """Return slopes of the cost along ways [a, m], from an acceleration [a, m], [] each.
@@ -219,6 +211,15 @@ class Arms:
         """Return the power along ways of contacts of arms with arms, []."""
         rows = _flat(problem.between)
         return row_forces(rows, here.ravel()) @ (rows.jacobian @ way.ravel())
+
+    def _lower(self, halves: Array) -> Array:
+        """Return the lower half of one matrix for all joints that are there, of the lower halves of each arm's."""
+        sizes = self._there.sum(1)
+        whole, starts = jnp.zeros(sizes.sum() * (sizes.sum() + 1) // 2), np.cumsum(sizes) - sizes
+        for arm, own in enumerate(self._there):
+            (i, j), places = np.tril_indices(sizes[arm]), self._places[np.ix_(own, own)]
+            whole = whole.at[self._all[starts[arm] + i, starts[arm] + j]].set(halves[arm][places[i, j]])
+        return whole
 
 
 def _flat(rows: Rows) -> Rows:

@@ -1,4 +1,4 @@
-"""Newton steps of arms that one object joins: each arm is factorised alone, and six numbers of the object join them.
+"""The way of arms that one object joins: each arm is factorised alone, and six numbers of the object join them.
 
 Without the object, the matrix B of all arms has one block for each arm. The object takes W.T @ W from it, where W is
 six rows. By Woodbury's identity (W. Hager, "Updating the inverse of a matrix", SIAM Review 31, 1989) the solution x of
@@ -9,7 +9,7 @@ larger than that of an arm, and all arms share the code of one, in loops.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,38 +17,124 @@ import numpy as np
 from jax import Array
 
 from surgical_marl.physics.factor import back, cholesky, forward
+from surgical_marl.physics.search import search
+from surgical_marl.physics.solver import JointRows, Rows, giving, rows_of, unbounded_forces
 
 
-def bridged_step(
-    stiff: Array, wide: Callable[[Array], Array], places: np.ndarray, gives: Array, excess: Array
-) -> Array:  # fmt: skip
-    """Return x [a, m] with (B - W.T @ W + diag(gives)) @ x = excess.
+class Own(NamedTuple):
+    """What belongs to each of a arms with m joints each at most."""
+
+    number: Array
+    """[a]"""
+    stiff: Array
+    """How forces fall with the acceleration of its joints, without the object: lower half, [a, m (m + 1) / 2]."""
+    force: Array
+    """All forces at `start`, but for friction and limits of joints, [a, m]."""
+    joints: JointRows
+    """Friction and limits of joints, [a, m]."""
+    start: Array
+    """The acceleration that it begins with, [a, m]."""
+
+
+class _State(NamedTuple):
+    ways: Array
+    """[a, m]"""
+    moved: Array
+    """W times the ways, [6]."""
+    settled: Array
+    steps: Array
+
+
+class Bridge:
+    """Solves for the ways of arms that one object joins.
 
     Args:
-        stiff: the lower half of each arm's block of B, [a, m (m + 1) / 2].
+        own: what belongs to each arm.
         wide: from the number of an arm to its columns of W, [6, m].
+        resisted: from accelerations [a, m], ways [a, m] and a length to the slope of friction and limits of joints
+            there, and by how much it grows per length.
         places: where each element of an arm's matrix is in its lower half, [m, m].
-        gives: [a, m].
-        excess: [a, m].
     """
-    numbers = jnp.arange(len(stiff))
 
-    def factorise(sums: tuple[Array, Array], row: Any) -> tuple[tuple[Array, Array], Array]:
-        number, stiff, gives, excess = row
-        factor = cholesky(stiff[places] + jnp.diag(gives))
-        eased = forward(factor, jnp.concatenate([excess[:, None], wide(number).T], 1))
-        joined = sums[0] - eased[:, 1:].T @ eased[:, 1:], sums[1] + eased[:, 1:].T @ eased[:, 0]
-        return joined, factor
+    def __init__(
+        self,
+        own: Own,
+        wide: Callable[[Array], Array],
+        resisted: Callable[[Array, Array, Array], tuple[Array, Array]],
+        places: np.ndarray,
+    ) -> None:
+        self._own, self._wide, self._resisted, self._places = own, wide, resisted, places
 
-    def step_of(row: Any) -> Array:
-        number, excess, factor = row
-        return _solved(factor, excess + wide(number).T @ joined)  # `wide` again: quicker than to keep it
+    def solve(self, iterations: int) -> Array:
+        """Return the ways [a, m], by at most `iterations` Newton steps: the last one is whole and changes no side."""
 
-    none = jnp.eye(6), jnp.zeros(6)
-    (matrix, right), factors = jax.lax.scan(factorise, none, (numbers, stiff, gives, excess))
-    joined = _solved(cholesky(matrix), right)
-    found: Array = jax.lax.map(step_of, (numbers, excess, factors))
-    return found
+        def unsettled(state: _State) -> Array:
+            return ~state.settled & (state.steps < iterations)
+
+        none = _State(jnp.zeros_like(self._own.start), jnp.zeros(6), jnp.bool_(False), jnp.int32(0))
+        return jax.lax.while_loop(unsettled, self._newton, none).ways
+
+    def _newton(self, state: _State) -> _State:
+        """Return the state after a step."""
+        excess, factors, joined = self._factorise(state)
+
+        def step_of(sums: tuple[Array, Array, Array], row: Any) -> tuple[tuple[Array, Array, Array], Array]:
+            own, way, excess, factor = row
+            across, (rows, force) = self._wide(own.number), _rows(own, way)  # again: quicker than to keep them
+            step = _solved(factor, excess + across.T @ joined)
+            end = force - rows.impedance * (rows.jacobian @ step)
+            kept = ((force > rows.low) == (end > rows.low)) & ((force < rows.high) == (end < rows.high))
+            moved, begin, whole = sums
+            return (moved + across @ step, begin - excess @ step, whole & kept.all()), step
+
+        start = jnp.zeros(6), jnp.float32(0.0), jnp.bool_(True)
+        (moved, begin, whole), steps = jax.lax.scan(step_of, start, (self._own, state.ways, excess, factors))
+        part = lambda: self._length(state, steps, moved, begin)  # noqa: E731
+        length = jax.lax.cond(whole, lambda: jnp.float32(1.0), part)
+        return _State(state.ways + length * steps, state.moved + length * moved, whole, state.steps + 1)
+
+    def _factorise(self, state: _State) -> tuple[Array, Array, Array]:
+        """Return the forces left over [a, m], the factors of the arms' matrices [a, m, m], and what joins them [6]."""
+
+        def factorise(sums: tuple[Array, Array], row: Any) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+            own, way = row
+            matrix, across, (rows, force) = own.stiff[self._places], self._wide(own.number), _rows(own, way)
+            excess = own.force + rows.jacobian.T @ jnp.clip(force, rows.low, rows.high)
+            excess += across.T @ state.moved - matrix @ way
+            gives = giving(rows, force)
+            factor = cholesky(matrix + rows.jacobian.T @ (gives[:, None] * rows.jacobian))
+            eased = forward(factor, jnp.concatenate([excess[:, None], across.T], 1))
+            joined = sums[0] - eased[:, 1:].T @ eased[:, 1:], sums[1] + eased[:, 1:].T @ eased[:, 0]
+            return joined, (excess, factor)
+
+        none = jnp.eye(6), jnp.zeros(6)
+        (matrix, right), (excess, factors) = jax.lax.scan(factorise, none, (self._own, state.ways))
+        return excess, factors, _solved(cholesky(matrix), right)
+
+    def _length(self, state: _State, steps: Array, moved: Array, begin: Array) -> Array:
+        """Return how far to go along steps [a, m], by which W moves `moved` [6]; `begin` is the slope before them."""
+
+        def add(sums: tuple[Array, Array], row: Any) -> tuple[tuple[Array, Array], None]:
+            own, way, step = row
+            spread = own.stiff[self._places] @ step
+            return (sums[0] + way @ spread - own.force @ step, sums[1] + step @ spread), None
+
+        none = jnp.float32(0.0)
+        (slope, growth), _ = jax.lax.scan(add, (none, none), (self._own, state.ways, steps))
+        slope, growth = slope - state.moved @ moved, growth - moved @ moved
+        here = self._own.start + state.ways
+
+        def measure(length: Array, seen: Array) -> tuple[Array, Array, Array]:
+            resists, gives = self._resisted(here, steps, length)
+            return slope + length * growth + resists, growth + gives, seen
+
+        return search(begin, 0.0, measure, none).length
+
+
+def _rows(own: Own, way: Array) -> tuple[Rows, Array]:
+    """Return friction and limits of an arm's joints as rows, and their forces at a way if they had no bounds."""
+    rows = rows_of(own.joints)
+    return rows, unbounded_forces(rows, own.start + way)
 
 
 def _solved(factor: Array, right: Array) -> Array:

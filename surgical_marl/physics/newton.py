@@ -75,8 +75,8 @@ class Newton:
     `dofs` [a, m] are the numbers of each arm's joints; where it has fewer than others, that of no joint.
     """
 
-    def __init__(self, dofs: np.ndarray, objects: int) -> None:
-        self._dofs, self._objects, self._arms = dofs, objects, Arms(*dofs.shape)
+    def __init__(self, dofs: np.ndarray, joints: int, objects: int) -> None:
+        self._dofs, self._objects, self._arms = dofs, objects, Arms(dofs, joints)
         self._passes = PASSES if len(dofs) else ALONE
 
     def twist(self, contact: Contact, arms: Array, objects: Array) -> Array:

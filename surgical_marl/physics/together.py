@@ -67,11 +67,11 @@ class Together:
         self._pairs, self._dynamics, self._kinds, self._arms = pairs, dynamics, kinds, len(scene.agents)
         self.tables = Tables(scene)
         self.names = self.tables.names
-        none = np.zeros((0, 0), int)
+        joints, none = scene.model.nv, np.zeros((0, 0), int)
         self._newton, self._objects_alone, self._object_alone = (
-            Newton(self.tables.dofs, len(self.names)),
-            Newton(none, len(self.names)),
-            Newton(none, 1),
+            Newton(self.tables.dofs, joints, len(self.names)),
+            Newton(none, 0, len(self.names)),
+            Newton(none, 0, 1),
         )
         self._finder = Finder(self.tables)
         self._nominal = self.tables
