@@ -157,7 +157,7 @@ class Pairs:
         slots = min(SLOTS, self.count)
         blocks = jnp.pad(depth, (0, -len(depth) % BLOCK), constant_values=-np.inf).reshape(-1, BLOCK)
 
-        def best(found: tuple[Array, Array, Array], block: tuple[Array, Array]) -> tuple[tuple[Array, ...], None]:
+        def best(found: Any, block: tuple[Array, Array]) -> tuple[Any, None]:
             depth, pair = (jnp.concatenate(both) for both in zip(found[:2], block, strict=True))
             depth, place = jax.lax.top_k(depth, slots)
             # a sum of real numbers: the fused engine looks for bounds of whole ones
