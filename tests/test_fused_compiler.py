@@ -17,7 +17,7 @@ from jax import lax
 
 from surgical_marl.engines.fused import emit, kernel
 from surgical_marl.engines.fused.emit import Emitter
-from surgical_marl.engines.fused.preludes import CUDA, UNDEFINE
+from surgical_marl.engines.fused.preludes import CUDA, STRETCH, UNDEFINE
 from surgical_marl.engines.fused.traced import Unsupported
 from tests.helpers.fused_blocks import all_blocks, random_arrays
 from tests.helpers.fused_kernels import gpu_code, make_stores, run, worked
@@ -84,6 +84,20 @@ def test_loops_in_loops_are_not_traced_in_all_combinations() -> None:
     assert tried[2] < 4 * tried[1] < 16 * tried[0], "twice the depth may take four times as many, and no more"
     column = np.ones((4, 9), np.float32)
     np.testing.assert_allclose(run(nested(4), column), jax.vmap(nested(4))(column), rtol=1e-5)
+
+
+def test_long_code_for_a_cpu_has_fences() -> None:
+    """Clang compares each store with all loads between two of them."""
+
+    def function(x: Any) -> Any:
+        for _ in range(500):
+            x = jnp.sqrt(x * x + 1.0)
+        return x
+
+    cuda, cpu = (body(function, np.ones(3, np.float32), vector=vector) for vector in (False, True))
+    stretches = [part.count(";") for part in cpu.split("FENCE")]
+    assert len(stretches) > 10 and max(stretches) <= STRETCH + 5
+    assert "FENCE" not in cuda
 
 
 def test_many_tables() -> None:

@@ -30,8 +30,12 @@ STRETCH = 120
 def fenced(code: Iterable[str]) -> list[str]:
     """Return code for a CPU, given as its statements, with fences."""
     lines: list[str] = []
-    for number, line in enumerate(code, 1):
-        lines += [line, "FENCE"] if number % STRETCH == 0 and line.endswith(";") else [line]
+    last = 0
+    for line in code:
+        lines.append(line)
+        if len(lines) - last > STRETCH and line.endswith(";"):
+            lines.append("FENCE")
+            last = len(lines)
     return lines
 
 
