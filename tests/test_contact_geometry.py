@@ -316,3 +316,4 @@ def test_few_pairs_are_never_too_many() -> None:
         poses = {"geom_xpos": places, "geom_xmat": frames, "cdof": none[: model.nv], "subtree_com": none[:, :3]}
         found = known.deepest(SimpleNamespace(**poses), distance)
         assert (np.asarray(distance) < 0).all() and int(found.left_out) == left
+        np.testing.assert_allclose(known.closest(places, frames, np.arange(known.count)).distance, distance)

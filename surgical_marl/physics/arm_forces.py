@@ -68,14 +68,13 @@ def apart(arms: ArmForces) -> tuple[Array, Array]:
 
 
 def changes(arms: ArmForces, qacc: Array) -> Array:
-    """Return accelerations [a, m] with what is implicit, from those without: see `Dynamics.moved`."""
+    """Return accelerations [a, m] with what is implicit, from those without: see `Dynamics.step`."""
     found: Array = jax.lax.map(lambda row: _changed(*row), (arms, qacc))
     return found
 
 
 def _relaxed(arm: ArmForces) -> Array:
-    # where `solve` begins: no derivative goes through it
-    return relax(*jax.lax.stop_gradient((_whole(arm.mass), arm.smooth, arm.joints, arm.start)))
+    return relax(_whole(arm.mass), arm.smooth, arm.joints, arm.start)
 
 
 def _changed(arm: ArmForces, qacc: Array) -> Array:

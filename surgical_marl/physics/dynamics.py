@@ -41,8 +41,6 @@ class Physics(NamedTuple):
 class Forces(NamedTuple):
     """Position-dependent quantities of a model and the forces on it, for n degrees of freedom."""
 
-    data: Any
-    """MJX's data with positions, Jacobians and mass matrix."""
     mass: Array
     """[n, n]"""
     smooth: Array
@@ -86,22 +84,16 @@ class Dynamics:
         for stage in ("fwd_position", "fwd_velocity", "fwd_actuation"):
             data = _stage(stage)(self.model, data)
         smooth = data.qfrc_passive - data.qfrc_bias + data.qfrc_actuator
-        return Forces(data, _internal(data).M, smooth, self._damping(data), self._rows(data))
-
-    def relaxed(self, forces: Forces, qacc: Array) -> Array:
-        """Return the acceleration [n] from a guess, relaxed with regard to friction and limits."""
-        # where `solve` begins: no derivative goes through it
-        return relax(*jax.lax.stop_gradient((forces.mass, forces.smooth, self.joint_rows(forces.rows), qacc)))
+        return Forces(_internal(data).M, smooth, self._damping(data), self._rows(data))
 
     def step(self, physics: Physics) -> Physics:
-        """Return the state after one physics step without contacts."""
-        forces = self.forces(physics)
-        qacc = self.relaxed(forces, physics.qacc_warmstart)
-        qacc, _ = solve(forces.mass, forces.smooth, forces.rows, qacc, *ITERATIONS)
-        return self.moved(physics, forces, qacc)
+        """Return the state after one physics step without contacts.
 
-    def moved(self, physics: Physics, forces: Forces, qacc: Array) -> Physics:
-        """Return the state one step later. The integration is implicit in the forces that depend on velocity."""
+        The integration is implicit in the forces that depend on velocity.
+        """
+        forces = self.forces(physics)
+        start = relax(forces.mass, forces.smooth, self.joint_rows(forces.rows), physics.qacc_warmstart)
+        qacc, _ = solve(forces.mass, forces.smooth, forces.rows, start, *ITERATIONS)
         change = solve_positive(forces.mass + self.dt * forces.damping, forces.mass @ qacc)
         qvel = physics.qvel + self.dt * change
         return physics._replace(qpos=physics.qpos + self.dt * qvel, qvel=qvel, qacc_warmstart=qacc)

@@ -66,7 +66,7 @@ class Joined:
         return qacc, force[2 * n :]
 
     def _moved(self, physics: Physics, found: list[ArmForces], qacc: Array) -> Physics:
-        """Return the state one step later, as `Dynamics.moved` does, for accelerations [n] of all joints."""
+        """Return the state one step later, as `Dynamics.step` does, for accelerations [n] of all joints."""
         dt, qvel = self._dynamics.dt, physics.qvel
         for kind, own in zip(self._kinds, found, strict=True):
             qvel = qvel.at[kind.dofs].add(dt * changes(own, qacc[kind.dofs]))

@@ -76,8 +76,9 @@ def relax(mass: Array, smooth: Array, joints: JointRows, qacc: Array) -> Array:
     """Return an acceleration [n] nearer to the solution, by `SWEEPS` sweeps that solve one joint's equation at a time.
 
     The equation has one unknown, and its sum of forces falls with the unknown, piecewise linearly. The sign of the
-    residual at each corner says on which piece the root lies.
+    residual at each corner says on which piece the root lies. No derivative goes through it: `solve` begins with it.
     """
+    mass, smooth, joints, qacc = jax.lax.stop_gradient((mass, smooth, joints, qacc))
     n = len(qacc)
     slack = joints.friction / jnp.where(joints.friction > 0, joints.friction_impedance, 1.0)
     corners = joints.friction_reference - slack, joints.friction_reference + slack, joints.side * joints.limit_reference

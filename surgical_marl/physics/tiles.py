@@ -36,7 +36,7 @@ class Tiles:
         for pair in pairs:
             for side, geom in zip(sides.setdefault((owner[pair[0]], owner[pair[1]]), ([], [])), pair, strict=True):
                 side.extend([geom] if geom not in side else [])
-        width = [max((len(tile[k]) for tile in sides.values()), default=0) for k in (0, 1)]
+        width = [max(len(tile[k]) for tile in sides.values()) for k in (0, 1)]
         filled = [np.array([t[k] + t[k][-1:] * (width[k] - len(t[k])) for t in sides.values()]) for k in (0, 1)]
         self.geoms = np.unique([first, second])
         """Geoms that are in pairs, [c]; below they are numbered in this order."""

@@ -84,6 +84,10 @@ class Arrays(ABC):
     def renew(self) -> None:
         """Make room for results, before a kernel is launched."""
 
+    def _use(self, outs: Any, warp: Any) -> None:
+        """Let kernels write results into other memory from now on; `warp` is Warp's array of it."""
+        self._buffers["outs"], self.all[list(_TYPES).index("outs")] = outs, warp
+
     @abstractmethod
     def _argsort(self, shares: int) -> Any:
         """Return the columns in the order of what they had to do, most first, for so many threads of a CPU."""
@@ -198,8 +202,7 @@ class CpuArrays(Arrays):
         if room is None:
             room = _Room(self._zeros(fields, stride, _TYPES["outs"]))
             self._rooms.append(room)
-        self._buffers["outs"] = room.lend()
-        self.all[list(_TYPES).index("outs")] = room.warp
+        self._use(room.lend(), room.warp)
 
     def _present(self, leaf: Leaf, array: np.ndarray, library: str) -> Any:
         return self.presented(array.reshape(self.num_envs, *leaf.shape) if len(leaf.shape) > 1 else array, library)
@@ -295,7 +298,7 @@ class CudaArrays(Arrays):
         import torch
 
         outs = torch.empty_like(self._buffers["outs"])
-        self._buffers["outs"], self.all[list(_TYPES).index("outs")] = outs, self.warp(outs)
+        self._use(outs, self.warp(outs))
 
     def _cut(self, node: Any, copies: dict[str, Any], library: str) -> Any:
         """Return a tree's leaves, taken out of copies of the buffers.

@@ -21,8 +21,6 @@ BRANCHES = 8
 """So many large branches make code long: all threads of a block should be at the same place of it."""
 WAYS = 14
 """Most branches that are told apart. With 17 bits for how much there was to do, they fill an int32."""
-
-
 STRETCH = 120
 """Statements between two fences. Clang's scheduler took 33 of 50 s for six arms without any, and takes 3 s."""
 
