@@ -7,11 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from surgical_marl.engines.fused import engine, kernel, order
 from surgical_marl.engines.fused.preludes import BRANCHES
+from surgical_marl.engines.fused.reorder import AT_ONCE, reordered
 from surgical_marl.envs.batch import BatchedEnv
 from tests.helpers.actions import random_actions
+from tests.helpers.devices import DEVICES, skip_where_warp_lacks
 
 N = 45  # the last vector of a CPU is not full
 BAD = [2, 30, 44]
@@ -98,6 +101,17 @@ def test_threads_of_a_cpu_get_as_much_to_do(both: list[BatchedEnv]) -> None:
     first, second = new[:24], new[24:40]  # three vectors and two, and what is left over
     assert sorted(new) == list(range(N)) and new[-1] == 0
     assert abs(np.mean(first) - np.mean(second)) < 8 < np.ptp(np.arange(N))
+
+
+@pytest.mark.parametrize("fields", [1, AT_ONCE - 1, AT_ONCE, AT_ONCE + 1, 3 * AT_ONCE])
+@pytest.mark.parametrize("device", DEVICES)
+def test_columns_are_copied_into_another_order(device: str, fields: int) -> None:
+    """Also from an array with padding, and where the last thread has fewer fields than the others."""
+    skip_where_warp_lacks(device)
+    rng = np.random.default_rng(fields)
+    source, columns = rng.random((fields, N + 3), np.float32), rng.permutation(N).astype(np.int32)
+    rows = torch.from_numpy(source).to(device)[:, :N]
+    assert np.array_equal(reordered(rows, torch.from_numpy(columns).to(device)).cpu(), source[:, columns])
 
 
 def test_what_is_recorded_begins_with_sorting() -> None:

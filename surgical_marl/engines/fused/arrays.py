@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from surgical_marl.engines.fused import reorder
 from surgical_marl.engines.fused.order import Order
 from surgical_marl.engines.fused.preludes import LANES
 from surgical_marl.engines.fused.program import Leaf, Source
@@ -22,10 +23,8 @@ wp = prepare_warp()
 _TYPES = {"state": np.float32, "counts": np.int32, "actions": np.float32, "outs": np.float32, "flags": np.uint8}
 _VIEWS = {"bool": np.bool_, "uint32": np.uint32}
 """Types of leaves that are not the type of their buffer: the same bits, seen as another type."""
-_READ = ("outs", "flags", "counts")
-"""Buffers that a step's results are in. Nothing else is in the first one, which is by far the largest."""
 _KEPT = ("state", "counts", "flags")
-"""Buffers that the next step reads."""
+"""Buffers that the next step reads. Only results are in "outs", which is where by far most of them are."""
 _ROOMS = 3
 """Rooms for results that are kept to be used again: a loop holds the last step's results, and some hold two."""
 
@@ -274,8 +273,13 @@ class CudaArrays(Arrays):
         return self._present(leaf, self._by_environment(self.rows(leaf)), library)
 
     def read_tree(self, tree: dict[str, Any], library: str) -> dict[str, Any]:
-        found = {name: self._by_environment(self.fields(name)) for name in _READ if self.order or name != "outs"}
-        return self._cut(tree, {"outs": self.fields("outs"), **found}, library)
+        found = {name: self._by_environment(self.fields(name)) for name in ("flags", "counts")}
+        outs = reorder.reordered(self.fields("outs"), self.order.columns) if self.order else self.fields("outs")
+        return self._cut(tree, {"outs": outs, **found}, library)
+
+    def sort_columns(self, every: int, shares: int) -> None:
+        super().sort_columns(every, shares)
+        reorder.prepare()
 
     def _by_environment(self, rows: Any) -> Any:
         """As in `CpuArrays`."""
