@@ -10,9 +10,12 @@ import pytest
 import torch
 
 from surgical_marl.engines.fused import engine, kernel, order
+from surgical_marl.engines.fused.load import load_source
+from surgical_marl.engines.fused.order import WORTH
 from surgical_marl.engines.fused.preludes import BRANCHES
 from surgical_marl.engines.fused.reorder import AT_ONCE, reordered
 from surgical_marl.envs.batch import BatchedEnv
+from surgical_marl.envs.env import Env
 from tests.helpers.actions import random_actions
 from tests.helpers.devices import DEVICES, skip_where_warp_lacks
 
@@ -130,15 +133,23 @@ def test_what_is_recorded_begins_with_sorting() -> None:
 
 def test_environments_are_sorted_where_neighbours_wait_for_each_other(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(order, "multiprocessors", lambda: 132)
-    none, short, long = [""], ["WORK(9)"], ["WORK(9)"] * BRANCHES
+    none, (short, long, longer) = [""], (["WORK(9)"] * branches for branches in (1, BRANCHES, WORTH))
     few, many = 4096, 8192  # of 32 a group
 
     def every(code: list[str], device: str, num_envs: int) -> int:
         return order.sorted_every(code, device, num_envs, decimation=8)
 
     assert [every(none, "cuda", many), every(short, "cuda", few), every(short, "cuda", many)] == [0, 0, 16]
-    assert [every(long, "cuda", few), every(long, "cuda", many), every(long, "cuda", 8)] == [4, 4, 0]
-    assert [every(short, "cpu", many), every(long, "cpu", few), every(long, "cpu", 8)] == [0, 4, 0]
+    assert [every(long, "cuda", few), every(long, "cuda", many), every(longer, "cuda", few)] == [0, 4, 4]
+    assert [every(long, "cpu", many), every(longer, "cpu", few)] == [0, 4]
+    assert [every(longer, device, 8) for device in ("cuda", "cpu")] == [0, 0]
+
+
+def test_on_a_cpu_only_arms_with_objects_are_sorted() -> None:
+    """Three arms alone are twice as fast where their results need not be copied."""
+    arms, objects = (load_source(Env("reach", scene), vector=True) for scene in ("trimanual_psm_ecm", "psm_needle"))
+    assert not order.sorted_every(arms.bodies.values(), "cpu", 4096, decimation=8)
+    assert order.sorted_every(objects.bodies.values(), "cpu", 4096, decimation=8)
 
 
 def test_every_multiprocessor_has_a_block_of_long_code() -> None:

@@ -174,7 +174,8 @@ class CpuArrays(Arrays):
 
     def _by_environment(self, rows: np.ndarray) -> np.ndarray:
         """Return a copy of rows [..., columns] in the order of the environments' numbers."""
-        return rows[:, self.order.columns] if self.order else rows.copy()
+        # five times as fast as `rows[:, columns]`
+        return np.take(rows, self.order.columns, axis=-1) if self.order else rows.copy()
 
     def _argsort(self, shares: int) -> Any:
         new = np.argsort(-self.work[: self.num_envs], kind="stable")

@@ -20,6 +20,10 @@ SELDOM, OFTEN = 128, 32
 """Physics steps after which environments are sorted: often where code is long. An environment that begins an
 episode, or loses what it held, has other things to do than its neighbours from then on. In long code that costs more
 than sorting."""
+WORTH = 12
+"""So many large branches make sorting worth it on a CPU, whose results have to be copied then, and on a GPU on which
+each group has a multiprocessor of its own, as what is beside the slowest group slows it no more. Arms alone have 9 at
+most, arms with objects 17 and more."""
 
 
 def control_steps(decimation: int, every: int = SELDOM) -> int:
@@ -30,12 +34,12 @@ def control_steps(decimation: int, every: int = SELDOM) -> int:
 def sorted_every(code: Collection[str], device: str, num_envs: int, decimation: int) -> int:
     """Return after how many control steps environments are sorted; 0 for never.
 
-    Only long code is worth it on a CPU, whose results then have to be copied, and on a GPU on which each group has a
-    multiprocessor of its own: what is beside the slowest group slows it no more.
+    What has no large branches is never sorted, and what has few only among many environments of a GPU.
     """
-    if not is_long(code) and (device == "cpu" or num_envs <= BLOCK * multiprocessors()):
+    branches = large_branches(code)
+    if num_envs <= LANES or not branches:
         return 0
-    if num_envs <= LANES or not large_branches(code):
+    if branches < WORTH and (device == "cpu" or num_envs <= BLOCK * multiprocessors()):
         return 0
     return control_steps(decimation, OFTEN if is_long(code) else SELDOM)
 
