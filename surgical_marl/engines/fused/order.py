@@ -21,9 +21,9 @@ SELDOM, OFTEN = 128, 32
 episode, or loses what it held, has other things to do than its neighbours from then on. In long code that costs more
 than sorting."""
 WORTH = 12
-"""So many large branches make sorting worth it on a CPU, whose results have to be copied then, and on a GPU on which
-each group has a multiprocessor of its own, as what is beside the slowest group slows it no more. Arms alone have 9 at
-most, arms with objects 17 and more."""
+"""Fewest large branches for which sorting is worth it on a CPU, whose results have to be copied then, and on a GPU that
+has a multiprocessor for each group: nothing waits there beside the slowest one. Arms alone have 9 at most, arms with
+objects 17 and more."""
 
 
 def control_steps(decimation: int, every: int = SELDOM) -> int:
