@@ -12,12 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from surgical_marl.cache import locked
 from surgical_marl.engines.faults import FINE, NEXT, checked, is_reward, places
 from surgical_marl.engines.fused.arrays import Arrays
-from surgical_marl.engines.fused.kernel import torch_stream
+from surgical_marl.engines.fused.kernel import load_for_gpu, torch_stream
 from surgical_marl.engines.fused.program import Leaf, Source
-from surgical_marl.runtime import cache_dir, prepare_warp
+from surgical_marl.runtime import prepare_warp
 
 wp = prepare_warp()
 
@@ -59,9 +58,7 @@ class Guard:
         self._none = np.zeros(0, np.int64)
         if arrays.device == "cuda":
             self._own = self.on_device()
-            # Here, because nothing can be compiled while a CUDA graph is captured; Warp itself does not lock.
-            with locked(cache_dir() / "kernels" / "guard"):
-                _check.module.load(wp.get_device("cuda"))
+            load_for_gpu(_check)  # here, before a CUDA graph is captured
 
     def clear(self, leaving: np.ndarray) -> None:
         """Take note of the environments, [N] bool, that the next step ends because of an older fault."""

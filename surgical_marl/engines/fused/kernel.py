@@ -163,6 +163,15 @@ class Kernel:
         command.launch(torch_stream())
 
 
+def load_for_gpu(kernel: Any) -> None:
+    """Compile one of Warp's kernels for the GPU, before a CUDA graph is captured: nothing can be compiled meanwhile.
+
+    Warp itself does not protect a module from two processes that compile it at the same time.
+    """
+    with locked(cache_dir() / "kernels" / kernel.module.name):
+        kernel.module.load(wp.get_device("cuda"))
+
+
 def torch_stream() -> Any:
     """Return torch's current stream, for Warp."""
     import torch

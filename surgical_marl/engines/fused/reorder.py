@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from surgical_marl.cache import locked
-from surgical_marl.engines.fused.kernel import torch_stream
-from surgical_marl.runtime import cache_dir, prepare_warp
+from surgical_marl.engines.fused.kernel import load_for_gpu, torch_stream
+from surgical_marl.runtime import prepare_warp
 
 wp = prepare_warp()
 
@@ -34,9 +33,8 @@ def reordered(rows: Any, columns: Any) -> Any:
 
 
 def prepare() -> None:
-    """Compile for the GPU: nothing can be compiled while a CUDA graph is captured, and Warp itself does not lock."""
-    with locked(cache_dir() / "kernels" / "reorder"):
-        _reorder.module.load(wp.get_device("cuda"))
+    """Compile for the GPU, before a CUDA graph is captured."""
+    load_for_gpu(_reorder)
 
 
 @wp.kernel(enable_backward=False)
