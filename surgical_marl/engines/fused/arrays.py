@@ -265,10 +265,12 @@ class CudaArrays(Arrays):
             values = torch.from_numpy(
                 np.array(values, leaf.dtype).view(np.int32 if leaf.dtype == "uint32" else leaf.dtype)
             )
-        values = values.detach().reshape(self.num_envs, leaf.size)
+        rows, values = self.rows(leaf), values.detach().reshape(self.num_envs, leaf.size).t()
         if self.order:
-            values = values.to("cuda").index_select(0, self.order.envs)
-        self.rows(leaf).copy_(values.t())
+            # along the second dimension: torch is slow where the first one is selected from, and rows have 16 bytes
+            torch.index_select(values.to(rows), 1, self.order.envs, out=rows)
+        else:
+            rows.copy_(values)
 
     def read(self, leaf: Leaf, library: str) -> Any:
         return self._present(leaf, self._by_environment(self.rows(leaf)), library)
