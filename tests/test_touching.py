@@ -14,6 +14,8 @@ import yaml
 
 from surgical_marl.physics.collision import Pairs
 from surgical_marl.physics.dynamics import Dynamics
+from surgical_marl.physics.placed import Places
+from surgical_marl.physics.shapes import on_plate
 from surgical_marl.physics.simulator import Physics, Simulator
 from surgical_marl.physics.together import Together
 from surgical_marl.physics.touching import AHEAD, MARGIN, NEAR, NEAREST, Slots
@@ -181,6 +183,33 @@ def test_patches_are_those_of_all_capsules_of_all_pairs(world: str, request: pyt
     assert met.max() > 300
     if world == "thrown":
         assert (met > 10).all()
+
+
+def test_no_capsule_is_nearer_to_a_plate_than_it_seems(thrown: Thrown) -> None:
+    """And few seem to be near: balls around the capsules let nearly twice as many seem to be."""
+    tables, model = thrown.together.tables, Dynamics(thrown.scene.model)
+    places, capsules = Places(tables), np.arange(tables.radius.shape[1], dtype=np.int32)
+
+    def gaps(state: Physics) -> Any:
+        data, bodies = model.pose(state.qpos), state.objects.bodies
+        placed = places.place(data, places.joints(data), state.qvel, bodies, 0.0)
+
+        def of_pair(pair: Any) -> Any:
+            i, j = pair
+            bound, ends = places.capsule_gap(placed, i, "pads", j), places.capsules(placed, "objects", i)
+            middle, plate = (ends.start + ends.end) / 2, places.plate(placed, "pads", j)
+            balls = jax.vmap(lambda at: places.distance(placed, "pads", j, at))(middle) - jnp.asarray(tables.around)[i]
+            exact = -jnp.max(jax.vmap(lambda capsule: on_plate(capsule, plate).depth)(ends), -1)
+            return jax.vmap(bound)(capsules), exact, balls
+
+        pairs = np.array(list(product(range(2), range(len(tables.pad_geoms)))), np.int32).T
+        return jax.vmap(of_pair)((pairs[0], pairs[1]))
+
+    bound, exact, balls = (np.asarray(x) for x in jax.jit(jax.vmap(gaps))(thrown.states))
+    assert (balls - 1e-6 <= bound).all() and (bound <= exact + 1e-6).all()
+    near = 0.0015
+    assert (exact < near).sum() > 100
+    assert 1.5 * (bound < near).sum() < (balls < near).sum()
 
 
 def test_overlaps_of_capsules_are_those_of_mujoco(thrown: Thrown) -> None:

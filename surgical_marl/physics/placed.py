@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -147,6 +148,26 @@ class Places:
             end = placed.links.end[i]
         radius = jnp.asarray(self._tables.bound)[i] if kind == "objects" else placed.links.radius[i]
         return jnp.max(jnp.maximum(jnp.minimum(start, end) - box[1], box[0] - jnp.maximum(start, end))) - radius
+
+    def capsule_gap(self, placed: Placed, i: Array, kind: str, j: Array) -> Callable[[Array], Array]:
+        """Return what finds a lower bound of the distance of object i's capsules, by their numbers, from a body, m.
+
+        For a plate it is the distance of a box around the capsule's axis, along the plate's sides: few bars of a block
+        are near a finger on one of them, but balls around most are.
+        """
+        t, frame, at = self._tables, placed.frames[i], placed.position[i]
+        if kind not in ("pads", "plates"):
+            middle = lambda c: at + frame @ jnp.asarray(t.middle)[i, c]  # noqa: E731
+            return lambda c: self.distance(placed, kind, j, middle(c)) - jnp.asarray(t.around)[i, c]
+        plate = self.plate(placed, kind, j)
+        turn, place, half = plate.frame.T @ frame, (at - plate.centre) @ plate.frame, jnp.append(plate.half, 0.0)
+
+        def gap(c: Array) -> Array:
+            ends = [place + turn @ jnp.asarray(end)[i, c] for end in (t.start, t.end)]
+            beyond = jnp.maximum(jnp.minimum(*ends) - half, -half - jnp.maximum(*ends))
+            return size(jnp.maximum(beyond, 0.0)) - plate.radius - jnp.asarray(t.radius)[i, c]
+
+        return gap
 
     def link_distance(self, placed: Placed, kind: str, j: Array, link: Segments) -> Array:
         """Return a lower bound of the distance of a link from what is fixed, m; exact for rods."""

@@ -174,19 +174,17 @@ class Finder:
         A capsule has none that is farther away than the one that touches by more than tilting can make up for: by the
         angle, times the way from a place of the one to a place of the other.
         """
-        t, c = self._tables, self._tables.radius.shape[1]
+        c = self._tables.radius.shape[1]
         if meeting.first != "objects" or c == 1:
             return jnp.zeros(1, jnp.int32), jnp.int32(1)
         one, other = (row_of(placed.balls[kind], n) for kind, n in (("objects", i), (meeting.second, j)))
         # places between the surfaces of both are that far from each other at most, but for half of their distances
         spread, tilt = 2 * jnp.minimum(one.radius, other.radius), _tilt(meeting)
         reach = (_reach(one, other) + tilt * spread + BLEND) / (1 - tilt)
-        frame = placed.frames[i]
+        gap = self._places.capsule_gap(placed, i, meeting.second, j)
 
         def look(found: tuple[Array, Array], capsule: Array) -> tuple[tuple[Array, Array], None]:
-            middle = one.centre + frame @ jnp.asarray(t.middle)[i, capsule]
-            gap = self._places.distance(placed, meeting.second, j, middle) - jnp.asarray(t.around)[i, capsule]
-            return _listed(found, capsule, gap < reach), None
+            return _listed(found, capsule, gap(capsule) < reach), None
 
         none = jnp.zeros(c, jnp.int32), jnp.int32(0)
         return jax.lax.scan(look, none, jnp.arange(c, dtype=jnp.int32))[0]
