@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from surgical_marl.physics import rest
-from surgical_marl.physics.placed import Ball
+from surgical_marl.physics.placed import Ball, Placed
 from surgical_marl.physics.rest import Company, company
+from surgical_marl.physics.shapes import Segments
 from tests.helpers.falling import Falling, Trace, random_turns, thrown, wide_pad
 
 
@@ -76,16 +77,18 @@ def test_what_turns_back_or_tips_over_is_not_at_rest(blocks: Falling) -> None:
 
 
 def test_an_arm_that_comes_near_wakes_an_object_and_its_neighbours() -> None:
-    """By balls around bodies: two objects side by side and one apart, an arm's pad at a distance, and coming fast."""
+    """Two objects side by side and one apart, an arm's pad at a distance, and coming fast, and a long shaft above all."""
     centres = np.array([[0.0, 0, 0], [0.015, 0, 0], [0.1, 0, 0]], np.float32)
     reach = lambda *balls: 3e-4 + sum(ball.moves for ball in balls)  # noqa: E731
 
-    def near(pad: float, moves: float = 0.0) -> Company:
-        none = np.zeros(3, np.float32)
-        balls = {"objects": Ball(jnp.asarray(centres), jnp.full(3, 0.008), jnp.asarray(none))}
+    def near(pad: float, moves: float = 0.0, shaft: float = 0.1, sinks: float = 0.0) -> Company:
+        objects = Ball(jnp.asarray(centres), jnp.full(3, 0.008), jnp.zeros(3))
         arm = Ball(jnp.array([[pad, 0.0, 0.0]]), jnp.array([0.004]), jnp.array([moves]))
-        balls |= {"pads": arm, "links": Ball(*(x[:0] for x in arm))}
-        return company(balls, reach)
+        ends = jnp.array([[[0.05, 0.0, shaft]], [[0.55, 0.0, shaft]]])
+        balls = {"objects": objects, "pads": arm, "links": Ball(ends.mean(0), jnp.full(1, 0.254), jnp.array([sinks]))}
+        links: Any = Segments(*ends, jnp.full(1, 0.004))
+        unread: Any = None
+        return company(Placed(unread, unread, unread, links, {}, balls), reach)
 
     still = jnp.zeros(3, bool)
     assert not np.asarray(near(-0.02).spread(still)).any()
@@ -93,3 +96,5 @@ def test_an_arm_that_comes_near_wakes_an_object_and_its_neighbours() -> None:
     assert np.asarray(near(-0.02, 0.009).spread(still)).tolist() == [True, True, False]
     assert np.asarray(near(0.1).spread(still)).tolist() == [False, False, True]
     assert np.asarray(near(0.5).spread(jnp.array([False, True, False]))).tolist() == [True, True, False]
+    assert np.asarray(near(-0.5, shaft=0.012).spread(still)).tolist() == [False, False, True]
+    assert np.asarray(near(-0.5, shaft=0.02, sinks=0.009).spread(still)).tolist() == [False, False, True]

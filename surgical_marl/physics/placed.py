@@ -137,9 +137,7 @@ class Places:
             beside = local[:2] - jnp.clip(local[:2], -plate.half, plate.half)
             return jnp.sqrt(jnp.sum(beside * beside) + local[2] * local[2]) - plate.radius
         rod = self.capsule(placed, kind, j, jnp.int32(0))
-        way = rod.end - rod.start
-        share = jnp.clip((point - rod.start) @ way / jnp.maximum(way @ way, 1e-12), 0.0, 1.0)
-        return size(point - rod.start - share * way) - rod.radius
+        return size(point - nearest(rod, point)) - rod.radius
 
     def gap(self, placed: Placed, kind: str, i: Array, box: Any) -> Array:
         """Return a lower bound of the distance of an object or a link from a box [2, 3] along the axes, m."""
@@ -185,6 +183,13 @@ def _moved(arm: Array, moves: Array, joints: tuple[Array, Array]) -> tuple[Array
 
 def size(vector: Array) -> Array:
     return jnp.sqrt(jnp.sum(vector * vector, -1))
+
+
+def nearest(segment: Segments, points: Array) -> Array:
+    """Return where a segment is nearest to points, [..., 3]."""
+    way = segment.end - segment.start
+    share = jnp.clip((points - segment.start) @ way / jnp.maximum(way @ way, 1e-12), 0.0, 1.0)
+    return segment.start + share[..., None] * way
 
 
 def between_balls(one: Ball, other: Ball) -> Array:

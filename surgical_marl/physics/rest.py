@@ -9,11 +9,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 
 from surgical_marl.physics.bodies import Bodies
-from surgical_marl.physics.placed import Ball, between_balls, size
+from surgical_marl.physics.placed import Ball, Placed, between_balls, nearest, size
+from surgical_marl.physics.shapes import Segments
 
 SLOW = 1e-4
 """Speed below which each point of an object has to be to come to rest, m/s. What lies still has less than a hundredth
@@ -38,19 +40,26 @@ class Company(NamedTuple):
         return awake
 
 
-def company(balls: dict[str, Ball], reach: Callable[..., Array]) -> Company:
+def company(placed: Placed, reach: Callable[..., Array]) -> Company:
     """Return what is near objects.
 
     Args:
-        balls: around all bodies, by their kind.
+        placed: where all bodies are.
         reach: of two balls or rows of balls, the distance below which their bodies may touch in the next step, m.
     """
-    own = Ball(*(x[:, None] for x in balls["objects"]))
+    balls, objects = placed.balls, placed.balls["objects"]
+    own = Ball(*(x[:, None] for x in objects))
 
     def near(kind: str) -> Array:
         return between_balls(own, balls[kind]) < reach(own, balls[kind])
 
-    return Company(near("pads").any(1) | near("links").any(1), near("objects"))
+    def by_link(found: Array, link: tuple[Segments, Ball]) -> tuple[Array, None]:
+        # an instrument's shaft is long: a ball around it would keep awake all that lies under it
+        gap = size(objects.centre - nearest(link[0], objects.centre)) - link[0].radius - objects.radius
+        return found | (gap < reach(objects, link[1])), None
+
+    arms, _ = jax.lax.scan(by_link, near("pads").any(1), (placed.links, balls["links"]))
+    return Company(arms, near("objects"))
 
 
 def moving(bodies: Bodies) -> Array:
