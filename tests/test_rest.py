@@ -77,7 +77,7 @@ def test_what_turns_back_or_tips_over_is_not_at_rest(blocks: Falling) -> None:
 
 
 def test_an_arm_that_comes_near_wakes_an_object_and_its_neighbours() -> None:
-    """Two objects side by side and one apart, an arm's pad at a distance, and coming fast, and a long shaft above all."""
+    """Two objects side by side and one apart; an arm's pad at a distance, or coming fast; a long shaft above all."""
     centres = np.array([[0.0, 0, 0], [0.015, 0, 0], [0.1, 0, 0]], np.float32)
     reach = lambda *balls: 3e-4 + sum(ball.moves for ball in balls)  # noqa: E731
 
@@ -88,7 +88,7 @@ def test_an_arm_that_comes_near_wakes_an_object_and_its_neighbours() -> None:
         balls = {"objects": objects, "pads": arm, "links": Ball(ends.mean(0), jnp.full(1, 0.254), jnp.array([sinks]))}
         links: Any = Segments(*ends, jnp.full(1, 0.004))
         unread: Any = None
-        return company(Placed(unread, unread, unread, links, {}, balls), reach)
+        return company(Placed(unread, unread, unread, links, {}, balls), np.array([0]), reach)
 
     still = jnp.zeros(3, bool)
     assert not np.asarray(near(-0.02).spread(still)).any()

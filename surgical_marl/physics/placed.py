@@ -150,11 +150,11 @@ class Places:
     def capsule_gap(self, placed: Placed, i: Array, kind: str, j: Array) -> Callable[[Array], Array]:
         """Return what finds a lower bound of the distance of object i's capsules, by their numbers, from a body, m.
 
-        For a plate it is the distance of a box around the capsule's axis, along the plate's sides: few bars of a block
-        are near a finger on one of them, but balls around most are.
+        Of long capsules and a plate it is the distance of a box around the capsule's axis, along the plate's sides: few
+        bars of a block are near a finger on one of them, but balls around most are.
         """
         t, frame, at = self._tables, placed.frames[i], placed.position[i]
-        if kind not in ("pads", "plates"):
+        if kind not in ("pads", "plates") or not t.has_bars:
             middle = lambda c: at + frame @ jnp.asarray(t.middle)[i, c]  # noqa: E731
             return lambda c: self.distance(placed, kind, j, middle(c)) - jnp.asarray(t.around)[i, c]
         plate = self.plate(placed, kind, j)

@@ -11,11 +11,11 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from surgical_marl.physics.bodies import Bodies
 from surgical_marl.physics.placed import Ball, Placed, between_balls, nearest, size
-from surgical_marl.physics.shapes import Segments
 
 SLOW = 1e-4
 """Speed below which each point of an object has to be to come to rest, m/s. What lies still has less than a hundredth
@@ -40,26 +40,23 @@ class Company(NamedTuple):
         return awake
 
 
-def company(placed: Placed, reach: Callable[..., Array]) -> Company:
+def company(placed: Placed, slender: np.ndarray, reach: Callable[..., Array]) -> Company:
     """Return what is near objects.
 
     Args:
         placed: where all bodies are.
+        slender: numbers of links that are long and thin, as shafts of instruments. A ball around one would keep awake
+            all that lies under it.
         reach: of two balls or rows of balls, the distance below which their bodies may touch in the next step, m.
     """
-    balls, objects = placed.balls, placed.balls["objects"]
+    objects, links = placed.balls["objects"], placed.balls["links"]
     own = Ball(*(x[:, None] for x in objects))
-
-    def near(kind: str) -> Array:
-        return between_balls(own, balls[kind]) < reach(own, balls[kind])
-
-    def by_link(found: Array, link: tuple[Segments, Ball]) -> tuple[Array, None]:
-        # an instrument's shaft is long: a ball around it would keep awake all that lies under it
-        gap = size(objects.centre - nearest(link[0], objects.centre)) - link[0].radius - objects.radius
-        return found | (gap < reach(objects, link[1])), None
-
-    arms, _ = jax.lax.scan(by_link, near("pads").any(1), (placed.links, balls["links"]))
-    return Company(arms, near("objects"))
+    near = {kind: between_balls(own, ball) < reach(own, ball) for kind, ball in placed.balls.items()}
+    shafts, around = (jax.tree.map(lambda x: x[slender], of) for of in (placed.links, links))
+    way = own.centre - jax.vmap(nearest, (0, None), 1)(shafts, objects.centre)
+    by_shaft = size(way) - shafts.radius - own.radius < reach(own, around)
+    by_link = near["links"].at[:, slender].set(by_shaft)
+    return Company(near["pads"].any(1) | by_link.any(1), near["objects"])
 
 
 def moving(bodies: Bodies) -> Array:

@@ -23,6 +23,10 @@ ENDLESS = 10.0
 """Half side of the plate that stands for a plane, m."""
 THICK = 0.01
 """Radius of that plate, m: the plane is its upper face."""
+BAR = 0.003
+"""Half length from which an object's capsule counts as a bar, m: a ball around it holds much that is not near it."""
+SLENDER = 10
+"""Half length of slender links at least, in radii."""
 
 
 class Finger(NamedTuple):
@@ -96,6 +100,7 @@ class Tables:
         self.middle = (self.start + self.end) / 2
         self.around = np.linalg.norm(self.end - self.start, axis=-1) / 2 + self.radius
         """Radius of a ball about the middle of each capsule that holds it, m, [k, c]."""
+        self.has_bars = bool((self.around - self.radius > BAR).any())
         objects = [place.object for place in free.values()]
         self.masses = Masses(
             np.array([thing.mass for thing in objects], np.float32),  # type: ignore[arg-type]
@@ -113,6 +118,8 @@ class Tables:
         capsule = model.geom_type[self.near] == mujoco.mjtGeom.mjGEOM_CAPSULE
         self.link_half = single(np.where(capsule, model.geom_size[self.near, 1], 0.0), (-1,))
         self.link_radius = single(model.geom_size[self.near, 0], (-1,))
+        self.slender = np.flatnonzero(self.link_half > SLENDER * self.link_radius)
+        """Numbers of links that are long and thin."""
         pads = np.array([finger.body for finger in self.fingers], int)
         self.bodies = {"pads": pads, "links": model.geom_bodyid[self.near]}
         """The model's bodies of each kind of thing that an arm has."""

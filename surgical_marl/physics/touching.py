@@ -77,7 +77,7 @@ class Finder:
             dt: time over which motions are looked ahead, s.
         """
         placed = self._places.place(data, joints, qvel, bodies, dt)
-        near = company(placed, _reach)
+        near = company(placed, self._tables.slender, _reach)
         awake, none = near.spread(moving(bodies)), jnp.int32(0)
         number, rows = 0, self.slots + 1  # what finds no room goes to the last one
         slots = Slots(room(jax.eval_shape(no_patch), rows), jnp.zeros(rows, jnp.int32), none, near, awake)
