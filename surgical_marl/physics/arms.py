@@ -100,15 +100,23 @@ class Arms:
         ]
         return jnp.stack(ways)
 
-    def each(self, problem: Problem, here: Array, left: Left) -> Array:
-        """Return the ways [a, m] of arms of which no two are joined: one problem after the other."""
+    def each(self, problem: Problem, here: Array, moving: Array, left: Left) -> Array:
+        """Return the ways [a, m] of arms of which no two are joined: one problem after the other.
+
+        Those that are not `moving` [a] have none.
+        """
         takes = np.ones(len(left.half), bool)
 
-        def one(row: Any) -> Array:
-            stiff, force = self._alone(left, takes, row)
-            return _way(stiff[self._places], force, rows_of(row.joints), row.start)
+        def one(each: tuple[_Row, Array]) -> Array:
+            row, moves = each
 
-        found: Array = jax.lax.map(one, self._rows(problem, here, left))
+            def way() -> Array:
+                stiff, force = self._alone(left, takes, row)
+                return _way(stiff[self._places], force, rows_of(row.joints), row.start)
+
+            return jax.lax.cond(moves, way, lambda: jnp.zeros_like(row.start))
+
+        found: Array = jax.lax.map(one, (self._rows(problem, here, left), moving))
         return found
 
     def bridged(self, problem: Problem, here: Array, left: Left) -> Array:

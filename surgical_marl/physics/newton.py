@@ -118,7 +118,10 @@ class Newton:
         def iterate(state: Any) -> Any:
             here, pressed, _, count = state
             local, pressed = self._contacts(problem, here, pressed)
-            way = self._direction(problem, here, pressed, local)
+            on = local.on_arm | problem.overlap
+            way = self._direction(problem, here, pressed, local, on | (count == 0))
+            # Arms that touch nothing go all of their way at once, as if nothing else were there, and are done.
+            free, way = jnp.where(on[:, None], 0.0, way.arms), way._replace(arms=jnp.where(on[:, None], way.arms, 0.0))
             begin, slope, growth = self._arms.slopes(problem, here.arms, way.arms, local.arm_force)
             begin -= jnp.sum(local.force * way.objects)
             inertia = problem.masses @ jnp.stack([here.objects - problem.free, way.objects], -1)
@@ -127,6 +130,7 @@ class Newton:
             seen = _Seen(pressed, jnp.bool_(True), jnp.bool_(False))
             found = search(begin, LEAST, self._measure(problem, here, way, slope, growth), seen)
             there = jax.tree.map(lambda x, step: x + found.length * step, here, way)
+            there = there._replace(arms=there.arms + free)
             settled = (found.looks < 2) & found.seen.same & ~found.seen.turned
             if len(problem.between.low):
                 settled &= (self._sides(problem, here.arms) == self._sides(problem, there.arms)).all()
@@ -230,10 +234,11 @@ class Newton:
 
     # -- the way from there
 
-    def _direction(self, problem: Problem, here: Point, pressed: Pressed, local: _Local) -> Point:
+    def _direction(self, problem: Problem, here: Point, pressed: Pressed, local: _Local, moving: Array) -> Point:
         """Return the way to the least cost if contacts are linear functions; friction and limits of joints are not.
 
-        Objects are eliminated, arms solved, and objects found from them.
+        Objects are eliminated, arms solved, and objects found from them. Arms that are not `moving` [a] are where their
+        forces balance.
         """
         touched, pressing = local.met, pressed.normal > 0
         linked = self._linked(problem, pressing)
@@ -243,13 +248,13 @@ class Newton:
         if len(self._dofs):
             on = touched | (linked & touched.any(0))  # what an object touches moves those that it touches
             left = Left(local.arm, local.on_arm, local.arm_force, gone.half, gone.wide, on)
-            found = self._ways(problem, here.arms, left)
+            found = self._ways(problem, here.arms, left, moving)
         return Point(found, elimination.ways(gone, found, touched, linked))
 
-    def _ways(self, problem: Problem, here: Array, left: Left) -> Array:
+    def _ways(self, problem: Problem, here: Array, left: Left, moving: Array) -> Array:
         """Return the ways [a, m] of arms: of each alone, of those that one object joins, or of all at once."""
-        arms = self._arms
-        each, bridged, together = (partial(ways, problem, here) for ways in (arms.each, arms.bridged, arms.together))
+        bridged, together = (partial(ways, problem, here) for ways in (self._arms.bridged, self._arms.together))
+        each = partial(self._arms.each, problem, here, moving)
         if len(self._dofs) < 2:
             return each(left)
         bridges, pressed = left.touched.sum(1) > 1, self._sides(problem, here).any()
