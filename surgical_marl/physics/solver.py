@@ -120,7 +120,7 @@ def relax(mass: Array, smooth: Array, joints: JointRows, qacc: Array) -> Array:
     return jnp.stack(found)
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(4, 5, 6, 7))
+@partial(jax.custom_jvp, nondiff_argnums=(4, 5, 6))
 def solve(
     mass: Array,
     smooth: Array,
@@ -129,7 +129,7 @@ def solve(
     iterations: int,
     line_search: int,
     arms: Sequence[np.ndarray] = (),
-    steady: int = 2,
+    steady: Any = 2,
 ) -> tuple[Array, Array]:
     """Return the acceleration [n] and the force of each row [r].
 
@@ -208,7 +208,6 @@ def _differentiate(
     iterations: int,
     line_search: int,
     arms: Sequence[np.ndarray],
-    steady: int,
     primals: tuple[Any, ...],
     tangents: tuple[Any, ...],
 ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
@@ -217,8 +216,8 @@ def _differentiate(
     At the solution all forces balance the inertia, and each row stays on its side. So the derivative takes one linear
     system, which is never degenerate. The way to the solution is no use: at rest it divides zero by zero.
     """
-    mass, smooth, rows, _ = primals
-    qacc, force = solve(*primals, iterations, line_search, arms, steady)
+    mass, smooth, rows, start, steady = primals
+    qacc, force = solve(mass, smooth, rows, start, iterations, line_search, arms, steady)
 
     def excess(mass: Array, smooth: Array, rows: Rows) -> Array:
         return smooth + rows.jacobian.T @ row_forces(rows, qacc) - mass @ qacc

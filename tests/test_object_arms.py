@@ -1,0 +1,64 @@
+"""Arms that touch nothing move as if alone, whatever others hold."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import jax
+import numpy as np
+
+from surgical_marl.bench.grasping import grasps
+from surgical_marl.bench.physics import PhysicsAlone
+from surgical_marl.engines.choose import make_engine
+from surgical_marl.envs.env import Env
+from surgical_marl.physics.arm_forces import ArmForces
+from surgical_marl.physics.factor import packed
+from surgical_marl.physics.solver import rows_of, solve
+
+COUNT, STEPS, SEEN = 64, 48, 8
+
+
+def test_an_arm_that_touches_nothing_moves_as_if_alone_while_another_holds_something() -> None:
+    """Its forces balance, as of a problem of its own that is solved in many more steps."""
+    env, rng = Env("reach", "bimanual_psm_needle"), np.random.default_rng(0)
+    simulator, engine = env.simulator, make_engine(PhysicsAlone(env), COUNT, "fused", "cpu")
+    together: Any = simulator._objects
+    starts = grasps(env.scene, COUNT, rng)
+    engine.reset(0)
+    for path, values in {"qpos": starts.qpos, "objects.bodies.position": starts.position,
+                         "objects.bodies.quaternion": starts.quaternion}.items():  # fmt: skip
+        engine.write(f".physics.{path}", values.astype(np.float32))
+    closed = np.array(simulator.home.ctrl)
+
+    def alone(arm: ArmForces) -> Any:
+        whole = arm.implicit[packed(len(arm.smooth))]
+        return solve(whole, arm.smooth, rows_of(arm.joints), arm.start, 60, 4)[0]
+
+    @jax.jit
+    @jax.vmap
+    def expected(physics: Any) -> Any:
+        slots = together.find(physics)
+        touched = (together._on_arm(slots)[:, None] == np.arange(together._arms)).any(0)
+        return together._of_joints(jax.vmap(alone)(together._forces(physics, {}))), touched
+
+    errors, dofs = [], together.tables.dofs
+    for k in range(STEPS):
+        if k % 12 == 0:  # jaws close, and all else moves to and fro
+            moves = rng.uniform(-0.05, 0.05, (COUNT, len(closed))).astype(np.float32)
+            engine.write(".physics.ctrl", np.where(closed > 0, closed + moves, closed - 0.03).astype(np.float32))
+        read = partial(engine.read, library="numpy")
+        leaves = {path: read(path) for path in engine.carry_shapes if path.startswith(".physics")}
+        engine.step({})
+        if k >= STEPS - SEEN:
+            tree = jax.tree_util.tree_flatten_with_path(simulator.home)
+            names = ["".join(f".{part.name}" for part in path) for path, _ in tree[0]]
+            before = jax.tree_util.tree_unflatten(tree[1], [leaves[f".physics{name}"] for name in names])
+            qacc, touched = (np.asarray(x) for x in expected(before))
+            found = read(".physics.qacc_warmstart")
+            one = touched.any(1) & ~touched.all(1)
+            for e, arm in zip(*np.nonzero(~touched & one[:, None]), strict=True):
+                own = dofs[arm]
+                errors.append(np.abs(found[e, own] - qacc[e, own]).max() / (1 + np.abs(qacc[e, own]).max()))
+    assert len(errors) > 50
+    assert np.max(errors) < 1e-3
