@@ -118,10 +118,10 @@ class Newton:
         def iterate(state: Any) -> Any:
             here, pressed, _, count = state
             local, pressed = self._contacts(problem, here, pressed)
-            on = local.on_arm | problem.overlap
-            way = self._direction(problem, here, pressed, local, on | (count == 0))
+            touching = (local.on_arm | problem.overlap)[:, None]
+            way = self._direction(problem, here, pressed, local, touching[:, 0] | (count == 0))
             # Arms that touch nothing go all of their way at once, as if nothing else were there, and are done.
-            free, way = jnp.where(on[:, None], 0.0, way.arms), way._replace(arms=jnp.where(on[:, None], way.arms, 0.0))
+            free, way = jnp.where(touching, 0.0, way.arms), way._replace(arms=jnp.where(touching, way.arms, 0.0))
             begin, slope, growth = self._arms.slopes(problem, here.arms, way.arms, local.arm_force)
             begin -= jnp.sum(local.force * way.objects)
             inertia = problem.masses @ jnp.stack([here.objects - problem.free, way.objects], -1)

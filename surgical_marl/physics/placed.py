@@ -11,7 +11,7 @@ from jax import Array
 
 from surgical_marl.physics.bodies import Bodies, rotation
 from surgical_marl.physics.rows import row_of
-from surgical_marl.physics.shapes import Plate, Points, Segments, between_segments
+from surgical_marl.physics.shapes import Plate, Points, Segments, between_segments, in_frame
 from surgical_marl.physics.tables import Tables
 
 
@@ -133,7 +133,7 @@ class Places:
             return size(point - placed.position[j]) - jnp.asarray(self._tables.bound)[j]
         if kind in ("pads", "plates"):
             plate = self.plate(placed, kind, j)
-            local = (point - plate.centre) @ plate.frame
+            local = in_frame(point, plate)
             beside = local[:2] - jnp.clip(local[:2], -plate.half, plate.half)
             return jnp.sqrt(jnp.sum(beside * beside) + local[2] * local[2]) - plate.radius
         rod = self.capsule(placed, kind, j, jnp.int32(0))
@@ -145,7 +145,7 @@ class Places:
         if kind == "links":
             end = placed.links.end[i]
         radius = jnp.asarray(self._tables.bound)[i] if kind == "objects" else placed.links.radius[i]
-        return jnp.max(jnp.maximum(jnp.minimum(start, end) - box[1], box[0] - jnp.maximum(start, end))) - radius
+        return jnp.max(_beyond(start, end, box[0], box[1])) - radius
 
     def capsule_gap(self, placed: Placed, i: Array, kind: str, j: Array) -> Callable[[Array], Array]:
         """Return what finds a lower bound of the distance of object i's capsules, by their numbers, from a body, m.
@@ -158,12 +158,12 @@ class Places:
             middle = lambda c: at + frame @ jnp.asarray(t.middle)[i, c]  # noqa: E731
             return lambda c: self.distance(placed, kind, j, middle(c)) - jnp.asarray(t.around)[i, c]
         plate = self.plate(placed, kind, j)
-        turn, place, half = plate.frame.T @ frame, (at - plate.centre) @ plate.frame, jnp.append(plate.half, 0.0)
+        turn, place, half = plate.frame.T @ frame, in_frame(at, plate), jnp.append(plate.half, 0.0)
 
         def gap(c: Array) -> Array:
-            ends = [place + turn @ jnp.asarray(end)[i, c] for end in (t.start, t.end)]
-            beyond = jnp.maximum(jnp.minimum(*ends) - half, -half - jnp.maximum(*ends))
-            return size(jnp.maximum(beyond, 0.0)) - plate.radius - jnp.asarray(t.radius)[i, c]
+            start, end = (place + turn @ jnp.asarray(of)[i, c] for of in (t.start, t.end))
+            beyond = jnp.maximum(_beyond(start, end, -half, half), 0.0)
+            return size(beyond) - plate.radius - jnp.asarray(t.radius)[i, c]
 
         return gap
 
@@ -179,6 +179,11 @@ class Places:
 
 def _moved(arm: Array, moves: Array, joints: tuple[Array, Array]) -> tuple[Array, Array]:
     return tuple(moves @ of[arm] for of in joints)  # type: ignore[return-value]
+
+
+def _beyond(start: Array, end: Array, low: Any, high: Any) -> Array:
+    """Return by how far the box around a segment is beyond another box on each axis, [3]; negative where it is not."""
+    return jnp.maximum(jnp.minimum(start, end) - high, low - jnp.maximum(start, end))
 
 
 def size(vector: Array) -> Array:

@@ -51,12 +51,13 @@ def company(placed: Placed, slender: np.ndarray, reach: Callable[..., Array]) ->
     """
     objects, links = placed.balls["objects"], placed.balls["links"]
     own = Ball(*(x[:, None] for x in objects))
-    near = {kind: between_balls(own, ball) < reach(own, ball) for kind, ball in placed.balls.items()}
+    by_pad, by_link, by_object = (
+        between_balls(own, ball) < reach(own, ball) for ball in (placed.balls["pads"], links, objects)
+    )
     shafts, around = (jax.tree.map(lambda x: x[slender], of) for of in (placed.links, links))
     way = own.centre - jax.vmap(nearest, (0, None), 1)(shafts, objects.centre)
-    by_shaft = size(way) - shafts.radius - own.radius < reach(own, around)
-    by_link = near["links"].at[:, slender].set(by_shaft)
-    return Company(near["pads"].any(1) | by_link.any(1), near["objects"])
+    by_link = by_link.at[:, slender].set(size(way) - shafts.radius - own.radius < reach(own, around))
+    return Company(by_pad.any(1) | by_link.any(1), by_object)
 
 
 def moving(bodies: Bodies) -> Array:

@@ -93,7 +93,7 @@ def on_plate(one: Segments, plate: Plate) -> Points:
 
     The ends of the part above the plate, for example, would not do: they jump when the capsule leaves over an edge.
     """
-    start, end = (_in_frame(point, plate) for point in (one.start, one.end))
+    start, end = (in_frame(point, plate) for point in (one.start, one.end))
     way = end - start
     half, radius = jnp.asarray(plate.half), one.radius + plate.radius
     share = _nearest(start, way, half, radius * jnp.sqrt(jnp.maximum(_dot(way, way), 1e-18)))
@@ -152,7 +152,8 @@ def _off(point: Array, half: Array) -> Array:
     return jnp.concatenate([point[..., :2] - held, point[..., 2:]], -1)
 
 
-def _in_frame(point: Array, plate: Plate) -> Array:
+def in_frame(point: Array, plate: Plate) -> Array:
+    """Return where points [..., 3] are in the frames of plates [...]."""
     return jnp.matmul((point - plate.centre)[..., None, :], plate.frame)[..., 0, :]
 
 
