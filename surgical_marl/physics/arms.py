@@ -112,8 +112,7 @@ class Arms:
 
             def way() -> Array:
                 stiff, force = self._alone(left, takes, row)
-                steady = jnp.where(row.on_arm, 1, 2)  # one that touches nothing has no other Newton step to go on in
-                return _way(stiff[self._places], force, rows_of(row.joints), row.start, steady)
+                return _way(stiff[self._places], force, rows_of(row.joints), row.start)
 
             return jax.lax.cond(moves, way, lambda: jnp.zeros_like(row.start))
 
@@ -244,9 +243,6 @@ def _added(sums: tuple[Array, Array], rows: Rows, here: Array, way: Array, lengt
     return sums[0] - along @ jnp.clip(force, rows.low, rows.high), sums[1] + along @ gives
 
 
-def _way(stiff: Array, force: Array, rows: Rows, start: Array, steady: Any = 1) -> Array:
-    """Return the way from an acceleration to the one at which these forces balance with those of joints.
-
-    `steady` is as for `solve`.
-    """
-    return solve(stiff, stiff @ start + force, rows, start, *ITERATIONS, steady=steady)[0] - start
+def _way(stiff: Array, force: Array, rows: Rows, start: Array) -> Array:
+    """Return the way from an acceleration to the one at which these forces balance with those of joints."""
+    return solve(stiff, stiff @ start + force, rows, start, *ITERATIONS, steady=1)[0] - start

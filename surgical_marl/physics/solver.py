@@ -120,7 +120,7 @@ def relax(mass: Array, smooth: Array, joints: JointRows, qacc: Array) -> Array:
     return jnp.stack(found)
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(4, 5, 6))
+@partial(jax.custom_jvp, nondiff_argnums=(4, 5, 6, 7))
 def solve(
     mass: Array,
     smooth: Array,
@@ -129,7 +129,7 @@ def solve(
     iterations: int,
     line_search: int,
     arms: Sequence[np.ndarray] = (),
-    steady: Any = 2,
+    steady: int = 2,
 ) -> tuple[Array, Array]:
     """Return the acceleration [n] and the force of each row [r].
 
@@ -138,8 +138,8 @@ def solve(
     joints, [a, m] for each type, and the first 2 n rows are those of `rows_of`: then no matrix larger than that of an
     arm is factorised (`_newton_step`), in loops over arms.
 
-    There are at most `iterations` Newton steps. A step over which no row changes sides ends at the solution, and a
-    second such step removes its rounding error. After `steady` of them the search stops.
+    There are at most `iterations` Newton steps. A whole step over which no row changes sides ends at the solution, and
+    a second such step removes its rounding error. After `steady` of them the search stops.
 
     Its derivative is that of the solution (`_differentiate`), whatever the way there.
     """
@@ -151,19 +151,14 @@ def solve(
         rest = mass @ qacc - smooth
         gives = jnp.where(above & below, rows.impedance, 0.0)
         search = _newton_step(mass, rows.jacobian, gives, rows.jacobian.T @ force - rest, arms)
-        looked = partial(_line_search, mass, rows, unbounded, rest, search, line_search, not arms)
-        kept = lambda end: (((end > rows.low) == above) & ((end < rows.high) == below)).all()  # noqa: E731
+        part = partial(_line_search, mass, rows, unbounded, rest, search, line_search, not arms)
         if iterations == 1:
-            return qacc + looked()[0] * search, jnp.bool_(True)
-        # the whole step is the best one if no row changes sides over it
-        whole = kept(unbounded - rows.impedance * (rows.jacobian @ search))
-
-        def part() -> tuple[Array, Array]:
-            step, end = looked()
-            return step, kept(end)
-
-        step, settled = jax.lax.cond(whole, lambda: (jnp.float32(1.0), jnp.bool_(True)), part)
-        return qacc + step * search, settled
+            return qacc + part() * search, jnp.bool_(True)
+        # The whole step is the best one if no row changes sides over it. A part of a step ends where one does, on
+        # either side of there by rounding, and not at the solution.
+        end = unbounded - rows.impedance * (rows.jacobian @ search)
+        whole = (((end > rows.low) == above) & ((end < rows.high) == below)).all()
+        return qacc + jax.lax.cond(whole, lambda: jnp.float32(1.0), part) * search, whole
 
     def unsettled(state: tuple[Array, Array, Array]) -> Array:
         _, settled, count = state
@@ -208,6 +203,7 @@ def _differentiate(
     iterations: int,
     line_search: int,
     arms: Sequence[np.ndarray],
+    steady: int,
     primals: tuple[Any, ...],
     tangents: tuple[Any, ...],
 ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
@@ -216,8 +212,8 @@ def _differentiate(
     At the solution all forces balance the inertia, and each row stays on its side. So the derivative takes one linear
     system, which is never degenerate. The way to the solution is no use: at rest it divides zero by zero.
     """
-    mass, smooth, rows, start, steady = primals
-    qacc, force = solve(mass, smooth, rows, start, iterations, line_search, arms, steady)
+    mass, smooth, rows, _ = primals
+    qacc, force = solve(*primals, iterations, line_search, arms, steady)
 
     def excess(mass: Array, smooth: Array, rows: Rows) -> Array:
         return smooth + rows.jacobian.T @ row_forces(rows, qacc) - mass @ qacc
@@ -246,8 +242,8 @@ def giving(rows: Rows, unbounded: Array) -> Array:
 
 def _line_search(
     mass: Array, rows: Rows, unbounded: Array, rest: Array, search: Array, iterations: int, unroll: bool
-) -> tuple[Array, Array]:
-    """Return how far to go along `search`, and the value of `unbounded` there.
+) -> Array:
+    """Return how far to go along `search`.
 
     The best length is the root of the slope of the cost, which grows piecewise linearly. It is found by Newton's method
     within a bracket.
@@ -269,7 +265,7 @@ def _line_search(
     whole, none = jnp.float32(1.0), jnp.float32(0.0)
     start = (whole, none, jnp.float32(jnp.inf))
     (step, _, _), _ = jax.lax.scan(iterate, start, None, length=iterations, unroll=unroll)
-    return step, unbounded - step * fall
+    return step
 
 
 def solve_positive(matrix: Array, right: Array) -> Array:
