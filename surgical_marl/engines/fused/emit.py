@@ -17,6 +17,7 @@ from surgical_marl.engines.fused.graph import Branch, Graph, Loop, Value
 from surgical_marl.engines.fused.memory_order import order_memory
 from surgical_marl.engines.fused.preludes import WAYS, fenced, is_long, large_branches
 from surgical_marl.engines.fused.schedule import Scheduler
+from surgical_marl.engines.fused.sharing import share_memory
 
 LARGE = 500
 """Least number of operations in a branch whose inputs are hidden from the compiler (`HIDEF`), or in a branch or a round
@@ -77,7 +78,8 @@ class Emitter(ArrayEmitter):
             self.lines.append(f"B bad_=watch_!=SPLAT(0.0f);if(ANY(bad_)){{STB(flags,{field},LDB(flags,{field})|bad_)}}")
         if large_branches(self.lines):
             self.lines = ["I work_=SPLATI(0),ways_=SPLATI(0);", *self.lines, "STI(work,0,WORKED)"]
-        return "\n".join(fenced(self.lines) if self.vector else self.lines)
+        lines = share_memory(self.lines)
+        return "\n".join(fenced(lines) if self.vector else lines)
 
     def _region(self, number: int, result: Any) -> list[int]:
         """Write a region. Return where its long branches and loops end, as numbers of lines."""
