@@ -109,12 +109,15 @@ def test_threads_of_a_cpu_get_as_much_to_do(both: list[BatchedEnv]) -> None:
 @pytest.mark.parametrize("fields", [1, AT_ONCE - 1, AT_ONCE, AT_ONCE + 1, 3 * AT_ONCE])
 @pytest.mark.parametrize("device", DEVICES)
 def test_columns_are_copied_into_another_order(device: str, fields: int) -> None:
-    """Also from an array with padding, and where the last thread has fewer fields than the others."""
+    """Also from and to arrays with padding, of columns too, and where the last thread has fewer fields than others."""
     skip_where_warp_lacks(device)
     rng = np.random.default_rng(fields)
     source, columns = rng.random((fields, N + 3), np.float32), rng.permutation(N).astype(np.int32)
-    rows = torch.from_numpy(source).to(device)[:, :N]
-    assert np.array_equal(reordered(rows, torch.from_numpy(columns).to(device)).cpu(), source[:, columns])
+    rows, at = torch.from_numpy(source).to(device)[:, :N], torch.from_numpy(columns).to(device)
+    assert np.array_equal(reordered(rows, at).cpu(), source[:, columns])
+    other = torch.zeros(fields, N + 3, device=device)
+    reordered(rows.t().contiguous().t(), at, out=other[:, 1 : N + 1])
+    assert np.array_equal(other.cpu(), np.pad(source[:, columns], ((0, 0), (1, 2))))
 
 
 def test_what_is_recorded_begins_with_sorting() -> None:

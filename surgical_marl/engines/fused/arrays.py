@@ -266,11 +266,12 @@ class CudaArrays(Arrays):
                 np.array(values, leaf.dtype).view(np.int32 if leaf.dtype == "uint32" else leaf.dtype)
             )
         rows, values = self.rows(leaf), values.detach().reshape(self.num_envs, leaf.size).t()
-        if self.order:
-            # along the second dimension: torch is slow where the first one is selected from, and rows have 16 bytes
-            torch.index_select(values.to(rows), 1, self.order.envs, out=rows)
-        else:
+        if not self.order:
             rows.copy_(values)
+        elif rows.dtype == torch.float32:  # actions, in each step
+            reorder.reordered(values.to(rows), self.order.envs, out=rows)
+        else:
+            torch.index_select(values.to(rows), 1, self.order.envs, out=rows)
 
     def read(self, leaf: Leaf, library: str) -> Any:
         return self._present(leaf, self._by_environment(self.rows(leaf)), library)

@@ -17,19 +17,22 @@ _rows: Any = wp.array2d(dtype=wp.float32)
 _wholes: Any = wp.array(dtype=wp.int32)
 
 
-def reordered(rows: Any, columns: Any) -> Any:
-    """Return a copy whose column c is column `columns[c]`, int32, of float32 rows [fields, N], on their device."""
+def reordered(rows: Any, columns: Any, out: Any = None) -> Any:
+    """Return a copy of float32 rows [fields, N] whose column c is column `columns[c]`, int32, on their device.
+
+    If there is an `out`, of the same shape, the copy is written there.
+    """
     import torch
 
-    found = torch.empty(rows.shape, dtype=rows.dtype, device=rows.device)
+    out = torch.empty(rows.shape, dtype=rows.dtype, device=rows.device) if out is None else out
     wp.launch(
         _reorder,
         dim=(-(-rows.shape[0] // AT_ONCE), rows.shape[1]),
-        inputs=[wp.from_torch(x) for x in (rows, columns, found)],
+        inputs=[wp.from_torch(x) for x in (rows, columns, out)],
         device=rows.device.type,
         stream=torch_stream() if rows.is_cuda else None,
     )
-    return found
+    return out
 
 
 def prepare() -> None:
