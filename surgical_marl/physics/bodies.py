@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 
@@ -78,26 +79,28 @@ def turned(angle: Array, quaternion: Array) -> Array:
 
 
 def inertias(masses: Masses, frames: Array) -> Array:
-    """Return the mass matrices [k, 6, 6] by the world's axes, from frames [k, 3, 3]."""
+    """Return the mass matrices [..., 6, 6] by the world's axes, from frames [..., 3, 3]; of one object or of many."""
     turning = frames @ masses.inertia @ jnp.swapaxes(frames, -1, -2)
-    moving = masses.mass[:, None, None] * jnp.eye(3)
+    moving = masses.mass[..., None, None] * jnp.eye(3)
     none = jnp.zeros_like(turning)
     return jnp.concatenate([jnp.concatenate([moving, none], -1), jnp.concatenate([none, turning], -1)], -2)
 
 
 def free_acceleration(bodies: Bodies, masses: Masses, frames: Array, gravity: Array, dt: Any) -> Array:
-    """Return the acceleration of objects that touch nothing, [k, 6].
+    """Return the acceleration of objects that touch nothing, [..., 6]; of one object or of many.
 
     Objects keep their angular momentum: the velocity at the end of the step is that with which the momentum is the same
     in the orientation to which it turns. It is found by repetition, and gains no energy. Torques from the start of the
     step alone would gain energy in every step.
     """
-    spin = bodies.velocity[:, 3:, None]
+    spin = bodies.velocity[..., 3:, None]
     momentum = frames @ (masses.inertia @ (jnp.swapaxes(frames, -1, -2) @ spin))
-    after = spin
-    for _ in range(REPETITIONS):
+
+    def again(_: Any, after: Array) -> Array:
         turns = rotation(turn(dt * after[..., 0])) @ frames
-        after = turns @ _solve3(masses.inertia, (jnp.swapaxes(turns, -1, -2) @ momentum)[..., 0])[..., None]
+        return turns @ _solve3(masses.inertia, (jnp.swapaxes(turns, -1, -2) @ momentum)[..., 0])[..., None]
+
+    after = jax.lax.fori_loop(0, REPETITIONS, again, spin)
     turns = rotation(turn(dt * after[..., 0])) @ frames
     local, before = jnp.swapaxes(turns, -1, -2) @ after, jnp.sum(spin * momentum, -2, keepdims=True)
     energy = jnp.sum(local * (masses.inertia @ local), -2, keepdims=True)
@@ -107,21 +110,21 @@ def free_acceleration(bodies: Bodies, masses: Masses, frames: Array, gravity: Ar
 
 
 def moved(bodies: Bodies, acceleration: Array, dt: Any) -> Bodies:
-    """Return the bodies after a step with accelerations [k, 6]."""
+    """Return the bodies after a step with accelerations [..., 6]; one or many."""
     velocity = bodies.velocity + dt * acceleration
-    spin = jnp.sqrt(jnp.sum(velocity[:, 3:] ** 2, -1, keepdims=True))
-    slowed = velocity[:, 3:] * jnp.minimum(1.0, MOST_TURN / (dt * jnp.maximum(spin, 1e-9)))
-    velocity = jnp.concatenate([velocity[:, :3], slowed], -1)
+    spin = jnp.sqrt(jnp.sum(velocity[..., 3:] ** 2, -1, keepdims=True))
+    slowed = velocity[..., 3:] * jnp.minimum(1.0, MOST_TURN / (dt * jnp.maximum(spin, 1e-9)))
+    velocity = jnp.concatenate([velocity[..., :3], slowed], -1)
     return Bodies(
-        bodies.position + dt * velocity[:, :3],
-        turned(dt * velocity[:, 3:], bodies.quaternion),
+        bodies.position + dt * velocity[..., :3],
+        turned(dt * velocity[..., 3:], bodies.quaternion),
         velocity,
         acceleration,
     )
 
 
 def _solve3(matrix: Array, right: Array) -> Array:
-    """Return x with matrix @ x = right, [k, 3], by Cramer's rule."""
+    """Return x with matrix @ x = right, [..., 3], by Cramer's rule."""
     a, b, c = (matrix[..., i] for i in range(3))
     bc, ca, ab = jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)
     determinant = jnp.sum(a * bc, -1, keepdims=True)

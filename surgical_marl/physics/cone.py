@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -67,13 +68,15 @@ def nearest(cone: Cone, push: Array, pull: Array) -> Forces:
     """
     mu, rub, stiff = cone.coefficient, cone.rub, cone.stiff
     size = jnp.sqrt(jnp.sum(pull * pull))
-    amount = size / rub
-    for _ in range(len(stiff)):
+
+    def step(_: Array, amount: Array) -> Array:
         raised = push + mu * stiff * amount
         presses = raised > 0
         excess = size - rub * amount - mu * jnp.sum(jnp.where(presses, raised, 0.0))
         slope = rub + mu**2 * jnp.sum(jnp.where(presses, stiff, 0.0))
-        amount = jnp.maximum(amount + excess / slope, 0.0)
+        return jnp.maximum(amount + excess / slope, 0.0)
+
+    amount = jax.lax.fori_loop(0, len(stiff), step, size / rub)
     raised = push + mu * stiff * amount
     left = jnp.where((raised > 0).any(), jnp.maximum(size - rub * amount, 0.0), 0.0)
     size = jnp.maximum(size, 1e-20)

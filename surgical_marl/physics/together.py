@@ -16,7 +16,7 @@ import numpy as np
 from jax import Array
 
 from surgical_marl.physics.arm_forces import ArmForces, apart, padded
-from surgical_marl.physics.bodies import Bodies, free_acceleration, inertias, moved, rotation
+from surgical_marl.physics.bodies import Bodies, Masses, free_acceleration, inertias, moved, rotation
 from surgical_marl.physics.collision import Pairs
 from surgical_marl.physics.dynamics import Dynamics, Physics
 from surgical_marl.physics.handling import DWELL, Fingers, Grips, Handling
@@ -180,8 +180,13 @@ class Together:
 
     def _moved(self, bodies: Bodies, acceleration: Array, slots: Slots) -> Bodies:
         """Return the objects after a step with accelerations [k, 6]; those at rest stay where they are."""
-        after = moved(bodies, acceleration, self._dynamics.dt)
-        after = Bodies(*(jnp.where(slots.awake[:, None], new, old) for new, old in zip(after, bodies, strict=True)))
+        dt = self._dynamics.dt
+
+        def one(row: tuple[Bodies, Array, Array]) -> Bodies:
+            body, acceleration, awake = row
+            return jax.lax.cond(awake, lambda: moved(body, acceleration, dt), lambda: body)
+
+        after: Bodies = jax.lax.map(one, (bodies, acceleration, slots.awake))
         return settled(after, self.tables.bound, slots.company)
 
     def _solve_objects(self, masses: Array, free: Array, contacts: Contacts, slots: Slots, start: Array) -> Array:
@@ -294,6 +299,13 @@ class Together:
 
         Those at rest have none.
         """
-        frames, masses = rotation(bodies.quaternion), self.tables.masses
-        free = free_acceleration(bodies, masses, frames, jnp.asarray(GRAVITY), self._dynamics.dt)
-        return inertias(masses, frames), jnp.where(awake[:, None], free, 0.0)
+        dt = self._dynamics.dt
+
+        def one(row: tuple[Bodies, Masses, Array]) -> tuple[Array, Array]:
+            body, masses, awake = row
+            frame = rotation(body.quaternion)
+            free = lambda: free_acceleration(body, masses, frame, jnp.asarray(GRAVITY), dt)  # noqa: E731
+            return inertias(masses, frame), jax.lax.cond(awake, free, lambda: jnp.zeros(6))
+
+        found: tuple[Array, Array] = jax.lax.map(one, (bodies, self.tables.masses, awake))
+        return found
