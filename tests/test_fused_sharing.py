@@ -20,8 +20,8 @@ def memory(lines: Code) -> int:
     return sum(int(size) for line in lines for size in re.findall(r"^F \w+\[(\d+)\];$", line))
 
 
-def use(name: str, place: str = "i") -> Code:
-    return [f"PUT(F,{name},{place},x)", f"y+=AT(F,{name},{place});"]
+def use(name: str) -> Code:
+    return [f"PUT(F,{name},i,x)", f"y+=AT(F,{name},i);"]
 
 
 def test_one_array_after_another_takes_its_memory() -> None:

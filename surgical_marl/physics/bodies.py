@@ -78,55 +78,44 @@ def turned(angle: Array, quaternion: Array) -> Array:
     return moved / jnp.sqrt(jnp.sum(moved * moved, -1, keepdims=True))
 
 
-def inertias(masses: Masses, frames: Array) -> Array:
-    """Return the mass matrices [..., 6, 6] by the world's axes, from frames [..., 3, 3]; of one object or of many."""
-    turning = frames @ masses.inertia @ jnp.swapaxes(frames, -1, -2)
-    moving = masses.mass[..., None, None] * jnp.eye(3)
-    none = jnp.zeros_like(turning)
-    return jnp.concatenate([jnp.concatenate([moving, none], -1), jnp.concatenate([none, turning], -1)], -2)
+def inertias(masses: Masses, frame: Array) -> Array:
+    """Return the mass matrix [6, 6] of one object by the world's axes, from its frame [3, 3]."""
+    none = jnp.zeros((3, 3))
+    return jnp.block([[masses.mass * jnp.eye(3), none], [none, frame @ masses.inertia @ frame.T]])
 
 
-def free_acceleration(bodies: Bodies, masses: Masses, frames: Array, gravity: Array, dt: Any) -> Array:
-    """Return the acceleration of objects that touch nothing, [..., 6]; of one object or of many.
+def free_acceleration(body: Bodies, masses: Masses, frame: Array, gravity: Array, dt: Any) -> Array:
+    """Return the acceleration [6] of one object that touches nothing, from its frame [3, 3].
 
     Objects keep their angular momentum: the velocity at the end of the step is that with which the momentum is the same
     in the orientation to which it turns. It is found by repetition, and gains no energy. Torques from the start of the
     step alone would gain energy in every step.
     """
-    spin = bodies.velocity[..., 3:, None]
-    momentum = frames @ (masses.inertia @ (jnp.swapaxes(frames, -1, -2) @ spin))
+    spin = body.velocity[3:]
+    momentum = frame @ (masses.inertia @ (frame.T @ spin))
 
     def again(_: Any, after: Array) -> Array:
-        turns = rotation(turn(dt * after[..., 0])) @ frames
-        return turns @ _solve3(masses.inertia, (jnp.swapaxes(turns, -1, -2) @ momentum)[..., 0])[..., None]
+        turns = rotation(turn(dt * after)) @ frame
+        return turns @ _solve3(masses.inertia, turns.T @ momentum)
 
     after = jax.lax.fori_loop(0, REPETITIONS, again, spin)
-    turns = rotation(turn(dt * after[..., 0])) @ frames
-    local, before = jnp.swapaxes(turns, -1, -2) @ after, jnp.sum(spin * momentum, -2, keepdims=True)
-    energy = jnp.sum(local * (masses.inertia @ local), -2, keepdims=True)
+    local = (rotation(turn(dt * after)) @ frame).T @ after
+    energy, before = jnp.sum(local * (masses.inertia @ local)), jnp.sum(spin * momentum)
     after *= jnp.sqrt(jnp.minimum(before / jnp.maximum(energy, 1e-30), 1.0))
-    angular = ((after - spin) / dt)[..., 0]
-    return jnp.concatenate([jnp.broadcast_to(gravity, angular.shape), angular], -1)
+    return jnp.concatenate([gravity, (after - spin) / dt])
 
 
-def moved(bodies: Bodies, acceleration: Array, dt: Any) -> Bodies:
-    """Return the bodies after a step with accelerations [..., 6]; one or many."""
-    velocity = bodies.velocity + dt * acceleration
-    spin = jnp.sqrt(jnp.sum(velocity[..., 3:] ** 2, -1, keepdims=True))
-    slowed = velocity[..., 3:] * jnp.minimum(1.0, MOST_TURN / (dt * jnp.maximum(spin, 1e-9)))
-    velocity = jnp.concatenate([velocity[..., :3], slowed], -1)
-    return Bodies(
-        bodies.position + dt * velocity[..., :3],
-        turned(dt * velocity[..., 3:], bodies.quaternion),
-        velocity,
-        acceleration,
-    )
+def moved(body: Bodies, acceleration: Array, dt: Any) -> Bodies:
+    """Return one body after a step with an acceleration [6]."""
+    velocity = body.velocity + dt * acceleration
+    spin = jnp.sqrt(jnp.sum(velocity[3:] ** 2))
+    slowed = velocity[3:] * jnp.minimum(1.0, MOST_TURN / (dt * jnp.maximum(spin, 1e-9)))
+    velocity = jnp.concatenate([velocity[:3], slowed])
+    return Bodies(body.position + dt * velocity[:3], turned(dt * velocity[3:], body.quaternion), velocity, acceleration)
 
 
 def _solve3(matrix: Array, right: Array) -> Array:
-    """Return x with matrix @ x = right, [..., 3], by Cramer's rule."""
-    a, b, c = (matrix[..., i] for i in range(3))
-    bc, ca, ab = jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)
-    determinant = jnp.sum(a * bc, -1, keepdims=True)
-    dot = lambda one: jnp.sum(one * right, -1, keepdims=True)  # noqa: E731
-    return jnp.concatenate([dot(bc), dot(ca), dot(ab)], -1) / determinant
+    """Return x with matrix @ x = right, [3], by Cramer's rule."""
+    a, b, c = matrix.T
+    rows = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)])
+    return rows @ right / (a @ rows[0])

@@ -10,9 +10,9 @@ import re
 from collections.abc import Sequence
 from typing import NamedTuple
 
-_DECLARED = re.compile(r"([FIUB]) (\w+)\[(\d+)\];")
+_DECLARED = re.compile(r"([FIUB]) ([vn]\d+)\[(\d+)\];")
 _NAME = re.compile(r"\b[vn]\d+\b")
-_FIXED = re.compile(r"\b([vn]\d+)\[[\d+*()k-]*\]")
+_FIXED = re.compile(r"\b[vn]\d+\[[\d+*()k-]*\]")
 """An element at a known place; `k` counts in short loops, which compilers unroll."""
 
 
