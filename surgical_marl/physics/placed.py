@@ -100,9 +100,8 @@ class Places:
         ways = {"objects": Way(dt * bodies.velocity[:, :3] - jnp.cross(turn, bodies.position), turn)}
         moves, columns = dt * jnp.append(qvel, 0.0)[t.dofs], joints.columns(jnp.asarray(t.slides), jnp.zeros(3))
         by_joint = tuple(column * moves[..., None] for column in columns)
-        for kind in t.bodies:
-            own = t.arm_of[kind], t.moves[kind]
-            ways[kind] = Way(*jax.lax.map(lambda row: _moved(row[0], row[1], by_joint), own))
+        for kind in t.bodies:  # not in a loop: links of an arm are moved by what moves those before them, and more
+            ways[kind] = Way(*(jnp.einsum("nm,nmd->nd", t.moves[kind], of[t.arm_of[kind]]) for of in by_joint))
         around = {"objects": (bodies.position, jnp.asarray(t.bound)), "pads": _around(pads), "links": _around(links)}
         around |= {"plates": _around(t.plates), "rods": _around(t.rods)}
         balls = {kind: _ball(*ball, ways.get(kind)) for kind, ball in around.items()}
@@ -139,13 +138,14 @@ class Places:
         rod = self.capsule(placed, kind, j, jnp.int32(0))
         return size(point - nearest(rod, point)) - rod.radius
 
-    def gap(self, placed: Placed, kind: str, i: Array, box: Any) -> Array:
-        """Return a lower bound of the distance of an object or a link from a box [2, 3] along the axes, m."""
-        start = end = placed.position[i] if kind == "objects" else placed.links.start[i]
-        if kind == "links":
-            end = placed.links.end[i]
-        radius = jnp.asarray(self._tables.bound)[i] if kind == "objects" else placed.links.radius[i]
-        return jnp.max(_beyond(start, end, box[0], box[1])) - radius
+    def gaps(self, placed: Placed, kind: str, fixed: str) -> Array:
+        """Return lower bounds of the distances of all objects, or links, from all fixed bodies of a kind, m, [n]."""
+        t, links = self._tables, placed.links
+        if kind == "links" and fixed == "plates":
+            plates = jax.tree.map(jnp.asarray, t.plates)
+            return jnp.min(_beside(jax.tree.map(lambda x: x[:, None], links), plates), 1)
+        start, end, radius = (placed.position, placed.position, t.bound) if kind == "objects" else links
+        return jnp.max(_beyond(start, end, *t.boxes[fixed]), -1) - radius
 
     def capsule_gap(self, placed: Placed, i: Array, kind: str, j: Array) -> Callable[[Array], Array]:
         """Return what finds a lower bound of the distance of object i's capsules, by their numbers, from a body, m.
@@ -171,14 +171,14 @@ class Places:
         """Return a lower bound of the distance of a link from what is fixed, m; exact for rods."""
         if kind == "rods":
             return -between_segments(link, self.capsule(placed, kind, j, jnp.int32(0))).depth
-        plate = self.plate(placed, kind, j)
-        heights = jnp.stack([(end - plate.centre) @ plate.frame[:, 2] for end in (link.start, link.end)])
-        beyond = jnp.maximum(jnp.min(heights), -jnp.max(heights))  # on one side of the middle plane, if above 0
-        return jnp.maximum(beyond, 0.0) - plate.radius - link.radius
+        return _beside(link, self.plate(placed, kind, j))
 
 
-def _moved(arm: Array, moves: Array, joints: tuple[Array, Array]) -> tuple[Array, Array]:
-    return tuple(moves @ of[arm] for of in joints)  # type: ignore[return-value]
+def _beside(link: Segments, plate: Plate) -> Array:
+    """Return lower bounds of the distances of links from plates, m. Shapes of the two broadcast."""
+    one, other = (jnp.sum((end - plate.centre) * plate.frame[..., 2], -1) for end in (link.start, link.end))
+    beyond = jnp.maximum(jnp.minimum(one, other), -jnp.maximum(one, other))  # on one side of the middle plane, if > 0
+    return jnp.maximum(beyond, 0.0) - plate.radius - link.radius
 
 
 def _beyond(start: Array, end: Array, low: Any, high: Any) -> Array:

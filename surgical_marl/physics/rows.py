@@ -11,8 +11,8 @@ import numpy as np
 from jax import Array
 
 
-def row_of(tree: Any, i: Array | int) -> Any:
-    """Return one row of all arrays of a tree."""
+def row_of(tree: Any, i: Array | np.ndarray | int) -> Any:
+    """Return one row of all arrays of a tree, or several of them, if `i` is an array of their numbers."""
     return jax.tree.map(lambda x: x[i], tree)
 
 
