@@ -121,21 +121,17 @@ class Finder:
         def of_one(found: tuple[Array, Array], row: Any) -> tuple[tuple[Array, Array], None]:
             number, i, others, near = row
 
-            def looked_at(found: tuple[Array, Array]) -> tuple[Array, Array]:
-                def look(found: tuple[Array, Array], partner: Any) -> tuple[tuple[Array, Array], None]:
-                    k, j, near = partner
-                    exactly = lambda: self._is_near(placed, meeting, i, j)  # noqa: E731
-                    near = jax.lax.cond(near, exactly, lambda: jnp.bool_(False))
-                    return _listed(found, meeting.partners * number + k, near), None
+            def look(found: tuple[Array, Array], partner: Any) -> tuple[tuple[Array, Array], None]:
+                k, j, near = partner
+                near = jax.lax.cond(near, lambda: self._is_near(placed, meeting, i, j), lambda: jnp.bool_(False))
+                return _listed(found, meeting.partners * number + k, near), None
 
-                listed: tuple[Array, Array] = jax.lax.scan(look, found, (jnp.arange(meeting.partners), others, near))[0]
-                return listed
+            partners = jnp.arange(meeting.partners), others, near
+            return _if_any(near, lambda found: jax.lax.scan(look, found, partners)[0], found), None
 
-            return jax.lax.cond(near.any(), looked_at, lambda found: found, found), None
-
+        rows = jnp.arange(len(one)), one[:, 0], other, near
         none = room(jnp.int32(0), most + 1), jnp.int32(0)
-        found: tuple[Array, Array] = jax.lax.scan(of_one, none, (jnp.arange(len(one)), one[:, 0], other, near))[0]
-        return found
+        return _if_any(near, lambda found: jax.lax.scan(of_one, found, rows)[0], none)
 
     def _perhaps_near(self, placed: Placed, meeting: Meeting, one: np.ndarray, other: np.ndarray) -> Array:
         """Return which of bodies `one` [n] may touch each of its partners `other` [n, p] in the next step, [n, p].
@@ -235,6 +231,11 @@ def _reach(*balls: Ball) -> Array:
 def _tilt(meeting: Meeting) -> float:
     """Return by how much bodies are tilted to find the rim of their contact, rad."""
     return TILT_IN_JAW if meeting.second == "pads" else TILT
+
+
+def _if_any(near: Array, change: Callable[[Any], Any], found: Any) -> Any:
+    """Return what was found, changed if anything is near."""
+    return jax.lax.cond(near.any(), change, lambda found: found, found)
 
 
 def _listed(found: tuple[Array, Array], number: Array, near: Array) -> tuple[Array, Array]:
