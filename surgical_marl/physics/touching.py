@@ -136,7 +136,7 @@ class Finder:
     def _perhaps_near(self, placed: Placed, meeting: Meeting, one: np.ndarray, other: np.ndarray) -> Array:
         """Return which of bodies `one` [n] may touch each of its partners `other` [n, p] in the next step, [n, p].
 
-        Of fixed bodies that is told by how far they are together.
+        Balls around both tell it. One that may be near any fixed body of a kind counts as near all of them.
         """
         balls, partners = row_of(placed.balls[meeting.first], one), row_of(placed.balls[meeting.second], other)
         if meeting.second in self._tables.boxes:
