@@ -13,6 +13,8 @@ from surgical_marl.envs.env import Env
 
 PARTS = (".qpos", ".qvel", ".objects.bodies.position", ".objects.bodies.quaternion", ".objects.bodies.velocity",
          ".objects.grips.force", ".objects.grips.position")  # fmt: skip
+DRAWS = 4
+"""Random ways to change last digits. One way is too few: a light needle in a stiff grip answers some far more."""
 
 
 class Beside:
@@ -39,7 +41,8 @@ class Beside:
             for path, values in _leaves(now).items():
                 self._engine.write(f".physics{path}", values)
             self._engine.step({})
-            others, expected = [_leaves(self._step(_nudged(now, way))) for way in (-99, 99)], _leaves(after)
+            draws, expected = map(np.random.default_rng, range(DRAWS)), _leaves(after)
+            others = [_leaves(self._step(_nudged(now, rng))) for rng in (None, *draws)]
             for part in PARTS:
                 found = self._engine.read(f".physics{part}", "numpy")
                 scale = np.abs(expected[part]).max() + 1e-3
@@ -49,9 +52,16 @@ class Beside:
         return after
 
 
-def _nudged(physics: Any, way: float) -> Any:
-    """Return the same states with the last digit changed of all joints, and of how objects are and move."""
-    change = lambda values: np.nextafter(values, np.float32(way))  # noqa: E731
+def _nudged(physics: Any, rng: np.random.Generator | None) -> Any:
+    """Return the same states with the last digit changed of all joints, and of how objects are and move.
+
+    Each number changes up or down by itself, or all of them up if `rng` is None.
+    """
+
+    def change(values: np.ndarray) -> np.ndarray:
+        up = np.ones(values.shape, bool) if rng is None else rng.random(values.shape) < 0.5
+        return np.nextafter(values, np.where(up, np.float32(99), np.float32(-99)))
+
     bodies = physics.objects.bodies
     moved = bodies._replace(**{part: change(getattr(bodies, part)) for part in ("position", "quaternion", "velocity")})
     return physics._replace(qpos=change(physics.qpos), objects=physics.objects._replace(bodies=moved))
