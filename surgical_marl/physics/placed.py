@@ -142,8 +142,7 @@ class Places:
         """Return lower bounds of the distances of all objects, or links, from all fixed bodies of a kind, m, [n]."""
         t, links = self._tables, placed.links
         if kind == "links" and fixed == "plates":
-            plates = jax.tree.map(jnp.asarray, t.plates)
-            return jnp.min(_beside(jax.tree.map(lambda x: x[:, None], links), plates), 1)
+            return jnp.min(_beside(jax.tree.map(lambda x: x[:, None], links), t.plates), 1)
         start, end, radius = (placed.position, placed.position, t.bound) if kind == "objects" else links
         return jnp.max(_beyond(start, end, *t.boxes[fixed]), -1) - radius
 
