@@ -105,10 +105,11 @@ def test_arms_that_an_object_joins_are_solved_as_all_at_once_in_float64(
     monkeypatch.setattr("surgical_marl.physics.arms.ITERATIONS", (60, 4))  # six do not solve all of these
     rng, errors = np.random.default_rng(10 * arms + objects), []
     solver = Arms(np.arange(arms * JOINTS).reshape(arms, JOINTS), arms * JOINTS)
-    bridged = jax.jit(lambda fields, here, left: here + solver.bridged(SimpleNamespace(**fields), here, left))  # type: ignore[arg-type]
+    bridged = jax.jit(lambda fields, *given: given[0] + solver.bridged(SimpleNamespace(**fields), *given))  # type: ignore[arg-type]
     for n in range(40):
         drawn = _drawn(rng, arms, objects, n % objects)
-        found = bridged(vars(drawn.problem), drawn.here, drawn.left)
+        begin = drawn.here * np.float32(rng.choice([1.0, 0.7, -2.0]))  # wherever it begins
+        found = bridged(vars(drawn.problem), drawn.here, begin, drawn.left)
         flat = JointRows(*(np.asarray(column, np.float64).ravel() for column in drawn.problem.joints))
         rows = Rows(*(np.asarray(column, np.float64) for column in rows_of(flat)))  # type: ignore[arg-type]
         rows = rows._replace(jacobian=np.pad(rows.jacobian, ((0, 0), (0, 6 * objects))))

@@ -14,7 +14,7 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from surgical_marl.physics.collision import SLOTS, Pairs
-from surgical_marl.physics.cone import Cone, between, curvature, forces, nearest, wrench
+from surgical_marl.physics.cone import Cone, Springs, Stuck, between, curvature, nearest, parting, stretched, wrench
 from surgical_marl.physics.factor import packed
 from surgical_marl.physics.patches import (
     ALIKE,
@@ -227,11 +227,11 @@ def test_a_fork_is_led_by_its_first_point_and_nothing_is_no_patch() -> None:
     assert not none.normal.any() and none.centre.tolist() == [0, 0, 0] and not none.points.normal.any()
 
 
-def cone(rng: np.random.Generator, points: int = 4) -> Cone:
-    stiff, rub = rng.uniform(0.1, 10, points), rng.uniform(0.1, 10)
-    parts = (rng.normal(size=(points, 6)), stiff, 3 * rng.normal(size=points), rng.normal(size=(3, 6)), rub,
-             3 * rng.normal(size=3), rng.uniform(0.1, 1))  # fmt: skip
-    return Cone(*map(single, parts))
+def cone(rng: np.random.Generator, points: int = 4) -> tuple[Cone, Stuck]:
+    springs = rng.uniform(0.1, 10, points), rng.uniform(0.1, 10), rng.uniform(0.1, 1)
+    ways, stuck = rng.normal(size=(points + 3, 6)), 3 * rng.normal(size=points + 3)
+    own = Cone(single(ways[:points]), single(ways[points:]), Springs(*map(single, springs)))
+    return own, Stuck(single(stuck[:points]), single(stuck[points:]))
 
 
 def test_forces_are_the_nearest_ones_in_the_friction_cone() -> None:
@@ -239,12 +239,12 @@ def test_forces_are_the_nearest_ones_in_the_friction_cone() -> None:
     rng, seen = np.random.default_rng(5), set()
     compiled = jax.jit(nearest)
     for _ in range(30):
-        c = cone(rng)
+        c, stuck = cone(rng)
         if rng.random() < 0.2:
-            c = c._replace(push=-jnp.abs(c.push) - 0.5, pull=0.1 * c.pull)
-        felt = compiled(c, c.push, c.pull)
-        stiff, mu, rub = (np.asarray(part, float) for part in (c.stiff, c.coefficient, c.rub))
-        push, pull = np.asarray(c.push, float), np.asarray(c.pull, float)
+            stuck = Stuck(-jnp.abs(stuck.push) - 0.5, 0.1 * stuck.pull)
+        felt = compiled(c.springs, stuck)
+        stiff, rub, mu = (np.asarray(part, float) for part in c.springs)
+        push, pull = (np.asarray(part, float) for part in stuck)
 
         def cost(f: np.ndarray, push: Any = push, pull: Any = pull, stiff: Any = stiff, rub: Any = rub) -> float:
             return float(np.sum((f[:4] - push) ** 2 / stiff) + np.sum((f[4:] - pull) ** 2) / rub)
@@ -266,28 +266,30 @@ def test_forces_are_the_nearest_ones_in_the_friction_cone() -> None:
 
 
 @jax.jit
-def curvatures(c: Cone, other: Cone, at: Any) -> Any:
+def curvatures(c: Cone, stuck: Stuck, other: Cone, at: Any) -> Any:
     """Three curvatures, and how the wrench falls as the first or the second body accelerates, by differences."""
 
-    def pulled(mine: Any, its: Any) -> Any:
-        push = c.push - c.stiff * (c.normal @ (at + mine) + other.normal @ its)
-        return wrench(c, nearest(c, push, c.pull - c.rub * (c.along @ (at + mine) + other.along @ its)))
+    def felt(mine: Any, its: Any) -> Any:
+        moved = stretched(c.springs, stretched(c.springs, stuck, parting(c, at + mine)), parting(other, its))
+        return nearest(c.springs, moved)
 
-    felt, zero, steps = forces(c, at), jnp.zeros(6), STEP * jnp.eye(6)
+    pulled = lambda mine, its: wrench(c, felt(mine, its))  # noqa: E731
+    zero, steps = jnp.zeros(6), STEP * jnp.eye(6)
+    here = felt(zero, zero)
     own = jax.vmap(lambda d: pulled(-d, zero) - pulled(d, zero), out_axes=1)(steps) / (2 * STEP)
     its = jax.vmap(lambda d: pulled(zero, -d) - pulled(zero, d), out_axes=1)(steps) / (2 * STEP)
-    presses = lambda at: forces(c, at).normal > 0  # noqa: E731
-    corner = jax.vmap(lambda d: presses(at + d) != presses(at - d))(steps).any()
-    return felt.slips, corner, curvature(c, felt)[packed(6)], between(c, c, felt), between(c, other, felt), own, its
+    presses = lambda d: felt(d, zero).normal > 0  # noqa: E731
+    corner = jax.vmap(lambda d: presses(d) != presses(-d))(steps).any()
+    return here.slips, corner, curvature(c, here)[packed(6)], between(c, c, here), between(c, other, here), own, its
 
 
 def test_curvatures_are_differences_of_the_wrench() -> None:
     """Of one body, and of a second one whose twists have another origin: its own and the mixed one."""
     rng, seen = np.random.default_rng(6), []
     for _ in range(60):
-        one, ways = cone(rng), cone(rng)
+        (one, stuck), (ways, _) = cone(rng), cone(rng)
         other = one._replace(normal=ways.normal, along=ways.along)
-        slips, corner, *parts = curvatures(one, other, single(rng.normal(size=6)))
+        slips, corner, *parts = curvatures(one, stuck, other, single(rng.normal(size=6)))
         whole, same, mixed, own, its = (np.asarray(part, float) for part in parts)
         np.testing.assert_allclose(same, whole, atol=1e-3, rtol=1e-3)
         np.testing.assert_array_equal(whole, whole.T)

@@ -11,11 +11,11 @@ import pytest
 from jax import Array
 
 from surgical_marl.physics import elimination
-from surgical_marl.physics.cone import Cone, between, curvature, forces
+from surgical_marl.physics.cone import between, curvature
 from surgical_marl.physics.factor import cholesky, packed
 from tests.helpers.falling import DT, Falling, random_turns, thrown
 from tests.test_random_objects import random_objects
-from tests.test_search import drawn
+from tests.test_search import drawn, forces
 
 OBJECTS, ARMS, JOINTS = 4, 2, 3
 
@@ -85,9 +85,9 @@ def test_the_curvature_between_two_bodies_is_how_the_force_on_one_falls_with_the
     moved = jax.jit(lambda cone, shift: cone._replace(normal=cone.normal @ shift, along=cone.along @ shift))
     of_both = jax.jit(lambda cone, other, felt: (between(cone, cone, felt), between(cone, other, felt)))
     for _ in range(50):
-        cone: Cone = drawn(rng)
+        cone, stuck = drawn(rng)
         at, shift = (jnp.asarray(rng.standard_normal(shape), jnp.float32) for shape in ((6,), (6, 6)))
-        felt = forces(cone, at)
+        felt = forces(cone, stuck, at)
         slipping.add((bool(felt.slips), bool((felt.normal > 0).any())))
         whole = curvature(cone, felt)[packed(6)]
         itself, other = of_both(cone, moved(cone, shift), felt)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from surgical_marl.bench.grasping import grasps
@@ -62,3 +63,20 @@ def test_an_arm_that_touches_nothing_moves_as_if_alone_while_another_holds_somet
             errors.append(np.abs(found[e, own] - qacc[e, own]).max() / (1 + np.abs(qacc[e, own]).max()))
     assert len(errors) > 50
     assert np.max(errors) < 1e-3
+
+
+def test_friction_of_joints_is_as_before_at_the_acceleration_that_joined_arms_begin_with() -> None:
+    simulator, rng = Env("reach", "bimanual_psm_needle").simulator, np.random.default_rng(0)
+    together, physics = cast(Any, simulator._objects), simulator.home
+    qvel, qacc = (jnp.asarray(rng.uniform(-1, 1, len(physics.qvel)), jnp.float32) for _ in range(2))
+
+    @jax.jit
+    def force(qvel: Any, accelerations: Any) -> Any:
+        """As if it had no bounds."""
+        joints = together._forces(physics._replace(qvel=qvel), {}).joints
+        return joints.friction_impedance * (joints.friction_reference - accelerations)
+
+    by_arm = together._newton.twists.by_arm(qacc)
+    before, after = force(qvel, by_arm), force(qvel + together._dynamics.dt * qacc, together._eases * by_arm)
+    np.testing.assert_allclose(after, before, rtol=1e-4)
+    assert np.abs(before).min() > 0

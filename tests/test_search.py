@@ -5,45 +5,60 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from surgical_marl.physics.cone import Cone, curvature, fall, forces, wrench
+from surgical_marl.physics.cone import (
+    Cone,
+    Forces,
+    Springs,
+    Stuck,
+    curvature,
+    falls,
+    nearest,
+    parting,
+    stretched,
+    wrench,
+)
 from surgical_marl.physics.factor import packed
 from surgical_marl.physics.search import ENOUGH, search
 
 POINTS = 4
 
 
-def drawn(rng: np.random.Generator) -> Cone:
+def drawn(rng: np.random.Generator) -> tuple[Cone, Stuck]:
     """A contact that sticks, slips, presses or is apart, by chance."""
     single = lambda *shape: jnp.asarray(rng.standard_normal(shape), jnp.float32)  # noqa: E731
     stiff, rub = rng.uniform(0.1, 10, POINTS), rng.uniform(0.1, 10)
-    return Cone(
-        single(POINTS, 6), jnp.asarray(stiff, jnp.float32), 3 * single(POINTS), single(3, 6), jnp.float32(rub),
-        3 * single(3), jnp.float32(rng.uniform(0.1, 1)),
-    )  # fmt: skip
+    normal, push, along, pull = single(POINTS, 6), 3 * single(POINTS), single(3, 6), 3 * single(3)
+    springs = Springs(jnp.asarray(stiff, jnp.float32), jnp.float32(rub), jnp.float32(rng.uniform(0.1, 1)))
+    return Cone(normal, along, springs), Stuck(push, pull)
 
 
 @jax.jit
-def along(cone: Cone, at: jax.Array, way: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """How the power of the forces falls along a way: by `fall`, and by the whole curvature."""
-    felt = forces(cone, at)
-    return fall(cone, felt, cone.normal @ way, cone.along @ way), way @ curvature(cone, felt)[packed(6)] @ way
+def forces(cone: Cone, stuck: Stuck, twist: jax.Array) -> Forces:
+    return nearest(cone.springs, stretched(cone.springs, stuck, parting(cone, twist)))
+
+
+@jax.jit
+def along(cone: Cone, stuck: Stuck, at: jax.Array, way: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """How the forces of a patch fall along a way, as a wrench: by `falls`, and by the whole curvature."""
+    felt = forces(cone, stuck, at)
+    normal, friction = falls(cone.springs, felt, parting(cone, way))
+    return normal @ cone.normal + friction @ cone.along, curvature(cone, felt)[packed(6)] @ way
 
 
 def test_what_falls_along_a_way_is_the_curvature_there() -> None:
     rng = np.random.default_rng(0)
     seen = set()
     for _ in range(100):
-        cone, (at, way) = drawn(rng), jnp.asarray(rng.standard_normal((2, 6)), jnp.float32)
-        one, other = along(cone, at, way)
-        assert float(one) == pytest.approx(float(other), rel=1e-4, abs=1e-4)
-        felt = forces(cone, at)
+        (cone, stuck), (at, way) = drawn(rng), jnp.asarray(rng.standard_normal((2, 6)), jnp.float32)
+        one, other = along(cone, stuck, at, way)
+        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-4)
+        felt = forces(cone, stuck, at)
         seen.add((bool(felt.slips), bool((felt.normal > 0).any())))
-        ahead = (wrench(cone, forces(cone, at + 1e-3 * way)) - wrench(cone, forces(cone, at - 1e-3 * way))) @ way
-        assert -float(ahead) > -1e-3, "the cost is convex"
+        ahead, behind = (wrench(cone, forces(cone, stuck, at + sign * 1e-3 * way)) for sign in (1, -1))
+        assert -float((ahead - behind) @ way) > -1e-3, "the cost is convex"
     assert seen == {(False, True), (True, True), (True, False)}
 
 

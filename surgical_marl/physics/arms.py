@@ -119,8 +119,11 @@ class Arms:
         found: Array = jax.lax.map(one, (self._rows(problem, here, left), moving))
         return found
 
-    def bridged(self, problem: Problem, here: Array, left: Left) -> Array:
-        """Return the ways [a, m] of arms that one object joins and nothing else."""
+    def bridged(self, problem: Problem, here: Array, begin: Array, left: Left) -> Array:
+        """Return the ways [a, m] of arms that one object joins and nothing else.
+
+        It is looked for from the acceleration `begin` [a, m] on.
+        """
         a, k = len(self._there), len(left.half)
         bridge = jnp.argmax(left.touched.sum(1) > 1)
         rows = self._rows(problem, here, left)
@@ -131,7 +134,8 @@ class Arms:
             return found if a == 2 else jnp.where(left.touched[bridge, arm], found, 0.0)
 
         own = Own(rows.number, stiff, force, problem.joints, here)
-        return Bridge(own, wide, partial(self._resisted, problem), self._places).solve(ITERATIONS[0])
+        resisted = partial(self._resisted, problem, np.ones(a, bool))
+        return Bridge(own, wide, resisted, self._places).solve(begin - here, ITERATIONS[0])
 
     def _rows(self, problem: Problem, here: Array, left: Left) -> _Row:
         arms = jnp.arange(len(self._there))
@@ -161,30 +165,39 @@ class Arms:
         found: tuple[Array, Array] = jax.lax.scan(subtract, total, objects)[0]
         return found
 
-    def slopes(self, problem: Problem, here: Array, way: Array, force: Array) -> tuple[Array, Array, Array]:
-        """Return slopes of the cost along ways [a, m], from an acceleration [a, m], [] each.
+    def slopes(
+        self, problem: Problem, moves: Array, here: Array, way: Array, force: Array
+    ) -> tuple[Array, Array, Array]:
+        """Return slopes of the cost along ways [a, m] of arms, of which some move [a], from an acceleration, [] each.
 
         The first is that of the whole cost, with forces of contacts [a, m]. The second is the slope, there, of what
         does not depend on contacts, nor on friction and limits; the third is by how much that grows per length.
         """
 
         def add(sums: tuple[Array, Array, Array], row: Any) -> tuple[tuple[Array, Array, Array], None]:
-            mass, smooth, joints, here, way, force = row
-            mass, rows = mass[self._places], rows_of(joints)
-            rest = mass @ here - smooth
-            whole = rest - force - rows.jacobian.T @ row_forces(rows, here)
-            return (sums[0] + way @ whole, sums[1] + way @ rest, sums[2] + way @ (mass @ way)), None
+            moves, lower, smooth, joints, here, way, force = row
+
+            def more(sums: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+                mass, rows = lower[self._places], rows_of(joints)
+                rest = mass @ here - smooth
+                whole = rest - force - rows.jacobian.T @ row_forces(rows, here)
+                return sums[0] + way @ whole, sums[1] + way @ rest, sums[2] + way @ (mass @ way)
+
+            return jax.lax.cond(moves, more, lambda sums: sums, sums), None
 
         zero = jnp.float32(0.0)
-        rows = problem.mass, problem.smooth, problem.joints, here, way, force
+        rows = moves, problem.mass, problem.smooth, problem.joints, here, way, force
         whole, slope, growth = jax.lax.scan(add, (zero, zero, zero), rows)[0]
         if len(problem.between.low):
             whole = jax.lax.cond(problem.overlap, lambda: whole - self._power(problem, here, way), lambda: whole)
         return whole, slope, growth
 
-    def resisted(self, problem: Problem, here: Array, way: Array, length: Array) -> tuple[Array, Array]:
-        """Return the slope of friction and limits of joints at a length of ways, and how much it grows per length."""
-        found = self._resisted(problem, here, way, length)
+    def resisted(self, problem: Problem, moves: Array, here: Array, way: Array, length: Array) -> tuple[Array, Array]:
+        """Return the slope of friction and limits of joints at a length of ways, and how much it grows per length.
+
+        Arms that do not move [a] are left out.
+        """
+        found = self._resisted(problem, moves, here, way, length)
         if not len(problem.between.low):
             return found
 
@@ -205,14 +218,16 @@ class Arms:
         pressed = lambda arms: row_forces(_flat(problem.between), arms.ravel())  # noqa: E731
         return jax.lax.cond(problem.overlap, pressed, lambda _: none, arms)
 
-    def _resisted(self, problem: Problem, here: Array, way: Array, length: Array) -> tuple[Array, Array]:
+    def _resisted(self, problem: Problem, moves: Any, here: Array, way: Array, length: Array) -> tuple[Array, Array]:
         """Return what `resisted` does, but for contacts of arms with arms."""
 
         def add(sums: tuple[Array, Array], row: Any) -> tuple[tuple[Array, Array], None]:
-            joints, here, way = row
-            return _added(sums, rows_of(joints), here, way, length), None
+            moves, joints, here, way = row
+            added = lambda sums: _added(sums, rows_of(joints), here, way, length)  # noqa: E731
+            return jax.lax.cond(moves, added, lambda sums: sums, sums), None
 
-        found: tuple[Array, Array] = jax.lax.scan(add, (jnp.float32(0.0),) * 2, (problem.joints, here, way))[0]
+        rows = moves, problem.joints, here, way
+        found: tuple[Array, Array] = jax.lax.scan(add, (jnp.float32(0.0),) * 2, rows)[0]
         return found
 
     def _power(self, problem: Problem, here: Array, way: Array) -> Array:

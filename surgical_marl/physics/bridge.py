@@ -65,14 +65,22 @@ class Bridge:
     ) -> None:
         self._own, self._wide, self._resisted, self._places = own, wide, resisted, places
 
-    def solve(self, iterations: int) -> Array:
-        """Return the ways [a, m], by at most `iterations` Newton steps: the last one is whole and changes no side."""
+    def solve(self, begin: Array, iterations: int) -> Array:
+        """Return the ways [a, m], by at most `iterations` Newton steps: the last one is whole and changes no side.
+
+        The first of them begins at the ways `begin` [a, m].
+        """
 
         def unsettled(state: _State) -> Array:
             return ~state.settled & (state.steps < iterations)
 
-        none = _State(jnp.zeros_like(self._own.start), jnp.zeros(6), jnp.bool_(False), jnp.int32(0))
-        return jax.lax.while_loop(unsettled, self._newton, none).ways
+        def add(moved: Array, row: tuple[Array, Array]) -> tuple[Array, None]:
+            number, way = row
+            return moved + self._wide(number) @ way, None
+
+        moved, _ = jax.lax.scan(add, jnp.zeros(6), (self._own.number, begin))
+        start = _State(begin, moved, jnp.bool_(False), jnp.int32(0))
+        return jax.lax.while_loop(unsettled, self._newton, start).ways
 
     def _newton(self, state: _State) -> _State:
         """Return the state after a step."""

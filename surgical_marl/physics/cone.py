@@ -18,6 +18,17 @@ from jax import Array
 _FIRST, _SECOND = np.tril_indices(6)
 
 
+class Springs(NamedTuple):
+    """What a patch resists with, at s points."""
+
+    stiff: Array
+    """Normal force per acceleration, [s]."""
+    rub: Array
+    """Friction per acceleration, []."""
+    coefficient: Array
+    """Friction coefficient, []."""
+
+
 class Cone(NamedTuple):
     """The contact of two bodies at s points.
 
@@ -26,18 +37,27 @@ class Cone(NamedTuple):
 
     normal: Array
     """Speed along the normal of each point by twist, [s, 6]."""
-    stiff: Array
-    """Normal force per acceleration, [s]."""
-    push: Array
-    """Normal force without acceleration, N, [s]."""
     along: Array
     """Speed in two directions along the surface, and about the normal times the patch's radius, by twist, [3, 6]."""
-    rub: Array
-    """Friction per acceleration, []."""
+    springs: Springs
+
+
+class Parting(NamedTuple):
+    """How the two bodies accelerate relative to each other at a patch."""
+
+    normal: Array
+    """Along the normal of each point, [s]."""
+    along: Array
+    """As in `Cone.along`, [3]."""
+
+
+class Stuck(NamedTuple):
+    """The forces of a patch that can neither part nor slip."""
+
+    push: Array
+    """Along the normal of each point, N, [s]; it pulls where this is below 0."""
     pull: Array
-    """Friction without acceleration, N, [3]."""
-    coefficient: Array
-    """Friction coefficient, []."""
+    """Friction, N, [3]."""
 
 
 class Forces(NamedTuple):
@@ -55,18 +75,23 @@ class Forces(NamedTuple):
     """Share of the friction that would stick, []."""
 
 
-def forces(cone: Cone, twist: Array) -> Forces:
-    """Return the forces at an acceleration of the two bodies [6]."""
-    return nearest(cone, cone.push - cone.stiff * (cone.normal @ twist), cone.pull - cone.rub * (cone.along @ twist))
+def parting(cone: Cone, twist: Array) -> Parting:
+    """Return the relative acceleration at a patch, of two bodies that accelerate by a twist [6]."""
+    return Parting(cone.normal @ twist, cone.along @ twist)
 
 
-def nearest(cone: Cone, push: Array, pull: Array) -> Forces:
-    """Return the forces in the cone that are nearest to those that stick: normal ones [s] and friction [3].
+def stretched(springs: Springs, stuck: Stuck, by: Parting) -> Stuck:
+    """Return the forces that stick once the bodies accelerate by so much more."""
+    return Stuck(stuck.push - springs.stiff * by.normal, stuck.pull - springs.rub * by.along)
+
+
+def nearest(springs: Springs, stuck: Stuck) -> Forces:
+    """Return the forces in the friction cone that are nearest to those that stick.
 
     Where friction slips it gives way by an unknown amount, and the normal forces grow with it. It is the root of a
     concave function, piecewise linear with a corner at each point: Newton's method from the far end never overshoots.
     """
-    mu, rub, stiff = cone.coefficient, cone.rub, cone.stiff
+    (stiff, rub, mu), (push, pull) = springs, stuck
     size = jnp.sqrt(jnp.sum(pull * pull))
 
     def step(_: Array, amount: Array) -> Array:
@@ -91,15 +116,18 @@ def wrench(cone: Cone, felt: Forces) -> Array:
 
 def curvature(cone: Cone, felt: Forces) -> Array:
     """Return by how much the wrench falls per acceleration: the lower half of a matrix [6, 6], row by row, [21]."""
-    pressed, rub, soft, ahead, across = _gives(cone, felt)
-    rubs = felt.way @ cone.along
-    turning = across * cone.along[:, _FIRST] * cone.along[:, _SECOND]
-    raised = cone.coefficient * (pressed @ cone.normal)
-    mixed = rub * rubs - raised / 2
-    lower = (pressed[:, None] * cone.normal)[:, _FIRST] * cone.normal[:, _SECOND]
-    lower = jnp.sum(lower, 0) + rub * (jnp.sum(turning, 0) + (ahead - across) * rubs[_FIRST] * rubs[_SECOND])
-    lower += soft * (raised[_FIRST] * mixed[_SECOND] + raised[_SECOND] * mixed[_FIRST])
-    return lower
+    pressed, rub, soft, ahead, across = _gives(cone.springs, felt)
+    lower = jnp.sum((pressed[:, None] * cone.normal)[:, _FIRST] * cone.normal[:, _SECOND], 0)
+    lower += rub * across * jnp.sum(cone.along[:, _FIRST] * cone.along[:, _SECOND], 0)
+
+    def slipping(lower: Array) -> Array:
+        rubs, raised = felt.way @ cone.along, cone.springs.coefficient * (pressed @ cone.normal)
+        mixed = rub * rubs - raised / 2
+        lower += rub * (ahead - across) * rubs[_FIRST] * rubs[_SECOND]
+        return lower + soft * (raised[_FIRST] * mixed[_SECOND] + raised[_SECOND] * mixed[_FIRST])
+
+    found: Array = jax.lax.cond(felt.slips, slipping, lambda lower: lower, lower)
+    return found
 
 
 def between(cone: Cone, other: Cone, felt: Forces) -> Array:
@@ -107,9 +135,9 @@ def between(cone: Cone, other: Cone, felt: Forces) -> Array:
 
     `other` is the cone with its twists at that body's origin. With that of the same body this is `curvature`, whole.
     """
-    pressed, rub, soft, ahead, across = _gives(cone, felt)
+    pressed, rub, soft, ahead, across = _gives(cone.springs, felt)
     (rubs, raised), (its, its_raised) = (
-        (felt.way @ own.along, own.coefficient * (pressed @ own.normal)) for own in (cone, other)
+        (felt.way @ own.along, cone.springs.coefficient * (pressed @ own.normal)) for own in (cone, other)
     )
     mixed, its_mixed = rub * rubs - raised / 2, rub * its - its_raised / 2
     whole = (pressed[:, None] * cone.normal).T @ other.normal
@@ -117,30 +145,29 @@ def between(cone: Cone, other: Cone, felt: Forces) -> Array:
     return whole + soft * (jnp.outer(raised, its_mixed) + jnp.outer(mixed, its_raised))
 
 
-def fall(cone: Cone, felt: Forces, normal: Array, along: Array) -> Array:
-    """Return by how much the forces' power along a way falls per length of it, []: `curvature` on that way alone.
+def falls(springs: Springs, felt: Forces, by: Parting) -> tuple[Array, Array]:
+    """Return by how much normal forces [s] and friction [3] fall per length of a way, at its beginning.
 
     Args:
-        cone: the contact.
-        felt: its forces.
-        normal: acceleration along the normal of each point per length, [s].
-        along: acceleration along the surface and about the normal, as in `Cone.along`, [3].
+        springs: of the contact.
+        felt: its forces at the beginning.
+        by: how much more the bodies accelerate per length.
     """
-    pressed, rub, soft, ahead, across = _gives(cone, felt)
-    rubs, raised = felt.way @ along, cone.coefficient * (pressed @ normal)
-    turning = across * jnp.sum(along * along) + (ahead - across) * rubs**2
-    return jnp.sum(pressed * normal**2) + rub * turning + soft * raised * (2 * rub * rubs - raised)
+    pressed, rub, soft, ahead, across = _gives(springs, felt)
+    rubs, raised = rub * (felt.way @ by.along), springs.coefficient * (pressed @ by.normal)
+    normal = pressed * (by.normal + springs.coefficient * soft * (rubs - raised))
+    return normal, rub * across * by.along + ((ahead - across) * rubs + soft * rub * raised) * felt.way
 
 
-def _gives(cone: Cone, felt: Forces) -> tuple[Array, Array, Array, Array, Array]:
+def _gives(springs: Springs, felt: Forces) -> tuple[Array, Array, Array, Array, Array]:
     """Return by how much forces fall per acceleration.
 
     Those along the normals of points that press, [s]; friction that sticks, []; the amount by which friction that slips
     gives way per force, []; and the shares of friction that are left along its own direction and across it, [].
     """
     presses = felt.normal > 0
-    pressed = jnp.where(presses, cone.stiff, 0.0)
-    grown = cone.coefficient**2 * jnp.sum(pressed)
-    soft = jnp.where(felt.slips, 1 / (cone.rub + grown), 0.0)
+    pressed = jnp.where(presses, springs.stiff, 0.0)
+    grown = springs.coefficient**2 * jnp.sum(pressed)
+    soft = jnp.where(felt.slips, 1 / (springs.rub + grown), 0.0)
     ahead, across = jnp.where(felt.slips, grown * soft, 1.0), jnp.where(felt.slips, felt.left, 1.0)
-    return pressed, jnp.where(presses.any(), cone.rub, 0.0), soft, ahead, across
+    return pressed, jnp.where(presses.any(), springs.rub, 0.0), soft, ahead, across

@@ -10,14 +10,14 @@ import numpy as np
 from jax import Array
 
 from surgical_marl.physics.bodies import Bodies, conjugate, product, rotation, turn
-from surgical_marl.physics.cone import Cone
-from surgical_marl.physics.newton import Newton
+from surgical_marl.physics.cone import Cone, Springs, Stuck, parting, stretched
 from surgical_marl.physics.patches import AWAY, Patch
 from surgical_marl.physics.placed import Joints
-from surgical_marl.physics.problem import SLIPS, Contact, Contacts, Pressed
+from surgical_marl.physics.problem import Contact, Contacts, Pressed
 from surgical_marl.physics.rows import filled, picked, put, row_of
 from surgical_marl.physics.tables import Tables
 from surgical_marl.physics.touching import AHEAD, MARGIN, Slots
+from surgical_marl.physics.twists import Twists
 
 DAMPING = 5e-3
 """Damping of a contact in the normal direction, s: this times its stiffness, N s/m."""
@@ -88,12 +88,8 @@ class _Kept(NamedTuple):
 
     second: Array
     """As in `Contact`."""
-    stiff: Array
-    """As in `Cone`."""
-    push: Array
-    rub: Array
-    pull: Array
-    coefficient: Array
+    springs: Springs
+    stuck: Stuck
     slip: Array
     """As in `Felt`."""
 
@@ -124,16 +120,20 @@ class _Motion(NamedTuple):
 class Handling:
     """What friction and contact do in a scene."""
 
-    def __init__(self, tables: Tables, newton: Newton) -> None:
-        self.tables, self._newton = tables, newton
+    def __init__(self, tables: Tables, twists: Twists) -> None:
+        self.tables, self._twists = tables, twists
 
     def feel(
-        self, slots: Slots, joints: Joints | None, fingers: Fingers | None, qvel: Array, bodies: Bodies, grips: Grips,
-        dt: Any,
+        self, slots: Slots, joints: Joints | None, fingers: Fingers | None, qvel: Array, start: Array, bodies: Bodies,
+        grips: Grips, dt: Any,
     ) -> Felt:  # fmt: skip
-        """Return how the patches that were found resist. There are neither joints nor fingers without arms."""
-        speeds = _Speeds(self._newton.by_arm(qvel), self._newton.by_object(bodies.velocity))
-        at = self._newton.by_object(bodies.position), self._newton.by_object(bodies.quaternion)
+        """Return how the patches that were found resist. There are neither joints nor fingers without arms.
+
+        The solver begins with the accelerations `start` [a, m] of arms, and with those that objects had last.
+        """
+        speeds = _Speeds(self._twists.by_arm(qvel), self._twists.by_object(bodies.velocity))
+        begin = start, self._twists.by_object(bodies.acceleration)
+        at = self._twists.by_object(bodies.position), self._twists.by_object(bodies.quaternion)
         columns = None if joints is None else joints.columns(jnp.asarray(self.tables.slides), jnp.zeros(3))
 
         def bare(n: Array) -> Contact:
@@ -142,21 +142,18 @@ class Handling:
         def one(n: Array) -> _Kept:
             patch, number, contact = row_of(slots.patch, n), slots.number[n], bare(n)
             slip = self._slip(patch, number, fingers, at, grips)
-            motion = self._motion(contact, patch, number, speeds)
-            cone = self._resisting(contact.cone, patch, number, slip, motion, dt)
-            resists = cone.stiff, cone.push, cone.rub, cone.pull, cone.coefficient
-            return _Kept(contact.second, *resists, slip)
+            twist, more = self._twists.each(contact, (speeds.joints, speeds.objects), begin)
+            motion = self._motion(contact, twist, patch, number, speeds)
+            springs, stuck = self._resisting(contact.cone, patch, number, slip, motion, dt)
+            return _Kept(contact.second, springs, stretched(springs, stuck, parting(contact.cone, more)), slip)
 
         kept: _Kept = filled(one, slots.found, len(slots.number))
 
         def whole(n: Array) -> Contact:
-            contact, own = bare(n), row_of(kept, n)
-            cone = Cone(
-                contact.cone.normal, own.stiff, own.push, contact.cone.along, own.rub, own.pull, own.coefficient
-            )
-            return contact._replace(cone=cone)
+            contact = bare(n)
+            return contact._replace(cone=contact.cone._replace(springs=row_of(kept.springs, n)))
 
-        return Felt(Contacts(kept.second, whole), kept.slip)
+        return Felt(Contacts(kept.second, kept.springs, kept.stuck, whole), kept.slip)
 
     def _contact(self, patch: Patch, number: Array, columns: tuple[Array, Array] | None, position: Array) -> Contact:
         """Return a contact that does not resist yet: what it is between, and its directions.
@@ -176,14 +173,16 @@ class Handling:
             pulls, (moving, turning) = jnp.asarray(t.pulls)[number], picked(columns, arm)
         points, (ahead, *across) = patch.points, patch.frame
         normal = jnp.concatenate([points.normal, jnp.cross(points.place - origin, points.normal)], -1)
-        lever, each = patch.centre - origin, jnp.zeros(len(normal))
+        lever = patch.centre - origin
         along = [jnp.concatenate([way, jnp.cross(lever, way)]) for way in across]
         about = jnp.concatenate([jnp.zeros(3), patch.radius * ahead])
-        cone = Cone(normal, each, each, jnp.stack([*along, about]), none, jnp.zeros(3), none)
+        cone = Cone(normal, jnp.stack([*along, about]), Springs(jnp.zeros(len(normal)), none, none))
         return Contact(cone, first, second, offset, arm, origin, pulls, moving, turning)
 
-    def _resisting(self, cone: Cone, patch: Patch, number: Array, slip: Array, motion: _Motion, dt: Any) -> Cone:
-        """Return the cone with the forces of its springs and dampers at a motion of now."""
+    def _resisting(
+        self, cone: Cone, patch: Patch, number: Array, slip: Array, motion: _Motion, dt: Any
+    ) -> tuple[Springs, Stuck]:
+        """Return the springs, and the forces of springs and dampers at a motion of now, without acceleration."""
         t, points = self.tables, patch.points
         speed = cone.normal @ motion.twist + dt / 2 * jnp.sum(points.normal * motion.bends[:-1], -1)
         reach = points.depth + jnp.clip(-dt * speed, 0.0, AHEAD)
@@ -203,12 +202,11 @@ class Handling:
         springs = jnp.where(remembers, k, 0.0)
         drag = jnp.where(remembers, k * (dt + DAMPING), k * CREEP)
         pull = -springs * slip - drag * rubbed
-        return Cone(cone.normal, dt * rate, push, cone.along, dt * drag, pull, coefficient)
+        return Springs(dt * rate, dt * drag, coefficient), Stuck(push, pull)
 
-    def _motion(self, contact: Contact, patch: Patch, number: Array, speeds: _Speeds) -> _Motion:
-        """Return how the two bodies of a contact move relative to each other now."""
+    def _motion(self, contact: Contact, twist: Array, patch: Patch, number: Array, speeds: _Speeds) -> _Motion:
+        """Return how the two bodies of a contact move relative to each other now, with a twist [6]."""
         t, places = self.tables, jnp.concatenate([patch.points.place, patch.centre[None]]) - contact.origin
-        twist = self._newton.twist(contact, speeds.joints, speeds.objects)
         spin = speeds.objects[contact.first][3:]
         bends = jnp.cross(spin, jnp.cross(spin, places))
         if t.count > 1:
@@ -255,8 +253,8 @@ class Handling:
         t, k = self.tables, len(bodies.position)
         if not t.grip:
             return grips
-        moves = self._newton.by_arm(shift[0]), self._newton.by_object(shift[1])
-        at = self._newton.by_object(bodies.position), self._newton.by_object(bodies.quaternion)
+        moves = self._twists.by_arm(shift[0]), self._twists.by_object(shift[1])
+        at = self._twists.by_object(bodies.position), self._twists.by_object(bodies.quaternion)
         normal = jnp.zeros((k, len(t.fingers), 3))
         fresh = grips._replace(force=jnp.zeros_like(grips.force), slid=jnp.zeros_like(grips.slid))
 
@@ -267,7 +265,7 @@ class Handling:
 
             def note(kept: tuple[Grips, Array]) -> tuple[Grips, Array]:
                 patch, slip, forces = row_of((slots.patch, felt.slip, pressed), n)
-                after = slip + contact.cone.along @ self._newton.twist(contact, *moves)
+                after = slip + contact.cone.along @ self._twists.of(contact, *moves)
                 pose = at[0][contact.first], at[1][contact.first]
                 new = self._kept(patch, number, forces, after, finger, pose, own)
                 found = put(tuple(getattr(kept[0], name) for name in OF_FINGERS), place, new)
@@ -284,9 +282,9 @@ class Handling:
     ) -> tuple[Array, Array, Array, Array]:  # fmt: skip
         """Return what is kept for one finger and one object: `OF_FINGERS`, as in `grip`."""
         (place, faces), (position, quaternion, force, slid), axes = finger, grip, rotation(finger.quaternion)
-        slips = forces.sides >= SLIPS
-        stretched = jnp.where(slips, -forces.friction / (SHEAR * jnp.asarray(self.tables.stiffness)[number]), after)
-        excess = after - stretched
+        slips = forces.slips
+        stretches = jnp.where(slips, -forces.friction / (SHEAR * jnp.asarray(self.tables.stiffness)[number]), after)
+        excess = after - stretches
         # Kept as it is while nothing slips: rounding errors of a pose made anew in each step would add up.
         along, about = excess[:2] @ patch.frame[1:], turn(excess[2] / patch.radius * patch.normal)
         was, faced = place + axes @ position, product(faces, quaternion)

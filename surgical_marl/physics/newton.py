@@ -18,11 +18,24 @@ from jax import Array
 
 from surgical_marl.physics import elimination
 from surgical_marl.physics.arms import Arms, Left
-from surgical_marl.physics.cone import Cone, Forces, between, curvature, fall, forces, wrench
+from surgical_marl.physics.cone import (
+    Cone,
+    Forces,
+    Parting,
+    Stuck,
+    between,
+    curvature,
+    falls,
+    nearest,
+    parting,
+    stretched,
+    wrench,
+)
 from surgical_marl.physics.factor import packed
-from surgical_marl.physics.problem import SLIPS, Contact, Point, Pressed, Problem, Solution
-from surgical_marl.physics.rows import absent, add, put, room, row_of
+from surgical_marl.physics.problem import Contact, Point, Pressed, Problem, Solution
+from surgical_marl.physics.rows import absent, add, filled, put, room, row_of
 from surgical_marl.physics.search import search
+from surgical_marl.physics.twists import Twists, moved_to
 
 PASSES, ALONE = 12, 24
 """Newton steps at most, with arms and of objects alone, whose steps are short. A GPU waits for the last one of its
@@ -30,19 +43,41 @@ environments (docs/physics.md)."""
 LEAST = 1e-7
 """Fall of the cost in a Newton step, N m/s2, after which none follows: that of a needle of 0.03 g whose acceleration
 changes by 0.06 m/s2."""
-TOLERANCE = 1e-2
-"""Change of friction in a Newton step, as a share of the normal force, at which sliding contacts have converged."""
+TOLERANCE = 3e-3
+"""Force of a contact that a Newton step did not foresee, as a share of its normal force, at which it is the last one.
+The error that is left in the forces is about as large: what was not foreseen is all that does not balance."""
+
+
+class _Base(NamedTuple):
+    """All contacts where a Newton step begins, [s]."""
+
+    stuck: Stuck
+    felt: Forces
+    pressed: Pressed
+
+
+class _Along(NamedTuple):
+    """A way, from an acceleration `here`."""
+
+    here: Point
+    way: Point
+    moves: Array
+    """Which arms move, [a]."""
+    by: Parting
+    """How much more the bodies of each contact accelerate per length, [s]."""
+    slope: Array
+    """Of the cost where it begins, without contacts and without friction and limits of joints, []."""
+    growth: Array
+    """By how much this slope grows per length, []."""
 
 
 class _Seen(NamedTuple):
-    """The forces of contacts at a point, and how they differ from those at the point where a Newton step began."""
+    """What contacts feel at a point."""
 
     pressed: Pressed
     """[s]"""
-    same: Array
-    """Whether each contact is on the same side, [] bool."""
-    turned: Array
-    """Whether friction has changed of any that slips, [] bool."""
+    foreseen: Array
+    """Whether that is what they feel if they are linear from the beginning of the Newton step on, [] bool."""
 
 
 class _Local(NamedTuple):
@@ -77,102 +112,104 @@ class Newton:
 
     def __init__(self, dofs: np.ndarray, joints: int, objects: int) -> None:
         self._dofs, self._objects, self._arms = dofs, objects, Arms(dofs, joints)
+        self.twists = Twists(dofs, objects)
         self._passes = PASSES if len(dofs) else ALONE
-
-    def twist(self, contact: Contact, arms: Array, objects: Array) -> Array:
-        """Return the twist [6] of a contact by motions of arms (`by_arm`) and of objects (`by_object`)."""
-        return self.twists(contact, (arms, objects))[0]
-
-    def twists(self, contact: Contact, *motions: tuple[Array, Array]) -> list[Array]:
-        """Return the twist [6] of a contact by each of several motions, as `twist` does."""
-        found = [objects[contact.first] for _, objects in motions]
-        if self._objects > 1:
-            others = [_moved_to(objects[contact.second], contact.offset) for _, objects in motions]
-            found = [twist - other for twist, other in zip(found, others, strict=True)]
-        if not len(self._dofs):
-            return found
-
-        def with_arm(found: list[Array]) -> list[Array]:
-            moved = [contact.by_joints(arms[contact.arm]) for arms, _ in motions]
-            return [twist + more for twist, more in zip(found, moved, strict=True)]
-
-        return jax.lax.cond(contact.arm < len(self._dofs), with_arm, lambda found: found, found)
-
-    def by_arm(self, joints: Array) -> Array:
-        """Return what belongs to the joints [n] of all arms by arm, [a, m]; 0 for joints that are not."""
-        return jnp.append(joints, 0.0)[np.minimum(self._dofs, len(joints))]
-
-    def by_object(self, each: Array) -> Array:
-        """Return what belongs to objects [k, ...], and 0 for the one that stands for none, [k + 1, ...]."""
-        return _with_none(each)
 
     def solve(self, problem: Problem, arms: Array, objects: Array) -> Solution:
         """Return the accelerations and forces, beginning with accelerations of arms [a, m] and objects [k, 6]."""
-        shape = jax.eval_shape(lambda: Pressed(jnp.float32(0.0), jnp.zeros(3), jnp.int32(0)))
-        state = Point(arms, objects), room(shape, len(problem.contacts.second)), jnp.bool_(False), jnp.int32(0)
+        contacts = problem.contacts
+        found = jax.eval_shape(lambda: nearest(*row_of((contacts.springs, contacts.stuck), 0)))
+        base = _Base(contacts.stuck, *room((found, jax.eval_shape(_pressed, found)), len(contacts.second)))
 
         def going(state: Any) -> Array:
-            settled, count = state[-2:]
+            *_, settled, count = state
             return ~settled & (count < self._passes)
 
         def iterate(state: Any) -> Any:
-            here, pressed, _, count = state
-            local, pressed = self._contacts(problem, here, pressed)
-            touching = (local.on_arm | problem.overlap)[:, None]
-            way = self._direction(problem, here, pressed, local, touching[:, 0] | (count == 0))
+            here, base, _, count = state
+            local, base = self._contacts(problem, here, base)
+            touching, first = local.on_arm | problem.overlap, count == 0
+            way = self._direction(problem, here, base.pressed, local, touching | first, first)
             # Arms that touch nothing go all of their way at once, as if nothing else were there, and are done.
-            free, way = jnp.where(touching, 0.0, way.arms), way._replace(arms=jnp.where(touching, way.arms, 0.0))
-            begin, slope, growth = self._arms.slopes(problem, here.arms, way.arms, local.arm_force)
-            begin -= jnp.sum(local.force * way.objects)
-            inertia = problem.masses @ jnp.stack([here.objects - problem.free, way.objects], -1)
-            of_objects = jnp.sum(way.objects[..., None] * inertia, (0, 1))
-            slope, growth = slope + of_objects[0], growth + of_objects[1]
-            seen = _Seen(pressed, jnp.bool_(True), jnp.bool_(False))
-            found = search(begin, LEAST, self._measure(problem, here, way, slope, growth), seen)
+            free = jnp.where(touching[:, None], 0.0, way.arms)
+            way = way._replace(arms=jnp.where(touching[:, None], way.arms, 0.0))
+            begin, along = self._along(problem, local, here, way, touching)
+            found = search(begin, LEAST, self._measure(problem, base, along), _Seen(base.pressed, jnp.bool_(True)))
             there = jax.tree.map(lambda x, step: x + found.length * step, here, way)
             there = there._replace(arms=there.arms + free)
-            settled = (found.looks < 2) & found.seen.same & ~found.seen.turned
+            settled = (found.looks < 2) & found.seen.foreseen
             if len(problem.between.low):
                 settled &= (self._sides(problem, here.arms) == self._sides(problem, there.arms)).all()
-            return there, found.seen.pressed, settled | (found.looks == 0), count + 1
+            base = self._stretched(problem, base, along.by, found.length)._replace(pressed=found.seen.pressed)
+            return there, base, settled | (found.looks == 0), count + 1
 
-        here, pressed, _, _ = jax.lax.while_loop(going, iterate, state)
-        return Solution(here.arms, here.objects, pressed, self._arms.between(problem, here.arms))
+        state = Point(arms, objects), base, jnp.bool_(False), jnp.int32(0)
+        here, base, _, _ = jax.lax.while_loop(going, iterate, state)
+        return Solution(here.arms, here.objects, base.pressed, self._arms.between(problem, here.arms))
+
+    def _along(self, problem: Problem, local: _Local, here: Point, way: Point, moves: Array) -> tuple[Array, _Along]:
+        """Return the slope of the whole cost at the beginning of a way, and what is known of the way."""
+        begin, slope, growth = self._arms.slopes(problem, moves, here.arms, way.arms, local.arm_force)
+        begin -= jnp.sum(local.force * way.objects)
+        inertia = problem.masses @ jnp.stack([here.objects - problem.free, way.objects], -1)
+        of_objects = jnp.sum(way.objects[..., None] * inertia, (0, 1))
+        by = self._partings(problem, way)
+        return begin, _Along(here, way, moves, by, slope + of_objects[0], growth + of_objects[1])
+
+    def _partings(self, problem: Problem, way: Point) -> Parting:
+        """Return how the bodies of all contacts accelerate relative to each other per length of a way, [s]."""
+        motion = way.arms, self.twists.by_object(way.objects)
+
+        def one(n: Array) -> Parting:
+            contact = problem.contacts.at(n)
+            return parting(contact.cone, self.twists.of(contact, *motion))
+
+        found: Parting = filled(one, problem.total, len(problem.contacts.second))
+        return found
+
+    def _stretched(self, problem: Problem, base: _Base, by: Parting, length: Array) -> _Base:
+        """Return all contacts a length further along a way, but for what they feel there."""
+
+        def one(n: Array, stuck: Stuck) -> Stuck:
+            springs, here, more = row_of((problem.contacts.springs, stuck, by), n)
+            return put(stuck, n, stretched(springs, here, _times(length, more)))
+
+        return base._replace(stuck=jax.lax.fori_loop(0, problem.total, one, base.stuck))
 
     def _measure(
-        self, problem: Problem, here: Point, way: Point, slope: Array, growth: Array
+        self, problem: Problem, base: _Base, along: _Along
     ) -> Callable[[Array, _Seen], tuple[Array, Array, _Seen]]:
         """Return what measures the slope of the cost at a length of a way, and by how much it grows per length.
 
-        It also notes the forces of contacts there. `slope` and `growth` are those at the beginning, without contacts,
-        friction and limits.
+        It also notes what contacts feel there.
         """
-        motions = [(point.arms, self.by_object(point.objects)) for point in (here, way)]
+        here, way, moves, by, slope, growth = along
 
         def measure(length: Array, seen: _Seen) -> tuple[Array, Array, _Seen]:
             def look(n: Array, state: tuple[Array, Array, _Seen]) -> tuple[Array, Array, _Seen]:
-                contact, before = problem.contacts.at(n), row_of(state[2].pressed, n)
-                cone, (at, by) = contact.cone, self.twists(contact, *motions)
-                felt = forces(cone, at + length * by)
-                own, normal, along = _pressed(felt), cone.normal @ by, cone.along @ by
-                slope = state[0] - felt.normal @ normal - felt.friction @ along
-                change = jnp.sum((own.friction - before.friction) ** 2) > TOLERANCE**2 * own.normal**2
-                same = state[2].same & (own.sides == before.sides)
-                seen = _Seen(put(state[2].pressed, n, own), same, state[2].turned | (change & felt.slips))
-                return slope, state[1] + fall(cone, felt, normal, along), seen
+                slope, growth, seen = state
+                springs, stuck, before, own = row_of((problem.contacts.springs, base.stuck, base.felt, by), n)
+                felt = nearest(springs, stretched(springs, stuck, _times(length, own)))
+                lost, (normal, friction) = falls(springs, before, _times(length, own)), falls(springs, felt, own)
+                missed = jnp.sum((before.normal - lost[0] - felt.normal) ** 2)
+                missed += jnp.sum((before.friction - lost[1] - felt.friction) ** 2)
+                pressed = _pressed(felt)
+                foreseen = seen.foreseen & (missed <= TOLERANCE**2 * pressed.normal**2)
+                slope -= felt.normal @ own.normal + felt.friction @ own.along
+                growth += normal @ own.normal + friction @ own.along
+                return slope, growth, _Seen(put(seen.pressed, n, pressed), foreseen)
 
-            resists, gives = self._arms.resisted(problem, here.arms, way.arms, length)
-            start = slope + length * growth + resists, growth + gives, seen
+            resists, gives = self._arms.resisted(problem, moves, here.arms, way.arms, length)
+            start = slope + length * growth + resists, growth + gives, _Seen(seen.pressed, jnp.bool_(True))
             return jax.lax.fori_loop(0, problem.total, look, start)
 
         return measure
 
     # -- forces at a point
 
-    def _contacts(self, problem: Problem, point: Point, pressed: Pressed) -> tuple[_Local, Pressed]:
-        """Return sums over all contacts, and their forces, in the place of those before."""
+    def _contacts(self, problem: Problem, point: Point, base: _Base) -> tuple[_Local, _Base]:
+        """Return sums over all contacts, and these with what they feel."""
         k, (a, m) = self._objects, self._dofs.shape
-        objects = self.by_object(point.objects)
         inertia = (problem.masses @ (problem.free - point.objects)[..., None])[..., 0]
         none = _Local(
             jnp.zeros((a, m)),
@@ -185,16 +222,16 @@ class Newton:
             jnp.zeros(a, bool),
         )
 
-        def one(n: Array, sums: tuple[_Local, Pressed]) -> tuple[_Local, Pressed]:
-            contact = problem.contacts.at(n)
-            found = forces(contact.cone, self.twist(contact, point.arms, objects))
-            return self._add(sums[0], contact, found), put(sums[1], n, _pressed(found))
+        def one(n: Array, sums: tuple[_Local, Forces, Pressed]) -> tuple[_Local, Forces, Pressed]:
+            (local, felt, pressed), contact = sums, problem.contacts.at(n)
+            found = nearest(contact.cone.springs, row_of(base.stuck, n))
+            return self._add(local, contact, found), put(felt, n, found), put(pressed, n, _pressed(found))
 
-        local, pressed = jax.lax.fori_loop(0, problem.total, one, (none, pressed))
+        local, felt, pressed = jax.lax.fori_loop(0, problem.total, one, (none, base.felt, base.pressed))
         cut = lambda each: each[:k]  # noqa: E731
         met = cut(local.met.reshape(k + 1, a))
         local = local._replace(force=cut(local.force), object=cut(local.object), met=met)
-        return local, pressed
+        return local, base._replace(felt=felt, pressed=pressed)
 
     def _add(self, local: _Local, contact: Contact, felt: Forces) -> _Local:
         """Return sums with one more contact."""
@@ -234,11 +271,13 @@ class Newton:
 
     # -- the way from there
 
-    def _direction(self, problem: Problem, here: Point, pressed: Pressed, local: _Local, moving: Array) -> Point:
+    def _direction(
+        self, problem: Problem, here: Point, pressed: Pressed, local: _Local, moving: Array, first: Array
+    ) -> Point:
         """Return the way to the least cost if contacts are linear functions; friction and limits of joints are not.
 
         Objects are eliminated, arms solved, and objects found from them. Arms that are not `moving` [a] are where their
-        forces balance.
+        forces balance. `first` says whether `here` is where the solver begins.
         """
         touched, pressing = local.met, pressed.normal > 0
         linked = self._linked(problem, pressing)
@@ -248,12 +287,13 @@ class Newton:
         if len(self._dofs):
             on = touched | (linked & touched.any(0))  # what an object touches moves those that it touches
             left = Left(local.arm, local.on_arm, local.arm_force, gone.half, gone.wide, on)
-            found = self._ways(problem, here.arms, left, moving)
+            found = self._ways(problem, here.arms, left, moving, first)
         return Point(found, elimination.ways(gone, found, touched, linked))
 
-    def _ways(self, problem: Problem, here: Array, left: Left, moving: Array) -> Array:
+    def _ways(self, problem: Problem, here: Array, left: Left, moving: Array, first: Array) -> Array:
         """Return the ways [a, m] of arms: of each alone, of those that one object joins, or of all at once."""
-        bridged, together = (partial(ways, problem, here) for ways in (self._arms.bridged, self._arms.together))
+        together = partial(self._arms.together, problem, here)
+        bridged = partial(self._arms.bridged, problem, here, jnp.where(first, problem.eased, here))
         each = partial(self._arms.each, problem, here, moving)
         if len(self._dofs) < 2:
             return each(left)
@@ -274,11 +314,6 @@ class Newton:
         return self._arms.between(problem, arms) > 0
 
 
-def _with_none(each: Array) -> Array:
-    """Return what belongs to objects [k, ...], and 0 for the one that stands for none, [k + 1, ...]."""
-    return jnp.concatenate([each, jnp.zeros((1, *each.shape[1:]))])
-
-
 def _with_room(each: Array) -> Array:
     """Return what belongs to objects [k, ...], and room for the one that stands for none, [k + 1, ...]."""
     return jnp.concatenate([each, absent(jax.ShapeDtypeStruct((1, *each.shape[1:]), each.dtype))])
@@ -289,15 +324,13 @@ def _begun(sums: Array, i: Array, row: Array, begun: Array) -> Array:
     return put(sums, i, jax.lax.cond(begun[i], lambda: sums[i] + row, lambda: row))
 
 
+def _times(length: Array, by: Parting) -> Parting:
+    return Parting(length * by.normal, length * by.along)
+
+
 def _pressed(felt: Forces) -> Pressed:
     """Return what is kept of the forces of a contact."""
-    bits = jnp.where(felt.normal > 0, 1 << np.arange(len(felt.normal), dtype=np.int32), 0)
-    return Pressed(jnp.sum(felt.normal), felt.friction, jnp.sum(bits) + jnp.where(felt.slips, SLIPS, 0))
-
-
-def _moved_to(twist: Array, offset: Array) -> Array:
-    """Return the twist [6] at a place from that of a body whose centre of mass is `offset` [3] away."""
-    return jnp.concatenate([twist[:3] - jnp.cross(twist[3:], offset), twist[3:]])
+    return Pressed(jnp.sum(felt.normal), felt.friction, felt.slips)
 
 
 def _moved_cone(contact: Contact) -> Cone:
@@ -311,5 +344,5 @@ def _moved_cone(contact: Contact) -> Cone:
 
 
 def _shift(offset: Array) -> Array:
-    """Return the matrix [6, 6] of `_moved_to`."""
-    return jax.vmap(lambda unit: _moved_to(unit, offset), out_axes=1)(jnp.eye(6))
+    """Return the matrix [6, 6] of `moved_to`."""
+    return jax.vmap(lambda unit: moved_to(unit, offset), out_axes=1)(jnp.eye(6))

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from surgical_marl.physics.cone import Cone
+from surgical_marl.physics.cone import Cone, Springs, Stuck
 from surgical_marl.physics.solver import JointRows, Rows
 
 
@@ -51,6 +51,10 @@ class Contacts(NamedTuple):
 
     second: Array
     """As in `Contact`, [s]."""
+    springs: Springs
+    """[s]"""
+    stuck: Stuck
+    """At the accelerations that the solver begins with, [s]."""
     at: Callable[[Array], Contact]
     """Makes one of them by its number, wherever it is needed: that takes less time than to load it from memory."""
 
@@ -64,6 +68,8 @@ class Problem(NamedTuple):
     """Sums of all other forces on the arms, [a, m]."""
     joints: JointRows
     """Friction and limits of joints, [a, m]."""
+    eased: Array
+    """Accelerations at which friction of joints is what it was at the end of the step before, [a, m]."""
     between: Rows
     """Contacts of arms with arms; their Jacobian is [r, a, m]."""
     overlap: Array
@@ -84,12 +90,8 @@ class Pressed(NamedTuple):
     """Of all points together, N, [s]."""
     friction: Array
     """N, [s, 3]."""
-    sides: Array
-    """Which points press, and whether friction slips: bits, [s]."""
-
-
-SLIPS = 1 << 8
-"""The bit of `Pressed.sides` for friction that slips."""
+    slips: Array
+    """Whether friction is at its bound, [s] bool."""
 
 
 class Solution(NamedTuple):

@@ -20,6 +20,7 @@ from surgical_marl.physics.bodies import Bodies, Masses, free_acceleration, iner
 from surgical_marl.physics.collision import Pairs
 from surgical_marl.physics.dynamics import Dynamics, Physics
 from surgical_marl.physics.handling import DWELL, Fingers, Grips, Handling
+from surgical_marl.physics.impedance import response
 from surgical_marl.physics.kind import Kind
 from surgical_marl.physics.newton import Newton
 from surgical_marl.physics.placed import Joints
@@ -74,6 +75,8 @@ class Together:
             Newton(none, 0, 1),
         )
         self._finder = Finder(self.tables)
+        self._eases = _eases(scene.model)[self.tables.dofs]
+        """Share of the last acceleration at which friction of joints stays as it was, [a, m]."""
         self._nominal = self.tables
         self._factors: Factors | None = None
 
@@ -172,7 +175,9 @@ class Together:
             return objects
         bodies, dt, none = objects.bodies, self._dynamics.dt, jnp.zeros(0)
         masses, free = self._free(bodies, slots.awake)
-        felt = Handling(self.tables, self._objects_alone).feel(slots, None, None, none, bodies, objects.grips, dt)
+        felt = Handling(self.tables, self._objects_alone.twists).feel(
+            slots, None, None, none, jnp.zeros((0, 0)), bodies, objects.grips, dt
+        )
         found = self._solve_objects(masses, free, felt.contacts, slots, bodies.acceleration)
         grips = objects.grips
         loose = grips._replace(force=0 * grips.force, slid=0 * grips.slid, held=0 * grips.held)
@@ -193,7 +198,7 @@ class Together:
         """Return the accelerations [k, 6] of objects that touch no arm: one by one, if none touches another."""
         none, k, total = jnp.zeros((0, 0)), len(free), slots.found
         rows = Rows(jnp.zeros((0, 0, 0)), *[jnp.zeros(0)] * 4)
-        arms = none, none, JointRows(*[none] * len(JointRows._fields)), rows, jnp.bool_(False)
+        arms = none, none, JointRows(*[none] * len(JointRows._fields)), none, rows, jnp.bool_(False)
 
         def whole() -> Array:
             return self._objects_alone.solve(Problem(*arms, masses, free, contacts, total), none, start).objects
@@ -221,13 +226,14 @@ class Together:
 
         The arms' damping is part of their mass matrix here, so the solver sees the velocities at the end of the step.
         """
-        dt, (bodies, grips), handling = self._dynamics.dt, physics.objects, Handling(self.tables, self._newton)
-        felt = handling.feel(slots, joints, fingers, physics.qvel, bodies, grips, dt)
+        dt, (bodies, grips), handling = self._dynamics.dt, physics.objects, Handling(self.tables, self._newton.twists)
+        felt = handling.feel(slots, joints, fingers, physics.qvel, arms.start, bodies, grips, dt)
         masses, free = self._free(bodies, slots.awake)
         between = self._between(physics, overlap)
         problem = Problem(
-            arms.implicit, arms.smooth, arms.joints, between.rows, overlap, masses, free, felt.contacts, slots.found
-        )
+            arms.implicit, arms.smooth, arms.joints, self._eases * arms.start, between.rows, overlap, masses, free,
+            felt.contacts, slots.found,
+        )  # fmt: skip
         found = self._newton.solve(problem, arms.start, bodies.acceleration)
         qacc = self._of_joints(found.arms)
         qvel = physics.qvel + dt * qacc
@@ -309,3 +315,13 @@ class Together:
 
         found: tuple[Array, Array] = jax.lax.map(one, (bodies, self.tables.masses, awake))
         return found
+
+
+def _eases(model: Any) -> np.ndarray:
+    """Return the share of each joint's last acceleration at which its friction is as before, [nv + 1]; 1 for no joint.
+
+    The reference of MuJoCo's friction falls by damping times velocity: in a step, by damping * dt * acceleration.
+    """
+    dt, still = np.float32(model.opt.timestep), jnp.zeros(model.nv)
+    _, damping, _ = response(model.dof_solref.T, model.dof_solimp.T, still, dt)
+    return np.append(1 - dt * np.asarray(damping), 1.0).astype(np.float32)

@@ -1,0 +1,49 @@
+"""How the two bodies of a contact move relative to each other, by motions of arms and objects."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from surgical_marl.physics.problem import Contact
+
+
+class Twists:
+    """Finds the twists of contacts in one scene with k objects. `dofs` [a, m] is as for `Newton`."""
+
+    def __init__(self, dofs: np.ndarray, objects: int) -> None:
+        self._dofs, self._objects = dofs, objects
+
+    def of(self, contact: Contact, arms: Array, objects: Array) -> Array:
+        """Return the twist [6] of a contact by motions of arms (`by_arm`) and of objects (`by_object`)."""
+        return self.each(contact, (arms, objects))[0]
+
+    def each(self, contact: Contact, *motions: tuple[Array, Array]) -> list[Array]:
+        """Return the twist [6] of a contact by each of several motions, as `of` does."""
+        found = [objects[contact.first] for _, objects in motions]
+        if self._objects > 1:
+            others = [moved_to(objects[contact.second], contact.offset) for _, objects in motions]
+            found = [twist - other for twist, other in zip(found, others, strict=True)]
+        if not len(self._dofs):
+            return found
+
+        def with_arm(found: list[Array]) -> list[Array]:
+            moved = [contact.by_joints(arms[contact.arm]) for arms, _ in motions]
+            return [twist + more for twist, more in zip(found, moved, strict=True)]
+
+        return jax.lax.cond(contact.arm < len(self._dofs), with_arm, lambda found: found, found)
+
+    def by_arm(self, joints: Array) -> Array:
+        """Return what belongs to the joints [n] of all arms by arm, [a, m]; 0 for joints that are not."""
+        return jnp.append(joints, 0.0)[np.minimum(self._dofs, len(joints))]
+
+    def by_object(self, each: Array) -> Array:
+        """Return what belongs to objects [k, ...], and 0 for the one that stands for none, [k + 1, ...]."""
+        return jnp.concatenate([each, jnp.zeros((1, *each.shape[1:]))])
+
+
+def moved_to(twist: Array, offset: Array) -> Array:
+    """Return the twist [6] at a place from that of a body whose centre of mass is `offset` [3] away."""
+    return jnp.concatenate([twist[:3] - jnp.cross(twist[3:], offset), twist[3:]])
