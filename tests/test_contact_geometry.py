@@ -14,7 +14,7 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from surgical_marl.physics.collision import SLOTS, Pairs
-from surgical_marl.physics.cone import Cone, Springs, Stuck, between, curvature, nearest, parting, stretched, wrench
+from surgical_marl.physics.cone import Cone, Stuck, between, curvature, nearest, parting, stretched, wrench
 from surgical_marl.physics.factor import packed
 from surgical_marl.physics.patches import (
     ALIKE,
@@ -30,6 +30,7 @@ from surgical_marl.physics.patches import (
 )
 from surgical_marl.physics.rows import row_of
 from surgical_marl.physics.shapes import EVEN, NEAR, Plate, Points, Segments, between_segments, on_plate, plate_of_box
+from tests.test_search import drawn
 
 COUNT = 200
 SHARES = np.linspace(0, 1, 2001)
@@ -227,19 +228,12 @@ def test_a_fork_is_led_by_its_first_point_and_nothing_is_no_patch() -> None:
     assert not none.normal.any() and none.centre.tolist() == [0, 0, 0] and not none.points.normal.any()
 
 
-def cone(rng: np.random.Generator, points: int = 4) -> tuple[Cone, Stuck]:
-    springs = rng.uniform(0.1, 10, points), rng.uniform(0.1, 10), rng.uniform(0.1, 1)
-    ways, stuck = rng.normal(size=(points + 3, 6)), 3 * rng.normal(size=points + 3)
-    own = Cone(single(ways[:points]), single(ways[points:]), Springs(*map(single, springs)))
-    return own, Stuck(single(stuck[:points]), single(stuck[points:]))
-
-
 def test_forces_are_the_nearest_ones_in_the_friction_cone() -> None:
     """In the metric of the springs, found by a general method (SLSQP)."""
     rng, seen = np.random.default_rng(5), set()
     compiled = jax.jit(nearest)
     for _ in range(30):
-        c, stuck = cone(rng)
+        c, stuck = drawn(rng)
         if rng.random() < 0.2:
             stuck = Stuck(-jnp.abs(stuck.push) - 0.5, 0.1 * stuck.pull)
         felt = compiled(c.springs, stuck)
@@ -287,7 +281,7 @@ def test_curvatures_are_differences_of_the_wrench() -> None:
     """Of one body, and of a second one whose twists have another origin: its own and the mixed one."""
     rng, seen = np.random.default_rng(6), []
     for _ in range(60):
-        (one, stuck), (ways, _) = cone(rng), cone(rng)
+        (one, stuck), (ways, _) = drawn(rng), drawn(rng)
         other = one._replace(normal=ways.normal, along=ways.along)
         slips, corner, *parts = curvatures(one, stuck, other, single(rng.normal(size=6)))
         whole, same, mixed, own, its = (np.asarray(part, float) for part in parts)

@@ -19,7 +19,6 @@ from jax import Array
 from surgical_marl.physics import elimination
 from surgical_marl.physics.arms import Arms, Left
 from surgical_marl.physics.cone import (
-    Cone,
     Forces,
     Parting,
     Stuck,
@@ -35,7 +34,7 @@ from surgical_marl.physics.factor import packed
 from surgical_marl.physics.problem import Contact, Point, Pressed, Problem, Solution
 from surgical_marl.physics.rows import absent, add, filled, put, room, row_of
 from surgical_marl.physics.search import search
-from surgical_marl.physics.twists import Twists, moved_to
+from surgical_marl.physics.twists import Twists, moved_cone
 
 PASSES, ALONE = 12, 24
 """Newton steps at most, with arms and of objects alone, whose steps are short. A GPU waits for the last one of its
@@ -128,8 +127,7 @@ class Newton:
         def iterate(state: Any) -> Any:
             here, base, _, count = state
             local, base = self._contacts(problem, here, base)
-            touching, first = local.on_arm | problem.overlap, count == 0
-            way = self._direction(problem, here, base.pressed, local, touching | first, first)
+            way, touching = self._direction(problem, here, base.pressed, local, count == 0), _touching(problem, local)
             # Arms that touch nothing go all of their way at once, as if nothing else were there, and are done.
             free = jnp.where(touching[:, None], 0.0, way.arms)
             way = way._replace(arms=jnp.where(touching[:, None], way.arms, 0.0))
@@ -189,11 +187,14 @@ class Newton:
             def look(n: Array, state: tuple[Array, Array, _Seen]) -> tuple[Array, Array, _Seen]:
                 slope, growth, seen = state
                 springs, stuck, before, own = row_of((problem.contacts.springs, base.stuck, base.felt, by), n)
-                felt = nearest(springs, stretched(springs, stuck, _times(length, own)))
-                lost, (normal, friction) = falls(springs, before, _times(length, own)), falls(springs, felt, own)
-                missed = jnp.sum((before.normal - lost[0] - felt.normal) ** 2)
-                missed += jnp.sum((before.friction - lost[1] - felt.friction) ** 2)
-                pressed = _pressed(felt)
+                step = _times(length, own)
+                felt, (normal, friction) = (
+                    nearest(springs, stretched(springs, stuck, step)),
+                    falls(springs, before, step),
+                )
+                missed = jnp.sum((before.normal - normal - felt.normal) ** 2)
+                missed += jnp.sum((before.friction - friction - felt.friction) ** 2)
+                pressed, (normal, friction) = _pressed(felt), falls(springs, felt, own)
                 foreseen = seen.foreseen & (missed <= TOLERANCE**2 * pressed.normal**2)
                 slope -= felt.normal @ own.normal + felt.friction @ own.along
                 growth += normal @ own.normal + friction @ own.along
@@ -240,7 +241,7 @@ class Newton:
         if self._objects > 1:
 
             def on_other(local: _Local) -> _Local:
-                moved = _moved_cone(contact)
+                moved = moved_cone(contact)
                 at = (36 * (self._objects * first + second),)
                 block = jax.lax.dynamic_slice(local.cross, at, (36,)) + between(cone, moved, felt).ravel()
                 return local._replace(
@@ -271,13 +272,11 @@ class Newton:
 
     # -- the way from there
 
-    def _direction(
-        self, problem: Problem, here: Point, pressed: Pressed, local: _Local, moving: Array, first: Array
-    ) -> Point:
+    def _direction(self, problem: Problem, here: Point, pressed: Pressed, local: _Local, first: Array) -> Point:
         """Return the way to the least cost if contacts are linear functions; friction and limits of joints are not.
 
-        Objects are eliminated, arms solved, and objects found from them. Arms that are not `moving` [a] are where their
-        forces balance. `first` says whether `here` is where the solver begins.
+        Objects are eliminated, arms solved, and objects found from them. Unless it is the `first` Newton step, arms
+        that touch nothing are where their forces balance.
         """
         touched, pressing = local.met, pressed.normal > 0
         linked = self._linked(problem, pressing)
@@ -287,14 +286,14 @@ class Newton:
         if len(self._dofs):
             on = touched | (linked & touched.any(0))  # what an object touches moves those that it touches
             left = Left(local.arm, local.on_arm, local.arm_force, gone.half, gone.wide, on)
-            found = self._ways(problem, here.arms, left, moving, first)
+            found = self._ways(problem, here.arms, left, first)
         return Point(found, elimination.ways(gone, found, touched, linked))
 
-    def _ways(self, problem: Problem, here: Array, left: Left, moving: Array, first: Array) -> Array:
+    def _ways(self, problem: Problem, here: Array, left: Left, first: Array) -> Array:
         """Return the ways [a, m] of arms: of each alone, of those that one object joins, or of all at once."""
         together = partial(self._arms.together, problem, here)
         bridged = partial(self._arms.bridged, problem, here, jnp.where(first, problem.eased, here))
-        each = partial(self._arms.each, problem, here, moving)
+        each = partial(self._arms.each, problem, here, _touching(problem, left) | first)
         if len(self._dofs) < 2:
             return each(left)
         bridges, pressed = left.touched.sum(1) > 1, self._sides(problem, here).any()
@@ -324,6 +323,11 @@ def _begun(sums: Array, i: Array, row: Array, begun: Array) -> Array:
     return put(sums, i, jax.lax.cond(begun[i], lambda: sums[i] + row, lambda: row))
 
 
+def _touching(problem: Problem, local: _Local | Left) -> Array:
+    """Return which arms touch anything, [a] bool."""
+    return local.on_arm | problem.overlap
+
+
 def _times(length: Array, by: Parting) -> Parting:
     return Parting(length * by.normal, length * by.along)
 
@@ -331,18 +335,3 @@ def _times(length: Array, by: Parting) -> Parting:
 def _pressed(felt: Forces) -> Pressed:
     """Return what is kept of the forces of a contact."""
     return Pressed(jnp.sum(felt.normal), felt.friction, felt.slips)
-
-
-def _moved_cone(contact: Contact) -> Cone:
-    """Return the cone with its twists at the centre of mass of the other object, and as that one feels it.
-
-    Its rows are moved before anything is made of them: in float32 a curvature about one body's centre, moved to that of
-    a small one, would be wrong by more than that one's inertia.
-    """
-    shift, cone = _shift(contact.offset), contact.cone
-    return cone._replace(normal=-cone.normal @ shift, along=-cone.along @ shift)
-
-
-def _shift(offset: Array) -> Array:
-    """Return the matrix [6, 6] of `moved_to`."""
-    return jax.vmap(lambda unit: moved_to(unit, offset), out_axes=1)(jnp.eye(6))

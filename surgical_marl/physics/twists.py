@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from surgical_marl.physics.cone import Cone
 from surgical_marl.physics.problem import Contact
 
 
@@ -24,7 +25,7 @@ class Twists:
         """Return the twist [6] of a contact by each of several motions, as `of` does."""
         found = [objects[contact.first] for _, objects in motions]
         if self._objects > 1:
-            others = [moved_to(objects[contact.second], contact.offset) for _, objects in motions]
+            others = [_moved_to(objects[contact.second], contact.offset) for _, objects in motions]
             found = [twist - other for twist, other in zip(found, others, strict=True)]
         if not len(self._dofs):
             return found
@@ -44,6 +45,21 @@ class Twists:
         return jnp.concatenate([each, jnp.zeros((1, *each.shape[1:]))])
 
 
-def moved_to(twist: Array, offset: Array) -> Array:
+def moved_cone(contact: Contact) -> Cone:
+    """Return the cone with its twists at the centre of mass of the other object, and as that one feels it.
+
+    Its rows are moved before anything is made of them: in float32 a curvature about one body's centre, moved to that of
+    a small one, would be wrong by more than that one's inertia.
+    """
+    shift, cone = _shift(contact.offset), contact.cone
+    return cone._replace(normal=-cone.normal @ shift, along=-cone.along @ shift)
+
+
+def _shift(offset: Array) -> Array:
+    """Return the matrix [6, 6] of `_moved_to`."""
+    return jax.vmap(lambda unit: _moved_to(unit, offset), out_axes=1)(jnp.eye(6))
+
+
+def _moved_to(twist: Array, offset: Array) -> Array:
     """Return the twist [6] at a place from that of a body whose centre of mass is `offset` [3] away."""
     return jnp.concatenate([twist[:3] - jnp.cross(twist[3:], offset), twist[3:]])
