@@ -54,13 +54,16 @@ class _Row(NamedTuple):
 
 
 class Arms:
-    """Solves for the ways of arms. `dofs` [a, m] are the numbers of their joints, as for `Newton`."""
+    """Solves for the ways of arms. `dofs` [a, m] are the numbers of their joints, as for `Newton`.
+
+    Ways lead from an acceleration `here`, and are looked for from an acceleration `begin` on, [a, m] each.
+    """
 
     def __init__(self, dofs: np.ndarray, joints: int) -> None:
         self._there = dofs < joints
         self._places, self._all = packed(dofs.shape[1]), packed((dofs < joints).sum())
 
-    def together(self, problem: Problem, here: Array, left: Left) -> Array:
+    def together(self, problem: Problem, here: Array, begin: Array, left: Left) -> Array:
         """Return the ways [a, m] from an acceleration [a, m] of arms that objects, or contacts of arms, join."""
         there, (first, second) = self._there, np.tril_indices(len(self._all))
 
@@ -94,36 +97,33 @@ class Arms:
             total = jax.lax.cond(problem.overlap, with_rows, lambda total: total, total)
         (stiff, force), _ = jax.lax.scan(subtract, total, (jnp.arange(len(left.half)), left.half, left.touched))
         joints = rows_of(JointRows(*map(flat, problem.joints)))
-        found, rows = _way(stiff[self._all], force, joints, start), np.cumsum(there.sum(1))
+        found, rows = _way(stiff[self._all], force, joints, start, flat(begin)), np.cumsum(there.sum(1))
         ways = [
             jnp.zeros(len(own)).at[own].set(way) for own, way in zip(there, jnp.split(found, rows[:-1]), strict=True)
         ]
         return jnp.stack(ways)
 
-    def each(self, problem: Problem, here: Array, moving: Array, left: Left) -> Array:
+    def each(self, problem: Problem, here: Array, begin: Array, moving: Array, left: Left) -> Array:
         """Return the ways [a, m] of arms of which no two are joined: one problem after the other.
 
         Those that are not `moving` [a] have none.
         """
         takes = np.ones(len(left.half), bool)
 
-        def one(each: tuple[_Row, Array]) -> Array:
-            row, moves = each
+        def one(each: tuple[_Row, Array, Array]) -> Array:
+            row, begin, moves = each
 
             def way() -> Array:
                 stiff, force = self._alone(left, takes, row)
-                return _way(stiff[self._places], force, rows_of(row.joints), row.start)
+                return _way(stiff[self._places], force, rows_of(row.joints), row.start, begin)
 
             return jax.lax.cond(moves, way, lambda: jnp.zeros_like(row.start))
 
-        found: Array = jax.lax.map(one, (self._rows(problem, here, left), moving))
+        found: Array = jax.lax.map(one, (self._rows(problem, here, left), begin, moving))
         return found
 
     def bridged(self, problem: Problem, here: Array, begin: Array, left: Left) -> Array:
-        """Return the ways [a, m] of arms that one object joins and nothing else.
-
-        It is looked for from the acceleration `begin` [a, m] on.
-        """
+        """Return the ways [a, m] of arms that one object joins and nothing else."""
         a, k = len(self._there), len(left.half)
         bridge = jnp.argmax(left.touched.sum(1) > 1)
         rows = self._rows(problem, here, left)
@@ -258,6 +258,6 @@ def _added(sums: tuple[Array, Array], rows: Rows, here: Array, way: Array, lengt
     return sums[0] - along @ jnp.clip(force, rows.low, rows.high), sums[1] + along @ gives
 
 
-def _way(stiff: Array, force: Array, rows: Rows, start: Array) -> Array:
-    """Return the way from an acceleration to the one at which these forces balance with those of joints."""
-    return solve(stiff, stiff @ start + force, rows, start, *ITERATIONS, steady=1)[0] - start
+def _way(stiff: Array, force: Array, rows: Rows, here: Array, begin: Array) -> Array:
+    """Return the way to the acceleration at which these forces balance with those of joints."""
+    return solve(stiff, stiff @ here + force, rows, begin, *ITERATIONS, steady=1)[0] - here

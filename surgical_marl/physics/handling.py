@@ -10,7 +10,7 @@ import numpy as np
 from jax import Array
 
 from surgical_marl.physics.bodies import Bodies, conjugate, product, rotation, turn
-from surgical_marl.physics.cone import Cone, Springs, Stuck, parting, stretched
+from surgical_marl.physics.cone import Cone, Springs, Stuck
 from surgical_marl.physics.patches import AWAY, Patch
 from surgical_marl.physics.placed import Joints
 from surgical_marl.physics.problem import Contact, Contacts, Pressed
@@ -124,15 +124,11 @@ class Handling:
         self.tables, self._twists = tables, twists
 
     def feel(
-        self, slots: Slots, joints: Joints | None, fingers: Fingers | None, qvel: Array, start: Array, bodies: Bodies,
-        grips: Grips, dt: Any,
+        self, slots: Slots, joints: Joints | None, fingers: Fingers | None, qvel: Array, bodies: Bodies, grips: Grips,
+        dt: Any,
     ) -> Felt:  # fmt: skip
-        """Return how the patches that were found resist. There are neither joints nor fingers without arms.
-
-        The solver begins with the accelerations `start` [a, m] of arms, and with those that objects had last.
-        """
+        """Return how the patches that were found resist. There are neither joints nor fingers without arms."""
         speeds = _Speeds(self._twists.by_arm(qvel), self._twists.by_object(bodies.velocity))
-        begin = start, self._twists.by_object(bodies.acceleration)
         at = self._twists.by_object(bodies.position), self._twists.by_object(bodies.quaternion)
         columns = None if joints is None else joints.columns(jnp.asarray(self.tables.slides), jnp.zeros(3))
 
@@ -142,10 +138,10 @@ class Handling:
         def one(n: Array) -> _Kept:
             patch, number, contact = row_of(slots.patch, n), slots.number[n], bare(n)
             slip = self._slip(patch, number, fingers, at, grips)
-            twist, more = self._twists.each(contact, (speeds.joints, speeds.objects), begin)
+            twist = self._twists.of(contact, speeds.joints, speeds.objects)
             motion = self._motion(contact, twist, patch, number, speeds)
             springs, stuck = self._resisting(contact.cone, patch, number, slip, motion, dt)
-            return _Kept(contact.second, springs, stretched(springs, stuck, parting(contact.cone, more)), slip)
+            return _Kept(contact.second, springs, stuck, slip)
 
         kept: _Kept = filled(one, slots.found, len(slots.number))
 

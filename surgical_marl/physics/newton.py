@@ -70,15 +70,6 @@ class _Along(NamedTuple):
     """By how much this slope grows per length, []."""
 
 
-class _Seen(NamedTuple):
-    """What contacts feel at a point."""
-
-    pressed: Pressed
-    """[s]"""
-    foreseen: Array
-    """Whether that is what they feel if they are linear from the beginning of the Newton step on, [] bool."""
-
-
 class _Local(NamedTuple):
     """Sums over contacts: forces, and by how much they fall with the acceleration."""
 
@@ -114,8 +105,8 @@ class Newton:
         self.twists = Twists(dofs, objects)
         self._passes = PASSES if len(dofs) else ALONE
 
-    def solve(self, problem: Problem, arms: Array, objects: Array) -> Solution:
-        """Return the accelerations and forces, beginning with accelerations of arms [a, m] and objects [k, 6]."""
+    def solve(self, problem: Problem) -> Solution:
+        """Return the accelerations and forces."""
         contacts = problem.contacts
         found = jax.eval_shape(lambda: nearest(*row_of((contacts.springs, contacts.stuck), 0)))
         base = _Base(contacts.stuck, *room((found, jax.eval_shape(_pressed, found)), len(contacts.second)))
@@ -131,27 +122,33 @@ class Newton:
             # Arms that touch nothing go all of their way at once, as if nothing else were there, and are done.
             free = jnp.where(touching[:, None], 0.0, way.arms)
             way = way._replace(arms=jnp.where(touching[:, None], way.arms, 0.0))
-            begin, along = self._along(problem, local, here, way, touching)
-            found = search(begin, LEAST, self._measure(problem, base, along), _Seen(base.pressed, jnp.bool_(True)))
-            there = jax.tree.map(lambda x, step: x + found.length * step, here, way)
-            there = there._replace(arms=there.arms + free)
-            settled = (found.looks < 2) & found.seen.foreseen
+            by, whole = self._partings(problem, way), _ahead(here, way, jnp.float32(1.0))
+            pressed, settled = self._foreseen(problem, base, by)
             if len(problem.between.low):
-                settled &= (self._sides(problem, here.arms) == self._sides(problem, there.arms)).all()
-            base = self._stretched(problem, base, along.by, found.length)._replace(pressed=found.seen.pressed)
-            return there, base, settled | (found.looks == 0), count + 1
+                settled &= (self._sides(problem, here.arms) == self._sides(problem, whole.arms)).all()
+            base = base._replace(pressed=pressed)
 
-        state = Point(arms, objects), base, jnp.bool_(False), jnp.int32(0)
+            def searched() -> tuple[Point, _Base, Array]:
+                begin, along = self._along(problem, local, here, way, touching, by)
+                found = search(begin, LEAST, self._measure(problem, base, along), base.pressed)
+                there = self._stretched(problem, base, by, found.length)._replace(pressed=found.seen)
+                return _ahead(here, way, found.length), there, found.looks == 0
+
+            there, base, settled = jax.lax.cond(settled, lambda: (whole, base, jnp.bool_(True)), searched)
+            return there._replace(arms=there.arms + free), base, settled, count + 1
+
+        state = Point(jnp.zeros(self._dofs.shape), jnp.zeros((self._objects, 6))), base, jnp.bool_(False), jnp.int32(0)
         here, base, _, _ = jax.lax.while_loop(going, iterate, state)
         return Solution(here.arms, here.objects, base.pressed, self._arms.between(problem, here.arms))
 
-    def _along(self, problem: Problem, local: _Local, here: Point, way: Point, moves: Array) -> tuple[Array, _Along]:
+    def _along(
+        self, problem: Problem, local: _Local, here: Point, way: Point, moves: Array, by: Parting
+    ) -> tuple[Array, _Along]:
         """Return the slope of the whole cost at the beginning of a way, and what is known of the way."""
         begin, slope, growth = self._arms.slopes(problem, moves, here.arms, way.arms, local.arm_force)
         begin -= jnp.sum(local.force * way.objects)
         inertia = problem.masses @ jnp.stack([here.objects - problem.free, way.objects], -1)
         of_objects = jnp.sum(way.objects[..., None] * inertia, (0, 1))
-        by = self._partings(problem, way)
         return begin, _Along(here, way, moves, by, slope + of_objects[0], growth + of_objects[1])
 
     def _partings(self, problem: Problem, way: Point) -> Parting:
@@ -174,34 +171,44 @@ class Newton:
 
         return base._replace(stuck=jax.lax.fori_loop(0, problem.total, one, base.stuck))
 
+    def _foreseen(self, problem: Problem, base: _Base, by: Parting) -> tuple[Pressed, Array]:
+        """Return what contacts feel at the end of a way, and whether it is as foreseen.
+
+        It is if no contact feels much else than if it were linear from the beginning of the way on.
+        """
+
+        def look(n: Array, seen: tuple[Pressed, Array]) -> tuple[Pressed, Array]:
+            springs, stuck, before, step = row_of((problem.contacts.springs, base.stuck, base.felt, by), n)
+            felt, (normal, friction) = nearest(springs, stretched(springs, stuck, step)), falls(springs, before, step)
+            missed = jnp.sum((before.normal - normal - felt.normal) ** 2)
+            missed += jnp.sum((before.friction - friction - felt.friction) ** 2)
+            pressed = _pressed(felt)
+            return put(seen[0], n, pressed), seen[1] & (missed <= TOLERANCE**2 * pressed.normal**2)
+
+        found: tuple[Pressed, Array] = jax.lax.fori_loop(0, problem.total, look, (base.pressed, jnp.bool_(True)))
+        return found
+
     def _measure(
         self, problem: Problem, base: _Base, along: _Along
-    ) -> Callable[[Array, _Seen], tuple[Array, Array, _Seen]]:
+    ) -> Callable[[Array, Pressed], tuple[Array, Array, Pressed]]:
         """Return what measures the slope of the cost at a length of a way, and by how much it grows per length.
 
         It also notes what contacts feel there.
         """
         here, way, moves, by, slope, growth = along
 
-        def measure(length: Array, seen: _Seen) -> tuple[Array, Array, _Seen]:
-            def look(n: Array, state: tuple[Array, Array, _Seen]) -> tuple[Array, Array, _Seen]:
+        def measure(length: Array, seen: Pressed) -> tuple[Array, Array, Pressed]:
+            def look(n: Array, state: tuple[Array, Array, Pressed]) -> tuple[Array, Array, Pressed]:
                 slope, growth, seen = state
-                springs, stuck, before, own = row_of((problem.contacts.springs, base.stuck, base.felt, by), n)
-                step = _times(length, own)
-                felt, (normal, friction) = (
-                    nearest(springs, stretched(springs, stuck, step)),
-                    falls(springs, before, step),
-                )
-                missed = jnp.sum((before.normal - normal - felt.normal) ** 2)
-                missed += jnp.sum((before.friction - friction - felt.friction) ** 2)
-                pressed, (normal, friction) = _pressed(felt), falls(springs, felt, own)
-                foreseen = seen.foreseen & (missed <= TOLERANCE**2 * pressed.normal**2)
+                springs, stuck, own = row_of((problem.contacts.springs, base.stuck, by), n)
+                felt = nearest(springs, stretched(springs, stuck, _times(length, own)))
+                normal, friction = falls(springs, felt, own)
                 slope -= felt.normal @ own.normal + felt.friction @ own.along
                 growth += normal @ own.normal + friction @ own.along
-                return slope, growth, _Seen(put(seen.pressed, n, pressed), foreseen)
+                return slope, growth, put(seen, n, _pressed(felt))
 
             resists, gives = self._arms.resisted(problem, moves, here.arms, way.arms, length)
-            start = slope + length * growth + resists, growth + gives, _Seen(seen.pressed, jnp.bool_(True))
+            start = slope + length * growth + resists, growth + gives, seen
             return jax.lax.fori_loop(0, problem.total, look, start)
 
         return measure
@@ -291,9 +298,10 @@ class Newton:
 
     def _ways(self, problem: Problem, here: Array, left: Left, first: Array) -> Array:
         """Return the ways [a, m] of arms: of each alone, of those that one object joins, or of all at once."""
-        together = partial(self._arms.together, problem, here)
-        bridged = partial(self._arms.bridged, problem, here, jnp.where(first, problem.eased, here))
-        each = partial(self._arms.each, problem, here, _touching(problem, left) | first)
+        begin = jnp.where(first, problem.eased, here)
+        together = partial(self._arms.together, problem, here, begin)
+        bridged = partial(self._arms.bridged, problem, here, begin)
+        each = partial(self._arms.each, problem, here, begin, _touching(problem, left) | first)
         if len(self._dofs) < 2:
             return each(left)
         bridges, pressed = left.touched.sum(1) > 1, self._sides(problem, here).any()
@@ -326,6 +334,11 @@ def _begun(sums: Array, i: Array, row: Array, begun: Array) -> Array:
 def _touching(problem: Problem, local: _Local | Left) -> Array:
     """Return which arms touch anything, [a] bool."""
     return local.on_arm | problem.overlap
+
+
+def _ahead(here: Point, way: Point, length: Array) -> Point:
+    """Return the point at a length of a way."""
+    return Point(here.arms + length * way.arms, here.objects + length * way.objects)
 
 
 def _times(length: Array, by: Parting) -> Parting:

@@ -54,7 +54,7 @@ class Contacts(NamedTuple):
     springs: Springs
     """[s]"""
     stuck: Stuck
-    """At the accelerations that the solver begins with, [s]."""
+    """Without acceleration, [s]."""
     at: Callable[[Array], Contact]
     """Makes one of them by its number, wherever it is needed: that takes less time than to load it from memory."""
 

@@ -176,9 +176,9 @@ class Together:
         bodies, dt, none = objects.bodies, self._dynamics.dt, jnp.zeros(0)
         masses, free = self._free(bodies, slots.awake)
         felt = Handling(self.tables, self._objects_alone.twists).feel(
-            slots, None, None, none, jnp.zeros((0, 0)), bodies, objects.grips, dt
+            slots, None, None, none, bodies, objects.grips, dt
         )
-        found = self._solve_objects(masses, free, felt.contacts, slots, bodies.acceleration)
+        found = self._solve_objects(masses, free, felt.contacts, slots)
         grips = objects.grips
         loose = grips._replace(force=0 * grips.force, slid=0 * grips.slid, held=0 * grips.held)
         return Objects(self._moved(bodies, found, slots), loose)
@@ -194,24 +194,24 @@ class Together:
         after: Bodies = jax.lax.map(one, (bodies, acceleration, slots.awake))
         return settled(after, self.tables.bound, slots.company)
 
-    def _solve_objects(self, masses: Array, free: Array, contacts: Contacts, slots: Slots, start: Array) -> Array:
+    def _solve_objects(self, masses: Array, free: Array, contacts: Contacts, slots: Slots) -> Array:
         """Return the accelerations [k, 6] of objects that touch no arm: one by one, if none touches another."""
         none, k, total = jnp.zeros((0, 0)), len(free), slots.found
         rows = Rows(jnp.zeros((0, 0, 0)), *[jnp.zeros(0)] * 4)
         arms = none, none, JointRows(*[none] * len(JointRows._fields)), none, rows, jnp.bool_(False)
 
         def whole() -> Array:
-            return self._objects_alone.solve(Problem(*arms, masses, free, contacts, total), none, start).objects
+            return self._objects_alone.solve(Problem(*arms, masses, free, contacts, total)).objects
 
         def single(row: tuple[Array, ...]) -> Array:
-            number, mass, free, start = row
+            number, mass, free = row
             at = lambda n: (one := contacts.at(n))._replace(first=jnp.where(one.first == number, 0, 1))  # noqa: E731
             problem = Problem(*arms, mass[None], free[None], contacts._replace(at=at), total)
-            solve = lambda: self._object_alone.solve(problem, none, start[None]).objects[0]  # noqa: E731
-            return jax.lax.cond(slots.awake[number], solve, lambda: start)
+            solve = lambda: self._object_alone.solve(problem).objects[0]  # noqa: E731
+            return jax.lax.cond(slots.awake[number], solve, lambda: jnp.zeros(6))
 
         def each() -> Array:
-            return jax.lax.map(single, (jnp.arange(k), masses, free, start))
+            return jax.lax.map(single, (jnp.arange(k), masses, free))
 
         if k < 2:
             return whole()
@@ -227,14 +227,14 @@ class Together:
         The arms' damping is part of their mass matrix here, so the solver sees the velocities at the end of the step.
         """
         dt, (bodies, grips), handling = self._dynamics.dt, physics.objects, Handling(self.tables, self._newton.twists)
-        felt = handling.feel(slots, joints, fingers, physics.qvel, arms.start, bodies, grips, dt)
+        felt = handling.feel(slots, joints, fingers, physics.qvel, bodies, grips, dt)
         masses, free = self._free(bodies, slots.awake)
         between = self._between(physics, overlap)
         problem = Problem(
             arms.implicit, arms.smooth, arms.joints, self._eases * arms.start, between.rows, overlap, masses, free,
             felt.contacts, slots.found,
         )  # fmt: skip
-        found = self._newton.solve(problem, arms.start, bodies.acceleration)
+        found = self._newton.solve(problem)
         qacc = self._of_joints(found.arms)
         qvel = physics.qvel + dt * qacc
         objects = self._moved(bodies, found.objects, slots)

@@ -19,22 +19,14 @@ class Twists:
 
     def of(self, contact: Contact, arms: Array, objects: Array) -> Array:
         """Return the twist [6] of a contact by motions of arms (`by_arm`) and of objects (`by_object`)."""
-        return self.each(contact, (arms, objects))[0]
-
-    def each(self, contact: Contact, *motions: tuple[Array, Array]) -> list[Array]:
-        """Return the twist [6] of a contact by each of several motions, as `of` does."""
-        found = [objects[contact.first] for _, objects in motions]
+        found = objects[contact.first]
         if self._objects > 1:
-            others = [_moved_to(objects[contact.second], contact.offset) for _, objects in motions]
-            found = [twist - other for twist, other in zip(found, others, strict=True)]
+            found -= _moved_to(objects[contact.second], contact.offset)
         if not len(self._dofs):
             return found
-
-        def with_arm(found: list[Array]) -> list[Array]:
-            moved = [contact.by_joints(arms[contact.arm]) for arms, _ in motions]
-            return [twist + more for twist, more in zip(found, moved, strict=True)]
-
-        return jax.lax.cond(contact.arm < len(self._dofs), with_arm, lambda found: found, found)
+        with_arm = lambda: found + contact.by_joints(arms[contact.arm])  # noqa: E731
+        whole: Array = jax.lax.cond(contact.arm < len(self._dofs), with_arm, lambda: found)
+        return whole
 
     def by_arm(self, joints: Array) -> Array:
         """Return what belongs to the joints [n] of all arms by arm, [a, m]; 0 for joints that are not."""
