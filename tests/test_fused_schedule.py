@@ -175,6 +175,20 @@ def test_a_loop_begins_with_an_array_that_nobody_reads_any_more() -> None:
         assert_schedule_is_right(partial(function, late=late), *COLUMNS)
 
 
+def test_a_loop_reads_an_array_before_it_changes() -> None:
+    """Also a loop whose last result nobody needs: what it counts with ends it."""
+
+    def function(x: Any, i: Any, y: Any, values: Any) -> Any:
+        array = values.at[i].set(y)
+        step = lambda s: (s[0] + array[i + 1], s[1] + 1)  # noqa: E731
+        total, _ = lax.while_loop(lambda s: s[1] < y, step, (x, x))
+        return array.at[i].set(x), total
+
+    _, plan = schedule(function, *COLUMNS)
+    assert plan.replaced
+    assert_schedule_is_right(function, *COLUMNS)
+
+
 def test_the_sides_of_a_branch_fill_its_result() -> None:
     def function(x: Any, i: Any, y: Any, values: Any) -> Any:
         return lax.cond(x > 0, lambda: lax.map(lambda v: v * x, values), lambda: lax.map(lambda v: v - y, values))[i]
