@@ -65,7 +65,7 @@ def test_an_arm_that_touches_nothing_moves_as_if_alone_while_another_holds_somet
     assert np.max(errors) < 1e-3
 
 
-def test_friction_of_joints_is_as_before_at_the_acceleration_that_joined_arms_begin_with() -> None:
+def test_friction_of_joints_is_as_before_at_the_acceleration_that_arms_begin_with() -> None:
     simulator, rng = Env("reach", "bimanual_psm_needle").simulator, np.random.default_rng(0)
     together, physics = cast(Any, simulator._objects), simulator.home
     qvel, qacc = (jnp.asarray(rng.uniform(-1, 1, len(physics.qvel)), jnp.float32) for _ in range(2))

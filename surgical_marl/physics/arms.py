@@ -41,13 +41,13 @@ class Left(NamedTuple):
 
 
 class _Row(NamedTuple):
-    """What is known of an arm, or of each [a, ...]: see `Problem` and `Left`, and where its acceleration begins."""
+    """What is known of an arm, or of each [a, ...]: see `Problem`, `Left` and `Arms`."""
 
     number: Array
     mass: Array
     smooth: Array
     joints: JointRows
-    start: Array
+    here: Array
     on_arm: Array
     stiff: Array
     force: Array
@@ -115,9 +115,9 @@ class Arms:
 
             def way() -> Array:
                 stiff, force = self._alone(left, takes, row)
-                return _way(stiff[self._places], force, rows_of(row.joints), row.start, begin)
+                return _way(stiff[self._places], force, rows_of(row.joints), row.here, begin)
 
-            return jax.lax.cond(moves, way, lambda: jnp.zeros_like(row.start))
+            return jax.lax.cond(moves, way, lambda: jnp.zeros_like(row.here))
 
         found: Array = jax.lax.map(one, (self._rows(problem, here, left), begin, moving))
         return found
@@ -160,7 +160,7 @@ class Arms:
             return jax.lax.cond(touched[row.number], less, lambda total: total, total), None
 
         whole = jax.lax.cond(row.on_arm, lambda: row.mass + row.stiff, lambda: row.mass)
-        total = whole, row.smooth + row.force - row.mass[self._places] @ row.start
+        total = whole, row.smooth + row.force - row.mass[self._places] @ row.here
         objects = jnp.arange(len(left.half)), left.half, left.touched, jnp.asarray(takes)
         found: tuple[Array, Array] = jax.lax.scan(subtract, total, objects)[0]
         return found

@@ -300,7 +300,8 @@ class Scheduler:
                 continue
             stack.append((item, True))
             reads = [read for read in self._item_reads(item) if self._here(read, region)]
-            # The highest pressure is popped, and so computed, first. What only comes first for its group has none.
+            # The highest pressure is popped, and so computed, first. A group that only has to come first may stand here
+            # as a result that nobody needs, of which no pressure is known.
             reads.sort(key=lambda read: self.room.get(read, 1))
             stack.extend((self._item(read), False) for read in reads if self._item(read) not in done)
 
