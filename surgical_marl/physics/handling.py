@@ -243,8 +243,7 @@ class Handling:
     ) -> Grips:  # fmt: skip
         """Return what friction remembers after a step with these forces.
 
-        Where friction slips, its spring is stretched no further than its force says. `shift` is by how much all arms'
-        joints [n] and objects [k, 6] move in the step.
+        `shift` is by how much all arms' joints [n] and objects [k, 6] move in the step.
         """
         t, k = self.tables, len(bodies.position)
         if not t.grip:
@@ -263,7 +262,7 @@ class Handling:
                 patch, slip, forces = row_of((slots.patch, felt.slip, pressed), n)
                 after = slip + contact.cone.along @ self._twists.of(contact, *moves)
                 pose = at[0][contact.first], at[1][contact.first]
-                new = self._kept(patch, number, forces, after, finger, pose, own)
+                new = self._kept(patch, forces, self._slid(number, forces, slip, after, dt), finger, pose, own)
                 found = put(tuple(getattr(kept[0], name) for name in OF_FINGERS), place, new)
                 return kept[0]._replace(**dict(zip(OF_FINGERS, found, strict=True))), put(kept[1], place, patch.normal)
 
@@ -272,15 +271,21 @@ class Handling:
         kept, normal = jax.lax.fori_loop(0, slots.found, one, (fresh, normal))
         return kept._replace(held=self._held(normal, kept.force, kept.held, dt))
 
+    def _slid(self, number: Array, forces: Pressed, slip: Array, after: Array, dt: Any) -> Array:
+        """Return how far friction slides in a step that would stretch its spring from `slip` to `after`, m, [3].
+
+        What slides is in series with the spring and the damper beside it, which bear its force together.
+        """
+        pulled = -forces.friction / (SHEAR * jnp.asarray(self.tables.stiffness)[number])
+        return jnp.where(forces.slips, after - (dt * pulled + DAMPING * slip) / (dt + DAMPING), 0.0)
+
     def _kept(
-        self, patch: Patch, number: Array, forces: Pressed, after: Array, finger: Fingers, at: tuple[Array, Array],
+        self, patch: Patch, forces: Pressed, excess: Array, finger: Fingers, at: tuple[Array, Array],
         grip: tuple[Array, Array, Array, Array],
     ) -> tuple[Array, Array, Array, Array]:  # fmt: skip
-        """Return what is kept for one finger and one object: `OF_FINGERS`, as in `grip`."""
+        """Return what is kept for one finger and one object after a slide: `OF_FINGERS`, as in `grip`."""
         (place, faces), (position, quaternion, force, slid), axes = finger, grip, rotation(finger.quaternion)
         slips = forces.slips
-        stretches = jnp.where(slips, -forces.friction / (SHEAR * jnp.asarray(self.tables.stiffness)[number]), after)
-        excess = after - stretches
         # Kept as it is while nothing slips: rounding errors of a pose made anew in each step would add up.
         along, about = excess[:2] @ patch.frame[1:], turn(excess[2] / patch.radius * patch.normal)
         was, faced = place + axes @ position, product(faces, quaternion)

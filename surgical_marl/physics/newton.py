@@ -7,7 +7,6 @@ is left is as large as the arms, whatever the number of objects. Objects that to
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -17,23 +16,13 @@ import numpy as np
 from jax import Array
 
 from surgical_marl.physics import elimination
+from surgical_marl.physics.along import look_ahead, set_out, stretch
 from surgical_marl.physics.arms import Arms, Left
-from surgical_marl.physics.cone import (
-    Forces,
-    Parting,
-    Stuck,
-    between,
-    curvature,
-    falls,
-    nearest,
-    parting,
-    stretched,
-    wrench,
-)
+from surgical_marl.physics.cone import Forces, Parting, Stuck, between, curvature, nearest, parting, wrench
 from surgical_marl.physics.factor import packed
 from surgical_marl.physics.problem import Contact, Point, Pressed, Problem, Solution
 from surgical_marl.physics.rows import absent, add, filled, put, room, row_of
-from surgical_marl.physics.search import search
+from surgical_marl.physics.search import ENOUGH, search
 from surgical_marl.physics.twists import Twists, moved_cone
 
 PASSES, ALONE = 12, 24
@@ -42,9 +31,9 @@ environments (docs/physics.md)."""
 LEAST = 1e-7
 """Fall of the cost in a Newton step, N m/s2, after which none follows: that of a needle of 0.03 g whose acceleration
 changes by 0.06 m/s2."""
-TOLERANCE = 3e-3
-"""Force of a contact that a Newton step did not foresee, as a share of its normal force, at which it is the last one.
-The error that is left in the forces is about as large: what was not foreseen is all that does not balance."""
+FIRST = 30.0
+"""Slope at the end of the first Newton step, as a share of what contacts resist along it, up to which it is gone whole.
+A search might find a better place to go on from, but seldom saves a step, and costs as much as half of one."""
 
 
 class _Base(NamedTuple):
@@ -53,21 +42,6 @@ class _Base(NamedTuple):
     stuck: Stuck
     felt: Forces
     pressed: Pressed
-
-
-class _Along(NamedTuple):
-    """A way, from an acceleration `here`."""
-
-    here: Point
-    way: Point
-    moves: Array
-    """Which arms move, [a]."""
-    by: Parting
-    """How much more the bodies of each contact accelerate per length, [s]."""
-    slope: Array
-    """Of the cost where it begins, without contacts and without friction and limits of joints, []."""
-    growth: Array
-    """By how much this slope grows per length, []."""
 
 
 class _Local(NamedTuple):
@@ -109,7 +83,7 @@ class Newton:
         """Return the accelerations and forces."""
         contacts = problem.contacts
         found = jax.eval_shape(lambda: nearest(*row_of((contacts.springs, contacts.stuck), 0)))
-        base = _Base(contacts.stuck, *room((found, jax.eval_shape(_pressed, found)), len(contacts.second)))
+        base = _Base(contacts.stuck, *room((found, jax.eval_shape(Pressed.of, found)), len(contacts.second)))
 
         def going(state: Any) -> Array:
             *_, settled, count = state
@@ -122,34 +96,33 @@ class Newton:
             # Arms that touch nothing go all of their way at once, as if nothing else were there, and are done.
             free = jnp.where(touching[:, None], 0.0, way.arms)
             way = way._replace(arms=jnp.where(touching[:, None], way.arms, 0.0))
-            by, whole = self._partings(problem, way), _ahead(here, way, jnp.float32(1.0))
-            pressed, settled = self._foreseen(problem, base, by)
+            by, whole = self._partings(problem, way), here.ahead(way, jnp.float32(1.0))
+            end = look_ahead(problem, base.stuck, base.felt, by, base.pressed)
+            base, settled = base._replace(pressed=end.pressed), end.foreseen
+            good = jnp.abs(end.slope) <= jnp.where(count == 0, FIRST, ENOUGH) * end.growth
+            good &= end.growth > LEAST
             if len(problem.between.low):
-                settled &= (self._sides(problem, here.arms) == self._sides(problem, whole.arms)).all()
-            base = base._replace(pressed=pressed)
+                same = (self._sides(problem, here.arms) == self._sides(problem, whole.arms)).all()
+                settled, good = settled & same, good & same
 
-            def searched() -> tuple[Point, _Base, Array]:
-                begin, along = self._along(problem, local, here, way, touching, by)
-                found = search(begin, LEAST, self._measure(problem, base, along), base.pressed)
-                there = self._stretched(problem, base, by, found.length)._replace(pressed=found.seen)
-                return _ahead(here, way, found.length), there, found.looks == 0
+            def searched() -> tuple[Array, Pressed, Array]:
+                forces = Point(local.arm_force, local.force)
+                begin, along = set_out(self._arms, problem, forces, here, way, touching, by)
+                found = search(begin, LEAST, along.measure(self._arms, problem, base.stuck), base.pressed)
+                return found.length, found.seen, found.looks == 0
 
-            there, base, settled = jax.lax.cond(settled, lambda: (whole, base, jnp.bool_(True)), searched)
+            def gone_on() -> tuple[Point, _Base, Array]:
+                as_seen = lambda: (jnp.float32(1.0), base.pressed, jnp.bool_(False))  # noqa: E731
+                length, pressed, settled = jax.lax.cond(good, as_seen, searched)
+                stuck = stretch(problem, base.stuck, by, length)
+                return here.ahead(way, length), base._replace(stuck=stuck, pressed=pressed), settled
+
+            there, base, settled = jax.lax.cond(settled, lambda: (whole, base, jnp.bool_(True)), gone_on)
             return there._replace(arms=there.arms + free), base, settled, count + 1
 
         state = Point(jnp.zeros(self._dofs.shape), jnp.zeros((self._objects, 6))), base, jnp.bool_(False), jnp.int32(0)
         here, base, _, _ = jax.lax.while_loop(going, iterate, state)
         return Solution(here.arms, here.objects, base.pressed, self._arms.between(problem, here.arms))
-
-    def _along(
-        self, problem: Problem, local: _Local, here: Point, way: Point, moves: Array, by: Parting
-    ) -> tuple[Array, _Along]:
-        """Return the slope of the whole cost at the beginning of a way, and what is known of the way."""
-        begin, slope, growth = self._arms.slopes(problem, moves, here.arms, way.arms, local.arm_force)
-        begin -= jnp.sum(local.force * way.objects)
-        inertia = problem.masses @ jnp.stack([here.objects - problem.free, way.objects], -1)
-        of_objects = jnp.sum(way.objects[..., None] * inertia, (0, 1))
-        return begin, _Along(here, way, moves, by, slope + of_objects[0], growth + of_objects[1])
 
     def _partings(self, problem: Problem, way: Point) -> Parting:
         """Return how the bodies of all contacts accelerate relative to each other per length of a way, [s]."""
@@ -161,57 +134,6 @@ class Newton:
 
         found: Parting = filled(one, problem.total, len(problem.contacts.second))
         return found
-
-    def _stretched(self, problem: Problem, base: _Base, by: Parting, length: Array) -> _Base:
-        """Return all contacts a length further along a way, but for what they feel there."""
-
-        def one(n: Array, stuck: Stuck) -> Stuck:
-            springs, here, more = row_of((problem.contacts.springs, stuck, by), n)
-            return put(stuck, n, stretched(springs, here, _times(length, more)))
-
-        return base._replace(stuck=jax.lax.fori_loop(0, problem.total, one, base.stuck))
-
-    def _foreseen(self, problem: Problem, base: _Base, by: Parting) -> tuple[Pressed, Array]:
-        """Return what contacts feel at the end of a way, and whether it is as foreseen.
-
-        It is if no contact feels much else than if it were linear from the beginning of the way on.
-        """
-
-        def look(n: Array, seen: tuple[Pressed, Array]) -> tuple[Pressed, Array]:
-            springs, stuck, before, step = row_of((problem.contacts.springs, base.stuck, base.felt, by), n)
-            felt, (normal, friction) = nearest(springs, stretched(springs, stuck, step)), falls(springs, before, step)
-            missed = jnp.sum((before.normal - normal - felt.normal) ** 2)
-            missed += jnp.sum((before.friction - friction - felt.friction) ** 2)
-            pressed = _pressed(felt)
-            return put(seen[0], n, pressed), seen[1] & (missed <= TOLERANCE**2 * pressed.normal**2)
-
-        found: tuple[Pressed, Array] = jax.lax.fori_loop(0, problem.total, look, (base.pressed, jnp.bool_(True)))
-        return found
-
-    def _measure(
-        self, problem: Problem, base: _Base, along: _Along
-    ) -> Callable[[Array, Pressed], tuple[Array, Array, Pressed]]:
-        """Return what measures the slope of the cost at a length of a way, and by how much it grows per length.
-
-        It also notes what contacts feel there.
-        """
-        here, way, moves, by, slope, growth = along
-
-        def measure(length: Array, seen: Pressed) -> tuple[Array, Array, Pressed]:
-            def look(n: Array, state: tuple[Array, Array, Pressed]) -> tuple[Array, Array, Pressed]:
-                slope, growth, seen = state
-                springs, stuck, own = row_of((problem.contacts.springs, base.stuck, by), n)
-                felt = nearest(springs, stretched(springs, stuck, _times(length, own)))
-                normal, friction = falls(springs, felt, own)
-                slope -= felt.normal @ own.normal + felt.friction @ own.along
-                growth += normal @ own.normal + friction @ own.along
-                return slope, growth, put(seen, n, _pressed(felt))
-
-            resists, gives = self._arms.resisted(problem, moves, here.arms, way.arms, length)
-            start = slope + length * growth + resists, growth + gives, seen
-            return jax.lax.fori_loop(0, problem.total, look, start)
-
-        return measure
 
     # -- forces at a point
 
@@ -233,7 +155,7 @@ class Newton:
         def one(n: Array, sums: tuple[_Local, Forces, Pressed]) -> tuple[_Local, Forces, Pressed]:
             (local, felt, pressed), contact = sums, problem.contacts.at(n)
             found = nearest(contact.cone.springs, row_of(base.stuck, n))
-            return self._add(local, contact, found), put(felt, n, found), put(pressed, n, _pressed(found))
+            return self._add(local, contact, found), put(felt, n, found), put(pressed, n, Pressed.of(found))
 
         local, felt, pressed = jax.lax.fori_loop(0, problem.total, one, (none, base.felt, base.pressed))
         cut = lambda each: each[:k]  # noqa: E731
@@ -334,17 +256,3 @@ def _begun(sums: Array, i: Array, row: Array, begun: Array) -> Array:
 def _touching(problem: Problem, local: _Local | Left) -> Array:
     """Return which arms touch anything, [a] bool."""
     return local.on_arm | problem.overlap
-
-
-def _ahead(here: Point, way: Point, length: Array) -> Point:
-    """Return the point at a length of a way."""
-    return Point(here.arms + length * way.arms, here.objects + length * way.objects)
-
-
-def _times(length: Array, by: Parting) -> Parting:
-    return Parting(length * by.normal, length * by.along)
-
-
-def _pressed(felt: Forces) -> Pressed:
-    """Return what is kept of the forces of a contact."""
-    return Pressed(jnp.sum(felt.normal), felt.friction, felt.slips)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from surgical_marl.physics.cone import Cone, Springs, Stuck
+from surgical_marl.physics.cone import Cone, Forces, Springs, Stuck
 from surgical_marl.physics.solver import JointRows, Rows
 
 
@@ -93,6 +93,11 @@ class Pressed(NamedTuple):
     slips: Array
     """Whether friction is at its bound, [s] bool."""
 
+    @classmethod
+    def of(cls, felt: Forces) -> Pressed:
+        """Return what is kept of the forces of one contact."""
+        return cls(jnp.sum(felt.normal), felt.friction, felt.slips)
+
 
 class Solution(NamedTuple):
     """Accelerations of arms [a, m] and objects [k, 6], forces of contacts and of arms on arms."""
@@ -108,3 +113,7 @@ class Point(NamedTuple):
 
     arms: Array
     objects: Array
+
+    def ahead(self, way: Point, length: Array) -> Point:
+        """Return the point at a length of a way from here."""
+        return Point(self.arms + length * way.arms, self.objects + length * way.objects)

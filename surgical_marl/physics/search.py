@@ -9,8 +9,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-ENOUGH = 0.1
-"""A length is good if the slope there is at most this share of that at the beginning."""
+ENOUGH = 0.7
+"""A length is good if the slope there is at most this share of that at the beginning: at a whole Newton step it nearly
+always is, and the next step needs no better one."""
 LOOKS = 10
 """Lengths that are tried at most."""
 
