@@ -18,9 +18,10 @@ from surgical_marl.physics.cone import Forces, Parting, Stuck, falls, nearest, s
 from surgical_marl.physics.problem import Point, Pressed, Problem
 from surgical_marl.physics.rows import put, row_of
 
-TOLERANCE = 3e-3
-"""Force of a contact that a Newton step did not foresee, as a share of its normal force, at which it is the last one.
-The error that is left in the forces is about as large: what was not foreseen is all that does not balance."""
+TOLERANCE = 5e-3
+"""Force of a contact that a Newton step did not foresee, as a share of the largest normal force on the same object, at
+which it is the last one. The error that is left in the forces is about as large: what was not foreseen is all that does
+not balance."""
 
 
 class End(NamedTuple):
@@ -28,8 +29,11 @@ class End(NamedTuple):
 
     pressed: Pressed
     """What contacts feel, [s]."""
-    foreseen: Array
-    """Whether that is what it would be if contacts were linear from the beginning of the way on, [] bool."""
+    missed: Array
+    """Square of the largest force that a contact of each object feels and would not if contacts were linear from the
+    beginning of the way on, N2; at the end of contacts without an object, [k + 1]."""
+    largest: Array
+    """Largest normal force likewise, N, [k + 1]."""
     slope: Array
     """Of the cost, []."""
     growth: Array
@@ -37,6 +41,10 @@ class End(NamedTuple):
 
     Without contacts it grows, too. So the slope where the way begins is less than minus this.
     """
+
+    def foreseen(self, tolerance: Any) -> Array:
+        """Return whether contacts feel what was foreseen, [] bool, but for a share of the largest force."""
+        return (self.missed <= (tolerance * self.largest) ** 2).all()
 
 
 def look_ahead(problem: Problem, stuck: Stuck, felt: Forces, by: Parting, pressed: Pressed) -> End:
@@ -53,17 +61,22 @@ def look_ahead(problem: Problem, stuck: Stuck, felt: Forces, by: Parting, presse
     def look(n: Array, end: End) -> End:
         springs, here, before, step = row_of((problem.contacts.springs, stuck, felt, by), n)
         found, (normal, friction) = nearest(springs, stretched(springs, here, step)), falls(springs, before, step)
-        missed = before.normal - normal - found.normal, before.friction - friction - found.friction
-        pressed, square = Pressed.of(found), sum(jnp.sum(part * part) for part in missed)
+        ahead, across = before.normal - normal - found.normal, before.friction - friction - found.friction
+        pressed, square = Pressed.of(found), jnp.sum(ahead**2) + jnp.sum(across**2)
+        missed, largest, first = end.missed, end.largest, problem.contacts.at(n).first
+        for number, on in ((first, True), (problem.contacts.second[n], problem.contacts.second[n] < objects)):
+            missed = put(missed, number, jnp.maximum(missed[number], jnp.where(on, square, 0.0)))
+            largest = put(largest, number, jnp.maximum(largest[number], jnp.where(on, pressed.normal, 0.0)))
         return End(
             put(end.pressed, n, pressed),
-            end.foreseen & (square <= TOLERANCE**2 * pressed.normal**2),
-            end.slope + missed[0] @ step.normal + missed[1] @ step.along,
+            missed,
+            largest,
+            end.slope + ahead @ step.normal + across @ step.along,
             end.growth + normal @ step.normal + friction @ step.along,
         )
 
-    none = jnp.float32(0.0)
-    found: End = jax.lax.fori_loop(0, problem.total, look, End(pressed, jnp.bool_(True), none, none))
+    none, each, objects = jnp.float32(0.0), jnp.zeros(len(problem.free) + 1), len(problem.free)
+    found: End = jax.lax.fori_loop(0, problem.total, look, End(pressed, each, each, none, none))
     return found
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from jax import Array
 
 from surgical_marl.physics import elimination
-from surgical_marl.physics.along import look_ahead, set_out, stretch
+from surgical_marl.physics.along import TOLERANCE, look_ahead, set_out, stretch
 from surgical_marl.physics.arms import Arms, Left
 from surgical_marl.physics.cone import Forces, Parting, Stuck, between, curvature, nearest, parting, wrench
 from surgical_marl.physics.factor import packed
@@ -98,7 +98,7 @@ class Newton:
             way = way._replace(arms=jnp.where(touching[:, None], way.arms, 0.0))
             by, whole = self._partings(problem, way), here.ahead(way, jnp.float32(1.0))
             end = look_ahead(problem, base.stuck, base.felt, by, base.pressed)
-            base, settled = base._replace(pressed=end.pressed), end.foreseen
+            base, settled = base._replace(pressed=end.pressed), end.foreseen(TOLERANCE * 2.0 ** jnp.maximum(count - 1, 0))
             good = jnp.abs(end.slope) <= jnp.where(count == 0, FIRST, ENOUGH) * end.growth
             good &= end.growth > LEAST
             if len(problem.between.low):
