@@ -91,3 +91,18 @@ def test_a_length_is_found_where_the_slope_is_small(
 def test_a_slope_that_is_next_to_none_takes_the_whole_way_without_a_look() -> None:
     found = search(jnp.float32(-1e-3), 1e-3, lambda length, seen: (length, length, length), jnp.float32(-1.0))
     assert (float(found.length), int(found.looks), float(found.seen)) == (1.0, 0, -1.0)
+
+
+def test_a_slope_that_is_steep_between_flat_ends_does_not_send_the_search_to_and_fro() -> None:
+    """Where friction of a block on a peg turns round on the way, Newton's steps lead from each end to the other one."""
+    slopes = [-455.5, -409.1, -360.4, -305.4, -230.2, -86.2, 124.6, 243.0, 305.1, 351.3, 392.2]
+    growths = [457.8, 471.3, 508.3, 611.4, 968.4, 2015.5, 1732.0, 789.1, 510.7, 427.4, 396.4]
+
+    def measure(length: jax.Array, seen: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        places = jnp.linspace(0.0, 1.0, len(slopes))
+        return jnp.interp(length, places, jnp.array(slopes)), jnp.interp(length, places, jnp.array(growths)), length
+
+    found = search(jnp.float32(slopes[0]), 0.0, measure, jnp.float32(0.0))
+    slope, *_ = measure(found.length, found.seen)
+    assert abs(float(slope)) <= -ENOUGH * slopes[0]
+    assert int(found.looks) <= 4

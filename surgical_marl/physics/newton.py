@@ -31,9 +31,9 @@ environments (docs/physics.md)."""
 LEAST = 1e-7
 """Fall of the cost in a Newton step, N m/s2, after which none follows: that of a needle of 0.03 g whose acceleration
 changes by 0.06 m/s2."""
-FIRST = 30.0
+FIRST = 3.0
 """Slope at the end of the first Newton step, as a share of what contacts resist along it, up to which it is gone whole.
-A search might find a better place to go on from, but seldom saves a step, and costs as much as half of one."""
+A search might find a better place to go on from, but seldom saves a step."""
 
 
 class _Base(NamedTuple):
@@ -98,7 +98,8 @@ class Newton:
             way = way._replace(arms=jnp.where(touching[:, None], way.arms, 0.0))
             by, whole = self._partings(problem, way), here.ahead(way, jnp.float32(1.0))
             end = look_ahead(problem, base.stuck, base.felt, by, base.pressed)
-            base, settled = base._replace(pressed=end.pressed), end.foreseen(TOLERANCE * 2.0 ** jnp.maximum(count - 1, 0))
+            base = base._replace(pressed=end.pressed)
+            settled = end.foreseen(TOLERANCE * (1 << jnp.maximum(count - 1, 0)))
             good = jnp.abs(end.slope) <= jnp.where(count == 0, FIRST, ENOUGH) * end.growth
             good &= end.growth > LEAST
             if len(problem.between.low):

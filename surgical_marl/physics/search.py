@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-ENOUGH = 0.7
-"""A length is good if the slope there is at most this share of that at the beginning: at a whole Newton step it nearly
-always is, and the next step needs no better one."""
+ENOUGH = 0.3
+"""A length is good if the slope there is at most this share of that at the beginning: the next Newton step needs no
+better one."""
 LOOKS = 10
 """Lengths that are tried at most."""
 
@@ -25,6 +25,8 @@ class _Tried(NamedTuple):
     """The longest that was too short."""
     high: Array
     """The shortest that was too long."""
+    step: Array
+    """How far the next one is from the last one."""
     looks: Array
     """How many there were."""
     done: Array
@@ -35,8 +37,10 @@ class _Tried(NamedTuple):
 def search(begin: Array, least: float, measure: Callable[[Array, Any], tuple[Array, Array, Any]], seen: Any) -> _Tried:
     """Return a length at which the slope of a convex function is small, and what was seen there.
 
-    Newton's method on the slope, within a bracket. The first length is 1. If the slope at the beginning is no more than
-    `least`, that is taken without a look.
+    Newton's method on the slope, within a bracket, which is halved instead where Newton's steps do not become half as
+    long each time: from one flat end of a slope that is steep in the middle they would lead to the other one, and back
+    (W. H. Press et al., "Numerical Recipes", 3rd edition, section 9.4). The first length is 1. If the slope at the
+    beginning is no more than `least`, that is taken without a look.
 
     Args:
         begin: slope at length 0, below 0, [].
@@ -52,11 +56,13 @@ def search(begin: Array, least: float, measure: Callable[[Array, Any], tuple[Arr
         done, short = (jnp.abs(slope) <= -ENOUGH * begin) | (looks >= LOOKS), slope < 0
         low, high = jnp.where(short, tried.length, tried.low), jnp.where(short, tried.high, tried.length)
         length = tried.length - slope / jnp.maximum(growth, 1e-20)
-        length = jnp.where(
-            (length > low) & (length < high), length, jnp.where(high < jnp.inf, (low + high) / 2, 2 * low)
-        )
-        return _Tried(jnp.where(done, tried.length, length), low, high, looks, done, seen)
+        nearer = (jnp.abs(length - tried.length) <= tried.step / 2) | (high == jnp.inf)
+        halved = jnp.where(high < jnp.inf, (low + high) / 2, 2 * low)
+        length = jnp.where((length > low) & (length < high) & nearer, length, halved)
+        step = jnp.abs(length - tried.length)
+        return _Tried(jnp.where(done, tried.length, length), low, high, step, looks, done, seen)
 
-    start = _Tried(jnp.float32(1.0), jnp.float32(0.0), jnp.float32(jnp.inf), jnp.int32(0), -begin <= least, seen)
+    one, none = jnp.float32(1.0), jnp.float32(0.0)
+    start = _Tried(one, none, jnp.float32(jnp.inf), one, jnp.int32(0), -begin <= least, seen)
     found: _Tried = jax.lax.while_loop(lambda tried: ~tried.done, look, start)
     return found
