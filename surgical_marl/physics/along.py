@@ -20,8 +20,8 @@ from surgical_marl.physics.rows import put, row_of
 
 TOLERANCE = 5e-3
 """Force of a contact that a Newton step did not foresee, as a share of the largest normal force on the same object, at
-which it is the last one: this in the first two steps, and then twice as much in each step as in the one before. The
-error that is left in the forces is about as large: what was not foreseen is all that does not balance."""
+which it is the last one. The error that is left in the forces is about as large: what was not foreseen is all that does
+not balance."""
 
 
 class End(NamedTuple):
@@ -42,9 +42,10 @@ class End(NamedTuple):
     Without contacts it grows, too. So the slope where the way begins is less than minus this.
     """
 
-    def foreseen(self, tolerance: Any) -> Array:
-        """Return whether contacts feel what was foreseen, [] bool, but for a share of the largest force."""
-        return (self.missed <= (tolerance * self.largest) ** 2).all()
+    @property
+    def foreseen(self) -> Array:
+        """Whether contacts feel what was foreseen, [] bool."""
+        return (self.missed <= (TOLERANCE * self.largest) ** 2).all()
 
 
 def look_ahead(problem: Problem, stuck: Stuck, felt: Forces, by: Parting, pressed: Pressed) -> End:

@@ -16,7 +16,7 @@ import numpy as np
 from jax import Array
 
 from surgical_marl.physics import elimination
-from surgical_marl.physics.along import TOLERANCE, look_ahead, set_out, stretch
+from surgical_marl.physics.along import look_ahead, set_out, stretch
 from surgical_marl.physics.arms import Arms, Left
 from surgical_marl.physics.cone import Forces, Parting, Stuck, between, curvature, nearest, parting, wrench
 from surgical_marl.physics.factor import packed
@@ -31,7 +31,7 @@ environments (docs/physics.md)."""
 LEAST = 1e-7
 """Fall of the cost in a Newton step, N m/s2, after which none follows: that of a needle of 0.03 g whose acceleration
 changes by 0.06 m/s2."""
-FIRST = 3.0
+FIRST = 10.0
 """Slope at the end of the first Newton step, as a share of what contacts resist along it, up to which it is gone whole.
 A search might find a better place to go on from, but seldom saves a step."""
 
@@ -99,7 +99,7 @@ class Newton:
             by, whole = self._partings(problem, way), here.ahead(way, jnp.float32(1.0))
             end = look_ahead(problem, base.stuck, base.felt, by, base.pressed)
             base = base._replace(pressed=end.pressed)
-            settled = end.foreseen(TOLERANCE * (1 << jnp.maximum(count - 1, 0)))
+            settled = end.foreseen
             good = jnp.abs(end.slope) <= jnp.where(count == 0, FIRST, ENOUGH) * end.growth
             good &= end.growth > LEAST
             if len(problem.between.low):
