@@ -62,7 +62,7 @@ def search(begin: Array, least: float, measure: Callable[[Array, Any], tuple[Arr
         step = jnp.abs(length - tried.length)
         return _Tried(jnp.where(done, tried.length, length), low, high, step, looks, done, seen)
 
-    one, none = jnp.float32(1.0), jnp.float32(0.0)
-    start = _Tried(one, none, jnp.float32(jnp.inf), one, jnp.int32(0), -begin <= least, seen)
+    one, none, far = (jnp.float32(x) for x in (1.0, 0.0, jnp.inf))
+    start = _Tried(one, none, far, far, jnp.int32(0), -begin <= least, seen)
     found: _Tried = jax.lax.while_loop(lambda tried: ~tried.done, look, start)
     return found
