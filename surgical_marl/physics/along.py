@@ -18,7 +18,7 @@ from surgical_marl.physics.cone import Forces, Parting, Stuck, falls, nearest, s
 from surgical_marl.physics.problem import Point, Pressed, Problem
 from surgical_marl.physics.rows import put, row_of
 
-TOLERANCE = 5e-3
+TOLERANCE = 3e-3
 """Force of a contact that a Newton step did not foresee, as a share of the largest normal force on the same object, at
 which it is the last one. The error that is left in the forces is about as large: what was not foreseen is all that does
 not balance."""

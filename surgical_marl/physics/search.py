@@ -37,10 +37,10 @@ class _Tried(NamedTuple):
 def search(begin: Array, least: float, measure: Callable[[Array, Any], tuple[Array, Array, Any]], seen: Any) -> _Tried:
     """Return a length at which the slope of a convex function is small, and what was seen there.
 
-    Newton's method on the slope, within a bracket, which is halved instead where Newton's steps do not become half as
-    long each time: from one flat end of a slope that is steep in the middle they would lead to the other one, and back
-    (W. H. Press et al., "Numerical Recipes", 3rd edition, section 9.4). The first length is 1. If the slope at the
-    beginning is no more than `least`, that is taken without a look.
+    Newton's method on the slope, within a bracket, which is halved instead where a step further is more than half as
+    long as the one before: from one flat end of a slope that is steep in the middle Newton's steps would lead to the
+    other one, and back (W. H. Press et al., "Numerical Recipes", 3rd edition, section 9.4). The first length is 1. If
+    the slope at the beginning is no more than `least`, that is taken without a look.
 
     Args:
         begin: slope at length 0, below 0, [].
@@ -56,7 +56,7 @@ def search(begin: Array, least: float, measure: Callable[[Array, Any], tuple[Arr
         done, short = (jnp.abs(slope) <= -ENOUGH * begin) | (looks >= LOOKS), slope < 0
         low, high = jnp.where(short, tried.length, tried.low), jnp.where(short, tried.high, tried.length)
         length = tried.length - slope / jnp.maximum(growth, 1e-20)
-        nearer = (jnp.abs(length - tried.length) <= tried.step / 2) | (high == jnp.inf)
+        nearer = (jnp.abs(length - tried.length) <= tried.step / 2) | ~short | (high == jnp.inf)
         halved = jnp.where(high < jnp.inf, (low + high) / 2, 2 * low)
         length = jnp.where((length > low) & (length < high) & nearer, length, halved)
         step = jnp.abs(length - tried.length)
