@@ -7,21 +7,52 @@ end is therefore the force that was not foreseen, times the way.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
 from surgical_marl.physics.arms import Arms
-from surgical_marl.physics.cone import Forces, Parting, Stuck, falls, nearest, stretched
-from surgical_marl.physics.problem import Point, Pressed, Problem
-from surgical_marl.physics.rows import put, row_of
+from surgical_marl.physics.cone import Forces, Parting, Stuck, falls, nearest, presses, stretched
+from surgical_marl.physics.problem import Contacts, Point, Pressed, Problem
+from surgical_marl.physics.rows import Listed, put, room, row_of
 
 TOLERANCE = 3e-3
 """Force of a contact that a Newton step did not foresee, as a share of the largest normal force on the same object, at
 which it is the last one. The error that is left in the forces is about as large: what was not foreseen is all that does
 not balance."""
+
+
+class Base(NamedTuple):
+    """What contacts feel where a way begins, [s]."""
+
+    stuck: Stuck
+    felt: Forces
+    pressing: Listed
+    """Which of them press."""
+    pressed: Pressed
+    """What is kept of `felt`, or of what they feel at the end of the way."""
+
+    @classmethod
+    def of(cls, contacts: Contacts) -> Base:
+        """Return what contacts feel without acceleration."""
+        pressed = room(jax.eval_shape(lambda: Pressed.of(row_of(contacts.felt, 0))), len(contacts.second))
+        return cls(contacts.stuck, contacts.felt, contacts.pressing, pressed)
+
+    def ahead(self, problem: Problem, by: Parting, length: Array) -> Base:
+        """Return what they feel at a length of a way, along which they part by so much more."""
+
+        def one(n: Array, base: Base) -> Base:
+            springs, here, more = row_of((problem.contacts.springs, base.stuck, by), n)
+            stuck = stretched(springs, here, _times(length, more))
+            felt = nearest(springs, stuck)
+            stuck, felts, pressed = put((base.stuck, base.felt, base.pressed), n, (stuck, felt, Pressed.of(felt)))
+            return Base(stuck, felts, base.pressing.after(n, presses(felt)), pressed)
+
+        start = self._replace(pressing=self.pressing._replace(length=jnp.int32(0)))
+        found: Base = jax.lax.fori_loop(0, problem.total, one, start)
+        return found
 
 
 class End(NamedTuple):
@@ -48,19 +79,17 @@ class End(NamedTuple):
         return (self.missed <= (TOLERANCE * self.largest) ** 2).all()
 
 
-def look_ahead(problem: Problem, stuck: Stuck, felt: Forces, by: Parting, pressed: Pressed) -> End:
+def look_ahead(problem: Problem, base: Base, by: Parting) -> End:
     """Return what is found at the whole length of a way.
 
     Args:
         problem: whose contacts [s] they are.
-        stuck: forces that would stick where the way begins, [s].
-        felt: forces there, [s].
+        base: what these feel where the way begins.
         by: how much more the bodies of each contact accelerate per length, [s].
-        pressed: room for what contacts feel, [s].
     """
 
     def look(n: Array, end: End) -> End:
-        springs, here, before, step = row_of((problem.contacts.springs, stuck, felt, by), n)
+        springs, here, before, step = row_of((problem.contacts.springs, base.stuck, base.felt, by), n)
         found, (normal, friction) = nearest(springs, stretched(springs, here, step)), falls(springs, before, step)
         ahead, across = before.normal - normal - found.normal, before.friction - friction - found.friction
         pressed, square = Pressed.of(found), jnp.sum(ahead**2) + jnp.sum(across**2)
@@ -77,18 +106,7 @@ def look_ahead(problem: Problem, stuck: Stuck, felt: Forces, by: Parting, presse
         )
 
     none, each, objects = jnp.float32(0.0), jnp.zeros(len(problem.free) + 1), len(problem.free)
-    found: End = jax.lax.fori_loop(0, problem.total, look, End(pressed, each, each, none, none))
-    return found
-
-
-def stretch(problem: Problem, stuck: Stuck, by: Parting, length: Array) -> Stuck:
-    """Return the forces of all contacts that would stick at a length of a way. See `look_ahead`."""
-
-    def one(n: Array, stuck: Stuck) -> Stuck:
-        springs, here, more = row_of((problem.contacts.springs, stuck, by), n)
-        return put(stuck, n, stretched(springs, here, _times(length, more)))
-
-    found: Stuck = jax.lax.fori_loop(0, problem.total, one, stuck)
+    found: End = jax.lax.fori_loop(0, problem.total, look, End(base.pressed, each, each, none, none))
     return found
 
 
@@ -106,28 +124,26 @@ class Along(NamedTuple):
     growth: Array
     """By how much this slope grows per length, []."""
 
-    def measure(
-        self, arms: Arms, problem: Problem, stuck: Stuck
-    ) -> Callable[[Array, Pressed], tuple[Array, Array, Pressed]]:
+    def measure(self, arms: Arms, problem: Problem, stuck: Stuck) -> Callable[[Array], tuple[Array, Array]]:
         """Return what measures the slope of the cost at a length of the way, and by how much it grows per length.
 
-        It also notes what contacts feel there. `stuck` is as for `look_ahead`.
+        `stuck` are the forces of contacts that would stick where the way begins, [s].
         """
         here, way, moves, by, slope, growth = self
 
-        def measure(length: Array, seen: Pressed) -> tuple[Array, Array, Pressed]:
-            def look(n: Array, state: tuple[Array, Array, Pressed]) -> tuple[Array, Array, Pressed]:
-                slope, growth, seen = state
+        def measure(length: Array) -> tuple[Array, Array]:
+            def look(n: Array, sums: tuple[Array, Array]) -> tuple[Array, Array]:
+                slope, growth = sums
                 springs, own_stuck, own = row_of((problem.contacts.springs, stuck, by), n)
                 felt = nearest(springs, stretched(springs, own_stuck, _times(length, own)))
                 normal, friction = falls(springs, felt, own)
                 slope -= felt.normal @ own.normal + felt.friction @ own.along
-                growth += normal @ own.normal + friction @ own.along
-                return slope, growth, put(seen, n, Pressed.of(felt))
+                return slope, growth + normal @ own.normal + friction @ own.along
 
             resists, gives = arms.resisted(problem, moves, here.arms, way.arms, length)
-            start: Any = slope + length * growth + resists, growth + gives, seen
-            return jax.lax.fori_loop(0, problem.total, look, start)
+            start = slope + length * growth + resists, growth + gives
+            found: tuple[Array, Array] = jax.lax.fori_loop(0, problem.total, look, start)
+            return found
 
         return measure
 

@@ -132,11 +132,11 @@ class Bridge:
         slope, growth = slope - state.moved @ moved, growth - moved @ moved
         here = self._own.start + state.ways
 
-        def measure(length: Array, seen: Array) -> tuple[Array, Array, Array]:
+        def measure(length: Array) -> tuple[Array, Array]:
             resists, gives = self._resisted(here, steps, length)
-            return slope + length * growth + resists, growth + gives, seen
+            return slope + length * growth + resists, growth + gives
 
-        return search(begin, 0.0, measure, none).length
+        return search(begin, 0.0, measure).length
 
 
 def _rows(own: Own, way: Array) -> tuple[Rows, Array]:

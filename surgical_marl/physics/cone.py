@@ -109,6 +109,11 @@ def nearest(springs: Springs, stuck: Stuck) -> Forces:
     return Forces(jnp.maximum(raised, 0.0), left * way, amount > 0, way, left / size)
 
 
+def presses(felt: Forces) -> Array:
+    """Return whether a patch presses at any point, [] bool."""
+    return (felt.normal > 0).any()
+
+
 def wrench(cone: Cone, felt: Forces) -> Array:
     """Return the force on the first body and the torque about the origin, [6]."""
     return felt.normal @ cone.normal + felt.friction @ cone.along

@@ -10,11 +10,11 @@ import numpy as np
 from jax import Array
 
 from surgical_marl.physics.bodies import Bodies, conjugate, product, rotation, turn
-from surgical_marl.physics.cone import Cone, Springs, Stuck
+from surgical_marl.physics.cone import Cone, Forces, Springs, Stuck, nearest, presses
 from surgical_marl.physics.patches import AWAY, Patch
 from surgical_marl.physics.placed import Joints
 from surgical_marl.physics.problem import Contact, Contacts, Pressed
-from surgical_marl.physics.rows import filled, picked, put, row_of
+from surgical_marl.physics.rows import Listed, picked, put, room, row_of
 from surgical_marl.physics.tables import Tables
 from surgical_marl.physics.touching import AHEAD, MARGIN, Slots
 from surgical_marl.physics.twists import Twists
@@ -90,6 +90,7 @@ class _Kept(NamedTuple):
     """As in `Contact`."""
     springs: Springs
     stuck: Stuck
+    felt: Forces
     slip: Array
     """As in `Felt`."""
 
@@ -135,21 +136,29 @@ class Handling:
         def bare(n: Array) -> Contact:
             return self._contact(row_of(slots.patch, n), slots.number[n], columns, at[0])
 
-        def one(n: Array) -> _Kept:
+        def one(n: Array) -> tuple[_Kept, Array]:
             patch, number, contact = row_of(slots.patch, n), slots.number[n], bare(n)
             slip = self._slip(patch, number, fingers, at, grips)
             twist = self._twists.of(contact, speeds.joints, speeds.objects)
             motion = self._motion(contact, twist, patch, number, speeds)
             springs, stuck = self._resisting(contact.cone, patch, number, slip, motion, dt)
-            return _Kept(contact.second, springs, stuck, slip)
+            return _Kept(contact.second, springs, stuck, nearest(springs, stuck), slip), contact.arm
 
-        kept: _Kept = filled(one, slots.found, len(slots.number))
+        def note(n: Array, found: tuple[_Kept, Listed, Array]) -> tuple[_Kept, Listed, Array]:
+            kept, pressing, on_arm = found
+            own, arm = one(n)
+            return put(kept, n, own), pressing.after(n, presses(own.felt)), put(on_arm, arm, True)
+
+        s, arms = len(slots.number), len(speeds.joints)
+        start = room(jax.eval_shape(one, jnp.int32(0))[0], s), Listed.none(s), jnp.zeros(arms + 1, bool)
+        kept, pressing, on_arm = jax.lax.fori_loop(0, slots.found, note, start)
 
         def whole(n: Array) -> Contact:
             contact = bare(n)
             return contact._replace(cone=contact.cone._replace(springs=row_of(kept.springs, n)))
 
-        return Felt(Contacts(kept.second, kept.springs, kept.stuck, whole), kept.slip)
+        found = kept.second, kept.springs, kept.stuck, kept.felt, pressing, on_arm[:arms], whole
+        return Felt(Contacts(*found), kept.slip)
 
     def _contact(self, patch: Patch, number: Array, columns: tuple[Array, Array] | None, position: Array) -> Contact:
         """Return a contact that does not resist yet: what it is between, and its directions.

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from surgical_marl.physics.cone import Cone, Forces, Springs, Stuck
+from surgical_marl.physics.rows import Listed
 from surgical_marl.physics.solver import JointRows, Rows
 
 
@@ -55,6 +56,12 @@ class Contacts(NamedTuple):
     """[s]"""
     stuck: Stuck
     """Without acceleration, [s]."""
+    felt: Forces
+    """Without acceleration, [s]."""
+    pressing: Listed
+    """Which of them press, without acceleration."""
+    on_arm: Array
+    """Which arms have contacts, [a] bool."""
     at: Callable[[Array], Contact]
     """Makes one of them by its number, wherever it is needed: that takes less time than to load it from memory."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -49,6 +49,25 @@ def absent(tree: Any) -> Any:
 def room(tree: Any, rows: int) -> Any:
     """Return arrays for `rows` trees like this one, as `absent` does."""
     return absent(jax.tree.map(lambda x: jax.ShapeDtypeStruct((rows, *x.shape), x.dtype), tree))
+
+
+class Listed(NamedTuple):
+    """Some of n numbers."""
+
+    numbers: Array
+    """The first `length` of [n + 1]; what does not belong to the list goes to the last place."""
+    length: Array
+
+    @classmethod
+    def none(cls, most: int) -> Listed:
+        """Return an empty list with room for so many numbers."""
+        return cls(room(jnp.int32(0), most + 1), jnp.int32(0))
+
+    def after(self, number: Array, belongs: Array) -> Listed:
+        """Return the list with one more number if it belongs to it. One that finds no room is only counted."""
+        last = len(self.numbers) - 1
+        place = jnp.where(belongs, jnp.minimum(self.length, last), last)
+        return Listed(put(self.numbers, place, number), self.length + belongs.astype(jnp.int32))
 
 
 def filled(row: Callable[[Array], Any], found: Array, rows: int) -> Any:

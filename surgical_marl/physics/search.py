@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -30,12 +30,10 @@ class _Tried(NamedTuple):
     looks: Array
     """How many there were."""
     done: Array
-    seen: Any
-    """What the last look saw."""
 
 
-def search(begin: Array, least: float, measure: Callable[[Array, Any], tuple[Array, Array, Any]], seen: Any) -> _Tried:
-    """Return a length at which the slope of a convex function is small, and what was seen there.
+def search(begin: Array, least: float, measure: Callable[[Array], tuple[Array, Array]]) -> _Tried:
+    """Return a length at which the slope of a convex function is small.
 
     Newton's method on the slope, within a bracket, which is halved instead where a step further is more than half as
     long as the one before: from one flat end of a slope that is steep in the middle Newton's steps would lead to the
@@ -45,13 +43,11 @@ def search(begin: Array, least: float, measure: Callable[[Array, Any], tuple[Arr
     Args:
         begin: slope at length 0, below 0, [].
         least: size of a slope that counts as none.
-        measure: from a length, and what was seen at the one before, to the slope there, by how much it grows per
-            length, and what is seen.
-        seen: what is seen at length 0.
+        measure: from a length to the slope there, and by how much it grows per length.
     """
 
     def look(tried: _Tried) -> _Tried:
-        slope, growth, seen = measure(tried.length, tried.seen)
+        slope, growth = measure(tried.length)
         looks = tried.looks + 1
         done, short = (jnp.abs(slope) <= -ENOUGH * begin) | (looks >= LOOKS), slope < 0
         low, high = jnp.where(short, tried.length, tried.low), jnp.where(short, tried.high, tried.length)
@@ -60,9 +56,9 @@ def search(begin: Array, least: float, measure: Callable[[Array, Any], tuple[Arr
         halved = jnp.where(high < jnp.inf, (low + high) / 2, 2 * low)
         length = jnp.where((length > low) & (length < high) & nearer, length, halved)
         step = jnp.abs(length - tried.length)
-        return _Tried(jnp.where(done, tried.length, length), low, high, step, looks, done, seen)
+        return _Tried(jnp.where(done, tried.length, length), low, high, step, looks, done)
 
     one, none, far = (jnp.float32(x) for x in (1.0, 0.0, jnp.inf))
-    start = _Tried(one, none, far, far, jnp.int32(0), -begin <= least, seen)
+    start = _Tried(one, none, far, far, jnp.int32(0), -begin <= least)
     found: _Tried = jax.lax.while_loop(lambda tried: ~tried.done, look, start)
     return found

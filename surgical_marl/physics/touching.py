@@ -18,7 +18,7 @@ from surgical_marl.physics.bodies import Bodies
 from surgical_marl.physics.patches import BLEND, TILT, TILT_IN_JAW, Patch, find_patch, no_patch
 from surgical_marl.physics.placed import Ball, Joints, Placed, Places, Way, between_balls
 from surgical_marl.physics.rest import Company, company, moving
-from surgical_marl.physics.rows import put, room, row_of
+from surgical_marl.physics.rows import Listed, put, room, row_of
 from surgical_marl.physics.shapes import Points, Segments, between_segments, on_plate
 from surgical_marl.physics.tables import Meeting, Tables
 from surgical_marl.scenes.object_contacts import SLOTS
@@ -106,8 +106,8 @@ class Finder:
         slots = jax.lax.fori_loop(0, jnp.minimum(count, most), meet, slots)
         return slots._replace(total=slots.total + jnp.maximum(count - most, 0))
 
-    def _near_pairs(self, placed: Placed, meeting: Meeting, awake: Array, most: int) -> tuple[Array, Array]:
-        """Return the numbers of pairs that may touch in the next step, at most so many, and how many they are.
+    def _near_pairs(self, placed: Placed, meeting: Meeting, awake: Array, most: int) -> Listed:
+        """Return the numbers of pairs that may touch in the next step, at most so many.
 
         What the first bodies may meet is gone through for each of them, but not for one that is far from all of it, and
         not for an object at rest. All of them are asked that at once: loops that ask one at a time take ten times as
@@ -118,20 +118,19 @@ class Finder:
         if meeting.first == "objects":
             near &= awake[one[:, 0], None]
 
-        def of_one(found: tuple[Array, Array], row: Any) -> tuple[tuple[Array, Array], None]:
+        def of_one(found: Listed, row: Any) -> tuple[Listed, None]:
             number, i, others, near = row
 
-            def look(found: tuple[Array, Array], partner: Any) -> tuple[tuple[Array, Array], None]:
+            def look(found: Listed, partner: Any) -> tuple[Listed, None]:
                 k, j, near = partner
                 near = jax.lax.cond(near, lambda: self._is_near(placed, meeting, i, j), lambda: jnp.bool_(False))
-                return _listed(found, meeting.partners * number + k, near), None
+                return found.after(meeting.partners * number + k, near), None
 
             partners = jnp.arange(meeting.partners), others, near
             return _if_any(near, lambda found: jax.lax.scan(look, found, partners)[0], found), None
 
         rows = jnp.arange(len(one)), one[:, 0], other, near
-        none = room(jnp.int32(0), most + 1), jnp.int32(0)
-        return _if_any(near, lambda found: jax.lax.scan(of_one, found, rows)[0], none)
+        return _if_any(near, lambda found: jax.lax.scan(of_one, found, rows)[0], Listed.none(most))
 
     def _perhaps_near(self, placed: Placed, meeting: Meeting, one: np.ndarray, other: np.ndarray) -> Array:
         """Return which of bodies `one` [n] may touch each of its partners `other` [n, p] in the next step, [n, p].
@@ -180,26 +179,25 @@ class Finder:
         patch = find_patch(look, count, self._tables.radius.shape[1], middle, axes, _tilt(meeting), torsion, centre)
         return patch, patch.reach > -NEAR
 
-    def _near_capsules(self, placed: Placed, meeting: Meeting, i: Array, j: Array) -> tuple[Array, Array]:
-        """Return the numbers of a body's capsules that may have a part in a patch, and how many they are.
+    def _near_capsules(self, placed: Placed, meeting: Meeting, i: Array, j: Array) -> Listed:
+        """Return the numbers of a body's capsules that may have a part in a patch.
 
         A capsule has none that is farther away than the one that touches by more than tilting can make up for: by the
         angle, times the way from a place of the one to a place of the other.
         """
         c = self._tables.radius.shape[1]
         if meeting.first != "objects" or c == 1:
-            return jnp.zeros(1, jnp.int32), jnp.int32(1)
+            return Listed(jnp.zeros(1, jnp.int32), jnp.int32(1))
         one, other = (row_of(placed.balls[kind], n) for kind, n in (("objects", i), (meeting.second, j)))
         # places between the surfaces of both are that far from each other at most, but for half of their distances
         spread, tilt = 2 * jnp.minimum(one.radius, other.radius), _tilt(meeting)
         reach = (_reach(one, other) + tilt * spread + BLEND) / (1 - tilt)
         gap = self._places.capsule_gap(placed, i, meeting.second, j)
 
-        def look(found: tuple[Array, Array], capsule: Array) -> tuple[tuple[Array, Array], None]:
-            return _listed(found, capsule, gap(capsule) < reach), None
+        def look(found: Listed, capsule: Array) -> tuple[Listed, None]:
+            return found.after(capsule, gap(capsule) < reach), None
 
-        none = room(jnp.int32(0), c + 1), jnp.int32(0)
-        return jax.lax.scan(look, none, jnp.arange(c, dtype=jnp.int32))[0]
+        return jax.lax.scan(look, Listed.none(c), jnp.arange(c, dtype=jnp.int32))[0]
 
     def _touch(self, placed: Placed, kind: str, j: Array) -> tuple[Callable[[Segments], Points], Array]:
         """Return what finds where a capsule may touch a body, [d], and two axes [2, 3] along which they spread."""
@@ -236,17 +234,6 @@ def _tilt(meeting: Meeting) -> float:
 def _if_any(near: Array, change: Callable[[Any], Any], found: Any) -> Any:
     """Return what was found, changed if anything is near."""
     return jax.lax.cond(near.any(), change, lambda found: found, found)
-
-
-def _listed(found: tuple[Array, Array], number: Array, near: Array) -> tuple[Array, Array]:
-    """Return a list of numbers and its length, with one more if it is near.
-
-    What is not goes to the end, where there is room for one more than may be listed. What finds none is only counted.
-    """
-    numbers, count = found
-    last = len(numbers) - 1
-    place = jnp.where(near, jnp.minimum(count, last), last)
-    return put(numbers, place, number), count + near.astype(jnp.int32)
 
 
 def _numbers(meeting: Meeting, pair: Array) -> tuple[Array, Array]:

@@ -1,0 +1,115 @@
+"""Sums over contacts that press: their forces, and by how much these fall with the acceleration of arms and objects."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from surgical_marl.physics.along import Base
+from surgical_marl.physics.cone import Forces, between, curvature, wrench
+from surgical_marl.physics.factor import packed
+from surgical_marl.physics.problem import Contact, Problem
+from surgical_marl.physics.rows import absent, add, put, row_of
+from surgical_marl.physics.twists import moved_cone
+
+_WHOLE = packed(6)
+
+
+class Sums(NamedTuple):
+    """Sums over contacts of a arms with m joints each at most and of k objects, and of one that stands for none."""
+
+    arm_force: Array
+    """[a, m]"""
+    force: Array
+    """On objects, with the rest of what their acceleration takes, [k + 1, 6]."""
+    arm: Array
+    """By how much those on arms fall, lower halves, [a, m (m + 1) / 2]; nothing for an arm on which nothing presses."""
+    object: Array
+    """By how much those on objects do, with their masses, lower halves, [k + 1, 21]."""
+    cross: Array
+    """Of objects with each other: see `elimination.Blocks`."""
+    coupling: Array
+    """Of object o and arm i in row a o + i, [(k + 1) a, 6, m]; nothing where they were not met."""
+    met: Array
+    """Which objects press on which arms, [(k + 1) a] bool."""
+    on_arm: Array
+    """On which arms anything presses, [a] bool."""
+    linked: Array
+    """Whether objects press on each other, [] bool."""
+
+    @classmethod
+    def of(cls, problem: Problem, base: Base, objects: Array) -> Sums:
+        """Return sums over what contacts feel at a base, where objects have these accelerations [k, 6]."""
+
+        def one(i: Array, sums: Sums) -> Sums:
+            n = base.pressing.numbers[i]
+            return sums._and(problem.contacts.at(n), row_of(base.felt, n))
+
+        found: Sums = jax.lax.fori_loop(0, base.pressing.length, one, cls._none(problem, objects))
+        return found
+
+    @classmethod
+    def _none(cls, problem: Problem, objects: Array) -> Sums:
+        """Return sums over no contacts."""
+        (a, m), k = problem.smooth.shape, len(objects)
+        inertia = (problem.masses @ (problem.free - objects)[..., None])[..., 0]
+        seconds = problem.contacts.second
+        linked = ((np.arange(len(seconds)) < problem.total) & (seconds < k)).any() if k > 1 else jnp.bool_(False)
+        return cls(
+            jnp.zeros((a, m)),
+            _with_room(inertia),
+            absent(jax.ShapeDtypeStruct((a, m * (m + 1) // 2), jnp.float32)),
+            _with_room(problem.masses[:, *np.tril_indices(6)]),
+            jax.lax.cond(linked, jnp.zeros_like, absent, jnp.zeros(36 * k * k if k > 1 else 0)),
+            absent(jax.ShapeDtypeStruct(((k + 1) * a, 6, m), jnp.float32)),
+            jnp.zeros((k + 1) * a, bool),
+            jnp.zeros(a, bool),
+            jnp.bool_(False),
+        )
+
+    def _and(self, contact: Contact, felt: Forces) -> Sums:
+        """Return sums with one more contact."""
+        a, k = len(self.arm_force), len(self.force) - 1
+        first, second, cone = contact.first, contact.second, contact.cone
+        pull, stiff = wrench(cone, felt), curvature(cone, felt)
+
+        def on_other(sums: Sums) -> Sums:
+            moved, at = moved_cone(contact), (36 * (k * first + second),)
+            block = jax.lax.dynamic_slice(sums.cross, at, (36,)) + between(cone, moved, felt).ravel()
+            return sums._replace(
+                force=add(sums.force, second, wrench(moved, felt)),
+                object=add(sums.object, second, curvature(moved, felt)),
+                cross=jax.lax.dynamic_update_slice(sums.cross, block, at),
+                linked=jnp.bool_(True),
+            )
+
+        def on_arm(sums: Sums) -> Sums:
+            arm, jacobian = contact.arm, contact.jacobian
+            half = stiff[_WHOLE] @ jacobian
+            first_joint, second_joint = np.tril_indices(jacobian.shape[1])
+            own, pair = jnp.sum(jacobian[:, first_joint] * half[:, second_joint], 0), a * first + arm
+            return sums._replace(
+                arm_force=add(sums.arm_force, arm, jacobian.T @ pull),
+                arm=_begun(sums.arm, arm, own, sums.on_arm),
+                coupling=_begun(sums.coupling, pair, half, sums.met),
+                met=put(sums.met, pair, True),
+                on_arm=put(sums.on_arm, arm, True),
+            )
+
+        sums = jax.lax.cond(second < k, on_other, lambda sums: sums, self) if k > 1 else self
+        sums = sums._replace(force=add(sums.force, first, pull), object=add(sums.object, first, stiff))
+        return jax.lax.cond(contact.arm < a, on_arm, lambda sums: sums, sums) if a else sums
+
+
+def _with_room(each: Array) -> Array:
+    """Return what belongs to objects [k, ...], and room for the one that stands for none, [k + 1, ...]."""
+    return jnp.concatenate([each, absent(jax.ShapeDtypeStruct((1, *each.shape[1:]), each.dtype))])
+
+
+def _begun(sums: Array, i: Array, row: Array, begun: Array) -> Array:
+    """Return sums with more in one row, which begins with it if it was not `begun`."""
+    return put(sums, i, jax.lax.cond(begun[i], lambda: sums[i] + row, lambda: row))
