@@ -197,11 +197,13 @@ def test_threads_wait_for_each_other_only_where_all_come_by(monkeypatch: pytest.
 
     def waits(function: Callable[[Any], Any]) -> list[int]:
         """How many loops are around each place where threads wait."""
-        around, found = [], []
+        around, found, last = [], [], ""
         for line in body(function, np.ones(3, np.float32), vector=False).splitlines():
-            if line == "TOGETHER":
+            if line in ("TOGETHER", "PACE"):
                 assert all(re.match(r"for\(int r\d+=0;r\d+<3;", head) for head in around)
+                assert (line == "PACE") == (bool(around) and last == around[-1]), "only at its top do all blocks wait"
                 found.append(len(around))
+            last = line
             if line.startswith("}"):
                 around.pop()
             if line.endswith("{"):

@@ -32,6 +32,7 @@ _ON_A_CPU = {
     "MAXF(a,b)": "__builtin_fmaxf(a,b)",
     "MINF(a,b)": "__builtin_fminf(a,b)",
     "TOGETHER": "",
+    "PACE": "",
     "FINITE(x)": "(fabsf(x)<SM_INF)",
     "HIDEF(x)": 'asm volatile("":"+x"(x));',
     "BITS(x)": "({float a_=(x);U r_;__builtin_memcpy(&r_,&a_,4);r_;})",

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from surgical_marl.engines.fused import reorder
+from surgical_marl.engines.fused.kernel import multiprocessors
 from surgical_marl.engines.fused.order import Order
 from surgical_marl.engines.fused.preludes import LANES
 from surgical_marl.engines.fused.program import Leaf, Source
@@ -37,8 +38,9 @@ def make_arrays(device: str, source: Source, tables: dict[str, np.ndarray], stri
 class Arrays(ABC):
     """`all` is what `Kernel.launch` takes; columns from `num_envs` on are padding.
 
-    Its last one is `work`, how much the environment in each column had to do. `order` says which environment that is;
-    if it is None, columns are in the order of the environments' numbers.
+    Its last but one is `work`, how much the environment in each column had to do. `order` says which environment that
+    is; if it is None, columns are in the order of the environments' numbers. The last one is `pace`: how many blocks of
+    threads wait for the others, how often all have, and how many multiprocessors there are (`preludes.py`).
     """
 
     device: str
@@ -61,6 +63,7 @@ class Arrays(ABC):
             *(self.warp(buffer) for buffer in self._buffers.values()),
             *(self.warp(constant) for constant in constants),
             self.warp(self.work),
+            self.warp(self.constant(np.array([0, 0, multiprocessors() if self.device == "cuda" else 0], np.int32))),
         ]
 
     @abstractmethod

@@ -160,10 +160,13 @@ class Emitter(ArrayEmitter):
         return len(items) + sum(self._size(inner) for group in groups for inner in self.schedule.inside[group])
 
     def _wait(self, top: int, places: list[int]) -> None:
-        """Let the threads of a block wait for each other before some lines, if there is much to do from `top` on."""
+        """Let threads wait for each other before some lines, if there is much to do from `top` on.
+
+        Those of all blocks do so at the top of a loop, those of one block behind long parts.
+        """
         if is_long(self.lines[top:]):
             for place in reversed(places):
-                self.lines.insert(place, "TOGETHER")
+                self.lines.insert(place, "PACE" if place == top else "TOGETHER")
 
     @contextmanager
     def _kept(self, arrays: Iterable[str], condition: str) -> Iterator[None]:

@@ -125,7 +125,7 @@ def _digest(folders: list[Path]) -> str:
 def _make(name: str, source: str, module: Any, max_registers: int | None = None) -> Any:
     def body(
         state: _reals, counts: _wholes, actions: _reals, outs: _reals, flags: _bytes, reals: _reals, wholes: _wholes,
-        work: _wholes, stride: int, t: int,
+        work: _wholes, pace: _wholes, stride: int, t: int,
     ) -> None: ...  # fmt: skip
 
     body.__qualname__ = body.__name__ = f"body_{name}"
@@ -133,9 +133,9 @@ def _make(name: str, source: str, module: Any, max_registers: int | None = None)
 
     def run(
         state: _reals, counts: _wholes, actions: _reals, outs: _reals, flags: _bytes, reals: _reals, wholes: _wholes,
-        work: _wholes, stride: int, start: int, lanes: int,
+        work: _wholes, pace: _wholes, stride: int, start: int, lanes: int,
     ) -> None:  # fmt: skip
-        body(state, counts, actions, outs, flags, reals, wholes, work, stride, start + wp.tid() * lanes)
+        body(state, counts, actions, outs, flags, reals, wholes, work, pace, stride, start + wp.tid() * lanes)
 
     return wp.kernel(
         run, name=name, module=module, enable_backward=False, grid_stride=False, cuda_max_registers=max_registers

@@ -7,7 +7,11 @@ Division and square root are CUDA's approximate ones, right to two units in the 
 `WORKED` is what there was to do: in its first bits which of the longest branches an environment took, then how much it
 was, as the exponent and twelve more bits of a float. Neighbours in this order go through the same code.
 `TOGETHER` lets the threads of a block wait for each other, so that they find each other's instructions in the cache. It
-stands where all of them come by, behind long branches and loops, and at the top of a loop that all go through.
+stands where all of them come by, behind long branches and loops.
+`PACE` stands at the top of a long loop that all go through, as that over the physics steps of an environment step. If
+there is a multiprocessor for each block (`pace` has their number), all blocks wait for each other there too, since
+multiprocessors share a cache for instructions. Nothing else depends on it, so that none waits for more than `PATIENCE`:
+other programs may keep some blocks from running.
 `FENCE` keeps Clang from moving loads and stores past it, so that it does not compare each with all others of long code.
 """
 
@@ -21,6 +25,8 @@ BRANCHES = 8
 """So many large branches make code long: all threads of a block should be at the same place of it."""
 WAYS = 14
 """Most branches that are told apart. With 17 bits for how much there was to do, they fill an int32."""
+PATIENCE = 2_000_000
+"""Cycles, about 1 ms: a physics step of any group of 32 takes less."""
 STRETCH = 120
 """Statements between two fences. Clang's scheduler took 33 of 50 s for six arms without any, and takes 3 s."""
 
@@ -115,11 +121,20 @@ typedef float F; typedef int I; typedef unsigned int U; typedef bool B;
 #define WORK(n,c) work_+=n;
 #define WAY(n,c) ways_|=1<<n;
 #define TOGETHER __syncthreads();
+#define PACE \
+    if(gridDim.x<=(U)pace.data[2]){ \
+        if(threadIdx.x==0){ \
+            volatile I*gate_=pace.data;I turn_=gate_[1];__threadfence(); \
+            if(atomicAdd(pace.data,1)==(I)gridDim.x-1){gate_[0]=0;__threadfence();gate_[1]=turn_+1;} \
+            else{long long since_=clock64();while(gate_[1]==turn_&&clock64()-since_<PATIENCE);} \
+        } \
+    } \
+    TOGETHER
 #define BITS(x) __float_as_uint(x)
 #define FLOAT(x) __uint_as_float(x)
 """
     + _WORKED
-)
+).replace("PATIENCE", str(PATIENCE))
 
 CPU = (
     f"""
@@ -206,6 +221,7 @@ typedef unsigned char C __attribute__((ext_vector_type(SM_W)));
 #define WORK(n,c) work_+=(c)&SPLATI(n);
 #define WAY(n,c) ways_|=(c)&SPLATI(1<<n);
 #define TOGETHER
+#define PACE
 #define FENCE __atomic_signal_fence(__ATOMIC_SEQ_CST);
 """
     + _WORKED
