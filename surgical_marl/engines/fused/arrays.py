@@ -39,8 +39,8 @@ class Arrays(ABC):
     """`all` is what `Kernel.launch` takes; columns from `num_envs` on are padding.
 
     Its last but one is `work`, how much the environment in each column had to do. `order` says which environment that
-    is; if it is None, columns are in the order of the environments' numbers. The last one is `pace`: how many blocks of
-    threads wait for the others, how often all have, and how many multiprocessors there are (`preludes.py`).
+    is; if it is None, columns are in the order of the environments' numbers. The last one is `pace`, as blocks of
+    threads keep it (`preludes.py`).
     """
 
     device: str

@@ -8,10 +8,11 @@ Division and square root are CUDA's approximate ones, right to two units in the 
 was, as the exponent and twelve more bits of a float. Neighbours in this order go through the same code.
 `TOGETHER` lets the threads of a block wait for each other, so that they find each other's instructions in the cache. It
 stands where all of them come by, behind long branches and loops.
-`PACE` stands at the top of a long loop that all go through, as that over the physics steps of an environment step. If
-there is a multiprocessor for each block (`pace` has their number), all blocks wait for each other there too, since
-multiprocessors share a cache for instructions. Nothing else depends on it, so that none waits for more than `PATIENCE`:
-other programs may keep some blocks from running.
+`PACE` stands at the top of a long loop that all go through, as that over the physics steps of an environment step. All
+blocks wait for each other there too, if there is a multiprocessor for each of them: what these fetch, their neighbours
+find in the caches. Nothing but time depends on it, so none waits for more than `PATIENCE`: other programs may keep some
+blocks from running. `pace` counts all blocks that came by, in 64 bits, and has the number of multiprocessors behind it.
+No fence orders memory, which would empty a cache that blocks need.
 `FENCE` keeps Clang from moving loads and stores past it, so that it does not compare each with all others of long code.
 """
 
@@ -27,6 +28,8 @@ WAYS = 14
 """Most branches that are told apart. With 17 bits for how much there was to do, they fill an int32."""
 PATIENCE = 2_000_000
 """Cycles, about 1 ms: a physics step of any group of 32 takes less."""
+FEW = 64
+"""So many threads in a block at most wait for other blocks. More of them keep a multiprocessor busy while some wait."""
 STRETCH = 120
 """Statements between two fences. Clang's scheduler took 33 of 50 s for six arms without any, and takes 3 s."""
 
@@ -57,7 +60,8 @@ _WORKED = """
 #define WORKED ((ways_<<SPLATI(17))|MAXI(U2I(BITS(I2F(work_))>>SPLATU(11))-SPLATI(520192),SPLATI(0)))
 """  # 520192 is what it would be for a work of 1
 CUDA = (
-    """
+    (
+        """
 typedef float F; typedef int I; typedef unsigned int U; typedef bool B;
 #define SM_INF __int_as_float(0x7f800000)
 #define SM_NAN __int_as_float(0x7fffffff)
@@ -122,19 +126,22 @@ typedef float F; typedef int I; typedef unsigned int U; typedef bool B;
 #define WAY(n,c) ways_|=1<<n;
 #define TOGETHER __syncthreads();
 #define PACE \
-    if(gridDim.x<=(U)pace.data[2]){ \
+    if(gridDim.x<=(U)pace.data[2]&&blockDim.x<=FEW){ \
         if(threadIdx.x==0){ \
-            volatile I*gate_=pace.data;I turn_=gate_[1];__threadfence(); \
-            if(atomicAdd(pace.data,1)==(I)gridDim.x-1){gate_[0]=0;__threadfence();gate_[1]=turn_+1;} \
-            else{long long since_=clock64();while(gate_[1]==turn_&&clock64()-since_<PATIENCE);} \
+            typedef unsigned long long Count;Count*count_=(Count*)pace.data; \
+            Count goal_=(atomicAdd(count_,1ull)/gridDim.x+1)*gridDim.x;long long since_=clock64(); \
+            while(*(volatile Count*)count_<goal_&&clock64()-since_<PATIENCE); \
         } \
     } \
     TOGETHER
 #define BITS(x) __float_as_uint(x)
 #define FLOAT(x) __uint_as_float(x)
 """
-    + _WORKED
-).replace("PATIENCE", str(PATIENCE))
+        + _WORKED
+    )
+    .replace("FEW", str(FEW))
+    .replace("PATIENCE", str(PATIENCE))
+)
 
 CPU = (
     f"""
