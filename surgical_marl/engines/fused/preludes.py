@@ -12,7 +12,6 @@ stands where all of them come by, behind long branches and loops.
 blocks wait for each other there too, if there is a multiprocessor for each of them: what these fetch, their neighbours
 find in the caches. Nothing but time depends on it, so none waits for more than `PATIENCE`: other programs may keep some
 blocks from running. `pace` counts all blocks that came by, in 64 bits, and has the number of multiprocessors behind it.
-No fence orders memory, which would empty a cache that blocks need.
 `FENCE` keeps Clang from moving loads and stores past it, so that it does not compare each with all others of long code.
 """
 
