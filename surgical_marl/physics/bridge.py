@@ -29,11 +29,11 @@ class Own(NamedTuple):
     stiff: Array
     """How forces fall with the acceleration of its joints, without the object: lower half, [a, m (m + 1) / 2]."""
     force: Array
-    """All forces at `start`, but for friction and limits of joints, [a, m]."""
+    """All forces at `here`, but for friction and limits of joints, [a, m]."""
     joints: JointRows
     """Friction and limits of joints, [a, m]."""
-    start: Array
-    """The acceleration that it begins with, [a, m]."""
+    here: Array
+    """The acceleration that ways lead from, [a, m]."""
 
 
 class _State(NamedTuple):
@@ -130,7 +130,7 @@ class Bridge:
         none = jnp.float32(0.0)
         (slope, growth), _ = jax.lax.scan(add, (none, none), (self._own, state.ways, steps))
         slope, growth = slope - state.moved @ moved, growth - moved @ moved
-        here = self._own.start + state.ways
+        here = self._own.here + state.ways
 
         def measure(length: Array) -> tuple[Array, Array]:
             resists, gives = self._resisted(here, steps, length)
@@ -142,7 +142,7 @@ class Bridge:
 def _rows(own: Own, way: Array) -> tuple[Rows, Array]:
     """Return friction and limits of an arm's joints as rows, and their forces at a way if they had no bounds."""
     rows = rows_of(own.joints)
-    return rows, unbounded_forces(rows, own.start + way)
+    return rows, unbounded_forces(rows, own.here + way)
 
 
 def _solved(factor: Array, right: Array) -> Array:
