@@ -59,8 +59,10 @@ _WORKED = """
 #define WORKED ((ways_<<SPLATI(17))|MAXI(U2I(BITS(I2F(work_))>>SPLATU(11))-SPLATI(520192),SPLATI(0)))
 """  # 520192 is what it would be for a work of 1
 CUDA = (
-    (
-        """
+    f"""
+enum {{ FEW = {FEW}, PATIENCE = {PATIENCE} }};
+"""
+    """
 typedef float F; typedef int I; typedef unsigned int U; typedef bool B;
 #define SM_INF __int_as_float(0x7f800000)
 #define SM_NAN __int_as_float(0x7fffffff)
@@ -135,11 +137,7 @@ typedef float F; typedef int I; typedef unsigned int U; typedef bool B;
     TOGETHER
 #define BITS(x) __float_as_uint(x)
 #define FLOAT(x) __uint_as_float(x)
-"""
-        + _WORKED
-    )
-    .replace("FEW", str(FEW))
-    .replace("PATIENCE", str(PATIENCE))
+""" + _WORKED
 )
 
 CPU = (
