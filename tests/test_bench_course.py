@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
@@ -73,6 +75,18 @@ def test_where_a_policy_plays_environments_are_anywhere_in_their_episodes() -> N
     assert np.std(actions[0]["ecm_0"][steps > most / 2] - actions[1]["ecm_0"][steps > most / 2]) > NOISE / 2
     course = make_course(workload)
     assert course.qpos.shape == (DISTINCT, 4) and course.commands.shape[:2] == (LAPS, DISTINCT)
+
+
+def test_arms_that_grasp_are_not_in_the_wall() -> None:
+    """A peg board has a wall between two arms that may stand anywhere. Of 48 such starts two used to be in it."""
+    simulator = Env("peg_transfer", "bimanual_psm_pegs").simulator
+    starts = grasps(simulator.scene, 48, np.random.default_rng(7))
+    assert simulator._objects and (starts.arms > 1).any()
+    tables, begin = simulator._objects.tables, jax.vmap(simulator.at)(jnp.float32(starts.qpos))
+    placed = {"position": jnp.float32(starts.position), "quaternion": jnp.float32(starts.quaternion)}
+    objects = begin.objects._replace(bodies=begin.objects.bodies._replace(**placed))
+    depths = np.asarray(jax.jit(jax.vmap(simulator._objects.depths))(begin._replace(objects=objects)))
+    assert depths[:, tables.owner < tables.arms].max() < 0
 
 
 @pytest.mark.slow

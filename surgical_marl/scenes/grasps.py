@@ -72,7 +72,7 @@ class Jaw:
         self._tip = axes.T @ (tip.xpos - origin), axes.T @ tip.xmat.reshape(3, 3)
 
     def draw(self, name: str, frame: Frame, rng: np.random.Generator) -> Grasp:
-        """Return a random grasp, with the arm anywhere, and the object nowhere in its way.
+        """Return a random grasp, with the arm anywhere, and neither the object nor anything fixed in its way.
 
         Args:
             name: a free object.
@@ -183,13 +183,13 @@ class Jaw:
         return left, right
 
     def _is_free(self, name: str, frame: Frame) -> bool:
-        """Return whether an object touches nothing."""
-        model, prefix = self.scene.model, f"{name}/"
+        """Return whether an object touches nothing, nor this arm any other one, or anything that is fixed."""
+        model, own = self.scene.model, (f"{name}/", f"{self.agent}/")
         self._put(name, frame)
         return all(
             distance(model, self._data, model.geom(one).id, model.geom(other).id) > 0
             for one, other in self._touches
-            if one.startswith(prefix) or other.startswith(prefix)
+            if one.startswith(own) or other.startswith(own)
         )
 
     def _put(self, name: str, frame: Frame) -> None:
