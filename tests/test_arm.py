@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 
 from surgical_marl import list_arms, load_arm
 from surgical_marl.robots.arm import Arm
-from surgical_marl.robots.spec import build_spec
+from surgical_marl.robots.spec import GEAR, build_spec
+from surgical_marl.scenes.timing import TIMESTEP
 
 PSM = load_arm("psm")
 HALF = np.pi / 2
@@ -152,6 +153,28 @@ def test_a_wrist_joint_never_carries_more_than_its_effort(name: str) -> None:
         mujoco.mj_forward(model, data)
         carried = [data.joint(joint).qfrc_actuator[0] for joint in ("wrist_pitch", "wrist_yaw")]
         assert carried == pytest.approx([0.25 * np.sign(pitch), 0.20 * np.sign(yaw)], rel=1e-9)
+
+
+@pytest.mark.parametrize("name", LENGTHS)
+def test_fingers_that_close_on_something_do_not_swing_aside(name: str) -> None:
+    """Both press at full effort and are held open, so their drives are at their limits. A torque pushes them sideways:
+    the gear between them gives way as its stiffness says, where nothing but friction would hold them without it."""
+    arm, push = load_arm(name), 0.01
+    spec = build_spec(arm)
+    spec.option.integrator, spec.option.timestep = mujoco.mjtIntegrator.mjINT_IMPLICITFAST, TIMESTEP
+    model = spec.compile()
+    model.dof_frictionloss[:] = 0
+    data, fingers = mujoco.MjData(model), [model.joint(joint).id for joint in ("jaw_left", "jaw_right")]
+    data.qpos[fingers] = 0.2
+    data.ctrl[:] = data.qpos[model.actuator_trnid[:, 0]] * (model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT)
+    effort = model.jnt_actfrcrange[fingers, 1]
+    data.ctrl[[model.actuator(joint).id for joint in ("jaw_left", "jaw_right")]] = 0.02
+    data.qfrc_applied[fingers] = effort + [push, -push]
+    for _ in range(400):
+        mujoco.mj_step(model, data)
+    assert data.qfrc_actuator[fingers] == pytest.approx(-effort), "they do not press at full effort"
+    left, right = data.qpos[fingers]
+    assert (left - right) / 2 == pytest.approx(push / (2 * GEAR * arm.actuated[-1].drive.stiffness), rel=1e-3)
 
 
 @pytest.mark.parametrize("name", LENGTHS)

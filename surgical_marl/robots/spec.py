@@ -25,6 +25,9 @@ VISUAL_GROUP, COLLISION_GROUP, PAD_GROUP = 2, 3, 4
 SOLREF = (0.005, 1.0)
 """Time constant in s and damping ratio of joint limits and contacts: as stiff as a step of 2.5 ms allows."""
 DEFAULT_RGBA = (0.7, 0.7, 0.72, 1.0)
+GEAR = 5.0
+"""Stiffness and damping of what ties a joint to the one that it mimics, relative to its drive's. Two fingers that close
+on something at their full effort would otherwise swing aside together, as nothing but friction held them."""
 
 
 def build_spec(arm: Arm, control: str = "position", pads: bool = False) -> mujoco.MjSpec:
@@ -77,6 +80,9 @@ def build_spec(arm: Arm, control: str = "position", pads: bool = False) -> mujoc
         _add_actuator(spec, joint.name, joint.drive, joint.effort, mode, _commands(joint, mode))
     for number, cable in enumerate(arm.cables):
         _add_cable(spec, f"cable_{number}", cable, joints, control)
+    for joint in arm.joints:
+        if joint.leader != joint.name:
+            _add_gear(spec, joint)
     return spec
 
 
@@ -120,6 +126,16 @@ def _add_cable(spec: mujoco.MjSpec, name: str, cable: Cable, joints: dict[str, J
     if control != "torque":
         ends = [coefficient * _commands(joints[joint], control) for joint, coefficient in cable.joints.items()]
         _add_actuator(spec, name, cable, cable.effort, control, np.sort(ends).sum(0), mujoco.mjtTrn.mjTRN_TENDON)
+
+
+def _add_gear(spec: mujoco.MjSpec, joint: Joint) -> None:
+    """Add the fixed tendon that ties a joint to the one that it mimics: a spring and a damper, without a limit."""
+    stiffness, damping = ([GEAR * of, 0, 0] for of in (joint.drive.stiffness, joint.drive.damping))
+    tendon = spec.add_tendon(
+        name=f"{joint.name}/gear", stiffness=stiffness, damping=damping, springlength=[joint.offset, joint.offset]
+    )
+    tendon.wrap_joint(joint.name, 1.0)
+    tendon.wrap_joint(joint.leader, -joint.multiplier)
 
 
 def _commands(joint: Joint, control: str) -> np.ndarray:
