@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
+from unittest.mock import patch
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import yaml
 
 from surgical_marl.envs.batch import BatchedEnv
+from surgical_marl.envs.env import Env
+from surgical_marl.physics import together
 from surgical_marl.physics.handling import FASTEST
 from surgical_marl.physics.together import Objects
 from surgical_marl.policies.oracle import oracle
@@ -169,6 +174,36 @@ def test_an_object_slides_where_coulomb_says(tmp_path: Path) -> None:
     np.testing.assert_allclose(way[slides], pulled[slides], atol=0.01)  # less than 1 % of gravity
     assert path.position[..., 2].max() < 0.0012, "what slides is not lifted"
     assert np.abs(way[~slides]).max() < 1e-3
+
+
+def test_what_an_arm_slides_along_a_floor_stays_on_it(tmp_path: Path) -> None:
+    """A sled is pushed as hard as friction resists, so it slides at the same speed all the time. If it counts as held, a
+    step knows that. If not, it takes the sled to be slowed by friction, and its cone lifts it."""
+    own = {"free": False, "stiffness": 1e6, "friction": {"sliding": 0.8, "torsion": 0.0}}
+    feet = [{"sphere": {"radius": 0.001, "position": [x, y, 0]}} for x, y in ((0.01, 0), (-0.01, 0.01), (-0.01, -0.01))]
+    sled = own | {"free": True, "mass": 0.001, "shapes": feet}
+    for name, settings in {"sled": sled, "floor": own | {"shapes": [{"plane": {}}]}}.items():
+        (tmp_path / f"{name}.yaml").write_text(yaml.safe_dump(settings))
+    objects = {"floor": {"object": "floor.yaml"}, "sled": {"object": "sled.yaml", "position": [0.3, 0, 0.001]}}
+    arms = {"psm_0": {"arm": "psm", "position": [0.0, 0.0, 0.25]}}
+    (tmp_path / "slide.yaml").write_text(yaml.safe_dump({"arms": arms, "objects": objects}))
+    simulator, push = Env("reach", str(tmp_path / "slide.yaml")).simulator, np.float32([0.8 * 9.81, 0.0, -9.81])
+    begin = thrown(simulator.home.objects, velocity=simulator.home.objects.bodies.velocity.at[0, 0].set(0.05))
+
+    def slide(held: Any) -> Any:
+        def step(physics: Any, _: None) -> Any:
+            grips = physics.objects.grips
+            objects = physics.objects._replace(grips=grips._replace(held=0 * grips.held + held))
+            physics, _touch = simulator._step(physics._replace(objects=objects), simulator.untouched)
+            return physics, physics.objects.bodies.position[0]
+
+        with patch.object(together, "GRAVITY", push):
+            return jax.lax.scan(step, simulator.home._replace(objects=begin), None, length=200)[1]
+
+    loose, held = np.asarray(jax.jit(jax.vmap(slide))(jnp.float32([0, 1])), float)
+    for way in (loose, held):
+        assert way[-1, 0] - way[0, 0] == pytest.approx(199 * 0.0025 * 0.05, rel=0.1)
+    assert np.ptp(held[:, 2]) < 2e-6 < 2e-5 < np.ptp(loose[:, 2])
 
 
 @pytest.mark.slow

@@ -132,6 +132,7 @@ class Handling:
         speeds = _Speeds(self._twists.by_arm(qvel), self._twists.by_object(bodies.velocity))
         at = self._twists.by_object(bodies.position), self._twists.by_object(bodies.quaternion)
         columns = None if joints is None else joints.columns(jnp.asarray(self.tables.slides), jnp.zeros(3))
+        moved = jnp.append((grips.held > 0).any(1), True)  # objects that arms hold, and arms
 
         def bare(n: Array) -> Contact:
             return self._contact(row_of(slots.patch, n), slots.number[n], columns, at[0])
@@ -141,7 +142,8 @@ class Handling:
             slip = self._slip(patch, number, fingers, at, grips)
             twist = self._twists.of(contact, speeds.joints, speeds.objects)
             motion = self._motion(contact, twist, patch, number, speeds)
-            springs, stuck = self._resisting(contact.cone, patch, number, slip, motion, dt)
+            goes_on = moved[contact.first] & (contact.second >= self.tables.count)
+            springs, stuck = self._resisting(contact.cone, patch, number, slip, motion, goes_on, dt)
             return _Kept(contact.second, springs, stuck, nearest(springs, stuck), slip), contact.arm
 
         def note(n: Array, found: tuple[_Kept, Listed, Array]) -> tuple[_Kept, Listed, Array]:
@@ -185,9 +187,12 @@ class Handling:
         return Contact(cone, first, second, offset, arm, origin, pulls, moving, turning)
 
     def _resisting(
-        self, cone: Cone, patch: Patch, number: Array, slip: Array, motion: _Motion, dt: Any
+        self, cone: Cone, patch: Patch, number: Array, slip: Array, motion: _Motion, goes_on: Array, dt: Any
     ) -> tuple[Springs, Stuck]:
-        """Return the springs, and the forces of springs and dampers at a motion of now, without acceleration."""
+        """Return the springs, and the forces of springs and dampers at a motion of now, without acceleration.
+
+        What `goes_on` is not stopped by friction, as an arm moves it along something fixed.
+        """
         t, points = self.tables, patch.points
         speed = cone.normal @ motion.twist + dt / 2 * jnp.sum(points.normal * motion.bends[:-1], -1)
         reach = points.depth + jnp.clip(-dt * speed, 0.0, AHEAD)
@@ -200,7 +205,7 @@ class Handling:
         # The cone lifts what slides by this speed times a step, as if the surfaces came closer (docs/physics.md). So
         # they part that much faster here, at the speed at which they slide on. Nothing slides for long in a jaw.
         remembers, sliding = self._finger(number) < len(t.fingers), jnp.sqrt(jnp.sum(rubbed * rubbed))
-        slows = coefficient * (STOPS * jnp.maximum(-speed, 0.0) + 9.81 * dt)
+        slows = jnp.where(goes_on, 0.0, coefficient * (STOPS * jnp.maximum(-speed, 0.0) + 9.81 * dt))
         lifts = jnp.where(remembers, 0.0, coefficient * jnp.maximum(sliding - slows, 0.0))
         push = jnp.where(near > 0, k * points.depth - rate * (speed + lifts), AWAY)
         k = SHEAR * stiffness
