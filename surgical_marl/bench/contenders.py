@@ -64,22 +64,24 @@ def _batched(name: str, workload: Workload, course: Course) -> Contender:
     # otherwise all episodes would end in the same step
     batch.steps = give(np.random.default_rng(0).integers(0, batch.max_steps, count, dtype=np.int32))
 
-    physics = make_engine(PhysicsAlone(batch.env), count, name, workload.where)
+    stride = math.gcd(HOLD, workload.decimation)
+    physics = make_engine(PhysicsAlone(batch.env, stride), count, name, workload.where)
     physics.reset(0)
     begin(physics)
-    step_physics = _along(physics, [give(tile(rows, count)) for rows in course.commands])
+    step_physics = _along(physics, [give(tile(rows, count)) for rows in course.commands], HOLD // stride)
     hold = max(1, HOLD // workload.decimation)
     step_env = _through(batch, actions, hold)
-    cycles = _cycle(HOLD * LAPS, 1), _cycle(hold * LAPS, workload.decimation)
+    lap = HOLD // stride * LAPS
+    cycles = _cycle(lap, stride), _cycle(hold * LAPS, workload.decimation)
     if workload.motion == "grasp":  # new episodes have nothing in their jaws
         step_env = _beginning(step_env, partial(begin, batch.engine), cycles[1])
     if workload.motion == "policy":  # what a policy does is not to and fro
-        step_physics = _beginning(step_physics, partial(begin, physics), HOLD * LAPS)
+        step_physics = _beginning(step_physics, partial(begin, physics), lap)
         step_env = _beginning(step_env, partial(begin, batch.engine), hold * LAPS)
     step_physics()  # compiles
     _wait(physics)
     clocks = _clock(step_physics, physics, cycles[0]), _clock(step_env, batch.engine, cycles[1])
-    return Contender(count, workload.where, compile_s, *clocks, bytes_per_env=_bytes_per_env(batch.engine))
+    return Contender(count, workload.where, compile_s, *clocks, stride, _bytes_per_env(batch.engine))
 
 
 def clock_of(batch: BatchedEnv, actions: list[Any]) -> Clock:
@@ -121,14 +123,14 @@ def _through(batch: BatchedEnv, actions: list[Any], hold: int = 1) -> Callable[[
     return step
 
 
-def _along(physics: Engine, commands: list[Any]) -> Callable[[], None]:
-    """Return a function that makes a physics step under the commands of a course, one step further at each call."""
+def _along(physics: Engine, commands: list[Any], hold: int = HOLD) -> Callable[[], None]:
+    """Return a function that steps physics under the commands of a course, each of them for `hold` steps."""
     turn = itertools.count()
 
     def step() -> None:
         now = next(turn)
-        if now % HOLD == 0:
-            physics.write(".physics.ctrl", commands[now // HOLD % LAPS])
+        if now % hold == 0:
+            physics.write(".physics.ctrl", commands[now // hold % LAPS])
         physics.step({})
 
     return step

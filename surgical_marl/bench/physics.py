@@ -1,28 +1,34 @@
-"""A physics step alone as an environment, so that any engine can run it."""
+"""Physics steps alone as an environment, so that any engine can run them."""
 
 from __future__ import annotations
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 
 from surgical_marl.envs.env import Env
 from surgical_marl.envs.state import Carry, State
+from surgical_marl.physics.dynamics import Physics
 from surgical_marl.physics.views import Contacts
 
 
 class PhysicsAlone(Env):
-    """An environment whose step is a physics step alone.
+    """An environment whose step is some physics steps alone.
 
-    The step takes a state and gives the next one and the distances of all pairs that can touch. There is no agent, no
-    reward and no reset. Commands are set by `engine.write(".physics.ctrl", ...)`.
+    The step takes a state and gives the next one, and the distances of all pairs that can touch where it began. There is
+    no agent, no reward and no reset. Commands are set by `engine.write(".physics.ctrl", ...)`.
+
+    Args:
+        env: whose physics it is.
+        steps: physics steps of a step.
     """
 
-    def __init__(self, env: Env) -> None:
+    def __init__(self, env: Env, steps: int = 1) -> None:
         vars(self).update(vars(env))
         self.simulator = env.simulator
-        self.task_name, self.agents, self.decimation = "physics alone", (), 1
+        self.task_name, self.agents, self.decimation = "physics alone", (), steps
         self.parameters = {}
 
     def reset(self, key: Array, episode: Array | int = 0, parameters: Any = None) -> State:
@@ -31,9 +37,15 @@ class PhysicsAlone(Env):
         return bare_state(carry, self.simulator.home_contacts.distance)
 
     def step(self, carry: Carry, actions: dict[str, Array], parameters: Any = None) -> State:
-        """Do one physics step; there are no actions."""
+        """Do the physics steps; there are no actions."""
+        simulator = self.plant.actual(carry.hidden)
         _, distance = self.simulator._look(carry.physics.qpos)
-        physics, _ = self.plant.actual(carry.hidden)._step(carry.physics, self.simulator.untouched, distance)
+        known = distance if self.decimation == 1 else None
+
+        def substep(physics: Physics, _: None) -> tuple[Physics, None]:
+            return simulator._step(physics, self.simulator.untouched, known)[0], None
+
+        physics, _ = jax.lax.scan(substep, carry.physics, None, length=self.decimation)
         return bare_state(carry._replace(physics=physics), distance)
 
     @property
