@@ -169,7 +169,7 @@ def test_fingers_that_close_on_something_do_not_swing_aside(name: str) -> None:
     data.ctrl[:] = data.qpos[model.actuator_trnid[:, 0]] * (model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT)
     effort = model.jnt_actfrcrange[fingers, 1]
     data.ctrl[[model.actuator(joint).id for joint in ("jaw_left", "jaw_right")]] = 0.02
-    data.qfrc_applied[fingers] = effort + [push, -push]
+    data.qfrc_applied[fingers] = effort + np.array([push, -push])
     for _ in range(400):
         mujoco.mj_step(model, data)
     assert data.qfrc_actuator[fingers] == pytest.approx(-effort), "they do not press at full effort"

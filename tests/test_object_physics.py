@@ -177,8 +177,8 @@ def test_an_object_slides_where_coulomb_says(tmp_path: Path) -> None:
 
 
 def test_what_an_arm_slides_along_a_floor_stays_on_it(tmp_path: Path) -> None:
-    """A sled is pushed as hard as friction resists, so it slides at the same speed all the time. If it counts as held, a
-    step knows that. If not, it takes the sled to be slowed by friction, and its cone lifts it."""
+    """A sled is pushed as hard as friction resists, so it slides at the same speed all the time. If it counts as held,
+    a step knows that. If not, it takes the sled to be slowed by friction, and its cone lifts it."""
     own = {"free": False, "stiffness": 1e6, "friction": {"sliding": 0.8, "torsion": 0.0}}
     feet = [{"sphere": {"radius": 0.001, "position": [x, y, 0]}} for x, y in ((0.01, 0), (-0.01, 0.01), (-0.01, -0.01))]
     sled = own | {"free": True, "mass": 0.001, "shapes": feet}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -10,14 +11,19 @@ import pytest
 import torch
 
 from surgical_marl.engines.fused import engine, kernel, order
+from surgical_marl.engines.fused.arrays import make_arrays
+from surgical_marl.engines.fused.emit import Emitter
+from surgical_marl.engines.fused.kernel import BLOCK
 from surgical_marl.engines.fused.load import load_source
-from surgical_marl.engines.fused.order import WORTH
-from surgical_marl.engines.fused.preludes import BRANCHES
+from surgical_marl.engines.fused.order import WORTH, slowest_first
+from surgical_marl.engines.fused.preludes import AMOUNT, BRANCHES
 from surgical_marl.engines.fused.reorder import AT_ONCE, reordered
+from surgical_marl.engines.fused.translate import tables
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.envs.env import Env
 from tests.helpers.actions import random_actions
 from tests.helpers.devices import DEVICES, skip_where_warp_lacks
+from tests.helpers.fused_kernels import gpu_code, make_stores
 
 N = 45  # the last vector of a CPU is not full
 BAD = [2, 30, 44]
@@ -100,7 +106,7 @@ def test_threads_of_a_cpu_get_as_much_to_do(both: list[BatchedEnv]) -> None:
     _, moving = both
     arrays: Any = moving.engine._arrays  # type: ignore[attr-defined]
     arrays.work[:N] = np.arange(N)
-    new = arrays._argsort(2)
+    new = arrays._argsort(2, split=False)
     first, second = new[:24], new[24:40]  # three vectors and two, and what is left over
     assert sorted(new) == list(range(N)) and new[-1] == 0
     assert abs(np.mean(first) - np.mean(second)) < 8 < np.ptp(np.arange(N))
@@ -153,6 +159,36 @@ def test_on_a_cpu_only_arms_with_objects_are_sorted() -> None:
     arms, objects = (load_source(Env("reach", scene), vector=True) for scene in ("trimanual_psm_ecm", "psm_needle"))
     assert not order.sorted_every(arms.bodies.values(), "cpu", 4096, decimation=8)
     assert order.sorted_every(objects.bodies.values(), "cpu", 4096, decimation=8)
+
+
+def test_idle_multiprocessors_take_halves_of_groups() -> None:
+    assert [kernel.split_of(count, 132) for count in (20, 45, 1024, 4096, 4200, 8192)] == [0, 1, 32, 4, 0, 0]
+
+
+def test_the_slowest_groups_come_first_and_stay_as_they_are() -> None:
+    rng, count = np.random.default_rng(0), 5 * BLOCK + 7
+    work = torch.from_numpy((rng.integers(0, 2, count) << 17 | rng.integers(0, AMOUNT, count)).astype(np.int32))
+    before = torch.argsort(work, descending=True)
+    groups = before[: 5 * BLOCK].view(5, BLOCK).clone()
+    after = slowest_first(work, before.clone())
+    assert torch.equal(after[5 * BLOCK :], before[5 * BLOCK :]) and not torch.equal(after, before)
+    slowest = [(work[group] & AMOUNT).max() for group in after[: 5 * BLOCK].view(5, BLOCK)]
+    assert slowest == sorted(slowest, reverse=True)
+    assert {tuple(group.tolist()) for group in after[: 5 * BLOCK].view(5, BLOCK)} == {tuple(g.tolist()) for g in groups}
+
+
+@pytest.mark.parametrize("split", [0, 1, 2])
+def test_every_column_is_run_once_where_groups_are_split(split: int) -> None:
+    """Code as for a GPU, on a CPU: each environment adds 1 to its number."""
+    count = 3 * BLOCK + 5
+    with gpu_code():
+        begin = np.zeros((count, 1), np.float32)
+        graph, stores, layout, leaf, _ = make_stores(lambda x: x + 1, (begin,), in_place=True)
+        made = kernel.compile_kernels({"run": Emitter(graph, stores, vector=False).body()}, "cpu")["run"]
+        arrays = make_arrays("cpu", SimpleNamespace(sizes=layout.sizes), tables(graph), count, count)
+        inputs = [*arrays.all, count, 0, 1, split]
+        kernel.wp.launch(made._kernel, count + split * BLOCK, inputs, device="cpu", block_dim=1)
+    assert np.array_equal(arrays.read(leaf[0], "numpy"), begin + 1)
 
 
 def test_every_multiprocessor_has_a_block_of_long_code() -> None:

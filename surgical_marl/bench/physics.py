@@ -17,8 +17,8 @@ from surgical_marl.physics.views import Contacts
 class PhysicsAlone(Env):
     """An environment whose step is some physics steps alone.
 
-    The step takes a state and gives the next one, and the distances of all pairs that can touch where it began. There is
-    no agent, no reward and no reset. Commands are set by `engine.write(".physics.ctrl", ...)`.
+    The step takes a state and gives the next one, and the distances of all pairs that can touch where it began. There
+    is no agent, no reward and no reset. Commands are set by `engine.write(".physics.ctrl", ...)`.
 
     Args:
         env: whose physics it is.

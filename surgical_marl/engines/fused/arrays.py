@@ -13,7 +13,7 @@ import numpy as np
 
 from surgical_marl.engines.fused import reorder
 from surgical_marl.engines.fused.kernel import multiprocessors
-from surgical_marl.engines.fused.order import Order
+from surgical_marl.engines.fused.order import Order, slowest_first
 from surgical_marl.engines.fused.preludes import LANES
 from surgical_marl.engines.fused.program import Leaf, Source
 from surgical_marl.machine import free_memory
@@ -91,18 +91,19 @@ class Arrays(ABC):
         self._buffers["outs"], self.all[list(_TYPES).index("outs")] = outs, warp
 
     @abstractmethod
-    def _argsort(self, shares: int) -> Any:
-        """Return the columns in the order of what they had to do, most first, for so many threads of a CPU."""
+    def _argsort(self, shares: int, split: bool) -> Any:
+        """Return the columns in the order of what they had to do, most first. The arguments are as above."""
 
-    def sort_columns(self, every: int, shares: int) -> None:
+    def sort_columns(self, every: int, shares: int, split: bool = False) -> None:
         """Sort columns from time to time (`order.py`).
 
         Args:
             every: control steps after which they are sorted.
             shares: threads of a CPU, each of which takes a part of the columns.
+            split: whether the first groups on a GPU are split, so that the slowest ones come first.
         """
         kept = [self.fields(name) for name in _KEPT]
-        self.order = Order(self._numbers, kept, partial(self._argsort, shares), every, self._recording)
+        self.order = Order(self._numbers, kept, partial(self._argsort, shares, split), every, self._recording)
 
     @property
     def envs(self) -> Any:
@@ -180,7 +181,7 @@ class CpuArrays(Arrays):
         # five times as fast as `rows[:, columns]`
         return np.take(rows, self.order.columns, axis=-1) if self.order else rows.copy()
 
-    def _argsort(self, shares: int) -> Any:
+    def _argsort(self, shares: int, split: bool) -> Any:
         new = np.argsort(-self.work[: self.num_envs], kind="stable")
         whole = self.num_envs // LANES * LANES
         vectors = new[:whole].reshape(-1, LANES)
@@ -284,19 +285,21 @@ class CudaArrays(Arrays):
         outs = reorder.reordered(self.fields("outs"), self.order.columns) if self.order else self.fields("outs")
         return self._cut(tree, {"outs": outs, **found}, library)
 
-    def sort_columns(self, every: int, shares: int) -> None:
-        super().sort_columns(every, shares)
+    def sort_columns(self, every: int, shares: int, split: bool = False) -> None:
+        super().sort_columns(every, shares, split)
         reorder.prepare()
 
     def _by_environment(self, rows: Any) -> Any:
         """As in `CpuArrays`."""
         return rows.index_select(1, self.order.columns) if self.order else rows.clone()
 
-    def _argsort(self, shares: int) -> Any:
+    def _argsort(self, shares: int, split: bool) -> Any:
         import torch
 
         # Those with the most to do come first: others run beside them, where they would be waited for at the end.
-        return torch.argsort(self.work[: self.num_envs], descending=True, stable=True)
+        work = self.work[: self.num_envs]
+        new = torch.argsort(work, descending=True, stable=True)
+        return slowest_first(work, new) if split else new
 
     def _recording(self) -> bool:
         import torch

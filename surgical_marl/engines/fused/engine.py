@@ -66,7 +66,7 @@ class FusedEngine:
         if shares == 1:
             self._shares = [(0, num_envs if self.device == "cuda" else self._stride)]
         if every := sorted_every(self.source.bodies.values(), self.device, num_envs, env.decimation):
-            self._arrays.sort_columns(every, shares)
+            self._arrays.sort_columns(every, shares, any(kernel.split for kernel in self._kernels.values()))
         self._pool: ThreadPoolExecutor | None = None
         self._process = 0
         self._stepped = False

@@ -51,7 +51,9 @@ def compile_kernels(
     Warp keeps compiled modules in its cache on disk. `stage` is told if there is none of these bodies.
     """
     cuda = device == "cuda"
-    block = block_of(num_envs, multiprocessors()) if cuda and is_long(bodies.values()) else BLOCK
+    block, split = BLOCK, 0
+    if cuda and is_long(bodies.values()):
+        block, split = block_of(num_envs, multiprocessors()), split_of(num_envs, multiprocessors())
     prelude = CUDA if cuda else CPU
     sources = tuple((name, f"{prelude}\n{body}\n{UNDEFINE}\n") for name, body in bodies.items())
     digest = hashlib.sha256("\0".join(source for _, source in sources).encode()).hexdigest()[:16]
@@ -63,7 +65,7 @@ def compile_kernels(
         if not _folders(module.name):
             stage("compiling the C code")
         module.load(wp.get_device(device), block_dim=WIDE if cuda else 1)
-    return {name: Kernel(kernel, device, block) for name, kernel in made.items()}
+    return {name: Kernel(kernel, device, block, split) for name, kernel in made.items()}
 
 
 def block_of(num_envs: int, multiprocessors: int) -> int:
@@ -72,6 +74,15 @@ def block_of(num_envs: int, multiprocessors: int) -> int:
     Threads of a block find each other's instructions in the cache, and with fewer blocks multiprocessors would be idle.
     """
     return min(WIDE, max(BLOCK, 2 ** round(math.log2(max(num_envs / multiprocessors, 1)))))
+
+
+def split_of(num_envs: int, multiprocessors: int) -> int:
+    """Return how many of the first groups of `BLOCK` environments of long code become two blocks each.
+
+    As many as there are multiprocessors that would be idle. All others wait for the slowest group, and half as many
+    environments go through fewer branches that only some of them take.
+    """
+    return max(0, min(multiprocessors - -(-num_envs // BLOCK), num_envs // BLOCK))
 
 
 @lru_cache(MOST_KEPT)
@@ -133,9 +144,14 @@ def _make(name: str, source: str, module: Any, max_registers: int | None = None)
 
     def run(
         state: _reals, counts: _wholes, actions: _reals, outs: _reals, flags: _bytes, reals: _reals, wholes: _wholes,
-        work: _wholes, pace: _wholes, stride: int, start: int, lanes: int,
+        work: _wholes, pace: _wholes, stride: int, start: int, lanes: int, split: int,
     ) -> None:  # fmt: skip
-        body(state, counts, actions, outs, flags, reals, wholes, work, pace, stride, start + wp.tid() * lanes)
+        i = wp.tid()
+        block = i // BLOCK
+        if block < 2 * split and i % BLOCK >= BLOCK // 2:
+            return  # the first blocks have half as many environments
+        i -= wp.min(block, 2 * split) * (BLOCK // 2)
+        body(state, counts, actions, outs, flags, reals, wholes, work, pace, stride, start + i * lanes)
 
     return wp.kernel(
         run, name=name, module=module, enable_backward=False, grid_stride=False, cuda_max_registers=max_registers
@@ -143,10 +159,10 @@ def _make(name: str, source: str, module: Any, max_registers: int | None = None)
 
 
 class Kernel:
-    """One compiled function."""
+    """One compiled function. `split` of its first groups of environments have two blocks (`split_of`)."""
 
-    def __init__(self, kernel: Any, device: str, block: int) -> None:
-        self._kernel, self._device, self._block = kernel, device, block
+    def __init__(self, kernel: Any, device: str, block: int, split: int = 0) -> None:
+        self._kernel, self._device, self._block, self.split = kernel, device, block, split
 
     def launch(self, arrays: list[Any], stride: int, start: int, count: int) -> None:
         """Run the columns from `start` up to, but without, `start + count`, of `stride`.
@@ -155,10 +171,11 @@ class Kernel:
         """
         inputs = [*arrays, stride, start]
         if self._device == "cpu":
-            wp.launch(self._kernel, -(-count // LANES), [*inputs, LANES], device=self._device, block_dim=1)
+            wp.launch(self._kernel, -(-count // LANES), [*inputs, LANES, 0], device=self._device, block_dim=1)
             return
         # compiled code is the same for blocks of all sizes, but Warp would compile it for each
-        command = wp.launch(self._kernel, count, [*inputs, 1], device="cuda", block_dim=WIDE, record_cmd=True)
+        threads, inputs = count + self.split * BLOCK, [*inputs, 1, self.split]
+        command = wp.launch(self._kernel, threads, inputs, device="cuda", block_dim=WIDE, record_cmd=True)
         command.block_dim = self._block
         command.launch(torch_stream())
 

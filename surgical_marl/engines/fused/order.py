@@ -14,7 +14,7 @@ from collections.abc import Callable, Collection
 from typing import Any
 
 from surgical_marl.engines.fused.kernel import BLOCK, multiprocessors
-from surgical_marl.engines.fused.preludes import LANES, is_long, large_branches
+from surgical_marl.engines.fused.preludes import AMOUNT, LANES, is_long, large_branches
 
 SELDOM, OFTEN = 128, 32
 """Physics steps after which environments are sorted: often where code is long. An environment that begins an
@@ -42,6 +42,20 @@ def sorted_every(code: Collection[str], device: str, num_envs: int, decimation: 
     if branches < WORTH and (device == "cpu" or num_envs <= BLOCK * multiprocessors()):
         return 0
     return control_steps(decimation, OFTEN if is_long(code) else SELDOM)
+
+
+def slowest_first(work: Any, columns: Any) -> Any:
+    """Return columns [N] of a GPU with those groups of a block first in which one had the most to do of all.
+
+    Args:
+        work: what each had to do, torch tensor [N] int32, as kernels note it.
+        columns: in the order of what they had to do, [N]. Within a group that stays.
+    """
+    whole = len(columns) // BLOCK * BLOCK
+    groups = columns[:whole].view(-1, BLOCK)
+    most = (work[groups] & AMOUNT).amax(1)
+    columns[:whole] = groups[most.argsort(descending=True, stable=True)].reshape(-1)
+    return columns
 
 
 class Order:

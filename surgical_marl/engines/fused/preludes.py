@@ -25,6 +25,8 @@ BRANCHES = 8
 """So many large branches make code long: all threads of a block should be at the same place of it."""
 WAYS = 14
 """Most branches that are told apart. With 17 bits for how much there was to do, they fill an int32."""
+AMOUNT = 2**17 - 1
+"""These bits."""
 PATIENCE = 2_000_000
 """Cycles, about 1 ms: a physics step of any group of 32 takes less."""
 FEW = 64
