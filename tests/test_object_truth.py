@@ -125,9 +125,9 @@ def test_a_needle_slides_in_jaws_that_pull_at_it_as_far_as_in_plain_mujoco() -> 
     """Two arms hold a needle, and one draws back until the needle slides in a jaw.
 
     Which jaw it slides in, and when, differs from needle to needle. How much farther apart the jaws are in the end does
-    not: the rest of the way is what the arms give way under friction. In four series of 60 needles they slid 0.85 to
-    0.89 times as far as in C MuJoCo, all of a series together. With 20 % less friction in ours it was 1.50 to 1.60
-    times as far, and with 20 % more 0.51 and 0.66 times.
+    not: the rest of the way is what the arms give way under friction. In four series of 60 needles half of them slid
+    0.89, 0.92, 0.92 and 0.95 times as far as in C MuJoCo, or less. With 20 % less friction in ours it was 1.31 times,
+    and with 20 % more 0.74 times. All of a series together hang by few that slide by millimetres: 0.75 to 0.92 times.
     """
     grasps, begin, held = two_arms_hold(NEEDLES)
     way = np.array([[0, 0, 0, 0, 0, 0, -1], [0.4 * SPEED, 0, -0.4 * SPEED, 0, 0, 0, -1]], np.float32)
@@ -144,5 +144,5 @@ def test_a_needle_slides_in_jaws_that_pull_at_it_as_far_as_in_plain_mujoco() -> 
     of_needle = np.einsum("etaji,etaj->etai", seen.rotation, seen.position)  # from a jaw to the needle, in its axes
     ours = np.linalg.norm(of_needle[:, :, 0] - of_needle[:, :, 1], axis=-1)
     theirs = in_mujoco(grasps, begin, seen.command, held, between)
-    slid, should = (np.mean(far[:, -1] - far[:, 0]) for far in (ours, theirs))
-    assert should > NEAR and 0.75 < slid / should < 1.15, (slid, should)
+    slid, should = (far[:, -1] - far[:, 0] for far in (ours, theirs))
+    assert should.mean() > NEAR and 0.82 < np.median(slid / should) < 1.15, (slid, should)
