@@ -42,6 +42,22 @@ def test_what_is_timed_is_what_c_mujoco_steps() -> None:
     assert np.abs(found[:, -1, 1 : 1 + scene.model.nq] - course.qpos[:rows]).max() > 1e-2, "nothing moved"
 
 
+def test_steps_made_at_once_are_those_made_one_by_one() -> None:
+    """The same commands for as many physics steps, a launch for each step or for all of a control step."""
+    rows, course, found = 8, make_course(Workload(scene="ecm")), []
+    for steps in (1, HOLD):
+        engine = make_engine(PhysicsAlone(Env("reach", "ecm"), steps), rows, "fused", "cpu")
+        engine.reset(0)
+        engine.write(".physics.qpos", course.qpos[:rows])
+        engine.write(".physics.qvel", course.qvel[:rows])
+        step = contenders._along(engine, [command[:rows] for command in course.commands], HOLD // steps)
+        for _ in range(2 * HOLD // steps):
+            step()
+        found.append(engine.read(".physics.qpos", "numpy"))
+    np.testing.assert_allclose(*found, atol=1e-6)
+    assert np.abs(found[0] - course.qpos[:rows]).max() > 1e-3, "nothing moved"
+
+
 @pytest.mark.parametrize("motion", ["random", "rough"])
 def test_a_course_takes_back_what_it_did(motion: str) -> None:
     course = make_course(Workload(scene="ecm", motion=motion))
