@@ -163,8 +163,8 @@ def test_fingers_that_close_on_something_do_not_swing_aside(name: str) -> None:
     spec = build_spec(arm)
     spec.option.integrator, spec.option.timestep = mujoco.mjtIntegrator.mjINT_IMPLICITFAST, TIMESTEP
     model = spec.compile()
-    model.dof_frictionloss[:] = 0
     data, fingers = mujoco.MjData(model), [model.joint(joint).id for joint in ("jaw_left", "jaw_right")]
+    model.dof_frictionloss[:], model.dof_damping[fingers] = 0, 0.1  # so that they come to rest where forces balance
     data.qpos[fingers] = 0.2
     data.ctrl[:] = data.qpos[model.actuator_trnid[:, 0]] * (model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT)
     effort = model.jnt_actfrcrange[fingers, 1]

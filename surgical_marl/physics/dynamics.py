@@ -116,7 +116,7 @@ class Dynamics:
         )
 
     def _damping(self, data: Any) -> Array:
-        """Return the damping matrix [n, n] of joints, tendons and actuators, but for actuators at their effort limit.
+        """Return the damping matrix [n, n] of joints and actuators, without actuators at their effort limit.
 
         An actuator at its effort limit can't damp any more, so its damping is left out, as in C MuJoCo. `mjx.step`
         keeps it, which would slow each joint that moves at full effort.
@@ -125,9 +125,8 @@ class Dynamics:
         low, high = model.actuator_forcerange[:, 0], model.actuator_forcerange[:, 1]
         saturated = (data.actuator_force <= low) | (data.actuator_force >= high)
         own = jnp.where(saturated, 0.0, -model.actuator_biasprm[:, 2])
-        moment, gears = _internal(data).actuator_moment, _internal(data).ten_J
-        damping = moment.T @ (own[:, None] * moment) + gears.T @ (model.tendon_damping[:, None] * gears)
-        return damping + jnp.diag(model.dof_damping)
+        moment = _internal(data).actuator_moment
+        return moment.T @ (own[:, None] * moment) + jnp.diag(model.dof_damping)
 
     def contact_rows(self, jacobian: Array, distance: Array, weight: Array, qvel: Array) -> Rows:
         """Return rows of frictionless contacts (condim 1) along normals: jacobian [k, n], distance and weight [k]."""

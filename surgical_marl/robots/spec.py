@@ -26,8 +26,9 @@ SOLREF = (0.005, 1.0)
 """Time constant in s and damping ratio of joint limits and contacts: as stiff as a step of 2.5 ms allows."""
 DEFAULT_RGBA = (0.7, 0.7, 0.72, 1.0)
 GEAR = 5.0
-"""Stiffness and damping of what ties a joint to the one that it mimics, relative to its drive's. Two fingers that close
-on something at their full effort would otherwise swing aside together, as nothing but friction held them."""
+"""Stiffness of what ties a joint to the one that it mimics, relative to its drive's. Two fingers that close on
+something at their full effort would otherwise swing aside together, as nothing but friction held them. There is no
+damper: `implicitfast` leaves out what couples joints of two branches, and would damp both fingers alike."""
 
 
 def build_spec(arm: Arm, control: str = "position", pads: bool = False) -> mujoco.MjSpec:
@@ -129,11 +130,9 @@ def _add_cable(spec: mujoco.MjSpec, name: str, cable: Cable, joints: dict[str, J
 
 
 def _add_gear(spec: mujoco.MjSpec, joint: Joint) -> None:
-    """Add the fixed tendon that ties a joint to the one that it mimics: a spring and a damper, without a limit."""
-    stiffness, damping = ([GEAR * of, 0, 0] for of in (joint.drive.stiffness, joint.drive.damping))
-    tendon = spec.add_tendon(
-        name=f"{joint.name}/gear", stiffness=stiffness, damping=damping, springlength=[joint.offset, joint.offset]
-    )
+    """Add the fixed tendon that ties a joint to the one that it mimics: a spring without a limit."""
+    stiffness, length = [GEAR * joint.drive.stiffness, 0, 0], [joint.offset, joint.offset]
+    tendon = spec.add_tendon(name=f"{joint.name}/gear", stiffness=stiffness, springlength=length)
     tendon.wrap_joint(joint.name, 1.0)
     tendon.wrap_joint(joint.leader, -joint.multiplier)
 

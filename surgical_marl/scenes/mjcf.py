@@ -194,8 +194,7 @@ def _add_actuators(root: Element, model: mujoco.MjModel) -> None:
     tendons = _add(root, "tendon")
     for i in range(model.ntendon):
         fixed = _add(tendons, "fixed", name=model.tendon(i).name, armature=model.tendon_armature[i],
-                     stiffness=model.tendon_stiffness[i], damping=model.tendon_damping[i],
-                     springlength=model.tendon_lengthspring[i])  # fmt: skip
+                     stiffness=model.tendon_stiffness[i], springlength=model.tendon_lengthspring[i])  # fmt: skip
         for wrap in range(model.tendon_adr[i], model.tendon_adr[i] + model.tendon_num[i]):
             _add(fixed, "joint", joint=model.joint(model.wrap_objid[wrap]).name, coef=model.wrap_prm[wrap])
     actuators = _add(root, "actuator")
