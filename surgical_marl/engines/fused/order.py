@@ -45,7 +45,7 @@ def sorted_every(code: Collection[str], device: str, num_envs: int, decimation: 
 
 
 def slowest_first(work: Any, columns: Any) -> Any:
-    """Return columns [N] of a GPU with those groups of a block first in which one had the most to do of all.
+    """Return columns [N] of a GPU, in groups of `BLOCK`, by the most that one of a group had to do: most first.
 
     Args:
         work: what each had to do, torch tensor [N] int32, as kernels note it.
