@@ -26,7 +26,7 @@ BRANCHES = 8
 WAYS = 14
 """Most branches that are told apart. With 17 bits for how much there was to do, they fill an int32."""
 AMOUNT = 2**17 - 1
-"""These bits."""
+"""The bits of `work` that say how much there was to do."""
 PATIENCE = 2_000_000
 """Cycles, about 1 ms: a physics step of any group of 32 takes less."""
 FEW = 64
