@@ -120,19 +120,26 @@ def test_on_a_gpu_mujoco_warp_stands_beside_c_mujoco(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("scene", "motion", "near"), [("ecm", "random", 1e-5), ("psm_needle", "grasp", 0.01)])
-def test_mujoco_warp_steps_as_c_mujoco_does(scene: str, motion: Any, near: float) -> None:
-    """A lap of a course, on a CPU: joints, and where objects are."""
-    workload = Workload(scene=scene, motion=motion, num_envs=3, device="cpu")
+@pytest.mark.parametrize(
+    ("scene", "motion", "count", "near", "nearest"),
+    [("ecm", "random", 3, 1e-5, 1e-5), ("psm_needle", "grasp", 16, 0.03, 0.005)],
+)
+def test_mujoco_warp_steps_as_c_mujoco_does(scene: str, motion: Any, count: int, near: float, nearest: float) -> None:
+    """A lap of a course, on a CPU: joints, and where objects are.
+
+    Single precision turns a needle that slides in a jaw by some mrad in a lap, so `nearest` is asked of three quarters.
+    """
+    workload = Workload(scene=scene, motion=motion, num_envs=count, device="cpu")
     course = make_course(workload)
     prepare_mjx()
     model, states = rivals._exported(workload, course)
-    controls = rivals._controls(course)[:3]
-    contacts, rows = rivals._most(model, states[:3], controls)
+    controls = rivals._controls(course)[:count]
+    contacts, rows = rivals._most(model, states[:count], controls)
     _, _, data, short = rivals._warp_lap(prepare_warp(), workload, course, model, states, contacts, rows)
-    found, _ = rollout.rollout(model, mujoco.MjData(model), states[:3], controls)
+    found, _ = rollout.rollout(model, mujoco.MjData(model), states[:count], controls)
     assert not short
-    np.testing.assert_allclose(data.qpos.numpy(), found[:, -1, 1 : 1 + model.nq], atol=near)
+    apart = np.abs(data.qpos.numpy() - found[:, -1, 1 : 1 + model.nq]).max(1)
+    assert apart.max() < near and np.quantile(apart, 0.75) < nearest
     *_, short = rivals._warp_lap(prepare_warp(), workload, course, model, states, 0, -6)
     assert short, "one row is not enough, and it did not say so"
 
