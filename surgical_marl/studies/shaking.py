@@ -103,6 +103,14 @@ class Watched(Env):
         carry = carry._replace(physics=physics)
         return self._state(carry, self._look(carry)._replace(overlap=overlap, struck=struck))
 
+    @property
+    def fingers(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the numbers of the two fingers of each arm, [a, 2], and those of their bodies in the scene's model."""
+        assert self.simulator._objects
+        tables = self.simulator._objects.tables
+        fingers = np.array([tables.jaws[arm] for arm in range(tables.arms)])
+        return fingers, tables.bodies["pads"][fingers]
+
     def _depths(self, physics: Physics) -> tuple[Array, Array]:
         """Return how deep objects overlap with fingers, and how deep with other parts of arms, m."""
         together = self.simulator._objects
@@ -114,10 +122,9 @@ class Watched(Env):
     def _look(self, carry: Carry) -> Seen:
         together, physics, held = self.simulator._objects, carry.physics, carry.goal
         assert together
-        bodies, tables = physics.objects.bodies, together.tables
+        bodies = physics.objects.bodies
         data, axes, place = self.simulator._together.pose(physics.qpos), rotation(bodies.quaternion), bodies.position
-        fingers = np.array([tables.jaws[arm] for arm in range(tables.arms)])
-        links = tables.bodies["pads"][fingers]
+        fingers, links = self.fingers
         along, down = (data.xmat[links][..., axis].sum(1) for axis in (1, 2))
         along, down = (way / jnp.sqrt(jnp.sum(way * way, -1, keepdims=True)) for way in (along, down))
         frames = jnp.stack([jnp.cross(along, down), along, down], -2)
@@ -153,6 +160,8 @@ class Grasps:
         self._env = env_of(objects, arms)
         self.scene, self.simulator = self._env.scene, self._env.simulator
         self.names, self.agents = tuple(self.scene.objects), self.scene.agents
+        self.fingers = self._env.fingers[1]
+        """The two fingers of each arm, by the numbers of their bodies in the scene's model, [a, 2]."""
         self._jaws = [Jaw(self.scene, agent) for agent in self.agents]
         self._engine = lru_cache(1)(self._make_engine)
 
