@@ -59,7 +59,7 @@ class Course(NamedTuple):
         return {f".physics.{name}{path}": v for name, tree in start.items() for path, v in _leaves(tree).items()}
 
 
-def make_course(workload: Workload, seed: int = 0) -> Course:
+def make_course(workload: Workload) -> Course:
     """Draw a course: every environment moves from home by random actions of its own, then to and fro.
 
     C MuJoCo moves the arms. The states therefore come from none of this package's own engines. Only where there are
@@ -75,7 +75,7 @@ def make_course(workload: Workload, seed: int = 0) -> Course:
 
     player = policy_of(workload) if workload.motion == "policy" else None  # refused before anything is compiled
     scene = load_scene(workload.scene, workload.control)
-    rng, n = np.random.default_rng(seed), min(workload.distinct, max(workload.count, DISTINCT))
+    rng, n = np.random.default_rng(workload.seed), min(workload.distinct, max(workload.count, DISTINCT))
     simulator = Simulator(scene, HOLD)
     command = jax.jit(jax.vmap(simulator.command))
     roll = _by_engine(workload, n) if scene.objects else partial(_by_mujoco, scene.model)

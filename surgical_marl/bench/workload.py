@@ -38,6 +38,7 @@ class Workload(Options):
     )
 
     distinct: int = number(DISTINCT, 1, 2**24, "environments that differ; a larger batch repeats them")
+    seed: int = number(0, 0, 2**31 - 1, "of the random numbers behind their states and actions")
 
     def __post_init__(self) -> None:
         super().__post_init__()
