@@ -17,7 +17,7 @@ from surgical_marl.physics.problem import Contact, Contacts, Pressed
 from surgical_marl.physics.rows import Listed, picked, put, room, row_of
 from surgical_marl.physics.tables import Tables
 from surgical_marl.physics.touching import AHEAD, MARGIN, Slots
-from surgical_marl.physics.twists import Twists
+from surgical_marl.physics.twists import Twists, bends
 
 DAMPING = 5e-3
 """Damping of a contact in the normal direction, s: this times its stiffness, N s/m."""
@@ -218,14 +218,14 @@ class Handling:
         """Return how the two bodies of a contact move relative to each other now, with a twist [6]."""
         t, places = self.tables, jnp.concatenate([patch.points.place, patch.centre[None]]) - contact.origin
         spin = speeds.objects[contact.first][3:]
-        bends = jnp.cross(spin, jnp.cross(spin, places))
+        bend = jnp.cross(spin, jnp.cross(spin, places))
         if t.count > 1:
             spin = speeds.objects[contact.second][3:]
-            bends -= jnp.cross(spin, jnp.cross(spin, places - contact.offset))
+            bend -= jnp.cross(spin, jnp.cross(spin, places - contact.offset))
         if len(speeds.joints):
             columns = contact.jacobian * speeds.joints.at[contact.arm].get(mode="clip")
-            bends += jnp.asarray(t.sign)[number] * _bends(columns, places)
-        return _Motion(twist, bends)
+            bend += jnp.asarray(t.sign)[number] * bends(columns, places)
+        return _Motion(twist, bend)
 
     def _finger(self, number: Array) -> Array:
         """Return the finger that a patch is on, []."""
@@ -326,22 +326,6 @@ class Handling:
                 opposite = jnp.sum(normal[o, one] * normal[o, other]) <= -OPPOSITE
                 held = held.at[o, a].set(jnp.where(presses & opposite, held[o, a] + dt, 0.0))
         return held
-
-
-def _bends(columns: Array, places: Array) -> Array:
-    """Return the acceleration of places on a link whose joints do not accelerate, m/s2, [n, 3].
-
-    `columns` [6, m] are the twists that its joints, one after the other, give it about the origin of the places: each
-    joint is moved by those before it (R. Featherstone, "Rigid Body Dynamics Algorithms", 2008, section 2.8).
-    """
-    moving, turning = columns[:3].T, columns[3:].T
-    lift = spin = straight = curved = jnp.zeros(3)
-    for move, turn_ in zip(moving, turning, strict=True):
-        straight = straight + jnp.cross(spin, move) + jnp.cross(lift, turn_)
-        curved = curved + jnp.cross(spin, turn_)
-        lift, spin = lift + move, spin + turn_
-    straight = straight + jnp.cross(spin, lift)
-    return straight + jnp.cross(curved, places) + jnp.cross(spin, jnp.cross(spin, places))
 
 
 def _of_finger(grips: Grips, o: Array, f: Array) -> tuple[Array, Array, Array, Array]:

@@ -37,6 +37,22 @@ class Twists:
         return jnp.concatenate([each, jnp.zeros((1, *each.shape[1:]))])
 
 
+def bends(columns: Array, places: Array) -> Array:
+    """Return the acceleration of places on a link whose joints do not accelerate, m/s2, [n, 3].
+
+    `columns` [6, m] are the twists that its joints, one after the other, give it about the origin of the places: each
+    joint is moved by those before it (R. Featherstone, "Rigid Body Dynamics Algorithms", 2008, section 2.8).
+    """
+    moving, turning = columns[:3].T, columns[3:].T
+    lift = spin = straight = curved = jnp.zeros(3)
+    for move, turn_ in zip(moving, turning, strict=True):
+        straight = straight + jnp.cross(spin, move) + jnp.cross(lift, turn_)
+        curved = curved + jnp.cross(spin, turn_)
+        lift, spin = lift + move, spin + turn_
+    straight = straight + jnp.cross(spin, lift)
+    return straight + jnp.cross(curved, places) + jnp.cross(spin, jnp.cross(spin, places))
+
+
 def moved_cone(contact: Contact) -> Cone:
     """Return the cone with its twists at the centre of mass of the other object, and as that one feels it.
 

@@ -23,9 +23,11 @@ LANES = 8
 """Environments in a vector on a CPU: 32 bytes of float32, an AVX register, and what `gatherd_d256` loads at once."""
 BRANCHES = 8
 """So many large branches make code long: all threads of a block should be at the same place of it."""
-WAYS = 14
-"""Most branches that are told apart. With 17 bits for how much there was to do, they fill an int32."""
-AMOUNT = 2**17 - 1
+AMOUNT_BITS = 17
+"""Of `work`, for how much there was to do."""
+WAYS = 31 - AMOUNT_BITS
+"""Most branches that are told apart: the other bits of an int32, but for its sign."""
+AMOUNT = 2**AMOUNT_BITS - 1
 """The bits of `work` that say how much there was to do."""
 PATIENCE = 2_000_000
 """Cycles, about 1 ms: a physics step of any group of 32 takes less."""
@@ -57,8 +59,8 @@ def is_long(code: Iterable[str]) -> bool:
     return large_branches(code) >= BRANCHES
 
 
-_WORKED = """
-#define WORKED ((ways_<<SPLATI(17))|MAXI(U2I(BITS(I2F(work_))>>SPLATU(11))-SPLATI(520192),SPLATI(0)))
+_WORKED = f"""
+#define WORKED ((ways_<<SPLATI({AMOUNT_BITS}))|MAXI(U2I(BITS(I2F(work_))>>SPLATU(11))-SPLATI(520192),SPLATI(0)))
 """  # 520192 is what it would be for a work of 1
 CUDA = (
     f"""
