@@ -73,7 +73,7 @@ def hold(
 ) -> Held:
     """Return how `count` random grasps of an object hold.
 
-    `share` is that of `Grasps.pull`. With `mujoco` C MuJoCo plays the grasps that dropped the object, 4 s for each.
+    `share` is that of `Grasps.pull`. With `mujoco` C MuJoCo plays the grasps that dropped it, too.
     """
     parts, jaws, size = [], Grasps([name], arms), min(BATCH, count)
     for seed in range(first, first - (-count // size)):
