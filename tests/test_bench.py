@@ -121,13 +121,14 @@ def test_on_a_gpu_mujoco_warp_stands_beside_c_mujoco(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("scene", "motion", "count", "near", "nearest"),
-    [("ecm", "random", 3, 1e-5, 1e-5), ("psm_needle", "grasp", 16, 0.03, 0.005)],
+    ("scene", "motion", "count", "near", "share"),
+    [("ecm", "random", 3, 1e-5, 1.0), ("psm_needle", "grasp", 16, 0.01, 0.9)],
 )
-def test_mujoco_warp_steps_as_c_mujoco_does(scene: str, motion: Any, count: int, near: float, nearest: float) -> None:
+def test_mujoco_warp_steps_as_c_mujoco_does(scene: str, motion: Any, count: int, near: float, share: float) -> None:
     """A lap of a course, on a CPU: joints, and where objects are.
 
-    Single precision turns a needle that slides in a jaw by some mrad in a lap, so `nearest` is asked of three quarters.
+    Single precision turns needles that slide in a jaw by some mrad in a lap, and one of 16 by 15 mrad. So the bound is
+    asked of nine tenths of them, half of it of three quarters, and twice as much of all.
     """
     workload = Workload(scene=scene, motion=motion, num_envs=count, device="cpu")
     course = make_course(workload)
@@ -139,7 +140,7 @@ def test_mujoco_warp_steps_as_c_mujoco_does(scene: str, motion: Any, count: int,
     found, _ = rollout.rollout(model, mujoco.MjData(model), states[:count], controls)
     assert not short
     apart = np.abs(data.qpos.numpy() - found[:, -1, 1 : 1 + model.nq]).max(1)
-    assert apart.max() < near and np.quantile(apart, 0.75) < nearest
+    assert apart.max() < 2 * near and np.quantile(apart, share) < near and np.quantile(apart, 0.75) < near / 2
     *_, short = rivals._warp_lap(prepare_warp(), workload, course, model, states, 0, -6)
     assert short, "one row is not enough, and it did not say so"
 

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from surgical_marl.studies import plain_mujoco
-from surgical_marl.studies.plain_mujoco import in_jaws
 from surgical_marl.studies.shaking import CHUNK, CLOSING, OBJECTS, Grasps, Seen
 
 SPEED = 0.5
@@ -46,7 +45,7 @@ def test_plain_mujoco_says_where_an_object_is_in_both_jaws_that_hold_it() -> Non
     """By which `studies.grasping --mujoco` tells whether it was dropped."""
     grasps, begin, held = two_arms_hold(4)
     _, seen = played(grasps, begin, [np.array([[0, 0, 0, 0, 0, 0, -1]] * 2, np.float32)], held)
-    np.testing.assert_allclose(in_jaws(grasps, begin, seen.command, held), seen.position, atol=NEAR)
+    np.testing.assert_allclose(plain_mujoco.play_in_jaws(grasps, begin, seen.command, held), seen.position, atol=NEAR)
 
 
 def two_arms_hold(count: int) -> tuple[Grasps, Any, np.ndarray]:
@@ -96,10 +95,9 @@ def test_a_needle_slides_in_jaws_that_pull_at_it_as_far_as_in_plain_mujoco() -> 
     grasps, begin, held = two_arms_hold(NEEDLES)
     way = np.array([[0, 0, 0, 0, 0, 0, -1], [0.4 * SPEED, 0, -0.4 * SPEED, 0, 0, 0, -1]], np.float32)
     _, seen = played(grasps, begin, [way], held)
-    fingers = [[grasps.scene.model.body(body).name for body in jaw] for jaw in grasps.fingers]
 
     def between(data: mujoco.MjData, _: str) -> Any:
-        first, second = (np.mean([data.body(name).xpos for name in jaw], 0) for jaw in fingers)
+        first, second = (np.mean([data.body(name).xpos for name in jaw], 0) for jaw in grasps.fingers)
         return np.linalg.norm(first - second)
 
     of_needle = np.einsum("etaji,etaj->etai", seen.rotation, seen.position)  # from a jaw to the needle, in its axes

@@ -16,7 +16,7 @@ import numpy as np
 
 from surgical_marl.cli.flags import whole
 from surgical_marl.studies.command import make_parser, run
-from surgical_marl.studies.plain_mujoco import in_jaws
+from surgical_marl.studies.plain_mujoco import play_in_jaws
 from surgical_marl.studies.shaking import CHUNK, CLOSING, OBJECTS, Grasps, Seen
 
 SLIP, TURN = 2e-4, np.radians(1.0)
@@ -82,7 +82,7 @@ def hold(
         parts.append(judge(seen))
         if mujoco and (which := np.flatnonzero(parts[-1].dropped)).size:
             begin = jax.tree.map(lambda x, which=which: np.asarray(x)[which], jaws.begin(held, seed))
-            place = in_jaws(jaws, begin, seen.command[which], held[which])[:, CLOSING * CHUNK - 1 :]
+            place = play_in_jaws(jaws, begin, seen.command[which], held[which])[:, CLOSING * CHUNK - 1 :]
             far = np.linalg.norm(place - place[:, :1], axis=-1).max((1, 2))
             parts[-1].dropped_in_mujoco[which] = ~(far < LOST)
     return Held(*(np.concatenate(part)[:count] for part in zip(*parts, strict=True)))

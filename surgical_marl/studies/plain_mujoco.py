@@ -11,7 +11,7 @@ import numpy as np
 from surgical_marl.robots.rotation import matrix_of
 from surgical_marl.scenes.mjcf import mjcf
 from surgical_marl.scenes.timing import DECIMATION
-from surgical_marl.studies.shaking import Grasps
+from surgical_marl.studies.shaking import Grasps, in_jaws
 
 FINE = 10
 """Steps of C MuJoCo in one of ours."""
@@ -59,21 +59,18 @@ def play(
     return np.array(found).reshape(*command.shape[:2], *found[0].shape)
 
 
-def in_jaws(grasps: Grasps, begin: Any, command: np.ndarray, held: np.ndarray) -> np.ndarray:
+def play_in_jaws(grasps: Grasps, begin: Any, command: np.ndarray, held: np.ndarray) -> np.ndarray:
     """Return where the centres of mass of held objects are in the frames of all jaws, m, [E, steps, a, 3].
 
     Arguments are as for `play`. Frames are those of `Seen.position`.
     """
-    names = [[grasps.scene.model.body(body).name for body in jaw] for jaw in grasps.fingers]
 
     def look(data: mujoco.MjData, name: str) -> np.ndarray:
-        jaws = [[data.body(finger) for finger in jaw] for jaw in names]
-        places = []
-        for jaw in jaws:
-            along, down = (sum(finger.xmat.reshape(3, 3)[:, axis] for finger in jaw) for axis in (1, 2))
-            along, down = along / np.linalg.norm(along), down / np.linalg.norm(down)
-            offset = data.body(name).xipos - sum(finger.xpos for finger in jaw) / 2
-            places.append(np.stack([np.cross(along, down), along, down]) @ offset)
-        return np.array(places)
+        position, rotation = (
+            np.array([[getattr(data.body(finger), of) for finger in jaw] for jaw in grasps.fingers])
+            for of in ("xpos", "xmat")
+        )
+        place: np.ndarray = in_jaws(np, position, rotation.reshape(*position.shape, 3), data.body(name).xipos)[1]
+        return place
 
     return play(grasps, begin, command, held, look)

@@ -125,15 +125,12 @@ class Watched(Env):
         bodies = physics.objects.bodies
         data, axes, place = self.simulator._together.pose(physics.qpos), rotation(bodies.quaternion), bodies.position
         fingers, links = self.fingers
-        along, down = (data.xmat[links][..., axis].sum(1) for axis in (1, 2))
-        along, down = (way / jnp.sqrt(jnp.sum(way * way, -1, keepdims=True)) for way in (along, down))
-        frames = jnp.stack([jnp.cross(along, down), along, down], -2)
-        offset = place[held] - data.xpos[links].sum(1) / 2
+        frames, offset = in_jaws(jnp, data.xpos[links], data.xmat[links], place[held])
         holds = [
             jnp.stack([h.holding for h in together.handles(physics.objects, a).values()]) for a in range(len(links))
         ]
         return Seen(
-            position=(frames @ offset[..., None])[..., 0],
+            position=offset,
             rotation=frames @ axes[held],
             force=physics.objects.grips.force[held][fingers],
             holding=jnp.stack(holds)[:, held],
@@ -148,6 +145,21 @@ class Watched(Env):
         return bare_state(carry, distance, {"seen": seen._asdict()})
 
 
+def in_jaws(xp: Any, position: Any, rotation: Any, place: Any) -> tuple[Any, Any]:
+    """Return the axes of the frames of jaws, [a, 3, 3], and where a place is in them, m, [a, 3].
+
+    Args:
+        xp: numpy or JAX's.
+        position: of each jaw's two fingers in the world, m, [a, 2, 3]: a frame begins midway between them.
+        rotation: of these fingers, [a, 2, 3, 3].
+        place: in the world, m, [3].
+    """
+    along, down = (rotation[..., axis].sum(1) for axis in (1, 2))
+    along, down = (way / xp.sqrt(xp.sum(way * way, -1, keepdims=True)) for way in (along, down))
+    frames = xp.stack([xp.cross(along, down), along, down], -2)
+    return frames, (frames @ (place - position.sum(1) / 2)[..., None])[..., 0]
+
+
 class Grasps:
     """One PSM, or two, that grasp one of some objects in the air, in environments side by side. All others fall.
 
@@ -160,8 +172,8 @@ class Grasps:
         self._env = env_of(objects, arms)
         self.scene, self.simulator = self._env.scene, self._env.simulator
         self.names, self.agents = tuple(self.scene.objects), self.scene.agents
-        self.fingers = self._env.fingers[1]
-        """The two fingers of each arm, by the numbers of their bodies in the scene's model, [a, 2]."""
+        self.fingers = [[self.scene.model.body(int(body)).name for body in jaw] for jaw in self._env.fingers[1]]
+        """Names of the two fingers of each arm."""
         self._jaws = [Jaw(self.scene, agent) for agent in self.agents]
         self._engine = lru_cache(1)(self._make_engine)
 
