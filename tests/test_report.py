@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import itertools
 import json
 import re
 from collections import Counter
@@ -205,7 +206,9 @@ def test_many_series_are_told_apart() -> None:
     assert {f"var(--s{i})" in svg for i in range(6)} == {True} and "var(--s6)" not in svg
 
 
-def test_what_shows_itself_in_a_notebook(tmp_path: Path) -> None:
+def test_what_shows_itself_in_a_notebook(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    minutes = itertools.count()  # a page says when it was made: what is written is what was shown, not another page
+    monkeypatch.setattr(page.time, "strftime", lambda *_: f"minute {next(minutes)}")
     run = evaluate(make_run(tmp_path / "run", rows=0), played((HOSTILE,)))
     report = sm.Report(run)
     (frame,) = Page(report._repr_html_()).of("iframe")

@@ -40,22 +40,21 @@ def report(names: Sequence[str], out: Path | None = None, evaluate: bool = False
     if evaluate:
         render(runs)  # refuse what does not belong together before minutes of work
         runs = [run if run.played else _evaluated(run) for run in runs]
-    write(path, runs)
+    write(path, render(runs))
     return path
 
 
 def report_run(run: Path) -> Path:
     """Write the report of a run folder into it, and return its path. ValueError if it cannot be written."""
     _check(path := run / REPORT)
-    write(path, [read_run(run)])
+    write(path, render([read_run(run)]))
     return path
 
 
-def write(path: Path, runs: Sequence[Run]) -> None:
-    """Write the report of some runs to a file. ValueError as in `report`."""
-    page = render(runs).encode()
+def write(path: Path, page: str) -> None:
+    """Write the page of a report to a file. ValueError if it cannot be written."""
     try:
-        write_atomic(path, lambda temporary: temporary.write_bytes(page))
+        write_atomic(path, lambda temporary: temporary.write_bytes(page.encode()))
     except OSError as error:
         raise ValueError(f"cannot write {error.filename}: {error.strerror}") from None
 

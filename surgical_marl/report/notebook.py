@@ -23,16 +23,17 @@ class Report:
     """
 
     def __init__(self, *runs: str | os.PathLike[str], height: int = 720) -> None:
-        self._runs, self._height = [read_run(run) for run in runs], height
-        self.html = render(self._runs)
+        read = [read_run(run) for run in runs]
+        self._given, self._height = [run.given for run in read], height
+        self.html = render(read)
         """The page."""
 
     def __repr__(self) -> str:
-        return f"Report({', '.join(repr(run.given) for run in self._runs)})"
+        return f"Report({', '.join(map(repr, self._given))})"
 
     def write(self, path: str | os.PathLike[str]) -> Path:
         """Write the page to a file, and return its path. ValueError if it cannot be written."""
-        write(Path(path), self._runs)
+        write(Path(path), self.html)
         return Path(path)
 
     def _repr_html_(self) -> str:
