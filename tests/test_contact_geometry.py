@@ -195,7 +195,7 @@ def test_a_patch_has_the_deepest_point_and_those_that_a_tilt_brings_in() -> None
         centre = weight @ places[which]
         spread = np.sqrt(weight @ np.sum((places[which] - centre) ** 2, 1))
         np.testing.assert_allclose(patch.centre, centre, atol=1e-6)
-        assert float(patch.radius) == pytest.approx(0.002 + spread, abs=1e-6)
+        assert float(patch.radius) == pytest.approx(np.hypot(0.002, spread), abs=1e-6)
         np.testing.assert_allclose(patch.normal, [0, 0, 1], atol=1e-6)
 
 

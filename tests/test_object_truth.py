@@ -42,10 +42,12 @@ def test_a_grasped_object_is_lifted_swung_and_let_go_as_in_plain_mujoco() -> Non
 
 @pytest.mark.slow
 def test_plain_mujoco_says_where_an_object_is_in_both_jaws_that_hold_it() -> None:
-    """By which `studies.grasping --mujoco` tells whether it was dropped."""
+    """By which `studies.grasping --mujoco` tells whether it was dropped or slipped."""
     grasps, begin, held = two_arms_hold(4)
     _, seen = played(grasps, begin, [np.array([[0, 0, 0, 0, 0, 0, -1]] * 2, np.float32)], held)
-    np.testing.assert_allclose(plain_mujoco.play_in_jaws(grasps, begin, seen.command, held), seen.position, atol=NEAR)
+    position, rotation = plain_mujoco.play_in_jaws(grasps, begin, seen.command, held)
+    np.testing.assert_allclose(position, seen.position, atol=NEAR)
+    np.testing.assert_allclose(rotation, seen.rotation, atol=0.02)
 
 
 def two_arms_hold(count: int) -> tuple[Grasps, Any, np.ndarray]:
@@ -62,8 +64,8 @@ def test_an_object_is_handed_over_as_in_plain_mujoco() -> None:
     As a jaw opens, what it held may slip in the other one, and the open finger may strike the needle as it leaves. Few
     needles do, but how far those go hangs by so little that C MuJoCo with half its step is 1.6 mm away from itself for
     one of 120, while nine of ten are within 0.08 mm. So the farthest needle says nothing about the solver, and half and
-    nine tenths of them are bounded here. In three series of 120 needles half were within 0.17 mm after the first jaw
-    had opened, and nine of ten within 0.44 mm.
+    nine tenths of them are bounded here. In three series of 120 needles half were within 0.14 mm after the first jaw
+    had opened, and nine of ten within 0.39 mm.
 
     With one Newton step instead of `PASSES` nine of ten are within 0.66 mm after the first jaw has opened, and within
     1.3 mm in the end; two steps are enough. Friction hardly matters, since a needle weighs next to nothing: the next
@@ -88,9 +90,10 @@ def test_a_needle_slides_in_jaws_that_pull_at_it_as_far_as_in_plain_mujoco() -> 
 
     Which jaw it slides in, and when, differs from needle to needle. How much farther apart the jaws are in the end does
     not: the rest of the way is what the arms give way under friction. In four series of 60 needles half of them slid
-    0.95, 0.90, 0.93 and 0.95 times as far as in C MuJoCo, or less. With 20 % less friction in ours it was 1.24 times in
-    the first series, and with 20 % more 0.74 times. All of a series together hang by few that slide by millimetres:
-    0.78, 0.76, 0.81 and 0.93 times, with other friction 1.53 and 0.43 times.
+    1.04, 1.06, 1.02 and 1.02 times as far as in C MuJoCo, or less. With 20 % less friction in ours it was 1.31 times in
+    the first series, and with 20 % more 0.86 times. All of a series together hang by few that slide by millimetres:
+    1.04, 1.05, 0.99 and 1.14 times, with other friction 1.64 and 0.54 times. Where a patch bore the sum of what its
+    points bear as they slide and as they turn in place, half slid 0.95 times as far, and all together 0.78 times.
     """
     grasps, begin, held = two_arms_hold(NEEDLES)
     way = np.array([[0, 0, 0, 0, 0, 0, -1], [0.4 * SPEED, 0, -0.4 * SPEED, 0, 0, 0, -1]], np.float32)
@@ -104,5 +107,5 @@ def test_a_needle_slides_in_jaws_that_pull_at_it_as_far_as_in_plain_mujoco() -> 
     ours = np.linalg.norm(of_needle[:, :, 0] - of_needle[:, :, 1], axis=-1)
     theirs = plain_mujoco.play(grasps, begin, seen.command, held, between)
     slid, should = (far[:, -1] - far[:, 0] for far in (ours, theirs))
-    assert should.mean() > NEAR and 0.75 < slid.mean() / should.mean() < 1.15, (slid, should)
-    assert 0.82 < np.median(slid / should) < 1.15, (slid, should)
+    assert should.mean() > NEAR and 0.85 < slid.mean() / should.mean() < 1.2, (slid, should)
+    assert 0.96 < np.median(slid / should) < 1.15, (slid, should)

@@ -177,9 +177,10 @@ def _patch(points: Points, torsion: Array, reach: Array) -> Patch:
     weight = jnp.maximum(points.depth, 1e-9)
     weight = weight / jnp.sum(weight)
     centre = weight @ points.place
-    spread = jnp.sqrt(jnp.maximum(weight @ jnp.sum((points.place - centre) ** 2, -1), 1e-18))
+    spread = weight @ jnp.sum((points.place - centre) ** 2, -1)
     normal = _unit(weight @ points.normal + 1e-3 * points.normal[0])
-    return Patch(points, centre, normal, torsion + spread, reach)
+    # As a patch turns, a point at a distance r slides and turns in place: that takes mu N hypot(r, torsion) a radian.
+    return Patch(points, centre, normal, jnp.sqrt(jnp.maximum(torsion * torsion + spread, 1e-18)), reach)
 
 
 def _unit(vector: Array) -> Array:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import sys
+from itertools import product
 from typing import NamedTuple
 
 import jax
@@ -33,39 +34,70 @@ COLUMNS = {
     "dropped": "dropped, of these struck",
     "dropped_in_mujoco": "of these dropped by C MuJoCo",
     "slipped": "slipped",
+    "slipped_in_mujoco": "of these slipped in C MuJoCo",
     "slip_mm": "slip: 95 %, worst (mm)",
     "turn_deg": "turn: 95 %, worst (degrees)",
+    "turn_in_mujoco_deg": "turn of those in C MuJoCo: worst (degrees)",
     "overlap_mm": "deepest overlap (mm)",
 }
-"""Names of figures, and headings of the table."""
+"""Names of figures, and headings of the table. Those of C MuJoCo are there if it played."""
+
+
+class Moved(NamedTuple):
+    """How objects moved in the jaws in which they moved most, once these had closed, [grasps] each."""
+
+    far: np.ndarray
+    """At most, m."""
+    slip: np.ndarray
+    """From rest to rest, m."""
+    turn: np.ndarray
+    """How far they turned from rest to rest, rad."""
+
+    @property
+    def lost(self) -> np.ndarray:
+        """Whether they moved so far that they count as dropped, bool."""
+        return ~(self.far < LOST)
+
+    @property
+    def slipped(self) -> np.ndarray:
+        """Whether they slipped, bool."""
+        return (self.slip > SLIP) | (self.turn > TURN)
 
 
 class Held(NamedTuple):
     """How grasps held, [grasps] each."""
 
-    slip: np.ndarray
-    """How far the object moved in the jaw in which it moved most, from rest to rest, m."""
-    turn: np.ndarray
-    """How far it turned, rad."""
+    moved: Moved
+    moved_in_mujoco: Moved
+    """NaN where C MuJoCo did not play."""
     overlap: np.ndarray
     """The deepest overlap with fingers once the jaws have closed, m."""
     dropped: np.ndarray
     """bool"""
     struck: np.ndarray
     """Whether the wrist of an arm struck the object, bool: then it may well slip."""
-    dropped_in_mujoco: np.ndarray
-    """Whether the object was dropped, and C MuJoCo drops it too, bool: False unless that was asked."""
+
+    @property
+    def slipped(self) -> np.ndarray:
+        """Whether objects slipped that were neither dropped nor struck, bool."""
+        return self.moved.slipped & ~self.dropped & ~self.struck
+
+
+def moves(position: np.ndarray, rotation: np.ndarray) -> Moved:
+    """Return how objects moved in jaws: positions [E, steps, a, 3] and axes [E, steps, a, 3, 3] in their frames."""
+    start = CLOSING * CHUNK - 1
+    far = np.linalg.norm(position[:, start:] - position[:, start, None], axis=-1)
+    turned_by = np.einsum("eaij,eaij->ea", rotation[:, start].astype(float), rotation[:, -1]) - 1
+    return Moved(far.max((1, 2)), far[:, -1].max(-1), np.arccos(np.clip(turned_by / 2, -1, 1)).max(-1))
 
 
 def judge(seen: Seen) -> Held:
     """Return how grasps [E] held in motions [E, steps] as `Grasps.shake` and `Grasps.pull` make them."""
     start = CLOSING * CHUNK - 1
-    moved = np.linalg.norm(seen.position[:, start:] - seen.position[:, start, None], axis=-1)
-    turned_by = np.einsum("eaij,eaij->ea", seen.rotation[:, start].astype(float), seen.rotation[:, -1]) - 1
-    dropped = ~(moved.max((1, 2)) < LOST) | ~(seen.force[:, -1] > 0).all((1, 2))
-    angle = np.arccos(np.clip(turned_by / 2, -1, 1)).max(-1)
-    overlap, struck = seen.overlap[:, start:].max(1), seen.struck[:, start:].any(1)
-    return Held(moved[:, -1].max(-1), angle, overlap, dropped, struck, np.zeros(len(dropped), bool))
+    moved = moves(seen.position, seen.rotation)
+    dropped = moved.lost | ~(seen.force[:, -1] > 0).all((1, 2))
+    unknown = Moved(*(np.full(len(dropped), np.nan) for _ in moved))
+    return Held(moved, unknown, seen.overlap[:, start:].max(1), dropped, seen.struck[:, start:].any(1))
 
 
 def hold(
@@ -73,45 +105,51 @@ def hold(
 ) -> Held:
     """Return how `count` random grasps of an object hold.
 
-    `share` is that of `Grasps.pull`. With `mujoco` C MuJoCo plays the grasps that dropped it, too.
+    `share` is that of `Grasps.pull`. With `mujoco` C MuJoCo plays the grasps that dropped it or let it slip, too.
     """
     parts, jaws, size = [], Grasps([name], arms), min(BATCH, count)
+    held = np.zeros(size, int)
     for seed in range(first, first - (-count // size)):
-        held = np.zeros(size, int)
-        seen = jaws.shake(held, seconds, seed) if arms == 1 else jaws.pull(held, seconds, seed, share)
+        begin = jaws.begin(held, seed)
+        seen = jaws.shake(begin, held, seconds, seed) if arms == 1 else jaws.pull(begin, held, seconds, seed, share)
         parts.append(judge(seen))
-        if mujoco and (which := np.flatnonzero(parts[-1].dropped)).size:
-            begin = jax.tree.map(lambda x, which=which: np.asarray(x)[which], jaws.begin(held, seed))
-            place = play_in_jaws(jaws, begin, seen.command[which], held[which])[:, CLOSING * CHUNK - 1 :]
-            far = np.linalg.norm(place - place[:, :1], axis=-1).max((1, 2))
-            parts[-1].dropped_in_mujoco[which] = ~(far < LOST)
-    return Held(*(np.concatenate(part)[:count] for part in zip(*parts, strict=True)))
+        which = np.flatnonzero(parts[-1].dropped | parts[-1].slipped)
+        if mujoco and which.size:
+            start = jax.tree.map(lambda x, which=which: np.asarray(x)[which], begin)
+            found = moves(*play_in_jaws(jaws, start, seen.command[which], held[which]))
+            for values, those in zip(parts[-1].moved_in_mujoco, found, strict=True):
+                values[which] = those
+    whole: Held = jax.tree.map(lambda *values: np.concatenate(values)[:count], *parts)
+    return whole
 
 
 def figures(name: str, arms: int, held: Held, mujoco: bool = False) -> dict[str, object]:
-    """Return the figures of an object, with that of C MuJoCo if it played what was dropped.
+    """Return the figures of an object, with those of C MuJoCo if it played what was dropped or slipped.
 
     Slips and turns are those of grasps that were neither dropped nor struck.
 
     Raises:
         ValueError: there is no such grasp.
     """
-    kept = ~held.struck & ~held.dropped
+    kept, theirs = ~held.struck & ~held.dropped, held.moved_in_mujoco
     if not kept.any():
         raise ValueError(f"no grasp of {name} holds it: all {len(kept)} drop it, or strike it with the wrist")
     spread = lambda values, digits: [round(float(np.quantile(values[kept], q)), digits) for q in (0.95, 1.0)]  # noqa: E731
-    return {
+    found: dict[str, object] = {
         "object": name,
         "arms": arms,
         "grasps": len(kept),
         "struck": int(held.struck.sum()),
         "dropped": [int(held.dropped.sum()), int((held.dropped & held.struck).sum())],
-        **({"dropped_in_mujoco": int(held.dropped_in_mujoco.sum())} if mujoco else {}),
-        "slipped": int(((held.slip > SLIP) | (held.turn > TURN))[kept].sum()),
-        "slip_mm": spread(1000 * held.slip, 4),
-        "turn_deg": spread(np.degrees(held.turn), 3),
+        "dropped_in_mujoco": int((held.dropped & theirs.lost).sum()),
+        "slipped": int(held.slipped.sum()),
+        "slipped_in_mujoco": int((held.slipped & theirs.slipped).sum()),
+        "slip_mm": spread(1000 * held.moved.slip, 4),
+        "turn_deg": spread(np.degrees(held.moved.turn), 3),
+        "turn_in_mujoco_deg": round(float(np.degrees(theirs.turn[held.slipped]).max(initial=0.0)), 3),
         "overlap_mm": round(1000 * float(held.overlap.max()), 4),
     }
+    return {key: value for key, value in found.items() if mujoco or "in_mujoco" not in key}
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -123,21 +161,18 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=whole(0), default=0, metavar="S", help=f"of the first {BATCH} (%(default)s)")
     parser.add_argument("--share", type=float, default=1.0, metavar="X", help="of the way that two arms pull (1)")
     parser.add_argument(
-        "--mujoco", action="store_true", help="let C MuJoCo play what is dropped, at a tenth of the step"
+        "--mujoco", action="store_true", help="let C MuJoCo play what is dropped or slips, at a tenth of the step"
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object a line")
     arguments = parser.parse_args(argv)
-    if not arguments.json:
-        columns = [title for name, title in COLUMNS.items() if name != "dropped_in_mujoco" or arguments.mujoco]
-        print(f"| {' | '.join(columns)} |\n|{'---|' * len(columns)}")
-    for arms in arguments.arms:
-        for name in arguments.objects:
-            held = hold(
-                name, arms, arguments.grasps, arguments.seconds, arguments.seed, arguments.share, arguments.mujoco
-            )
-            found = figures(name, arms, held, arguments.mujoco)
-            cells = (", ".join(map(str, value)) if isinstance(value, list) else str(value) for value in found.values())
-            print(json.dumps(found) if arguments.json else f"| {' | '.join(cells)} |", flush=True)
+    count, seconds, mujoco = arguments.grasps, arguments.seconds, arguments.mujoco
+    for number, (arms, name) in enumerate(product(arguments.arms, arguments.objects)):
+        held = hold(name, arms, count, seconds, arguments.seed, arguments.share, mujoco)
+        found = figures(name, arms, held, mujoco)
+        if not arguments.json and number == 0:
+            print(f"| {' | '.join(COLUMNS[key] for key in found)} |\n|{'---|' * len(found)}")
+        cells = (", ".join(map(str, value)) if isinstance(value, list) else str(value) for value in found.values())
+        print(json.dumps(found) if arguments.json else f"| {' | '.join(cells)} |", flush=True)
     return 0
 
 

@@ -59,10 +59,10 @@ def play(
     return np.array(found).reshape(*command.shape[:2], *found[0].shape)
 
 
-def play_in_jaws(grasps: Grasps, begin: Any, command: np.ndarray, held: np.ndarray) -> np.ndarray:
-    """Return where the centres of mass of held objects are in the frames of all jaws, m, [E, steps, a, 3].
+def play_in_jaws(grasps: Grasps, begin: Any, command: np.ndarray, held: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return where held objects are in the frames of all jaws: centres of mass, m, [E, steps, a, 3], and axes.
 
-    Arguments are as for `play`. Frames are those of `Seen.position`.
+    Arguments are as for `play`. Frames are those of `Seen.position`, axes [E, steps, a, 3, 3] as in `Seen.rotation`.
     """
 
     def look(data: mujoco.MjData, name: str) -> np.ndarray:
@@ -70,7 +70,9 @@ def play_in_jaws(grasps: Grasps, begin: Any, command: np.ndarray, held: np.ndarr
             np.array([[getattr(data.body(finger), of) for finger in jaw] for jaw in grasps.fingers])
             for of in ("xpos", "xmat")
         )
-        place: np.ndarray = in_jaws(np, position, rotation.reshape(*position.shape, 3), data.body(name).xipos)[1]
-        return place
+        held = data.body(name)
+        frames, place = in_jaws(np, position, rotation.reshape(*position.shape, 3), held.xipos)
+        return np.concatenate([place[..., None], frames @ held.xmat.reshape(3, 3)], -1)
 
-    return play(grasps, begin, command, held, look)
+    found = play(grasps, begin, command, held, look)
+    return found[..., 0], found[..., 1:]

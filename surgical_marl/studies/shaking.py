@@ -1,7 +1,8 @@
 """Grasps of objects that are shaken, or that two arms pull at, and what is seen of them.
 
 grasps = Grasps(["needle_sh"], arms=2)
-seen = grasps.pull(np.zeros(100, int), seconds=10.0, seed=0)
+held = np.zeros(100, int)
+seen = grasps.pull(grasps.begin(held, seed=0), held, seconds=10.0, seed=0)
 """
 
 from __future__ import annotations
@@ -215,27 +216,31 @@ class Grasps:
         actions[..., -1] = -1.0
         return actions
 
-    def shake(self, held: np.ndarray, seconds: float, seed: int = 0) -> Seen:
-        """Return what is seen [E, steps] of grasps that close, are shaken at full speed and stand still again."""
-        rng, physics = np.random.default_rng(seed + 1), self.begin(held, seed)
+    def shake(self, physics: Physics, held: np.ndarray, seconds: float, seed: int = 0) -> Seen:
+        """Return what is seen [E, steps] of grasps that close, are shaken at full speed and stand still again.
+
+        Arguments are as for `pull`.
+        """
+        rng = np.random.default_rng(seed + 1)
         actions = self.still(len(held), CLOSING + _chunks(seconds) + RESTING)
         for chunk in range(CLOSING, CLOSING + _chunks(seconds)):
             ways = rng.choice([-1.0, 1.0], (len(held), 1, *actions.shape[2:]))
             actions[:, chunk * CHUNK : (chunk + 1) * CHUNK, :, :-1] = ways[..., :-1]
         return self.play(physics, actions, held)[1]
 
-    def pull(self, held: np.ndarray, seconds: float, seed: int = 0, share: float = 1.0) -> Seen:
+    def pull(self, physics: Physics, held: np.ndarray, seconds: float, seed: int = 0, share: float = 1.0) -> Seen:
         """Return what is seen [E, steps] of grasps that close, pull and turn against each other, and let go of that.
 
         Each arm's tip is told to go to random places near where it grasped, and back at the end.
 
         Args:
+            physics: states at the start, as `begin` returns them.
             held: number of the object, [E].
-            seconds: how long they pull, in changing directions.
+            seconds: how long they move, in changing directions.
             seed: of the random numbers.
             share: of `PULL` and `TURN`.
         """
-        rng, physics = np.random.default_rng(seed + 1), self.begin(held, seed)
+        rng = np.random.default_rng(seed + 1)
         physics, closing = self.play(physics, self.still(len(held), CLOSING), held)
         reach = share * np.repeat([PULL, TURN], 3)
         tips = rng.uniform(-1, 1, (len(held), _chunks(seconds), len(self.agents), 6)) * reach
