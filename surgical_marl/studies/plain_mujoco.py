@@ -70,9 +70,9 @@ def play_in_jaws(grasps: Grasps, begin: Any, command: np.ndarray, held: np.ndarr
             np.array([[getattr(data.body(finger), of) for finger in jaw] for jaw in grasps.fingers])
             for of in ("xpos", "xmat")
         )
-        held = data.body(name)
-        frames, place = in_jaws(np, position, rotation.reshape(*position.shape, 3), held.xipos)
-        return np.concatenate([place[..., None], frames @ held.xmat.reshape(3, 3)], -1)
+        body = data.body(name)
+        frames, place = in_jaws(np, position, rotation.reshape(*position.shape, 3), body.xipos)
+        return np.concatenate([place[..., None], frames @ body.xmat.reshape(3, 3)], -1)
 
     found = play(grasps, begin, command, held, look)
     return found[..., 0], found[..., 1:]
