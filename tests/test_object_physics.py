@@ -156,17 +156,23 @@ def test_a_spinning_body_keeps_its_angular_momentum(tmp_path: Path) -> None:
         assert (energy / energy[:, :1]).max() < 1 + 1e-5
 
 
+def sleds(folder: Path, feet: list[tuple[float, float]], frictions: list[tuple[float, float]]) -> Falling:
+    """Return sleds of 1 g on feet at x and y, m, on a floor; each has a friction with it: sliding, and torsion, m."""
+    floor = {"free": False, "stiffness": 1e6, "friction": {"sliding": 1.0, "torsion": 1.0}, "shapes": [{"plane": {}}]}
+    shapes = [{"sphere": {"radius": 0.001, "position": [x, y, 0]}} for x, y in feet]
+    own = {"stiffness": 1e6, "free": True, "mass": 0.001, "shapes": shapes}
+    files = {f"sled_{i}": own | {"friction": {"sliding": sliding**2, "torsion": torsion**2}}
+             for i, (sliding, torsion) in enumerate(frictions)} | {"floor": floor}  # fmt: skip
+    for name, settings in files.items():
+        (folder / f"{name}.yaml").write_text(yaml.safe_dump(settings))
+    places = {f"sled_{i}": {"object": f"sled_{i}.yaml", "position": [0, 0.1 * i, 0.001]} for i in range(len(frictions))}
+    return Falling(folder, {"floor": {"object": "floor.yaml"}, **places})
+
+
 def test_an_object_slides_where_coulomb_says(tmp_path: Path) -> None:
     """Blocks of three frictions on a plane: gravity tilts by 5 % more or less than atan(mu); only more moves them."""
-    frictions, own = (0.2, 0.5, 1.0), {"stiffness": 1e6, "free": True, "mass": 0.001}
-    feet = [{"sphere": {"radius": 0.001, "position": [x, y, 0]}} for x, y in ((0.01, 0), (-0.01, 0.01), (-0.01, -0.01))]
-    floor = {"free": False, "stiffness": 1e6, "friction": {"sliding": 1.0, "torsion": 0.0}, "shapes": [{"plane": {}}]}
-    files = {f"sled_{i}": own | {"friction": {"sliding": mu**2, "torsion": 0.0}, "shapes": feet}
-             for i, mu in enumerate(frictions)} | {"floor": floor}  # fmt: skip
-    for name, settings in files.items():
-        (tmp_path / f"{name}.yaml").write_text(yaml.safe_dump(settings))
-    sleds = {f"sled_{i}": {"object": f"sled_{i}.yaml", "position": [0, 0.1 * i, 0.001]} for i in range(3)}
-    scene = Falling(tmp_path, {"floor": {"object": "floor.yaml"}, **sleds})
+    frictions = (0.2, 0.5, 1.0)
+    scene = sleds(tmp_path, [(0.01, 0.0), (-0.01, 0.01), (-0.01, -0.01)], [(mu, 0.0) for mu in frictions])
     slopes = np.array([mu * share for mu in frictions for share in (0.95, 1.05)])
     tilts = np.arctan(slopes)
     gravity = 9.81 * np.stack([np.sin(tilts), 0 * tilts, -np.cos(tilts)], 1)
@@ -188,26 +194,19 @@ def test_what_spins_on_a_floor_slows_as_in_plain_mujoco_and_as_coulomb_says(tmp_
     """
     r, mu, spin, seconds = 0.01, 0.2, 30.0, 0.05
     torsions = np.array([0.0, 0.005, 0.01, 0.02])
-    corners = r * np.stack([np.cos(angles := 2 * np.pi * np.arange(3) / 3), np.sin(angles), 0 * angles], 1)
-    feet = [{"sphere": {"radius": 0.001, "position": corner.tolist()}} for corner in corners]
-    floor = {"free": False, "stiffness": 1e6, "friction": {"sliding": 1.0, "torsion": 0.02}, "shapes": [{"plane": {}}]}
-    own = {"stiffness": 1e6, "free": True, "mass": 0.001, "shapes": feet}
-    files = {f"sled_{i}": own | {"friction": {"sliding": mu**2, "torsion": float(t**2 / 0.02)}}
-             for i, t in enumerate(torsions)} | {"floor": floor}  # fmt: skip
-    for name, settings in files.items():
-        (tmp_path / f"{name}.yaml").write_text(yaml.safe_dump(settings))
-    sleds = {f"sled_{i}": {"object": f"sled_{i}.yaml", "position": [0, 0.1 * i, 0.001]} for i in range(len(torsions))}
-    scene = Falling(tmp_path, {"floor": {"object": "floor.yaml"}, **sleds})
+    angles = 2 * np.pi * np.arange(3) / 3
+    feet = list(zip((r * np.cos(angles)).tolist(), (r * np.sin(angles)).tolist(), strict=True))
+    scene = sleds(tmp_path, feet, [(mu, t) for t in torsions.tolist()])
     start = scene.begin(1)
     _, path = scene.play(thrown(start, velocity=np.tile([0, 0, 0, 0, 0, spin], (1, len(torsions), 1))), seconds)
     ours = spin - path.velocity[0, -1, :, 5]
     model = mujoco.MjModel.from_xml_string(mjcf(scene.scene, timestep=DT / 400))
     model.opt.impratio, model.opt.tolerance = IMPRATIO, TOLERANCE
     data = mujoco.MjData(model)
-    for name in sleds:
+    for name in scene.names:
         data.joint(name).qvel[5] = spin
     mujoco.mj_step(model, data, round(seconds / model.opt.timestep))
-    theirs = spin - np.array([data.joint(name).qvel[5] for name in sleds])
+    theirs = spin - np.array([data.joint(name).qvel[5] for name in scene.names])
     coulomb = mu * 9.81 * scene.masses.mass * np.hypot(r, torsions) / scene.masses.inertia[:, 2, 2] * seconds
     assert (ours / coulomb > 0.8).all() and (ours / coulomb < 1.02).all(), (ours, coulomb)
     np.testing.assert_allclose(theirs, coulomb, rtol=0.02)

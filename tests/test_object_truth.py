@@ -107,5 +107,5 @@ def test_a_needle_slides_in_jaws_that_pull_at_it_as_far_as_in_plain_mujoco() -> 
     ours = np.linalg.norm(of_needle[:, :, 0] - of_needle[:, :, 1], axis=-1)
     theirs = plain_mujoco.play(grasps, begin, seen.command, held, between)
     slid, should = (far[:, -1] - far[:, 0] for far in (ours, theirs))
-    assert should.mean() > NEAR and 0.85 < slid.mean() / should.mean() < 1.2, (slid, should)
+    assert should.mean() > NEAR and 0.85 < slid.mean() / should.mean() < 1.15, (slid, should)
     assert 0.96 < np.median(slid / should) < 1.15, (slid, should)

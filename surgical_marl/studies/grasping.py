@@ -24,6 +24,8 @@ SLIP, TURN = 2e-4, np.radians(1.0)
 """An object that has moved or turned further than this in a jaw has slipped, m and rad."""
 LOST = 2e-3
 """An object that has moved this far in a jaw counts as dropped, m."""
+CLOSED = CLOSING * CHUNK - 1
+"""Control step at whose end the jaws have closed."""
 BATCH = 250
 """Grasps that are drawn with one seed."""
 COLUMNS = {
@@ -85,19 +87,17 @@ class Held(NamedTuple):
 
 def moves(position: np.ndarray, rotation: np.ndarray) -> Moved:
     """Return how objects moved in jaws: positions [E, steps, a, 3] and axes [E, steps, a, 3, 3] in their frames."""
-    start = CLOSING * CHUNK - 1
-    far = np.linalg.norm(position[:, start:] - position[:, start, None], axis=-1)
-    turned_by = np.einsum("eaij,eaij->ea", rotation[:, start].astype(float), rotation[:, -1]) - 1
+    far = np.linalg.norm(position[:, CLOSED:] - position[:, CLOSED, None], axis=-1)
+    turned_by = np.einsum("eaij,eaij->ea", rotation[:, CLOSED].astype(float), rotation[:, -1]) - 1
     return Moved(far.max((1, 2)), far[:, -1].max(-1), np.arccos(np.clip(turned_by / 2, -1, 1)).max(-1))
 
 
 def judge(seen: Seen) -> Held:
     """Return how grasps [E] held in motions [E, steps] as `Grasps.shake` and `Grasps.pull` make them."""
-    start = CLOSING * CHUNK - 1
     moved = moves(seen.position, seen.rotation)
     dropped = moved.lost | ~(seen.force[:, -1] > 0).all((1, 2))
-    unknown = Moved(*(np.full(len(dropped), np.nan) for _ in moved))
-    return Held(moved, unknown, seen.overlap[:, start:].max(1), dropped, seen.struck[:, start:].any(1))
+    unknown = Moved(*np.full((len(moved), len(dropped)), np.nan))
+    return Held(moved, unknown, seen.overlap[:, CLOSED:].max(1), dropped, seen.struck[:, CLOSED:].any(1))
 
 
 def hold(
