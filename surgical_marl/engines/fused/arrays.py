@@ -63,7 +63,7 @@ class Arrays(ABC):
             *(self.warp(buffer) for buffer in self._buffers.values()),
             *(self.warp(constant) for constant in constants),
             self.warp(self.work),
-            self.warp(self.constant(np.array([0, 0, multiprocessors() if self.device == "cuda" else 0], np.int32))),
+            self.warp(self.constant(np.array([0, multiprocessors() if self.device == "cuda" else 0], np.int32))),
         ]
 
     @abstractmethod

@@ -14,6 +14,7 @@ import numpy as np
 
 from surgical_marl.engines.fused.emit_arrays import TYPES, ArrayEmitter
 from surgical_marl.engines.fused.graph import Branch, Graph, Loop, Value
+from surgical_marl.engines.fused.interleaving import interleave
 from surgical_marl.engines.fused.memory_order import order_memory
 from surgical_marl.engines.fused.preludes import WAYS, fenced, is_long, large_branches
 from surgical_marl.engines.fused.schedule import Scheduler
@@ -78,8 +79,9 @@ class Emitter(ArrayEmitter):
             self.lines.append(f"B bad_=watch_!=SPLAT(0.0f);if(ANY(bad_)){{STB(flags,{field},LDB(flags,{field})|bad_)}}")
         if large_branches(self.lines):
             self.lines = ["I work_=SPLATI(0),ways_=SPLATI(0);", *self.lines, "STI(work,0,WORKED)"]
-        lines = share_memory(self.lines)
-        return "\n".join(fenced(lines) if self.vector else lines)
+        if self.vector:
+            return "\n".join(fenced(share_memory(self.lines)))
+        return "\n".join(share_memory(interleave(self.lines) if is_long(self.lines) else self.lines))
 
     def _region(self, number: int, result: Any) -> list[int]:
         """Write a region. Return where its long branches and loops end, as numbers of lines."""

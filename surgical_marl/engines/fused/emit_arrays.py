@@ -116,7 +116,7 @@ class ArrayEmitter:
         stored, kept, place = self._name(element), self.kept.get(name, ""), self._within(value, index)
         if kept:
             stored = f"SELECT({kept},AT({kind},{name},{place}),{stored})"
-        self.lines.append(f"PUT({kind},{name},{place},{stored})")
+        self.lines.append(f"PUT({kind},{name},{place},{stored})" if self.vector else f"{name}[{place}]={stored};")
 
     def _fill(self, name: str, start: str, values: list[Value], stored: Set[int] = frozenset()) -> None:
         """Store values from `start` on; elements of one other array, and equal constants, by a loop."""
@@ -165,9 +165,9 @@ class ArrayEmitter:
         """Return the element of an array. An element at a known place gets no name of its own, and so no register."""
         array, index = self.graph.args[value]
         at = self._whole(index)
-        if at is None:
+        if at is None and self.vector:
             return f"AT({TYPES[self.graph.kinds[value]]},{self.names[array]},{self._within(array, index)})"
-        return f"{self.names[array]}[{at}]"
+        return f"{self.names[array]}[{self._name(index) if at is None else at}]"
 
     def _within(self, array: Value, index: Value) -> str:
         """Return a place in an array. In a vector, environments that sit out this branch or round may be anywhere."""

@@ -10,10 +10,12 @@ import re
 from collections.abc import Sequence
 from typing import NamedTuple
 
-_DECLARED = re.compile(r"([FIUB]) ([vn]\d+)\[(\d+)\];")
-_NAME = re.compile(r"\b[vn]\d+\b")
-_FIXED = re.compile(r"\b[vn]\d+\[[\d+*()k-]*\]")
-"""An element at a known place; `k` counts in short loops, which compilers unroll."""
+DECLARED = re.compile(r"([FIUB]) ([vnw]\d+)\[(\d+)\];")
+"""The declaration of an array: its type, name and size."""
+FIXED = re.compile(r"[\d+*()k-]*")
+"""A known place in an array; `k` counts in short loops, which compilers unroll."""
+_NAME = re.compile(r"\b[vnw]\d+\b")
+_AT_FIXED = re.compile(rf"{_NAME.pattern}\[{FIXED.pattern}\]")
 
 
 class _Loop(NamedTuple):
@@ -41,7 +43,7 @@ def share_memory(lines: Sequence[str]) -> list[str]:
     lines = "\n".join(lines).split("\n")
     arrays = _arrays(lines)
     names, declared = _assign(arrays)
-    kept = (line for line in lines if not ((found := _DECLARED.fullmatch(line)) and found[2] in names))
+    kept = (line for line in lines if not ((found := DECLARED.fullmatch(line)) and found[2] in names))
     return declared + [_NAME.sub(lambda name: names.get(name[0], name[0]), line) for line in kept]
 
 
@@ -49,14 +51,14 @@ def _arrays(lines: list[str]) -> list[_Array]:
     """Return all arrays of which some element is at a place that is not known."""
     declared, uses, moving = {}, dict[str, tuple[int, int]](), set[str]()
     for at, line in enumerate(lines):
-        if match := _DECLARED.fullmatch(line):
+        if match := DECLARED.fullmatch(line):
             declared[match[2]] = at, match[1], int(match[3])
             continue
         names = [name for name in _NAME.findall(line) if name in declared]
         for name in names:
             uses[name] = uses.get(name, (at, at))[0], at
         if names:
-            moving |= set(_NAME.findall(_FIXED.sub("", line)))
+            moving |= set(_NAME.findall(_AT_FIXED.sub("", line)))
     loops, ends = _loops(lines)
     found = []
     for name in declared.keys() & uses.keys() & moving:
@@ -97,7 +99,7 @@ def _assign(arrays: list[_Array]) -> tuple[dict[str, str], list[str]]:
             rooms.append(room := [])
         room.append(array)
         names[array.name] = room[0].name
-    return names, [f"{room[0].kind} {room[0].name}[{room[0].size}];" for room in rooms]
+    return names, [f"ALIGNED {room[0].kind} {room[0].name}[{room[0].size}];" for room in rooms]
 
 
 def _meets(room: list[_Array], array: _Array) -> bool:
