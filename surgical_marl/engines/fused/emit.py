@@ -79,9 +79,10 @@ class Emitter(ArrayEmitter):
             self.lines.append(f"B bad_=watch_!=SPLAT(0.0f);if(ANY(bad_)){{STB(flags,{field},LDB(flags,{field})|bad_)}}")
         if large_branches(self.lines):
             self.lines = ["I work_=SPLATI(0),ways_=SPLATI(0);", *self.lines, "STI(work,0,WORKED)"]
-        if self.vector:
-            return "\n".join(fenced(share_memory(self.lines)))
-        return "\n".join(share_memory(interleave(self.lines) if is_long(self.lines) else self.lines))
+        # short code keeps few numbers in arrays, and fewer others in registers if it moves several at a time
+        lines = interleave(self.lines) if is_long(self.lines) and not self.vector else self.lines
+        lines = share_memory(lines)
+        return "\n".join(fenced(lines) if self.vector else lines)
 
     def _region(self, number: int, result: Any) -> list[int]:
         """Write a region. Return where its long branches and loops end, as numbers of lines."""
