@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from typing import NamedTuple
 
 from surgical_marl.engines.fused.sharing import DECLARED, FIXED
 
@@ -18,13 +17,6 @@ _USED = re.compile(r"\b([vn]\d+)\[((?:[^][]|\[[^][]*\])+)\](=)?")
 """An element of an array, and what follows where it is stored."""
 _ENDS = "for(", "if(", "}"
 """How lines begin that code does not simply run through."""
-
-
-class _Array(NamedTuple):
-    """What arrays must have in common to lie side by side: the block that declares them, and their size."""
-
-    block: int
-    size: int
 
 
 def interleave(lines: Sequence[str]) -> list[str]:
@@ -51,28 +43,32 @@ def interleave(lines: Sequence[str]) -> list[str]:
             continue
         memory, row = rows[declaration[2]]
         if memory not in declared:
-            found.append(f"F {memory}[{len(row) * arrays[row[0]].size}];")
+            _, size = arrays[row[0]]
+            found.append(f"F {memory}[{len(row) * size}];")
             declared.add(memory)
     return found
 
 
-def _arrays(lines: Sequence[str]) -> dict[str, _Array]:
-    """Return the arrays that may be moved, by their names."""
+def _arrays(lines: Sequence[str]) -> dict[str, tuple[int, int]]:
+    """Return the arrays that may be moved: name -> the block that declares it, and its size.
+
+    Arrays that differ in either can't lie side by side.
+    """
     moving = {name for line in lines for name, index, _ in _USED.findall(line) if not FIXED.fullmatch(index)}
-    arrays, blocks = dict[str, _Array](), [0]
+    arrays, blocks = dict[str, tuple[int, int]](), [0]
     for at, line in enumerate(lines, 1):
         if (found := DECLARED.fullmatch(line)) and found[1] == "F" and found[2] in moving:
-            arrays[found[2]] = _Array(blocks[-1], int(found[3]))
+            arrays[found[2]] = blocks[-1], int(found[3])
         for brace in re.findall("[{}]", line):
             blocks = [*blocks, at] if brace == "{" else blocks[:-1]
     return arrays
 
 
-def _rows(lines: Sequence[str], arrays: Mapping[str, _Array]) -> Iterator[tuple[str, ...]]:
+def _rows(lines: Sequence[str], arrays: Mapping[str, tuple[int, int]]) -> Iterator[tuple[str, ...]]:
     """Yield arrays that are to lie side by side: code reads, or stores, elements of them one after the other."""
     taken, used = set[str](), [line for line in lines if not DECLARED.fullmatch(line)]
     for width in WIDTHS:
-        waiting = dict[tuple[str, str, _Array], list[str]]()
+        waiting = dict[tuple[str, str, tuple[int, int]], list[str]]()
         for line in used:
             if line.startswith(_ENDS):
                 waiting.clear()
