@@ -3,13 +3,15 @@
     python -m surgical_marl.studies.baselines                           # all of them
     python -m surgical_marl.studies.baselines reach track --only psm    # some tasks, some scenes
 
-It prints a table for each task and writes the hashes of the goals to `surgical_marl/evaluation/goal_sets.yaml`, so what
-is committed must not change without a reason.
+It prints a table for each task, or two if only some of its scenes have objects. It writes the hashes of the goals to
+`surgical_marl/evaluation/goal_sets.yaml`, so what is committed must not change without a reason.
 """
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterable
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -45,15 +47,15 @@ def main(argv: list[str] | None = None) -> int:
     hashes = yaml.safe_load(before)
     for task in arguments.tasks or list_tasks():
         for start in TASKS.load(task).starts:
-            rows = []
+            rows = list[list[Any]]()
             for scene in [name for name in simple_first(task) if name in (arguments.only or list_scenes())]:
                 for policy in BASELINES:
                     asked = {"task": task, "scene": scene, "start": start}
                     result = summarise([play_all([policy], asked, episodes=200, seed=0)[policy]])
                     rows.append([scene, policy, result])
                 hashes.setdefault(start, {}).setdefault(task, {})[scene] = result["goal_set"]
-            if rows:
-                print(f"{task} from {start}:\n\n{table(rows)}", flush=True)
+            for columns, alike in groupby(rows, lambda row: columns_of(row[2])):
+                print(f"{task} from {start}:\n\n{table(columns, alike)}", flush=True)
     HASHES.write_text("\n".join([*comments, yaml.safe_dump(hashes)]))
     return 0
 
@@ -63,10 +65,13 @@ def simple_first(task: str) -> list[str]:
     return sorted(scenes_for(task), key=lambda name: (name.count("_"), name))
 
 
-def table(rows: list[list[Any]]) -> str:
-    result = rows[0][2]
+def columns_of(result: dict[str, Any]) -> dict[str, str]:
+    """Return the metrics of a result that a table shows, and their headings. Scenes of one task may differ in them."""
     columns = ERRORS | (MOVING if "rmse_mm" in result else OBJECTS if "drop_rate" in result else FIXED) | ALWAYS
-    columns |= {name: title for name, title in (PICTURES | VIEWS).items() if name in rows[0][2]}
+    return columns | {name: title for name, title in (PICTURES | VIEWS).items() if name in result}
+
+
+def table(columns: dict[str, str], rows: Iterable[list[Any]]) -> str:
     lines = ["| " + " | ".join(["scene", "policy", *columns.values()]) + " |", "|---" * (2 + len(columns)) + "|"]
     for scene, policy, result in rows:
         cells = (cell(name, result[name], result["intervals"][name]) for name in columns)
