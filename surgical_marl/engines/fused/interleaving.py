@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping, Sequence
 
-from surgical_marl.engines.fused.sharing import DECLARED, FIXED
+from surgical_marl.engines.fused.sharing import DECLARED, names_at_unknown_places
 
 WIDTHS = 4, 2
 """How many arrays lie side by side. Those that find no three others may find one."""
@@ -54,7 +54,7 @@ def _arrays(lines: Sequence[str]) -> dict[str, tuple[int, int]]:
 
     Arrays that differ in either can't lie side by side.
     """
-    moving = {name for line in lines for name, index, _ in _USED.findall(line) if not FIXED.fullmatch(index)}
+    moving = {name for line in lines for name in names_at_unknown_places(line)}
     arrays, blocks = dict[str, tuple[int, int]](), [0]
     for at, line in enumerate(lines, 1):
         if (found := DECLARED.fullmatch(line)) and found[1] == "F" and found[2] in moving:

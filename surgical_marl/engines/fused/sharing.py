@@ -12,10 +12,9 @@ from typing import NamedTuple
 
 DECLARED = re.compile(r"([FIUB]) ([vnw]\d+)\[(\d+)\];")
 """The declaration of an array: its type, name and size."""
-FIXED = re.compile(r"[\d+*()k-]*")
-"""A known place in an array; `k` counts in short loops, which compilers unroll."""
 _NAME = re.compile(r"\b[vnw]\d+\b")
-_AT_FIXED = re.compile(rf"{_NAME.pattern}\[{FIXED.pattern}\]")
+_FIXED = re.compile(r"\b[vnw]\d+\[[\d+*()k-]*\]")
+"""An element at a known place; `k` counts in short loops, which compilers unroll."""
 
 
 class _Loop(NamedTuple):
@@ -47,6 +46,11 @@ def share_memory(lines: Sequence[str]) -> list[str]:
     return declared + [_NAME.sub(lambda name: names.get(name[0], name[0]), line) for line in kept]
 
 
+def names_at_unknown_places(line: str) -> set[str]:
+    """Return the names in a line of code, but for arrays whose elements there are at known places."""
+    return set(_NAME.findall(_FIXED.sub("", line)))
+
+
 def _arrays(lines: list[str]) -> list[_Array]:
     """Return all arrays of which some element is at a place that is not known."""
     declared, uses, moving = {}, dict[str, tuple[int, int]](), set[str]()
@@ -58,7 +62,7 @@ def _arrays(lines: list[str]) -> list[_Array]:
         for name in names:
             uses[name] = uses.get(name, (at, at))[0], at
         if names:
-            moving |= set(_NAME.findall(_AT_FIXED.sub("", line)))
+            moving |= names_at_unknown_places(line)
     loops, ends = _loops(lines)
     found = []
     for name in declared.keys() & uses.keys() & moving:
