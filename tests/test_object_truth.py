@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from typing import Any
+from unittest.mock import patch
 
 import mujoco
 import numpy as np
@@ -57,6 +58,15 @@ def two_arms_hold(count: int) -> tuple[Grasps, Any, np.ndarray]:
     return grasps, begin, held
 
 
+def converged(grasps: Grasps, begin: Any, command: np.ndarray, held: np.ndarray) -> np.ndarray:
+    """Return of which objects C MuJoCo with half its step says the same, to half of `NEAR`, [E]."""
+    whole = plain_mujoco.play(grasps, begin, command, held)
+    with patch.object(plain_mujoco, "FINE", 2 * plain_mujoco.FINE):
+        off = np.linalg.norm(plain_mujoco.play(grasps, begin, command, held) - whole, axis=-1)
+    found: np.ndarray = off.max(1) < NEAR / 2
+    return found
+
+
 @pytest.mark.slow
 def test_an_object_is_handed_over_as_in_plain_mujoco() -> None:
     """Two arms hold a needle; the first opens its jaw and draws back, and the second carries the needle away.
@@ -64,8 +74,11 @@ def test_an_object_is_handed_over_as_in_plain_mujoco() -> None:
     As a jaw opens, what it held may slip in the other one, and the open finger may strike the needle as it leaves. Few
     needles do, but how far those go hangs by so little that C MuJoCo with half its step is 1.6 mm away from itself for
     one of 120, while nine of ten are within 0.08 mm. So the farthest needle says nothing about the solver, and half and
-    nine tenths of them are bounded here. In three series of 120 needles half were within 0.14 mm after the first jaw
-    had opened, and nine of ten within 0.39 mm.
+    nine tenths of them are bounded here. In two series of 120 needles half were within 0.14 mm after the first jaw had
+    opened, and nine of ten within 0.42 mm.
+
+    While both arms hold it a needle stays within 0.13 mm, in four series of 60, but for one of the 240: jaws have
+    rocked its arc and left it on its way, C MuJoCo moves it by 0.3 mm at once, and with half its step elsewhere.
 
     With one Newton step instead of `PASSES` nine of ten are within 0.66 mm after the first jaw has opened, and within
     1.3 mm in the end; two steps are enough. Friction hardly matters, since a needle weighs next to nothing: the next
@@ -79,7 +92,9 @@ def test_an_object_is_handed_over_as_in_plain_mujoco() -> None:
     off = np.linalg.norm(plain_mujoco.play(grasps, begin, seen.command, held) - seen.place, axis=-1)
     within = lambda steps, share: np.quantile(off[:, :steps].max(1), share)  # noqa: E731
     assert seen.holding[:, CHUNK - 1].all() and (seen.holding[:, -1] == [False, True]).all(1).mean() > 0.95
-    assert off[:, :CHUNK].max() < NEAR and within(CHUNK, 0.5) < NEAR / 4, "while both hold it"
+    sure = converged(grasps, begin, seen.command[:, :CHUNK], held)
+    assert sure.mean() > 0.95 and off[sure, :CHUNK].max() < NEAR / 2, "while both hold it"
+    assert within(CHUNK, 0.5) < NEAR / 4, "while both hold it"
     assert within(4 * CHUNK, 0.5) < 2.5e-4 and within(4 * CHUNK, 0.9) < 6e-4, "when one has let go"
     assert within(5 * CHUNK, 0.5) < NEAR and within(5 * CHUNK, 0.9) < 8e-4, "when the other one has carried it away"
 

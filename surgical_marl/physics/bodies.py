@@ -78,6 +78,15 @@ def turned(angle: Array, quaternion: Array) -> Array:
     return moved / jnp.sqrt(jnp.sum(moved * moved, -1, keepdims=True))
 
 
+def carried(quaternion: Array, place: Array) -> Array:
+    """Return by how much a turn by unit quaternions [..., 4] about the origin moved what is at places [..., 3] now.
+
+    It keeps its precision where the turn is small.
+    """
+    real, axis = quaternion[..., :1], quaternion[..., 1:]
+    return 2 * jnp.cross(axis, real * place - jnp.cross(axis, place))
+
+
 def inertias(masses: Masses, frame: Array) -> Array:
     """Return the mass matrix [6, 6] of one object by the world's axes, from its frame [3, 3]."""
     none = jnp.zeros((3, 3))

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from surgical_marl.physics.bodies import Bodies, conjugate, product, rotation, turn
+from surgical_marl.physics.bodies import Bodies, carried, conjugate, product, rotation, turn, turned
 from surgical_marl.physics.cone import Cone, Forces, Springs, Stuck, nearest, presses
 from surgical_marl.physics.patches import AWAY, Patch
 from surgical_marl.physics.placed import Joints
@@ -241,9 +241,10 @@ class Handling:
 
         def moved(_: None) -> Array:
             was = frame.position + rotation(frame.quaternion) @ position
-            turned = product(at[1][o], conjugate(product(frame.quaternion, quaternion)))
-            angle = 2 * turned[1:] * jnp.where(turned[0] < 0, -1.0, 1.0)
-            shift = at[0][o] - was + jnp.cross(angle, patch.centre - at[0][o])
+            turns = product(at[1][o], conjugate(product(frame.quaternion, quaternion)))
+            angle = 2 * turns[1:] * jnp.where(turns[0] < 0, -1.0, 1.0)
+            # Exact, as jaws that close rock a wire by tens of degrees.
+            shift = at[0][o] - was + carried(turns, patch.centre - at[0][o])
             slip = jnp.concatenate([patch.frame[1:] @ shift, (patch.radius * (patch.normal @ angle))[None]])
             return jnp.where(force > 0, slip, 0.0)
 
@@ -276,7 +277,7 @@ class Handling:
                 patch, slip, forces = row_of((slots.patch, felt.slip, pressed), n)
                 after = slip + contact.cone.along @ self._twists.of(contact, *moves)
                 pose = at[0][contact.first], at[1][contact.first]
-                new = self._kept(patch, forces, self._slid(number, forces, slip, after, dt), finger, pose, own)
+                new = self._kept(patch, forces, slip, self._slid(number, forces, slip, after, dt), finger, pose, own)
                 found = put(tuple(getattr(kept[0], name) for name in OF_FINGERS), place, new)
                 return kept[0]._replace(**dict(zip(OF_FINGERS, found, strict=True))), put(kept[1], place, patch.normal)
 
@@ -294,25 +295,35 @@ class Handling:
         return jnp.where(forces.slips, after - (dt * pulled + DAMPING * slip) / (dt + DAMPING), 0.0)
 
     def _kept(
-        self, patch: Patch, forces: Pressed, excess: Array, finger: Fingers, at: tuple[Array, Array],
+        self, patch: Patch, forces: Pressed, slip: Array, slid: Array, finger: Fingers, at: tuple[Array, Array],
         grip: tuple[Array, Array, Array, Array],
     ) -> tuple[Array, Array, Array, Array]:  # fmt: skip
-        """Return what is kept for one finger and one object after a slide: `OF_FINGERS`, as in `grip`."""
-        (place, faces), (position, quaternion, force, slid), axes = finger, grip, rotation(finger.quaternion)
-        slips = forces.slips
+        """Return what is kept for one finger and one object after a step: `OF_FINGERS`, as in `grip`.
+
+        Args:
+            patch: at the start of the step.
+            forces: in the step.
+            slip: how far friction's spring was stretched, m, [3].
+            slid: how far friction slid, m, [3].
+            finger: its place and orientation.
+            at: place and orientation of the object.
+            grip: what was kept.
+
+        Where it slides, friction's spring is relaxed in the pose of now, less what it stays stretched by along the
+        surface and about the normal. In all other directions that pose is taken as it is: if an object that rolls as it
+        slides kept its old one, the spring would feel it roll back.
+        """
+        (place, faces), (position, quaternion, force, before), axes = finger, grip, rotation(finger.quaternion)
+        new, left = force <= 0, slip - slid
         # Kept as it is while nothing slips: rounding errors of a pose made anew in each step would add up.
-        along, about = excess[:2] @ patch.frame[1:], turn(excess[2] / patch.radius * patch.normal)
-        was, faced = place + axes @ position, product(faces, quaternion)
-        was, faced = patch.centre + rotation(about) @ (was - patch.centre) + along, product(about, faced)
-        new = force <= 0
-        was, faced = jnp.where(new, at[0] + along, was), jnp.where(new, at[1], faced)
-        facing = product(conjugate(faces), faced)
-        moves, way = new | slips, jnp.sqrt(jnp.sum(excess[:2] ** 2))
+        moves, way = new | forces.slips, jnp.sqrt(jnp.sum(slid[:2] ** 2))
+        spin = left[2] / patch.radius * patch.normal
+        was = at[0] + carried(turn(spin), patch.centre - at[0]) - left[:2] @ patch.frame[1:]
         return (
             jnp.where(moves, axes.T @ (was - place), position),
-            jnp.where(moves, facing / jnp.linalg.norm(facing), quaternion),
+            jnp.where(moves, product(conjugate(faces), turned(-spin, at[1])), quaternion),
             forces.normal,
-            jnp.where(new, 0.0, slid + jnp.where(slips, way, 0.0)),
+            jnp.where(new, 0.0, before + jnp.where(forces.slips, way, 0.0)),
         )
 
     def _held(self, normal: Array, force: Array, held: Array, dt: Any) -> Array:
