@@ -8,6 +8,7 @@ other = Jaw(scene, "psm_1").join("needle", grasp, {"psm_0": grasp.q}, rng)
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import product
 from typing import NamedTuple
 
 import mujoco
@@ -29,6 +30,12 @@ CENTRINGS = 5
 """Times that the object is moved to the middle between the pads, and the jaw opened as wide as its bends need."""
 TRIES = 48
 """Postures in which an arm tries to join another's grasp."""
+WRIST = [4, 5]
+"""Numbers of the joints between the shaft and the jaw."""
+STOPS = 9
+"""Positions of each of them, from end to end, that are looked at."""
+ROOM = 1e-3
+"""How near an object may come to the wrist there, m. Between two such positions it moves by about as much."""
 ACROSS = np.stack([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]], 1)
 """Axes of a wire across the jaw, by the axes of the jaw's link: x along the wire."""
 
@@ -141,6 +148,28 @@ class Jaw:
             if self._is_free(name, object_frame):
                 return found
         return None
+
+    def clears_wrist(self, name: str, grasp: Grasp) -> bool:
+        """Return whether the wrist can turn with an object as far as it goes: only the fingers come near the object.
+
+        Args:
+            name: the object.
+            grasp: around it, by this jaw.
+        """
+        model, limits = self.scene.model, zip(self.mount.arm.lower[WRIST], self.mount.arm.upper[WRIST], strict=True)
+        hinge, link = self._place({self.agent: grasp.q})
+        held = link.T @ (grasp.position - hinge), link.T @ grasp.rotation
+        named = [pair for pair in self._touches if {geom.partition("/")[0] for geom in pair} == {name, self.agent}]
+        pairs = [[model.geom(geom).id for geom in pair] for pair in named]
+        pairs = [pair for pair in pairs if not np.isin(pair, self._pads).any()]
+        for angles in product(*(np.linspace(*ends, STOPS) for ends in limits)):
+            q = grasp.q.copy()
+            q[WRIST] = angles
+            hinge, link = self._place({self.agent: q})
+            self._put(name, (hinge + link @ held[0], link @ held[1]))
+            if min(distance(model, self._data, *pair) for pair in pairs) < ROOM:
+                return False
+        return True
 
     def _opening(self, name: str, depth: float) -> float:
         """Return the jaw's position at which a straight wire fits between the pads, rad."""

@@ -101,13 +101,15 @@ def judge(seen: Seen) -> Held:
 
 
 def hold(
-    name: str, arms: int, count: int, seconds: float, first: int = 0, share: float = 1.0, mujoco: bool = False
-) -> Held:
+    name: str, arms: int, count: int, seconds: float, first: int = 0, share: float = 1.0, mujoco: bool = False,
+    struck: bool = False,
+) -> Held:  # fmt: skip
     """Return how `count` random grasps of an object hold.
 
-    `share` is that of `Grasps.pull`. With `mujoco` C MuJoCo plays the grasps that dropped it or let it slip, too.
+    `share` is that of `Grasps.pull`, and `struck` that of `Grasps`. With `mujoco` C MuJoCo plays the grasps that
+    dropped it or let it slip, too.
     """
-    parts, jaws, size = [], Grasps([name], arms), min(BATCH, count)
+    parts, jaws, size = [], Grasps([name], arms, struck), min(BATCH, count)
     held = np.zeros(size, int)
     for seed in range(first, first - (-count // size)):
         begin = jaws.begin(held, seed)
@@ -163,11 +165,14 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument(
         "--mujoco", action="store_true", help="let C MuJoCo play what is dropped or slips, at a tenth of the step"
     )
+    parser.add_argument(
+        "--struck", action="store_true", help="let one arm also grasp an object where its own wrist can strike it"
+    )
     parser.add_argument("--json", action="store_true", help="print one JSON object a line")
     arguments = parser.parse_args(argv)
     count, seconds, mujoco = arguments.grasps, arguments.seconds, arguments.mujoco
     for number, (arms, name) in enumerate(product(arguments.arms, arguments.objects)):
-        held = hold(name, arms, count, seconds, arguments.seed, arguments.share, mujoco)
+        held = hold(name, arms, count, seconds, arguments.seed, arguments.share, mujoco, arguments.struck)
         found = figures(name, arms, held, mujoco)
         if not arguments.json and number == 0:
             print(f"| {' | '.join(COLUMNS[key] for key in found)} |\n|{'---|' * len(found)}")

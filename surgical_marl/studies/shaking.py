@@ -37,6 +37,8 @@ CLOSING, RESTING = 3, 2
 """Chunks in which the jaw closes at the start, and in which the arm stands at the end."""
 CLOSE = 2e-4
 """An object this near to another part of an arm counts as struck by it, m."""
+DRAWS = 1000
+"""Grasps that are drawn at most until one is as it should be."""
 PULL, TURN = 1e-4, np.radians(0.25)
 """How far each of two arms is told to go from where it grasped, in each direction, m, and about each axis, rad."""
 ARMS = (
@@ -167,10 +169,12 @@ class Grasps:
     Args:
         objects: their names or files. One that isn't in `OBJECTS` has a site `grasp`.
         arms: how many grasp the object, 1 or 2.
+        struck: whether one arm also grasps an object where its own wrist can strike it. Two arms, which hardly turn
+            their wrists, do so anyway.
     """
 
-    def __init__(self, objects: Sequence[str], arms: int = 1) -> None:
-        self._env = env_of(objects, arms)
+    def __init__(self, objects: Sequence[str], arms: int = 1, struck: bool = False) -> None:
+        self._env, self._struck = env_of(objects, arms), struck or arms > 1
         self.scene, self.simulator = self._env.scene, self._env.simulator
         self.names, self.agents = tuple(self.scene.objects), self.scene.agents
         self.fingers = [[self.scene.model.body(int(body)).name for body in jaw] for jaw in self._env.fingers[1]]
@@ -264,16 +268,17 @@ class Grasps:
     def _draw(self, rng: np.random.Generator, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return qpos, and the object's centre of mass and quaternion: between the pads, and not in the wrist's way."""
         item = self.scene.objects[name].object
-        while True:
+        for _ in range(DRAWS):
             first, *others = rng.permutation(len(self._jaws))
             grasp = self._jaws[first].draw(name, item.sites[OBJECTS.get(name, "grasp")], rng)
             joints: dict[str, np.ndarray | None] = {self.agents[first]: grasp.q}
             for other in others:
                 joints[self.agents[other]] = self._jaws[other].join(name, grasp, {self.agents[first]: grasp.q}, rng)
             q = {agent: own for agent, own in joints.items() if own is not None}
-            if len(q) == len(joints):
+            if len(q) == len(joints) and (self._struck or self._jaws[first].clears_wrist(name, grasp)):
                 place = grasp.position + grasp.rotation @ item.center
                 return self.scene.full_qpos(q), place, quaternion(grasp.rotation)
+        raise ValueError(f"all of {DRAWS} random grasps of {name!r} are out of reach or in the way of the arm's wrist")
 
     def _make_engine(self, count: int) -> Engine:
         engine = make_engine(self._env, count)
