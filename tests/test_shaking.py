@@ -30,5 +30,5 @@ def test_a_wrist_strikes_no_grasp_that_is_clear_of_it() -> None:
     anywhere = Grasps(["block"], struck=True)
     assert not judge(clear.shake(clear.begin(block), block, 10.0)).struck.any()
     assert judge(anywhere.shake(anywhere.begin(block), block, 10.0)).struck.any()
-    with patch.object(shaking, "DRAWS", 1), pytest.raises(ValueError, match="1 random grasps of 'block'.*wrist"):
+    with patch.object(shaking, "DRAWS", 1), pytest.raises(ValueError, match=r"1 random grasps of 'block'.*wrist"):
         clear.begin(block)
