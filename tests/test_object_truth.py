@@ -42,6 +42,24 @@ def test_a_grasped_object_is_lifted_swung_and_let_go_as_in_plain_mujoco() -> Non
 
 
 @pytest.mark.slow
+def test_a_needle_lies_in_a_closed_jaw_nearly_as_in_plain_mujoco() -> None:
+    """From an open jaw around it. Springs of friction give way as they take the load, and a thin wire rolls on them.
+
+    Of 120 needles half were within 2.7 degrees and 0.12 mm, and nine of ten within 5.0 degrees and 0.24 mm. Where
+    friction took a part of what had rolled for a slide it was 3.1 and 5.9 degrees, and up to 42 instead of 13.
+    """
+    grasps, held = Grasps(["needle_sh"]), np.zeros(120, int)
+    begin = grasps.begin(held, seed=6)
+    _, seen = grasps.play(begin, grasps.still(len(held)), held)
+    position, rotation = (x[:, -1, 0] for x in plain_mujoco.play_in_jaws(grasps, begin, seen.command, held))
+    same = np.einsum("eij,eij->e", seen.rotation[:, -1, 0].astype(float), rotation)
+    turn = np.degrees(np.arccos(np.clip((same - 1) / 2, -1, 1)))
+    off = np.linalg.norm(seen.position[:, -1, 0] - position, axis=-1)
+    assert np.median(turn) < 3.0 and np.quantile(turn, 0.9) < 5.5 and turn.max() < 25, np.sort(turn)
+    assert np.median(off) < 1.3e-4 and np.quantile(off, 0.9) < 2.8e-4, np.sort(off)
+
+
+@pytest.mark.slow
 def test_plain_mujoco_says_where_an_object_is_in_both_jaws_that_hold_it() -> None:
     """By which `studies.grasping --mujoco` tells whether it was dropped or slipped."""
     grasps, begin, held = two_arms_hold(4)
