@@ -88,8 +88,14 @@ class Held(NamedTuple):
 def moves(position: np.ndarray, rotation: np.ndarray) -> Moved:
     """Return how objects moved in jaws: positions [E, steps, a, 3] and axes [E, steps, a, 3, 3] in their frames."""
     far = np.linalg.norm(position[:, CLOSED:] - position[:, CLOSED, None], axis=-1)
-    turned_by = np.einsum("eaij,eaij->ea", rotation[:, CLOSED].astype(float), rotation[:, -1]) - 1
-    return Moved(far.max((1, 2)), far[:, -1].max(-1), np.arccos(np.clip(turned_by / 2, -1, 1)).max(-1))
+    return Moved(far.max((1, 2)), far[:, -1].max(-1), angle(rotation[:, CLOSED], rotation[:, -1]).max(-1))
+
+
+def angle(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Return by how much axes [..., 3, 3] are turned from others, rad, [...]."""
+    trace = np.einsum("...ij,...ij->...", one.astype(float), other)
+    found: np.ndarray = np.arccos(np.clip((trace - 1) / 2, -1, 1))
+    return found
 
 
 def judge(seen: Seen) -> Held:
