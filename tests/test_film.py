@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import imageio.v3 as imageio
@@ -10,7 +11,7 @@ import pytest
 
 from surgical_marl.cli.main import main
 from surgical_marl.envs.batch import BatchedEnv
-from surgical_marl.view.film import Look, camera_of, film, wall, written
+from surgical_marl.view.film import Look, camera_of, film, pictures, wall, written
 from surgical_marl.view.movers import Movers, first
 from surgical_marl.view.render import View
 
@@ -56,6 +57,14 @@ def test_a_film_is_as_long_as_its_episode_and_slow_ones_are_longer(tmp_path: Pat
     assert len(imageio.imread(slow)) == 4
     assert imageio.immeta(slow)["duration"] == 80  # ms: 4 steps of 20 ms take 320 ms
     assert (frames[0] != frames[1]).any()
+
+
+def test_the_last_picture_of_a_film_is_of_the_last_step() -> None:
+    short, long = (BatchedEnv("reach", "psm", device="cpu", max_steps=steps) for steps in (3, 8))
+    look = Look(words=False, size=(120, 90))
+    last = list(pictures(short, Movers(short, "oracle"), look))[-1]
+    np.testing.assert_array_equal(last, next(pictures(long, Movers(long, "oracle"), replace(look, fps=50 / 3))))
+    assert short.autoreset and long.autoreset
 
 
 def test_a_film_that_becomes_a_gif_says_why(

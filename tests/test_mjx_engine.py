@@ -32,7 +32,7 @@ def watch() -> Iterator[list[str]]:
 def play(engine: MjxEngine) -> np.ndarray:
     engine.reset(3)
     engine.step({"ecm_0": np.full((engine.num_envs, 4), 0.5, np.float32)})
-    engine.restart()
+    engine.begin(engine.read(".key", "numpy"), np.ones(engine.num_envs, np.int32))
     return engine.outcome("numpy")["observations"]["ecm_0"]
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -50,15 +53,53 @@ def test_a_masked_reset_goes_on_to_the_episode_that_a_whole_one_goes_on_to() -> 
         np.testing.assert_array_equal(found["psm_0"], expected["psm_0"][[0, 2]])
 
 
-def test_a_masked_reset_after_an_end_shows_the_episode_that_has_begun() -> None:
-    env = make()
-    env.reset(seed=4)
-    for _ in range(STEPS):
-        step = env.step(act(env, np.random.default_rng(0)))
-    assert step.truncated.all()
-    begun, _, infos = env.reset(mask=np.array([True, False, True]))
-    np.testing.assert_array_equal(begun["psm_0"], step.observations["psm_0"][[0, 2]])
-    assert not np.allclose(infos["psm_0"]["tip_error"], step.infos["psm_0"]["tip_error"][[0, 2]])
+def copied(env: BatchedEnv) -> BatchedEnv:
+    other = make(engine=env.engine.name)
+    other.set_carry(env.carry())
+    return other
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("steps", [0, 1, STEPS, STEPS + 1])
+@pytest.mark.parametrize("copy", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env)), copied])
+def test_a_copy_goes_on_to_the_episodes_that_the_original_goes_on_to(
+    engine: str, steps: int, copy: Callable[[BatchedEnv], BatchedEnv]
+) -> None:
+    env, rng = make(engine=engine), np.random.default_rng(0)
+    played = [env.reset(seed=4)[0]["psm_0"]]
+    for _ in range(steps):
+        played.append(env.step(act(env, rng)).observations["psm_0"])
+    other = copy(env)
+    for mask in (None, np.array([True, False, True]), None):
+        rows = slice(None) if mask is None else mask
+        one, two = (each.reset(mask=mask)[0]["psm_0"] for each in (env, other))
+        np.testing.assert_array_equal(one, two)
+        goals = [np.round(before[rows][:, 24:27], 7) for before in played]
+        assert not any((np.round(one[:, 24:27], 7) == goal).all(1).any() for goal in goals)  # none is played twice
+        played += [] if mask is not None else [one]
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_without_autoreset_an_environment_stays_where_its_episode_ended(engine: str) -> None:
+    env, usual = make(engine=engine), make(engine=engine)
+    env.autoreset = False
+    for each in (env, usual):
+        each.reset(seed=4)
+    for number in range(STEPS):
+        one, other = (each.step(act(each, np.random.default_rng(number))) for each in (env, usual))
+    assert one.truncated.all() and other.truncated.all()
+    np.testing.assert_array_equal(one.observations["psm_0"], other.final_observations["psm_0"])
+    assert env.steps.tolist() == [STEPS] * 3 and usual.steps.tolist() == [0] * 3
+    np.testing.assert_array_equal(env.reset()[0]["psm_0"], other.observations["psm_0"])  # the episode that follows
+    assert not pickle.loads(pickle.dumps(env)).autoreset
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_seeds_of_all_63_bits_lead_to_episodes_of_their_own(engine: str) -> None:
+    env = make(engine=engine)
+    seeds = [5, 5 + 2**32, 5 + 2**62, 0, 2**32, 2**63 - 1, 2**31 - 1]
+    goals = [env.reset(seed=seed)[0]["psm_0"][:, 24:27].tobytes() for seed in seeds]
+    assert len(set(goals)) == len(seeds)
 
 
 @pytest.mark.parametrize("engine", ENGINES)

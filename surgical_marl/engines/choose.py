@@ -7,6 +7,8 @@ import sys
 from collections.abc import Callable
 from typing import Any, Literal, Protocol, get_args
 
+import numpy as np
+
 from surgical_marl.engines.stepper import Stepper
 
 EngineName = Literal["auto", "fused", "mjx"]
@@ -25,7 +27,9 @@ class Engine(Protocol):
 
     def reset(self, seed: int, first: int = 0) -> None: ...
 
-    def restart(self) -> None: ...
+    def begin(self, keys: np.ndarray, episodes: np.ndarray) -> None: ...
+
+    def set_parameters(self) -> None: ...
 
     def step(self, actions: dict[str, Any], sense: Callable[[], dict[str, Any]] | None = None) -> None: ...
 

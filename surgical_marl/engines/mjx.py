@@ -15,6 +15,7 @@ import numpy as np
 from jax import Array
 
 from surgical_marl.engines.faults import FINE, NEXT, checked, is_reward, places
+from surgical_marl.engines.fused.threefry import episode_keys
 from surgical_marl.engines.stages import compiling
 from surgical_marl.engines.stepper import MOST_KEPT, Stepper, representative
 from surgical_marl.machine import cores
@@ -49,11 +50,6 @@ def _functions(env: Stepper, num_envs: int) -> Functions:
         finish=every(env.finish, (0, 0)),
         carry=jax.eval_shape(env.reset, key, number, env.parameters).carry,
     )
-
-
-@jax.jit
-def _first_keys(key: Array, numbers: Array) -> Array:
-    return jax.vmap(jax.random.fold_in, (None, 0))(key, numbers)
 
 
 @partial(jax.jit, static_argnums=1)
@@ -107,7 +103,7 @@ class MjxEngine:
         self.env, self.num_envs = env, num_envs
         self._on = find_device(device)
         self.device = "cpu" if self._on.platform == "cpu" else "cuda"
-        self._parameters = jax.device_put(env.parameters, self._on)
+        self.set_parameters()
         self._functions = _functions(representative(env), num_envs)
         # XLA runs a step on one CPU core: every core takes a share of the environments
         shares = min(cores(), num_envs // LEAST_SHARE) if self.device == "cpu" else 1
@@ -115,29 +111,22 @@ class MjxEngine:
         self._pool = ThreadPoolExecutor(self._shares, "surgical_marl")
         self._state: Any = None
         self._moved: Any = None
-        self._stepped = False
         self._leaving: Any = np.zeros(num_envs, bool)
         self._tree = jax.tree.structure(self._functions.carry)
         self.carry_shapes = {name: leaf.shape for name, leaf in _paths(self._functions.carry).items()}
 
     def reset(self, seed: int, first: int = 0) -> None:
         """First episodes. Environment i depends on `seed` and `first` + i alone, not on how many there are."""
-        with jax.default_device(self._on):
-            keys = _first_keys(jax.random.PRNGKey(seed), jnp.arange(first, first + self.num_envs))
-            self._begin(keys, jnp.zeros(self.num_envs, jnp.int32))
+        self.begin(episode_keys(seed, self.num_envs, first), np.zeros(self.num_envs, np.int32))
 
-    def restart(self) -> None:
-        """Begin the next episode of every environment that has not just begun one.
-
-        An environment has just begun one if the last step ended its episode.
-        """
-        carry = self._state.carry
-        begun = (carry.steps == 0) & self._stepped
-        self._begin(carry.key, carry.episode + ~begun)
-
-    def _begin(self, keys: Array, episodes: Array) -> None:
+    def begin(self, keys: np.ndarray, episodes: np.ndarray) -> None:
+        """Begin episodes by their number, [N] int32, among those of each environment's key, [N, 2] uint32."""
         with self._compiling("reset"), jax.default_device(self._on):
-            self._state, self._stepped = self._functions.reset(keys, episodes, self._parameters), False
+            self._state = self._functions.reset(self._take(keys), self._take(episodes), self._parameters)
+
+    def set_parameters(self) -> None:
+        """Read the environment's `parameters` again."""
+        self._parameters = jax.device_put(self.env.parameters, self._on)
 
     def step(self, actions: dict[str, Any], sense: Callable[[], dict[str, Any]] | None = None) -> None:
         """One control step of all environments.
@@ -153,7 +142,6 @@ class MjxEngine:
             self._state = self._run("finish", self._moved, sensed)
         else:
             self._state = self._run("step", self._state.carry, given)
-        self._stepped = True
 
     def _run(self, name: str, *given: Any) -> Any:
         """Run a function on all environments, with a share of them on each core."""
@@ -223,7 +211,7 @@ class MjxEngine:
         parts = _paths(self._state.carry)
         parts[name] = jnp.array(self._take(values), parts[name].dtype)  # a copy: a step gives its carry away
         carry = jax.tree.unflatten(self._tree, list(parts.values()))
-        self._state, self._stepped = self._state._replace(carry=carry), True
+        self._state = self._state._replace(carry=carry)
 
     def close(self) -> None:
         """End the threads. The arrays are freed with the engine."""

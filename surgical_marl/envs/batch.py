@@ -4,7 +4,7 @@
     observations, state, infos = env.reset(seed=0)
     step = env.step({agent: torch.zeros(1024, 7) for agent in env.agents})
 
-An environment that ends starts its next episode within the same step.
+An environment that ends starts its next episode within the same step, unless `autoreset` is set to False.
 """
 
 from __future__ import annotations
@@ -103,8 +103,6 @@ class BatchedEnv:
             self._sight = Sight(self.env, self.engine, num_envs, arrays)
             self.observation_spaces |= self._sight.spaces(self.observation_spaces)
         self._started = False
-        self._fresh = np.zeros(num_envs, bool)
-        """Where a reset began the episode, and no step has followed."""
 
     @property
     def engine(self) -> Engine:
@@ -124,16 +122,42 @@ class BatchedEnv:
         self._engine = self._sight = None
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what a copy is made from: the arguments, and where all environments are (None before a reset)."""
+        """Return what a copy is made from: the arguments, the state of all environments, and of the spaces' samplers.
+
+        The state is None before a reset.
+        """
         closed = self._engine is None
-        return {"made": self._made, "closed": closed, "carry": self.carry() if self._started and not closed else None}
+        return {
+            "made": self._made,
+            "closed": closed,
+            "carry": self.carry() if self._started and not closed else None,
+            "autoreset": self.autoreset,
+            "spaces": (self.action_spaces, self.observation_spaces, self.state_space),
+        }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__init__(**state["made"])  # type: ignore[misc]
+        self.action_spaces, self.observation_spaces, self.state_space = state["spaces"]
+        self.autoreset = state["autoreset"]
         if state["carry"] is not None:
             self.set_carry(state["carry"])
         if state["closed"]:
             self.close()
+
+    @property
+    def autoreset(self) -> bool:
+        """Whether a step that ends an episode also begins the next one, which is so unless it is set to False.
+
+        Without it an environment stays where its episode ended, and can be looked at there, until `reset`. A step
+        before that goes on from there, and has `truncated` again after the time limit.
+        """
+        return bool(self.env.parameters["autoreset"])
+
+    @autoreset.setter
+    def autoreset(self, wanted: bool) -> None:
+        if wanted != self.autoreset:
+            self.env.parameters["autoreset"] = np.bool_(wanted)
+            self.engine.set_parameters()
 
     def observation_terms(self, agent: str) -> dict[str, slice]:
         """Return the names of what an agent observes, and where each stands in its vector.
@@ -174,8 +198,9 @@ class BatchedEnv:
 
         Args:
             seed: environment i plays the same episodes for the same seed, whatever `num_envs`. None goes on to each
-                environment's next episode, or draws a seed if there was none yet. A list holds one of these for each
-                environment: with a seed it plays what an environment alone plays with that seed.
+                environment's next episode, or draws a seed if there was none yet: an episode that a step began and
+                that nothing was done in counts as played. A list holds one of these for each environment: with a seed
+                it plays what an environment alone plays with that seed.
             first: the number of the first environment, where several processes share the environments of a seed.
             mask: [N] bool, the environments that start a new episode. The others stay as they are, and what is
                 returned is of those in the mask alone, in their order. None for all.
@@ -187,7 +212,7 @@ class BatchedEnv:
         if mask is None and not isinstance(seed, Sequence | np.ndarray):
             whole = check_seed(seed)
             if whole is None and self._started:
-                engine.restart()
+                engine.begin(engine.read(".key", "numpy"), engine.read(".episode", "numpy") + np.int32(1))
             else:
                 engine.reset(secrets.randbits(63) if whole is None else whole, first)
             engine.expect_end(np.zeros(self.num_envs, bool))
@@ -195,7 +220,6 @@ class BatchedEnv:
             mask = np.ones(self.num_envs, bool) if mask is None else np.asarray(mask)
             self._begin(seed, first, mask)
         self._started = True
-        self._fresh[... if mask is None else mask] = True
         found = engine.outcome(self.arrays)
         if self._sight is not None:
             self._sight.begin(found)
@@ -216,11 +240,8 @@ class BatchedEnv:
             self.engine.reset(secrets.randbits(63))
             self._started = True
         before = None if mask.all() else self.carry()
-        begun = (self.engine.read(".steps", "numpy") == 0) & ~self._fresh  # by the step that ended the last episode
-        self.engine.write(".key", np.where(seeded[:, None], keys, self.engine.read(".key", "numpy")))
-        self.engine.write(".episode", np.where(seeded, -1, self.engine.read(".episode", "numpy")))
-        self.engine.write(".steps", (seeded | ~begun).astype(np.int32))
-        self.engine.restart()
+        keys = np.where(seeded[:, None], keys, self.engine.read(".key", "numpy"))
+        self.engine.begin(keys, np.where(seeded, np.int32(0), self.engine.read(".episode", "numpy") + np.int32(1)))
         self.engine.expect_end(np.zeros(self.num_envs, bool))
         if before is not None:
             self.set_carry(before, ~mask)
@@ -239,7 +260,7 @@ class BatchedEnv:
         faults = self.engine.end_faulty(self.max_steps, self.arrays)
         found = self.engine.outcome(self.arrays)
         if self._sight is not None:
-            self._sight.show(found)
+            self._sight.show(found, self.autoreset)
         return BatchStep(**{**found, "contacts": Contacts(**found["contacts"])}, faults=faults)
 
     def step_raw(self, actions: dict[str, Any]) -> None:
@@ -249,7 +270,6 @@ class BatchedEnv:
             raise ValueError("step before reset: call reset() first")
         checked = check_actions(actions, self._action_shapes)
         engine.step(checked, None if self._sight is None else self._sight.sense)
-        self._fresh[:] = False
 
     @property
     def qpos(self) -> np.ndarray:

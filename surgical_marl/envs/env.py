@@ -140,9 +140,11 @@ class Env:
     def parameters(self) -> dict[str, Any]:
         """Numbers that a step reads as inputs, so that nothing is compiled again when one of them changes.
 
-        A tree of numpy arrays: `max_steps`, the `weights` of reward terms, and the task's `tables`.
+        A tree of numpy arrays: `max_steps`, the `weights` of reward terms, the task's `tables`, and `autoreset`,
+        whether a step that ends an episode begins the next one.
         """
         return {
+            "autoreset": np.bool_(True),
             "max_steps": np.int32(self.max_steps),
             "weights": {name: np.float32(weight) for name, weight in self.task.weights.items()},
             "tables": {name: _single(table) for name, table in self.task.tables.items()},
@@ -200,7 +202,7 @@ class Env:
             episode: the number of the episode among those of the key.
             parameters: a tree like `self.parameters`; None for the environment's own.
         """
-        task, _ = self._bound(parameters)
+        task, *_ = self._bound(parameters)
         carry, contacts, arms = self._start(task, key, jnp.int32(episode))
         observations, state = self._observe(task, carry, contacts, arms)
         world = World(arms, carry.goal, self._unsensed(), self.plant.objects(carry.physics, carry.hidden))
@@ -227,7 +229,7 @@ class Env:
 
     def move(self, carry: Carry, actions: dict[str, Array], parameters: Any = None) -> Moved:
         """Do the first half of a step: physics, and the goals after it."""
-        task, _ = self._bound(parameters)
+        task, *_ = self._bound(parameters)
         actions, messages = self._part(actions)
         commanded = jnp.clip(jnp.concatenate([actions[agent] for agent in self.agents]), -1.0, 1.0)
         physics, hidden = self.plant.command(carry.physics, carry.hidden, actions)
@@ -250,7 +252,7 @@ class Env:
 
     def finish(self, moved: Moved, sensed: dict[str, Array], parameters: Any = None) -> State:
         """Do the second half of a step: observations, reward, and a reset if the step ends the episode."""
-        task, max_steps = self._bound(parameters)
+        task, max_steps, autoreset = self._bound(parameters)
         carry, contacts = moved.carry, moved.contacts
         arms = {agent: moved.arms[agent] for agent in self.agents}  # JAX sorts them by name
         objects, ends = self.plant.objects(carry.physics, carry.hidden), np.cumsum(self._joints)[:-1]
@@ -267,7 +269,7 @@ class Env:
             return fresh, *self._observe(task, fresh, touching, seen)
 
         going = carry, final_observations, final_state
-        done = terminated | truncated
+        done = (terminated | truncated) & autoreset
         next_carry, observations, state = jax.lax.cond(done, begin, lambda going: going, going)
         return State(
             carry=next_carry,
@@ -282,13 +284,13 @@ class Env:
             contacts=contacts,
         )
 
-    def _bound(self, parameters: Any) -> tuple[Task, Array]:
-        """Return the task with the given parameters, and the time limit in steps.
+    def _bound(self, parameters: Any) -> tuple[Task, Array, Array]:
+        """Return the task with the given parameters, the time limit in steps, and whether an end is a reset too.
 
         Where `parameters` is None, the environment's own are used.
         """
         known = jax.tree.map(jnp.asarray, self.parameters) if parameters is None else parameters
-        return self.task.bound(known["weights"], known["tables"]), known["max_steps"]
+        return self.task.bound(known["weights"], known["tables"]), known["max_steps"], known["autoreset"]
 
     def _unsensed(self) -> dict[str, Array]:
         return {name: jnp.float32(0.0) for name in self.senses}

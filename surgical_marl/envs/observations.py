@@ -48,6 +48,21 @@ def each(tree: Any, change: Callable[[Any], Any]) -> Any:
     return {name: change(value) for name, value in tree.items()} if isinstance(tree, dict) else change(tree)
 
 
+def replaced(tree: Any, rows: np.ndarray, new: Any) -> Any:
+    """Return a copy of a dict of dicts of arrays [N, ...], numpy's or torch's, with other values in some rows.
+
+    Args:
+        tree: the arrays.
+        rows: numbers of the rows, [n].
+        new: what stands there instead, arrays [n, ...].
+    """
+    if isinstance(tree, dict):
+        return {name: replaced(own, rows, new[name]) for name, own in tree.items()}
+    found = tree.clone() if hasattr(tree, "clone") else np.array(tree)
+    found[rows] = new
+    return found
+
+
 def proprioception(tree: Any) -> Any:
     """Return the one array that observations hold besides pictures."""
     return tree["proprioception"] if isinstance(tree, dict) else tree

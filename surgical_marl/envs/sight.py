@@ -72,11 +72,11 @@ class Sight:
         self._seen = self._draw(".moved.carry")
         return self._env.task.sense(self._seen)
 
-    def show(self, found: dict[str, Any]) -> None:
-        """Put pictures into the outcome of a step: where an episode ended, `observations` are of the next one."""
+    def show(self, found: dict[str, Any], autoreset: bool) -> None:
+        """Put pictures into the outcome of a step: after an autoreset, `observations` are of the next episode."""
         ended = self._own(found["terminated"]) | self._own(found["truncated"])
         found["final_observations"] = self._with(found["final_observations"], self._seen)
-        found["observations"] = self._with(found["observations"], self._next(ended))
+        found["observations"] = self._with(found["observations"], self._next(ended) if autoreset else self._seen)
 
     def _next(self, ended: Any) -> Seen:
         if not self._home:

@@ -80,6 +80,7 @@ class SurgicalEnv(LimitInSpec, gymnasium.Env[Any, np.ndarray]):
         check_size(render_size)
         options["max_steps"] = _limit_of_make() or options.get("max_steps")
         self.batch = make_batch(task, scene, 1, options)
+        self.batch.autoreset = False  # after the last step, a picture is of that step
         self.joint = JointAgent(self.batch, agent, list(teammates or ()), alone=True)
         self.teammates = Teammates(self.batch, teammates or {}, alone=True)
         self.observation_space, self.action_space = self.joint.observation_space, self.joint.action_space

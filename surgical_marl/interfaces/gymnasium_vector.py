@@ -14,6 +14,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
+from surgical_marl.envs.observations import replaced
 from surgical_marl.interfaces.gymnasium import RENDER_MODES, LimitInSpec, make_batch
 from surgical_marl.interfaces.joint import JointAgent
 from surgical_marl.interfaces.rendering import check_mode, check_size
@@ -73,6 +74,7 @@ class SurgicalVectorEnv(LimitInSpec, VectorEnv[Any, np.ndarray, Any]):
         self._over = np.zeros(self.num_envs, bool)
         """Where an episode is over and the next one has not been shown yet."""
         self._pictures: Any = None
+        self.batch.autoreset = False
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
@@ -184,8 +186,8 @@ class SurgicalVectorEnv(LimitInSpec, VectorEnv[Any, np.ndarray, Any]):
             self._seen = seen
             return first
         rows = np.flatnonzero(chosen)
-        self._seen = {arm: _replaced(self._seen[arm], rows, seen[arm]) for arm in seen}
-        return _replaced(info or _zeros(first, self.num_envs), rows, first)
+        self._seen = {arm: replaced(self._seen[arm], rows, seen[arm]) for arm in seen}
+        return replaced(info or _zeros(first, self.num_envs), rows, first)
 
     def _final(self, done: np.ndarray) -> np.ndarray:
         """Return the last observations where episodes are over, [N] objects, and None elsewhere."""
@@ -209,22 +211,11 @@ def _number(seed: Any) -> int | None:
     return None if first is None else int(first)
 
 
-def _mapped(change: Callable[..., Any], tree: Any, *others: Any) -> Any:
-    """Return a dict of dicts with `change` applied to its leaves, and to those of the others."""
+def _mapped(change: Callable[[Any], Any], tree: Any) -> Any:
+    """Return a dict of dicts with `change` applied to its leaves."""
     if isinstance(tree, dict):
-        return {name: _mapped(change, own, *(other[name] for other in others)) for name, own in tree.items()}
-    return change(tree, *others)
-
-
-def _replaced(tree: Any, rows: np.ndarray, new: Any) -> Any:
-    """Return a copy with other values in some rows."""
-
-    def replace(values: Any, own: Any) -> np.ndarray:
-        found = np.array(values)
-        found[rows] = own
-        return found
-
-    return _mapped(replace, tree, new)
+        return {name: _mapped(change, own) for name, own in tree.items()}
+    return change(tree)
 
 
 def _zeros(tree: Any, count: int) -> Any:

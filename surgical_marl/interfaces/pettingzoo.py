@@ -108,6 +108,7 @@ class SurgicalParallelEnv(_Face, ParallelEnv[str, Any, Any]):
     ) -> None:
         super().__init__(batch, render_mode, list(MODES), render_size)
         self.agents: list[str] = []
+        batch.autoreset = False  # after the last step, a picture is of that step
         self._shapes = {agent: space.shape for agent, space in batch.action_spaces.items()}
 
     def reset(

@@ -24,7 +24,7 @@ from surgical_marl.machine import cores
 from surgical_marl.runs.progress import progress
 from surgical_marl.view.history import summary
 from surgical_marl.view.moment import Observer
-from surgical_marl.view.record import FPS, HEIGHT, WIDTH, Pose, ScenePicture
+from surgical_marl.view.record import FPS, HEIGHT, WIDTH, Pose, ScenePicture, played
 from surgical_marl.view.render import View
 from surgical_marl.view.video import write_video
 
@@ -202,16 +202,11 @@ def _shots(
     env: BatchedEnv, movers: Movers, look: Look, picture: ScenePicture, episodes: int, seed: int
 ) -> Iterator[list[Shot]]:
     """Yield what each frame shows, while the environments play."""
-    every = _every(env, look)
-    observations, _, infos = env.reset(seed)
-    movers.begin(observations)
-    for step in range(episodes * env.max_steps):
-        if step % every == 0:
+    every, steps = _every(env, look), episodes * env.max_steps
+    for step, (infos, ended) in enumerate(played(env, movers.actions, movers.begin, steps, seed), 1):
+        if step % every == 0 or ended.any():
             words = [_words(env, infos, index) if look.words else [] for index in range(env.num_envs)]
             yield [Shot(picture.pose(index), words[index]) for index in range(env.num_envs)]
-        outcome = env.step(movers.actions(observations))
-        observations, infos = outcome.observations, outcome.infos
-        movers.begin(observations, np.asarray(outcome.terminated | outcome.truncated))
 
 
 def _every(env: BatchedEnv, look: Look) -> int:

@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from surgical_marl.envs.observations import replaced
 from surgical_marl.machine import cores
 from surgical_marl.policies.acting import forget
 from surgical_marl.runs.progress import progress
@@ -101,15 +102,46 @@ def _poses(
     seed: int,
 ) -> Iterator[Pose]:
     """Yield the poses that the pictures of `frames` show."""
-    every = _every(env)
-    observations, *_ = env.reset(seed)
-    forget(policy)
-    for step in range(_steps(env, episodes)):
-        if step % every == 0:
+    every, steps = _every(env), _steps(env, episodes)
+    begin = lambda _, ended: forget(policy, ended)  # noqa: E731
+    for step, (_, ended) in enumerate(played(env, policy, begin, steps, seed), 1):
+        if step % every == 0 or ended[0]:
             yield picture.pose()
-        outcome = env.step(dict(policy(observations)))
-        observations = outcome.observations
-        forget(policy, outcome.terminated | outcome.truncated)
+
+
+def played(
+    env: BatchedEnv,
+    act: Callable[[Mapping[str, Any]], Mapping[str, Any]],
+    begin: Callable[[Any, Any], None],
+    steps: int,
+    seed: int,
+) -> Iterator[tuple[dict[str, dict[str, Any]], NDArray[np.bool_]]]:
+    """Play episodes, and yield after each step while the environments are as that step left them, ended or not.
+
+    Args:
+        env: environments.
+        act: from observations to actions.
+        begin: called with observations, and with None before the first step or where episodes have ended, [N] bool.
+        steps: how many.
+        seed: of the first episodes.
+
+    Yields:
+        Infos by agent, [N] each, and where the step ended an episode, [N] bool.
+    """
+    before, env.autoreset = env.autoreset, False
+    try:
+        observations: Any = env.reset(seed)[0]
+        begin(observations, None)
+        for _ in range(steps):
+            outcome = env.step(dict(act(observations)))
+            observations, ends = outcome.observations, outcome.terminated | outcome.truncated
+            ended = np.array([bool(end) for end in ends])
+            yield outcome.infos, ended
+            if ended.any():
+                observations = replaced(observations, np.flatnonzero(ended), env.reset(mask=ended)[0])
+            begin(observations, ends)
+    finally:
+        env.autoreset = before
 
 
 def _every(env: BatchedEnv) -> int:

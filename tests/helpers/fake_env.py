@@ -50,6 +50,7 @@ class FakeEnv:
         self.line = 1.2  # an arm collides beyond it
         self.poison = False  # return NaN observations
         self.terminate = False  # end episodes by termination as well
+        self.autoreset = True
 
     @staticmethod
     def _box(size: int, limit: float = float("inf")) -> Box:
@@ -65,7 +66,10 @@ class FakeEnv:
         shapes = {agent: (self.num_envs, 2 * size) for agent, size in self.sizes.items()}
         return {a: torch.rand(s, generator=self.generator) * 2 - 1 for a, s in shapes.items()}
 
-    def reset(self, seed: int | None = None, first: int = 0) -> tuple[dict[str, Tensor], Tensor, dict[str, Any]]:
+    def reset(
+        self, seed: int | None = None, first: int = 0, mask: np.ndarray | None = None
+    ) -> tuple[dict[str, Tensor], Tensor, dict[str, Any]]:
+        assert mask is None or mask.all()  # its environments all end at once
         if seed is not None:
             self.generator.manual_seed(seed + 1000 * first)
         self.where = self._draw()
@@ -89,9 +93,10 @@ class FakeEnv:
         final_observations, final_state = self._observe()
         self.steps = self.steps + 1
         truncated = torch.from_numpy(self.steps >= self.max_steps)
-        fresh = self._draw()
-        self.where = {a: torch.where(truncated[:, None], fresh[a], w) for a, w in self.where.items()}
-        self.steps = np.where(truncated, 0, self.steps)
+        if self.autoreset:
+            fresh = self._draw()
+            self.where = {a: torch.where(truncated[:, None], fresh[a], w) for a, w in self.where.items()}
+            self.steps = np.where(truncated, 0, self.steps)
         observations, state = self._observe()
         return SimpleNamespace(
             observations=observations,

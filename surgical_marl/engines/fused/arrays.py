@@ -58,10 +58,10 @@ class Arrays(ABC):
         self._buffers = {name: self._zeros(max(source.sizes[name], 1), stride, dtype) for name, dtype in _TYPES.items()}
         self.work = self._zeros(1, stride, np.int32)[0]
         self._numbers = self.constant(np.arange(num_envs, dtype=np.int32))
-        constants = [self.constant(table) for table in tables.values()]
+        self._tables = {name: self.constant(table) for name, table in tables.items()}
         self.all = [
             *(self.warp(buffer) for buffer in self._buffers.values()),
-            *(self.warp(constant) for constant in constants),
+            *(self.warp(table) for table in self._tables.values()),
             self.warp(self.work),
             self.warp(self.constant(np.array([0, multiprocessors() if self.device == "cuda" else 0], np.int32))),
         ]
@@ -77,6 +77,10 @@ class Arrays(ABC):
     @abstractmethod
     def read_tree(self, tree: dict[str, Any], library: str) -> dict[str, Any]:
         """Return the leaves of a dict of dicts, of results. Later steps leave them as they are."""
+
+    @abstractmethod
+    def set_tables(self, tables: dict[str, np.ndarray]) -> None:
+        """Write other numbers into the constant tables, which have the same sizes."""
 
     @abstractmethod
     def presented(self, array: Any, library: str) -> Any:
@@ -165,6 +169,10 @@ class CpuArrays(Arrays):
         if self.order:
             values = values[self.order.envs]
         self.rows(leaf)[:] = values.T.view(np.int32) if leaf.dtype == "uint32" else values.T
+
+    def set_tables(self, tables: dict[str, np.ndarray]) -> None:
+        for name, table in tables.items():
+            self._tables[name][:] = table
 
     def read(self, leaf: Leaf, library: str) -> Any:
         fields = self._by_environment(self.rows(leaf)).view(_VIEWS.get(leaf.dtype, leaf.dtype)).T
@@ -276,6 +284,10 @@ class CudaArrays(Arrays):
             reorder.reordered(values.to(rows), self.order.envs, out=rows)
         else:
             torch.index_select(values.to(rows), 1, self.order.envs, out=rows)
+
+    def set_tables(self, tables: dict[str, np.ndarray]) -> None:
+        for name, table in tables.items():
+            self._tables[name].copy_(self.constant(table))
 
     def read(self, leaf: Leaf, library: str) -> Any:
         return self._present(leaf, self._by_environment(self.rows(leaf)), library)

@@ -69,21 +69,20 @@ class FusedEngine:
             self._arrays.sort_columns(every, shares, any(kernel.split for kernel in self._kernels.values()))
         self._pool: ThreadPoolExecutor | None = None
         self._process = 0
-        self._stepped = False
 
     def reset(self, seed: int, first: int = 0) -> None:
         """Start first episodes. Environment i depends on `seed` and `first` + i alone, and not on `num_envs`."""
-        self.write(".key", episode_keys(seed, self.num_envs, first))
-        self.write(".episode", np.zeros(self.num_envs, np.int32))
-        self._launch("reset")
-        self._stepped = False
+        self.begin(episode_keys(seed, self.num_envs, first), np.zeros(self.num_envs, np.int32))
 
-    def restart(self) -> None:
-        """Begin the next episode of every environment that has not just begun one."""
-        begun = (self.read(".steps", "numpy") == 0) & self._stepped
-        self.write(".episode", (self.read(".episode", "numpy") + ~begun).astype(np.int32))
+    def begin(self, keys: np.ndarray, episodes: np.ndarray) -> None:
+        """Begin episodes by their number, [N] int32, among those of each environment's key, [N, 2] uint32."""
+        self.write(".key", keys)
+        self.write(".episode", episodes)
         self._launch("reset")
-        self._stepped = False
+
+    def set_parameters(self) -> None:
+        """Read the environment's `parameters` again."""
+        self._arrays.set_tables(self._filled_tables())
 
     def step(self, actions: dict[str, Any], sense: Callable[[], dict[str, Any]] | None = None) -> None:
         """Do one control step of all environments.
@@ -103,7 +102,6 @@ class FusedEngine:
             self._launch("finish")
         else:
             self._launch("step")
-        self._stepped = True
 
     @property
     def guard(self) -> Guard:
@@ -160,7 +158,6 @@ class FusedEngine:
         self._arrays.write(leaf, values)
         if leaf.buffer == "state":  # a kernel checks what it stores alone
             self._arrays.rows(self.source.fault)[:] = 1
-        self._stepped = True
 
     def close(self) -> None:
         """End the threads. The arrays are freed with the engine."""

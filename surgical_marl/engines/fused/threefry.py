@@ -46,11 +46,13 @@ def threefry(
 
 
 def episode_keys(seed: int, count: int, first: int = 0) -> np.ndarray:
-    """Return `jax.random.fold_in(jax.random.PRNGKey(seed), first + i)` for i = 0 to count - 1, [count, 2] uint32.
+    """Return the keys of `count` environments of a seed, [count, 2] uint32, for environments `first`, `first` + 1, ...
 
-    The engine that JAX runs, MJX, has the same keys.
+    They are `jax.random.fold_in(key, first + i)`, where the two words of `key` are the upper and the lower 32 bits of
+    the seed. Below 2^32 that is `jax.random.PRNGKey(seed)`; beyond, `PRNGKey` drops the upper word unless JAX computes
+    with 64 bits.
     """
-    key = np.zeros(1, np.uint32), np.array([seed & 0xFFFFFFFF], np.uint32)  # JAX takes 32 bits of a seed
+    key = np.array([seed >> 32 & 0xFFFFFFFF], np.uint32), np.array([seed & 0xFFFFFFFF], np.uint32)
     counter = np.zeros(count, np.uint32), np.arange(first, first + count, dtype=np.uint32)
     return np.stack(threefry(key, counter, operator.add, operator.xor, _rotate, np.uint32), -1)
 
