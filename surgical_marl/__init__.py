@@ -16,6 +16,7 @@ from surgical_marl.content import list_arms, list_objects, list_policies, list_s
 from surgical_marl.interfaces.registration import register_ids, register_task
 from surgical_marl.plugins.algorithms import list_algorithms, register_algorithm
 from surgical_marl.plugins.tasks import list_tasks, module_name
+from surgical_marl.runtime import note_forks
 
 if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv
@@ -64,6 +65,7 @@ __all__ = [
 ]
 
 register_ids()
+note_forks()
 
 
 def __getattr__(name: str) -> Any:

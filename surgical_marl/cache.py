@@ -1,7 +1,8 @@
 """Arrays that take a while to compute, kept on disk, keyed by everything that they were computed from.
 
-What an array was computed from is data, code and the versions of the libraries that the code calls. The code is found
-by following imports from the module that computes: no list of modules is kept by hand.
+That is data, code and the versions of the libraries that the code calls. Code of this package is found by following
+imports from the module that computes: no list of modules is kept by hand. Code of somebody else can depend on anything,
+such as a global or `sys.argv`, so what it computes is not kept.
 """
 
 from __future__ import annotations
@@ -9,51 +10,59 @@ from __future__ import annotations
 import contextlib
 import functools
 import hashlib
-import importlib.util
+import inspect
 import os
 import re
 import sys
 import tempfile
-import uuid
 import zlib
 from collections.abc import Callable, Iterable, Iterator
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
+from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
 
 from surgical_marl.runtime import cache_dir
 
-THIS_PROCESS = uuid.uuid4().hex
+PACKAGE = __name__.partition(".")[0]
+_ROOT = Path(__file__).parent
 _IMPORT = re.compile(
     r"^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+import[ \t]*(\([^)]*\)|[^\n#]*)|import[ \t]+([\w., \t]+))", re.M
 )
 
 
 def cached(
-    kind: str, compute: Callable[[], np.ndarray], *content: str | bytes, roots: Iterable[str] = ()
+    kind: str, compute: Callable[[], np.ndarray], *content: str | bytes, classes: Iterable[type] = ()
 ) -> np.ndarray:
     """Return what `compute` returns, from disk if it was computed before from the same content, code and libraries.
 
     Args: see `cached_arrays`.
     """
-    return cached_arrays(kind, lambda: {"array": compute()}, *content, roots=(compute.__module__, *roots))["array"]
+    return cached_arrays(kind, lambda: {"array": compute()}, *content, classes=classes)["array"]
 
 
 def cached_arrays(
-    kind: str, compute: Callable[[], dict[str, np.ndarray]], *content: str | bytes, roots: Iterable[str] = ()
+    kind: str,
+    compute: Callable[[], dict[str, np.ndarray]],
+    *content: str | bytes,
+    classes: Iterable[type] = (),
 ) -> dict[str, np.ndarray]:
     """Return what `compute` returns, arrays by name, as `cached` does with one.
 
     Args:
         kind: folder within the cache.
         compute: the work. Its arrays appear on disk completely or not at all. If the cache fails, that is no error.
+            Where it runs code that is not of this package, its result is not kept.
         content: data that the result depends on.
-        roots: modules whose code `compute` runs, besides the module that it is defined in and all that they import.
+        classes: classes whose code `compute` runs, besides the functions and objects that it holds.
     """
+    modules = modules_of(compute, *classes)
+    if modules is None:
+        return compute()
     digest = hashlib.sha256(kind.encode())
-    for part in (*content, code_digest(frozenset((compute.__module__, *roots))), *_versions()):
+    for part in (*content, code_digest(modules), *_versions()):
         data = part.encode() if isinstance(part, str) else part
         digest.update(len(data).to_bytes(8, "little") + data)
     path = cache_dir() / kind / f"{digest.hexdigest()[:32]}.npz"
@@ -95,34 +104,66 @@ def _load(path: Path) -> dict[str, np.ndarray] | None:
         return None
 
 
-@functools.cache
-def code_digest(roots: frozenset[str]) -> str:
-    """Return a hash of the source of modules and of all that they import, directly or not, of their own packages.
+def is_shipped(*code: Any) -> bool:
+    """Return whether code is of this package alone; the arguments are those of `modules_of`."""
+    return modules_of(*code) is not None
 
-    A program that runs as `__main__` is a module too, and the files beside it belong to it. Code without a file, such
-    as a notebook's cells, counts as different in each process, so its results are never found again.
+
+def modules_of(*code: Any) -> frozenset[str] | None:
+    """Return the modules in which code is defined, or None if some of it is not of this package.
 
     Args:
-        roots: names of modules, as in "surgical_marl.tasks.reach".
+        code: classes, with all that they inherit, and functions and methods, with the objects that they hold.
     """
-    packages = {root.partition(".")[0] for root in roots} | {__name__.partition(".")[0]}
-    waiting, seen = sorted(roots), dict[str, str]()
+    waiting, seen, modules = [*code], list[Any](), set[str]()
+    while waiting:
+        one = waiting.pop()
+        if any(one is other for other in seen):
+            continue
+        seen.append(one)
+        if inspect.isclass(one):
+            if not all(map(_is_shipped_class, one.__mro__)):
+                return None
+            modules |= {base.__module__ for base in one.__mro__}
+        elif inspect.isfunction(one):
+            if _package(one) != PACKAGE:
+                return None
+            modules.add(one.__module__)
+            waiting += (*inspect.getclosurevars(one).nonlocals.values(), *(one.__defaults__ or ()))
+        elif inspect.ismethod(one):
+            waiting += one.__func__, one.__self__
+        elif isinstance(one, functools.partial):
+            waiting += one.func, *one.args, *one.keywords.values()
+        elif any(_package(base) == PACKAGE for base in type(one).__mro__):  # anything else is data
+            waiting.append(type(one))
+    return frozenset(modules)
+
+
+def _is_shipped_class(one: type) -> bool:
+    """Return whether a class is of this package or of Python, and no function was put into it from outside."""
+    functions = (own for own in vars(one).values() if inspect.isfunction(own))
+    ours = {PACKAGE, f"namedtuple_{one.__name__}", *sys.stdlib_module_names}
+    return _package(one) in ours and all(_package(own) in ours for own in functions)
+
+
+def _package(code: Any) -> str:
+    return str(code.__module__).partition(".")[0]
+
+
+@functools.cache
+def code_digest(modules: frozenset[str]) -> str:
+    """Return a hash of the source of modules of this package and of all that they import, directly or not, of it.
+
+    Args:
+        modules: names, as in "surgical_marl.tasks.reach".
+    """
+    waiting, seen = sorted(modules), dict[str, str]()
     while waiting:
         name = waiting.pop()
-        if name in seen or not (name.partition(".")[0] in packages or _beside_main(name, roots)):
-            continue
-        if path := _file(name):
+        if name not in seen and (path := _file(name)):
             seen[name], imported = _read(path)
             waiting += imported
-        elif name in roots:
-            seen[name] = THIS_PROCESS
     return hashlib.sha256(repr(sorted(seen.items())).encode()).hexdigest()
-
-
-def _beside_main(module: str, roots: frozenset[str]) -> bool:
-    """Return whether a module lies beside the program that runs, if the program is one of the roots."""
-    main = _file("__main__") if "__main__" in roots else None
-    return main is not None and any((main.parent / f"{module.partition('.')[0]}{end}").exists() for end in ("", ".py"))
 
 
 @functools.cache
@@ -143,29 +184,12 @@ def _imported(text: str) -> Iterator[str]:
 
 
 def _file(module: str) -> Path | None:
-    """Return the source file of a module or package; None if it has no such file, or if there is no such module."""
-    if module == "__main__":
-        file = getattr(sys.modules["__main__"], "__file__", None)
-        return Path(file) if file and Path(file).is_file() else None
+    """Return the source file of a module of this package; None if there is no such module."""
     top, *inner = module.split(".")
-    for folder in _folders(top):
-        path = Path(folder, *inner)
-        for file in (path.with_suffix(".py"), path / "__init__.py"):
-            if file.is_file():
-                return file
-    return None
-
-
-@functools.cache
-def _folders(package: str) -> tuple[str, ...]:
-    """Return the folder of a package's modules.
-
-    For a module that is no package, return its file's path without the suffix.
-    """
-    spec = importlib.util.find_spec(package)
-    if spec is None or spec.origin is None:
-        return ()
-    return tuple(spec.submodule_search_locations or [str(Path(spec.origin).with_suffix(""))])
+    if top != PACKAGE:
+        return None
+    path = _ROOT.joinpath(*inner)
+    return next((file for file in (path.with_suffix(".py"), path / "__init__.py") if file.is_file()), None)
 
 
 @functools.cache

@@ -75,6 +75,72 @@ def prepare_jax() -> None:
     _set_option("jax_default_matmul_precision", "highest")
 
 
+@contextlib.contextmanager
+def jax_scope() -> Iterator[None]:
+    """Run JAX in this block, or in a function as its decorator, as this package is written for it.
+
+    Settings that change what is computed are JAX's defaults there, whatever the user's are: the kind and the draws of
+    random numbers, 32-bit types, and how types and shapes are promoted. Products of matrices have full precision.
+
+    Raises:
+        ValueError: JAX can't run in this process.
+    """
+    check_jax()
+    import jax
+
+    with (
+        jax.enable_x64(False),
+        jax.threefry_partitionable(True),
+        jax.default_prng_impl("threefry2x32"),
+        jax.numpy_rank_promotion("allow"),
+        jax.numpy_dtype_promotion("standard"),
+        jax.default_matmul_precision("highest"),
+        jax.disable_jit(False),
+        # Numbers that are not finite appear in branches that are not taken, and engines find those that matter.
+        jax.debug_nans(False),
+        jax.debug_infs(False),
+    ):
+        yield
+
+
+def check_jax() -> None:
+    """Raise a ValueError with one sentence if JAX has no device, or would hang because this process was forked."""
+    prepare_jax()
+    if _forked_beside_jax:
+        raise ValueError(
+            "this process was forked from one in which JAX had started, and JAX would hang here: start processes with "
+            "the method 'spawn' or 'forkserver', as in AsyncVectorEnv(..., context='spawn')"
+        )
+    _check_devices()
+
+
+@functools.cache
+def _check_devices() -> None:
+    import jax
+
+    try:
+        jax.devices()
+    except (RuntimeError, AssertionError) as error:  # the latter where JAX has no plugin for what was asked for
+        asked, said = getattr(jax.config, "jax_platforms", None), " ".join(str(error).split())
+        raise ValueError(
+            f"JAX has no device of JAX_PLATFORMS={asked}: set it to cpu, or unset it{said and f' ({said})'}"
+        ) from None
+
+
+_forked_beside_jax = False
+
+
+def note_forks() -> None:
+    """Let forked processes know whether JAX had started in their parent. Call this function once."""
+    if hasattr(os, "register_at_fork"):
+        os.register_at_fork(after_in_child=_note_fork)
+
+
+def _note_fork() -> None:
+    global _forked_beside_jax
+    _forked_beside_jax = _backend_started()
+
+
 @functools.cache
 def prepare_mjx() -> Any:
     """Import MJX and return it, without what the import prints.

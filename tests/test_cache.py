@@ -1,16 +1,22 @@
-"""Results on disk are keyed by all that they were made from: content, code and versions."""
+"""Results on disk are keyed by all that they were made from: content, code of this package, and versions."""
 
 from __future__ import annotations
 
-import subprocess
-import sys
+import functools
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from surgical_marl import cache
 from surgical_marl.envs.env import Env
+from surgical_marl.robots.arm import load_arm
+from surgical_marl.tasks.base.paths import walks
+from surgical_marl.tasks.needle_pick import Task as NeedlePick
+from surgical_marl.tasks.reach import Task as Reach
 
 PACKAGE = Path(cache.__file__).parent
 
@@ -41,78 +47,113 @@ def edited(monkeypatch: pytest.MonkeyPatch, file: str) -> None:
 def test_a_kernel_is_keyed_by_the_code_that_it_comes_from(
     file: str, matters: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    roots = frozenset(Env("reach", "psm").roots)
-    before = cache.code_digest(roots)
+    modules = cache.modules_of(*Env("reach", "psm").classes)
+    assert modules is not None
+    before = cache.code_digest(modules)
     edited(monkeypatch, file)
-    assert (cache.code_digest(roots) != before) == matters
+    assert (cache.code_digest(modules) != before) == matters
 
 
-def test_an_edited_module_is_computed_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cache, "cache_dir", lambda: tmp_path / "cache")
-    monkeypatch.syspath_prepend(str(tmp_path))
-    (tmp_path / "stranger").mkdir()
-    (tmp_path / "stranger/__init__.py").write_text("")
-    (tmp_path / "stranger/helper.py").write_text("VALUE = 1\n")
-    (tmp_path / "stranger/task.py").write_text("def draw():\n    from stranger.helper import VALUE\n    return VALUE\n")
+def held(value: Any) -> Callable[[], Any]:
+    """Return a function that looks as if it were of this package, and holds a value."""
+    function = lambda: value  # noqa: E731
+    function.__module__ = "surgical_marl.scenes.load"
+    return function
+
+
+class Mine(Reach):
+    """A task of somebody else."""
+
+
+class Patched(Reach):
+    """A task that looks as if it were of this package, with a function from elsewhere."""
+
+    def reward_terms(self, world: Any) -> Any:
+        return {}
+
+
+Patched.__module__ = "surgical_marl.tasks.reach"
+
+
+def recursive() -> Callable[[], Any]:
+    def again() -> Any:
+        return again
+
+    again.__module__ = "surgical_marl.scenes.load"
+    return again
+
+
+@pytest.mark.parametrize(
+    ("code", "shipped"),
+    [
+        (Env, True),
+        (Reach, True),
+        (NeedlePick, True),
+        (Mine, False),
+        (Patched, False),
+        (dict, True),
+        (np.ndarray, False),
+        (SimpleNamespace, True),
+        (held(None), True),
+        (held(np.ones(3)), True),
+        (held(load_arm("psm")), True),
+        (held(walks), True),
+        (held(lambda: 1), False),
+        (held(Mine.__new__(Mine)), False),
+        (held(held(Mine.__new__(Mine))), False),
+        (held(functools.partial(walks, 1)), True),
+        (held(functools.partial(print, test_a_kernel_is_keyed_by_the_code_that_it_comes_from)), False),
+        (functools.partial(held(1), Mine.__new__(Mine)), False),
+        (Mine.__new__(Mine).reward_terms, False),
+        (Reach.__new__(Reach).reward_terms, True),
+        (recursive(), True),
+    ],
+)
+def test_code_of_somebody_else_is_told_from_that_of_the_package(code: Any, shipped: bool) -> None:
+    assert cache.is_shipped(code) == shipped
+
+
+def test_what_is_kept_is_found_until_content_code_or_versions_change(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cache, "cache_dir", lambda: tmp_path)
     made: list[float] = []
 
-    def ask(content: str = "") -> float:
-        def compute() -> np.ndarray:
-            made.append(0.0)
-            return np.array(float(len(made)))
+    def ask(content: str = "", **options: Any) -> float:
+        return float(cache.cached("numbers", shipped, content, **options))
 
-        for remembered in (cache.code_digest, cache._read, cache._folders):
-            remembered.cache_clear()
-        return float(cache.cached("numbers", compute, content, roots=["stranger.task"]))
+    def shipped() -> np.ndarray:
+        made.append(0.0)
+        return np.array(float(len(made)))
 
+    shipped.__module__ = "surgical_marl.scenes.load"
     assert ask() == ask() == 1
     assert ask("other content") == 2
-    (tmp_path / "stranger/helper.py").write_text("VALUE = 2\n")
-    assert ask() == 3
+    assert ask(classes=[Reach]) == ask(classes=[Reach]) == 3
+    assert ask(classes=[Mine]) == 4 and ask(classes=[Mine]) == 5  # nothing is kept
+    edited(monkeypatch, "scenes/load.py")
+    assert ask() == ask() == 6
     monkeypatch.setattr(cache, "_versions", lambda: ("jax 99",))
-    assert ask() == 4
+    assert ask() == 7
+    shipped.__module__ = "__main__"
+    assert ask() == 8 and ask() == 9
+
+
+def counted(count: int) -> Callable[[], np.ndarray]:
+    compute = lambda: np.arange(count)  # noqa: E731
+    compute.__module__ = "surgical_marl.scenes.load"
+    return compute
 
 
 def test_damaged_files_are_made_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cache, "cache_dir", lambda: tmp_path)
-    assert cache.cached("numbers", lambda: np.arange(3), "x").tolist() == [0, 1, 2]
+    assert cache.cached("numbers", counted(3), "x").tolist() == [0, 1, 2]
     (file,) = (tmp_path / "numbers").glob("*.npz")
     file.write_bytes(file.read_bytes()[:40])
-    assert cache.cached("numbers", lambda: np.arange(4), "x").tolist() == [0, 1, 2, 3]
+    assert cache.cached("numbers", counted(4), "x").tolist() == [0, 1, 2, 3]
 
 
 def test_a_cache_that_cannot_be_written_is_no_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").write_text("")
     monkeypatch.setattr(cache, "cache_dir", lambda: tmp_path / "file")
-    assert cache.cached("numbers", lambda: np.arange(3), "x").tolist() == [0, 1, 2]
-
-
-PROGRAM = """
-import sys
-from surgical_marl import cache
-import numpy as np
-from beside import VALUE
-
-def compute():
-    print("made", VALUE)
-    return np.array(float(VALUE))
-
-cache.cached("numbers", compute)
-"""
-
-
-def test_a_program_is_code_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What a script makes is found again until the script, or a file beside it, changes."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setenv("PYTHONPATH", str(PACKAGE.parent))
-    (tmp_path / "program.py").write_text(PROGRAM)
-
-    def run(*how: str, value: int) -> str:
-        (tmp_path / "beside.py").write_text(f"VALUE = {value}\n")
-        done = subprocess.run([sys.executable, *how], cwd=tmp_path, capture_output=True, text=True, check=True)
-        return done.stdout
-
-    assert [run("program.py", value=value) for value in (1, 1, 2, 2)] == ["made 1\n", "", "made 2\n", ""]
-    (tmp_path / "program.py").write_text(PROGRAM.replace("made", "anew"))
-    assert run("program.py", value=2) == "anew 2\n"
-    assert [run("-c", PROGRAM, value=2) for _ in range(2)] == ["made 2\n"] * 2  # without a file nothing is kept
+    assert cache.cached("numbers", counted(3), "x").tolist() == [0, 1, 2]

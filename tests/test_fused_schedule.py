@@ -18,7 +18,7 @@ from jax import lax
 from surgical_marl.engines.fused.graph import Branch, Graph, Loop
 from surgical_marl.engines.fused.schedule import Schedule, Scheduler
 from surgical_marl.engines.fused.traced import Table
-from surgical_marl.engines.fused.translate import trace
+from surgical_marl.engines.fused.translate import interpret, trace
 from tests.helpers.fused_blocks import all_blocks, random_arrays
 from tests.helpers.fused_kernels import make_stores
 from tests.helpers.fused_programs import programs, several
@@ -246,7 +246,7 @@ def test_rows_of_parameters() -> None:
         Table(g.input_table(values.ravel()), (6, 4, 3), values.dtype),
         Table(g.input_table(truths.ravel().astype(np.int32)), (6, 4), truths.dtype),
     ]
-    leaves, _ = trace(g, function, (), tables, shapes)
+    leaves = interpret(g, trace(function, shapes), (), tables)
     results = [value for leaf in leaves for value in leaf]
     plan = Scheduler(g, results).run()
     assert sum(len(region.items) for region in plan.regions) < 250

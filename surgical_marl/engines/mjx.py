@@ -19,7 +19,7 @@ from surgical_marl.engines.fused.threefry import episode_keys
 from surgical_marl.engines.stages import compiling
 from surgical_marl.engines.stepper import MOST_KEPT, Stepper, representative
 from surgical_marl.machine import cores
-from surgical_marl.runtime import no_collection
+from surgical_marl.runtime import jax_scope, no_collection
 
 LEAST_SHARE = 32
 """Environments that are worth a thread."""
@@ -99,6 +99,7 @@ class MjxEngine:
 
     name = "mjx"
 
+    @jax_scope()
     def __init__(self, env: Stepper, num_envs: int, device: str = "auto") -> None:
         self.env, self.num_envs = env, num_envs
         self._on = find_device(device)
@@ -119,15 +120,18 @@ class MjxEngine:
         """First episodes. Environment i depends on `seed` and `first` + i alone, not on how many there are."""
         self.begin(episode_keys(seed, self.num_envs, first), np.zeros(self.num_envs, np.int32))
 
+    @jax_scope()
     def begin(self, keys: np.ndarray, episodes: np.ndarray) -> None:
         """Begin episodes by their number, [N] int32, among those of each environment's key, [N, 2] uint32."""
         with self._compiling("reset"), jax.default_device(self._on):
             self._state = self._functions.reset(self._take(keys), self._take(episodes), self._parameters)
 
+    @jax_scope()
     def set_parameters(self) -> None:
         """Read the environment's `parameters` again."""
         self._parameters = jax.device_put(self.env.parameters, self._on)
 
+    @jax_scope()
     def step(self, actions: dict[str, Any], sense: Callable[[], dict[str, Any]] | None = None) -> None:
         """One control step of all environments.
 
@@ -177,15 +181,18 @@ class MjxEngine:
         leaves = _floats(self._state.carry) | dict(checked(results))
         return [place for name, leaf in leaves.items() for place in places(name, leaf.shape[1:])]
 
+    @jax_scope()
     def end_faulty(self, limit: int, library: str) -> Any:
         """End the episode of every environment that the last step left NaN or infinite, as `FusedEngine` does it."""
         self._state, self._leaving, codes = _end_faulty(self._state, self._leaving, limit)
         return self._present(codes, library)
 
+    @jax_scope()
     def expect_end(self, leaving: np.ndarray) -> None:
         """Take note of the environments, [N] bool, whose next step ends an episode because of an older fault."""
         self._leaving = jax.device_put(leaving, self._on)
 
+    @jax_scope()
     def outcome(self, library: str) -> dict[str, Any]:
         """Return what the last step or reset led to: fields of the environment's `State` as dicts.
 
@@ -195,6 +202,7 @@ class MjxEngine:
         found = {name: self._present(value, library) for name, value in known.items() if jax.tree.leaves(value)}
         return {**found, "contacts": found["contacts"]._asdict()}
 
+    @jax_scope()
     def read(self, name: str, library: str) -> Any:
         """Return a part of the `Carry` or of what has moved, [N, ...].
 
@@ -206,6 +214,7 @@ class MjxEngine:
             tree, path = self._moved, name.removeprefix(".moved")
         return self._present(_paths(tree)[path], library)
 
+    @jax_scope()
     def write(self, name: str, values: Any) -> None:
         """Set a part of the `Carry`."""
         parts = _paths(self._state.carry)
@@ -217,6 +226,7 @@ class MjxEngine:
         """End the threads. The arrays are freed with the engine."""
         self._pool.shutdown()
 
+    @jax_scope()
     def _run_share(self, function: Any, share: tuple[Any, ...]) -> Any:
         with jax.default_device(self._on):  # of this thread
             found = function(*share, self._parameters)

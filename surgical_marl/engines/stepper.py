@@ -10,6 +10,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from surgical_marl.cache import is_shipped
+
 MOST_KEPT = 16
 """Steppers, and what was compiled for them, that a process keeps for later ones that are alike."""
 
@@ -32,15 +34,14 @@ class Stepper(Protocol):
 
     @property
     def content(self) -> bytes:
-        """Everything that the functions depend on except code and the values of `parameters`."""
+        """Everything that the functions depend on except code and the values of `parameters`.
+
+        Code that is not of this package may depend on more.
+        """
 
     @property
     def classes(self) -> tuple[type, ...]:
         """Classes whose code the functions run."""
-
-    @property
-    def roots(self) -> tuple[str, ...]:
-        """Modules of these classes: their code and all that they import is what the functions run."""
 
     @property
     def parameters(self) -> Any:
@@ -73,8 +74,11 @@ class Stepper(Protocol):
 def representative(stepper: Stepper) -> Stepper:
     """Return the first stepper of this process that steps as this one does.
 
-    Parameters of the two may differ in their values. What JAX traces and compiles for the one serves the other.
+    Parameters of the two may differ in their values. What JAX traces and compiles for the one serves the other. Code
+    that is not of this package may step otherwise the next time, so such a stepper stands for itself alone.
     """
+    if not is_shipped(*stepper.classes):
+        return stepper
     known = hashlib.sha256(f"{describe(stepper.parameters)} ".encode() + stepper.content).digest()
     return _first(_Alike(known, stepper.classes, stepper))
 

@@ -26,7 +26,7 @@ from surgical_marl.envs.observations import Scale
 from surgical_marl.envs.observed import Observed
 from surgical_marl.envs.state import Carry, Moved, State
 from surgical_marl.plugins.tasks import TASKS
-from surgical_marl.runtime import jax, jnp, prepare_jax
+from surgical_marl.runtime import jax, jax_scope, jnp, prepare_jax
 from surgical_marl.scenes.load import load_scene
 from surgical_marl.tasks.base.options import Options, make_options
 from surgical_marl.tasks.base.task import Task
@@ -101,12 +101,13 @@ class Env:
     def begins_at_home(self) -> bool:
         """Whether all episodes begin with all arms at home. It is kept on disk: JAX finds it out by tracing."""
 
+        @jax_scope()
         def trace() -> np.ndarray:
             start = lambda key, p: self.task.bound(p["weights"], p["tables"]).start(key)  # noqa: E731
             found = jax.eval_shape(start, jax.ShapeDtypeStruct((2,), np.uint32), self.parameters)
             return np.array(found.qpos is None)
 
-        return bool(cached("starts", trace, self.content, describe(self.parameters), roots=self.roots))
+        return bool(cached("starts", trace, self.content, describe(self.parameters), classes=self.classes))
 
     @property
     def senses(self) -> tuple[str, ...]:
@@ -131,11 +132,6 @@ class Env:
         """Classes whose code a step runs."""
         return type(self), type(self.task)
 
-    @property
-    def roots(self) -> tuple[str, ...]:
-        """Modules whose code a step runs, with all that these import."""
-        return tuple(cls.__module__ for cls in self.classes)
-
     @cached_property
     def parameters(self) -> dict[str, Any]:
         """Numbers that a step reads as inputs, so that nothing is compiled again when one of them changes.
@@ -151,6 +147,7 @@ class Env:
         }
 
     @cached_property
+    @jax_scope()
     def simulator(self) -> Simulator:
         """The physics, set up when first needed, even while JAX traces a step."""
         from surgical_marl.physics.simulator import Simulator

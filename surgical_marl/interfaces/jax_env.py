@@ -21,7 +21,7 @@ from surgical_marl.engines.stepper import MOST_KEPT, Stepper, representative
 from surgical_marl.envs.actions import check_agents, shown
 from surgical_marl.envs.env import Env
 from surgical_marl.envs.state import Carry
-from surgical_marl.runtime import jax, jnp
+from surgical_marl.runtime import jax, jax_scope, jnp
 
 if TYPE_CHECKING:
     from gymnasium import spaces
@@ -74,6 +74,7 @@ class JaxEnv:
         env: the environment behind it, which every face shares.
     """
 
+    @jax_scope()
     def __init__(self, env: Env) -> None:
         if env.pauses:
             raise ValueError(f"{env.title} needs pictures, which are drawn outside JAX: use surgical_marl.parallel_env")
@@ -98,6 +99,7 @@ class JaxEnv:
         """Return the space [-1, 1] of what an agent does. ValueError for an unknown agent."""
         return self._of(agent, self.action_spaces)
 
+    @jax_scope()
     def reset(self, key: Array, *, number: Array | int = 0) -> tuple[dict[str, Array], EnvState]:
         """Return the observations, [d] by agent, and the state at the start of an episode.
 
@@ -113,6 +115,7 @@ class JaxEnv:
         state = self._functions[0](_raw(key), number, self.env.parameters)
         return state.observations, EnvState(state.carry, state.state)
 
+    @jax_scope()
     def step(
         self, key: Array | None, state: EnvState, actions: Mapping[str, Any]
     ) -> tuple[dict[str, Array], EnvState, dict[str, Array], dict[str, Array], dict[str, dict[str, Array]]]:

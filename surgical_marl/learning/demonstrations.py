@@ -93,7 +93,7 @@ class Demonstrations:
         try:
             tables = (np.asarray(table).tobytes() for _, table in sorted(env.task.tables.items()))
             about = env.env.content, describe(env.env.parameters).encode(), f"{env.max_steps} {env.num_envs}".encode()
-            rows = cached_arrays("demonstrations", lambda: _record(env), *about, *tables, roots=env.env.roots)
+            rows = cached_arrays("demonstrations", lambda: _record(env), *about, *tables, classes=env.env.classes)
             states, pairs = (
                 {name: torch.from_numpy(part).to(device) for name, part in _cut(rows[kind], shapes)}
                 for kind, shapes in _shapes(env).items()

@@ -91,5 +91,5 @@ def cached_model(compute: Callable[[], mujoco.MjModel], *content: str | bytes) -
         return buffer
 
     name = "model.mjb"
-    binary = cached("models", saved, *content, roots=(compute.__module__,)).tobytes()
+    binary = cached("models", saved, *content).tobytes()
     return mujoco.MjModel.from_binary_path(name, {name: binary})

@@ -18,7 +18,7 @@ from surgical_marl.engines.fused.emit import Emitter
 from surgical_marl.engines.fused.graph import Graph
 from surgical_marl.engines.fused.load import load_source
 from surgical_marl.engines.fused.preludes import CUDA
-from surgical_marl.engines.fused.translate import Fields, tables, trace
+from surgical_marl.engines.fused.translate import Fields, interpret, tables, trace
 
 Stores = list[tuple[str, int, int]]
 
@@ -53,8 +53,9 @@ def make_stores(
     same ones."""
     layout, graph = Fields(), Graph()
     inputs = layout.place(shapes_of(columns), "state")
-    values, shapes = trace(graph, function, inputs)
-    outputs = inputs if in_place else layout.place(shapes, "outs")
+    traced = trace(function, *shapes_of(columns))
+    values = interpret(graph, traced, inputs)
+    outputs = inputs if in_place else layout.place(traced.result, "outs")
     pairs = zip(jax.tree.leaves(outputs), values, strict=True)
     stores = [(leaf.buffer, leaf.first + k, value) for leaf, row in pairs for k, value in enumerate(row)]
     return graph, stores, layout, inputs, outputs

@@ -8,35 +8,55 @@ from typing import Any
 
 import numpy as np
 
-from surgical_marl.cache import cached
+from surgical_marl.cache import cached, is_shipped
 from surgical_marl.engines.fused.program import TREES, Leaf, Source
 from surgical_marl.engines.stages import Stage, unsaid
 from surgical_marl.engines.stepper import Stepper, describe
-from surgical_marl.runtime import no_collection
+from surgical_marl.runtime import jax_scope, no_collection
 
 
 def load_source(env: Stepper, vector: bool, stage: Stage = unsaid) -> Source:
     """Return the source of an environment's kernels: for a CPU, with vectors, or for CUDA.
 
-    The source is kept on disk. `stage` is told the stages in which it is made.
+    The source is kept on disk. For an environment of this package alone, the key is the code of the package and the
+    environment's content. Code of somebody else can depend on anything, so it is traced, which takes seconds, and what
+    it computes is the key. `stage` is told the stages in which the source is made.
 
     Raises:
         Unsupported: the environment can't be traced.
     """
+    about = f"vector={vector} {describe(env.parameters)}"
+    if is_shipped(*env.classes):
+        made = cached("fused", lambda: _make(_trace(env, stage), env.parameters, vector, stage), about, env.content,
+                      classes=env.classes)  # fmt: skip
+    else:
+        from surgical_marl.engines.fused.jaxpr_digest import jaxpr_digest  # imports JAX
 
-    def compute() -> np.ndarray:
-        from surgical_marl.engines.fused.translate import make_source  # imports JAX
-
-        # what tracing makes stays: to look for garbage among it takes a fifth of the time
-        with no_collection():
-            source = make_source(env, vector, stage)
-        return np.frombuffer(json.dumps(asdict(source), default=np.ndarray.tolist).encode(), np.uint8)
-
-    settings = f"vector={vector} {describe(env.parameters)}"
-    found = json.loads(cached("fused", compute, settings, env.content, roots=env.roots).tobytes())
+        functions, parameters = _trace(env, stage), env.parameters
+        made = cached("fused", lambda: _make(functions, parameters, vector, stage), about, jaxpr_digest(functions))
+    found = json.loads(made.tobytes())
     tables = {dtype: np.array(table, dtype) for dtype, table in found.pop("tables").items()}
     trees = {name: _leaves(found.pop(name)) for name in TREES}
     return Source(tables=tables, **trees, **found)
+
+
+@jax_scope()
+def _trace(env: Stepper, stage: Stage) -> dict[str, Any]:
+    from surgical_marl.engines.fused.translate import trace_environment  # imports JAX
+
+    # what tracing makes stays: to look for garbage among it takes a fifth of the time
+    with no_collection():
+        return trace_environment(env, stage)
+
+
+@jax_scope()
+def _make(functions: dict[str, Any], parameters: Any, vector: bool, stage: Stage) -> np.ndarray:
+    """Return a source as bytes."""
+    from surgical_marl.engines.fused.translate import make_source  # imports JAX
+
+    with no_collection():
+        source = make_source(functions, parameters, vector, stage)
+    return np.frombuffer(json.dumps(asdict(source), default=np.ndarray.tolist).encode(), np.uint8)
 
 
 def _leaves(tree: Any) -> Any:

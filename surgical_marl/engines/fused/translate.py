@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from jax.extend import core
 
 from surgical_marl.engines.faults import checked
 from surgical_marl.engines.fused.emit import Emitter, Watch, table_offsets
@@ -40,28 +41,67 @@ class Fields:
         return leaf
 
 
-def make_source(env: Stepper, vector: bool, stage: Stage) -> Source:
-    """Traces an environment's functions."""
-    stage("tracing the step")
-    fields, graph = Fields(), Graph()
+class Function(NamedTuple):
+    """A function as JAX traced it."""
+
+    jaxpr: core.ClosedJaxpr
+    arguments: tuple[Any, ...]
+    """Trees of shapes."""
+    result: Any
+    """A tree of shapes."""
+
+
+def trace(function: Callable[..., Any], *arguments: Any) -> Function:
+    """Trace a function of trees of arrays or their shapes."""
+    jaxpr, result = jax.make_jaxpr(function, return_shape=True)(*arguments)
+    return Function(jaxpr, arguments, result)
+
+
+def trace_environment(env: Stepper, stage: Stage) -> dict[str, Function]:
+    """Trace an environment's functions: "reset", and "step" or "move" and "finish"."""
+    real = lambda *shape: jax.ShapeDtypeStruct(shape, np.float32)  # noqa: E731
+    parameters = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), env.parameters)
     key, number = jax.ShapeDtypeStruct((2,), np.uint32), jax.ShapeDtypeStruct((), np.int32)
-    given, places = _parameters(graph, env.parameters)
-    shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), env.parameters)
-    carry = fields.place(jax.eval_shape(env.reset, key, number, shapes).carry, "state")
-    actions = {agent: fields.leaf((env.num_actions(agent),), "float32", "actions") for agent in env.agents}
-    moved: Any = {}
-    sensed = {name: fields.leaf((), "float32", "actions") for name in env.senses}
-    kernels: dict[str, list[list[Value]]] = {}
-    if env.pauses:
-        kernels["move"], between = trace(graph, env.move, (carry, actions), given, shapes)
-        moved = fields.place(between, "state")
-        last, found = trace(graph, env.finish, (moved, sensed), given, shapes)
-        kernels["finish"] = last
-    else:
-        last, found = trace(graph, env.step, (carry, actions), given, shapes)
-        kernels["step"] = last
     stage("tracing the reset")
-    first, _ = trace(graph, env.reset, (carry.key, carry.episode), given, shapes)
+    reset = trace(env.reset, key, number, parameters)
+    actions = {agent: real(env.num_actions(agent)) for agent in env.agents}
+    stage("tracing the step")
+    if not env.pauses:
+        return {"reset": reset, "step": trace(env.step, reset.result.carry, actions, parameters)}
+    move = trace(env.move, reset.result.carry, actions, parameters)
+    finish = trace(env.finish, move.result, {name: real() for name in env.senses}, parameters)
+    return {"reset": reset, "move": move, "finish": finish}
+
+
+def make_source(functions: dict[str, Function], parameters: Any, vector: bool, stage: Stage) -> Source:
+    """Return the source of an environment's kernels.
+
+    Args:
+        functions: what `trace_environment` returned.
+        parameters: the environment's, a tree of numpy arrays.
+        vector: whether the kernels are for a CPU, with vectors.
+        stage: is told the stages in which the source is made.
+
+    Raises:
+        Unsupported: for something that has no kernel code, with the line of the source that uses it.
+    """
+    fields, graph = Fields(), Graph()
+    given, places = _parameters(graph, parameters)
+    carry = fields.place(functions["reset"].result.carry, "state")
+    one = "move" if "move" in functions else "step"
+    leaves_of = lambda shapes: {name: fields.leaf(x.shape, "float32", "actions") for name, x in shapes.items()}  # noqa: E731
+    actions, moved, sensed = leaves_of(functions[one].arguments[1]), dict[str, Any](), dict[str, Leaf]()
+    if one == "move":
+        sensed = leaves_of(functions["finish"].arguments[1])
+    stage("interpreting the step")
+    kernels = {one: interpret(graph, functions[one], (carry, actions), given)}
+    if one == "move":
+        moved = fields.place(functions["move"].result, "state")
+        kernels["finish"] = interpret(graph, functions["finish"], (moved, sensed), given)
+    name, last = list(kernels.items())[-1]
+    found = functions[name].result
+    stage("interpreting the reset")
+    first = interpret(graph, functions["reset"], (carry.key, carry.episode), given)
     known = len(jax.tree.leaves(carry))
     leaves = [
         *jax.tree.leaves(carry),
@@ -114,37 +154,30 @@ def _tree(tree: Any) -> dict[str, Any]:
     return _nest(list(paths), list(leaves))
 
 
-def trace(
-    graph: Graph,
-    function: Callable[..., Any],
-    arguments: tuple[Any, ...],
-    given: Sequence[Traced | Table] = (),
-    extra: Any = None,
-) -> tuple[list[list[Value]], Any]:
-    """Run a function on trees of `Leaf`s.
+def interpret(
+    graph: Graph, function: Function, arguments: tuple[Any, ...], given: Sequence[Traced | Table] = ()
+) -> list[list[Value]]:
+    """Run a traced function on trees of `Leaf`s.
 
     Args:
         graph: where the values go.
-        function: takes the arguments, and one more if there is `extra`.
+        function: takes them.
         arguments: trees of leaves.
-        given: what stands for the leaves of the last argument, the tree of shapes `extra`.
+        given: what stands for the leaves of the function's last argument.
 
     Returns:
-        The values of each leaf of the function's result, and the result's tree of shapes.
+        The values of each leaf of the function's result.
 
     Raises:
         Unsupported: for something that has no kernel code, with the line of the source that uses it.
     """
-    shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), arguments)
-    last = () if extra is None else (extra,)
-    closed, results = jax.make_jaxpr(function, return_shape=True)(*shapes, *last)
     inputs: list[Traced] = []
     for leaf in jax.tree.leaves(arguments):
         kind = KINDS[leaf.dtype]
         ids = [graph.node("load", leaf.buffer, leaf.first + k, kind=kind) for k in range(leaf.size)]
         inputs.append(lower(graph, np.array(ids, np.int32).reshape(leaf.shape), np.dtype(leaf.dtype)))
-    outputs = Tracer(graph).run(closed, [*inputs, *given])
-    return [lift(graph, x).ravel().tolist() for x in outputs], results
+    outputs = Tracer(graph).run(function.jaxpr, [*inputs, *given])
+    return [lift(graph, x).ravel().tolist() for x in outputs]
 
 
 def tables(graph: Graph) -> dict[str, np.ndarray]:
