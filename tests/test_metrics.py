@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.stats import binomtest
 
-from surgical_marl.evaluation.interval import interval
+from surgical_marl.evaluation.interval import interval, over_seeds
 from surgical_marl.evaluation.metrics import HOLD, Metric, Trajectory, measure, metrics, spectral_arc_length
 
 DT = 0.04  # success is judged over five steps
@@ -280,6 +281,10 @@ def mean_of(values: Any) -> Metric:
     return Metric(np.asarray(values, float), lambda drawn: drawn.mean(-1))
 
 
+def share_of(values: Any) -> Metric:
+    return mean_of(values)._replace(share=True)
+
+
 def bounds(metric: Metric) -> tuple[float, float]:
     found = interval(metric)
     assert found is not None
@@ -312,13 +317,64 @@ def test_more_episodes_narrow_an_interval_and_arms_of_one_episode_do_not() -> No
 
 
 def test_the_spread_between_runs_counts() -> None:
-    """Runs that differ by their seed alone: the interval is as wide as their means are apart, however many episodes."""
+    """Runs that differ by their seed alone: the interval is the t interval of their means, however many episodes."""
     rng = np.random.default_rng(2)
     offsets = np.array([-1.0, -0.3, 0.2, 0.4, 0.9])[:, None, None]
     few, many = (np.ptp(bounds(mean_of(offsets + 0.1 * rng.normal(size=(5, n, 1))))) for n in (50, 500))
-    expected_width = 2 * 1.96 * offsets.std() / math.sqrt(5)
-    assert few == pytest.approx(expected_width, rel=0.15) and many == pytest.approx(expected_width, rel=0.15)
+    expected_width = 2 * 2.776 * offsets.std(ddof=1) / math.sqrt(5)  # t of 4 degrees of freedom
+    assert few == pytest.approx(expected_width, rel=0.05) and many == pytest.approx(expected_width, rel=0.05)
     assert np.ptp(bounds(mean_of(0.1 * rng.normal(size=(1, 500, 1))))) < many / 20
+
+
+@pytest.mark.parametrize("episodes", [2, 10, 200, 1000])
+def test_the_interval_of_a_share_is_that_of_clopper_and_pearson(episodes: int) -> None:
+    for hits in {0, 1, episodes // 2, episodes - 1, episodes}:
+        values = (np.arange(episodes) < hits).astype(float)[None, :, None]
+        exact = binomtest(hits, episodes).proportion_ci(0.95, "exact")
+        expected = pytest.approx([exact.low, exact.high], abs=1e-9)
+        assert bounds(share_of(values)) == expected
+        assert bounds(share_of(np.repeat(values, 3, -1))) == expected  # arms of an episode are not independent
+
+
+@settings(deadline=None, max_examples=25)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 4), st.integers(2, 60), st.integers(1, 3), st.floats(0.0, 1.0))
+def test_an_interval_of_a_share_has_a_width(seed: int, runs: int, episodes: int, arms: int, chance: float) -> None:
+    values = (np.random.default_rng(seed).random((runs, episodes, arms)) < chance).astype(float)
+    low, high = bounds(share_of(values))
+    assert 0 <= low <= values.mean() <= high <= 1
+    assert high - low > 0.9 * (1 - 0.025 ** (1 / episodes))  # that of the narrowest, 0 or all of the episodes
+
+
+def test_shares_of_steps_have_a_width_too_where_all_episodes_agree() -> None:
+    """One that is 1 in all 200 episodes, one that is not; and a mean without spread, which has no interval."""
+    steps = np.ones((1, 200, 1))
+    assert bounds(share_of(steps)) == pytest.approx((0.98172, 1.0), abs=1e-5)
+    steps[0, :20] = 0.5
+    assert bounds(share_of(steps)) == bounds(mean_of(steps))
+    assert interval(mean_of(np.full((1, 200, 1), 0.3))) is None and interval(mean_of(np.ones((3, 20, 2)))) is None
+
+
+def test_three_seeds_hold_the_truth_as_often_as_they_say() -> None:
+    """Seeds and goals that matter equally, and seeds that do not matter: few seeds must not look like many."""
+    rng = np.random.default_rng(0)
+    for spread in (0.0, 0.1):
+        covered = []
+        for _ in range(400):
+            goals = rng.normal(size=100)
+            seeds = spread * rng.normal(size=3)
+            values = goals.mean() + seeds
+            half = 1.96 * goals.std() / 10
+            found = over_seeds(values, [[value - half, value + half] for value in values.tolist()])
+            assert found is not None
+            covered.append(found[0] <= 0 <= found[1])
+        assert 0.91 < np.mean(covered) < 0.98
+
+
+def test_an_interval_over_seeds_keeps_to_what_can_be() -> None:
+    assert over_seeds([1.0, 1.0, 0.4], [[0.9, 1.0], [0.9, 1.0], [0.2, 0.6]], most=1.0) == [pytest.approx(0.0), 1.0]
+    assert over_seeds([3.0, 0.1], [[2.0, 4.0], [0.0, 0.2]])[0] == 0.0  # type: ignore[index]
+    assert over_seeds([-3.0, -0.1], [[-4.0, -2.0], [-0.2, 0.0]])[1] == 0.0  # type: ignore[index]
+    assert over_seeds([2.0], [[1.0, 3.0]]) == [1.0, 3.0] and over_seeds([2.0, 2.0], [[1.0, 3.0], None]) is None
 
 
 def test_no_interval_without_a_sample() -> None:

@@ -10,6 +10,7 @@ from typing import Any
 
 from surgical_marl.content import find, list_policies
 from surgical_marl.evaluation.goal_set import is_standard
+from surgical_marl.evaluation.interval import Interval, over_seeds, share_interval
 from surgical_marl.evaluation.report import number, title
 from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.policies.onnx_file import SUFFIX, read_pictures
@@ -28,9 +29,11 @@ SHOWN = ("median_error_mm", "p95_error_mm", "rmse_mm", "success_1mm", "success_2
 SCORE, ERRORS = "score", SHOWN[:7]
 """Points of an episode, and how near to goals it ends: that says nothing where an episode goes on for points."""
 COLUMNS = (
-    *("policy", "median error of the worst arm (mm)", "on training goals (mm)", "RMSE (mm)", "within 2 mm"),
-    *("from random starts", "collisions", "median error of each training seed (mm)", "training", "misses"),
+    *("policy", "imitated the oracle", "seeds", "median error of the worst arm (mm)", "within 2 mm", "collisions"),
+    *("these weights: median error (mm)", "on training goals (mm)", "RMSE (mm)", "within 2 mm from random starts"),
+    *("training", "misses"),
 )
+"""Of the table of all policies: up to the collisions means over the training seeds, then what the shipped weights do."""
 _HOLDS = {"below": operator.lt, "at least": operator.ge}
 
 
@@ -40,10 +43,24 @@ def worst_median(result: Mapping[str, Any]) -> float | None:
     Arms that only keep still can't hide the error of another arm in this number. Return None in a task whose tool tips
     have no targets, and in one that goes on for points: what is left at its end is some object's way.
     """
-    if SCORE in result:
-        return None
-    errors = (agent["median_error_mm"] for agent in result["agents"].values())
-    return max((error for error in errors if error is not None), default=None)
+    arm = _worst_arm(result)
+    return None if arm is None else arm["median_error_mm"]
+
+
+def worst_over_seeds(runs: Sequence[Mapping[str, Any]]) -> tuple[float | None, Interval]:
+    """Return the mean of `worst_median` over the results of training seeds, in mm, and its 95 % interval."""
+    arms = [arm for arm in map(_worst_arm, runs) if arm is not None]
+    if not arms:
+        return None, None
+    values = [arm["median_error_mm"] for arm in arms]
+    return sum(values) / len(values), over_seeds(values, [arm["intervals"]["median_error_mm"] for arm in arms])
+
+
+def _worst_arm(result: Mapping[str, Any]) -> Mapping[str, Any] | None:
+    """Return the metrics of the arm with the largest median error; None as `worst_median`."""
+    agents = [] if SCORE in result else result["agents"].values()
+    known = [agent for agent in agents if agent["median_error_mm"] is not None]
+    return max(known, key=lambda agent: agent["median_error_mm"], default=None)
 
 
 def _worst(result: Mapping[str, Any]) -> str:
@@ -71,19 +88,21 @@ def table() -> str:
 
 def _row(folder: Path) -> tuple[str, ...]:
     result = read_json(folder / EVALUATION)
-    also = result.get("also", {})
+    also, runs, whole = result.get("also", {}), result["seeds"]["runs"], result["seeds"]["aggregate"]
     seen = also.get("training goals")
     elsewhere = result if result["start"] == "random" else also.get("random starts", {})
     last, origin = _training(folder), read_origin(folder)["origin"]
     return (
         as_link(folder.name),
+        "yes" if read_settings(folder).shown_by_oracle else "no",
+        str(len(runs)),
+        _spanned("median_error_mm", *worst_over_seeds(runs)),
+        "-" if SCORE in result else _with_interval("success_2mm", whole),
+        _with_interval("collision_rate", whole),
         _worst(result),
         _worst(seen) if seen else "-",
         number("rmse_mm", result.get("rmse_mm")),
-        "-" if SCORE in result else number("success_2mm", result["success_2mm"]),
         number("success_2mm", elsewhere.get("success_2mm")),
-        number("collision_rate", result["collision_rate"]),
-        ", ".join(_worst(run) for run in result["seeds"]["runs"]),
         f"{last['seconds']:.0f} s, {as_markdown(origin.get('device') or 'unknown device')}",
         "; ".join(misses(result)) or "-",
     )
@@ -173,9 +192,13 @@ def _elsewhere(result: Mapping[str, Any], shown: Sequence[str]) -> str:
 def _with_interval(key: str, result: Mapping[str, Any]) -> str:
     if key not in result:  # an older protocol did not measure it
         return "-"
-    bounds = result["intervals"][key]
+    return _spanned(key, result[key], result["intervals"][key])
+
+
+def _spanned(key: str, value: float | None, bounds: Interval) -> str:
+    """Return the value of a metric as text, with its interval in brackets where it has one."""
     span = "" if bounds is None else f" ({' to '.join(number(key, bound) for bound in bounds)})"
-    return f"{number(key, result[key])}{span}"
+    return f"{number(key, value)}{span}"
 
 
 def _how_trained(folder: Path, settings: Settings) -> str:
@@ -224,7 +247,7 @@ def _training(folder: Path) -> dict[str, float]:
 
 def _limits(result: Mapping[str, Any], settings: Settings) -> str:
     missed = [f"- Misses its goal: {text}." for text in misses(result)]
-    rare = 3 / result["episodes"]  # Hanley and Lippman-Hand, JAMA 249(13), 1983
+    rare = share_interval(0.0, result["episodes"])[1]
     none = [f"- No collision in {result['episodes']} episodes is compatible with a collision rate of up to {rare:.1%}."]
     goals = ", ".join(
         f"{title(name)} {how} {number(name, goal)}" for name, (how, goal) in TASKS.load(settings.task).wanted.items()

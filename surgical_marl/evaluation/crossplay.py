@@ -104,7 +104,7 @@ def _cell(run: Played, role: str = "") -> dict[str, float]:
 def _mean(runs: Sequence[Played]) -> dict[str, Any]:
     """Return the mean team success of pairings, and its 95 % interval over pairings and episodes."""
     success = np.stack([run.measures["success"].all(-1, keepdims=True) for run in runs]).astype(float)
-    bounds = interval(Metric(success, lambda values: values.mean(-1)))
+    bounds = interval(Metric(success, lambda values: values.mean(-1), share=True))
     return {"team_success": float(success.mean()), "interval": bounds}
 
 

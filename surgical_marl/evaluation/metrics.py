@@ -19,6 +19,8 @@ TERMS = ("reward_", "cost")
 """Prefixes of the names of reward terms and costs in `infos`."""
 STAGE = "stage_"
 """Prefix of the names of a task's stages there."""
+SHARES = (STAGE, "cost_")
+"""Prefixes of the names of `infos` that are 0 or 1 in each step."""
 LAST = {
     "angle_error": ("angle_error_deg", 180 / math.pi),
     "image_error": ("image_error", 1.0),
@@ -78,6 +80,8 @@ class Metric(NamedTuple):
     """[..., n] -> [...]"""
     extreme: bool = False
     """Whether the metric is the worst value seen, for which a bootstrap can't give an interval."""
+    share: bool = False
+    """Whether each value is from 0 to 1, so that the metric is a share of episodes or of their steps."""
 
 
 def measure(trajectory: Trajectory, dt: float, following: bool) -> dict[str, np.ndarray]:
@@ -162,8 +166,8 @@ def metrics(measures: Mapping[str, np.ndarray], following: bool) -> dict[str, Me
         found[f"success_{threshold}mm"] = success(mm["held"], threshold)
     found |= {
         f"team_success_{SUCCESS_MM}mm": success(mm["held"].max(-1, keepdims=True), SUCCESS_MM),
-        "success_rate": Metric(measures["success"].astype(float), _mean),
-        "collision_rate": Metric(measures["collided"].any(-1, keepdims=True).astype(float), _mean),
+        "success_rate": Metric(measures["success"].astype(float), _mean, share=True),
+        "collision_rate": Metric(measures["collided"].any(-1, keepdims=True).astype(float), _mean, share=True),
         "time_to_success_s": Metric(measures["time"], _mean_of_known),
         "path_length_mm": Metric(mm["path"], _mean),
         "smoothness": Metric(measures["smoothness"], _mean_of_known),
@@ -174,12 +178,14 @@ def metrics(measures: Mapping[str, np.ndarray], following: bool) -> dict[str, Me
     if following:
         found["rmse_mm"] = Metric(1e6 * measures["squared"], lambda values: np.sqrt(values.mean(-1)))
     if DROP in measures:
-        found["drop_rate"] = Metric(measures[DROP].max(-1, keepdims=True), _mean)
+        found["drop_rate"] = Metric(measures[DROP].max(-1, keepdims=True), _mean, share=True)
     for name, (title, unit) in (LAST | VIEWED | TRAVEL | PEAK).items():
         if name in measures:
-            found[title] = Metric(unit * measures[name], _mean_of_known)
+            found[title] = Metric(unit * measures[name], _mean_of_known, share=title.endswith("_rate"))
     return found | {
-        n: Metric(values, _mean_of_known) for n, values in measures.items() if n.startswith((*TERMS, STAGE))
+        name: Metric(values, _mean_of_known, share=name.startswith(SHARES))
+        for name, values in measures.items()
+        if name.startswith((*TERMS, STAGE))
     }
 
 
@@ -188,7 +194,7 @@ def success(held: np.ndarray, threshold: float) -> Metric:
 
     Where the held error is NaN, so is the value of that arm.
     """
-    return Metric(np.where(np.isnan(held), np.nan, held < threshold), _mean)
+    return Metric(np.where(np.isnan(held), np.nan, held < threshold), _mean, share=True)
 
 
 def spectral_arc_length(speed: np.ndarray, dt: float) -> float:

@@ -80,7 +80,7 @@ def _threshold(drawing: Drawing, series: Sequence[Series], following: bool) -> C
     grid = np.unique([*np.geomspace(low, high, THRESHOLDS), *THRESHOLDS_MM])
     lines, columns, sentences = [], [], []
     for one in series:
-        metrics = [Metric(success(held[one.label], threshold).values, _known_mean) for threshold in grid]
+        metrics = [success(held[one.label], threshold)._replace(reduce=_known_mean) for threshold in grid]
         value = np.array([_mean(metric) for metric in metrics])
         bounds = np.array([interval(metric) or (np.nan, np.nan) for metric in metrics])
         lines.append(Line(one.number, grid, value, (bounds[:, 0], bounds[:, 1])))
@@ -155,7 +155,7 @@ def _stages(drawing: Drawing, series: Sequence[Series], stages: Sequence[str]) -
     stages = [stage for stage in stages if all(f"{STAGE}{stage}" in one.measures for one in series)]
     if not stages:
         return None
-    metrics = [[Metric(one.measures[f"{STAGE}{stage}"], _known_mean) for one in series] for stage in stages]
+    metrics = [[Metric(one.measures[f"{STAGE}{s}"], _known_mean, share=True) for one in series] for s in stages]
     values = np.array([[_mean(metric) for metric in row] for row in metrics])
     missing = np.full(2, np.nan)
     bounds = np.array([

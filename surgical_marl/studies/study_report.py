@@ -136,7 +136,7 @@ def broken(played: Sequence[dict[str, np.ndarray]], agents: Sequence[str], what:
     return {
         "others": number(success(1000 * np.concatenate(others, -1), SUCCESS_MM)),
         "itself": number(success(1000 * np.concatenate(itself, -1), SUCCESS_MM)),
-        "collisions": number(Metric(np.concatenate(collided, -1), lambda values: values.mean(-1))),
+        "collisions": number(Metric(np.concatenate(collided, -1), lambda values: values.mean(-1), share=True)),
     }
 
 
