@@ -16,7 +16,7 @@ import pytest
 from surgical_marl import load_arm
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.evaluation.evaluate import difference, evaluate, play, summarise
-from surgical_marl.evaluation.report import format_table
+from surgical_marl.evaluation.report import format_table, number
 from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.policies.policy import random_policy
 from surgical_marl.tasks.base.options import Options
@@ -276,3 +276,12 @@ def test_several_runs_pool_their_episodes() -> None:
     assert whole["intervals"]["success_1mm"] == [0, 1]  # a run that fails and one that does not say nothing
     assert summarise(runs[:1])["intervals"]["success_1mm"] == pytest.approx([0.025 ** (1 / 3), 1])
     assert summarise(runs[:1]) == evaluate(good, still, 3, seed=0)
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(0.0, "0.0%"), (1.0, "100.0%"), (0.995, "99.5%"), (0.9996, "99.96%"), (0.99999, "99.999%"), (0.0001, "0.01%"),
+     (1 - 1e-12, "100.0%"), (None, "-")],
+)  # fmt: skip
+def test_a_rate_looks_like_all_or_nothing_only_if_it_is(value: float | None, text: str) -> None:
+    assert number("success_rate", value) == text

@@ -107,6 +107,11 @@ def test_a_page(page: Path, page_folder: Path, capsys: pytest.CaptureFixture[str
             yaml.safe_load(text)
 
 
+def test_the_command_of_every_figure_is_understood(page_folder: Path) -> None:
+    for run in yaml.safe_load((ROOT / "docs" / "figures.yaml").read_text(encoding="utf-8")):
+        check_command(shlex.split(run["run"]))
+
+
 def install(settings: dict[str, Any], names: dict[str, Any]) -> None:
     """Register the page's classes as a package with this pyproject.toml would."""
     for registry in (TASKS, ALGORITHMS):

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
 import surgical_marl as sm
 
@@ -73,22 +74,25 @@ def test_the_reference_describes_every_public_name() -> None:
         assert getattr(importlib.import_module(module), last).__doc__, name
 
 
-def test_the_readmes_speeds_are_those_of_the_benchmarks() -> None:
+def test_a_figure_stands_in_one_place_and_is_set_into_the_others(tables: Any) -> None:
+    """Each is used, and is written nowhere by hand."""
+    texts = {page: page.read_text(encoding="utf-8") for page in PAGES}
+    used = {name for text in texts.values() for _, name, _ in tables.FIGURE.findall(text)}
+    assert used == set(tables.figures())
+    assert all(len(tables.FIGURE.findall(text)) == text.count("<!-- figure:") for text in texts.values())
+    runs = yaml.safe_load((ROOT / "docs" / "figures.yaml").read_text(encoding="utf-8"))
+    for name, value in (figure for run in runs for figure in run["figures"].items()):
+        alone = re.compile(rf"(?<![\d.,]){re.escape(value)}(?!\d)")
+        pages = [page.name for page, text in texts.items() if alone.search(tables.FIGURE.sub("", text))]
+        assert not pages, f"{pages} have {value!r}: write <!-- figure: {name} --><!-- end --> there"
+
+
+def test_the_speeds_of_readme_and_comparison_are_figures(tables: Any) -> None:
     _, _, rest = (ROOT / "README.md").read_text(encoding="utf-8").partition("## Speed")
     rows = [row for row in rest.partition("##")[0].splitlines() if row.startswith("|")][2:]
-    figures = [figure for row in rows for figure in re.findall(r"\d[\d,.]*\d", row.split("|")[4])]
-    measured = (ROOT / "docs" / "benchmarks.md").read_text(encoding="utf-8")
-    assert len(figures) >= len(rows) > 5
-    assert not [figure for figure in figures if figure not in measured]
-
-
-def test_the_comparison_has_our_own_figures() -> None:
     text = (ROOT / "docs" / "comparison.md").read_text(encoding="utf-8")
-    measured = (ROOT / "docs" / "benchmarks.md").read_text(encoding="utf-8")
-    ours = [row.split("|")[2] for row in text.splitlines() if row.startswith("| surgical-marl,")]
-    assert len(ours) == 3 and all(" ".join(row.split()[:2]) in measured for row in ours)
-    (tasks,) = (row.split("|")[2].strip() for row in text.splitlines() if row.startswith("| tasks registered"))
-    assert int(tasks) == len(sm.list_tasks())
+    rows += [row for row in text.splitlines() if row.startswith("| surgical-marl,")]
+    assert len(rows) > 10 and all(tables.FIGURE.search(row) for row in rows)
 
 
 def test_every_algorithm_has_its_place_in_the_page() -> None:

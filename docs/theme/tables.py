@@ -1,9 +1,10 @@
-"""Writes the tables of content into the pages: what there is stands in the content itself, and in no list kept by hand.
+"""Writes tables of content and figures into the pages: each stands in one place, and in no list kept by hand.
 
     python docs/theme/tables.py
 
 A table stands between `<!-- table: NAME -->` and `<!-- end of table -->`. A picture docs/images/<kind>/<name>.webp
-is shown in the row of its arm, object, scene or task. `tests/test_site.py` holds the pages to the content.
+is shown in the row of its arm, object, scene or task. A figure stands between `<!-- figure: NAME -->` and
+`<!-- end -->`: one of docs/figures.yaml, or one that is counted here. `tests/test_site.py` holds the pages to both.
 """
 
 from __future__ import annotations
@@ -12,35 +13,57 @@ import ast
 import json
 import re
 from collections.abc import Callable, Iterable, Iterator
+from functools import cache
 from pathlib import Path
+
+import yaml
 
 from surgical_marl import list_arms, list_objects, list_policies, list_scenes, list_tasks
 from surgical_marl.content import find
+from surgical_marl.evaluation.card import worst_over_seeds
 from surgical_marl.plugins.tasks import TASKS, scenes_for
 from surgical_marl.robots.arm import load_arm
-from surgical_marl.runs.folder import read_metrics, read_origin
+from surgical_marl.runs.folder import read_metrics, read_origin, read_settings
 from surgical_marl.scenes.load import load_scene
 from surgical_marl.scenes.objects import load_object
 
 DOCS = Path(__file__).resolve().parents[1]
 MARKED = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end of table -->)", re.DOTALL)
+FIGURE = re.compile(r"(<!-- figure: (\w+) -->).*?(<!-- end -->)")
 
 
 def main() -> None:
-    """Write all tables of all pages."""
+    """Write all tables and figures of all pages."""
     for page in pages():
         page.write_text(written(page.read_text(encoding="utf-8")), encoding="utf-8")
 
 
 def pages() -> list[Path]:
-    """Return the pages that have tables of content."""
-    places = [DOCS.parent / "README.md", *sorted(DOCS.rglob("*.md"))]
-    return [path for path in places if MARKED.search(path.read_text(encoding="utf-8"))]
+    """Return the pages that have tables of content, or figures."""
+    places = [DOCS.parent / "README.md", DOCS.parent / "policies" / "README.md", *sorted(DOCS.rglob("*.md"))]
+    return [path for path in places if any(mark.search(path.read_text(encoding="utf-8")) for mark in (MARKED, FIGURE))]
 
 
 def written(text: str) -> str:
-    """Return a page with the tables that it should have."""
-    return MARKED.sub(lambda match: f"{match[1]}{TABLES[match[2]]()}\n{match[3]}", text)
+    """Return a page with the tables and figures that it should have."""
+    text = MARKED.sub(lambda match: f"{match[1]}{TABLES[match[2]]()}\n{match[3]}", text)
+    return FIGURE.sub(lambda match: f"{match[1]}{figures()[match[2]]}{match[3]}", text)
+
+
+@cache
+def figures() -> dict[str, str]:
+    """Return all figures by name: those that were measured, and those that are counted or follow from the policies."""
+    measured = yaml.safe_load((DOCS / "figures.yaml").read_text(encoding="utf-8"))
+    policies, handover = [Card(name) for name in list_policies()], Card("needle_handover-bimanual_psm_needle")
+    return {
+        "scenes": str(len(list_scenes())),
+        "tasks": str(len(list_tasks())),
+        "imitated": f"{sum(card.imitated for card in policies)} of {len(policies)}",
+        "handover": handover.success,
+        "handover_seeds": str(handover.seeds),
+        "handover_time": f"{handover.time:.1f} s",
+        **{name: value for run in measured for name, value in run["figures"].items()},
+    }
 
 
 def arms() -> str:
@@ -110,7 +133,7 @@ def examples() -> str:
 
 
 def results() -> str:
-    """Return how well the shipped policies do, of those without objects all in one row."""
+    """Return how well trainings do, as means over their seeds; of those without objects all in one row."""
     cards = [Card(name) for name in list_policies()]
     objects, without = [card for card in cards if card.objects], [card for card in cards if not card.objects]
     assisting = [card for card in without if "in_view_rate" in card.result]
@@ -123,48 +146,58 @@ def results() -> str:
             if "score" in card.result:
                 minutes = card.result["max_steps"] * card.result["control_dt"] / 60
                 done = f"{card.points} points in {minutes:.0f} minutes, {card.episodes} unseen trials"
-            yield [card.link, card.training, done]
+            yield [*card.row, done]
         for card in assisting:
             seen_share = f"tools in view {100 * card.result['in_view_rate']:.2f} % of the time"
-            yield [card.link, card.training, f"{seen_share}; {card.success} of {card.episodes} unseen starts"]
-        worst = max(card.error for card in usual if card not in seen)
-        pictures = " and ".join(f"{error:.2f}" for error in sorted(card.error for card in seen))
+            yield [*card.row, f"{seen_share}; {card.success} of {card.episodes} unseen starts"]
+        worst = max((card for card in usual if card not in seen), key=lambda card: card.error[0])
+        pictures = " and ".join(card.millimetres for card in sorted(seen, key=lambda card: card.error[0]))
         times = [card.seconds for card in usual if card.on_gpu]
         others = sorted(f"{card.link} {card.seconds:.0f} s on a CPU" for card in usual if not card.on_gpu)
         yield [
             f"{len(usual)} policies, one for each task without objects on each scene",
+            f"{sum(card.imitated for card in usual)} of them",
+            " or ".join(sorted({str(card.seeds) for card in usual})) + " each",
             "; ".join(
                 [f"{min(times):.0f} to {max(times):.0f} s each on an H200 or H100 that up to 15 others share", *others]
             ),
-            f"median error of the worst arm at most {worst:.2f} mm; {pictures} mm where pictures are matched",
+            f"median error of the worst arm at most {worst.millimetres} mm; {pictures} mm where pictures are matched",
         ]
         for card in without:
             if card not in usual and card not in assisting:
-                yield [card.link, card.training, f"{card.success} within 2 mm in {card.episodes} episodes"]
+                yield [*card.row, f"{card.success} within 2 mm in {card.episodes} episodes"]
 
-    return table(["policies", "training", "result"], rows())
+    head = ["policies", "imitated the oracle", "seeds", "training of the one that ships", "result, mean over the seeds"]
+    return table(head, rows())
 
 
 class Card:
-    """What the files of a shipped policy say about it."""
+    """What the files of a shipped policy say about its training: means over seeds, with 95 % intervals."""
 
     def __init__(self, name: str) -> None:
         folder = find("policies", name)
-        result = json.loads((folder / "evaluation.json").read_text(encoding="utf-8"))
-        origin = read_origin(folder)["origin"]
+        evaluation = json.loads((folder / "evaluation.json").read_text(encoding="utf-8"))
+        origin, runs = read_origin(folder)["origin"], evaluation["seeds"]["runs"]
         self.link = f"[`{name}`](policies/{name}/README.md)"
-        self.result = result
+        self.result = result = evaluation["seeds"]["aggregate"]
         self.task, self.level, self.episodes = result["task"], result["difficulty"], result["episodes"]
         self.objects = bool(load_scene(result["scene"]).free_objects)
+        self.seeds, self.imitated = len(runs), read_settings(folder).shown_by_oracle
         self.seconds = sum(row["seconds"] for row in read_metrics(folder))
         self.on_gpu = "NVIDIA" in str(origin.get("device"))
-        self.training = f"{self.seconds:.0f} s, {origin.get('device')}"
-        low, high = result["intervals"]["success_rate"]
-        self.success = f"{100 * result['success_rate']:.1f} % ({100 * low:.1f} to {100 * high:.1f})"
-        low, high = result["intervals"].get("score") or (0.0, 0.0)
-        self.points = f"{result.get('score', 0.0):.1f} ({low:.1f} to {high:.1f})"
-        self.error = max(own["median_error_mm"] for own in result["agents"].values())
+        training = f"{self.seconds:.0f} s, {origin.get('device')}"
+        self.row = [self.link, "yes" if self.imitated else "no", str(self.seeds), training]
+        self.success = spanned(100 * result["success_rate"], [100 * b for b in result["intervals"]["success_rate"]], " %")
+        self.points = spanned(result.get("score", 0.0), result["intervals"].get("score"))
+        self.error = worst_over_seeds(runs)
+        self.millimetres = spanned(*self.error, digits=2)
         self.time = result["time_to_success_s"]
+
+
+def spanned(value: float | None, bounds: list[float] | None, unit: str = "", digits: int = 1) -> str:
+    """Return a value with its interval in brackets, such as "98.3 % (94.0 to 100.0)"."""
+    span = f" ({' to '.join(f'{bound:.{digits}f}' for bound in bounds)})" if bounds else ""
+    return "-" if value is None else f"{value:.{digits}f}{unit}{span}"
 
 
 TABLES: dict[str, Callable[[], str]] = {

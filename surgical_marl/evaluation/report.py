@@ -129,8 +129,14 @@ def explained(name: str) -> str:
 
 
 def number(name: str, value: float | None) -> str:
-    """Return the value of a metric as text: a rate in percent with one decimal, all else with two, "-" for None."""
+    """Return the value of a metric as text: a rate in percent with one decimal, all else with two, "-" for None.
+
+    A rate that is not quite 0 or 100 % has up to three decimals, so that it does not look as if it were.
+    """
     if value is None:
         return "-"
-    rate = name.endswith("_rate") or name.startswith(("success_", "team_success_", "cost_"))
-    return f"{value:z.1%}" if rate else f"{value:z.2f}"
+    if not (name.endswith("_rate") or name.startswith(("success_", "team_success_", "cost_"))):
+        return f"{value:z.2f}"
+    texts = (f"{value:z.{digits}%}" for digits in (1, 2, 3))
+    exact = next((text for text in texts if float(text[:-1]) not in (0, 100)), None)
+    return exact or f"{value:z.1%}"
