@@ -187,7 +187,8 @@ class Card:
         self.on_gpu = "NVIDIA" in str(origin.get("device"))
         training = f"{self.seconds:.0f} s, {origin.get('device')}"
         self.row = [self.link, "yes" if self.imitated else "no", str(self.seeds), training]
-        self.success = spanned(100 * result["success_rate"], [100 * b for b in result["intervals"]["success_rate"]], " %")
+        bounds = [100 * bound for bound in result["intervals"]["success_rate"]]
+        self.success = spanned(100 * result["success_rate"], bounds, " %")
         self.points = spanned(result.get("score", 0.0), result["intervals"].get("score"))
         self.error = worst_over_seeds(runs)
         self.millimetres = spanned(*self.error, digits=2)

@@ -14,7 +14,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, PercentFormatter
 
-from surgical_marl.evaluation.interval import interval
+from surgical_marl.evaluation.interval import interval, over_seeds
 from surgical_marl.evaluation.metrics import SUCCESS_MM, Metric, metrics, success
 from surgical_marl.files import write_atomic
 from surgical_marl.plugins.tasks import TASKS
@@ -91,7 +91,7 @@ def describe(jobs: Sequence[Job], out: Path) -> dict[str, Any]:
         **{key: abouts[0][key] for key in ("goal_set", "episodes", "cpu", "gpu")},
         **{name: number(final[name]) for name in FINAL},
         "samples": rows[0][-1]["env_steps"],
-        "seconds": number(_over_runs([sum(row["seconds"] for row in run) for run in rows])),
+        "seconds": _over_runs([sum(row["seconds"] for row in run) for run in rows]),
         "by_seed": [{name: _value(final[name], at) for name in FINAL} for at in range(len(jobs))],
         "curves": {axis: curve(rows, axis) for axis in ("samples", "seconds")},
         "broken": {what: broken(played, abouts[0]["agents"], what) for what in BROKEN if _was_played(played, what)},
@@ -116,7 +116,7 @@ def curve(runs: Sequence[Sequence[dict[str, float]]], axis: str) -> dict[str, An
             y = np.array([row[name] for row in run])
             known = np.isfinite(y)  # no episode ended
             lines.append(np.interp(grid, x[known], y[known], left=0.0) if known.any() else np.zeros(POINTS))
-        found[name] = [number(_over_runs(values)) for values in np.transpose(lines)]
+        found[name] = [_over_runs(values, most=1.0) for values in np.transpose(lines).tolist()]
     reaches = [x for x, y in zip(grid, found["success_rate"], strict=True) if y[0] >= LEVEL]
     return {**found, "reached": float(reaches[0]) if reaches else None}
 
@@ -245,9 +245,10 @@ def _stacked(played: Sequence[dict[str, np.ndarray]], what: str) -> dict[str, np
     return {name: np.stack([each[f"{what}/{name}"] for each in played]) for name in names}
 
 
-def _over_runs(values: Any) -> Metric:
-    """Return a metric that is the mean over runs; its interval resamples the runs."""
-    return Metric(np.asarray(values, float)[None, :, None], lambda drawn: drawn.mean(-1))
+def _over_runs(values: Sequence[float], most: float = np.inf) -> list[float | None]:
+    """Return [mean, low, high] of one number of each run, by t; its largest possible value is `most`."""
+    bounds = over_seeds(values, [[value, value] for value in values], most) if len(values) > 1 else None
+    return [float(np.mean(values)), *(bounds or (None, None))]
 
 
 def _value(metric: Metric, run: int) -> float:
