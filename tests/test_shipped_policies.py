@@ -11,7 +11,7 @@ import onnx
 import pytest
 
 from surgical_marl.content import content_dir, list_policies
-from surgical_marl.evaluation.card import table
+from surgical_marl.evaluation.card import card, table
 from surgical_marl.evaluation.command import play_all
 from surgical_marl.evaluation.evaluate import summarise
 from surgical_marl.evaluation.goal_set import is_standard
@@ -69,6 +69,16 @@ def missing_weights(path: Path) -> set[str]:
 def test_all_of_them_are_small_and_in_the_table() -> None:
     assert sum(path.stat().st_size for path in POLICIES.rglob("*") if path.is_file()) < 60e6
     assert table() in (POLICIES / "README.md").read_text()
+
+
+@pytest.mark.parametrize("name", list_policies())
+def test_its_intervals_have_a_width_and_its_card_is_of_its_files(name: str) -> None:
+    result = read(name)
+    every = [result, *result["also"].values(), *result["seeds"]["runs"], result["seeds"]["aggregate"]]
+    for part in [one for each in every for one in (each, *each["agents"].values())]:
+        bounds = [(key, *pair) for key, pair in part["intervals"].items() if pair is not None]
+        assert bounds and not [key for key, low, high in bounds if not low < high]
+    assert card(POLICIES / name, name) == (POLICIES / name / "README.md").read_text()
 
 
 @pytest.mark.parametrize("name", ["reach-psm", "reach-bimanual_psm"])

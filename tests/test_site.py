@@ -87,6 +87,12 @@ def test_a_figure_stands_in_one_place_and_is_set_into_the_others(tables: Any) ->
         assert not pages, f"{pages} have {value!r}: write <!-- figure: {name} --><!-- end --> there"
 
 
+def test_it_is_counted_who_imitated_the_oracle(tables: Any) -> None:
+    configs = [yaml.safe_load((ROOT / "policies" / name / "config.yaml").read_text()) for name in sm.list_policies()]
+    imitated = sum(bool((config.get("imitation") or {}).get("steps")) for config in configs)
+    assert tables.figures()["imitated"] == f"{imitated} of {len(configs)}" and 0 < imitated < len(configs)
+
+
 def test_the_speeds_of_readme_and_comparison_are_figures(tables: Any) -> None:
     _, _, rest = (ROOT / "README.md").read_text(encoding="utf-8").partition("## Speed")
     rows = [row for row in rest.partition("##")[0].splitlines() if row.startswith("|")][2:]
