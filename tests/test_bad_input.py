@@ -53,6 +53,11 @@ def poisoned(shape: tuple[int, ...], value: Any, dtype: Any = np.float32) -> np.
     return array
 
 
+def masked(shape: tuple[int, ...], value: float) -> np.ma.MaskedArray[Any, Any]:
+    array = poisoned(shape, value)
+    return np.ma.masked_array(array, array != 0)
+
+
 BAD: dict[str, Callable[[tuple[int, ...]], Any]] = {
     "a column too few": lambda shape: np.zeros((*shape[:-1], shape[-1] - 1)),
     "an axis too many": lambda shape: np.zeros((1, *shape)),
@@ -74,6 +79,10 @@ BAD: dict[str, Callable[[tuple[int, ...]], Any]] = {
     "infinity of torch": lambda shape: torch.from_numpy(poisoned(shape, np.inf)).to(torch.bfloat16),
     "nan of jax": lambda shape: jnp.asarray(poisoned(shape, np.nan)),
     "infinity of jax": lambda shape: jnp.asarray(poisoned(shape, np.inf), jnp.bfloat16),
+    "nan under a mask": lambda shape: masked(shape, np.nan),
+    "a number under a mask": lambda shape: masked(shape, 0.5),
+    "masks in a list": lambda shape: list(masked(shape, 0.5)),
+    "a sparse tensor": lambda shape: torch.zeros(shape).to_sparse(),
     "nan in a list": lambda shape: poisoned(shape, np.nan).tolist(),
     "a function": lambda shape: np.zeros,
 }

@@ -121,6 +121,7 @@ def test_spaces_are_pytrees() -> None:
         ({"psm_0": np.zeros(7, bool)}, "must hold real numbers, not bool"),
         ({"psm_0": np.zeros(7, complex)}, "must hold real numbers, not complex64"),
         ({"psm_0": np.full(7, np.nan)}, "action of 'psm_0' holds a value that is not finite"),
+        ({"psm_0": np.ma.masked_equal(np.ones(7), 1)}, "action of 'psm_0' has masked entries"),
     ],
 )
 def test_a_bad_action_is_one_sentence(actions: Any, words: str) -> None:

@@ -24,12 +24,13 @@ def check_actions(actions: Any, shapes: Mapping[str, tuple[int, ...]]) -> dict[s
         shapes: agent -> shape of its action.
 
     Raises:
-        ValueError: it is no dict, an agent is missing or unknown, a shape is wrong, or a value is not a finite number.
+        ValueError: it is no dict, an agent is missing or unknown, a shape is wrong, or a value is masked or not a
+            finite number.
     """
     check_agents(actions, shapes.keys())
     checked, away = {}, {}
     for agent, shape in shapes.items():
-        action = _array(agent, actions[agent])
+        action = as_array(agent, actions[agent])
         if tuple(action.shape) != shape:
             raise ValueError(f"action of {agent!r} has shape {tuple(action.shape)}, it must be {shape}")
         if not isinstance(action, np.ndarray):
@@ -56,12 +57,30 @@ def check_agents(actions: Any, agents: Collection[str]) -> None:
             raise ValueError(f"no action for agent {agent!r}")
 
 
-def _array(agent: str, given: Any) -> Any:
-    """Return an action as an array of numbers: of numpy, or of its own library if it is on a GPU."""
-    array = given if isinstance(given, np.ndarray) else _converted(agent, given)
+def as_array(agent: str, given: Any) -> Any:
+    """Return an action of any shape as an array of numbers: of numpy, or of its own library if it is on a GPU.
+
+    Raises:
+        ValueError: it holds something else than real numbers, or masked entries.
+    """
+    check_unmasked(agent, given)
+    array = np.asarray(given) if isinstance(given, np.ndarray) else _converted(agent, given)
     if getattr(array.dtype, "kind", "f") not in _NUMBERS:  # torch's types have no kind, and are checked already
         raise _no_numbers(agent, given if array.dtype.kind == "O" else array.dtype)
     return array
+
+
+def check_unmasked(agent: str, given: Any) -> None:
+    """Raise a ValueError if an action has masked entries: as an array it would hold what is under the mask."""
+    if _is_masked(given):
+        raise ValueError(f"action of {agent!r} has masked entries, which are no numbers: fill them, as filled(0) does")
+
+
+def _is_masked(given: Any) -> bool:
+    """Return whether an array of numpy, or one in nested lists, has masked entries."""
+    if isinstance(given, list | tuple):
+        return any(isinstance(part, list | tuple | np.ndarray) and _is_masked(part) for part in given)
+    return isinstance(given, np.ma.MaskedArray) and bool(np.ma.is_masked(given))
 
 
 def _converted(agent: str, given: Any) -> Any:
@@ -73,7 +92,10 @@ def _converted(agent: str, given: Any) -> Any:
         tensor = given.detach()
         if given.device.type != "cpu":
             return tensor
-        return tensor.float().numpy() if given.dtype == torch.bfloat16 else tensor.numpy()
+        try:
+            return tensor.float().numpy() if given.dtype == torch.bfloat16 else tensor.numpy()
+        except (TypeError, RuntimeError):  # a sparse, quantised or masked tensor
+            raise _no_numbers(agent, given) from None
     if jax is not None and isinstance(given, jax.Array):
         if given.dtype == jax.numpy.bfloat16:
             given = given.astype(np.float32)

@@ -18,7 +18,7 @@ import numpy as np
 
 from surgical_marl.content import unknown
 from surgical_marl.engines.stepper import MOST_KEPT, Stepper, representative
-from surgical_marl.envs.actions import check_agents, shown
+from surgical_marl.envs.actions import check_agents, check_unmasked, shown
 from surgical_marl.envs.env import Env
 from surgical_marl.envs.state import Carry
 from surgical_marl.runtime import jax, jax_scope, jnp
@@ -157,6 +157,7 @@ class JaxEnv:
 
     def _checked_action(self, agent: str, actions: Mapping[str, Any]) -> Array:
         shape = self.action_spaces[agent].shape
+        check_unmasked(agent, actions[agent])
         try:
             action = jnp.asarray(actions[agent])
         except (TypeError, ValueError):

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from surgical_marl.content import BASELINES, unknown
+from surgical_marl.envs.actions import as_array
 from surgical_marl.envs.observations import each
 from surgical_marl.policies.acting import Policy, forget
 from surgical_marl.policies.oracle import oracle
@@ -72,7 +73,7 @@ class Teammates:
             actions |= {agent: found[agent] for agent in agents}
         for agent, function in self._functions.items():
             if self._alone:
-                actions[agent] = np.asarray(function(each(observations[agent], lambda part: part[0])))[None]
+                actions[agent] = as_array(agent, function(each(observations[agent], lambda part: part[0])))[None]
             else:
                 actions[agent] = function(observations[agent])
         return actions
