@@ -28,7 +28,7 @@ from surgical_marl.physics.together import Together
 from surgical_marl.physics.variation import Factors
 from surgical_marl.physics.views import ArmView, Contacts, ObjectView, Touch
 from surgical_marl.scenes.poses import Pose
-from surgical_marl.scenes.scene import PAYLOAD, Scene
+from surgical_marl.scenes.scene import Scene, payload_body
 from surgical_marl.scenes.timing import DECIMATION
 
 
@@ -154,8 +154,8 @@ class Simulator:
         pull = model.actuator_biasprm[:, 1] * stiffness
         misread = pull * (self.moment @ offset[self.address])
         bias = jnp.stack([misread, pull, model.actuator_biasprm[:, 2] * damping], -1)
-        loaded = self.scene.agents if self.scene.randomisation.payload else ()
-        bodies = [nominal.body(f"{agent}/{PAYLOAD}").id for agent in loaded]
+        loaded = self.scene.mounts if self.scene.randomisation.payload else {}
+        bodies = [nominal.body(payload_body(agent, mount.arm)).id for agent, mount in loaded.items()]
         varied._fields = {
             "actuator_gainprm": model.actuator_gainprm.at[:, 0].set(model.actuator_gainprm[:, 0] * gain),
             "actuator_biasprm": model.actuator_biasprm.at[:, :3].set(bias),

@@ -22,7 +22,7 @@ from surgical_marl.robots.drives import Cable, Drive, read_cables, read_drives
 from surgical_marl.robots.jaw import Jaw, read_jaw
 from surgical_marl.robots.mesh import MAX_MESH, mesh_files, resolve_meshes
 from surgical_marl.robots.reach import Box, box_of
-from surgical_marl.robots.urdf import Faults, read_urdf
+from surgical_marl.robots.urdf import Faults, link_name, read_urdf
 from surgical_marl.robots.urdf_faults import robot_faults
 from surgical_marl.untrusted.files import is_file, read_bytes
 from surgical_marl.untrusted.markup import check_name
@@ -252,14 +252,21 @@ def load_arm(name: str | Path) -> Arm:
     path = _urdf_path(folder, settings.get("urdf"))
     robot, lost = resolve_meshes(read_urdf(path), path, folder)
     faults += robot_faults(robot, path) + lost
-    leaders = [joint.name for joint in robot.joints if joint.type in MOVING and not joint.mimic]
-    drives = read_drives(settings.get("joints") or {}, leaders, where, keep)
+    given = settings.get("joints") or {}
+    moving = [joint for joint in robot.joints if joint.type != "fixed" and not joint.mimic]
+    leaders = [joint.name for joint in moving]
+    # one of a type that is a fault already may have a drive, which is then no fault
+    known = given if isinstance(given, dict) else ()
+    driven = [joint.name for joint in moving if joint.type in MOVING or joint.name in known]
+    drives = read_drives(given, driven, where, keep)
     camera = None if settings.get("camera") is None else keep(build, Camera, settings["camera"], where)
     jaw = None if settings.get("jaw") is None else keep(read_jaw, settings["jaw"], where)
-    pulled = [name for name in drives if jaw is None or name != jaw.joint]
+    pulled = [name for name in leaders if jaw is None or name != jaw.joint]
     cables = read_cables(settings.get("cables") or [], pulled, where, keep)
     links = [link.name for link in robot.links]
-    named = {key: settings.get(key) for key in ("tool_tip", "remote_center")} | {"camera": camera and camera.link}
+    named = {key: link_name(settings.get(key)) for key in ("tool_tip", "remote_center")}
+    camera = camera and replace(camera, link=link_name(camera.link))
+    named |= {"camera": camera and camera.link}
     named |= {f"jaw pad {number}": pad.link for number, pad in enumerate(jaw.pads if jaw else ())}
     for key, link in named.items():
         if link not in links and (key == "tool_tip" or link is not None):
@@ -274,8 +281,8 @@ def load_arm(name: str | Path) -> Arm:
         name=folder.name,
         folder=folder,
         description=str(settings.get("description", "")),
-        tool_tip=str(settings["tool_tip"]),
-        remote_center=settings.get("remote_center"),
+        tool_tip=named["tool_tip"],
+        remote_center=named["remote_center"],
         jaw=jaw,
         camera=camera,
         joints=tuple(_joint(joint, drives, where) for joint in robot.joints if joint.type in MOVING),

@@ -8,6 +8,7 @@ from typing import Any
 
 from surgical_marl.robots.description import Matrix, Vector
 from surgical_marl.robots.rotation import turned
+from surgical_marl.robots.urdf import link_name
 from surgical_marl.yaml_file import build, check_keys, read_mapping, read_vector
 
 
@@ -43,7 +44,8 @@ def read_jaw(settings: Any, where: Path) -> Jaw:
     """
     jaw: Jaw = build(Jaw, settings, where)
     pads = read_mapping(settings.get("pads"), f"{where}, jaw, pads")
-    return replace(jaw, pads=tuple(_pad(link, pad, f"{where}, jaw pad of {link!r}") for link, pad in pads.items()))
+    found = tuple(_pad(link_name(link), pad, f"{where}, jaw pad of {link!r}") for link, pad in pads.items())
+    return replace(jaw, pads=found)
 
 
 def _pad(link: str, settings: Any, where: str) -> Pad:

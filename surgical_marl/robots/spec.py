@@ -8,6 +8,7 @@ around it if that is smaller. Collision geoms collide only through the explicit 
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,14 @@ GEAR = 5.0
 """Stiffness of what ties a joint to the one that it mimics, relative to its drive's. Two fingers that close on
 something at their full effort would otherwise swing aside together, as nothing but friction held them. There is no
 damper: `implicitfast` leaves out what couples joints of two branches, and would damp both fingers alike."""
+
+
+def own_name(name: str, taken: Iterable[str]) -> str:
+    """Return the name of a part that the builder adds, with a slash behind it if a link or joint has that name.
+
+    No link and no joint has a slash in its name, so that this one is free.
+    """
+    return f"{name}/" if name in taken else name
 
 
 def build_spec(arm: Arm, control: str = "position", pads: bool = False) -> mujoco.MjSpec:
@@ -80,7 +89,7 @@ def build_spec(arm: Arm, control: str = "position", pads: bool = False) -> mujoc
         mode = _mode(arm, joint, control)
         _add_actuator(spec, joint.name, joint.drive, joint.effort, mode, _commands(joint, mode))
     for number, cable in enumerate(arm.cables):
-        _add_cable(spec, f"cable_{number}", cable, joints, control)
+        _add_cable(spec, own_name(f"cable_{number}", joints), cable, joints, control)
     for joint in arm.joints:
         if joint.leader != joint.name:
             _add_gear(spec, joint)
@@ -191,9 +200,10 @@ def _add_link(spec: mujoco.MjSpec, body: Any, link: Link, folder: Path) -> None:
         rgba = DEFAULT_RGBA if visual.rgba is None else visual.rgba
         _add_geom(body, shape, np.array(visual.origin), rgba=rgba, group=VISUAL_GROUP)
     for i, collision in enumerate(link.collisions):
-        name = collision.name or f"{link.name}_{i}"
-        if spec.geom(name) is not None:  # in a URDF shapes of two links may have the same name, in MuJoCo they may not
-            name = f"{link.name}_{i}_{name}"
+        # in a URDF shapes may have the same name, in MuJoCo they may not; no shape has the last of these names
+        given = (collision.name or f"{link.name}_{i}").replace("/", "_")
+        names = given, f"{link.name}_{i}_{given}", f"{link.name}/{i}"
+        name = next(name for name in names if spec.geom(name) is None)
         shape, place = _collision_shape(collision, folder)
         place = np.array(collision.origin) @ place
         _add_geom(body, shape, place, name=name, rgba=[0.9, 0.3, 0.2, 0.3], group=COLLISION_GROUP)

@@ -12,6 +12,7 @@ from collections.abc import Iterable, Mapping
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from xml.etree.ElementTree import Element
 
 import numpy as np
 
@@ -55,9 +56,8 @@ class Faults(ValueError):
 def read_urdf(path: Path) -> Robot:
     """Read a URDF file; lengths in m, angles in rad, meshes by the names that it gives them.
 
-    A link called "world", the name that MuJoCo reserves for the ground, becomes "world_link". The result of yourdfpy is
-    kept on disk, keyed by the content of the file, because importing yourdfpy takes longer than the rest of loading a
-    scene.
+    Links have the names that `link_name` gives them. The result of yourdfpy is kept on disk, keyed by the content of
+    the file, because importing yourdfpy takes longer than the rest of loading a scene.
 
     Raises:
         ValueError: not there, too large, no XML, a DOCTYPE (so entities never expand), or a tag that lacks something or
@@ -73,8 +73,14 @@ def read_urdf(path: Path) -> Robot:
     return from_json(cached("urdf", compute, data).tobytes())
 
 
+def link_name(name: Any) -> Any:
+    """Return the name of a link that a file calls `name`: "world", which MuJoCo reserves for the ground, is changed."""
+    return "world_link" if name == "world" else name
+
+
 def _parse(data: bytes, path: Path) -> Robot:
     document = parse_xml(data, path, "URDF")
+    _simplify_still_joints(document.root)
     if faults := list(islice(xml_faults(document, path), MAX_FAULTS)):
         raise Faults(faults)
     import yourdfpy
@@ -84,6 +90,14 @@ def _parse(data: bytes, path: Path) -> Robot:
         return _plain(yourdfpy.URDF.load(text, build_scene_graph=False, load_meshes=False).robot)
     except Exception as error:  # yourdfpy passes on any exception of float() and of its own code
         raise ValueError(f"{path} is not a URDF that can be read: {' '.join(str(error).split())}") from None
+
+
+def _simplify_still_joints(root: Element) -> None:
+    """Remove from joints without an axis what says how they move: exporters fill it with zeros, and nobody reads it."""
+    for joint in root.findall("joint"):
+        if joint.get("type") in ("fixed", "floating"):
+            for part in [part for part in joint if part.tag not in ("origin", "parent", "child")]:
+                joint.remove(part)
 
 
 def _plain(robot: yourdf.Robot) -> Robot:
@@ -97,7 +111,7 @@ def _link(link: yourdf.Link, colors: Mapping[str, Any]) -> Link:
     if (given := link.inertial) is not None:
         inertial = Inertial(float(given.mass), _matrix(given.inertia), _pose(given.origin))
     visuals = tuple(_shape(visual, _color(visual.material, colors)) for visual in link.visuals)
-    return Link(_link_name(link.name), inertial, visuals, tuple(_shape(part, None) for part in link.collisions))
+    return Link(link_name(link.name), inertial, visuals, tuple(_shape(part, None) for part in link.collisions))
 
 
 def _shape(part: yourdf.Visual | yourdf.Collision, rgba: Vector | None) -> Shape:
@@ -132,8 +146,8 @@ def _joint(joint: yourdf.Joint) -> RobotJoint:
     return RobotJoint(
         name=joint.name,
         type=joint.type,
-        parent=_link_name(joint.parent),
-        child=_link_name(joint.child),
+        parent=link_name(joint.parent),
+        child=link_name(joint.child),
         origin=_pose(joint.origin),
         axis=_vector(joint.axis),
         limit=Limit(*limits) if limits and None not in limits else None,
@@ -141,10 +155,6 @@ def _joint(joint: yourdf.Joint) -> RobotJoint:
         damping=float((dynamics and dynamics.damping) or 0.0),  # yourdfpy leaves these two as text
         friction=float((dynamics and dynamics.friction) or 0.0),
     )
-
-
-def _link_name(name: str) -> str:
-    return "world_link" if name == "world" else name
 
 
 def _pose(origin: np.ndarray | None) -> Matrix:

@@ -66,7 +66,7 @@ _CHILDREN = {"joint": ("parent", "child"), "inertial": ("mass", "inertia"),
 
 def robot_faults(robot: Robot, path: Path) -> list[str]:
     """Return what is wrong with links, joints and inertias: one sentence each that names the file."""
-    faults = list(_tree_faults(robot)) or list(_inertia_faults(robot))
+    faults = [*_name_faults(robot), *_tree_faults(robot)] or list(_inertia_faults(robot))
     return [f"{path}: {fault}" for fault in (*faults, *_joint_faults(robot))]
 
 
@@ -119,17 +119,25 @@ def _number_fault(tag: str, key: str, text: str) -> str | None:
     )
 
 
+def _name_faults(robot: Robot) -> Iterator[str]:
+    """Yield names that two links or joints have, or that names of the model's own parts could be equal to."""
+    for noun, parts in (("link", robot.links), ("joint", robot.joints)):
+        for name, count in Counter(part.name for part in parts).items():
+            if count > 1:
+                read = " ('world', which MuJoCo reserves, is read as 'world_link')" * (name == "world_link")
+                yield f"{count} {noun}s are called {name!r}{read}; each needs a name of its own"
+            if "/" in name:
+                free = shown(name.replace("/", "_"))
+                yield f"{noun} {shown(name)} has a slash in its name, as only the model's own parts have; call it {free}"
+
+
 def _tree_faults(robot: Robot) -> Iterator[str]:
     """Yield the reasons why links and joints are not one tree."""
     links = [link.name for link in robot.links]
-    for noun, names in (("link", links), ("joint", [joint.name for joint in robot.joints])):
-        for name, count in Counter(names).items():
-            if count > 1:
-                yield f"{count} {noun}s are called {name!r}; each needs a name of its own"
-    for joint in robot.joints:
-        for role, name in (("parent", joint.parent), ("child", joint.child)):
-            if name not in links:
-                yield f"joint {joint.name!r} has the {role} {name!r}, which is not a link of the URDF"
+    ends = [(joint, role, getattr(joint, role)) for joint in robot.joints for role in ("parent", "child")]
+    lost = [end for end in ends if end[2] not in links]
+    for joint, role, name in lost:
+        yield f"joint {joint.name!r} has the {role} {name!r}, which is not a link of the URDF"
     for name, count in Counter(joint.child for joint in robot.joints).items():
         if count > 1:
             yield f"link {name!r} is the child of {count} joints; a link of a tree has one parent"
@@ -137,7 +145,7 @@ def _tree_faults(robot: Robot) -> Iterator[str]:
     roots = [name for name in dict.fromkeys(links) if name not in parents]
     if not links:
         yield "it has no links"
-    if len(roots) > 1:
+    if len(roots) > 1 and not lost:  # a child that is no link leaves another link without its parent
         yield f"the links {listed(map(repr, roots))} have no parent; a tree has one root"
     if (looped := _looped(parents)) is not None:
         yield f"link {looped!r} is its own ancestor; links must form a tree"
@@ -159,7 +167,7 @@ def _looped(parents: dict[str, str]) -> str | None:
 
 
 def _joint_faults(robot: Robot) -> Iterator[str]:
-    moving = {joint.name: joint for joint in robot.joints if joint.type in MOVING}
+    moving = {joint.name: joint for joint in robot.joints if joint.type != "fixed"}
     for joint in robot.joints:
         name, limit, mimic = joint.name, joint.limit, joint.mimic
         if joint.type == "continuous":
@@ -172,7 +180,8 @@ def _joint_faults(robot: Robot) -> Iterator[str]:
         if mimic is not None and mimic.joint not in moving:
             yield f"joint {name!r} mimics {mimic.joint!r}, which is not a moving joint of the URDF"
         elif mimic is not None and moving[mimic.joint].mimic is not None:
-            yield f"joint {name!r} mimics {mimic.joint!r}, which mimics a joint itself; let both mimic the same joint"
+            cure = "leave its <mimic> out" if mimic.joint == name else "let both mimic the same joint"
+            yield f"joint {name!r} mimics {mimic.joint!r}, which mimics a joint itself; {cure}"
         if limit is None:
             yield f"joint {name!r} needs a limit with lower, upper, velocity and effort"
         elif not limit.lower < limit.upper:

@@ -12,7 +12,7 @@ from surgical_marl.cache import cached
 from surgical_marl.robots.rotation import quaternion
 from surgical_marl.robots.spec import COLLISION_GROUP, build_spec
 from surgical_marl.scenes.randomisation import Randomisation
-from surgical_marl.scenes.scene import PAYLOAD, Mount, Scene
+from surgical_marl.scenes.scene import Mount, Scene, payload_body
 from surgical_marl.scenes.timing import TIMESTEP
 
 
@@ -39,7 +39,7 @@ def build_scene(
         frame = spec.worldbody.add_frame(pos=mount.position, quat=quaternion(mount.rotation))
         spec.attach(build_spec(mount.arm, control, pads), prefix=f"{agent}/", frame=frame)
         if randomisation.payload:
-            spec.body(f"{agent}/{mount.arm.tool_tip}").add_body(name=f"{agent}/{PAYLOAD}")
+            spec.body(f"{agent}/{mount.arm.tool_tip}").add_body(name=payload_body(agent, mount.arm))
     return spec
 
 

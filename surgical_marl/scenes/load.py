@@ -52,6 +52,8 @@ def load_scene(name: str | Path, control: str = "position") -> Scene:
     check_count(len(arms), MAX_ARMS, "arms", path)
     tissue = read_mapping(settings.get("tissue"), f"{path}, tissue")
     check_count(len(tissue), MAX_TISSUE, "pieces of tissue", path)
+    if (wrong := next((piece for piece in tissue if not isinstance(piece, str)), None)) is not None:
+        raise ValueError(f"{path}, tissue {shown(wrong)}: a name is a text; write it in quotes")
     load = cache(load_arm)  # two agents may be the same arm
     mounts = {agent: _read_mount(agent, mount, path, load) for agent, mount in arms.items()}
     objects = read_placements(settings.get("objects"), mounts, path)

@@ -133,15 +133,13 @@ class _Side(NamedTuple):
 
 
 def touches(scene: Scene) -> Iterator[Touch]:
-    """Yield the pairs of geoms of which at least one is an object's, in the order of the scene."""
+    """Yield the pairs of geoms of which one is an object's and one can move, in the order of the scene."""
     arms = [(True, _arm_sides(scene, agent)) for agent in scene.agents]
-    objects = [(place.object.free, _object_sides(scene, name)) for name, place in scene.objects.items()]
-    groups = [(True, moves, sides) for moves, sides in arms] + [(False, moves, sides) for moves, sides in objects]
-    for (arm, moves, sides), (other_arm, other_moves, others) in combinations(groups, 2):
-        if (arm and other_arm) or not (moves or other_moves):
-            continue
-        for one, other in product(sides, others):
-            yield Touch(one.name, other.name, one.surface.against(other.surface), one.weight + other.weight)
+    objects = [(False, _object_sides(scene, name)) for name in scene.objects]
+    for (arm, sides), (other_arm, others) in combinations(arms + objects, 2):
+        for one, other in product(sides, others) if not (arm and other_arm) else ():
+            if one.weight + other.weight > 0:  # fixed objects, and an arm's base, have an inverse weight of 0
+                yield Touch(one.name, other.name, one.surface.against(other.surface), one.weight + other.weight)
 
 
 def _arm_sides(scene: Scene, agent: str) -> list[_Side]:

@@ -37,9 +37,9 @@ def read_placements(settings: Any, agents: Iterable[str], path: Path) -> dict[st
     check_count(len(given), MAX_OBJECTS, "objects", path)
     for name, place in given.items():
         where = f"{path}, object {shown(name)}"
-        if not re.fullmatch(r"[A-Za-z_]\w*", str(name)):
+        if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z_]\w*", name):
             raise ValueError(f"{where}: a name in a scene is of letters, digits and underscores")
-        if name in agents or name == "world":
+        if name in (*agents, "world", "tissue"):
             raise ValueError(f"{where}: {name} is taken; give the object another name")
         found[name] = _read_placement(place, where, path.parent)
     return found

@@ -16,13 +16,10 @@ import numpy as np
 
 from surgical_marl.content import unknown
 from surgical_marl.robots.arm import Arm
-from surgical_marl.robots.spec import COLLISION_GROUP, build_spec
+from surgical_marl.robots.spec import COLLISION_GROUP, build_spec, own_name
 from surgical_marl.scenes.geometry import Capsule, capsule_distance, link_capsule
 from surgical_marl.scenes.objects import Placement
 from surgical_marl.scenes.randomisation import Randomisation
-
-PAYLOAD = "payload"
-"""The body at an arm's tool tip that represents a payload, if payloads are randomised: `<agent>/payload`."""
 
 
 @dataclass(frozen=True)
@@ -176,6 +173,11 @@ class Scene:
                 on_arm = link_capsule(model, geom).placed(pose[..., :3, :3], pose[..., :3, 3])
                 capsules[geom] = on_arm.placed(mount.rotation, mount.position)
         return capsules
+
+
+def payload_body(agent: str, arm: Arm) -> str:
+    """Return the name of the body at an arm's tool tip that represents a payload, if payloads are randomised."""
+    return f"{agent}/{own_name('payload', [link.name for link in arm.urdf.links])}"
 
 
 def are_alike(one: Arm, other: Arm) -> bool:
