@@ -13,6 +13,7 @@ from pettingzoo import ParallelEnv
 
 import surgical_marl as sm
 from surgical_marl.cli.main import main
+from surgical_marl.robots.arm_findings import number_findings
 from surgical_marl.scenes.check import check
 from surgical_marl.scenes.mjcf import mjcf
 from surgical_marl.view.render import Renderer, View
@@ -111,6 +112,7 @@ def test_nothing_is_wrong_with_what_ships(name: str, capsys: pytest.CaptureFixtu
 
 LIMIT_1 = '<limit lower="-2.9" upper="2.9" velocity="2" effort="20"/>'
 LIMIT_2 = '<limit lower="-2" upper="2" velocity="2" effort="20"/>'
+MIMIC = '<mimic joint="joint_5" multiplier="{}" offset="{}"/>'
 SHOULDER = '<inertia ixx="2e-3" iyy="2e-3" izz="2e-3" ixy="0" ixz="0" iyz="0"/>'
 
 
@@ -146,6 +148,31 @@ SHOULDER = '<inertia ixx="2e-3" iyy="2e-3" izz="2e-3" ixy="0" ixz="0" iyz="0"/>'
         ),
         ("urdf/lab_arm.urdf", LIMIT_2, LIMIT_2 + '<mimic joint="joint_9"/>', "mimics 'joint_9', which is not a moving"),
         ("urdf/lab_arm.urdf", "meshes/base.stl", "meshes/bass.stl", "bass.stl', which is not found"),
+        ("arm.yaml", "speed: 2.0", "speed: 60", "the speed 60 rad/s in arm.yaml, above its velocity limit of 3 rad/s"),
+        (
+            "urdf/lab_arm.urdf",
+            LIMIT_1,
+            '<limit lower="-170" upper="170" velocity="180" effort="20"/>',
+            'which look like degrees: a URDF\'s are in rad; write lower="-2.967" upper="2.967" velocity="3.142"',
+        ),
+        ("urdf/lab_arm.urdf", LIMIT_1, LIMIT_1.replace('velocity="2"', 'velocity="90"'), 'write velocity="1.571"'),
+        (
+            "urdf/lab_arm.urdf",
+            f'"joint_1" type="revolute"><parent link="base_link"/><child link="shoulder"/>\n'
+            f'    <origin xyz="0 0 0.12"/><axis xyz="0 0 1"/>{LIMIT_1}',
+            '"joint_1" type="prismatic"><parent link="base_link"/><child link="shoulder"/>'
+            '<origin xyz="0 0 0.12"/><axis xyz="0 0 1"/><limit lower="0" upper="240" velocity="200" effort="20"/>',
+            'which look like mm: a URDF\'s are in m; write lower="0" upper="0.24" velocity="0.2"',
+        ),
+        (
+            "urdf/lab_arm.urdf",
+            '<origin xyz="0 0 0.12"/><axis xyz="0 0 1"/>',
+            '<origin xyz="0 0 0.12"/><axis xyz="0 0 -2"/>',
+            'the axis 0 0 -2 of length 2, which is read as one of length 1; write xyz="0 0 -1"',
+        ),
+        ("urdf/lab_arm.urdf", LIMIT_2, LIMIT_2 + MIMIC.format(1, 0), "'joint_2' mimics 'joint_5' and has no drive"),
+        ("arm.yaml", "  joint_1:", "  flange_to_tool0: {}\n  joint_1:", "'flange_to_tool0' is fixed and has no drive"),
+        ("urdf/lab_arm.urdf", SHOULDER, SHOULDER.replace("2e-3", "2e3"), "a radius of gyration of 44.7 m"),
         ("urdf/lab_arm.urdf", "<collision>", "<sensor>", "has no <collision>"),
     ],
 )
@@ -158,6 +185,40 @@ def test_what_is_wrong_is_one_sentence(own: Path, file: str, old: str, new: str,
     assert not any("\n" in finding for finding in findings)
     assert findings == check(own / "lab_arm" / "arm.yaml")
     assert sorted(own.rglob("*")) == before, "a check must leave nothing behind"
+
+
+@pytest.mark.parametrize(
+    ("lower", "upper", "multiplier", "offset", "margin", "kept"),
+    [
+        (-2, 2, 1, 0, 0, None),
+        (-2.9, 2.9, -1, 0.5, 0, None),
+        (-2, 2, 1, 0, 0.1, None),
+        (-1.99, 1.99, 1, 0, 0, None),
+        (-2, 0.08, 1, 0, 0, ("48 %", -2, 2)),
+        (0, 2, -1, 0, 0, ("50 %", -2, 2)),
+        (-2, 2, 2, 0, 0, ("50 %", -4, 4)),
+        (-2, 2, 1, 1, 0.1, ("26 %", -1, 3)),
+        (3, 4, 1, 0, 0, ("100 %", -2, 2)),
+        (-1, 1, 0, 0.1, 0, None),
+    ],
+)
+def test_limits_that_hold_back_a_leader_are_named(
+    own: Path, lower: float, upper: float, multiplier: float, offset: float, margin: float,
+    kept: tuple[str, float, float] | None,
+) -> None:  # fmt: skip
+    old = '<limit lower="-2.9" upper="2.9" velocity="3" effort="3"/></joint>\n  <joint name="flange_to_tool0"'
+    new = f'<limit lower="{lower}" upper="{upper}" velocity="3" effort="3"/>{MIMIC.format(multiplier, offset)}'
+    replace(own / "lab_arm/urdf/lab_arm.urdf", (old, new + '</joint>\n  <joint name="flange_to_tool0"'))
+    replace(own / "lab_arm/arm.yaml", ("  joint_6: {stiffness: 4, damping: 0.2, speed: 2.0, armature: 0.001}\n", ""),
+            ("home: 0.6", f"home: 0.0, margin: {margin}"))  # fmt: skip
+    findings = [finding for finding in number_findings(sm.load_arm(own / "lab_arm")) if "joint_6" in finding]
+    if multiplier == 0:
+        assert "mimics 'joint_5' with multiplier 0, so it stays at 0.1 rad; make it fixed" in findings.pop()
+    assert len(findings) == (kept is not None), findings
+    if kept is not None:
+        share, least, most = kept
+        assert f"keep both from {share} of that" in findings[0]
+        assert f'write lower="{least:g}" upper="{most:g}", or give' in findings[0]
 
 
 def test_a_home_that_collides_with_itself_is_named(own: Path) -> None:

@@ -179,7 +179,10 @@ def test_a_function_that_answers_wrongly_is_named() -> None:
 def test_masked_entries_are_no_actions() -> None:
     """Under a mask is no number that anybody gave, so neither an agent nor a teammate acts by it."""
     hidden = np.ma.masked_equal(np.ones(7, np.float32), 1)
-    for env, shape in ((make({"psm_0": lambda _: hidden}), (7,)), (make_vec({"psm_0": lambda _: [hidden] * 2}), (2, 7))):
+    for env, shape in (
+        (make({"psm_0": lambda _: hidden}), (7,)),
+        (make_vec({"psm_0": lambda _: [hidden] * 2}), (2, 7)),
+    ):
         env.reset(seed=0)
         with pytest.raises(ValueError, match="action of 'psm_0' has masked entries"):
             env.step(np.zeros(shape))

@@ -230,10 +230,65 @@ def test_all_that_is_wrong_is_listed(folder: Path) -> None:
         assert words in text
 
 
+FIXED = '<joint name="still" type="fixed"><parent link="lower"/><child link="tip"/>{}</joint><link name="tip"/></robot>'
+
+
+@pytest.mark.parametrize(
+    "idle",
+    [
+        '<axis xyz="0 0 0"/>',
+        '<axis xyz="0 0 0"/><limit lower="0" upper="0" velocity="-1" effort="0"/><dynamics damping="nan"/>',
+        '<axis xyz=""/><limit/><mimic/><calibration rising="none"/><safety_controller k_velocity="x"/>',
+    ],
+)
+def test_a_fixed_joint_has_nothing_to_say_about_motion(folder: Path, idle: str) -> None:
+    (folder / "two.urdf").write_text(URDF.replace("</robot>", FIXED.format("")))
+    known = load_arm(folder).urdf
+    (folder / "two.urdf").write_text(URDF.replace("</robot>", FIXED.format(idle)))
+    assert load_arm(folder).urdf == known
+
+
+@pytest.mark.parametrize("kind", ["continuous", "floating", "planar"])
+@pytest.mark.parametrize(
+    ("urdf", "yaml"),
+    [
+        (("", ""), ""),
+        (('axis xyz="0 0 1"/>', 'axis xyz="0 0 1"/><mimic joint="first"/>'), ""),
+        (("", ""), "cables: [{joints: {first: 1, second: 1}, stiffness: 1, damping: 1, effort: 1}]\n"),
+        (("", ""), "jaw: {joint: first, open: 1, closed: 0}\n"),
+        (('"second" type="prismatic"', '"second" type="fixed"'), ""),
+    ],
+)
+def test_a_joint_of_a_type_that_does_not_work_is_one_fault(
+    folder: Path, kind: str, urdf: tuple[str, str], yaml: str
+) -> None:
+    """With its drive in arm.yaml, as another joint's leader, in a cable, at the jaw, and alone."""
+    text = URDF.replace('"first" type="revolute"', f'"first" type="{kind}"').replace(*urdf)
+    drives = {"second": "" if "fixed" in text or "mimic" in text else "second: {stiffness: 10, damping: 1, speed: 1}"}
+    (folder / "two.urdf").write_text(text)
+    named = f"joints: {{first: {{stiffness: 10, damping: 1, speed: 1}}, {drives['second']}}}\n"
+    (folder / "arm.yaml").write_text(f"urdf: two.urdf\ntool_tip: lower\n{named}{yaml}")
+    with pytest.raises(Faults) as caught:
+        load_arm(folder)
+    (fault,) = caught.value.faults
+    assert f"joint 'first' is {kind}" in fault
+
+
+def test_a_child_that_is_no_link_is_one_fault(folder: Path) -> None:
+    """Of the two links that are then without a parent nothing is said."""
+    (folder / "two.urdf").write_text(URDF.replace('<child link="upper"/>', '<child link="uper"/>'))
+    with pytest.raises(Faults) as caught:
+        load_arm(folder)
+    assert len(caught.value.faults) == 1 and "the child 'uper', which is not a link" in str(caught.value)
+
+
 def test_a_link_called_world_is_renamed(folder: Path) -> None:
     (folder / "two.urdf").write_text(URDF.replace('"base"', '"world"'))
     assert read_urdf(folder / "two.urdf").links[0].name == "world_link"
     assert build_spec(load_arm(folder)).compile().nbody == 4
+    (folder / "two.urdf").write_text(URDF.replace('"lower"', '"world"'))
+    (folder / "arm.yaml").write_text(YAML.replace("tool_tip: lower", "tool_tip: world"))
+    assert load_arm(folder).tool_tip == "world_link"
 
 
 @pytest.mark.parametrize("kind", ["stl", "obj", "dae"])
@@ -278,6 +333,17 @@ def test_a_dae_says_what_its_unit_is(folder: Path) -> None:
     path.write_text(text.replace("<asset>", '<asset><unit name="millimeter" meter="0.001"/>'))
     vertices, _ = read_mesh(path)
     assert np.ptp(vertices, axis=0) == pytest.approx([0.1, 0.2, 0.6])
+
+
+@pytest.mark.parametrize("up", ["X_UP", "Y_UP", "Z_UP"])
+def test_no_axis_of_a_dae_is_turned_up(folder: Path, up: str) -> None:
+    """RViz and MoveIt leave `up_axis` out too, so that a robot's meshes are drawn for that."""
+    path = folder / "part.dae"
+    trimesh.creation.box((0.1, 0.2, 0.6)).export(path)
+    text = re.sub(r"<up_axis>.*?</up_axis>", "", path.read_text())
+    path.write_text(text.replace("</asset>", f"<up_axis>{up}</up_axis></asset>"))
+    assert up in path.read_text()
+    assert np.ptp(read_mesh(path)[0], axis=0) == pytest.approx([0.1, 0.2, 0.6])
 
 
 def test_a_flat_mesh_can_be_seen(folder: Path) -> None:

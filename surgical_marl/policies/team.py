@@ -15,6 +15,7 @@ import numpy as np
 from surgical_marl.content import BASELINES, PARTNERS, unknown
 from surgical_marl.policies.acting import forget
 from surgical_marl.policies.convert import like, to_numpy
+from surgical_marl.policies.frozen import Frozen
 from surgical_marl.policies.oracle import oracle
 from surgical_marl.policies.policy import load_policy
 from surgical_marl.policies.teammates import Teammates
@@ -54,17 +55,20 @@ class Team:
         own = [agent for agent in env.agents if agent not in others]
         self._own = oracle(env, own) if name == "oracle" else load_policy(name, env)
         self._mates = Teammates(env, others)
+        self._still = Frozen(env, self._late)
 
     def __call__(self, observations: Mapping[str, Any]) -> dict[str, Any]:
         actions = {**self._own(observations), **self._mates.actions(observations)}
         begun = (to_numpy(self._env.steps) * self._env.control_dt >= DELAY)[:, None]
-        late = {agent: like(actions[agent], np.where(begun, to_numpy(actions[agent]), 0.0)) for agent in self._late}
-        return {**actions, **late}
+        for agent, still in self._still(observations).items():
+            actions[agent] = like(still, np.where(begun, to_numpy(actions[agent]), to_numpy(still)))
+        return actions
 
     def reset(self, ended: Any = None) -> None:
         """Tell all that episodes begin: in all environments, or where the last one `ended`, [N] bool."""
         forget(self._own, ended)
         self._mates.forget(ended)
+        self._still.reset(ended)
 
 
 def check_partners(partners: Mapping[str, str], settings: Settings) -> None:

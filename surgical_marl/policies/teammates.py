@@ -18,6 +18,7 @@ from surgical_marl.content import BASELINES, unknown
 from surgical_marl.envs.actions import as_array
 from surgical_marl.envs.observations import each
 from surgical_marl.policies.acting import Policy, forget
+from surgical_marl.policies.frozen import Frozen
 from surgical_marl.policies.oracle import oracle
 from surgical_marl.policies.policy import load_policy
 
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv
 
 FROZEN = "frozen"
-"""An arm that keeps still: the policy "zero" leaves it where it was sent."""
+"""An arm that keeps still, its jaw too."""
 
 _TEAMMATES = 1
 """Put before a seed, so that teammates draw other numbers than an agent whose generator has the same seed."""
@@ -98,7 +99,9 @@ class Teammates:
 def _load(name: str, env: BatchedEnv, agents: list[str]) -> Policy:
     if name == "oracle":
         return oracle(env, agents)
+    if name == FROZEN:
+        return Frozen(env, agents)
     try:
-        return load_policy("zero" if name == FROZEN else name, env)
+        return load_policy(name, env)
     except ValueError as error:
         raise ValueError(f"teammate {agents[0]!r}: {error}") from None

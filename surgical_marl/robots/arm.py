@@ -258,6 +258,11 @@ def load_arm(name: str | Path) -> Arm:
     # one of a type that is a fault already may have a drive, which is then no fault
     known = given if isinstance(given, dict) else ()
     driven = [joint.name for joint in moving if joint.type in MOVING or joint.name in known]
+    for joint in robot.joints:
+        if joint.name in known and joint.name not in leaders:
+            why = f"mimics {joint.mimic.joint!r}" if joint.mimic else "is fixed"
+            faults.append(f"{where}: joint {joint.name!r} {why} and has no drive of its own; leave its line out")
+            given = {name: drive for name, drive in given.items() if name != joint.name}
     drives = read_drives(given, driven, where, keep)
     camera = None if settings.get("camera") is None else keep(build, Camera, settings["camera"], where)
     jaw = None if settings.get("jaw") is None else keep(read_jaw, settings["jaw"], where)

@@ -128,7 +128,7 @@ def _name_faults(robot: Robot) -> Iterator[str]:
                 yield f"{count} {noun}s are called {name!r}{read}; each needs a name of its own"
             if "/" in name:
                 free = shown(name.replace("/", "_"))
-                yield f"{noun} {shown(name)} has a slash in its name, as only the model's own parts have; call it {free}"
+                yield f"{noun} {shown(name)} has a slash in its name, as only parts of the model have; call it {free}"
 
 
 def _tree_faults(robot: Robot) -> Iterator[str]:

@@ -19,6 +19,7 @@ import numpy as np
 
 from surgical_marl.content import find, list_arms, list_objects, list_scenes, unknown
 from surgical_marl.robots.arm import Arm, load_arm
+from surgical_marl.robots.arm_findings import number_findings
 from surgical_marl.robots.inverse_kinematics import inverse_kinematics
 from surgical_marl.robots.spec import COLLISION_GROUP, build_spec
 from surgical_marl.robots.urdf import Faults
@@ -149,25 +150,11 @@ _SUMMARIES = {"arms": _sum_up_arm, "scenes": _sum_up_scene, "objects": _sum_up_o
 
 def _arm_findings(arm: Arm) -> Iterator[str]:
     where = f"arm {arm.name!r}"
-    for finding in (*_joint_findings(arm), *_remote_center_findings(arm)):
+    for finding in (*number_findings(arm), *_remote_center_findings(arm)):
         yield f"{where}: {finding}"
     model = _model(arm)
     for finding in (*_collision_findings(arm, model), *_controller_findings(arm, model)):
         yield f"{where}: {finding}"
-
-
-def _joint_findings(arm: Arm) -> Iterator[str]:
-    for joint in arm.joints:
-        unit = "m" if joint.slides else "rad"
-        home = joint.multiplier * joint.drive.home + joint.offset
-        if not joint.lower <= home <= joint.upper:
-            limits = f"[{joint.lower:g}, {joint.upper:g}] {unit}"
-            yield f"joint {joint.name!r} has its home at {home:g} {unit}, outside its limits {limits}"
-        if arm.jaw is not None and arm.jaw.joint == joint.name:
-            for what, value in (("open", arm.jaw.open), ("closed", arm.jaw.closed)):
-                if not joint.lower <= value <= joint.upper:
-                    limits = f"[{joint.lower:g}, {joint.upper:g}]"
-                    yield f"the jaw is {what} at {value:g} {unit}, outside the limits {limits} of joint {joint.name!r}"
 
 
 def _remote_center_findings(arm: Arm) -> Iterator[str]:

@@ -48,7 +48,7 @@ def _candidates(scene: Scene) -> list[tuple[int, int, float]]:
     """Return pairs of geom ids that may touch, each with the distance in m below which it is near.
 
     Left out are geoms on one body, and geoms next to each other in a chain. So are geoms of one arm that overlap at
-    home.
+    home, and those of two bases: they never move.
     """
     model, at_home = scene.model, scene.capsules({agent: mount.arm.home for agent, mount in scene.mounts.items()})
     geoms = {agent: collision_geoms(model, agent) for agent in scene.agents}
@@ -56,7 +56,9 @@ def _candidates(scene: Scene) -> list[tuple[int, int, float]]:
     count = sum(sizes) * (sum(sizes) - 1) // 2
     check_count(count, MAX_PAIRS, f"pairs of the {sum(sizes):,} collision shapes of all arms", f"scene {scene.name!r}")
     solid = _solid(model)
-    between = [pair for one, other in combinations(scene.agents, 2) for pair in product(geoms[one], geoms[other])]
+    still = {geom for own in geoms.values() for geom in own if model.body_weldid[model.geom_bodyid[geom]] == 0}
+    every = [pair for one, other in combinations(scene.agents, 2) for pair in product(geoms[one], geoms[other])]
+    between = [pair for pair in every if not still.issuperset(pair)]
     within = [pair for own in geoms.values() for pair in combinations(own, 2) if not _follow(model, *pair, solid)]
     free = [(a, b) for a, b in within if capsule_distance(at_home[a], at_home[b]) > 0]
     return [(*pair, NEAR_WITHIN) for pair in free] + [(*pair, NEAR) for pair in between]

@@ -65,10 +65,15 @@ class Hand:
     def hold(self, observation: Any) -> None:
         """Forget what was wanted: in the first environment the arm is to stay where it is sent to now.
 
+        Its jaw opens or closes, to whichever it is nearer.
+
         Args:
             observation: what the agent observes now, as in an action.
         """
         self.q = np.array(self._commands(observation)[0], float)
+        if (jaw := self._arm.jaw) is not None:
+            (command,) = self.q[self.jaw]
+            self.jaw_open = bool(abs(command - jaw.open) < abs(command - jaw.closed))
 
     def set_joint(self, index: int, value: float) -> None:
         """Want another position of one joint, rad or m, cut off at its limits."""

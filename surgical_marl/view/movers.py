@@ -114,9 +114,9 @@ def choices(env: BatchedEnv, further: Iterable[str] = ()) -> list[str]:
 
 
 def first(env: BatchedEnv) -> str:
-    """Return who moves the arms if nobody is named: the policy that ships, or the oracle, or nobody."""
+    """Return who moves the arms if nobody is named: the policy that ships, or the oracle, or "frozen"."""
     known = choices(env)
-    return next(name for name in (f"{env.task_name}-{env.scene.name}", "oracle", "zero") if name in known)
+    return next(name for name in (f"{env.task_name}-{env.scene.name}", "oracle", FROZEN) if name in known)
 
 
 def _fits(name: str, env: BatchedEnv) -> bool:

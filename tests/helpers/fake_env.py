@@ -17,7 +17,7 @@ from surgical_marl.tasks.base.options import Options
 class Point:
     """An arm whose joints are its tip's coordinates."""
 
-    remote_center = None
+    remote_center = jaw = None
 
     def forward_kinematics(self, q: np.ndarray) -> np.ndarray:
         pose = np.broadcast_to(np.eye(4), (*q.shape[:-1], 4, 4)).copy()
