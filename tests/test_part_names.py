@@ -37,8 +37,9 @@ SCENE = """arms: {{two_0: {{arm: ./two, position: [0, 0, 3]}}}}
 objects: {{{name}: {{object: needle_sh}}, floor: {{object: pad, position: [0, 0, -0.5]}}}}
 randomisation: {{payload: 0.1}}
 """
-OURS = ["payload", "cable_0", "world", "world_link", "tool_tip", "pad", "contact", "gear", "overview", "field", "left",
-        "right", "left_0", "upper_0", "right_0", "upper_0_right_0", "right_0_left_0", "tissue", "two_0"]  # fmt: skip
+OURS = ["payload", "cable_0", "world", "world_link", "tool_tip", "pad", "gear", "overview", "field", "left",
+        "right", "left_0", "upper_0", "right_0", "upper_0_right_0", "right_0_left_0", "tissue", "two_0", "contact",
+        "reward_a"]  # fmt: skip
 """Names of the model's own parts, and of what they are made with."""
 
 
@@ -73,7 +74,7 @@ def test_any_name_is_a_users(
     if {"world", "world_link"} <= set(links):
         with pytest.raises(ValueError, match=r"2 links are called 'world_link'.*'world', which MuJoCo reserves"):
             load_scene(path)
-    elif name in ("world", "tissue", "two_0"):
+    elif name in ("world", "tissue", "two_0", "contact", "reward_a"):
         with pytest.raises(ValueError, match=f"{name} is taken"):
             load_scene(path)
     else:

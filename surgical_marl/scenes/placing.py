@@ -20,6 +20,9 @@ from surgical_marl.yaml_file import check_keys, read_mapping, read_vector, read_
 MAX_OBJECTS = 50
 """Objects of a scene."""
 
+TAKEN = re.compile(r"world|tissue|contact|target|(?:reward|cost|stage)(?:_\w*)?")
+"""Names that parts of a model, observations or infos have or begin with: `contact_force`, `reward_reach`."""
+
 
 def scenes_without_objects() -> list[str]:
     """Return the names of the scenes in which arms have nothing to touch but each other."""
@@ -39,7 +42,7 @@ def read_placements(settings: Any, agents: Iterable[str], path: Path) -> dict[st
         where = f"{path}, object {shown(name)}"
         if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z_]\w*", name):
             raise ValueError(f"{where}: a name in a scene is of letters, digits and underscores")
-        if name in (*agents, "world", "tissue"):
+        if name in agents or TAKEN.fullmatch(name):
             raise ValueError(f"{where}: {name} is taken; give the object another name")
         found[name] = _read_placement(place, where, path.parent)
     return found

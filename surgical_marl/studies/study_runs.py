@@ -79,7 +79,7 @@ def taken_over(
         policy: moves all arms until then, and the other arms afterwards.
         env: the environment in which both act, with torch arrays.
         arm: the arm that is taken over.
-        instead: moves that arm. `zero_policy` freezes the arm: it holds its position target.
+        instead: moves that arm. With `zero_policy` it holds its position target, and its jaw closes.
         start: control step of an episode.
     """
     import torch
