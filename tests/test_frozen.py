@@ -45,7 +45,7 @@ def test_a_jaw_stays_where_it_is_commanded_to_be(control: str, opening: int) -> 
     for _ in range(9):
         action = still({"psm_0": np.zeros((1, 3))})["psm_0"]
         assert action.shape == (1, 9) and action.dtype == np.float32 and not action[:, 7:].any()
-        env.physics = made.command(env.physics, {"psm_0": action[0, :7]})
+        env.physics, env.steps = made.command(env.physics, {"psm_0": action[0, :7]}), env.steps + 1
         np.testing.assert_allclose(env.physics.ctrl, before, atol=reach + 1e-6)
         jaw = scene.model.actuator("psm_0/jaw_left").id
         others = np.delete(env.physics.ctrl - before, [jaw, jaw + 1])
@@ -61,7 +61,7 @@ def test_partners_teammates_and_late_ones_keep_their_jaws() -> None:
         "partner": Team(env, "zero", {"psm_1": "frozen"}),
         "late": Team(env, "zero", {"psm_1": "delayed"}),
     }
-    for who, play in players.items():
+    for who, play in [*players.items(), *players.items()]:  # the second time none is told that episodes begin
         observations = env.reset(seed=1)[0]
         actions = {agent: np.zeros((2, 7), np.float32) for agent in env.agents}
         actions["psm_1"][0, -1] = 1

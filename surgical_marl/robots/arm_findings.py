@@ -84,7 +84,7 @@ def _unit_findings(arm: Arm) -> Iterator[str]:
         slides = joint.type == "prismatic"
         factor, other = (1e-3, "mm") if slides else (math.pi / 180, "degrees")
         far, fast = (MOST_SLIDE, MOST_SLIDING) if slides else (MOST_TURN, MOST_TURNING)
-        wrong = {}
+        wrong: dict[str, float] = {}
         if max(abs(limit.lower), abs(limit.upper)) > far:
             wrong |= {"lower": limit.lower, "upper": limit.upper}
         if limit.velocity > fast:
