@@ -11,10 +11,13 @@ import yaml
 
 import surgical_marl as sm
 from surgical_marl.robots.rotation import matrix_of
+from surgical_marl.scenes.check import check
 from surgical_marl.scenes.mjcf import mjcf
+from surgical_marl.scenes.object_contacts import touches
 from surgical_marl.scenes.objects import JAW
 from surgical_marl.scenes.placing import scenes_without_objects
 from surgical_marl.scenes.scene import Scene
+from tests.helpers.samples import ARM, SPHERES
 
 WITH_OBJECTS = sorted({*sm.list_scenes()} - {*scenes_without_objects()})
 
@@ -127,3 +130,22 @@ def test_a_scene_without_objects_exports_none() -> None:
     text = mjcf(sm.load_scene("bimanual_psm"))
     assert not any(word in text for word in ("freejoint", "gravcomp", "cone", "/pad"))
     assert 'gravity="0.0 0.0 0.0"' in text
+
+
+def test_a_base_stands_beside_what_is_fixed(tmp_path: Path) -> None:
+    """It has no weight in a contact, and neither has a fixed object or another base, so that such two are no pair."""
+    shape = '<collision><geometry><sphere radius="0.145"/></geometry></collision>'
+    (tmp_path / "two").mkdir()
+    (tmp_path / "two/two.urdf").write_text(SPHERES.replace('<link name="base">', f'<link name="base">{shape}'))
+    (tmp_path / "two/arm.yaml").write_text(ARM)
+    arms = "arms: {two_0: {arm: two}, two_1: {arm: two, position: [0.295, 0, 0]}}\n"
+    objects = (
+        "objects: {pad: {object: pad, position: [0, 0, -0.14]}, needle: {object: needle_sh, position: [0, 3, 0]}}\n"
+    )
+    (tmp_path / "scene.yaml").write_text(arms + objects)
+    scene = sm.load_scene(tmp_path / "scene.yaml")
+    pairs = {frozenset((touch.one, touch.other)) for touch in touches(scene)} | set(map(frozenset, scene.pairs))
+    assert frozenset(("two_0/base_0", "needle/0")) in pairs and frozenset(("two_0/lower_1", "pad/0")) in pairs
+    assert not any(pair <= {"two_0/base_0", "two_1/base_0", "pad/0"} for pair in pairs)
+    assert written(scene).npair == len(pairs)
+    assert not any("overlap" in finding for finding in check(tmp_path / "scene.yaml"))

@@ -1,7 +1,8 @@
 """Which shapes of a scene touch an object, and how: found by what they are, not by their names.
 
-An object can touch every arm and every other object, except that fixed objects don't touch each other. The plates of a
-jaw stand for their fingers; elsewhere the shapes are those that touch other arms too.
+An object can touch every arm and every other object, except that fixed objects touch neither each other nor what no
+force moves, such as the base of an arm. The plates of a jaw stand for their fingers; elsewhere the shapes are those
+that touch other arms too.
 """
 
 from __future__ import annotations
@@ -138,7 +139,7 @@ def touches(scene: Scene) -> Iterator[Touch]:
     objects = [(False, _object_sides(scene, name)) for name in scene.objects]
     for (arm, sides), (other_arm, others) in combinations(arms + objects, 2):
         for one, other in product(sides, others) if not (arm and other_arm) else ():
-            if one.weight + other.weight > 0:  # fixed objects, and an arm's base, have an inverse weight of 0
+            if one.weight + other.weight > 0:  # 0 is that of fixed objects, and of a base: no force moves them
                 yield Touch(one.name, other.name, one.surface.against(other.surface), one.weight + other.weight)
 
 
