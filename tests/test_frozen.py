@@ -37,7 +37,7 @@ def test_a_jaw_stays_where_it_is_commanded_to_be(control: str, opening: int) -> 
     """To within one step's way, and exactly where it is open or closed. Two numbers of each action are a message."""
     made = simulator(control)
     scene, arm = made.scene, made.scene.mounts["psm_0"].arm
-    env = commanded(made.start(np.float32(scene.home)), made)
+    env = commanded(made.home, made)
     for _ in range(opening):
         env.physics = made.command(env.physics, {"psm_0": np.ones(7, np.float32) * arm.moves_jaw})
     before, still = np.asarray(env.physics.ctrl), Frozen(env, ["psm_0"])

@@ -241,7 +241,7 @@ FIXED = '<joint name="still" type="fixed"><parent link="lower"/><child link="tip
         '<axis xyz=""/><limit/><mimic/><calibration rising="none"/><safety_controller k_velocity="x"/>',
     ],
 )
-def test_a_fixed_joint_has_nothing_to_say_about_motion(folder: Path, idle: str) -> None:
+def test_a_fixed_joint_is_read_without_its_axis_and_limits(folder: Path, idle: str) -> None:
     (folder / "two.urdf").write_text(URDF.replace("</robot>", FIXED.format("")))
     known = load_arm(folder).urdf
     (folder / "two.urdf").write_text(URDF.replace("</robot>", FIXED.format(idle)))
