@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
+from typing import Any
 
 from surgical_marl.untrusted.files import is_file, is_folder, user_path
 from surgical_marl.untrusted.values import listed, shown
@@ -77,7 +78,7 @@ def find(kind: str, name_or_path: str | os.PathLike[str], where: str = "") -> Pa
     Raises:
         ValueError: nothing has that name or is at that path, or two packages have something of that name.
     """
-    places, text = _places(kind), os.fspath(name_or_path)
+    places, text = _places(kind), as_name(_NOUNS[kind], name_or_path)
     if text in places:
         if len(places[text]) > 1:
             where = " and ".join(str(path) for path in places[text])
@@ -88,6 +89,14 @@ def find(kind: str, name_or_path: str | os.PathLike[str], where: str = "") -> Pa
         return path.resolve()
     error = unknown(_NOUNS[kind], text, list(places))
     raise ValueError(f"{where}: {error}") if where else error
+
+
+def as_name(noun: str, value: Any) -> str:
+    """Return a name or a path as a text; ValueError for a value that is neither, such as a mapping."""
+    text = os.fspath(value) if isinstance(value, str | os.PathLike) else None
+    if not isinstance(text, str):
+        raise ValueError(f"the {noun} must be a name or a path, not {shown(value)}")
+    return text
 
 
 def unknown(noun: str, value: object, good: Sequence[str]) -> ValueError:

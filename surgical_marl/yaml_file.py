@@ -1,160 +1,218 @@
-"""YAML files that people write: one mapping with known keys and finite numbers."""
+"""YAML files that people write: YAML 1.2, of limited size and depth, with the line of each value.
+
+PyYAML's scanner, in C where it is compiled, splits a text into events, and this module makes values of them. PyYAML's
+own values are those of YAML 1.1, where 010 is 8, 1:30 is 90, 1e-3 is a text, `no` is false, and a key given twice loses
+one of its values. Libraries in Python that read YAML 1.2 take five times as long.
+"""
 
 from __future__ import annotations
 
-from dataclasses import fields
+import re
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-import numpy as np
 import yaml
-from yaml.composer import Composer
 
 from surgical_marl.untrusted.files import MB, read_text
-from surgical_marl.untrusted.values import LARGEST, LONGEST, as_number, listed, shown
+from surgical_marl.untrusted.schema import Place, check
+from surgical_marl.untrusted.values import shown
 
 MAX_YAML = MB
 """Bytes of a file."""
 MAX_NODES, MAX_DEPTH = 50_000, 32
 """Values, lists and mappings in a file, and how deeply they are nested."""
 MAX_KEY, MAX_NUMBER = 200, 100
-"""Characters of a key, and of a number: whole numbers and numbers with colons take more than linear time."""
+"""Characters of a key, and of a number: whole numbers take more than linear time."""
 
-# The scanner in C, where PyYAML has it, reads a file in a sixth of the time. Nodes are composed in Python: in C, deeply
-# nested brackets crash the process.
-_BASES = (Composer, yaml.CSafeLoader) if yaml.__with_libyaml__ else (yaml.SafeLoader,)
-
-
-class _Loader(*_BASES):  # type: ignore[misc]
-    """PyYAML's safe loader without aliases, tags and dates, for texts of limited size."""
-
-    def __init__(self, text: str) -> None:
-        Composer.__init__(self)
-        _BASES[-1].__init__(self, text)
-        self._nodes = self._depth = 0
-
-    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        if self.check_event(yaml.AliasEvent):
-            raise ValueError("an alias (*name) can stand for more than fits in memory; write the value out")
-        event = self.peek_event()
-        line = f"line {event.start_mark.line + 1}"
-        self._nodes += 1
-        if self._nodes > MAX_NODES:
-            raise ValueError(f"{line}: more than {MAX_NODES:,} values are not read")
-        if self._depth == MAX_DEPTH:
-            raise ValueError(f"{line}: lists and mappings are nested deeper than {MAX_DEPTH}")
-        if getattr(event, "tag", None) is not None:
-            raise ValueError(f"{line}: the tag {shown(event.tag)} is not read; leave it out")
-        self._depth += 1
-        node: yaml.Node | None = super().compose_node(parent, index)
-        self._depth -= 1
-        if isinstance(node, yaml.ScalarNode):
-            _check_scalar(node, line, is_key=isinstance(parent, yaml.MappingNode) and index is None)
-        return node
+T = TypeVar("T")
+_WORDS: dict[str, Any] = {
+    **dict.fromkeys(("", "~", "null", "Null", "NULL"), None),
+    **dict.fromkeys(("true", "True", "TRUE"), True),
+    **dict.fromkeys(("false", "False", "FALSE"), False),
+    **dict.fromkeys((".nan", ".NaN", ".NAN"), float("nan")),
+    **{f"{sign}{word}": float(f"{sign}inf") for sign in ("", "+", "-") for word in (".inf", ".Inf", ".INF")},
+}
+_WHOLE = re.compile(r"[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+")
+_REAL = re.compile(r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?")
+_BASES = {"0o": 8, "0x": 16}
+_UNPRINTABLE = yaml.reader.Reader.NON_PRINTABLE
+_Events = yaml.CSafeLoader if yaml.__with_libyaml__ else yaml.SafeLoader
 
 
-def _check_scalar(node: yaml.ScalarNode, line: str, is_key: bool) -> None:
-    """Raise ValueError for a key or a number that is too long."""
-    kind = node.tag.rpartition(":")[2]
-    if is_key and len(node.value) > MAX_KEY:
-        raise ValueError(f"{line}: the key {shown(node.value)} has {len(node.value):,} characters, more than {MAX_KEY}")
-    if kind in ("int", "float") and len(node.value) > MAX_NUMBER:
-        raise ValueError(
-            f"{line}: the number {shown(node.value)} has {len(node.value):,} characters; write at most {MAX_NUMBER}"
-        )
-    if kind == "timestamp":
-        node.tag = "tag:yaml.org,2002:str"
+class YamlMapping(dict[str, Any]):
+    """A mapping of a file, with the line of each key in `lines`."""
+
+    def __init__(self) -> None:
+        self.lines: dict[str, int] = {}
+
+
+class YamlList(list[Any]):
+    """A list of a file, with the line of each part in `lines`, by its index."""
+
+    def __init__(self) -> None:
+        self.lines: dict[int, int] = {}
+
+
+class Malformed(ValueError):
+    """A text that is not YAML, or more of it than is read; `line` is 0 if the whole text is meant."""
+
+    def __init__(self, line: int, what: str) -> None:
+        super().__init__(f"line {line}: {what}" if line else what)
+        self.line, self.what = line, what
 
 
 def parse_yaml(text: str) -> Any:
-    """Return what a YAML text holds.
+    """Return the value of a YAML text, mappings as `YamlMapping` and lists as `YamlList`.
 
     Raises:
-        ValueError: it does not parse (the error has the line), has aliases or tags, or is too large.
+        Malformed: it does not parse, has aliases, tags or a key twice, or is too large.
     """
     if len(text) > MAX_YAML:
-        raise ValueError(f"it has {len(text):,} characters, more than {MAX_YAML:,}")
+        raise Malformed(0, f"it has {len(text):,} characters, more than {MAX_YAML:,}")
     try:
-        return yaml.load(text, _Loader)
-    except (yaml.YAMLError, RecursionError) as error:
-        raise ValueError(" ".join(str(error).split())[:500]) from None
+        return _Reader(text).document()
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        what = ": ".join(" ".join(part.split()) for part in (error.context, error.problem) if part)
+        raise Malformed(mark.line + 1 if mark else 0, what[:500]) from None
+    except yaml.reader.ReaderError as error:
+        line = text.count("\n", 0, bad.start()) + 1 if (bad := _UNPRINTABLE.search(text)) else 0
+        raise Malformed(line, f"{chr(error.character)!a} is a character that no text has") from None
+    except UnicodeEncodeError:
+        raise Malformed(0, "it holds a character that is no text in UTF-8") from None
 
 
 def load_yaml(path: Path) -> Any:
-    """Return what a YAML file holds; ValueError if it cannot be read, or does not parse (the error has the line)."""
+    """Return the value of a YAML file.
+
+    Raises:
+        ValueError: it cannot be read, or is `Malformed`; the error has the file and the line.
+    """
     text = read_text(path, MAX_YAML)
     try:
         return parse_yaml(text)
-    except ValueError as error:
-        raise ValueError(f"{path} is not valid YAML: {error}") from None
+    except Malformed as error:
+        line = f", line {error.line}" if error.line else ""
+        raise ValueError(f"{path}{line} is not valid YAML: {error.what}") from None
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """Read a YAML mapping from a file.
+    """Return the mapping that a YAML file holds.
 
     Raises:
         ValueError: as of `load_yaml`, or the file holds no mapping.
     """
     content = load_yaml(path)
     if not isinstance(content, dict):
-        raise ValueError(f"{path} must hold a YAML mapping, not {type(content).__name__}")
+        raise ValueError(f"{path} must hold a YAML mapping, not {shown(content)}")
     return content
 
 
-def check_keys(mapping: dict[str, Any], known: tuple[str, ...], where: Path | str) -> None:
-    """Raise ValueError if the mapping has an unknown key."""
-    for key in mapping:
-        if key not in known:
-            raise ValueError(f"{where}: unknown key {shown(key)}; the keys are {listed(known)}")
-
-
-def build(cls: type, mapping: Any, where: Path | str) -> Any:
-    """Return a dataclass of floats and strings, made from a mapping.
+def read_as(kind: type[T], path: Path) -> T:
+    """Return the content of a YAML file as a dataclass (see `surgical_marl.untrusted.schema`).
 
     Raises:
-        ValueError: a key or a number is wrong or missing.
+        ValueError: it cannot be read, or is not YAML.
+        Faults: it lacks a key, has an unknown one, or a value of a wrong type or out of bounds.
     """
-    if not isinstance(mapping, dict):
-        raise ValueError(f"{where}: {shown(mapping)} must be a mapping with the keys of {cls.__name__.lower()}")
-    names = tuple(f.name for f in fields(cls))
-    check_keys(mapping, names, where)
-    values: dict[str, Any] = {}
-    for key, value in mapping.items():
-        if cls.__annotations__[key] == "float":
-            value = read_number(value, f"{where}: {key}")
-        elif cls.__annotations__[key] == "str" and not isinstance(value, str):
-            raise ValueError(f"{where}: {key} must be a text, not {shown(value)}")
-        values[key] = value
-    try:
-        return cls(**values)
-    except TypeError:
-        missing = [name for name in names if name not in values]
-        raise ValueError(f"{where}: a {cls.__name__.lower()} lacks {', '.join(missing)}") from None
+    found: T = check(Place(file=path), load_yaml(path), kind)
+    return found
 
 
-def read_number(value: Any, where: str, most: float = LARGEST) -> float:
-    """Return a number that a person wrote; raise ValueError if it is none, or not from -`most` to `most`."""
-    number = as_number(value)
-    if not abs(number) <= most:
-        raise ValueError(f"{where} must be a finite number from {-most:g} to {most:g}, not {shown(value)}")
-    return number
+def dump_yaml(value: Any, flow: bool = False) -> str:
+    """Return a text that `parse_yaml` reads as this value, keys in their order; with `flow` on one line."""
+    text: str = yaml.dump(value, Dumper=_Dumper, sort_keys=False, default_flow_style=flow, width=10**9)
+    return text.removesuffix("...\n").strip() if flow else text
 
 
-def read_vector(value: Any, where: str, count: int = 3, words: str = "three finite numbers") -> np.ndarray:
-    """Return numbers [count] that a person wrote, lengths in m or angles in degrees.
-
-    Raises:
-        ValueError: not as many, or not numbers, or not from -1000 to 1000.
-    """
-    given = value if isinstance(value, list | tuple) else []
-    vector = np.array([as_number(part, words=True) for part in given[: count + 1]])
-    if vector.shape != (count,) or not (np.abs(vector) <= LONGEST).all():
-        raise ValueError(f"{where}: {shown(value)} must be {words}, each from {-LONGEST:g} to {LONGEST:g}")
-    return vector
+class _Dumper(yaml.SafeDumper):
+    """PyYAML's safe dumper, with quotes around texts that are numbers in YAML 1.2 too."""
 
 
-def read_mapping(value: Any, where: str) -> dict[str, Any]:
-    """Return a mapping, empty for None; raise ValueError for anything else."""
-    if value is not None and not isinstance(value, dict):
-        raise ValueError(f"{where}: {shown(value)} must be a mapping")
-    return value or {}
+for _tag, _pattern in (("int", _WHOLE), ("float", _REAL)):
+    _Dumper.add_implicit_resolver(
+        f"tag:yaml.org,2002:{_tag}", re.compile(f"(?:{_pattern.pattern})$"), list("-+.0123456789")
+    )
+for _kind, _represent in ((dict, yaml.SafeDumper.represent_dict), (list, yaml.SafeDumper.represent_list)):
+    _Dumper.add_multi_representer(_kind, _represent)
+
+
+class _Reader:
+    """Makes values of the events of a text."""
+
+    def __init__(self, text: str) -> None:
+        self._events = _Events(text)
+        self._nodes = 0
+
+    def document(self) -> Any:
+        """Return the value of the only document; None if there is none."""
+        self._events.get_event()  # the start of the stream
+        if self._events.check_event(yaml.StreamEndEvent):
+            return None
+        self._events.get_event()  # the start of the document
+        value = self._value(self._events.get_event(), depth=0)
+        self._events.get_event()  # its end
+        if not self._events.check_event(yaml.StreamEndEvent):
+            line = self._events.peek_event().start_mark.line + 1
+            raise Malformed(line, "a second document begins; a file holds one")
+        return value
+
+    def _value(self, event: yaml.Event, depth: int) -> Any:
+        line = event.start_mark.line + 1
+        self._check(event, line, depth)
+        if isinstance(event, yaml.ScalarEvent):
+            return _scalar(event.value, line) if event.implicit[0] else event.value
+        return self._mapping(depth) if isinstance(event, yaml.MappingStartEvent) else self._sequence(depth)
+
+    def _check(self, event: yaml.Event, line: int, depth: int) -> None:
+        """Raise Malformed for what stands for more than it shows, and for too much of anything."""
+        self._nodes += 1
+        if self._nodes > MAX_NODES:
+            raise Malformed(line, f"more than {MAX_NODES:,} values are not read")
+        if depth >= MAX_DEPTH:
+            raise Malformed(line, f"lists and mappings are nested deeper than {MAX_DEPTH}")
+        if isinstance(event, yaml.AliasEvent):
+            raise Malformed(line, "an alias (*name) can stand for more than fits in memory; write the value out")
+        if event.tag is not None:
+            raise Malformed(line, f"the tag {shown(event.tag)} is not read; leave it out")
+
+    def _sequence(self, depth: int) -> YamlList:
+        items = YamlList()
+        while not isinstance(event := self._events.get_event(), yaml.SequenceEndEvent):
+            items.lines[len(items)] = event.start_mark.line + 1
+            items.append(self._value(event, depth + 1))
+        return items
+
+    def _mapping(self, depth: int) -> YamlMapping:
+        mapping = YamlMapping()
+        while not isinstance(event := self._events.get_event(), yaml.MappingEndEvent):
+            key, line = self._key(event, depth + 1), event.start_mark.line + 1
+            if key in mapping:
+                raise Malformed(line, f"the key {shown(key)} is given twice, first in line {mapping.lines[key]}")
+            mapping[key], mapping.lines[key] = self._value(self._events.get_event(), depth + 1), line
+        return mapping
+
+    def _key(self, event: yaml.Event, depth: int) -> str:
+        """Return a key as it is written: keys are names, also those that look like a number."""
+        line = event.start_mark.line + 1
+        self._check(event, line, depth)
+        if not isinstance(event, yaml.ScalarEvent) or not event.value:
+            raise Malformed(line, "a key must be a text")
+        key: str = event.value
+        if len(key) > MAX_KEY:
+            raise Malformed(line, f"the key {shown(key)} has {len(key):,} characters, more than {MAX_KEY}")
+        return key
+
+
+def _scalar(text: str, line: int) -> Any:
+    """Return the value of a plain scalar, by the core schema of YAML 1.2."""
+    if text in _WORDS:
+        return _WORDS[text]
+    if text[0] not in "-+.0123456789":
+        return text
+    whole = _WHOLE.fullmatch(text)
+    if not whole and not _REAL.fullmatch(text):
+        return text
+    if len(text) > MAX_NUMBER:
+        raise Malformed(line, f"the number {shown(text)} has {len(text):,} characters; write at most {MAX_NUMBER}")
+    return int(text, _BASES.get(text[:2], 10)) if whole else float(text)

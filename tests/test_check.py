@@ -120,12 +120,12 @@ SHOULDER = '<inertia ixx="2e-3" iyy="2e-3" izz="2e-3" ixy="0" ixz="0" iyz="0"/>'
     ("file", "old", "new", "words"),
     [
         ("arm.yaml", "tool_tip: tool0", "tool_tip: tip", "tool_tip 'tip' is not a link"),
-        ("arm.yaml", "tool_tip: tool0", "", "tool_tip None is not a link"),
+        ("arm.yaml", "tool_tip: tool0", "", "arm.yaml lacks tool_tip"),
         ("arm.yaml", "stiffness: 80", "stiffness: 800000", "unstable at the physics step of 2.5 ms, joint 'joint_"),
         ("arm.yaml", "stiffness: 80", "stiffness: 1.0e+9", "unstable"),
-        ("arm.yaml", "stiffness: 80", "stiffness: -1", "stiffness must be 0 or more, not -1"),
+        ("arm.yaml", "stiffness: 80", "stiffness: -1", "stiffness must be a number from 0 to 1,000,000,000, not -1"),
         ("arm.yaml", "home: 0.6", "home: 2.6", "home at 2.6 rad, outside its limits [-2, 2] rad"),
-        ("arm.yaml", "speed: 2.0", "speed: 0", "speed must be above 0, not 0"),
+        ("arm.yaml", "speed: 2.0", "speed: 0", "speed must be a number from 1e-12 to 1,000,000,000, not 0"),
         ("arm.yaml", "tool_tip:", "remote_center: forearm\ntool_tip:", "misses the origin of the base frame by up to"),
         ("arm.yaml", "tool_tip:", "jaw: {joint: joint_6, open: 3, closed: 0}\ntool_tip:", "the jaw is open at 3 rad"),
         ("urdf/lab_arm.urdf", LIMIT_1, "", "joint 'joint_1' needs a limit"),
@@ -231,7 +231,14 @@ def test_several_things_are_found_at_once(own: Path, capsys: pytest.CaptureFixtu
     replace(own / "lab_arm/arm.yaml", ("tool_tip: tool0", "tool_tip: tip"), ("  joint_4:", "  joint_44:"))
     replace(own / "lab_arm/urdf/lab_arm.urdf", (LIMIT_1, ""), (SHOULDER, SHOULDER.replace("2e-3", "0")),
             ("base.stl", "bass.stl"))  # fmt: skip
-    wanted = ("'joint_1' needs a limit", "'shoulder' has a mass", "bass.stl", "'joint_44'", "'joint_4'", "'tip'")
+    wanted = (
+        "'joint_1' needs a limit",
+        "'shoulder' has a mass",
+        "bass.stl",
+        "'joint_44'",
+        "joints lacks joint_4",
+        "'tip'",
+    )
     for source in ("lab_arm", "beside_psm.yaml"):
         assert main(["check", source]) == 1
         out, err = capsys.readouterr()
@@ -246,7 +253,13 @@ def test_several_things_are_found_at_once(own: Path, capsys: pytest.CaptureFixtu
         ("workspace: [0.33, 0.0, 0.12]", "workspace: [0.0, 0.0, 2.0]", "mm out of its reach"),
         ("position: [-0.45, 0.0, 0.0]", "position: [-0.33, 0.0, 0.0]", "psm_0 and lab_arm_0 overlap at home"),
         ("arm: lab_arm,", "arm: lab_army,", "unknown arm 'lab_army'"),
-        ("arms:", "arms: [", "not valid YAML"),
+        ("arms:", "tissue: 3\narms:", "line 2: tissue must be a mapping of names to pieces of tissue, not 3"),
+        (
+            "arms:",
+            "observe: qpos\narms:",
+            "observe must be a mapping of names to lists of observation terms, not 'qpos'",
+        ),
+        ("arms:", "observe: {psm_7: [qpos]}\narms:", "observe.psm_7 is not an agent of the scene (psm_0, lab_arm_0)"),
     ],
 )
 def test_what_is_wrong_with_a_scene_is_one_sentence(own: Path, old: str, new: str, words: str) -> None:

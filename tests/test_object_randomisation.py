@@ -149,9 +149,9 @@ def test_both_engines_step_varied_objects_alike(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "wrong, words",
     [
-        ("{object_size: 1.0}", "object_size must be from 0 to less than 1, not 1"),
-        ("{object_mass: -0.1}", "object_mass must be from 0 to less than 1, not -0.1"),
-        ("{object_friction: .nan}", "object_friction must be a finite number"),
+        ("{object_size: 1.0}", "object_size must be a number from 0 to 0.999, not 1"),
+        ("{object_mass: -0.1}", "object_mass must be a number from 0 to 0.999, not -0.1"),
+        ("{object_friction: .nan}", "object_friction must be a number from 0 to 0.999, not nan"),
         ("{object_shape: 0.1}", "unknown key 'object_shape'"),
     ],
 )

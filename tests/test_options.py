@@ -230,7 +230,7 @@ def test_an_unknown_option_is_a_type_error_too_as_for_any_function() -> None:
 
 
 def test_options_are_plain_data() -> None:
-    options = make_options("track", "psm", {"difficulty": "hard", "max_steps": None, "reward": {"collision": "-1e-1"}})
+    options = make_options("track", "psm", {"difficulty": "hard", "max_steps": None, "reward": {"collision": -1e-1}})
     assert options == Options("track", "psm", difficulty="hard", reward={"collision": -0.1})
 
 

@@ -87,21 +87,30 @@ def test_a_scene_of_ones_own_is_a_file_anywhere(tmp_path: Path) -> None:
     ("text", "words"),
     [
         ("[1, 2", "apart.yaml"),
-        ("arms: 3", "must map agent names"),
-        ("arms: {}", "must map agent names"),
+        ("arms: 3", "arms must be a mapping of names to arms, not 3"),
+        ("arms: {}", "arms must hold one or more arms"),
         ("arms: {psm_0: {arm: psm}}\nfriction: 1", "'friction'"),
-        ("arms: {psm_0: {arm: psn}}", "agent 'psm_0': unknown arm 'psn', did you mean 'psm'"),
-        ("arms: {psm_0: {position: [0, 0, 0]}}", "names its arm"),
+        ("arms: {psm_0: {arm: psn}}", "line 1: arms.psm_0: unknown arm 'psn', did you mean 'psm'"),
+        ("arms: {psm_0: {position: [0, 0, 0]}}", "line 1: arms.psm_0 lacks arm"),
         ("arms: {psm_0: {arm: psm, positon: [0, 0, 0]}}", "'positon'"),
         ("arms: {psm_0: {arm: psm, position: [0, 0]}}", "three finite numbers"),
         ("arms: {psm_0: {arm: psm, tilt: [0, .nan, 0]}}", "three finite numbers"),
         ("arms: {left: {arm: psm}}", "called psm_0, psm_1"),
         ("arms: {psm_0: {arm: psm}}\ntissue: [liver]", "must be a mapping"),
-        (f"{LIVER} shape: cone}}}}", "shape 'cone' must be one of ellipsoid, box, capsule"),
+        (
+            f"{LIVER} shape: cone, size: [1], colour: [1, 0, 0]}}}}",
+            "shape must be one of ellipsoid, box, capsule, not 'cone'",
+        ),
         (f"{LIVER} shape: box, color: 1}}}}", "unknown key 'color'"),
-        (f"{LIVER} shape: capsule, size: [0.1, 0.1, 0.1]}}}}", "must be radius and half length along z in m"),
-        (f"{LIVER} shape: box, size: [0.1, 0, 0.1], colour: [1, 0, 0]}}}}", "must be above 0"),
-        (f"{LIVER} shape: box, size: [0.1, 0.1, 0.1], colour: [2, 0, 0]}}}}", "colour .* from 0 to 1"),
+        (
+            f"{LIVER} shape: capsule, size: [0.1, 0.1, 0.1], colour: [1, 0, 0]}}}}",
+            "must be radius and half length along z in m",
+        ),
+        (f"{LIVER} shape: box, size: [0.1, 0, 0.1], colour: [1, 0, 0]}}}}", "size.1 must be a number from 1e-06"),
+        (
+            f"{LIVER} shape: box, size: [0.1, 0.1, 0.1], colour: [2, 0, 0]}}}}",
+            "tissue.liver.colour .* each from 0 to 1, not",
+        ),
     ],
 )
 def test_a_wrong_file_is_one_sentence(tmp_path: Path, text: str, words: str) -> None:

@@ -171,7 +171,7 @@ def test_what_is_wrong_is_one_sentence(folder: Path, old: str, new: str, words: 
         ("../two.urdf", "leaves the arm's folder"),
         ("/etc/passwd", "leaves the arm's folder"),
         ("link.urdf", "leaves the arm's folder"),
-        ("", "must name the URDF file"),
+        ("", "no URDF file"),
         ("no.urdf", "no URDF file"),
     ],
 )

@@ -9,7 +9,8 @@ from surgical_marl.content import find
 from surgical_marl.engines.choose import DeviceName
 from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.runtime import has_cuda
-from surgical_marl.tasks.base.options import Options, choice, number
+from surgical_marl.tasks.base.options import Options
+from surgical_marl.untrusted.schema import choice, number
 
 NUM_ENVS = {"cpu": 4096, "cuda": 131072}
 """Default number of environments on each device."""

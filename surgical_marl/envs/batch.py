@@ -43,7 +43,7 @@ class BatchedEnv:
 
     Args:
         task: a name of `list_tasks()`.
-        scene: a name of `list_scenes()` or the path of a scene file.
+        scene: a name of `list_scenes()` or the path of a scene file; the task's own, or "psm", if None.
         num_envs: how many environments.
         engine: "fused", "mjx" (the reference), or "auto" for the fastest that works.
         device: "cpu", "cuda" or "auto".
@@ -59,7 +59,7 @@ class BatchedEnv:
     def __init__(
         self,
         task: str = "reach",
-        scene: str = "bimanual_psm",
+        scene: str | None = "bimanual_psm",
         *,
         num_envs: int = 1,
         engine: str = "auto",

@@ -25,7 +25,7 @@ from surgical_marl.envs.knowledge import Knowledge
 from surgical_marl.envs.observations import Scale
 from surgical_marl.envs.observed import Observed
 from surgical_marl.envs.state import Carry, Moved, State
-from surgical_marl.plugins.tasks import TASKS
+from surgical_marl.plugins.tasks import TASKS, scene_of
 from surgical_marl.runtime import jax, jax_scope, jnp, prepare_jax
 from surgical_marl.scenes.load import load_scene
 from surgical_marl.tasks.base.options import Options, make_options
@@ -49,15 +49,16 @@ class Env:
 
     Args:
         task: a name of `list_tasks()`.
-        scene: a name of `list_scenes()` or the path of a scene file.
+        scene: a name of `list_scenes()` or the path of a scene file; the task's own, or "psm", if None.
         options: further fields of `surgical_marl.tasks.base.options.Options`.
 
     Raises:
         ValueError: naming what is unknown or out of range.
     """
 
-    def __init__(self, task: str = "reach", scene: str = "bimanual_psm", **options: Any) -> None:
+    def __init__(self, task: str = "reach", scene: str | None = "bimanual_psm", **options: Any) -> None:
         prepare_jax()
+        scene = scene_of(task) if scene is None else scene
         self.options: Options = make_options(task, scene, options)
         task_class = TASKS.load(task)
         self.scene = load_scene(scene, self.options.control)

@@ -8,7 +8,7 @@ from surgical_marl.plugins.tasks import TASKS, list_tasks
 from surgical_marl.scenes.load import load_scene
 
 
-def meant_for(task: str, scene: str, error: ValueError) -> str:
+def meant_for(task: str, scene: str | None, error: ValueError) -> str:
     """Return the scenes that a task is meant for, as the end of an error about a scene that is none of them.
 
     "" for other errors, and where the error says it itself.
@@ -16,6 +16,6 @@ def meant_for(task: str, scene: str, error: ValueError) -> str:
     if type(error) is not ValueError or task not in list_tasks() or "choose from" in str(error):
         return ""
     with suppress(ValueError):  # of a scene that fits no task
-        if (meant := TASKS.load(task).scenes) and load_scene(scene).name not in meant:
+        if scene and (meant := TASKS.load(task).scenes) and load_scene(scene).name not in meant:
             return f"; {task} is meant for the scenes {', '.join(meant)}"
     return ""

@@ -11,9 +11,9 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import yaml
 
 from surgical_marl.untrusted.values import one_line
+from surgical_marl.yaml_file import read_yaml
 
 if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv
@@ -83,7 +83,7 @@ def standard_hashes() -> dict[str, dict[str, dict[str, str]]]:
     These are the goal sets that `surgical-marl eval` plays if no option chooses others, with `--start random`, and with
     `--difficulty` of a level that has policies of its own.
     """
-    found: dict[str, dict[str, dict[str, str]]] = yaml.safe_load(_FILE.read_text())
+    found: dict[str, dict[str, dict[str, str]]] = read_yaml(_FILE)
     return found
 
 

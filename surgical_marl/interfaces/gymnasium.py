@@ -20,7 +20,6 @@ from gymnasium.envs.registration import EnvSpec
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.interfaces.joint import JointAgent
 from surgical_marl.interfaces.rendering import Rendering, check_mode, check_size
-from surgical_marl.plugins.tasks import scene_of
 from surgical_marl.policies.teammates import Teammate, Teammates
 
 RENDER_MODES = ("rgb_array",)
@@ -136,7 +135,7 @@ def make_batch(task: str, scene: str | None, num_envs: int, options: dict[str, A
     """
     if options.get("arrays", "numpy") != "numpy":
         raise ValueError(f"arrays {options['arrays']!r}: Gymnasium's faces speak numpy; leave it out")
-    return BatchedEnv(task, scene or scene_of(task), num_envs=num_envs, **options)
+    return BatchedEnv(task, scene, num_envs=num_envs, **options)
 
 
 def _limit_of_make() -> int | None:

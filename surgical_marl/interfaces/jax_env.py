@@ -171,12 +171,12 @@ class JaxEnv:
         return action.astype(jnp.float32)
 
 
-def jax_env(task: str = "reach", scene: str = "bimanual_psm", **options: Any) -> JaxEnv:
+def jax_env(task: str = "reach", scene: str | None = "bimanual_psm", **options: Any) -> JaxEnv:
     """Make an environment of pure JAX functions: `reset(key)` and `step(key, state, actions)`.
 
     Args:
         task: a name of `list_tasks()`.
-        scene: a name of `list_scenes()` or the path of a scene file.
+        scene: a name of `list_scenes()` or the path of a scene file; the task's own, or "psm", if None.
         options: further fields of `surgical_marl.tasks.base.options.Options`, such as `control`, `difficulty`, `start`
             and `max_steps`.
 

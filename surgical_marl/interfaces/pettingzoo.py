@@ -200,7 +200,7 @@ def _first(tree: dict[str, Any]) -> dict[str, Any]:
 
 def parallel_env(
     task: str = "reach",
-    scene: str = "bimanual_psm",
+    scene: str | None = "bimanual_psm",
     *,
     engine: str = "auto",
     device: str = "auto",
@@ -215,7 +215,7 @@ def parallel_env(
 
     Args:
         task: a name of `list_tasks()`.
-        scene: a name of `list_scenes()` or the path of a scene file.
+        scene: a name of `list_scenes()` or the path of a scene file; the task's own, or "psm", if None.
         engine: "auto", "fused" or "mjx".
         device: "auto", "cpu" or "cuda".
         num_envs: None for one environment, N for the same dicts with a leading N.

@@ -5,11 +5,10 @@ from __future__ import annotations
 import shlex
 from typing import Any
 
-import yaml
-
 from surgical_marl.report.run import Run, flatten
 from surgical_marl.runs.folder import read_settings
 from surgical_marl.runs.settings import config_text, load_config
+from surgical_marl.yaml_file import dump_yaml, parse_yaml
 
 # What a command need not say of the settings that choose which defaults hold.
 _USUAL = {"device": "auto", "difficulty": "default", "start": "home"}
@@ -35,7 +34,7 @@ def train_command(run: Run) -> str:
         if name in _USUAL:  # the defaults above are those of the run's own level and start, on two devices
             usual = value == _USUAL[name]
         if not usual and name not in ("task", "scene", "seed"):
-            command.append(f"{name}={_flow(value)}")
+            command.append(f"{name}={dump_yaml(value, flow=True)}")
     return shlex.join(command)
 
 
@@ -53,12 +52,7 @@ def _settings(run: Run) -> dict[str, Any]:
 
 
 def _flat(text: str) -> dict[str, Any]:
-    return flatten(yaml.safe_load(text))
-
-
-def _flow(value: Any) -> str:
-    """Return a value as YAML on one line."""
-    return str(yaml.safe_dump(value, default_flow_style=True, width=10**9)).removesuffix("...\n").strip()
+    return flatten(parse_yaml(text))
 
 
 def quote(*words: str) -> str:

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import yaml
 
 from surgical_marl.evaluation.card import SHOWN
 from surgical_marl.evaluation.report import explained, number
@@ -100,12 +99,11 @@ def settings(groups: Sequence[Group]) -> Table:
 def origins(groups: Sequence[Group]) -> Table:
     """Return device, commit, time and versions of each run; one column for runs that have all of them in common."""
     every = [run for group in groups for run in group.runs]
-    common: dict[str, list[str]] = {}
+    common: dict[tuple[tuple[str, str], ...], list[str]] = {}
     for run in every:
         facts = {"device": run.origin.get("device", "unknown"), "commit": run.origin.get("commit", "unknown")}
-        text = yaml.safe_dump({**facts, **run.versions}, sort_keys=False)
-        common.setdefault(text, []).append(run.name)
-    columns = [{str(k): str(v) for k, v in yaml.safe_load(text).items()} for text in common]
+        common.setdefault(tuple({**facts, **run.versions}.items()), []).append(run.name)
+    columns = [dict(facts) for facts in common]
     names = dict.fromkeys(name for column in columns for name in column)
     head = ["what", *(", ".join(who) if len(common) > 1 else "all runs" for who in common.values())]
     rows = [[name, *(column.get(name, "-") for column in columns)] for name in names]

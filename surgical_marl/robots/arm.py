@@ -8,7 +8,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -18,19 +17,21 @@ import numpy as np
 
 from surgical_marl.content import find
 from surgical_marl.robots.description import MOVING, Robot, RobotJoint, Vector
-from surgical_marl.robots.drives import Cable, Drive, read_cables, read_drives
-from surgical_marl.robots.jaw import Jaw, read_jaw
+from surgical_marl.robots.drives import Cable, Drive
+from surgical_marl.robots.jaw import Jaw, JawEntry
 from surgical_marl.robots.mesh import MAX_MESH, mesh_files, resolve_meshes
 from surgical_marl.robots.reach import Box, box_of
-from surgical_marl.robots.urdf import Faults, link_name, read_urdf
+from surgical_marl.robots.urdf import link_name, read_urdf
 from surgical_marl.robots.urdf_faults import robot_faults
 from surgical_marl.untrusted.files import is_file, read_bytes
 from surgical_marl.untrusted.markup import check_name
-from surgical_marl.untrusted.values import listed, shown
-from surgical_marl.yaml_file import build, check_keys, read_yaml
+from surgical_marl.untrusted.schema import REQUIRED, Faults, Place, check, collecting, number, several, unknown_keys
+from surgical_marl.untrusted.values import LONGEST, listed, shown
+from surgical_marl.yaml_file import read_yaml
 
 CONTROL_MODES = ("position", "velocity", "torque")
-KEYS = ("description", "urdf", "tool_tip", "remote_center", "camera", "joints", "cables", "jaw")
+MAX_JOINTS = 200
+"""Joints of an `arm.yaml`, and cables."""
 
 
 @dataclass(frozen=True)
@@ -38,9 +39,9 @@ class Camera:
     """A stereo endoscope. It looks along -z of `link`, x to the right, y up, as a MuJoCo camera does."""
 
     link: str
-    fovy: float
+    fovy: float = number(REQUIRED, 0.1, 179.0, unit="degrees")
     """Vertical field of view in degrees."""
-    baseline: float
+    baseline: float = number(REQUIRED, 0.0, LONGEST, unit="m")
     """Distance of the two eyes along x in m."""
 
 
@@ -229,6 +230,20 @@ class Arm:
         return chain[::-1]
 
 
+@dataclass(frozen=True)
+class ArmFile:
+    """The content of an `arm.yaml`."""
+
+    urdf: str
+    tool_tip: str
+    description: str = ""
+    remote_center: str | None = None
+    camera: Camera | None = None
+    joints: dict[str, Drive] = several("drives", MAX_JOINTS)
+    cables: tuple[Cable, ...] | None = several("cables", MAX_JOINTS, empty=tuple)
+    jaw: JawEntry | None = None
+
+
 def load_arm(name: str | Path) -> Arm:
     """Read an arm by a shipped name (`list_arms()`) or the path of a folder that holds `arm.yaml`.
 
@@ -238,87 +253,113 @@ def load_arm(name: str | Path) -> Arm:
     """
     folder = find("arms", name)
     check_name(folder.name, "an arm's folder")
-    where = folder / "arm.yaml"
-    settings = read_yaml(where)
+    place = Place(file=folder / "arm.yaml")
+    settings = read_yaml(folder / "arm.yaml")
+    about: ArmFile | None = None
+    robot: Robot | None = None
     faults: list[str] = []
-
-    def keep(read: Callable[..., Any], *arguments: Any) -> Any:
-        try:
-            return read(*arguments)
-        except ValueError as error:
-            faults.append(str(error))
-
-    keep(check_keys, settings, KEYS, where)
-    path = _urdf_path(folder, settings.get("urdf"))
-    robot, lost = resolve_meshes(read_urdf(path), path, folder)
-    faults += robot_faults(robot, path) + lost
-    given = settings.get("joints") or {}
-    moving = [joint for joint in robot.joints if joint.type != "fixed" and not joint.mimic]
-    leaders = [joint.name for joint in moving]
-    # one of a type that is a fault already may have a drive, which is then no fault
-    known = given if isinstance(given, dict) else ()
-    driven = [joint.name for joint in moving if joint.type in MOVING or joint.name in known]
-    for joint in robot.joints:
-        if joint.name in known and joint.name not in leaders:
-            why = f"mimics {joint.mimic.joint!r}" if joint.mimic else "is fixed"
-            faults.append(f"{where}: joint {joint.name!r} {why} and has no drive of its own; leave its line out")
-            given = {name: drive for name, drive in given.items() if name != joint.name}
-    drives = read_drives(given, driven, where, keep)
-    camera = None if settings.get("camera") is None else keep(build, Camera, settings["camera"], where)
-    jaw = None if settings.get("jaw") is None else keep(read_jaw, settings["jaw"], where)
-    pulled = [name for name in leaders if jaw is None or name != jaw.joint]
-    cables = read_cables(settings.get("cables") or [], pulled, where, keep)
-    links = [link.name for link in robot.links]
-    named = {key: link_name(settings.get(key)) for key in ("tool_tip", "remote_center")}
-    camera = camera and replace(camera, link=link_name(camera.link))
-    named |= {"camera": camera and camera.link}
-    named |= {f"jaw pad {number}": pad.link for number, pad in enumerate(jaw.pads if jaw else ())}
-    for key, link in named.items():
-        if link not in links and (key == "tool_tip" or link is not None):
-            faults.append(f"{where}: {key} {shown(link)} is not a link of the URDF ({listed(links)})")
-    if jaw is not None and jaw.joint not in leaders:
-        faults.append(f"{where}: jaw joint {shown(jaw.joint)} is not one of {listed(leaders)}")
-    if not leaders:
-        faults.append(f"{path}: no joint moves; an arm needs one that is revolute or prismatic")
-    if faults:
+    with collecting(faults):
+        about = check(place, settings, ArmFile)
+    if isinstance(settings.get("urdf"), str):
+        with collecting(faults):
+            robot, wrong = _read_robot(folder, settings["urdf"], place.part("urdf", settings))
+            faults += wrong
+    if about and robot:
+        faults += _misfits(about, robot, place, settings)
+    if faults or not about or not robot:
         raise Faults(faults)
+    drives = place.part("joints", settings)
     return Arm(
         name=folder.name,
         folder=folder,
-        description=str(settings.get("description", "")),
-        tool_tip=named["tool_tip"],
-        remote_center=named["remote_center"],
-        jaw=jaw,
-        camera=camera,
-        joints=tuple(_joint(joint, drives, where) for joint in robot.joints if joint.type in MOVING),
-        cables=cables,
+        description=about.description,
+        tool_tip=link_name(about.tool_tip),
+        remote_center=link_name(about.remote_center),
+        jaw=about.jaw.make() if about.jaw else None,
+        camera=about.camera and replace(about.camera, link=link_name(about.camera.link)),
+        joints=tuple(_joint(joint, about.joints, drives) for joint in robot.joints if joint.type in MOVING),
+        cables=about.cables or (),
         urdf=robot,
     )
 
 
-def _urdf_path(folder: Path, name: Any) -> Path:
-    if not isinstance(name, str) or not name:
-        raise ValueError(f"{folder / 'arm.yaml'}: urdf must name the URDF file in the folder, not {shown(name)}")
+def _read_robot(folder: Path, name: str, place: Place) -> tuple[Robot, list[str]]:
+    """Return the content of an arm's URDF, and a sentence for everything that is wrong with it."""
+    path = _urdf_path(folder, name, place)
+    robot, faults = resolve_meshes(read_urdf(path), path, folder)
+    faults = [*robot_faults(robot, path), *faults]
+    if not _leaders(robot):
+        faults.append(f"{path}: no joint moves; an arm needs one that is revolute or prismatic")
+    return robot, faults
+
+
+def _leaders(robot: Robot) -> list[str]:
+    """Return the names of the joints that move on their own, also those of a type that an arm may not have."""
+    return [joint.name for joint in robot.joints if joint.type != "fixed" and not joint.mimic]
+
+
+def _misfits(about: ArmFile, robot: Robot, place: Place, settings: dict[str, Any]) -> list[str]:
+    """Return a sentence for each name of an `arm.yaml` that its URDF does not have, and for each drive that is missing.
+
+    Args:
+        about: the content of the file.
+        robot: the URDF.
+        place: of the file.
+        settings: the mapping that `about` was read from.
+    """
+    leaders, links = _leaders(robot), [link.name for link in robot.links]
+    drives, given = place.part("joints", settings), settings.get("joints") or {}
+    still = {joint.name: joint for joint in robot.joints if joint.name not in leaders}
+    faults = [
+        f"{drives.part(name, given)} {f'mimics {follower.mimic.joint!r}' if follower.mimic else 'is fixed'} and has no "
+        "drive of its own; leave its line out"
+        for name, follower in still.items()
+        if name in about.joints
+    ]
+    faults += unknown_keys(drives, given, leaders, faulty=still)
+    # a joint of a type that an arm may not have is a fault already, with or without a drive
+    driven = [joint.name for joint in robot.joints if joint.name in leaders and joint.type in MOVING]
+    if lacking := [name for name in driven if name not in about.joints]:
+        faults.append(f"{drives} lacks {listed(lacking)}")
+    pulled = [name for name in leaders if about.jaw is None or name != about.jaw.joint]
+    for index, cable in enumerate(settings.get("cables") or ()):
+        # a jaw is under position control in every mode, so no cable may drive it
+        faults += unknown_keys(place.at(settings, "cables", index, "joints"), cable["joints"], pulled)
+    named: dict[tuple[str, ...], str | None] = {("tool_tip",): about.tool_tip, ("remote_center",): about.remote_center}
+    if about.camera:
+        named |= {("camera", "link"): about.camera.link}
+    if about.jaw:
+        named |= {("jaw", "pads", link): link for link in about.jaw.pads}
+        if about.jaw.joint not in leaders:
+            at = place.at(settings, "jaw", "joint")
+            faults.append(f"{at} {shown(about.jaw.joint)} is not one of {listed(leaders)}")
+    for keys, link in named.items():
+        if link is not None and link_name(link) not in links:
+            faults.append(f"{place.at(settings, *keys)} {shown(link)} is not a link of the URDF ({listed(links)})")
+    return faults
+
+
+def _urdf_path(folder: Path, name: str, place: Place) -> Path:
     path = folder / name
     try:
         inside = path.resolve().is_relative_to(folder.resolve())
     except (OSError, RuntimeError, ValueError):  # an impossible file name, or a cycle of links
-        raise ValueError(f"{folder / 'arm.yaml'}: urdf {shown(name)} is not a name that a file can have") from None
+        raise ValueError(f"{place} {shown(name)} is not a name that a file can have") from None
     if not inside:
-        raise ValueError(f"{folder / 'arm.yaml'}: urdf {shown(name)} leaves the arm's folder; copy it into the folder")
+        raise ValueError(f"{place} {shown(name)} leaves the arm's folder; copy it into the folder")
     if not is_file(path):
-        raise ValueError(f"{folder / 'arm.yaml'}: there is no URDF file {shown(name)} in the folder")
+        raise ValueError(f"{place}: there is no URDF file {shown(name)} in the folder")
     return path
 
 
-def _joint(joint: RobotJoint, drives: dict[str, Drive], where: Path) -> Joint:
+def _joint(joint: RobotJoint, drives: dict[str, Drive], place: Place) -> Joint:
     limit, mimic = joint.limit, joint.mimic
     assert limit is not None  # `robot_faults` has checked this
     leader = mimic.joint if mimic else joint.name
     margin = drives[leader].margin
     if not 2 * margin < limit.upper - limit.lower:
         span = f"[{limit.lower:g}, {limit.upper:g}]"
-        raise ValueError(f"{where}, joint {joint.name!r}: a margin of {margin:g} leaves nothing of {span}")
+        raise ValueError(f"{place}.{joint.name}: a margin of {margin:g} leaves nothing of {span}")
     return Joint(
         name=joint.name,
         slides=joint.type == "prismatic",

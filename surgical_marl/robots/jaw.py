@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
+from dataclasses import dataclass
 
 from surgical_marl.robots.description import Matrix, Vector
 from surgical_marl.robots.rotation import turned
 from surgical_marl.robots.urdf import link_name
-from surgical_marl.yaml_file import build, check_keys, read_mapping, read_vector
+from surgical_marl.untrusted.schema import REQUIRED, angles, extent, lengths, number, several
+from surgical_marl.untrusted.schema import Vector as Vector3
+from surgical_marl.untrusted.values import LONGEST
+
+MAX_PADS = 100
+"""Pads of a jaw."""
 
 
 @dataclass(frozen=True)
@@ -36,24 +39,28 @@ class Jaw:
     """The plates of the fingers; without them the jaw holds nothing."""
 
 
-def read_jaw(settings: Any, where: Path) -> Jaw:
-    """Return the jaw of an `arm.yaml`.
+@dataclass(frozen=True)
+class PadEntry:
+    """A plate of a finger in an `arm.yaml`: its sides, and its place in the frame of its link."""
 
-    Raises:
-        ValueError: a key or a number is wrong or missing.
-    """
-    jaw: Jaw = build(Jaw, settings, where)
-    pads = read_mapping(settings.get("pads"), f"{where}, jaw, pads")
-    found = tuple(_pad(link_name(link), pad, f"{where}, jaw pad of {link!r}") for link, pad in pads.items())
-    return replace(jaw, pads=found)
+    size: Vector3 = extent()
+    position: Vector3 = lengths()
+    tilt: Vector3 = angles()
 
 
-def _pad(link: str, settings: Any, where: str) -> Pad:
-    settings = read_mapping(settings, where)
-    check_keys(settings, ("size", "position", "tilt"), where)
-    size = read_vector(settings.get("size"), f"{where}, size")
-    if not (size > 0).all():
-        raise ValueError(f"{where}: size {size.tolist()} must be above 0")
-    position, tilt = (read_vector(settings.get(key, [0, 0, 0]), f"{where}, {key}") for key in ("position", "tilt"))
-    rotation = tuple(tuple(row) for row in turned(tilt).tolist())
-    return Pad(link, tuple(size.tolist()), tuple(position.tolist()), rotation)
+@dataclass(frozen=True)
+class JawEntry:
+    """A jaw in an `arm.yaml`; pads by link."""
+
+    joint: str
+    open: float = number(REQUIRED, -LONGEST, LONGEST, unit="rad or m")
+    closed: float = number(REQUIRED, -LONGEST, LONGEST, unit="rad or m")
+    pads: dict[str, PadEntry] = several("pads", MAX_PADS)
+
+    def make(self) -> Jaw:
+        """Return the jaw."""
+        pads = (
+            Pad(link_name(link), pad.size, pad.position, tuple(map(tuple, turned(pad.tilt).tolist())))
+            for link, pad in self.pads.items()
+        )
+        return Jaw(self.joint, self.open, self.closed, tuple(pads))

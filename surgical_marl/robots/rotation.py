@@ -5,6 +5,8 @@ SciPy's `Rotation` does the same, but its import takes 0.3 s of CPU time, as lon
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import mujoco
 import numpy as np
 
@@ -23,7 +25,7 @@ def matrix_of(quat: np.ndarray) -> np.ndarray:
     return matrix.reshape(3, 3)
 
 
-def turned(degrees: np.ndarray) -> np.ndarray:
+def turned(degrees: Sequence[float] | np.ndarray) -> np.ndarray:
     """Return the rotation matrix [3, 3] of turns by [3] degrees about the fixed axes x, then y, then z."""
     quat = np.zeros(4)
     mujoco.mju_euler2Quat(quat, np.radians(degrees), "XYZ")

@@ -8,7 +8,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -34,23 +34,13 @@ from surgical_marl.robots.description import (
 from surgical_marl.robots.safe_xml import parse_xml, write_xml
 from surgical_marl.robots.urdf_faults import MAX_FAULTS, xml_faults
 from surgical_marl.untrusted.files import is_file, read_bytes
+from surgical_marl.untrusted.schema import Faults
 
 if TYPE_CHECKING:
     from yourdfpy import urdf as yourdf
 
 MAX_URDF = 10_000_000
 """Bytes; more is a mistake or an attack."""
-
-
-class Faults(ValueError):
-    """Everything that keeps an arm from loading, one sentence each in `faults`.
-
-    The error's message is the first one.
-    """
-
-    def __init__(self, faults: Iterable[str]) -> None:
-        self.faults = list(faults)
-        super().__init__(self.faults[0])
 
 
 def read_urdf(path: Path) -> Robot:

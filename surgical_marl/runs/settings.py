@@ -10,17 +10,18 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, ClassVar, Literal, get_type_hints
 
-import yaml
-
-from surgical_marl.content import find, list_configs
+from surgical_marl.content import as_name, find, list_configs
 from surgical_marl.engines.choose import DeviceName, EngineName
 from surgical_marl.plugins.algorithms import ALGORITHMS
 from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.runtime import has_cuda
-from surgical_marl.tasks.base.options import Checked, Options, as_mapping, choice, number
+from surgical_marl.tasks.base.options import Options
+from surgical_marl.untrusted.schema import Checked, Place, as_mapping, check, choice, fields_of, number
 from surgical_marl.untrusted.values import shown
-from surgical_marl.yaml_file import load_yaml, parse_yaml
+from surgical_marl.yaml_file import dump_yaml, load_yaml, parse_yaml
 
+SECTIONS = ("scenes", "difficulties", "starts")
+"""Sections of a task's file: settings for a scene, for a level of difficulty, and for where episodes start."""
 MAX_LAYERS, MAX_WEIGHTS = 32, 50_000_000
 """Layers of a network, and weights between them: 200 MB, and four times that to learn with."""
 
@@ -101,7 +102,7 @@ class NetworkSettings(Checked):
 
     prefix: ClassVar[str] = "network."
 
-    hidden: tuple[int, ...] = number((256, 128, 64), 1, 65536)
+    hidden: tuple[int, ...] = number((256, 128, 64), 1, 65536, least=1)
     activation: Literal["elu", "relu", "tanh", "selu", "gelu"] = "elu"
     normalise_observations: bool = True
     init_std: float = number(0.5, 0.001, 10.0)
@@ -213,28 +214,16 @@ def load_config(task: str, scene: str, overrides: Iterable[str] = ()) -> Setting
         ValueError: unknown task, algorithm or key, or a value of the wrong type or out of range.
     """
     TASKS.check(task)
+    scene = as_name("scene", scene)
     values, overrides = _read_task(task), list(overrides)
-    kinds = ("scenes", "difficulties", "starts")
-    scenes, difficulties, starts = (as_mapping(name, values.pop(name, None) or {}) for name in kinds)
+    scenes, difficulties, starts = (values.pop(name, None) or {} for name in SECTIONS)
     asked = _override(values, overrides)
     difficulty, start = str(asked.get("difficulty", "default")), str(asked.get("start", "home"))
-    level, place, here = f"difficulties.{difficulty}", f"starts.{start}", f"scenes.{scene}"
-    own = dict(as_mapping(here, scenes.get(scene) or {}))
-    levels, places = (as_mapping(f"{here}.{name}", own.pop(name, None) or {}) for name in kinds[1:])
-    parts = {
-        "": values,
-        level: difficulties.get(difficulty) or {},
-        here: own,
-        f"{here}.{level}": levels.get(difficulty) or {},
-        place: starts.get(start) or {},
-        f"{here}.{place}": places.get(start) or {},
-    }
-    layers, on_gpu = [], []
-    for name, part in parts.items():
-        layers.append(dict(as_mapping(name, part)))
-        on_gpu.append(as_mapping(f"{name}.cuda".lstrip("."), layers[-1].pop("cuda", None) or {}))
-        for section in (layers[-1], on_gpu[-1]):
-            _reject_unknown(section, without=("task", "scene"))
+    own = dict(scenes.get(scene) or {})
+    levels, places = (own.pop(name, None) or {} for name in SECTIONS[1:])
+    parts = [values, difficulties.get(difficulty), own, levels.get(difficulty), starts.get(start), places.get(start)]
+    layers = [dict(part or {}) for part in parts]
+    on_gpu = [layer.pop("cuda", None) or {} for layer in layers]
     device = _override(reduce(_merge, layers), overrides).get("device", "auto")
     if any(on_gpu) and (device == "cuda" or (device == "auto" and has_cuda())):
         layers = [_merge(*pair) for pair in zip(layers, on_gpu, strict=True)]
@@ -245,7 +234,7 @@ def load_config(task: str, scene: str, overrides: Iterable[str] = ()) -> Setting
 
 def own_sections(task: str, kind: str) -> list[str]:
     """Return the names for which a task's file has settings of their own, of the kind "difficulties" or "starts"."""
-    return list(as_mapping(kind, _read_task(task).get(kind) or {}))
+    return list(_read_task(task).get(kind) or {})
 
 
 def read_config(path: Path, overrides: Iterable[str] = ()) -> Settings:
@@ -253,7 +242,7 @@ def read_config(path: Path, overrides: Iterable[str] = ()) -> Settings:
     values = _read_yaml(path)
     for note in ("versions", "origin"):
         values.pop(note, None)
-    _reject_unknown(values)
+    _check_settings(Place(file=path), values)
     for name in ("task", "scene"):
         if name not in values:
             raise ValueError(f"{path} has no {name}: it is cut short, so restore it from a copy")
@@ -265,16 +254,51 @@ def config_text(settings: Settings, notes: Mapping[str, Mapping[str, Any]]) -> s
     values = asdict(settings)
     values["network"]["hidden"] = list(settings.network.hidden)
     values["observe"] = {agent: list(names) for agent, names in settings.observe.items()}
-    return yaml.safe_dump({**values, **notes}, sort_keys=False)
+    return dump_yaml({**values, **notes})
 
 
 def _read_task(task: str) -> dict[str, Any]:
-    """Return what a task's file says; a task without one uses the defaults."""
-    return _read_yaml(find("configs", task)) if task in list_configs() else {}
+    """Return the content of a task's file, checked; a task without one uses the defaults."""
+    if task not in list_configs():
+        return {}
+    path = find("configs", task)
+    values = _read_yaml(path)
+    _check_settings(Place(file=path), values, (*SECTIONS, "cuda"), without=("task", "scene"))
+    return values
 
 
 def _read_yaml(path: Path) -> dict[str, Any]:
-    return dict(as_mapping(str(path), load_yaml(path) or {}))
+    """Return the mapping that a file holds; an empty file holds an empty one."""
+    content = load_yaml(path)
+    as_mapping(str(path), {} if content is None else content)
+    return content or {}
+
+
+def _check_settings(place: Place, values: Any, sections: tuple[str, ...] = (), without: tuple[str, ...] = ()) -> None:
+    """Raise ValueError for a setting that is unknown, or a value of a wrong type or out of bounds.
+
+    Args:
+        place: of the values.
+        values: settings, and sections of settings.
+        sections: sections that they may hold.
+        without: settings that they may not hold.
+    """
+    known = fields_of(Settings)
+    for key, value in as_mapping(place, values).items():
+        at = place.part(key, values)
+        if key == "cuda" and key in sections:
+            _check_settings(at, value or {}, without=without)
+        elif key in sections:
+            inner = (*SECTIONS[1:], "cuda") if key == "scenes" else ("cuda",)
+            for name, section in as_mapping(at, value or {}).items():
+                _check_settings(at.part(name, value), section or {}, inner, without)
+        else:
+            try:
+                _reject_unknown({key: value}, without)
+            except ValueError as error:
+                raise ValueError(f"{at}: {error}") from None
+            item, hint = known[key]
+            check(at, value, hint, item.metadata)
 
 
 def _override(values: dict[str, Any], overrides: Iterable[str]) -> dict[str, Any]:

@@ -8,7 +8,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import chain, combinations
@@ -17,12 +16,11 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from surgical_marl.content import find, list_arms, list_objects, list_scenes, unknown
+from surgical_marl.content import as_name, find, list_arms, list_objects, list_scenes, unknown
 from surgical_marl.robots.arm import Arm, load_arm
 from surgical_marl.robots.arm_findings import number_findings
 from surgical_marl.robots.inverse_kinematics import inverse_kinematics
 from surgical_marl.robots.spec import COLLISION_GROUP, build_spec
-from surgical_marl.robots.urdf import Faults
 from surgical_marl.scenes.build import set_physics
 from surgical_marl.scenes.contacts import collision_geoms, neighbours
 from surgical_marl.scenes.crowding import crowding
@@ -31,6 +29,7 @@ from surgical_marl.scenes.objects import load_object
 from surgical_marl.scenes.scene import Scene
 from surgical_marl.scenes.timing import TIMESTEP
 from surgical_marl.untrusted.files import is_file, is_folder, user_path
+from surgical_marl.untrusted.schema import Faults
 from surgical_marl.yaml_file import read_yaml
 
 REACH = 0.001
@@ -52,7 +51,7 @@ def check(source: str | Path) -> list[str]:
             scene or an object.
 
     Raises:
-        ValueError: if there is nothing of that name.
+        ValueError: if there is nothing of that name, or it is a file that is no YAML mapping.
     """
     findings = [finding for kind, path in _find(source).items() for finding in _CHECKS[kind](path)]
     return list(dict.fromkeys(findings))
@@ -87,7 +86,8 @@ def _count(number: int, noun: str) -> str:
 
 def _find(source: str | Path) -> dict[str, Path]:
     """Return the arm's folder, the scene's file and the object's file of this name, by their kind, as far as any."""
-    text, named = os.fspath(source), {"arms": list_arms(), "scenes": list_scenes(), "objects": list_objects()}
+    text = as_name("arm, scene or object", source)
+    named = {"arms": list_arms(), "scenes": list_scenes(), "objects": list_objects()}
     found = {kind: find(kind, text) for kind, names in named.items() if text in names}
     if found:
         return found
@@ -104,11 +104,8 @@ def _find(source: str | Path) -> dict[str, Path]:
 
 
 def _is_object(path: Path) -> bool:
-    """Return whether a file looks like an object's rather than a scene's."""
-    try:
-        settings = read_yaml(path)
-    except ValueError:
-        return False
+    """Return whether a file looks like an object's rather than a scene's; ValueError if it is no YAML mapping."""
+    settings = read_yaml(path)
     return "arms" not in settings and not {"shapes", "free"}.isdisjoint(settings)
 
 
@@ -139,6 +136,8 @@ def _check_scene(path: Path) -> list[str]:
 def _check_object(path: Path) -> list[str]:
     try:
         load_object(path)
+    except Faults as error:
+        return error.faults
     except ValueError as error:
         return [str(error)]
     return []

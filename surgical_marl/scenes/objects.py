@@ -20,18 +20,16 @@ import numpy as np
 from surgical_marl.content import find
 from surgical_marl.robots.rotation import matrix_of, quaternion, turned
 from surgical_marl.scenes.poses import Pose
+from surgical_marl.scenes.shapes import GREY, MAX_SHAPES, Material, ShapeEntry, make_shapes
 from surgical_marl.scenes.shapes import Shape as Shape
-from surgical_marl.scenes.shapes import read_colour, read_material, read_number, read_shapes
 from surgical_marl.untrusted.markup import check_name
-from surgical_marl.untrusted.values import check_count, shown
-from surgical_marl.yaml_file import check_keys, read_mapping, read_vector, read_yaml
+from surgical_marl.untrusted.schema import REQUIRED, Place, Vector, angles, check, lengths, number, rgb, several
+from surgical_marl.untrusted.values import LARGEST, LEAST
+from surgical_marl.yaml_file import read_as
 
-KEYS = ("description", "free", "mass", "density", "friction", "stiffness", "colour", "material", "shapes", "sites")
 MAX_SITES = 100
 HEAVIEST, LIGHTEST = 1e6, 1e-12
 """Masses of a free object, kg."""
-GREY = (0.7, 0.7, 0.72)
-"""The colour of an object that has none."""
 GEOMS = {
     "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
     "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
@@ -121,6 +119,49 @@ class Placement:
         return Pose(self.position, quaternion(self.rotation))
 
 
+@dataclass(frozen=True)
+class Friction:
+    """The friction of an object: its coefficient of sliding, and its torsion radius in m."""
+
+    sliding: float = number(REQUIRED, 0.0, LARGEST)
+    torsion: float = number(REQUIRED, 0.0, LARGEST, unit="m")
+
+
+@dataclass(frozen=True)
+class SiteEntry:
+    """A named place of an object's file, in the object's frame."""
+
+    position: Vector = lengths()
+    tilt: Vector = angles()
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObjectFile:
+    """The content of an object's file. Its `repr` is a key for caches, so it has no materials."""
+
+    description: str = ""
+    free: bool
+    mass: float | None = number(None, LEAST, LARGEST, unit="kg")
+    density: float | None = number(None, LEAST, LARGEST, unit="kg/m3")
+    friction: Friction
+    stiffness: float = number(REQUIRED, LEAST, LARGEST, unit="N/m")
+    colour: Vector | None = rgb()
+    material: Material | None = field(default=None, repr=False)
+    shapes: tuple[ShapeEntry, ...] = several("shapes", MAX_SHAPES, least=1)
+    sites: dict[str, SiteEntry] = several("sites", MAX_SITES)
+
+    def __post_init__(self) -> None:
+        given = [key for key in ("mass", "density") if getattr(self, key) is not None]
+        if not self.free and given:
+            raise ValueError(f"a fixed object has no {given[0]}; leave it out, or say free: true")
+        if self.free and len(given) != 1:
+            raise ValueError("a free object needs either its mass (kg) or its density (kg/m3)")
+        if self.free and any(shape.plane for shape in self.shapes):
+            raise ValueError("a plane has no end, so it can't be part of a free object; take capsules")
+        if self.free and any(shape.box for shape in self.shapes):
+            raise ValueError("a box can't be part of a free object; build it of capsules, with round edges")
+
+
 def load_object(name: str | Path, colour: Any = None) -> Object:
     """Read an object by a shipped name (`list_objects()`) or the path of a YAML file.
 
@@ -133,66 +174,34 @@ def load_object(name: str | Path, colour: Any = None) -> Object:
     """
     path = find("objects", name)
     check_name(path.stem, "an object's file")
-    settings, where = read_yaml(path), str(path)
-    check_keys(settings, KEYS, path)
-    free = settings.get("free")
-    if not isinstance(free, bool):
-        raise ValueError(f"{path}: free must be true, for an object that moves, or false, not {shown(free)}")
-    painted = read_colour(colour, where, read_colour(settings.get("colour"), where, np.array(GREY)))
-    made = read_material(settings.get("material"), where)
-    shapes = read_shapes(settings.get("shapes"), painted, made, where)
-    density = _density(settings, free, shapes, where)
+    about = read_as(ObjectFile, path)
+    painted = check(Place("colour"), colour, Vector | None, rgb().metadata) or about.colour or GREY
+    shapes = make_shapes(about.shapes, painted, about.material or "", Place("shapes", path))
+    density = about.density or _density(about.mass, shapes)
     try:
-        mass, center, inertia = _inertia(shapes, density, free)
+        mass, center, inertia = _inertia(shapes, density, about.free)
     except (ValueError, mujoco.FatalError) as error:
-        raise ValueError(
-            f"{where}: its shapes are too small or too far apart: {' '.join(str(error).split())}"
-        ) from None
-    if free and not LIGHTEST <= mass <= HEAVIEST:
-        raise ValueError(f"{where}: a free object must weigh from {LIGHTEST:g} to {HEAVIEST:g} kg, not {mass:g}")
-    friction = read_mapping(settings.get("friction"), f"{where}, friction")
-    check_keys(friction, ("sliding", "torsion"), f"{where}, friction")
-    sliding, torsion = (read_number(friction.get(key), f"{where}: {key} friction") for key in ("sliding", "torsion"))
+        raise ValueError(f"{path}: its shapes are too small or too far apart: {' '.join(str(error).split())}") from None
+    if about.free and not LIGHTEST <= mass <= HEAVIEST:
+        raise ValueError(f"{path}: a free object must weigh from {LIGHTEST:g} to {HEAVIEST:g} kg, not {mass:g}")
     return Object(
         name=path.stem,
-        description=str(settings.get("description", "")),
-        free=free,
+        description=about.description,
+        free=about.free,
         mass=mass,
         center=center,
         inertia=inertia,
-        friction=(sliding, torsion),
-        stiffness=read_number(settings.get("stiffness"), f"{where}: stiffness (N/m)", above=0.0),
+        friction=(about.friction.sliding, about.friction.torsion),
+        stiffness=about.stiffness,
         shapes=shapes,
-        sites=_sites(settings.get("sites"), where),
-        content=repr((path.stem, _without_materials(settings), painted.tolist())).encode(),
+        sites={name: (np.array(site.position), turned(site.tilt)) for name, site in about.sites.items()},
+        content=repr((path.stem, about, painted)).encode(),
     )
 
 
-def _without_materials(settings: dict[str, Any]) -> dict[str, Any]:
-    """Return the settings of a file as they would be without any material."""
-
-    def bare(given: Any) -> Any:
-        return given and {key: value for key, value in given.items() if key != "material"}
-
-    shapes = [{kind: bare(values) for kind, values in shape.items()} for shape in settings["shapes"]]
-    return {**bare(settings), "shapes": shapes}
-
-
-def _density(settings: dict[str, Any], free: bool, shapes: tuple[Shape, ...], where: str) -> float:
-    """Return the mean density, kg/m3; 0 for a fixed object."""
-    given = [key for key in ("mass", "density") if settings.get(key) is not None]
-    if not free:
-        if given:
-            raise ValueError(f"{where}: a fixed object has no {given[0]}; leave it out, or say free: true")
-        return 0.0
-    if len(given) != 1:
-        raise ValueError(f"{where}: a free object needs either its mass (kg) or its density (kg/m3)")
-    if any(shape.kind == "plane" for shape in shapes):
-        raise ValueError(f"{where}: a plane has no end, so it can't be part of a free object; take capsules")
-    if any(shape.kind == "box" for shape in shapes):
-        raise ValueError(f"{where}: a box can't be part of a free object; build it of capsules, with round edges")
-    value = read_number(settings[given[0]], f"{where}: {given[0]}", above=0.0)
-    return value if given == ["density"] else value / sum(shape.volume for shape in shapes)
+def _density(mass: float | None, shapes: tuple[Shape, ...]) -> float:
+    """Return the mean density, kg/m3; 0 for a fixed object, which has no mass."""
+    return mass / sum(shape.volume for shape in shapes) if mass else 0.0
 
 
 def _inertia(shapes: tuple[Shape, ...], density: float, free: bool) -> tuple[float, np.ndarray, np.ndarray]:
@@ -213,16 +222,3 @@ def add_shape(body: Any, shape: Shape, **rest: Any) -> None:
     """Add a shape to a body of an MjSpec as a geom with the rest of its attributes."""
     size = [0.0, 0.0, 1.0] if shape.kind == "plane" else [*shape.size, 0.0, 0.0][:3]
     body.add_geom(type=GEOMS[shape.kind], size=size, pos=shape.position, quat=quaternion(shape.rotation), **rest)
-
-
-def _sites(settings: Any, where: str) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    sites = {}
-    given = read_mapping(settings, f"{where}, sites")
-    check_count(len(given), MAX_SITES, "sites", where)
-    for name, place in given.items():
-        at = f"{where}, site {shown(name)}"
-        place = read_mapping(place, at)
-        check_keys(place, ("position", "tilt"), at)
-        position, tilt = (read_vector(place.get(key, [0, 0, 0]), f"{at}, {key}") for key in ("position", "tilt"))
-        sites[str(name)] = position, turned(tilt)
-    return sites

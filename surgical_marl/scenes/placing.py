@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
-from pathlib import Path
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import mujoco
+import numpy as np
 
 from surgical_marl.content import find, list_scenes
 from surgical_marl.robots.rotation import quaternion, turned
 from surgical_marl.scenes.objects import Placement, add_shape, load_object
 from surgical_marl.scenes.surroundings import STILL
 from surgical_marl.untrusted.files import is_file
-from surgical_marl.untrusted.values import check_count, shown
-from surgical_marl.yaml_file import check_keys, read_mapping, read_vector, read_yaml
+from surgical_marl.untrusted.schema import Place, Vector, angles, lengths, rgb
+from surgical_marl.yaml_file import read_yaml
 
 MAX_OBJECTS = 50
 """Objects of a scene."""
@@ -24,39 +25,46 @@ TAKEN = re.compile(r"world|tissue|contact|target|(?:reward|cost|stage)(?:_\w*)?"
 """Names that parts of a model, observations or infos have or begin with: `contact_force`, `reward_reach`."""
 
 
+@dataclass(frozen=True)
+class PlacementEntry:
+    """An object in a scene file; `object` is its name or its file."""
+
+    object: str
+    position: Vector = lengths()
+    tilt: Vector = angles()
+    colour: Vector | None = rgb()
+
+
 def scenes_without_objects() -> list[str]:
     """Return the names of the scenes in which arms have nothing to touch but each other."""
     return [name for name in list_scenes() if not read_yaml(find("scenes", name)).get("objects")]
 
 
-def read_placements(settings: Any, agents: Iterable[str], path: Path) -> dict[str, Placement]:
-    """Return the objects of a scene file by their names in the scene.
+def read_placements(
+    entries: Mapping[str, PlacementEntry], place: Place, settings: Any, taken: Iterable[str]
+) -> dict[str, Placement]:
+    """Return the objects of a scene by their names in it.
+
+    Args:
+        entries: the objects of the scene file, by name.
+        place: of `settings` in the file.
+        settings: the mapping that `entries` were read from.
+        taken: names of the scene's agents.
 
     Raises:
-        ValueError: a name that is also an agent's, an unknown object or key, or a bad number.
+        ValueError: a name that is also an agent's or can't be one, or an object that is unknown or has a fault.
     """
     found = {}
-    given = read_mapping(settings, f"{path}, objects")
-    check_count(len(given), MAX_OBJECTS, "objects", path)
-    for name, place in given.items():
-        where = f"{path}, object {shown(name)}"
-        if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z_]\w*", name):
+    for name, entry in entries.items():
+        where = place.at(settings, name)
+        if not re.fullmatch(r"[A-Za-z_]\w*", name):
             raise ValueError(f"{where}: a name in a scene is of letters, digits and underscores")
-        if name in agents or TAKEN.fullmatch(name):
+        if name in taken or TAKEN.fullmatch(name):
             raise ValueError(f"{where}: {name} is taken; give the object another name")
-        found[name] = _read_placement(place, where, path.parent)
+        local = where.folder / entry.object  # a user's own object may be named relative to the scene file
+        source = local if is_file(local) else find("objects", entry.object, str(where))
+        found[name] = Placement(load_object(source, entry.colour), np.array(entry.position), turned(entry.tilt))
     return found
-
-
-def _read_placement(settings: Any, where: str, folder: Path) -> Placement:
-    if not isinstance(settings, dict) or "object" not in settings:
-        raise ValueError(f"{where}: must be a mapping that names its object")
-    check_keys(settings, ("object", "position", "tilt", "colour"), where)
-    source = str(settings["object"])
-    local = folder / source  # a user's own object may be named relative to the scene file
-    item = load_object(local if is_file(local) else find("objects", source, where), settings.get("colour"))
-    position, tilt = (read_vector(settings.get(key, [0, 0, 0]), f"{where}, {key}") for key in ("position", "tilt"))
-    return Placement(item, position, turned(tilt))
 
 
 def add_objects(spec: mujoco.MjSpec, objects: dict[str, Placement]) -> None:

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from pathlib import Path
-from typing import Any
 
-from surgical_marl.untrusted.values import shown
-from surgical_marl.yaml_file import build
+from surgical_marl.untrusted.schema import number
+from surgical_marl.untrusted.values import LARGEST
 
-SHARES = "stiffness", "damping", "friction", "object_size", "object_mass", "object_friction"
-"""Ranges that are shares of a value."""
+SHARE = 0.999
+"""The largest share of a value by which it may be off."""
 
 
 @dataclass(frozen=True)
@@ -21,52 +19,34 @@ class Randomisation:
     get only other gains and friction. docs/randomisation.md has the sources of sensible values.
     """
 
-    offset_angle: float = 0.0
+    offset_angle: float = number(0.0, 0.0, LARGEST, unit="rad")
     """A joint's reading is off by up to this, rad; `offset_slide`, m, for prismatic joints."""
-    offset_slide: float = 0.0
-    backlash_angle: float = 0.0
+    offset_slide: float = number(0.0, 0.0, LARGEST, unit="m")
+    backlash_angle: float = number(0.0, 0.0, LARGEST, unit="rad")
     """Greatest play between a joint and its motor, which has the encoder, rad. Only under position control."""
-    backlash_slide: float = 0.0
-    noise_angle: float = 0.0
+    backlash_slide: float = number(0.0, 0.0, LARGEST, unit="m")
+    noise_angle: float = number(0.0, 0.0, LARGEST, unit="rad")
     """Standard deviation of a reading at each step, rad."""
-    noise_slide: float = 0.0
-    stiffness: float = 0.0
+    noise_slide: float = number(0.0, 0.0, LARGEST, unit="m")
+    stiffness: float = number(0.0, 0.0, SHARE)
     """Gains of the controllers are off by up to this share of their value."""
-    damping: float = 0.0
-    friction: float = 0.0
+    damping: float = number(0.0, 0.0, SHARE)
+    friction: float = number(0.0, 0.0, SHARE)
     """Viscous and Coulomb friction are off by up to this share of their value."""
-    payload: float = 0.0
+    payload: float = number(0.0, 0.0, LARGEST, unit="kg")
     """Greatest mass at the tool tip, kg."""
-    latency: int = 0
+    latency: int = number(0, 0, 50, unit="control steps")
     """Greatest number of control steps until an action acts."""
-    object_shift: float = 0.0
+    object_shift: float = number(0.0, 0.0, LARGEST, unit="m")
     """Free objects begin up to this far from their place, m, along the world's x and y each."""
-    object_turn: float = 0.0
+    object_turn: float = number(0.0, 0.0, LARGEST, unit="rad")
     """They begin turned about the vertical by up to this, rad."""
-    object_size: float = 0.0
+    object_size: float = number(0.0, 0.0, SHARE)
     """All their lengths are off by up to this share. Mass grows with their cube, unless `object_mass` is given."""
-    object_mass: float = 0.0
+    object_mass: float = number(0.0, 0.0, SHARE)
     """Their masses are off by up to this share of their value, whatever their size."""
-    object_friction: float = 0.0
+    object_friction: float = number(0.0, 0.0, SHARE)
     """Their coefficients of friction likewise."""
 
     def __bool__(self) -> bool:
         return any(getattr(self, item.name) for item in fields(self))
-
-
-def read_randomisation(settings: Any, path: Path) -> Randomisation:
-    """Return the ranges in a scene file.
-
-    Raises ValueError for an unknown key or a value out of range.
-    """
-    where = f"{path}, randomisation"
-    found: Randomisation = build(Randomisation, {} if settings is None else settings, where)
-    late = found.latency
-    if isinstance(late, bool) or not isinstance(late, int) or not 0 <= late <= 50:
-        raise ValueError(f"{where}: latency must be a whole number of control steps from 0 to 50, not {shown(late)}")
-    for item in fields(found):
-        value, relative = getattr(found, item.name), item.name in SHARES
-        if value < 0 or (relative and value >= 1):
-            good = "from 0 to less than 1" if relative else "0 or more"
-            raise ValueError(f"{where}: {item.name} must be {good}, not {value:g}")
-    return found

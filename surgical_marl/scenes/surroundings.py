@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any
+from dataclasses import dataclass
+from typing import Literal
 
 import mujoco
 import numpy as np
 
 from surgical_marl.robots.rotation import quaternion, turned
 from surgical_marl.scenes.scene import Mount
-from surgical_marl.scenes.shapes import check_size
-from surgical_marl.untrusted.values import shown
-from surgical_marl.yaml_file import check_keys, read_mapping, read_vector
+from surgical_marl.untrusted.schema import REQUIRED, Vector, angles, extent, lengths, rgb
 
 STILL = {"contype": 0, "conaffinity": 0, "group": 1}
 """Attributes of geoms that are only visible: nothing collides with them."""
@@ -21,10 +19,48 @@ TISSUE_SHAPES = {
     "box": (mujoco.mjtGeom.mjGEOM_BOX, 3, "three half sides"),
     "capsule": (mujoco.mjtGeom.mjGEOM_CAPSULE, 2, "radius and half length along z"),
 }
-"""The content of `size` for each shape of tissue: how many lengths in m, and which."""
+"""MuJoCo's geom for each shape of tissue, how many lengths in m its `size` has, and which."""
 
 
-def add_surroundings(spec: mujoco.MjSpec, mounts: dict[str, Mount], view: Any, path: Path) -> None:
+@dataclass(frozen=True)
+class View:
+    """Where the overview camera stands, and the point that it looks at, in the world."""
+
+    position: Vector = lengths((0.0, 0.75, 0.40))
+    target: Vector = lengths((0.0, 0.0, 0.07))
+
+    def __post_init__(self) -> None:
+        if not np.linalg.norm(self.right) > 1e-6:
+            raise ValueError(f"position {self.position} must not be straight above or at the target {self.target}")
+
+    @property
+    def back(self) -> np.ndarray:
+        """The way from the target to the camera, m, [3]."""
+        return np.subtract(self.position, self.target)
+
+    @property
+    def right(self) -> np.ndarray:
+        """The picture's x axis, not normalised, [3]."""
+        return np.cross([0.0, 0.0, 1.0], self.back)
+
+
+@dataclass(frozen=True)
+class TissueEntry:
+    """A coloured piece of tissue in a scene file, for an endoscope to look at."""
+
+    shape: Literal["ellipsoid", "box", "capsule"]
+    size: tuple[float, ...] = extent()
+    colour: Vector = rgb(REQUIRED)
+    position: Vector = lengths()
+    tilt: Vector = angles()
+
+    def __post_init__(self) -> None:
+        _, count, words = TISSUE_SHAPES[self.shape]
+        if len(self.size) != count:
+            raise ValueError(f"size must be {words} in m, not {list(self.size)}")
+
+
+def add_surroundings(spec: mujoco.MjSpec, mounts: dict[str, Mount], view: View) -> None:
     """Add what a picture needs: the operating field, a trocar at each remote center, light, a camera.
 
     None of these geoms collides.
@@ -40,32 +76,13 @@ def add_surroundings(spec: mujoco.MjSpec, mounts: dict[str, Mount], view: Any, p
                 pos=mount.position, quat=quaternion(mount.rotation), rgba=[0.95, 0.78, 0.20, 1], **STILL,
             )  # fmt: skip
     spec.worldbody.add_light(pos=[0.2, 0.4, 0.9], dir=[-0.2, -0.4, -0.9])
-    view = {"position": [0.0, 0.75, 0.40], "target": [0.0, 0.0, 0.07], **read_mapping(view, f"{path}, view")}
-    check_keys(view, ("position", "target"), f"{path}, view")
-    position, target = (read_vector(view[key], f"{path}, view, {key}") for key in ("position", "target"))
-    back = position - target
-    right = np.cross([0.0, 0.0, 1.0], back)
-    if not np.linalg.norm(right) > 1e-6:
-        raise ValueError(f"{path}, view: position {position} must not be straight above or at the target {target}")
-    axes = np.concatenate([right, np.cross(back, right)])
-    spec.worldbody.add_camera(name="overview", pos=position, xyaxes=axes, fovy=42)
+    axes = np.concatenate([view.right, np.cross(view.back, view.right)])
+    spec.worldbody.add_camera(name="overview", pos=view.position, xyaxes=axes, fovy=42)
 
 
-def add_tissue(spec: mujoco.MjSpec, name: str, settings: Any, where: str) -> None:
-    """Add a coloured piece of tissue for an endoscope to look at. It is fixed in the world."""
-    settings = read_mapping(settings, where)
-    check_keys(settings, ("shape", "size", "position", "tilt", "colour"), where)
-    shape = settings.get("shape")
-    if not isinstance(shape, str) or shape not in TISSUE_SHAPES:
-        raise ValueError(f"{where}: shape {shown(shape)} must be one of {', '.join(TISSUE_SHAPES)}")
-    kind, lengths, words = TISSUE_SHAPES[shape]
-    size = read_vector(settings.get("size"), f"{where}, size", lengths, f"{words} in m")
-    colour = read_vector(settings.get("colour"), f"{where}, colour")
-    check_size(size, where)
-    if not ((colour >= 0) & (colour <= 1)).all():
-        raise ValueError(f"{where}: colour {colour.tolist()} must be from 0 to 1")
-    position, tilt = (read_vector(settings.get(key, [0, 0, 0]), f"{where}, {key}") for key in ("position", "tilt"))
-    quat = quaternion(turned(tilt))
+def add_tissue(spec: mujoco.MjSpec, name: str, piece: TissueEntry) -> None:
+    """Add a piece of tissue. It is fixed in the world."""
     spec.worldbody.add_geom(
-        name=name, type=kind, size=[*size, 0][:3], pos=position, quat=quat, rgba=[*colour, 1], **STILL
-    )
+        name=name, type=TISSUE_SHAPES[piece.shape][0], size=[*piece.size, 0][:3], pos=piece.position,
+        quat=quaternion(turned(piece.tilt)), rgba=[*piece.colour, 1], **STILL,
+    )  # fmt: skip

@@ -15,8 +15,6 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 import surgical_marl.evaluation.goal_set
 from surgical_marl.cli.flags import one_of
 from surgical_marl.content import BASELINES, list_scenes
@@ -24,6 +22,7 @@ from surgical_marl.evaluation.command import play_all
 from surgical_marl.evaluation.evaluate import summarise
 from surgical_marl.plugins.tasks import TASKS, list_tasks, scenes_for
 from surgical_marl.studies.command import make_parser, run
+from surgical_marl.yaml_file import dump_yaml, parse_yaml
 
 HASHES = Path(surgical_marl.evaluation.goal_set.__file__).with_name("goal_sets.yaml")
 ERRORS = {"median_error_mm": "median error (mm)", "p95_error_mm": "95th percentile (mm)"}
@@ -44,7 +43,7 @@ def main(argv: list[str] | None = None) -> int:
     arguments = parser.parse_args(argv)
     before = HASHES.read_text()
     comments = [line for line in before.splitlines() if line.startswith("#")]
-    hashes = yaml.safe_load(before)
+    hashes = parse_yaml(before)
     for task in arguments.tasks or list_tasks():
         for start in TASKS.load(task).starts:
             rows = list[list[Any]]()
@@ -56,7 +55,7 @@ def main(argv: list[str] | None = None) -> int:
                 hashes.setdefault(start, {}).setdefault(task, {})[scene] = result["goal_set"]
             for columns, alike in groupby(rows, lambda row: columns_of(row[2])):
                 print(f"{task} from {start}:\n\n{table(columns, alike)}", flush=True)
-    HASHES.write_text("\n".join([*comments, yaml.safe_dump(hashes)]))
+    HASHES.write_text("\n".join([*comments, dump_yaml(hashes)]))
     return 0
 
 

@@ -19,7 +19,6 @@ from typing import Any
 
 import mujoco
 import numpy as np
-import yaml
 
 from surgical_marl import list_scenes, list_tasks, load_scene
 from surgical_marl.content import find
@@ -32,6 +31,7 @@ from surgical_marl.runs.fault import write_fault
 from surgical_marl.runs.settings import Settings
 from surgical_marl.scenes.poses import Poses
 from surgical_marl.scenes.scene import Scene
+from surgical_marl.yaml_file import dump_yaml, read_yaml
 
 COUNT = 1024
 """Environments at once."""
@@ -226,10 +226,10 @@ def cases(folder: Path, seed: int, only: Sequence[str] | None = None, plain: boo
 
 def _write_wild(folder: Path, scene: str) -> Path:
     """Write a scene with wild ranges: its objects begin where they are if they would overlap others elsewhere."""
-    about, path = yaml.safe_load(find("scenes", scene).read_text()), folder / f"{scene}-wild.yaml"
+    about, path = read_yaml(find("scenes", scene)), folder / f"{scene}-wild.yaml"
     ranges = [WILD_OBJECTS, WILD_IN_PLACE] if load_scene(scene).free_objects else [{}]
     for objects in ranges:
-        path.write_text(yaml.safe_dump({**about, "randomisation": WILD | objects}, sort_keys=False))
+        path.write_text(dump_yaml({**about, "randomisation": WILD | objects}))
         try:
             load_scene(str(path))
             break

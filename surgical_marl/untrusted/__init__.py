@@ -1,1 +1,1 @@
-"""Reads what strangers wrote: files of limited size, numbers of limited size, values that are short in errors."""
+"""Reads what strangers wrote: files and numbers of limited size, fields of known types, short values in errors."""

@@ -24,7 +24,7 @@ def as_number(value: Any, words: bool = False) -> float:
 
     Args:
         value: anything.
-        words: whether a text may be a number: YAML takes 1e5 for a text.
+        words: whether a text may be a number: numbers of an XML file are texts.
     """
     if isinstance(value, bool) or not isinstance(value, (numbers.Real, str) if words else numbers.Real):
         return math.nan
