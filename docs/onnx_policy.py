@@ -7,7 +7,7 @@ import onnxruntime
 
 import surgical_marl as sm
 
-env = sm.parallel_env("reach", scene="bimanual_psm")
+env = sm.parallel_env("reach", scene="bimanual_psm", observations="si")  # what the policy learned with
 folder = Path(__file__).parents[1] / "policies/reach-bimanual_psm"
 psm = onnxruntime.InferenceSession(folder / "psm.onnx")
 observations, infos = env.reset(seed=0)

@@ -216,8 +216,12 @@ def test_black_death_and_padding_make_arms_of_different_kinds_alike() -> None:
 SCENE, AGENTS, WIDTH = "bimanual_psm", ("psm_0", "psm_1"), 7
 
 
+def batch(arrays: str) -> BatchedEnv:
+    return BatchedEnv("reach", SCENE, num_envs=1, arrays=arrays, max_steps=STEPS, engine="fused", observations="scaled")
+
+
 def numbers_of_batch(arrays: str, actions: np.ndarray) -> list[np.ndarray]:
-    env = BatchedEnv("reach", SCENE, num_envs=1, arrays=arrays, max_steps=STEPS, engine="fused")
+    env = batch(arrays)
     seen = [env.reset(11)[1]]
     for action in actions:
         seen.append(env.step({a: action[None, i] for i, a in enumerate(AGENTS)}).final_state)
@@ -255,8 +259,7 @@ def numbers_of_turns(actions: np.ndarray) -> list[np.ndarray]:
 
 
 def numbers_of_rsl_rl(actions: np.ndarray) -> list[np.ndarray]:
-    batch = BatchedEnv("reach", SCENE, num_envs=1, arrays="torch", max_steps=STEPS, engine="fused")
-    env = RslRlVecEnv(batch, grouping="agent", seed=11)
+    env = RslRlVecEnv(batch("torch"), grouping="agent", seed=11)
     seen = [env.get_observations()]
     for action in actions:
         seen.append(env.step(torch.from_numpy(action).reshape(1, -1))[-1]["final_obs"])
@@ -267,7 +270,7 @@ def numbers_of_torchrl(actions: np.ndarray) -> list[np.ndarray]:
     pytest.importorskip("torchrl")
     from surgical_marl.interfaces.torchrl import TorchRLEnv
 
-    env = TorchRLEnv(BatchedEnv("reach", SCENE, num_envs=1, arrays="torch", max_steps=STEPS, engine="fused"))
+    env = TorchRLEnv(batch("torch"))
     env.set_seed(11)
     data, seen = env.reset(), []
     seen.append(data)

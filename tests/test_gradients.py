@@ -25,7 +25,7 @@ class Episode:
     """The first steps of an episode, as a function of all actions as one array [STEPS, actions]."""
 
     def __init__(self, scene: str) -> None:
-        self.env: Any = sm.jax_env("reach", scene=scene)
+        self.env: Any = sm.jax_env("reach", scene=scene, observations="si")
         _, self.start = self.env.reset(jax.random.key(0))
         still, self._split = ravel_pytree({a: jnp.zeros(self.env.action_space(a).shape) for a in self.env.agents})
         self.size = len(still)

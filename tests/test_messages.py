@@ -113,8 +113,8 @@ def test_every_face_has_them() -> None:
     for face in (single, vector, alone):
         face.reset(seed=0)
     found, many = single.step(said)[0], vector.step(np.stack([said, said]))[0][0]
-    np.testing.assert_array_equal(found[seen : seen + K], said[-K:])  # ecm_0 hears ecm_1
-    np.testing.assert_array_equal(many[-K:], said[JOINTS : JOINTS + K])
+    np.testing.assert_allclose(found[seen : seen + K], said[-K:], atol=1e-6)  # ecm_0 hears ecm_1
+    np.testing.assert_allclose(many[-K:], said[JOINTS : JOINTS + K], atol=1e-6)
     np.testing.assert_allclose(alone.step(said[: JOINTS + K])[0][-K:], MUTE)
 
 
@@ -135,7 +135,7 @@ def test_pure_functions_have_them() -> None:
     _, state = env.reset(jax.random.key(0))
     actions = {agent: env.action_space(agent).sample(jax.random.key(1)) for agent in env.agents}
     observations, *_ = env.step(None, state, actions)
-    np.testing.assert_array_equal(observations["ecm_0"][-K:], actions["ecm_1"][-K:])
+    np.testing.assert_allclose(observations["ecm_0"][-K:], actions["ecm_1"][-K:], atol=1e-6)
 
 
 def test_torchrl_has_them() -> None:

@@ -144,8 +144,8 @@ def vectors(observations: dict[str, Any]) -> dict[str, np.ndarray]:
     return {a: own["proprioception"] if isinstance(own, dict) else own for a, own in observations.items()}
 
 
-def test_every_face_scales_alike() -> None:
-    options = {"scene": "psm", "observations": "scaled"}
+@pytest.mark.parametrize("options", [{"scene": "psm"}, {"scene": "psm", "observations": None}])
+def test_every_face_for_learners_scales_alike_unless_it_is_asked_for_si_units(options: dict[str, Any]) -> None:
     alone, many = sm.parallel_env("reach", **options), sm.parallel_env("reach", num_envs=1, arrays="torch", **options)
     single = gymnasium.make("surgical_marl/Reach-v0", **options)
     vector = gymnasium.make_vec("surgical_marl/Reach-v0", num_envs=1, **options)
@@ -158,6 +158,9 @@ def test_every_face_scales_alike() -> None:
     found = functions.reset(sm.runtime.jax.random.key(3))[0]["psm_0"]
     np.testing.assert_allclose(found, seen, atol=1e-6)
     assert bool(functions.observation_space("psm_0").contains(found))
+    plain: Any = sm.parallel_env("reach", scene="psm", observations="si")
+    np.testing.assert_allclose(plain.batch.restated(plain.reset(seed=3)[0], "scaled")["psm_0"], seen, atol=1e-6)
+    assert plain.observation_space("psm_0") == BatchedEnv("reach", "psm").observation_space("psm_0")
 
 
 def test_an_unknown_kind_of_observations_names_the_good_ones() -> None:

@@ -10,13 +10,17 @@ import torch
 
 from surgical_marl import content
 from surgical_marl.learning import train
+from surgical_marl.runs import settings as settings_of_runs
 from surgical_marl.runs.settings import NetworkSettings, Settings, load_config
 
 
 @pytest.fixture
 def reach(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
     """Replaces the text of `reach.yaml`."""
-    monkeypatch.setattr(content, "content_dir", lambda kind: tmp_path)
+    for module in (content, settings_of_runs):
+        monkeypatch.setattr(module, "content_dir", lambda kind: tmp_path)
+
+    (tmp_path / "_default.yaml").touch()
 
     def write(text: str) -> None:
         (tmp_path / "reach.yaml").write_text(text)
@@ -34,9 +38,21 @@ def test_settings_come_from_task_scene_and_overrides(reach: Callable[[str], None
     assert load_config("reach", "ecm", ["num_envs=5", "num_envs=6", "max_steps=null"]).num_envs == 6
 
 
-def test_a_task_without_a_file_has_the_defaults(reach: Callable[[str], None]) -> None:
+def test_a_task_without_a_file_has_the_settings_of_all_such_tasks(reach: Callable[[str], None], tmp_path: Path) -> None:
     reach("num_envs: 64\n")
-    assert load_config("track", "psm", ["seed=3"]) == Settings(task="track", scene="psm", seed=3)
+    (tmp_path / "_default.yaml").write_text("num_envs: 32\ncuda: {num_envs: 128}\n")
+    found = load_config("track", "psm", ["seed=3", "device=cpu"])
+    assert found == Settings(task="track", scene="psm", seed=3, device="cpu", num_envs=32)
+    assert content.list_configs() == ["reach"]
+
+
+@pytest.mark.parametrize(("there", "count"), [(False, 256), (True, 4096)])
+def test_a_task_of_ones_own_has_as_many_environments_as_learn(
+    there: bool, count: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: there)
+    monkeypatch.setattr("surgical_marl.runs.settings.list_configs", lambda: [])
+    assert load_config("reach", "psm").num_envs == count
 
 
 def test_a_gpu_has_settings_of_its_own(reach: Callable[[str], None], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,7 +3,8 @@
     python docs/examples/cleanrl_ppo.py [steps] [seed]
 
 Needs nothing but this package. One arm ends within half a millimetre of its target after 2,000,000 steps, in less than
-a minute on two CPU cores. Observations and rewards are in SI units, so both are divided by their spread.
+a minute on two CPU cores. Observations fill a small part of their bounds, and returns are up to a hundred, so both are
+divided by their spread.
 """
 
 import sys

@@ -19,7 +19,7 @@ DAMPING = 1e-5
 
 
 class Controller:
-    """Actions of one arm, from what it observes."""
+    """Actions of one arm, from what it observes in SI units."""
 
     def __init__(self, env, agent: str) -> None:
         self.arm = env.batch.scene.mounts[agent].arm  # or sm.load_arm("psm")
@@ -39,7 +39,7 @@ class Controller:
 
 def main(episodes: int = 20, scene: str = "bimanual_psm") -> float:
     """Play some episodes, and return the median error in mm."""
-    env = sm.parallel_env("reach", scene=scene)
+    env = sm.parallel_env("reach", scene=scene, observations="si")
     controllers = {agent: Controller(env, agent) for agent in env.possible_agents}
     errors, infos = [], {}
     for episode in range(episodes):

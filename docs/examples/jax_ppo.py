@@ -3,7 +3,8 @@
     python docs/examples/jax_ppo.py [steps] [seed]     (--quick: a short run, to see that it works)
 
 Needs nothing but this package. The arm ends within 0.6 mm of its target (the median) after 2,000,000 steps.
-Observations are in SI units, so they are divided by what is seen of their spread; rewards are scaled to order one.
+Observations fill a small part of their bounds, so they are divided by what is seen of their spread; rewards are scaled
+to order one.
 """
 
 import sys

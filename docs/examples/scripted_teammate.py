@@ -26,7 +26,8 @@ class OneArm:
     """The learner's side of many scenes, with what PPO needs of Gymnasium's vector environments."""
 
     def __init__(self, num_envs: int, **options) -> None:
-        self.team = sm.parallel_env("reach", scene="bimanual_psm", num_envs=num_envs, **options)
+        options = {"num_envs": num_envs, "observations": "si", **options}  # the controller reads metres and radians
+        self.team = sm.parallel_env("reach", scene="bimanual_psm", **options)
         self.num_envs = num_envs
         self.single_observation_space = self.team.observation_space(LEARNER)
         self.single_action_space = self.team.action_space(LEARNER)

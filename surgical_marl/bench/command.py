@@ -11,8 +11,8 @@ from argparse import Namespace
 from collections.abc import Iterator, Mapping
 
 from surgical_marl.bench.workload import NUM_ENVS, Workload
-from surgical_marl.content import find, unknown
-from surgical_marl.plugins.tasks import list_tasks, scene_of
+from surgical_marl.content import find
+from surgical_marl.plugins.tasks import find_task, scene_of
 from surgical_marl.runs.settings import Settings
 from surgical_marl.untrusted.files import is_folder
 
@@ -34,8 +34,7 @@ def run(arguments: Namespace) -> int:
             return 0
         print(run(arguments.scene, arguments.num_envs, arguments.device or "auto", arguments.json))
         return 0
-    if arguments.task not in list_tasks():
-        raise unknown("task", arguments.task, list_tasks())
+    arguments.task = find_task(arguments.task)
     with _no_caches() if arguments.cold else contextlib.nullcontext():
         if arguments.scene is None:
             arguments.scene = scene_of(arguments.task)

@@ -24,6 +24,7 @@ from surgical_marl.bench.text import aligned, describe_machine
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.learning.room import in_memory
 from surgical_marl.learning.train import make_training
+from surgical_marl.plugins.task_file import label
 from surgical_marl.runs.settings import Settings
 from surgical_marl.scenes.timing import TIMESTEP
 
@@ -138,9 +139,9 @@ def table(settings: Settings, speed: Speed) -> str:
     ppo = settings.ppo
     return "\n".join(
         [
-            f"{settings.task} on {settings.scene}, {settings.algo}: steps of {1e3 * speed.dt * speed.decimation:g} ms, "
-            f"{settings.steps_per_iteration} of each environment an iteration, {ppo.epochs} epochs of "
-            f"{ppo.mini_batches} mini-batches",
+            f"{label(settings.task)} on {settings.scene}, {settings.algo}: "
+            f"steps of {1e3 * speed.dt * speed.decimation:g} ms, {settings.steps_per_iteration} of each environment an "
+            f"iteration, {ppo.epochs} epochs of {ppo.mini_batches} mini-batches",
             describe_machine(),
             "",
             *aligned(cells),

@@ -14,6 +14,7 @@ from surgical_marl.bench.text import aligned, describe_machine
 from surgical_marl.bench.workload import Workload
 from surgical_marl.files import write_atomic
 from surgical_marl.machine import machine
+from surgical_marl.plugins.task_file import label
 
 QUOTED = {
     "SurRoL": 4_124,
@@ -40,7 +41,7 @@ def run(
     """All of `surgical-marl bench sim`: the text of its table or JSON."""
     if sweeping:
         counts = [count for count in SWEEP if count <= (workload.num_envs or SWEEP[-1])]
-        points, title = [], f"{workload.task} on {workload.scene}; {describe_machine()}"
+        points, title = [], f"{label(workload.task)} on {workload.scene}; {describe_machine()}"
         for point in sweep(workload, engines, counts):
             points.append(point)
             if out:  # anew with each: a sweep takes minutes, and may be stopped

@@ -28,6 +28,7 @@ from surgical_marl.evaluation.metrics import SUCCESS_MM, metrics
 from surgical_marl.learning.room import in_memory
 from surgical_marl.learning.train import make_training
 from surgical_marl.learning.trainer import Trainer
+from surgical_marl.plugins.task_file import label
 from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.policies.actor import acting_policy
 from surgical_marl.runs.environment import make_env
@@ -284,7 +285,7 @@ def table(settings: Settings, goal: Goal, found: Solution) -> str:
     wanted = f"{goal.success:.0%} {exam.what} and less than {goal.collisions:.0%} collisions"
     return "\n".join(
         [
-            f"{settings.task} in {settings.scene}, {settings.algo}, seed {settings.seed}: "
+            f"{label(settings.task)} in {settings.scene}, {settings.algo}, seed {settings.seed}: "
             + (f"{wanted} after {found.seconds:.1f} s" if found.solved else f"given up after {found.seconds:.1f} s"),
             describe_machine(),
             "",

@@ -7,7 +7,7 @@ from typing import Literal
 
 from surgical_marl.content import find
 from surgical_marl.engines.choose import DeviceName
-from surgical_marl.plugins.tasks import TASKS
+from surgical_marl.plugins.tasks import find_task
 from surgical_marl.runtime import has_cuda
 from surgical_marl.tasks.base.options import Options
 from surgical_marl.untrusted.schema import choice, number
@@ -43,7 +43,7 @@ class Workload(Options):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        TASKS.check(self.task)
+        find_task(self.task)
         find("scenes", self.scene)
         if self.device == "cuda" and not has_cuda():
             raise ValueError("device 'cuda' is not there: PyTorch finds no CUDA device; the other is cpu")

@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from surgical_marl.bench.workload import BENCHED, Workload
-from surgical_marl.cli.flags import add_flags, flagged, given, one_of, some_of, whole
-from surgical_marl.plugins.tasks import list_tasks
+from surgical_marl.cli.flags import add_flags, flagged, given, one_of, some_of, task_help, whole
 from surgical_marl.runs.settings import Settings
 
 _OWN_SCENE = "a name (see `list scenes`) or a .yaml file (default: the task's own, or psm)"
@@ -43,7 +42,7 @@ def add_bench(commands: Any) -> None:
 def _bench_parser(kinds: Any, kind: str, what: str, of: type) -> argparse.ArgumentParser:
     """Return the parser of one benchmark: the flags of what it measures, and those that all benchmarks take."""
     parser: argparse.ArgumentParser = kinds.add_parser(kind, help=what)
-    parser.add_argument("--task", default="reach", help=f"one of: {', '.join(list_tasks())}")
+    parser.add_argument("--task", default="reach", help=task_help())
     parser.add_argument("--scene", help=_OWN_SCENE)
     add_flags(parser, of, [name for name in flagged(of) if name != "iterations"])
     parser.add_argument("--cold", action="store_true", help="start without caches")
@@ -68,7 +67,7 @@ def _add_render(kinds: Any) -> None:
 def _add_small(kinds: Any, kind: str, what: str) -> argparse.ArgumentParser:
     """Return the parser of a benchmark that has no settings but its task and its scene."""
     parser: argparse.ArgumentParser = kinds.add_parser(kind, help=what)
-    parser.add_argument("--task", default="reach", help=f"one of: {', '.join(list_tasks())}")
+    parser.add_argument("--task", default="reach", help=task_help())
     parser.add_argument("--scene", help=_OWN_SCENE)
     parser.add_argument("--json", action="store_true", help="one JSON object instead of a sentence")
     parser.set_defaults(command=_bench, name=f"bench {kind}", kind=kind, of=Settings, cold=False)

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from surgical_marl.cli.flags import add_flags, whole
+from surgical_marl.cli.flags import add_flags, task_help, whole
 from surgical_marl.content import BASELINES, PARTNERS, find, list_policies, list_scenes, unknown
-from surgical_marl.plugins.tasks import list_tasks
+from surgical_marl.plugins.tasks import find_task, list_tasks
 from surgical_marl.runs.progress import preparing
 from surgical_marl.tasks.base.options import Options
 from surgical_marl.untrusted.files import is_file, is_folder
@@ -56,7 +56,7 @@ def add_report(commands: Any) -> None:
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
     """Add the flags that say which episodes are played."""
-    parser.add_argument("--task", help="of a policy that is not trained")
+    parser.add_argument("--task", help=f"of a policy that is not trained, {task_help()}")
     parser.add_argument("--scene", help="likewise: a name (see `list scenes`) or a .yaml file")
     add_flags(parser, Options, ("control", "knowledge", "messages", "difficulty", "start"), default="the policy's own")
     add_flags(parser, Options, ("goals",), default="held_out")
@@ -115,8 +115,7 @@ def _check(arguments: argparse.Namespace, policies: Sequence[str]) -> None:
     if not trained and None in (arguments.task, arguments.scene):
         good = f"--task ({', '.join(list_tasks())}) and --scene ({', '.join(list_scenes())})"
         raise ValueError(f"{arguments.name} {policies[0]} needs {good}")
-    if arguments.task not in (None, *list_tasks()):
-        raise unknown("task", arguments.task, list_tasks())
+    arguments.task = None if arguments.task is None else find_task(arguments.task)
     if arguments.scene is not None:
         find("scenes", arguments.scene)
     for policy in trained:

@@ -9,6 +9,7 @@ from dataclasses import fields
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from surgical_marl.content import unknown
+from surgical_marl.plugins.tasks import list_tasks
 
 
 def flagged(of: type) -> list[str]:
@@ -42,6 +43,11 @@ def given(arguments: argparse.Namespace, of: type) -> dict[str, Any]:
     """Return the values of the flags of a dataclass that were given, by the names of its fields."""
     values = {name: getattr(arguments, name, None) for name in flagged(of)}
     return {name: value for name, value in values.items() if value is not None}
+
+
+def task_help() -> str:
+    """Return the text for `--help` of a flag or an argument that names a task."""
+    return f"one of: {', '.join(list_tasks())}; or a task file, my_task.py or my_task.py:Class"
 
 
 def _reader(kind: Any, limits: tuple[int, int] | None) -> tuple[Callable[[str], Any], str]:

@@ -15,13 +15,14 @@ from typing import Any, NoReturn
 
 from surgical_marl.cli.benching import add_bench
 from surgical_marl.cli.evaluating import add_crossplay, add_eval, add_report
-from surgical_marl.cli.flags import add_flags, given, one_of
+from surgical_marl.cli.flags import add_flags, given, one_of, task_help
 from surgical_marl.cli.viewing import add_play, add_replay, add_view
-from surgical_marl.content import find, list_arms, list_objects, list_policies, list_scenes, unknown
+from surgical_marl.content import find, list_arms, list_objects, list_policies, list_scenes
 from surgical_marl.engines.stages import told
 from surgical_marl.machine import lacks_memory
 from surgical_marl.plugins.algorithms import list_algorithms
-from surgical_marl.plugins.tasks import list_tasks
+from surgical_marl.plugins.task_file import is_task_file, label
+from surgical_marl.plugins.tasks import find_task, list_tasks, scene_of
 from surgical_marl.runs.progress import Compilations, preparing
 from surgical_marl.runs.settings import Settings
 from surgical_marl.runtime import calm_threads, defer_compiler
@@ -119,7 +120,7 @@ def _parser() -> argparse.ArgumentParser:
         "Training stops if more than 10 of them, and more than 1 in 10,000 steps, do so in an iteration, or if an "
         "action, value, gradient, loss or weight is not finite.",
     )
-    train.add_argument("task", nargs="?", metavar="TASK", help=f"one of: {', '.join(list_tasks())}")
+    train.add_argument("task", nargs="?", metavar="TASK", help=task_help())
     train.add_argument(
         "--scene", help="a name (see `list scenes`) or a .yaml file (default: the task's own, if it has one)"
     )
@@ -142,8 +143,11 @@ def _parser() -> argparse.ArgumentParser:
     names.add_argument("-v", "--verbose", action="store_true", help="what each one is")
     names.set_defaults(command=_list, name="list")
 
-    audit = commands.add_parser("check", help="say what is wrong with an arm, a scene or an object")
-    audit.add_argument("source", metavar="SOURCE", help="an arm, scene or object: its name, folder or .yaml file")
+    audit = commands.add_parser("check", help="say what is wrong with an arm, a scene, an object or a task file")
+    audit.add_argument(
+        "source", metavar="SOURCE", help="an arm, scene or object: its name, folder or .yaml file; or a task file"
+    )
+    audit.add_argument("--scene", help="in which a task is looked at (default: the task's own, or psm)")
     audit.set_defaults(command=_check, name="check")
 
     export = commands.add_parser("export", help="write a scene for other programs, or a policy to pass on")
@@ -186,6 +190,11 @@ def _list(arguments: argparse.Namespace) -> None:
 
 
 def _check(arguments: argparse.Namespace) -> int:
+    if is_task_file(arguments.source):
+        return _check_task(arguments)
+    if arguments.scene is not None:
+        raise ValueError(f"--scene {arguments.scene} is for a task file such as my_task.py, not for {arguments.source}")
+
     from surgical_marl.scenes.check import check, summary
 
     findings = check(arguments.source)
@@ -194,6 +203,18 @@ def _check(arguments: argparse.Namespace) -> int:
     if not findings:
         print(f"{arguments.source}: nothing wrong found ({summary(arguments.source)})")
     return 1 if findings else 0
+
+
+def _check_task(arguments: argparse.Namespace) -> int:
+    task = find_task(arguments.source)
+
+    from surgical_marl.envs.env import Env
+    from surgical_marl.envs.out_of_reach import out_of_reach
+
+    env = Env(task, arguments.scene or scene_of(task))
+    finding = out_of_reach(env)
+    print(finding or f"{arguments.source}: nothing wrong found ({env.title}, {', '.join(env.agents)})")
+    return 1 if finding else 0
 
 
 def _export_policy(arguments: argparse.Namespace) -> None:
@@ -228,8 +249,7 @@ def _doctor(arguments: argparse.Namespace) -> None:
 
 
 def _train(arguments: argparse.Namespace) -> None:
-    if arguments.task is not None and arguments.task not in list_tasks():
-        raise unknown("task", arguments.task, list_tasks())
+    arguments.task = None if arguments.task is None else find_task(arguments.task)
     if arguments.task is not None and arguments.scene is None and not arguments.resume:
         from surgical_marl.plugins.tasks import TASKS
 
@@ -265,7 +285,8 @@ def _train(arguments: argparse.Namespace) -> None:
     from surgical_marl.runs.lock import owned
 
     try:
-        with preparing(f"{settings.task} on {Path(settings.scene).stem}") if is_first() else contextlib.nullcontext():
+        title = f"{label(settings.task)} on {Path(settings.scene).stem}"
+        with preparing(title) if is_first() else contextlib.nullcontext():
             run = train(settings, out=out, resume=resume)
     except (FloatingPointError, KeyboardInterrupt):
         if is_first() and has_begun(out):
@@ -282,7 +303,7 @@ def _train(arguments: argparse.Namespace) -> None:
 
 
 def _run_folder(settings: Any) -> Path:
-    name = f"{settings.task}-{Path(settings.scene).stem}-{settings.algo}-seed{settings.seed}"
+    name = f"{label(settings.task)}-{Path(settings.scene).stem}-{settings.algo}-seed{settings.seed}"
     return Path("runs") / f"{name}-{time.strftime('%Y%m%d-%H%M%S')}"
 
 

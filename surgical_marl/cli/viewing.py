@@ -10,9 +10,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from surgical_marl.cli.flags import add_flags, whole
+from surgical_marl.cli.flags import add_flags, task_help, whole
 from surgical_marl.content import BASELINES, find, list_policies, list_scenes, unknown
-from surgical_marl.plugins.tasks import list_tasks
+from surgical_marl.plugins.tasks import find_task
 from surgical_marl.runs.progress import preparing
 from surgical_marl.tasks.base.options import Options
 from surgical_marl.untrusted.files import is_file, is_folder
@@ -56,7 +56,7 @@ def add_replay(commands: Any) -> None:
 
 def _add_what(parser: argparse.ArgumentParser) -> None:
     """Add the flags that say what is shown."""
-    parser.add_argument("task", metavar="TASK", help=f"one of: {', '.join(list_tasks())}")
+    parser.add_argument("task", metavar="TASK", help=task_help())
     parser.add_argument(
         "--scene", help="a name (see `list scenes`) or a .yaml file (default: the policy's, or else the task's own)"
     )
@@ -188,8 +188,7 @@ def _settings(arguments: argparse.Namespace) -> tuple[Any, str | None]:
     """Return the settings of what is shown, and who moves the arms; ValueError if it does not exist or fit together."""
     # for policies that need torch: with few environments its threads wait for each other longer than they compute
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    if arguments.task not in list_tasks():
-        raise unknown("task", arguments.task, list_tasks())
+    arguments.task = find_task(arguments.task)
     if arguments.scene is not None:
         find("scenes", arguments.scene)
     who = arguments.policy

@@ -42,7 +42,7 @@ class BatchedEnv:
     """N environments of one task on one scene.
 
     Args:
-        task: a name of `list_tasks()`.
+        task: a name of `list_tasks()`, or a task file, `my_task.py` or `my_task.py:Escort`.
         scene: a name of `list_scenes()` or the path of a scene file; the task's own, or "psm", if None.
         num_envs: how many environments.
         engine: "fused", "mjx" (the reference), or "auto" for the fastest that works.
@@ -50,7 +50,8 @@ class BatchedEnv:
         arrays: library of the arrays that come back, "numpy", "torch" or "jax". Don't write into what you get: it may
             share memory with the engine.
         options: further fields of `surgical_marl.tasks.base.options.Options`: control, difficulty, start, max_steps,
-            decimation, reward, observe, knowledge, messages.
+            decimation, reward, observe, knowledge, messages, and observations, which are "si" by default: policies of
+            runs and controllers read them. For a learner without a normaliser choose "scaled".
 
     Raises:
         ValueError: naming what is unknown or out of range.
@@ -82,12 +83,13 @@ class BatchedEnv:
             if more := meant_for(task, scene, error):
                 raise ValueError(f"{error}{more}") from None
             raise
+        self._made["task"] = self.env.task_name  # of a task file its absolute path
         self._engine: Engine | None = make_engine(self.env, num_envs, engine, device)
         self.num_envs, self.arrays = num_envs, arrays
         self.agents = list(self.env.agents)
         self.scene = self.env.scene
         self.types = alike(self.env)
-        self.task, self.task_name = self.env.task, task
+        self.task, self.task_name = self.env.task, self.env.task_name
         self.control = self.scene.control
         self.max_steps, self.control_dt = self.env.max_steps, self.env.control_dt
         self.device = self.engine.device

@@ -25,7 +25,8 @@ from surgical_marl.envs.knowledge import Knowledge
 from surgical_marl.envs.observations import Scale
 from surgical_marl.envs.observed import Observed
 from surgical_marl.envs.state import Carry, Moved, State
-from surgical_marl.plugins.tasks import TASKS, scene_of
+from surgical_marl.plugins.task_file import label
+from surgical_marl.plugins.tasks import TASKS, find_task, scene_of
 from surgical_marl.runtime import jax, jax_scope, jnp, prepare_jax
 from surgical_marl.scenes.load import load_scene
 from surgical_marl.tasks.base.options import Options, make_options
@@ -48,7 +49,7 @@ class Env:
     """A task on a scene, for one environment.
 
     Args:
-        task: a name of `list_tasks()`.
+        task: a name of `list_tasks()`, or a task file, `my_task.py` or `my_task.py:Escort`.
         scene: a name of `list_scenes()` or the path of a scene file; the task's own, or "psm", if None.
         options: further fields of `surgical_marl.tasks.base.options.Options`.
 
@@ -58,11 +59,12 @@ class Env:
 
     def __init__(self, task: str = "reach", scene: str | None = "bimanual_psm", **options: Any) -> None:
         prepare_jax()
+        task = find_task(task)
         scene = scene_of(task) if scene is None else scene
         self.options: Options = make_options(task, scene, options)
-        task_class = TASKS.load(task)
+        self.task_name = self.options.task
+        task_class = TASKS.load(self.task_name)
         self.scene = load_scene(scene, self.options.control)
-        self.task_name = task
         self.task: Task = task_class(self.scene, self.options)
         self.max_steps = self.options.max_steps or self.task.max_steps
         self.agents = self.scene.agents
@@ -88,7 +90,7 @@ class Env:
     @property
     def title(self) -> str:
         """Name for messages."""
-        return f"{self.task_name} on {self.scene.name}"
+        return f"{label(self.task_name)} on {self.scene.name}"
 
     @property
     def pauses(self) -> bool:

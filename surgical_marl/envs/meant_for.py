@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from contextlib import suppress
 
+from surgical_marl.plugins.task_file import is_task_file, label
 from surgical_marl.plugins.tasks import TASKS, list_tasks
 from surgical_marl.scenes.load import load_scene
 
@@ -13,9 +14,9 @@ def meant_for(task: str, scene: str | None, error: ValueError) -> str:
 
     "" for other errors, and where the error says it itself.
     """
-    if type(error) is not ValueError or task not in list_tasks() or "choose from" in str(error):
+    if type(error) is not ValueError or not (is_task_file(task) or task in list_tasks()) or "choose from" in str(error):
         return ""
     with suppress(ValueError):  # of a scene that fits no task
         if scene and (meant := TASKS.load(task).scenes) and load_scene(scene).name not in meant:
-            return f"; {task} is meant for the scenes {', '.join(meant)}"
+            return f"; {label(task)} is meant for the scenes {', '.join(meant)}"
     return ""

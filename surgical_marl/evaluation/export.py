@@ -17,6 +17,7 @@ from surgical_marl.evaluation.card import CARD, CLIP, EVALUATION, card, misses, 
 from surgical_marl.evaluation.command import play_all
 from surgical_marl.evaluation.evaluate import summarise
 from surgical_marl.files import write_atomic
+from surgical_marl.plugins.task_file import label
 from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.policies.actor import load_actor
 from surgical_marl.policies.onnx_file import SUFFIX, write_onnx
@@ -134,7 +135,7 @@ def _fill(folder: Path, run: Path, settings: Settings, evaluation: dict[str, Any
     for name in (CONFIG, METRICS):
         shutil.copyfile(run / name, folder / name)
     (folder / EVALUATION).write_text(_compact(evaluation))
-    draw_curve(folder, f"{settings.task} in {settings.scene}, {settings.algo}, seed {settings.seed}")
+    draw_curve(folder, f"{label(settings.task)} in {settings.scene}, {settings.algo}, seed {settings.seed}")
     print("recording a clip", file=sys.stderr)
     try:
         record(env, load_policy(run, env), folder / CLIP, small=True)

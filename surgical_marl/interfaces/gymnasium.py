@@ -21,6 +21,7 @@ from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.interfaces.joint import JointAgent
 from surgical_marl.interfaces.rendering import Rendering, check_mode, check_size
 from surgical_marl.policies.teammates import Teammate, Teammates
+from surgical_marl.tasks.base.options import scaled_by_default
 
 RENDER_MODES = ("rgb_array",)
 
@@ -40,8 +41,8 @@ class LimitInSpec:
     def spec(self, spec: EnvSpec | None) -> None:
         self._spec = found = copy.copy(spec)
         if found is not None:
-            limit = self.batch.max_steps
-            found.max_episode_steps, found.kwargs = limit, {**found.kwargs, "max_steps": limit}
+            limit, task = self.batch.max_steps, self.batch.task_name
+            found.max_episode_steps, found.kwargs = limit, {**found.kwargs, "task": task, "max_steps": limit}
 
 
 class SurgicalEnv(LimitInSpec, gymnasium.Env[Any, np.ndarray]):
@@ -53,14 +54,14 @@ class SurgicalEnv(LimitInSpec, gymnasium.Env[Any, np.ndarray]):
     "agents": the values of each arm.
 
     Args:
-        task: a name of `list_tasks()`.
+        task: a name of `list_tasks()`, or a task file, `my_task.py` or `my_task.py:Escort`.
         scene: a name of `list_scenes()` or the path of a scene file; the task's own, or "psm", if None.
         agent: the arm that is moved. None for all arms that have no teammate, as one joint agent.
         teammates: arm -> who moves it: a policy's name or run folder, "oracle", "zero", "random", "frozen", or a
             function from what the arm observes to its action. With `agent`, each other arm needs one.
         render_mode: "rgb_array" or None. For a window, "human" makes `gymnasium.make` add its own `HumanRendering`.
         render_size: width and height of a picture, pixels; None for 480 and 360.
-        options: further arguments of `surgical_marl.envs.batch.BatchedEnv`.
+        options: further arguments of `surgical_marl.envs.batch.BatchedEnv`; `observations` are "scaled" by default.
 
     Raises:
         ValueError: naming the unknown value and the good ones.
@@ -135,7 +136,7 @@ def make_batch(task: str, scene: str | None, num_envs: int, options: dict[str, A
     """
     if options.get("arrays", "numpy") != "numpy":
         raise ValueError(f"arrays {options['arrays']!r}: Gymnasium's faces speak numpy; leave it out")
-    return BatchedEnv(task, scene, num_envs=num_envs, **options)
+    return BatchedEnv(task, scene, num_envs=num_envs, **scaled_by_default(options))
 
 
 def _limit_of_make() -> int | None:

@@ -26,7 +26,7 @@ class SurgicalVectorEnv(LimitInSpec, VectorEnv[Any, np.ndarray, Any]):
 
     Args:
         num_envs: N.
-        task: a name of `list_tasks()`.
+        task: a name of `list_tasks()`, or a task file, `my_task.py` or `my_task.py:Escort`.
         scene: a name of `list_scenes()` or the path of a scene file; the task's own, or "psm", if None.
         agent: the arm that is moved, and `teammates` those who move the others: as of
             `surgical_marl.interfaces.gymnasium.SurgicalEnv`, but functions get and return arrays [N, ...].
@@ -35,7 +35,7 @@ class SurgicalVectorEnv(LimitInSpec, VectorEnv[Any, np.ndarray, Any]):
             step, or when `reset(options={"reset_mask": ...})` says so.
         render_mode: "rgb_array" or None.
         render_size: width and height of a picture, pixels; None for 480 and 360.
-        options: further arguments of `surgical_marl.envs.batch.BatchedEnv`.
+        options: further arguments of `surgical_marl.envs.batch.BatchedEnv`; `observations` are "scaled" by default.
 
     Raises:
         ValueError: naming the unknown value and the good ones.

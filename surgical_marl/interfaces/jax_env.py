@@ -22,6 +22,7 @@ from surgical_marl.envs.actions import check_agents, check_unmasked, shown
 from surgical_marl.envs.env import Env
 from surgical_marl.envs.state import Carry
 from surgical_marl.runtime import jax, jax_scope, jnp
+from surgical_marl.tasks.base.options import scaled_by_default
 
 if TYPE_CHECKING:
     from gymnasium import spaces
@@ -175,15 +176,15 @@ def jax_env(task: str = "reach", scene: str | None = "bimanual_psm", **options: 
     """Make an environment of pure JAX functions: `reset(key)` and `step(key, state, actions)`.
 
     Args:
-        task: a name of `list_tasks()`.
+        task: a name of `list_tasks()`, or a task file, `my_task.py` or `my_task.py:Escort`.
         scene: a name of `list_scenes()` or the path of a scene file; the task's own, or "psm", if None.
         options: further fields of `surgical_marl.tasks.base.options.Options`, such as `control`, `difficulty`, `start`
-            and `max_steps`.
+            and `max_steps`. `observations` are "scaled" by default.
 
     Raises:
         ValueError: naming the unknown value and the good ones, or an environment that needs pictures.
     """
-    return JaxEnv(Env(task, scene, **options))
+    return JaxEnv(Env(task, scene, **scaled_by_default(options)))
 
 
 @lru_cache(MOST_KEPT)

@@ -22,6 +22,7 @@ from pettingzoo import ParallelEnv
 from surgical_marl.envs.actions import check_actions
 from surgical_marl.interfaces.rendering import MODES, Rendering, check_mode, check_size
 from surgical_marl.plugins.tasks import module_name
+from surgical_marl.tasks.base.options import scaled_by_default
 
 if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv
@@ -214,7 +215,7 @@ def parallel_env(
     """Make a PettingZoo parallel environment.
 
     Args:
-        task: a name of `list_tasks()`.
+        task: a name of `list_tasks()`, or a task file, `my_task.py` or `my_task.py:Escort`.
         scene: a name of `list_scenes()` or the path of a scene file; the task's own, or "psm", if None.
         engine: "auto", "fused" or "mjx".
         device: "auto", "cpu" or "cuda".
@@ -224,10 +225,12 @@ def parallel_env(
         render_mode: of one environment: None, "rgb_array" for pictures, or "human" for a window that follows.
         render_size: width and height of a picture, pixels; None for 480 and 360.
         options: `control` ("position", "velocity" or "torque"), `difficulty` (a level of the task), `start` ("home" or
-            "random"), `max_steps` (control steps until truncation), `decimation` (physics steps a control step),
-            `reward` (weights of reward terms, as in {"collision": -5}), `knowledge` ("task", "all", "own" or "one": who
-            knows what), `messages` (numbers that an agent says to its teammates in a step) and `observe` (terms that
-            agents see, as in {"ecm_0": ["qpos", "image"]}): see `surgical_marl.tasks.base.options.Options`.
+            "random"), `observations` ("scaled" for numbers from -1 to 1 between their bounds, the default, or "si" for
+            metres, radians and newtons), `max_steps` (control steps until truncation), `decimation` (physics steps a
+            control step), `reward` (weights of reward terms, as in {"collision": -5}), `knowledge` ("task", "all",
+            "own" or "one": who knows what), `messages` (numbers that an agent says to its teammates in a step) and
+            `observe` (terms that agents see, as in {"ecm_0": ["qpos", "image"]}): see
+            `surgical_marl.tasks.base.options.Options`.
 
     Raises:
         ValueError: naming the unknown value and the good ones.
@@ -243,6 +246,7 @@ def parallel_env(
     if options.get("max_steps") is None:
         options["max_steps"] = max_cycles
     count = 1 if num_envs is None else num_envs
+    options = scaled_by_default(options)
     batch = BatchedEnv(task, scene, num_envs=count, engine=engine, device=device, arrays=arrays, **options)
     if num_envs is not None:
         return SurgicalBatchedParallelEnv(batch)

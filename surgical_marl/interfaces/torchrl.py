@@ -1,6 +1,7 @@
 """The TorchRL face: agents of a kind are a group, and tensors stay where the environments are.
 
-    env = TorchRLEnv(BatchedEnv("reach", "trimanual_psm_ecm", num_envs=1024, arrays="torch"))
+    batch = BatchedEnv("reach", "trimanual_psm_ecm", num_envs=1024, arrays="torch", observations="scaled")
+    env = TorchRLEnv(batch)
     env.rollout(100, break_when_any_done=False)["psm", "observation"]      # [1024, 100, 2, 34]
 
 As in TorchRL's own environments with many agents, what a group has lies under the group's name, and what all share at

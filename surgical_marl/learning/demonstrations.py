@@ -26,6 +26,7 @@ from torch import Tensor
 from surgical_marl.cache import cached_arrays
 from surgical_marl.engines.stepper import describe
 from surgical_marl.envs.env import Env
+from surgical_marl.plugins.task_file import label
 from surgical_marl.policies.actor import acting_policy
 from surgical_marl.policies.layout import Layout
 from surgical_marl.policies.oracle import oracle
@@ -102,7 +103,7 @@ class Demonstrations:
         finally:
             env.close()
         if not len(rows["states"]):
-            raise ValueError(f"{_NEITHER} for {settings.task}: its oracle never succeeded")
+            raise ValueError(f"{_NEITHER} for {label(settings.task)}: its oracle never succeeded")
         groups = {**layout.stack({agent: states.pop(agent) for agent in agents}), "state": states.pop("state")}
         self._settings, self._layout, self._asked = settings, layout, 0
         self.carry: dict[str, Tensor] = states

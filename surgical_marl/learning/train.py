@@ -17,6 +17,8 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
+from surgical_marl.envs.env import Env
+from surgical_marl.envs.out_of_reach import out_of_reach
 from surgical_marl.files import remove_temporaries
 from surgical_marl.learning import distributed
 from surgical_marl.learning.demonstrations import check_demonstrations
@@ -24,6 +26,8 @@ from surgical_marl.learning.faults import Diverged, Fault
 from surgical_marl.learning.log import Log, Reports
 from surgical_marl.learning.room import check_room, in_memory
 from surgical_marl.learning.trainer import OWN, Trainer
+from surgical_marl.plugins.task_file import label
+from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.runs.checkpoint import (
     not_finite,
     read_checkpoint,
@@ -75,6 +79,7 @@ MOST_FAULTS = 10
 def make_training(settings: Settings) -> Trainer:
     """Make a run in memory. ValueError if memory is short, or the oracle can't demonstrate what it should."""
     settings = settings.in_training()
+    check_reach(settings)
     if settings.shown_by_oracle:
         check_demonstrations(settings)
     with distributed.in_turn():
@@ -82,6 +87,17 @@ def make_training(settings: Settings) -> Trainer:
     check_room(settings, env)
     with in_memory(settings.num_envs):
         return Trainer(settings, env)
+
+
+def check_reach(settings: Settings) -> None:
+    """Raise a ValueError if arms can't reach many of the targets of a task.
+
+    Tasks of this package draw targets that are within reach.
+    """
+    if TASKS.load(settings.task).__module__ == f"{TASKS.package}.{settings.task}":
+        return
+    if (finding := out_of_reach(Env(**settings.of_environment()))) is not None:
+        raise ValueError(finding)
 
 
 def train(settings: Settings, *, out: Path, resume: Path | None = None) -> Path:
@@ -211,7 +227,7 @@ def _run(training: Trainer, out: Path) -> None:
     if distributed.rank() == 0:
         from surgical_marl.runs.curve import draw_curve  # matplotlib: not before training has begun
 
-        draw_curve(out, f"{settings.task} in {settings.scene}, {settings.algo}, seed {settings.seed}")
+        draw_curve(out, f"{label(settings.task)} in {settings.scene}, {settings.algo}, seed {settings.seed}")
     distributed.wait()  # where one process ends early, torchrun ends them all
     if training.stopping:
         number = received[0] if received else signal.SIGTERM

@@ -10,6 +10,7 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import Any, NamedTuple
 
 from surgical_marl.content import unknown
+from surgical_marl.plugins.task_file import file_of
 
 
 class Source(NamedTuple):
@@ -122,4 +123,6 @@ def _itself(cls: type) -> type:
 
 def _where(cls: Any) -> str:
     """Return the origin of a class that a program defines."""
+    if (path := file_of(cls)) is not None:
+        return f"{path}:{cls.__qualname__}"
     return f"{getattr(cls, '__module__', 'this program')}.{getattr(cls, '__qualname__', cls)}"

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from surgical_marl.envs.observations import proprioception
+from surgical_marl.plugins.task_file import label
 from surgical_marl.policies.convert import like, to_numpy
 from surgical_marl.policies.scripted import Scripted, without_words
 from surgical_marl.robots.inverse_kinematics import inverse_kinematics
@@ -65,7 +66,7 @@ def oracle(env: BatchedEnv, agents: Sequence[str] | None = None) -> Oracle:
     check_control(env.control)
     steps = env.task.script()
     if not env.task.has_targets and not steps:
-        raise ValueError(f"the task {env.task_name!r} has no target for tool tips that an oracle could move to")
+        raise ValueError(f"the task {label(env.task_name)!r} has no target for tool tips that an oracle could move to")
     agents = env.agents if agents is None else agents
     return Scripted(env, steps, agents) if steps else _Oracle(env, agents)
 

@@ -12,6 +12,7 @@ import jinja2
 from markupsafe import Markup
 
 import surgical_marl
+from surgical_marl.plugins.task_file import label
 from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.report import judged, repeat, tables, training
 from surgical_marl.report.charts import COLORS, Chart, Drawing
@@ -55,7 +56,7 @@ def render(runs: Sequence[Run]) -> str:
     _check(runs)
     groups = group(runs)
     task, scenes = runs[0].config["task"], list(dict.fromkeys(str(run.config["scene"]) for run in runs))
-    heading = f"{task} in {', '.join(scenes)}"
+    heading = f"{label(str(task))} in {', '.join(scenes)}"
     drawing = Drawing()
     sections = [*_evaluation(drawing, groups), *_training(drawing, groups), *_settings(groups)]
     page = _template().render(

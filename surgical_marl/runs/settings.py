@@ -10,7 +10,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, ClassVar, Literal, get_type_hints
 
-from surgical_marl.content import as_name, find, list_configs
+from surgical_marl.content import as_name, content_dir, find, list_configs
 from surgical_marl.engines.choose import DeviceName, EngineName
 from surgical_marl.plugins.algorithms import ALGORITHMS
 from surgical_marl.plugins.tasks import TASKS
@@ -22,6 +22,8 @@ from surgical_marl.yaml_file import dump_yaml, load_yaml, parse_yaml
 
 SECTIONS = ("scenes", "difficulties", "starts")
 """Sections of a task's file: settings for a scene, for a level of difficulty, and for where episodes start."""
+DEFAULT = "_default.yaml"
+"""File in `configs/` with the settings of tasks that have none of their own."""
 MAX_LAYERS, MAX_WEIGHTS = 32, 50_000_000
 """Layers of a network, and weights between them: 200 MB, and four times that to learn with."""
 
@@ -205,7 +207,8 @@ def load_config(task: str, scene: str, overrides: Iterable[str] = ()) -> Setting
     On a GPU each of the first six is followed by the section `cuda` in it.
 
     Args:
-        task: a name of `list_tasks()`. Its file is the one of that name in `configs/`, if there is one.
+        task: a name of `list_tasks()`, or a task file. Its settings are the file of that name in `configs/`, or else
+            `configs/_default.yaml`.
         scene: a scene's name, or the path of a scene file.
         overrides: `key=value` strings, dotted for sections: `num_envs=512`,
             `ppo.learning_rate=1e-3`.
@@ -213,7 +216,7 @@ def load_config(task: str, scene: str, overrides: Iterable[str] = ()) -> Setting
     Raises:
         ValueError: unknown task, algorithm or key, or a value of the wrong type or out of range.
     """
-    TASKS.check(task)
+    TASKS.check(task)  # a report of a stranger's run asks for its settings: a task file is not allowed to run by that
     scene = as_name("scene", scene)
     values, overrides = _read_task(task), list(overrides)
     scenes, difficulties, starts = (values.pop(name, None) or {} for name in SECTIONS)
@@ -258,10 +261,8 @@ def config_text(settings: Settings, notes: Mapping[str, Mapping[str, Any]]) -> s
 
 
 def _read_task(task: str) -> dict[str, Any]:
-    """Return the content of a task's file, checked; a task without one uses the defaults."""
-    if task not in list_configs():
-        return {}
-    path = find("configs", task)
+    """Return the content of a task's file, checked; a task without one has the settings of `DEFAULT`."""
+    path = find("configs", task) if task in list_configs() else content_dir("configs") / DEFAULT
     values = _read_yaml(path)
     _check_settings(Place(file=path), values, (*SECTIONS, "cuda"), without=("task", "scene"))
     return values

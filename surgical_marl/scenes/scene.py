@@ -34,6 +34,10 @@ class Mount:
     workspace: np.ndarray
     """The point in front of the arm around which targets are drawn, base frame, m, shape [3]."""
 
+    def to_base(self, points: np.ndarray) -> np.ndarray:
+        """Return points [..., 3] of the world, m, in the arm's base frame."""
+        return np.asarray((points - self.position) @ self.rotation)
+
 
 @dataclass(frozen=True)
 class Scene:

@@ -197,10 +197,10 @@ def environment(task: str, scene: str | None = None) -> dict[str, Any]:
     """What a seed of an environment leads to: the agents' terms and infos, and fingerprints of the numbers.
 
     Fingerprints are sums with fixed weights, and no hashes: another processor rounds last digits in another way, which
-    changes all of a hash.
+    changes all of a hash. Observations are in SI units, of which every other kind is made.
     """
     scene = scene or first_scene(task)
-    env = sm.parallel_env(task, scene=scene, engine="fused", device="cpu")
+    env = sm.parallel_env(task, scene=scene, engine="fused", device="cpu", observations="si")
     rng = np.random.default_rng(0)
     first, _ = env.reset(seed=0)
     rewards = dict.fromkeys(env.possible_agents, 0.0)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 
+from surgical_marl.plugins.task_file import label
 from surgical_marl.runtime import jnp
 from surgical_marl.tasks.base.grips import bars, frames
 from surgical_marl.tasks.base.object_terms import PARTS
@@ -100,14 +101,14 @@ class ObjectTask(Task):
 
     def __init__(self, scene: Scene, options: Options) -> None:
         super().__init__(scene, options)
-        self.object = find_object(scene, options.task, (self.point,), self.scenes or ())
+        self.object = find_object(scene, label(options.task), (self.point,), self.scenes or ())
         self.called = self.object
         """What the terms about it begin with that agents observe."""
         holders = [agent for agent, mount in scene.mounts.items() if mount.arm.jaw and len(mount.arm.jaw.pads) == 2]
         if len(holders) != self.hands:
             raise ValueError(
-                f"{options.task} needs a scene with {self.hands} arm{'s' * (self.hands > 1)} whose jaws have pads; "
-                f"{scene.name!r} has {len(holders)}{_such_as(self.scenes or ())}"
+                f"{label(options.task)} needs a scene with {self.hands} arm{'s' * (self.hands > 1)} "
+                f"whose jaws have pads; {scene.name!r} has {len(holders)}{_such_as(self.scenes or ())}"
             )
         self.picker, self.presenter = holders[0], holders[-1]
         """The arm that picks the object up, and the one that brings it to the goal: the same if there is one."""

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_type_hints
 
 from surgical_marl.content import as_name
+from surgical_marl.plugins.task_file import absolute
 from surgical_marl.scenes.timing import DECIMATION
 from surgical_marl.untrusted.schema import Checked, choice, number
 
@@ -26,7 +27,7 @@ class Options(Checked):
     """The options of an environment.
 
     Attributes:
-        task: a name of `list_tasks()`.
+        task: a name of `list_tasks()`, or a task file, `my_task.py` or `my_task.py:Escort`.
         scene: a name of `list_scenes()` or the path of a scene file.
         control: what an action commands: "position" moves position targets, "velocity" and "torque" command those.
         difficulty: a level of the task; the docstring of the task says what each level is.
@@ -36,7 +37,8 @@ class Options(Checked):
         max_steps: control steps until an episode is truncated; the task's own number if None.
         decimation: physics steps per control step.
         reward: weights of reward terms that replace the task's own, as in {"collision": -5}.
-        observations: "si" for metres, radians and newtons, or "scaled" for numbers from -1 to 1 between their bounds.
+        observations: "si" for metres, radians and newtons, or "scaled" for numbers from -1 to 1 between their bounds,
+            which is the default of `parallel_env`, `jax_env` and Gymnasium's environments.
         knowledge: who knows what (docs/tasks.md). "task": what the task shows each arm. "all": every arm also knows the
             joints, tips and goals of the others. "own": nothing about other arms. "one": one arm knows the goals of
             all, and the others none.
@@ -61,6 +63,10 @@ class Options(Checked):
     messages: int = number(0, 0, 64, "numbers that an agent says to its teammates in a step")
     reward: Mapping[str, float] = field(default_factory=dict, metadata={"range": (-MOST_WEIGHT, MOST_WEIGHT)})
     observe: Mapping[str, Sequence[str]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "task", absolute(self.task))
 
     def of_environment(self) -> dict[str, Any]:
         """Return the environment's options by name, without what a subclass adds to them."""
@@ -90,6 +96,12 @@ def make_options(task: str, scene: str | Path, options: Mapping[str, Any]) -> Op
             raise UnknownOption(f"unexpected keyword argument {name!r}{hint} (the options are {', '.join(known)})")
     given = {name: value for name, value in options.items() if value is not None}
     return Options(**{"task": task, "scene": as_name("scene", scene), **given})
+
+
+def scaled_by_default(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the options of an interface for other libraries' learners: observations are scaled unless they say how."""
+    chosen = options.get("observations")
+    return {**options, "observations": "scaled" if chosen is None else chosen}
 
 
 def choices(name: str, of: type = Options) -> tuple[str, ...]:

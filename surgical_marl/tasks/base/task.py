@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 import numpy as np
 
 from surgical_marl.content import unknown
+from surgical_marl.plugins.task_file import label
 from surgical_marl.runtime import jax, jnp
 from surgical_marl.scenes.poses import Pose
 from surgical_marl.tasks.base.object_terms import object_terms
@@ -107,7 +108,7 @@ class Task:
         if options.difficulty not in self.levels:
             raise unknown("difficulty", options.difficulty, list(self.levels))
         if options.start not in self.starts:
-            raise unknown(f"start of task {options.task!r}", options.start, self.starts)
+            raise unknown(f"start of task {label(options.task)!r}", options.start, self.starts)
         self.scene, self.level, self.starts_at = scene, self.levels[options.difficulty], options.start
         self.seed = SEEDS[options.goals]
         """Seed of the draws on the host: held-out goals come from another seed than those of training."""

@@ -103,7 +103,8 @@ class Panel:
         scene = self._session.settings.scene
         scenes = list(dict.fromkeys([*list_scenes(), scene]))
         levels = list(TASKS.load(env.task_name).levels)
-        task = gui.add_dropdown("task", list_tasks(), initial_value=env.task_name)
+        tasks = list(dict.fromkeys([*list_tasks(), env.task_name]))
+        task = gui.add_dropdown("task", tasks, initial_value=env.task_name)
         place = gui.add_dropdown("scene", scenes, initial_value=scene)
         level = gui.add_dropdown("difficulty", levels, initial_value=self._session.settings.difficulty)
         count = gui.add_dropdown(

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from surgical_marl.plugins.task_file import label
 from surgical_marl.untrusted.markup import as_html
 from surgical_marl.untrusted.values import one_line
 from surgical_marl.view.history import summary
@@ -19,7 +20,7 @@ _CELL = "padding:1px 8px 1px 0;vertical-align:top"
 def status(session: Session, paused: bool = False) -> str:
     """Return what the first environment is at, as HTML: its time, and errors, stages and contacts of all agents."""
     env = session.env
-    names = [as_html(one_line(name)) for name in (env.task_name, env.scene.name, session.settings.difficulty)]
+    names = [as_html(one_line(name)) for name in (label(env.task_name), env.scene.name, session.settings.difficulty)]
     step, dt = int(np.asarray(env.steps)[0]), env.control_dt
     time = f"{step * dt:.2f} of {env.max_steps * dt:.0f} s, seed {session.seed}{', paused' if paused else ''}"
     rows = "".join(_row(agent, session.infos[agent]) for agent in env.agents if agent in session.infos)

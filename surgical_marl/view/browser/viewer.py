@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from surgical_marl.engines.stages import told
+from surgical_marl.plugins.task_file import label
 from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.runs.settings import Settings
 from surgical_marl.view.browser.arms import Arms
@@ -108,7 +109,7 @@ class Viewer:
         old = self.session
         if choice == _choice(old):
             return
-        self._say("Preparing", f"{choice.task} on {choice.scene}", 5)
+        self._say("Preparing", f"{label(choice.task)} on {choice.scene}", 5)
         try:
             settings, who = _settings(choice, old)
             self._further = tuple(dict.fromkeys([*self._further, *old.choices]))  # with runs that a person named
