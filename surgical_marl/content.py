@@ -67,26 +67,26 @@ def list_policies() -> list[str]:
     return _names("policies")
 
 
-def find(kind: str, name_or_path: str | os.PathLike[str], where: str = "") -> Path:
+def find(kind: str, name_or_path: str | os.PathLike[str], where: str = "", folder: Path | None = None) -> Path:
     """Return the file or folder of content by its name, or of a user's own by its path.
 
     Args:
         kind: one of the folders of content, such as "arms".
         name_or_path: what to find.
         where: the place in a file that names it, for the error.
+        folder: of the file that names it, where a relative path begins; None for the working folder.
 
     Raises:
         ValueError: nothing has that name or is at that path, or two packages have something of that name.
     """
     places, text = _places(kind), as_name(_NOUNS[kind], name_or_path)
+    if (own := own_path(kind, text, folder)) is not None:
+        return own
     if text in places:
         if len(places[text]) > 1:
             where = " and ".join(str(path) for path in places[text])
             raise ValueError(f"the {_NOUNS[kind]} {text!r} is in {where}: name the one that is meant by its path")
         return places[text][0]
-    path = user_path(text)
-    if text and (is_file(path) if kind in _SUFFIX else is_folder(path)):
-        return path.resolve()
     error = unknown(_NOUNS[kind], text, list(places))
     raise ValueError(f"{where}: {error}") if where else error
 
@@ -97,6 +97,23 @@ def as_name(noun: str, value: Any) -> str:
     if not isinstance(text, str):
         raise ValueError(f"the {noun} must be a name or a path, not {shown(value)}")
     return text
+
+
+def own_path(kind: str, text: str, folder: Path | None = None) -> Path | None:
+    """Return the absolute path of a user's own content, links resolved; None if it is content by its name, or none.
+
+    The arguments are those of `find`. Beside a file that names it, own content goes before content of the same name.
+    """
+    path = (folder or Path()) / user_path(text)
+    there = bool(text) and (is_file(path) if kind in _SUFFIX else is_folder(path))
+    if not there or (text in _places(kind) and (folder is None or not is_file(path / _MARKER.get(kind, "")))):
+        return None
+    return path.resolve()
+
+
+def absolute(kind: str, text: str) -> str:
+    """Return a path of content as an absolute one, so that it is the same from any working folder; names stay."""
+    return str(own_path(kind, text) or text)
 
 
 def unknown(noun: str, value: object, good: Sequence[str]) -> ValueError:

@@ -33,8 +33,13 @@ def write_atomic(path: Path, write: Callable[[Path], object]) -> None:
 def remove_temporaries(folder: Path) -> None:
     """Remove temporary files that `write_atomic`, or a film, leaves in a folder if its process is killed."""
     for temporary in folder.glob(".*"):
-        if re.fullmatch(r"\..+\.\d+\.(tmp|mp4|gif|webp)", temporary.name):
+        if is_temporary(temporary.name):
             temporary.unlink(missing_ok=True)
+
+
+def is_temporary(name: str) -> bool:
+    """Return whether a file of this name is one that `remove_temporaries` removes."""
+    return re.fullmatch(r"\..+\.\d+\.(tmp|mp4|gif|webp)", name) is not None
 
 
 def _flush(path: Path, flags: int) -> None:

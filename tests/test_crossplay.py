@@ -25,7 +25,7 @@ SMALL = Settings(num_envs=8, iterations=1, steps_per_iteration=8, network=Networ
 
 def make_env(settings: Settings, num_envs: int | None = None) -> Any:
     env = FakeEnv({"psm": 2}, {"psm": 3}, num_envs or settings.num_envs, max_steps=14)
-    env.scene.name = settings.scene
+    env.scene.name, env.env.options = settings.scene, settings
     return env
 
 

@@ -217,6 +217,22 @@ def test_a_take_leads_to_the_same_numbers(tmp_path: Path) -> None:
     assert found.differs_at == 33 and found.largest > 0
 
 
+def test_a_take_keeps_a_scene_of_the_users_own(tmp_path: Path) -> None:
+    """The program is that of the test above: the scene has the name and the content of one that ships."""
+    own, takes = tmp_path / "bimanual_psm.yaml", tmp_path / "takes"
+    shutil.copy(find("scenes", "bimanual_psm"), own)
+    settings = dataclasses.replace(SETTINGS, scene=str(own))
+    session = Session(settings, "zero", num_envs=2, record=takes)
+    session.step()
+    session.close()
+    own.write_text(find("scenes", "psm").read_text())
+    moved = takes.rename(tmp_path / "moved")
+    assert read_take(moved / "take-0001.npz")[0]["environment"]["scene"] == "content/bimanual_psm.yaml"
+    assert replay(moved / "take-0001.npz")[:3] == (1, None, 0.0)
+    with pytest.raises(ValueError, match=r"bimanual_psm.yaml differs from .*: name another folder"):
+        Session(settings, "zero", num_envs=2, record=moved)
+
+
 def test_a_file_that_is_no_take_is_refused(tmp_path: Path) -> None:
     (tmp_path / "text.npz").write_text("no")
     np.savez(tmp_path / "other.npz", qpos=np.zeros(3))

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 # Only light imports here, as in main.py.
 import argparse
-from pathlib import Path
 from typing import Any
 
 from surgical_marl.bench.workload import BENCHED, Workload
 from surgical_marl.cli.flags import add_flags, flagged, given, one_of, some_of, task_help, whole
 from surgical_marl.runs.settings import Settings
+from surgical_marl.untrusted.files import user_path
 
 _OWN_SCENE = "a name (see `list scenes`) or a .yaml file (default: the task's own, or psm)"
 
@@ -23,7 +23,7 @@ def add_bench(commands: Any) -> None:
     sim.add_argument("--engine", type=some_of(BENCHED), default=BENCHED[:1], metavar=shape, help=several)
     counts = "from 1 to 4 million environments, or to --num-envs, as far as memory goes"
     sim.add_argument("--sweep", action="store_true", help=counts)
-    sim.add_argument("--out", type=Path, metavar="FILE.png", help="picture of a sweep")
+    sim.add_argument("--out", type=user_path, metavar="FILE.png", help="picture of a sweep")
     for kind, what in (("train", "steps/s with learning"), ("solve", "seconds until a policy is good")):
         learns = _bench_parser(kinds, kind, what, Settings)
         learns.usage = "%(prog)s [options] [key=value ...]"

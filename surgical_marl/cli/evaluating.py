@@ -13,7 +13,7 @@ from surgical_marl.content import BASELINES, PARTNERS, find, list_policies, list
 from surgical_marl.plugins.tasks import find_task, list_tasks
 from surgical_marl.runs.progress import preparing
 from surgical_marl.tasks.base.options import Options
-from surgical_marl.untrusted.files import is_file, is_folder
+from surgical_marl.untrusted.files import is_file, is_folder, user_path
 
 
 def add_eval(commands: Any) -> None:
@@ -24,10 +24,12 @@ def add_eval(commands: Any) -> None:
     _add_options(parser)
     who = f"who moves an agent instead: a run folder, a policy's name, {', '.join(PARTNERS)}; can be given again"
     parser.add_argument("--partner", action="append", default=[], metavar="ROLE=POLICY", help=who)
-    parser.add_argument("--against", type=Path, metavar="FILE.json", help="an older result to compare with")
+    parser.add_argument("--against", type=user_path, metavar="FILE.json", help="an older result to compare with")
     parser.add_argument("--json", action="store_true", help="one JSON object instead of a table")
-    parser.add_argument("--csv", type=Path, metavar="FILE.csv", help="a row for each run and agent")
-    parser.add_argument("--figure", type=Path, metavar="FILE.png", help="success against threshold, and the errors")
+    parser.add_argument("--csv", type=user_path, metavar="FILE.csv", help="a row for each run and agent")
+    parser.add_argument(
+        "--figure", type=user_path, metavar="FILE.png", help="success against threshold, and the errors"
+    )
     parser.set_defaults(command=_eval, name="eval")
 
 
@@ -38,7 +40,7 @@ def add_crossplay(commands: Any) -> None:
     parser.add_argument("teams", nargs="+", metavar="RUN_OR_POLICY", help=what)
     _add_options(parser)
     parser.add_argument("--json", action="store_true", help="one JSON object instead of tables")
-    parser.add_argument("--figure", type=Path, metavar="FILE.png", help="heat maps of the success")
+    parser.add_argument("--figure", type=user_path, metavar="FILE.png", help="heat maps of the success")
     parser.set_defaults(command=_crossplay, name="crossplay")
 
 
@@ -48,7 +50,7 @@ def add_report(commands: Any) -> None:
     what = "run folders and shipped policies of one task; runs that differ by their seed alone are shown as one group"
     parser.add_argument("runs", nargs="+", metavar="RUN", help=what)
     where = "default: report.html in the run's folder, or here for several runs and for shipped policies"
-    parser.add_argument("--out", type=Path, metavar="FILE.html", help=where)
+    parser.add_argument("--out", type=user_path, metavar="FILE.html", help=where)
     evaluate = "first play 200 episodes with each policy whose episodes are not kept"
     parser.add_argument("--evaluate", action="store_true", help=evaluate)
     parser.set_defaults(command=_report, name="report")
@@ -99,7 +101,7 @@ def _crossplay(arguments: argparse.Namespace) -> None:
 def _report(arguments: argparse.Namespace) -> None:
     _check_files(("--out", arguments.out, ".html"))
     for run in arguments.runs:
-        if not (is_file(run) or is_folder(run)) and run not in list_policies():
+        if not (is_file(user_path(run)) or is_folder(user_path(run))) and run not in list_policies():
             raise unknown("run or policy", run, list_policies())
 
     from surgical_marl.report.command import report
@@ -119,7 +121,7 @@ def _check(arguments: argparse.Namespace, policies: Sequence[str]) -> None:
     if arguments.scene is not None:
         find("scenes", arguments.scene)
     for policy in trained:
-        if not is_folder(policy) and policy not in list_policies():
+        if not is_folder(user_path(policy)) and policy not in list_policies():
             raise unknown("run or policy", policy, [*list_policies(), *BASELINES])
 
 
@@ -132,7 +134,7 @@ def _partners(given: Sequence[str]) -> dict[str, str]:
             raise ValueError(f"--partner must be ROLE=POLICY such as psm_0=frozen, not {text!r}")
         if role in found:
             raise ValueError(f"--partner names {role!r} twice")
-        if policy not in PARTNERS and not is_folder(policy) and policy not in list_policies():
+        if policy not in PARTNERS and not is_folder(user_path(policy)) and policy not in list_policies():
             raise unknown("partner", policy, [*list_policies(), *PARTNERS])
         found[role] = policy
     return found

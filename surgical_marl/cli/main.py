@@ -27,6 +27,7 @@ from surgical_marl.runs.progress import Compilations, preparing
 from surgical_marl.runs.settings import Settings
 from surgical_marl.runtime import calm_threads, defer_compiler
 from surgical_marl.tasks.base.options import choices
+from surgical_marl.untrusted.files import user_path
 from surgical_marl.untrusted.values import shown
 
 _LISTS = {
@@ -125,9 +126,9 @@ def _parser() -> argparse.ArgumentParser:
         "--scene", help="a name (see `list scenes`) or a .yaml file (default: the task's own, if it has one)"
     )
     add_flags(train, Settings)
-    train.add_argument("--out", type=Path, metavar="DIR", help="run folder (default: runs/...)")
+    train.add_argument("--out", type=user_path, metavar="DIR", help="run folder (default: runs/...)")
     train.add_argument(
-        "--resume", type=Path, metavar="DIR", help="run folder to go on with, or to start in with TASK and --scene"
+        "--resume", type=user_path, metavar="DIR", help="run folder to go on with, or to start in with TASK and --scene"
     )
     train.set_defaults(command=_train, name="train")
 
@@ -155,7 +156,7 @@ def _parser() -> argparse.ArgumentParser:
     scene = kinds.add_parser("scene", help="a scene as one file for MuJoCo")
     scene.add_argument("source", metavar="NAME_OR_PATH", help="a scene's name or .yaml file")
     scene.add_argument("--format", type=one_of(("mjcf",)), default="mjcf", metavar="mjcf", help="MuJoCo's XML")
-    scene.add_argument("--out", type=Path, metavar="FILE", help="default: <scene>.xml in the current folder")
+    scene.add_argument("--out", type=user_path, metavar="FILE", help="default: <scene>.xml in the current folder")
     scene.add_argument("--control", type=one_of(_CONTROL), default=_CONTROL[0], metavar="|".join(_CONTROL))
     scene.set_defaults(command=_export_scene, name="export scene")
     policy = kinds.add_parser("policy", help="a trained policy as a folder: ONNX, safetensors, evaluation, card, clip")
@@ -163,7 +164,7 @@ def _parser() -> argparse.ArgumentParser:
         "runs", nargs="+", metavar="RUN", help="run folders of one training, one a seed: the best is taken"
     )
     policy.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="the policy's folder, such as policies/NAME"
+        "--out", type=user_path, required=True, metavar="DIR", help="the policy's folder, such as policies/NAME"
     )
     policy.set_defaults(command=_export_policy, name="export policy")
 
@@ -261,7 +262,9 @@ def _train(arguments: argparse.Namespace) -> None:
     flags = [f"{key}={value}" for key, value in given(arguments, Settings).items()]
 
     from surgical_marl.learning.distributed import claim_gpu, is_first
+    from surgical_marl.runs.content import scene_label
     from surgical_marl.runs.folder import has_begun, read_settings
+    from surgical_marl.runs.identity import setting
     from surgical_marl.runs.settings import load_config
 
     overrides, resume = [*flags, *arguments.overrides], arguments.resume
@@ -271,9 +274,10 @@ def _train(arguments: argparse.Namespace) -> None:
         resume = None  # the same command starts a run and resumes it, however early it was killed
     if resume:
         settings = read_settings(resume, overrides)
-        for key, own in (("task", settings.task), ("scene", settings.scene)):
-            if (given_name := getattr(arguments, key)) not in (None, own):
-                raise ValueError(f"the run in {resume} is of {key} {own!r}, not {given_name!r}")
+        named = {"task": arguments.task, "scene": arguments.scene and scene_label(arguments.scene)}
+        for key, name in named.items():
+            if name is not None and name != (own := setting(settings, key)):
+                raise ValueError(f"the run in {resume} is of {key} {own!r}, not {name!r}: leave it out to go on")
     else:
         settings = load_config(arguments.task, arguments.scene, overrides)
     out = arguments.out or arguments.resume or _run_folder(settings)

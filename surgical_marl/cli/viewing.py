@@ -15,7 +15,7 @@ from surgical_marl.content import BASELINES, find, list_policies, list_scenes, u
 from surgical_marl.plugins.tasks import find_task
 from surgical_marl.runs.progress import preparing
 from surgical_marl.tasks.base.options import Options
-from surgical_marl.untrusted.files import is_file, is_folder
+from surgical_marl.untrusted.files import is_file, is_folder, user_path
 
 _OWN = ("control", "knowledge", "messages", "difficulty", "start", "goals")
 
@@ -26,7 +26,9 @@ def add_view(commands: Any) -> None:
     _add_what(parser)
     parser.add_argument("--num-envs", type=whole(1, 4), default=1, metavar="N", help="environments side by side")
     parser.add_argument("--port", type=whole(0, 65535), default=8080, metavar="N", help="of the page; 0 for any")
-    parser.add_argument("--record", type=Path, metavar="DIR", help="keep what was done, for `surgical-marl replay`")
+    parser.add_argument(
+        "--record", type=user_path, metavar="DIR", help="keep what was done, for `surgical-marl replay`"
+    )
     parser.set_defaults(command=_view, name="view")
 
 
@@ -34,7 +36,7 @@ def add_play(commands: Any) -> None:
     """Add the command play."""
     parser = commands.add_parser("play", help="a film of a policy, from outside and from the endoscope")
     _add_what(parser)
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="an .mp4, a .gif or a .webp")
+    parser.add_argument("--out", type=user_path, required=True, metavar="FILE", help="an .mp4, a .gif or a .webp")
     parser.add_argument("--episodes", type=whole(1, 1000), default=1, metavar="N")
     parser.add_argument("--grid", type=_grid, default=(1, 1), metavar="RxC", help="so many environments, such as 4x4")
     parser.add_argument("--slow", type=_number, default=1.0, metavar="X", help="times slower than real time")
@@ -50,7 +52,7 @@ def add_replay(commands: Any) -> None:
     """Add the command replay."""
     parser = commands.add_parser("replay", help="step a recording of the viewer, or towards a fault, again")
     what = "what `surgical-marl view --record` wrote, or a fault-*.npz of a run folder: where numbers became NaN"
-    parser.add_argument("file", type=Path, metavar="FILE.npz", help=what)
+    parser.add_argument("file", type=user_path, metavar="FILE.npz", help=what)
     parser.set_defaults(command=_replay, name="replay")
 
 
@@ -90,10 +92,13 @@ def _open(arguments: argparse.Namespace) -> Any:
     check_viser()  # this and the port are looked at before anything is compiled
     check_port(arguments.port)
 
-    from surgical_marl.runs.folder import check_writable
+    from surgical_marl.runs.content import CONTENT
+    from surgical_marl.runs.folder import check_own, check_writable, has_begun
     from surgical_marl.view.browser.viewer import Viewer
 
     if arguments.record is not None:
+        if not has_begun(arguments.record):
+            check_own(arguments.record, "take-*.npz", CONTENT)
         check_writable(arguments.record)
     return Viewer(settings, who, arguments.num_envs, arguments.port, arguments.record)
 
@@ -211,13 +216,15 @@ def _settings(arguments: argparse.Namespace) -> tuple[Any, str | None]:
 
 def _scene_of(arguments: argparse.Namespace, who: str) -> str:
     """Return the scene of a run or policy; ValueError if it is of another task or scene than the arguments say."""
-    if who not in list_policies() and not is_folder(who):
+    if who not in list_policies() and not is_folder(user_path(who)):
         raise unknown("run or policy", who, [*list_policies(), *BASELINES])
 
+    from surgical_marl.runs.content import scene_label
     from surgical_marl.runs.folder import read_settings
 
     own = read_settings(find("policies", who))
-    if own.task != arguments.task or arguments.scene not in (None, own.scene):
+    other = arguments.scene is not None and scene_label(arguments.scene) != scene_label(own.scene)
+    if own.task != arguments.task or other:
         raise ValueError(
             f"{who} is of task {own.task!r} and scene {own.scene!r}: look at it with `surgical-marl {arguments.name} "
             f"{own.task} --scene {own.scene} --policy {who}`"

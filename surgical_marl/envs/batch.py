@@ -83,7 +83,8 @@ class BatchedEnv:
             if more := meant_for(task, scene, error):
                 raise ValueError(f"{error}{more}") from None
             raise
-        self._made["task"] = self.env.task_name  # of a task file its absolute path
+        # a copy may be made in another working folder
+        self._made |= {"task": self.env.task_name, "scene": self.env.options.scene}
         self._engine: Engine | None = make_engine(self.env, num_envs, engine, device)
         self.num_envs, self.arrays = num_envs, arrays
         self.agents = list(self.env.agents)

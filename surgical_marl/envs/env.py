@@ -64,7 +64,7 @@ class Env:
         self.options: Options = make_options(task, scene, options)
         self.task_name = self.options.task
         task_class = TASKS.load(self.task_name)
-        self.scene = load_scene(scene, self.options.control)
+        self.scene = load_scene(self.options.scene, self.options.control)
         self.task: Task = task_class(self.scene, self.options)
         self.max_steps = self.options.max_steps or self.task.max_steps
         self.agents = self.scene.agents

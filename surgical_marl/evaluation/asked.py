@@ -9,7 +9,9 @@ from typing import Any
 
 from surgical_marl.content import BASELINES, find
 from surgical_marl.policies.oracle import check_control
+from surgical_marl.runs.content import scene_label
 from surgical_marl.runs.folder import check_trained, read_settings
+from surgical_marl.runs.identity import setting
 from surgical_marl.runs.settings import Settings
 
 OWN = ("task", "scene", "control", "knowledge", "messages")
@@ -30,7 +32,7 @@ def common_settings(policies: Sequence[str], asked: Mapping[str, str | None]) ->
     name, first = next(iter(settings.items()))
     for policy, other in settings.items():
         for key in (*OWN, *CHOSEN, "max_steps"):
-            if (theirs := getattr(other, key)) != (ours := getattr(first, key)):
+            if (theirs := setting(other, key)) != (ours := setting(first, key)):
                 raise ValueError(f"{policy} has {key} {theirs!r} and {name} has {ours!r}: they can't be compared")
     for policy in trained:
         check_trained(find("policies", policy))
@@ -49,7 +51,10 @@ def _settings(policy: str, asked: Mapping[str, str]) -> Settings:
         return Settings(**asked)  # type: ignore[arg-type]
     settings = read_settings(find("policies", policy))
     for key in OWN:
-        if asked.get(key, own := getattr(settings, key)) != own:
-            raise ValueError(f"{policy} is of {key} {own!r}, not {asked[key]!r}: leave --{key} out")
+        if key not in asked:
+            continue
+        wanted = scene_label(asked[key]) if key == "scene" else asked[key]
+        if wanted != (own := setting(settings, key)):
+            raise ValueError(f"{policy} is of {key} {own!r}, not {wanted!r}: leave --{key} out")
     chosen: Any = {key: asked[key] for key in CHOSEN if key in asked}
     return replace(settings, engine="auto", device="auto", **chosen)

@@ -15,6 +15,7 @@ from surgical_marl.evaluation.report import number, title
 from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.policies.onnx_file import SUFFIX, read_pictures
 from surgical_marl.policies.weights import read_weights
+from surgical_marl.runs.content import stored_scene
 from surgical_marl.runs.folder import CURVE, read_metrics, read_origin, read_settings
 from surgical_marl.runs.settings import Settings
 from surgical_marl.scenes.load import load_scene
@@ -132,7 +133,7 @@ def _what(settings: Settings, name: str, folder: Path, result: Mapping[str, Any]
         clip = ""
     return f"""# {as_markdown(name)}
 
-This policy plays the task {as_code(settings.task)} in the scene {as_code(settings.scene)}. The task: {task}
+This policy plays the task {as_code(settings.task)} in the scene {as_code(scene.name)}. The task: {task}
 The scene: {as_markdown(scene.description)}; agents {", ".join(map(as_code, scene.agents))}.
 {clip}"""
 
@@ -206,7 +207,7 @@ def _how_trained(folder: Path, settings: Settings) -> str:
     device, commit, started = (notes["origin"].get(key) or "unknown" for key in ("device", "commit", "started"))
     level = [] if settings.difficulty == "default" else ["--difficulty", settings.difficulty]
     start = [] if settings.start == "home" else ["--start", settings.start]
-    what = ["surgical-marl", "train", settings.task, "--scene", settings.scene, *level, *start]
+    what = ["surgical-marl", "train", settings.task, "--scene", stored_scene(settings.scene, folder), *level, *start]
     command = shlex.join([*what, "--seed", str(settings.seed)])
     steps = f"{last['env_steps']:,.0f} environment steps in {last['seconds']:,.0f} s of rollouts and updates"
     iterations = f"{last['iteration']:,.0f}"

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from surgical_marl.content import PARTNERS, find
+from surgical_marl.content import PARTNERS
 from surgical_marl.evaluation.asked import common_settings, find_policy
 from surgical_marl.evaluation.evaluate import MAX_BATCH, Played, play
 from surgical_marl.evaluation.interval import interval
@@ -43,8 +43,8 @@ def crossplay(teams: Sequence[str], asked: Mapping[str, str | None], episodes: i
         ValueError: something is unknown, teams don't fit together, or the scene has a single agent.
     """
     settings = common_settings(teams, asked)
-    if len(load_scene(find("scenes", settings.scene)).agents) < 2:
-        raise ValueError(f"crossplay needs a scene with several agents, and {settings.scene!r} has one")
+    if len((scene := load_scene(settings.scene)).agents) < 2:
+        raise ValueError(f"crossplay needs a scene with several agents, and {scene.name!r} has one")
     env = make_env(settings, min(episodes, MAX_BATCH))
     roles = env.agents[1:] if len(env.agents) == 2 else env.agents  # of two, one is the other one's transpose
     others = [(team, role, other) for role in roles for team in teams for other in teams]

@@ -23,10 +23,12 @@ from surgical_marl.policies.actor import load_actor
 from surgical_marl.policies.onnx_file import SUFFIX, write_onnx
 from surgical_marl.policies.policy import load_policy
 from surgical_marl.policies.weights import write_weights
+from surgical_marl.runs.content import copy_content, stored_scene
 from surgical_marl.runs.curve import draw_curve
 from surgical_marl.runs.environment import make_env
-from surgical_marl.runs.folder import CONFIG, METRICS, read_settings
-from surgical_marl.runs.settings import Settings
+from surgical_marl.runs.folder import CONFIG, METRICS, read_origin, read_settings
+from surgical_marl.runs.identity import identity, setting
+from surgical_marl.runs.settings import Settings, config_text
 from surgical_marl.untrusted.files import read_json
 from surgical_marl.view.record import record
 
@@ -67,7 +69,7 @@ def _settings(runs: Sequence[str]) -> list[Settings]:
     settings = [read_settings(find("policies", run)) for run in runs]
     for run, other in zip(runs[1:], settings[1:], strict=True):
         for name in (item.name for item in fields(Settings) if item.name not in MAY_DIFFER):
-            if (theirs := getattr(other, name)) != (ours := getattr(settings[0], name)):
+            if (theirs := setting(other, name)) != (ours := setting(settings[0], name)):
                 raise ValueError(f"{run} has {name} {theirs!r} and {runs[0]} has {ours!r}: export them one at a time")
     seeds = [each.seed for each in settings]
     if twice := [seed for seed in seeds if seeds.count(seed) > 1]:
@@ -129,13 +131,14 @@ def _rank(result: dict[str, Any]) -> tuple[int, float, float]:
 def _fill(folder: Path, run: Path, settings: Settings, evaluation: dict[str, Any]) -> None:
     env = make_env(read_settings(run, ["engine=auto", "device=auto", "goals=held_out"]), num_envs=1)
     actor, layout = load_actor(run, env)
-    write_weights(folder, actor)
+    write_weights(folder, actor, identity(settings.in_training()))
     for name, model in actor.models.items():
         write_onnx(folder / f"{name}{SUFFIX}", model, layout.pictures[name])
-    for name in (CONFIG, METRICS):
-        shutil.copyfile(run / name, folder / name)
+    scene = stored_scene(copy_content(settings.scene, folder), folder)
+    (folder / CONFIG).write_text(config_text(settings, {"scene": scene, **read_origin(run)}))
+    shutil.copyfile(run / METRICS, folder / METRICS)
     (folder / EVALUATION).write_text(_compact(evaluation))
-    draw_curve(folder, f"{label(settings.task)} in {settings.scene}, {settings.algo}, seed {settings.seed}")
+    draw_curve(folder, f"{label(settings.task)} in {Path(settings.scene).stem}, {settings.algo}, seed {settings.seed}")
     print("recording a clip", file=sys.stderr)
     try:
         record(env, load_policy(run, env), folder / CLIP, small=True)

@@ -9,6 +9,7 @@ The numbers are those of the parallel face. `surgical_marl.interfaces.gymnasium_
 from __future__ import annotations
 
 import copy
+import os
 import sys
 from collections.abc import Mapping
 from typing import Any
@@ -17,6 +18,7 @@ import gymnasium
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
+from surgical_marl.content import absolute
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.interfaces.joint import JointAgent
 from surgical_marl.interfaces.rendering import Rendering, check_mode, check_size
@@ -34,15 +36,18 @@ class LimitInSpec:
 
     @property
     def spec(self) -> EnvSpec | None:
-        """How to make the same again."""
+        """How to make the same again, from any working folder."""
         return self._spec
 
     @spec.setter
     def spec(self, spec: EnvSpec | None) -> None:
         self._spec = found = copy.copy(spec)
         if found is not None:
-            limit, task = self.batch.max_steps, self.batch.task_name
-            found.max_episode_steps, found.kwargs = limit, {**found.kwargs, "task": task, "max_steps": limit}
+            task, scene, limit = self.batch.task_name, self.batch.env.options.scene, self.batch.max_steps
+            found.max_episode_steps = limit
+            found.kwargs = {**found.kwargs, "task": task, "scene": scene, "max_steps": limit}
+            if mates := found.kwargs.get("teammates"):
+                found.kwargs["teammates"] = {agent: _anywhere(who) for agent, who in mates.items()}
 
 
 class SurgicalEnv(LimitInSpec, gymnasium.Env[Any, np.ndarray]):
@@ -151,6 +156,11 @@ def _limit_of_make() -> int | None:
     caller = sys._getframe(2)
     asked = caller.f_locals.get("max_episode_steps") if caller.f_code is gymnasium.make.__code__ else None
     return asked if asked != -1 else None
+
+
+def _anywhere(teammate: Teammate) -> Teammate:
+    """Return a teammate whose run folder, if it is one, is named by an absolute path."""
+    return absolute("policies", os.fspath(teammate)) if isinstance(teammate, str | os.PathLike) else teammate
 
 
 def _first(values: Any) -> Any:

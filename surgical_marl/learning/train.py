@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 import shlex
+import shutil
 import signal
 import sys
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
-from dataclasses import fields, is_dataclass
+from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -36,6 +37,7 @@ from surgical_marl.runs.checkpoint import (
     write_checkpoint,
     write_environments,
 )
+from surgical_marl.runs.content import CONTENT, copy_content
 from surgical_marl.runs.environment import make_env
 from surgical_marl.runs.fault import write_fault
 from surgical_marl.runs.folder import (
@@ -52,25 +54,9 @@ from surgical_marl.runs.folder import (
     write_divergence,
     write_metrics,
 )
+from surgical_marl.runs.identity import identity
 from surgical_marl.runs.lock import LOCK, owned
 from surgical_marl.runs.settings import Settings
-from surgical_marl.untrusted.values import shown
-
-# Settings that may change when a run is resumed; all others shape the checkpoint or the problem.
-CHANGEABLE = {
-    "engine",
-    "device",
-    "iterations",
-    "steps_per_iteration",
-    "checkpoint_every",
-    "team_reward",
-    "ppo",
-    "constraint",
-    "oracle_states",
-}
-# Except these, which determine the content of a checkpoint.
-FIXED = {"ppo.normalise_values", "constraint.cost"}
-
 
 MOST_FAULTS = 10
 """Files of faults in a run folder."""
@@ -124,7 +110,8 @@ def train(settings: Settings, *, out: Path, resume: Path | None = None) -> Path:
             _say(f"the run in {out} has its {settings.iterations} iterations: to go on, ask for more")
             return out
         rows = read_metrics(Path(resume)) if resume is not None and state is not None else []
-        with _storing(out), _claimed(out, resume, settings, closing):
+        with _storing(out), _claimed(out, resume, settings, closing) as scene:
+            settings = replace(settings, scene=distributed.agreed(scene))
             training = make_training(settings)
             closing.callback(training.close)
             if state is not None:
@@ -164,14 +151,15 @@ def _storing(out: Path) -> Iterator[None]:
 
 
 @contextmanager
-def _claimed(out: Path, resume: Path | None, settings: Settings, closing: ExitStack) -> Iterator[None]:
-    """Prepare the run folder, and clean it up if the run is refused while it is made in memory.
+def _claimed(out: Path, resume: Path | None, settings: Settings, closing: ExitStack) -> Iterator[str]:
+    """Prepare the run folder, and clean it up if the run is refused while it is made in memory; yield its scene.
 
-    A new run has its settings in the folder from the start, so that it can be resumed whenever it is killed. If a new
-    run is refused, its folder is removed. `closing` gets the lock of the folder.
+    A user's own scene is copied into the folder, and training goes on in the copy. A new run has its settings in the
+    folder from the start, so that it can be resumed whenever it is killed. If a new run is refused, its folder is
+    removed. `closing` gets the lock of the folder.
     """
     if distributed.rank() > 0:
-        yield
+        yield settings.scene
         return
     made = [folder for folder in (out, *out.parents) if not folder.exists()]
     if _same(out, resume):
@@ -184,10 +172,15 @@ def _claimed(out: Path, resume: Path | None, settings: Settings, closing: ExitSt
             write_config(out, settings)
     remove_temporaries(out)
     try:
-        yield
+        scene = copy_content(settings.scene, out)
+        if resume is None and scene != settings.scene:
+            write_config(out, replace(settings, scene=scene))
+        yield scene
     except ValueError:
         if resume is None:
             (out / CONFIG).unlink()
+        if not _same(out, resume):
+            shutil.rmtree(out / CONTENT, ignore_errors=True)
         (out / LOCK).unlink(missing_ok=True)
         with suppress(OSError):  # another run may have begun in `runs` meanwhile
             for folder in made:
@@ -227,7 +220,7 @@ def _run(training: Trainer, out: Path) -> None:
     if distributed.rank() == 0:
         from surgical_marl.runs.curve import draw_curve  # matplotlib: not before training has begun
 
-        draw_curve(out, f"{label(settings.task)} in {settings.scene}, {settings.algo}, seed {settings.seed}")
+        draw_curve(out, f"{label(settings.task)} in {Path(settings.scene).stem}, {settings.algo}, seed {settings.seed}")
     distributed.wait()  # where one process ends early, torchrun ends them all
     if training.stopping:
         number = received[0] if received else signal.SIGTERM
@@ -273,20 +266,14 @@ def _keep_fault(training: Trainer, out: Path, fault: Fault) -> None:
 
 def _read_resumed(settings: Settings, run: Path, goes_on: bool) -> dict[str, Any] | None:
     """Return what this process resumes, or None if the run was stopped before its first checkpoint."""
-    asked = _dotted(settings)
-    for name, before in _dotted(read_settings(run)).items():
-        fixed = name in FIXED or name.partition(".")[0] not in CHANGEABLE
-        if fixed and before != asked[name]:
+    asked = identity(settings)
+    for name, before in identity(read_settings(run)).items():
+        if before != asked[name]:
             raise ValueError(f"the run in {run} has {name} {before!r}, and cannot go on with {asked[name]!r}")
     if not (run / CHECKPOINT).is_file() and not holds_weights(run):
         _say(f"{run} holds no checkpoint yet: its run starts from the beginning")
         return None
     state = read_checkpoint(run)
-    for name, value in state.get("of", {}).items():
-        if value != (now := getattr(settings, name)):
-            raise ValueError(
-                f"{run / CHECKPOINT} is of {name} {shown(value)}, and not of {now!r} as the run it lies in"
-            )
     if state["iteration"] > settings.iterations or (state["iteration"] == settings.iterations and not goes_on):
         raise ValueError(
             f"the run in {run} already has {state['iteration']} iterations: ask for more than {settings.iterations}"
@@ -295,16 +282,6 @@ def _read_resumed(settings: Settings, run: Path, goes_on: bool) -> dict[str, Any
     # a checkpoint of an older version lacks these two
     state = {"processes": 1, "env_steps": steps, **state}
     return _own(state, run)
-
-
-def _dotted(settings: Any) -> dict[str, Any]:
-    """Return the settings by their dotted names, such as "ppo.gamma"."""
-    named: dict[str, Any] = {}
-    for item in fields(settings):
-        value = getattr(settings, item.name)
-        inner = _dotted(value) if is_dataclass(value) else None
-        named |= {item.name: value} if inner is None else {f"{item.name}.{name}": part for name, part in inner.items()}
-    return named
 
 
 def _own(state: dict[str, Any], run: Path) -> dict[str, Any]:

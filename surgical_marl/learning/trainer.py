@@ -20,6 +20,7 @@ from surgical_marl.learning.imitation import RATE, Imitation, ImitationLoss
 from surgical_marl.learning.reporter import Report, Reporter
 from surgical_marl.learning.stopwatch import mark
 from surgical_marl.plugins.algorithms import ALGORITHMS
+from surgical_marl.runs.identity import identity
 from surgical_marl.runs.settings import Settings
 
 if TYPE_CHECKING:
@@ -51,7 +52,7 @@ class Trainer:
 
     def __init__(self, settings: Settings, env: BatchedEnv) -> None:
         torch.manual_seed(settings.seed)
-        self.settings = settings
+        self.settings, self._identity = settings, identity(settings)
         self.iteration, self.env_steps = 0, 0
         self.stop_wanted = self.stopping = False
         first = distributed.rank() * env.num_envs
@@ -208,7 +209,7 @@ class Trainer:
             "iteration": self.iteration,
             "env_steps": self.env_steps,
             "processes": distributed.size(),
-            "of": {name: getattr(self.settings, name) for name in ("task", "scene", "algo")},
+            "of": self._identity,
             "groups": {name: _widths(actor, name) for name in actor.counts},
             "algorithm": self.algorithm.save(),
             "imitation": self._imitation.state() if self._imitation is not None and self.imitating else None,

@@ -19,7 +19,9 @@ from surgical_marl.policies.frozen import Frozen
 from surgical_marl.policies.oracle import oracle
 from surgical_marl.policies.policy import load_policy
 from surgical_marl.policies.teammates import Teammates
+from surgical_marl.runs.content import scene_label
 from surgical_marl.runs.folder import find_run, read_settings
+from surgical_marl.runs.identity import setting
 from surgical_marl.scenes.load import load_scene
 
 if TYPE_CHECKING:
@@ -84,7 +86,7 @@ def check_fits(who: str, env: BatchedEnv) -> None:
     Task, scene, control, knowledge and the length of messages must be the same.
     """
     asked = env.env.options
-    own = env.task_name, env.scene.name, env.control, asked.knowledge, asked.messages
+    own = env.task_name, asked.scene, env.control, asked.knowledge, asked.messages
     check_same(who, dict(zip(SAME, own, strict=True)))
 
 
@@ -100,8 +102,8 @@ def check_same(who: str, own: Mapping[str, Any]) -> None:
         return
     settings = read_settings(find_run(who))
     for key, value in own.items():
-        theirs = getattr(settings, key)
-        if key == "scene":  # one by its file is known by its name
-            theirs, value = Path(theirs).stem, Path(value).stem
+        theirs = setting(settings, key)
+        if key == "scene":
+            value = scene_label(value)
         if theirs != value:
             raise ValueError(f"{who} is of {key} {theirs!r}, not {value!r}: a policy acts where it was trained")

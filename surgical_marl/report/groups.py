@@ -99,7 +99,7 @@ def _number(metric: Metric) -> tuple[float, list[float] | None]:
 
 
 def _compared(run: Run) -> Mapping[str, Any]:
-    return {name: value for name, value in run.config.items() if name != "seed"}
+    return {name: value for name, value in run.config.items() if name != "seed"} | {"scene": run.scene}
 
 
 def _name(group: Sequence[Run]) -> str:

@@ -55,7 +55,7 @@ def render(runs: Sequence[Run]) -> str:
     """
     _check(runs)
     groups = group(runs)
-    task, scenes = runs[0].config["task"], list(dict.fromkeys(str(run.config["scene"]) for run in runs))
+    task, scenes = runs[0].config["task"], list(dict.fromkeys(run.scene for run in runs))
     heading = f"{label(str(task))} in {', '.join(scenes)}"
     drawing = Drawing()
     sections = [*_evaluation(drawing, groups), *_training(drawing, groups), *_settings(groups)]

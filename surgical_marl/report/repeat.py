@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from pathlib import Path
 from typing import Any
 
 from surgical_marl.report.run import Run, flatten
@@ -28,6 +29,8 @@ def train_command(run: Run) -> str:
         ]
     except (ValueError, KeyError):  # a task, or settings, that are not of this installation
         both = []
+    if scene != run.scene:  # a copy in the folder
+        scene = str(Path(run.given) / scene)
     command = ["surgical-marl", "train", task, "--scene", scene, "--seed", run.seed]
     for name, value in settings.items():
         usual = bool(both) and all(name in defaults and defaults[name] == value for defaults in both)

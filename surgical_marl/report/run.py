@@ -6,6 +6,7 @@ import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from surgical_marl.evaluation.card import CLIP, EVALUATION
 from surgical_marl.evaluation.command import FILM, RESULT, read_result
 from surgical_marl.evaluation.episodes import EPISODES, read_played
 from surgical_marl.evaluation.evaluate import Played
+from surgical_marl.runs.content import found_scene, scene_label
 from surgical_marl.runs.folder import CHECKPOINT, CONFIG, DIVERGED, METRICS, holds_weights, read_metrics
 from surgical_marl.untrusted.files import is_file, is_folder
 from surgical_marl.yaml_file import load_yaml
@@ -50,6 +52,16 @@ class Run:
     clip: Path | None
     notes: tuple[str, ...]
     """Sentences about what is missing or damaged."""
+
+    @cached_property
+    def scene(self) -> str:
+        """The name of the scene, and of a copy in the folder also the hash of its content."""
+        stored = str(self.config["scene"])
+        try:
+            found = found_scene(stored, self.folder)
+            return stored if found == stored else scene_label(found)
+        except ValueError:  # something is missing or damaged
+            return stored
 
     @property
     def seed(self) -> str:

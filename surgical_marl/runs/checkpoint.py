@@ -13,7 +13,8 @@ from typing import Any, BinaryIO, cast
 import torch
 
 from surgical_marl.files import write_atomic
-from surgical_marl.runs.folder import CHECKPOINT, check_trained, holds_weights
+from surgical_marl.runs.folder import CHECKPOINT, check_trained, has_begun, holds_weights, read_settings
+from surgical_marl.runs.identity import check_identity
 from surgical_marl.untrusted.arrays import check_checkpoint
 from surgical_marl.untrusted.values import listed
 
@@ -58,7 +59,7 @@ class _FirstError:
 
 
 def read_checkpoint(run: str | Path) -> dict[str, Any]:
-    """Read the checkpoint of a run, on the CPU. ValueError if there is none or it is damaged."""
+    """Read the checkpoint of a run, on the CPU. ValueError if there is none, it is damaged, or it is of another run."""
     path = Path(run) / CHECKPOINT
     if not path.is_file() and holds_weights(Path(run)):
         raise ValueError(f"{run} holds an exported policy, which can be evaluated but not resumed")
@@ -75,6 +76,8 @@ def read_checkpoint(run: str | Path) -> dict[str, Any]:
         raise ValueError(f"{path} is damaged, or not a checkpoint of this program: restore it from a copy")
     if bad:
         raise ValueError(f"{path} holds numbers that are not finite ({listed(bad, 3)}): restore it from a copy")
+    if has_begun(path.parent):
+        check_identity(checkpoint.get("of", {}), read_settings(path.parent), path)
     return checkpoint
 
 
@@ -104,9 +107,8 @@ def _is_whole(checkpoint: dict[str, Any]) -> bool:
     """Return whether a checkpoint has what every reader needs, counts that are some, and says what it is of."""
     counts = [checkpoint.get(name, 0) for name in ("iteration", "env_steps", "processes")]
     good = all(type(count) is int and 0 <= count < 2**62 for count in counts)
-    of = checkpoint.get("of", {})
-    known = isinstance(of, dict) and of.keys() <= {"task", "scene", "algo"}
-    return good and known and {"iteration", "groups", "algorithm"} <= checkpoint.keys()
+    told = isinstance(checkpoint.get("of", {}), dict)
+    return good and told and {"iteration", "groups", "algorithm"} <= checkpoint.keys()
 
 
 def not_finite(tree: Any, name: str = "") -> list[str]:

@@ -22,6 +22,7 @@ from surgical_marl.engines.choose import DeviceName
 from surgical_marl.engines.faults import checked
 from surgical_marl.envs.fault_place import fault_place
 from surgical_marl.files import write_atomic
+from surgical_marl.runs.content import found_scene, stored_scene
 from surgical_marl.runs.environment import make_env
 from surgical_marl.runs.settings import Settings
 from surgical_marl.runtime import has_cuda
@@ -76,7 +77,7 @@ def write_fault(
     about = {
         "layout": LAYOUT,
         "kind": "fault",
-        "environment": settings.of_environment(),
+        "environment": {**settings.of_environment(), "scene": stored_scene(settings.scene, path.parent)},
         "engine": env.engine.name,
         "device": env.device,
         "versions": {name: importlib.metadata.version(name) for name in PACKAGES},
@@ -133,7 +134,7 @@ def reproduce(path: Path, about: Mapping[str, Any], arrays: Mapping[str, np.ndar
     """
     device: DeviceName = "cuda" if about["device"] == "cuda" and has_cuda() else "cpu"
     try:
-        settings = Settings(**about["environment"], engine=about["engine"], device=device)
+        settings = made_in(about["environment"], path, engine=about["engine"], device=device)
     except TypeError:  # options of another version
         raise ValueError(f"{path} was found in an environment that this version does not know") from None
     env = make_env(settings, 1, "numpy")
@@ -157,6 +158,16 @@ def reproduce(path: Path, about: Mapping[str, Any], arrays: Mapping[str, np.ndar
     env.close()
     told = f"seed {about['seed']}, environment {about['index']}: {one_line(about['place'])}"
     return Reproduced(count, at, found, told, device, changed_versions(about["versions"]))
+
+
+def made_in(environment: Mapping[str, Any], path: Path, **more: Any) -> Settings:
+    """Return the settings of an environment that a recording names, whose copy of a scene may lie beside it.
+
+    ValueError or TypeError if a setting is bad or unknown.
+    """
+    scene = environment.get("scene")
+    own = {"scene": found_scene(scene, path.parent)} if isinstance(scene, str) else {}
+    return Settings(**{**environment, **own, **more})
 
 
 def changed_versions(versions: Mapping[str, Any]) -> list[str]:

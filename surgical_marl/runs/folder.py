@@ -1,10 +1,10 @@
 """The files of a run folder, and how they are read and written, but for its checkpoint (`runs/checkpoint.py`).
 
 A run folder holds `config.yaml`, `checkpoint.pt`, `metrics.csv`, `curve.png`, `tensorboard/` and `train.lock`
-(`surgical_marl/runs/lock.py`). What is made of them at the end, `eval.json`, `episodes.npz`, `video.mp4` and
-`report.html`, is written elsewhere. If there were several processes, `environments-*.pt` of the other ranks are beside
-the checkpoint. If training diverged, there is also `diverged.json`; if environments became NaN, `fault-*.npz`
-(`surgical_marl/runs/fault.py`).
+(`surgical_marl/runs/lock.py`), and a user's own scene in `content/` (`surgical_marl/runs/content.py`). What is made of
+them at the end, `eval.json`, `episodes.npz`, `video.mp4` and `report.html`, is written elsewhere. If there were several
+processes, `environments-*.pt` of the other ranks are beside the checkpoint. If training diverged, there is also
+`diverged.json`; if environments became NaN, `fault-*.npz` (`surgical_marl/runs/fault.py`).
 
 A shipped policy has safetensors instead of the checkpoint (`surgical_marl/evaluation/export.py`). Every write is
 atomic, except that `metrics.csv` grows by rows.
@@ -23,14 +23,17 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Iterable, Mapping
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
 from surgical_marl.content import find, list_policies
-from surgical_marl.files import write_atomic
+from surgical_marl.files import is_temporary, write_atomic
+from surgical_marl.runs.content import stored_scene
+from surgical_marl.runs.lock import LOCK
 from surgical_marl.runs.settings import Settings, config_text, read_config
-from surgical_marl.untrusted.files import MB, check_file, is_file
-from surgical_marl.untrusted.values import shown
+from surgical_marl.untrusted.files import MB, check_file, is_file, user_path
+from surgical_marl.untrusted.values import listed, shown
 from surgical_marl.yaml_file import read_yaml
 
 CONFIG, CHECKPOINT, METRICS, CURVE = "config.yaml", "checkpoint.pt", "metrics.csv", "curve.png"
@@ -43,14 +46,14 @@ PACKAGES = ("surgical-marl", "torch", "rsl-rl-lib", "jax", "mujoco", "mujoco-mjx
 
 
 def find_run(run: str | Path) -> Path:
-    """Find the folder of a run, by its path, or of a policy that ships, by its name.
+    """Find the folder of a policy that ships, by its name, or of a run, by its path.
 
     ValueError if there is none.
     """
-    if is_file(Path(run) / CONFIG):
-        return Path(run)
     if str(run) in list_policies():
         return find("policies", str(run))
+    if is_file(folder := user_path(run) / CONFIG):
+        return folder.parent
     shipped = ", ".join(list_policies()) or "none yet"
     raise ValueError(
         f"{shown(str(run))} is not a run folder, nor zero, random, oracle or a policy that ships ({shipped})"
@@ -58,10 +61,22 @@ def find_run(run: str | Path) -> Path:
 
 
 def claim_folder(out: Path) -> None:
-    """Make the folder of a new run. ValueError if it cannot be written or already holds a run."""
+    """Make the folder of a new run. ValueError if it cannot be written, or already holds a run or something else."""
     if any((out / name).exists() for name in (CONFIG, CHECKPOINT)):
         raise ValueError(f"{out} already holds a run: choose another folder, or continue it with --resume {out}")
+    check_own(out, LOCK)
     check_writable(out)
+
+
+def check_own(out: Path, *ours: str) -> None:
+    """Raise ValueError if a folder holds more than temporary files, and what has these names, with `*` for any text."""
+    try:
+        names = [path.name for path in out.iterdir()]
+    except OSError:  # there is no such folder yet, or `check_writable` says what is wrong
+        return
+    strange = [name for name in names if not is_temporary(name) and not any(fnmatch(name, own) for own in ours)]
+    if strange:
+        raise ValueError(f"{out} is not empty, it holds {listed(sorted(strange), 3)}: name a new or an empty folder")
 
 
 def check_writable(out: Path) -> None:
@@ -88,7 +103,8 @@ def write_config(run: Path, settings: Settings) -> None:
         "commit": _commit(),
         "started": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
     }
-    text = config_text(settings, {"versions": versions, "origin": origin})
+    scene = stored_scene(settings.scene, run)
+    text = config_text(settings, {"scene": scene, "versions": versions, "origin": origin})
     write_atomic(run / CONFIG, lambda path: path.write_text(text))
 
 
@@ -106,7 +122,7 @@ def has_begun(run: Path) -> bool:
 def read_settings(run: str | Path, overrides: Iterable[str] = ()) -> Settings:
     """Read the settings of a run or of a shipped policy, with `key=value` overrides.
 
-    ValueError if it is not a run folder.
+    ValueError if it is not a run folder, or lacks its copy of a scene.
     """
     path = Path(run) / CONFIG
     if not is_file(path):

@@ -14,6 +14,7 @@ from surgical_marl.content import as_name, content_dir, find, list_configs
 from surgical_marl.engines.choose import DeviceName, EngineName
 from surgical_marl.plugins.algorithms import ALGORITHMS
 from surgical_marl.plugins.tasks import TASKS
+from surgical_marl.runs.content import found_scene
 from surgical_marl.runtime import has_cuda
 from surgical_marl.tasks.base.options import Options
 from surgical_marl.untrusted.schema import Checked, Place, as_mapping, check, choice, fields_of, number
@@ -249,11 +250,16 @@ def read_config(path: Path, overrides: Iterable[str] = ()) -> Settings:
     for name in ("task", "scene"):
         if name not in values:
             raise ValueError(f"{path} has no {name}: it is cut short, so restore it from a copy")
+    if isinstance(values["scene"], str):
+        values["scene"] = found_scene(values["scene"], path.parent)
     return _build(_override(values, overrides))
 
 
-def config_text(settings: Settings, notes: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return the text of a run's `config.yaml`: what `read_config` reads, and notes that it ignores."""
+def config_text(settings: Settings, notes: Mapping[str, Any]) -> str:
+    """Return the text of a run's `config.yaml`.
+
+    It is what `read_config` reads, but for notes that it ignores, and a scene in them that stands for the settings'.
+    """
     values = asdict(settings)
     values["network"]["hidden"] = list(settings.network.hidden)
     values["observe"] = {agent: list(names) for agent, names in settings.observe.items()}

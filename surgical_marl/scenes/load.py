@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from pathlib import Path
 
@@ -28,7 +28,6 @@ from surgical_marl.scenes.placing import MAX_OBJECTS, PlacementEntry, add_object
 from surgical_marl.scenes.randomisation import Randomisation
 from surgical_marl.scenes.scene import Mount, Scene
 from surgical_marl.scenes.surroundings import TissueEntry, View, add_surroundings, add_tissue
-from surgical_marl.untrusted.files import is_file
 from surgical_marl.untrusted.markup import check_name
 from surgical_marl.untrusted.schema import Place, Vector, angles, check, lengths, number, several
 from surgical_marl.untrusted.values import LONGEST
@@ -103,12 +102,17 @@ def load_scene(name: str | Path, control: str = "position") -> Scene:
 
     contents = (part for mount in mounts.values() for part in mount.arm.content)
     held = (item.object.content for item in objects.values())
-    return scene(model=cached_model(compute, repr((path.stem, control, about)), *contents, *held))
+    return scene(model=cached_model(compute, repr((path.stem, control, _without_sources(about))), *contents, *held))
+
+
+def _without_sources(about: SceneFile) -> SceneFile:
+    """Return the content of a scene file without the places of its arms and objects, which may move."""
+    arms = {agent: replace(entry, arm="") for agent, entry in about.arms.items()}
+    return replace(about, arms=arms, objects={name: replace(own, object="") for name, own in about.objects.items()})
 
 
 def _mount(agent: str, entry: MountEntry, place: Place, load: Callable[[str | Path], Arm]) -> Mount:
-    local = place.folder / entry.arm  # a user's own arm may be named relative to the scene file
-    arm = load(local if is_file(local / "arm.yaml") else find("arms", entry.arm, str(place)))
+    arm = load(find("arms", entry.arm, str(place), place.folder))
     if not re.fullmatch(re.escape(arm.name) + r"_\d+", agent):
         raise ValueError(f"{place}: an agent of arm {arm.name!r} is called {arm.name}_0, {arm.name}_1 and so on")
     rotation = turned(entry.tilt) @ turned((0.0, 0.0, entry.turn))

@@ -14,7 +14,6 @@ from surgical_marl.content import find, list_scenes
 from surgical_marl.robots.rotation import quaternion, turned
 from surgical_marl.scenes.objects import Placement, add_shape, load_object
 from surgical_marl.scenes.surroundings import STILL
-from surgical_marl.untrusted.files import is_file
 from surgical_marl.untrusted.schema import Place, Vector, angles, lengths, rgb
 from surgical_marl.yaml_file import read_yaml
 
@@ -61,8 +60,7 @@ def read_placements(
             raise ValueError(f"{where}: a name in a scene is of letters, digits and underscores")
         if name in taken or TAKEN.fullmatch(name):
             raise ValueError(f"{where}: {name} is taken; give the object another name")
-        local = where.folder / entry.object  # a user's own object may be named relative to the scene file
-        source = local if is_file(local) else find("objects", entry.object, str(where))
+        source = find("objects", entry.object, str(where), where.folder)
         found[name] = Placement(load_object(source, entry.colour), np.array(entry.position), turned(entry.tilt))
     return found
 

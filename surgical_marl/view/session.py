@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from surgical_marl.runs.content import copy_content
 from surgical_marl.runs.environment import make_env
 from surgical_marl.runs.settings import Settings
 from surgical_marl.view.history import History
@@ -37,7 +38,7 @@ class Session:
         who: moves all arms at first: a policy, a run, or a name of `movers.SIMPLE`; or agent -> who moves it; None
             for the policy that ships for the task and the scene, or the oracle, or nobody.
         num_envs: how many environments, 1 to `MOST_ENVS`.
-        record: a folder for takes; None to keep none.
+        record: a folder for takes, and for the scene if it is the user's own; None to keep none.
         further: runs that may move arms, by their folders, beside the policies that ship.
 
     Raises:
@@ -54,7 +55,8 @@ class Session:
     ) -> None:
         if not 1 <= num_envs <= MOST_ENVS:
             raise ValueError(f"the viewer shows 1 to {MOST_ENVS} environments, not {num_envs}")
-        self.settings = replace(settings, device="cpu")
+        scene = settings.scene if record is None else copy_content(settings.scene, record)
+        self.settings = replace(settings, scene=scene, device="cpu")
         self.env = make_env(self.settings, num_envs, "numpy")
         self.seed = settings.seed
         self.observations: Any = self.env.reset(self.seed)[0]

@@ -24,8 +24,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from surgical_marl.files import write_atomic
+from surgical_marl.runs.content import stored_scene
 from surgical_marl.runs.environment import make_env
-from surgical_marl.runs.fault import PACKAGES, changed_versions
+from surgical_marl.runs.fault import PACKAGES, changed_versions, made_in
 from surgical_marl.runs.settings import Settings
 from surgical_marl.untrusted.arrays import read_npz
 from surgical_marl.untrusted.values import check_count, shown
@@ -74,7 +75,10 @@ class Take:
 
     def write(self, path: Path) -> Path:
         """Write the file, completely or not at all, and return its path."""
-        content = {"about": np.array(json.dumps(self._about))}
+        environment = self._about["environment"]
+        scene = stored_scene(environment["scene"], path.parent)
+        about = {**self._about, "environment": {**environment, "scene": scene}}
+        content = {"about": np.array(json.dumps(about))}
         content |= {f"{_START}{name}": value for name, value in self._start.items()}
         content |= {name: np.stack([step[name] for step in self._steps]) for name in self._steps[0]}
 
@@ -107,7 +111,7 @@ def replay(path: Path) -> Replayed:
     """
     about, arrays = read_take(path)
     try:
-        settings = Settings(**about["environment"], engine=about["engine"], device=about["device"])
+        settings = made_in(about["environment"], path, engine=about["engine"], device=about["device"])
     except TypeError:  # options of another version
         raise ValueError(f"{path} was recorded in an environment that this version does not know") from None
     env = make_env(settings, about["num_envs"], "numpy")

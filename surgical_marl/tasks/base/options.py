@@ -13,8 +13,8 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal, get_args, get_type_hints
 
-from surgical_marl.content import as_name
-from surgical_marl.plugins.task_file import absolute
+from surgical_marl.content import absolute, as_name
+from surgical_marl.plugins.task_file import absolute as absolute_task
 from surgical_marl.scenes.timing import DECIMATION
 from surgical_marl.untrusted.schema import Checked, choice, number
 
@@ -28,7 +28,7 @@ class Options(Checked):
 
     Attributes:
         task: a name of `list_tasks()`, or a task file, `my_task.py` or `my_task.py:Escort`.
-        scene: a name of `list_scenes()` or the path of a scene file.
+        scene: a name of `list_scenes()` or the path of a scene file, which becomes absolute.
         control: what an action commands: "position" moves position targets, "velocity" and "torque" command those.
         difficulty: a level of the task; the docstring of the task says what each level is.
         goals: "training", or "held_out" for goals of evaluations, which training never draws.
@@ -66,7 +66,8 @@ class Options(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        object.__setattr__(self, "task", absolute(self.task))
+        object.__setattr__(self, "task", absolute_task(self.task))
+        object.__setattr__(self, "scene", absolute("scenes", self.scene))
 
     def of_environment(self) -> dict[str, Any]:
         """Return the environment's options by name, without what a subclass adds to them."""

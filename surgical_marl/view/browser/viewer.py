@@ -109,7 +109,7 @@ class Viewer:
         old = self.session
         if choice == _choice(old):
             return
-        self._say("Preparing", f"{label(choice.task)} on {choice.scene}", 5)
+        self._say("Preparing", f"{label(choice.task)} on {Path(choice.scene).stem}", 5)
         try:
             settings, who = _settings(choice, old)
             self._further = tuple(dict.fromkeys([*self._further, *old.choices]))  # with runs that a person named
