@@ -41,13 +41,14 @@ def audit(arguments: list[str]) -> str | None:
     command = [sys.executable, "-m", "pip_audit", "--disable-pip", "--no-deps", "--progress-spinner", "off",
                "--timeout", "5", "--format", "json", "-r", str(ROOT / "constraints.txt"), *arguments]  # fmt: skip
     try:
-        return subprocess.run(command, capture_output=True, text=True, timeout=SECONDS).stdout
+        return subprocess.run(command, capture_output=True, encoding="utf-8", timeout=SECONDS).stdout
     except subprocess.TimeoutExpired:
         return None
 
 
 def licences() -> tuple[int, str]:
-    done = subprocess.run([Path(sys.executable).with_name("pip-licenses")], cwd=ROOT, capture_output=True, text=True)
+    command = [Path(sys.executable).with_name("pip-licenses")]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, encoding="utf-8")
     count = len(done.stdout.splitlines()) - 1
     return done.returncode, done.stderr.strip() if done.returncode else f"licences: {count} packages, all as allowed"
 

@@ -32,7 +32,7 @@ WITH_TORCH = ("tests/test_public_surface.py", "tests/test_determinism.py", "test
 
 def allowed() -> dict[str, str]:
     """Return what pyproject.toml asks of each of the four, such as ">=0.6,<0.13"."""
-    wanted = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
+    wanted = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["dependencies"]
     found = {re.split(r"[^\w-]", text)[0]: text for text in wanted}
     return {name: found[name].removeprefix(name) for name in NAMES}
 
@@ -47,7 +47,7 @@ def asked(name: str, versions: str) -> str:
 
 def run(*command: str | Path, **environment: str) -> subprocess.CompletedProcess[str]:
     own = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV")}
-    return subprocess.run([*map(str, command)], env={**own, **environment}, capture_output=True, text=True)
+    return subprocess.run([*map(str, command)], env={**own, **environment}, capture_output=True, encoding="utf-8")
 
 
 def torch_for_cpus(python: Path, wanted: str) -> str | None:
@@ -55,12 +55,12 @@ def torch_for_cpus(python: Path, wanted: str) -> str | None:
 
     Of the newest releases, that is the one of constraints.txt where pip knows no other build for CPUs.
     """
-    pin = re.search(r"^torch==.*$", (ROOT / "constraints.txt").read_text(), re.M)
+    pin = re.search(r"^torch==.*$", (ROOT / "constraints.txt").read_text(encoding="utf-8"), re.M)
     assert pin
     for requirement in (wanted, pin[0]) if ">=" in wanted else (wanted,):
         with tempfile.NamedTemporaryFile(suffix=".json") as file:
             done = run(python, "-m", "pip", "install", "-q", "--dry-run", "--report", file.name, requirement)
-            items = json.loads(Path(file.name).read_text())["install"] if done.returncode == 0 else []
+            items = json.loads(Path(file.name).read_text(encoding="utf-8"))["install"] if done.returncode == 0 else []
         found = {item["metadata"]["name"].lower(): item["metadata"]["version"] for item in items}
         if "torch" in found and not [name for name in found if name.startswith(("nvidia", "cuda", "triton"))]:
             return found["torch"]
@@ -72,14 +72,14 @@ def try_one(python: str, versions: str, folder: Path, cuda_builds: bool) -> tupl
     uv, own = Path(sys.executable).with_name("uv"), folder / "bin/python"
     run(python, "-m", "venv", folder)
     wanted, override, with_torch = {name: asked(name, versions) for name in NAMES}, folder / "override.txt", cuda_builds
-    override.write_text("")
+    override.write_text("", encoding="utf-8")
     if not cuda_builds:
         run(own, "-m", "pip", "install", "-q", "-U", "pip")
         if torch := torch_for_cpus(own, wanted.pop("torch")):
             with_torch = True
             run(own, "-m", "pip", "install", "-q", f"torch=={torch}")
         # torch is there already, or not to be had: uv leaves it alone
-        override.write_text("torch; python_version < '3'\ntorchvision; python_version < '3'\n")
+        override.write_text("torch; python_version < '3'\ntorchvision; python_version < '3'\n", encoding="utf-8")
     packages = [ROOT, "pytest>=9", "hatchling", *wanted.values()]
     done = run(uv, "pip", "install", "-q", "--python", own, "--override", override, *packages)
     if done.returncode:
@@ -88,7 +88,7 @@ def try_one(python: str, versions: str, folder: Path, cuda_builds: bool) -> tupl
     found = {item["name"]: item["version"] for item in listed if item["name"] in NAMES}
     tests = [f"{ROOT}/{name}" for name in (WITH_TORCH if with_torch else WITHOUT_TORCH)]
     done = run(own, "-m", "pytest", "-q", "-p", "no:cacheprovider", *tests, XDG_CACHE_HOME=str(folder / "cache"))
-    (folder / "pytest.log").write_text(done.stdout + done.stderr)
+    (folder / "pytest.log").write_text(done.stdout + done.stderr, encoding="utf-8")
     return found, re.sub(r" in [\d.]+s.*| \(.*|=", "", done.stdout.strip().splitlines()[-1]).strip()
 
 

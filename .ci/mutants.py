@@ -108,7 +108,7 @@ def change(mutant: Mutant, text: str) -> str:
 def tracked_files() -> list[str]:
     listed = subprocess.run(
         ["git", "ls-files", "--cached", "--others", "--exclude-standard"],
-        cwd=ROOT, check=True, capture_output=True, text=True,
+        cwd=ROOT, check=True, capture_output=True, encoding="utf-8",
     )  # fmt: skip
     return [name for name in listed.stdout.splitlines() if (ROOT / name).is_file()]
 
@@ -128,7 +128,7 @@ class Place:
 
     def start(self, mutant: Mutant, source: str, tests: Sequence[str], seconds: float) -> None:
         """Try a mutant in a new process."""
-        (self.folder / mutant.module).write_text(source)
+        (self.folder / mutant.module).write_text(source, encoding="utf-8")
         self.mutant, self.began = mutant, time.monotonic()
         sys.stdout.flush()
         self.pid = os.fork()
@@ -195,7 +195,7 @@ def try_all(work: Sequence[Mutant], tests: dict[str, list[str]], limits: dict[st
             for place in places:
                 if not place.pid and waiting:
                     mutant = waiting.pop()
-                    text = (ROOT / mutant.module).read_text()
+                    text = (ROOT / mutant.module).read_text(encoding="utf-8")
                     source = change(mutant, text) if mutant.operator else text
                     place.start(mutant, source, tests[mutant.module], limits[mutant.module])
             ended, status = wait(places, limits)
@@ -206,7 +206,7 @@ def try_all(work: Sequence[Mutant], tests: dict[str, list[str]], limits: dict[st
             if mutant.operator:
                 say(mutant)
             elif mutant.outcome != "survived":
-                raise SystemExit((ended.folder / "tests.log").read_text()[-3000:])
+                raise SystemExit((ended.folder / "tests.log").read_text(encoding="utf-8")[-3000:])
 
 
 def wait(places: list[Place], limits: dict[str, float]) -> tuple[Place, int]:
@@ -249,7 +249,7 @@ def measured(modules: Sequence[str], tests: dict[str, list[str]]) -> dict[str, f
 def equivalents() -> dict[tuple[str, str, str], list[dict[str, str]]]:
     """Return the known equivalent mutants by module, line and operator."""
     found: dict[tuple[str, str, str], list[dict[str, str]]] = {}
-    for module, entries in tomllib.loads(EQUIVALENT.read_text()).items():
+    for module, entries in tomllib.loads(EQUIVALENT.read_text(encoding="utf-8")).items():
         for entry in entries:
             found.setdefault((module, entry["was"], entry["operator"]), []).append(entry)
     return found
@@ -270,7 +270,7 @@ def row(area: str, everything: int, tried: Sequence[Mutant]) -> str:
 
 
 def main() -> int:
-    areas = tomllib.loads(SETTINGS.read_text())
+    areas = tomllib.loads(SETTINGS.read_text(encoding="utf-8"))
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--area", action="append", choices=areas)
     parser.add_argument("--module", help="only modules whose path ends with this")
@@ -285,10 +285,12 @@ def main() -> int:
     for area in arguments.area or areas:
         tests = {f"surgical_marl/{module}": words for module, words in areas[area].items()}
         modules = [module for module in tests if module.endswith(arguments.module or "")]
-        found = [mutant for module in modules for mutant in mutants_of(module, (ROOT / module).read_text())]
+        found = [
+            mutant for module in modules for mutant in mutants_of(module, (ROOT / module).read_text(encoding="utf-8"))
+        ]
         drawn = random.Random(arguments.seed).sample(found, min(arguments.sample or len(found), len(found)))
         if arguments.again:
-            before = [Mutant(**item) for item in json.loads(arguments.again.read_text())]
+            before = [Mutant(**item) for item in json.loads(arguments.again.read_text(encoding="utf-8"))]
             drawn = [mutant for mutant in before if mutant.module in tests]
         if not drawn:  # a file of --again may be of other areas
             continue
@@ -303,7 +305,7 @@ def main() -> int:
         done += drawn
         rows.append(row(area, len(found), drawn))
         if arguments.out:
-            arguments.out.write_text(json.dumps([asdict(mutant) for mutant in done], indent=1))
+            arguments.out.write_text(json.dumps([asdict(mutant) for mutant in done], indent=1), encoding="utf-8")
     print("| area | mutants | tried | killed | equivalent | survived | killed of the others (95 % interval) |")
     print("|---|---|---|---|---|---|---|", *rows, sep="\n")
     return 0

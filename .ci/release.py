@@ -30,7 +30,7 @@ sm.parallel_env(1)
 
 
 def run(*command: str | Path, cwd: Path) -> str:
-    done = subprocess.run([*map(str, command)], cwd=cwd, capture_output=True, text=True)
+    done = subprocess.run([*map(str, command)], cwd=cwd, capture_output=True, encoding="utf-8")
     if done.returncode:
         raise SystemExit(f"{' '.join(map(str, command))}\n{done.stdout}{done.stderr}")
     return done.stdout
@@ -44,7 +44,9 @@ def plain(name: str) -> str:
 def hashed(report: str) -> str:
     """Return the lines of constraints.hashes.txt for what pip reports that it would install."""
     wanted = {plain(item["metadata"]["name"]) for item in json.loads(report)["install"]} - {"surgical-marl"}
-    blocks = re.split(r"\n(?=\S)", re.sub(r"(?m)^\s*#.*\n", "", (ROOT / "constraints.hashes.txt").read_text()))
+    blocks = re.split(
+        r"\n(?=\S)", re.sub(r"(?m)^\s*#.*\n", "", (ROOT / "constraints.hashes.txt").read_text(encoding="utf-8"))
+    )
     found = {plain(re.split("[= ;]", block)[0]): block for block in blocks}
     return "\n".join(found[name] for name in sorted(wanted)) + "\n"
 
@@ -66,7 +68,7 @@ def install(wheel: Path, folder: Path) -> Path:
     run(*pip, *constraints, "torch", cwd=folder)  # by itself: a build for CPUs has other hashes than PyPI's
     report, wanted = folder / "report.json", folder / "hashed.txt"
     run(*pip, *constraints, "--dry-run", "--report", report, wheel, cwd=folder)
-    wanted.write_text(hashed(report.read_text()))
+    wanted.write_text(hashed(report.read_text(encoding="utf-8")), encoding="utf-8")
     run(*pip, "--require-hashes", "--no-deps", "-r", wanted, cwd=folder)
     # by its name, so that no path of this machine gets into the list
     run(*pip, "--no-deps", "--no-index", "--find-links", wheel.parent, "surgical-marl", cwd=folder)
@@ -85,9 +87,9 @@ def try_out(python: Path, folder: Path) -> None:
     for policy in ("run", "reach-psm"):
         found = json.loads(run(command, "eval", policy, "--episodes", "4", "--json", cwd=folder))
         assert found["episodes"] == 4 and found["task"] == "reach", found
-    (folder / "client.py").write_text(CLIENT)
+    (folder / "client.py").write_text(CLIENT, encoding="utf-8")
     checker = [sys.executable, "-m", "mypy", "--python-executable", python, "--follow-imports", "silent", "client.py"]
-    said = subprocess.run(checker, cwd=folder, capture_output=True, text=True).stdout.splitlines()
+    said = subprocess.run(checker, cwd=folder, capture_output=True, encoding="utf-8").stdout.splitlines()
     kinds = [re.split(r": (?=note|error)", line)[1][:60] for line in said[:-1]]
     assert len(kinds) == 3 and "Any" not in "".join(kinds[:2]) and "error" in kinds[2], "\n".join(said)
 
@@ -102,7 +104,7 @@ def main() -> int:
         bom = dist / "sbom.cdx.json"
         run(sys.executable, "-m", "cyclonedx_py", "environment", python, "--pyproject", ROOT / "pyproject.toml",
             "--output-reproducible", "-o", bom, cwd=folder)  # fmt: skip
-    print(wheel, bom, f"{len(json.loads(bom.read_text())['components'])} packages", sep="\n")
+    print(wheel, bom, f"{len(json.loads(bom.read_text(encoding='utf-8'))['components'])} packages", sep="\n")
     return 0
 
 

@@ -191,11 +191,11 @@ def evaluate(folder: Path) -> None:
 def write_table(path: Path) -> None:
     """Replace what stands between the two marks in a file by the table of all policies that ship."""
     from surgical_marl.evaluation.card import table
-    from surgical_marl.files import write_atomic
+    from surgical_marl.files import write_text
 
-    before, mark, rest = path.read_text().partition("<!-- table -->\n")
+    before, mark, rest = path.read_text(encoding="utf-8").partition("<!-- table -->\n")
     _, end, after = rest.partition("<!-- end of table -->\n")
-    write_atomic(path, lambda part: part.write_text(f"{before}{mark}{table()}\n{end}{after}"))
+    write_text(path, f"{before}{mark}{table()}\n{end}{after}")
 
 
 if __name__ == "__main__":

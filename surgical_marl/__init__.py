@@ -7,7 +7,27 @@
 Importing this package is quick: JAX, MuJoCo and torch start when an environment is made.
 """
 
-from __future__ import annotations
+import os
+import sys
+
+
+def _reason_to_refuse() -> str:
+    """Return why nothing works here, or an empty text. Python 3.6 can read this file up to its end, too."""
+    if sys.version_info < (3, 11):  # noqa: UP036  # pip looks at it, but a folder on PYTHONPATH comes without pip
+        return "surgical_marl needs Python 3.11 or newer, and this is Python {}.{}.{}".format(*sys.version_info)
+    try:
+        os.getcwd()
+    except OSError:  # PettingZoo and MKL ask for it when they are imported
+        return "the working folder does not exist any more: change to another one"
+    return ""
+
+
+_reason = _reason_to_refuse()
+if _reason:
+    if os.path.basename(sys.argv[0]) in ("surgical-marl", "-m"):  # a command, which needs no traceback
+        sys.stderr.write("surgical-marl: " + _reason + "\n")
+        sys.exit(2)
+    raise ImportError(_reason)
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any

@@ -11,10 +11,8 @@ import contextlib
 import functools
 import hashlib
 import inspect
-import os
 import re
 import sys
-import tempfile
 import zlib
 from collections.abc import Callable, Iterable, Iterator
 from importlib.metadata import PackageNotFoundError, requires, version
@@ -24,6 +22,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
+from surgical_marl.files import writable, write_atomic
 from surgical_marl.runtime import cache_dir
 
 PACKAGE = __name__.partition(".")[0]
@@ -65,7 +64,7 @@ def cached_arrays(
     for part in (*content, code_digest(modules), *_versions()):
         data = part.encode() if isinstance(part, str) else part
         digest.update(len(data).to_bytes(8, "little") + data)
-    path = cache_dir() / kind / f"{digest.hexdigest()[:32]}.npz"
+    path = writable(cache_dir() / kind) / f"{digest.hexdigest()[:32]}.npz"
     if (arrays := _load(path)) is not None:
         return arrays
     with locked(path):
@@ -74,9 +73,7 @@ def cached_arrays(
         arrays = compute()
         with contextlib.suppress(OSError):
             path.parent.mkdir(parents=True, exist_ok=True)
-            with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
-                np.savez(file, **arrays)  # type: ignore[arg-type]  # the one option is no array's name
-            os.replace(file.name, path)
+            write_atomic(path, lambda part: _save(part, arrays))
     return arrays
 
 
@@ -93,6 +90,11 @@ def locked(path: Path) -> Iterator[None]:
             path.parent.mkdir(parents=True, exist_ok=True)
             held.enter_context(FileLock(path.with_name(f".{path.name}.lock")))
         yield
+
+
+def _save(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    with path.open("wb") as file:  # a name without .npz would get one
+        np.savez(file, **arrays)  # type: ignore[arg-type]  # the one option is no array's name
 
 
 def _load(path: Path) -> dict[str, np.ndarray] | None:
@@ -169,8 +171,8 @@ def code_digest(modules: frozenset[str]) -> str:
 @functools.cache
 def _read(path: Path) -> tuple[str, list[str]]:
     """Return the hash of a source file, and the names that it may import: of modules, and of objects in modules."""
-    text = path.read_text()
-    return hashlib.sha256(text.encode()).hexdigest(), list(_imported(text))
+    source = path.read_bytes()
+    return hashlib.sha256(source).hexdigest(), list(_imported(source.decode(errors="replace")))
 
 
 def _imported(text: str) -> Iterator[str]:

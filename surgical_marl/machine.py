@@ -26,7 +26,7 @@ def free_memory(device: str) -> int | None:
 
         return int(torch.cuda.mem_get_info()[0])
     try:
-        lines = Path("/proc/meminfo").read_text().splitlines()
+        lines = Path("/proc/meminfo").read_text(encoding="utf-8").splitlines()
     except OSError:
         return None
     return next((1024 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")), None)
@@ -56,7 +56,7 @@ def cores() -> int:
 def age() -> float:
     """Return the seconds since this process started, or since Python's clock started where the system does not say."""
     with contextlib.suppress(OSError, AttributeError, ValueError):
-        started = Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19]
+        started = Path("/proc/self/stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()[19]
         return time.clock_gettime(time.CLOCK_BOOTTIME) - int(started) / os.sysconf("SC_CLK_TCK")
     return time.process_time()
 
@@ -67,7 +67,7 @@ def restart_peak() -> float:
     if "torch" in sys.modules and sys.modules["torch"].cuda.is_available():
         sys.modules["torch"].cuda.empty_cache()
     with contextlib.suppress(OSError):
-        Path("/proc/self/clear_refs").write_text("5")
+        Path("/proc/self/clear_refs").write_text("5", encoding="utf-8")
     return peak()
 
 
@@ -99,6 +99,7 @@ def _bytes(file: str, name: str, otherwise: float) -> float:
 def _values(file: str, name: str) -> list[str]:
     """Return a value from lines of the form `name: value`."""
     with contextlib.suppress(OSError):
-        lines = [line.split(":", 1) for line in Path(file).read_text().splitlines() if ":" in line]
+        text = Path(file).read_text(encoding="utf-8", errors="replace")
+        lines = [line.split(":", 1) for line in text.splitlines() if ":" in line]
         return [value.strip() for key, value in lines if key.strip() == name]
     return []

@@ -19,6 +19,8 @@ from typing import TYPE_CHECKING, Any
 
 import platformdirs
 
+from surgical_marl.files import writable
+
 FLAG = "--xla_cpu_use_fusion_emitters"
 """XLA's fusion emitter on CPUs computes a serial chain of rotations again for each link that uses it, so the cost of an
 arm grows some three times with every joint. `surgical-marl doctor` measures this."""
@@ -67,7 +69,8 @@ def prepare_jax() -> None:
     os.environ["XLA_FLAGS"] = " ".join([flags, *(f"{flag}=false" for flag in ours)]).strip()
     if not {"NPROC", "PJRT_NPROC"} & os.environ.keys():
         os.environ["PJRT_NPROC"] = str(max(_LEAST_THREADS, os.cpu_count() or 1))
-    _set_option("jax_compilation_cache_dir", str(cache_dir() / "xla"))
+    if not os.environ.get("JAX_COMPILATION_CACHE_DIR"):
+        _set_option("jax_compilation_cache_dir", str(writable(cache_dir() / "xla")))
     _set_option("jax_persistent_cache_min_compile_time_secs", 0)
     # JAX would reserve three quarters of a GPU's memory, which torch needs.
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
@@ -234,10 +237,15 @@ def defer_compiler() -> None:
 
 @functools.cache
 def prepare_warp() -> Any:
-    """Import Warp, and start it without its banner and without a warning that there is no GPU."""
+    """Import Warp, and start it with a cache that can be written, without its banner or a warning without a GPU."""
     import warp
 
     warp.config.log_level = max(warp.config.log_level, warp.LOG_WARNING)
+    name, version = platformdirs.user_cache_dir("warp", "NVIDIA"), warp.config.version
+    root = Path(warp.config.kernel_cache_dir or os.environ.get("WARP_CACHE_PATH") or name)
+    usual = root if root.name == version else root / version  # Warp adds it
+    if (folder := writable(usual)) != usual:
+        warp.config.kernel_cache_dir = str(folder.parent)
     with contextlib.nullcontext() if _has_gpu() else _silence():
         warp.init()
     return warp
@@ -271,7 +279,7 @@ def _silence() -> Iterator[None]:
     """Suppress stderr, also that of compiled code."""
     sys.stderr.flush()
     kept = os.dup(2)
-    with open(os.devnull, "w") as nowhere:
+    with open(os.devnull, "w", encoding="utf-8") as nowhere:
         os.dup2(nowhere.fileno(), 2)
     try:
         yield

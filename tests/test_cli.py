@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from surgical_marl.cli.doctor import chain_seconds
+from surgical_marl.cli.doctor import Finding, chain_seconds
 from surgical_marl.cli.main import main
 
 ROOT = Path(__file__).parents[1]
@@ -109,6 +110,68 @@ def test_bad_input_is_one_sentence_and_code_2(
 
 
 @pytest.mark.parametrize(
+    "argv, wrong",
+    [
+        (["train", "ppo.learning_rte=1e-3"], "'ppo.learning_rte'; did you mean 'ppo.learning_rate'?"),
+        (["train", "reach", "ppo.learning_rte=1e-3"], "ppo.learning_rte"),
+        (["train", "reach", "ppo.gamma=2"], "ppo.gamma must be a number from 0 to 1, not 2"),
+        (["train", "reach", "--algo", "mapo"], "'mapo', did you mean 'mappo'"),
+        (["train", "reach", "--difficulty", "hrad"], "unknown difficulty 'hrad'"),
+        (["train", "--scene", "psmm"], "'psmm', did you mean 'psm'"),
+        (["train", "reach", "--scne", "psm"], "'--scne'"),
+        (["eval", "--task", "reech"], "'reech', did you mean 'reach'"),
+        (["eval", "--scen", "psm"], "'--scen'"),
+        (["eval", "zero", "--difficulty", "hrad"], "unknown difficulty 'hrad', did you mean 'hard'"),
+        (["eval", "zero", "--csv", "table.txt"], "table.txt: name a .csv file"),
+        (["eval", "zero", "--figure", "table.jpg"], "table.jpg: name a .png file"),
+        (["eval", "zero", "--against", "none.json"], "none.json"),
+        (["eval", "zero", "--partner", "psm_0"], "ROLE=POLICY"),
+        (["crossplay", "zero", "--figure", "map.jpg"], "map.jpg: name a .png file"),
+        (["crossplay", "--scene", "psmm"], "'psmm', did you mean 'psm'"),
+        (["report", "--out", "page.htm"], "page.htm: name a .html file"),
+        (["play", "reach", "--out", "film.avi"], "film.avi: name a .mp4, .gif or .webp file"),
+        (["play", "reach", "--otu", "film.mp4"], "'--otu'"),
+        (["play", "reech", "--scene", "psm"], "'reech', did you mean 'reach'"),
+        (["play", "reach", "--policy", "orcle"], "'orcle', did you mean 'oracle'"),
+        (["view", "--policy", "orcle"], "'orcle', did you mean 'oracle'"),
+        (["view", "reach", "--difficulty", "hrad"], "unknown difficulty 'hrad'"),
+        (["view", "--prt", "80"], "'--prt'"),
+        (["export", "scene", "--out", "."], ". exists already"),
+        (["export", "policy", "no_such_run"], "unknown run or policy 'no_such_run'"),
+        (["check", "--verbose"], "'--verbose'"),
+    ],
+)
+def test_what_is_wrong_is_named_before_what_is_missing(
+    argv: list[str],
+    wrong: str,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(argv) == 2
+    err = capsys.readouterr().err
+    assert wrong in err and err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "argv, missing",
+    [
+        (["play"], "play needs TASK and --out FILE; see surgical-marl play --help"),
+        (["eval", "--seed", "1"], "eval needs RUN_OR_POLICY"),
+        (["replay"], "replay needs FILE.npz"),
+        (["check"], "check needs SOURCE"),
+        (["report"], "report needs RUN"),
+        (["export", "policy"], "export policy needs RUN and --out DIR"),
+        (["play", "reach", "--out", "film.mp4"], "play reach needs --scene (bimanual_psm"),
+    ],
+)
+def test_what_is_missing_is_named(argv: list[str], missing: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(argv) == 2
+    assert missing in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
     "growth, verdict",
     [(3.5, "has the serial-chain fault"), (1.1, "does not have"), (None, "not measured")],
 )
@@ -125,6 +188,55 @@ def test_doctor_looks_at_everything(
     for word in ("Python", "mujoco", "jax devices", "torch devices", *caches, verdict):
         assert word in out
     assert "works, no OpenGL needed" in out
+    assert out.splitlines()[-1].split(maxsplit=1)[0] == "verdict"
+
+
+@pytest.mark.parametrize(
+    "findings, text, code",
+    [
+        ([Finding("video", "mp4")], "ready", 0),
+        ([Finding("video", "gif", slow="it is a gif"), Finding("jax", "0.9")], "slowly or in part, because it is a", 0),
+        ([Finding("video", "gif", slow="it is a gif"), Finding("jax", "missing", broken="jax is missing")],
+         "will not work, because jax is missing", 1),
+    ],
+)  # fmt: skip
+def test_the_doctor_ends_with_a_verdict(
+    findings: list[Finding],
+    text: str,
+    code: int,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("surgical_marl.cli.doctor.report", lambda: findings)
+    assert main(["doctor"]) == code
+    last = capsys.readouterr().out.splitlines()[-1]
+    assert last.startswith("verdict ") and text in last
+
+
+def test_the_doctor_tells_of_a_library_that_fails(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail() -> Iterator[Finding]:
+        raise RuntimeError("no backend\nfor it")
+
+    monkeypatch.setattr("surgical_marl.cli.doctor._growth", lambda flag: 1.0)
+    monkeypatch.setattr("surgical_marl.cli.doctor._jax_devices", fail)
+    assert main(["doctor"]) == 1
+    out = capsys.readouterr().out
+    assert "jax devices      fails: no backend for it\n" in out and "works, no OpenGL needed" in out
+    assert out.endswith("verdict          will not work, because jax devices fails: no backend for it\n")
+
+
+@pytest.mark.parametrize("columns", [40, 80, 200])
+@pytest.mark.parametrize("argv", [["list"], ["list", "-v", "scenes"], ["list", "-v", "policies"]])
+def test_lists_fit_the_terminal(
+    argv: list[str], columns: int, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", str(columns))
+    assert main(argv) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) > columns / 3
+    assert all(len(line) <= columns or " " not in line.strip() for line in lines)
 
 
 def test_the_probe_of_the_doctor_measures() -> None:

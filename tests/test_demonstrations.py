@@ -206,7 +206,7 @@ def test_a_signal_ends_imitation_within_a_step_and_it_goes_on_bit_for_bit(
     settings = replace(SETTINGS, iterations=1, imitation=ImitationSettings(steps=20, batch_size=64, hold=0))
     whole, stopped = tmp_path / "whole", tmp_path / "stopped"
     train.train(settings, out=whole)
-    assert "imitating: 20 of 20 step" in capsys.readouterr().err
+    assert "imitating: 20 of 20 steps" in capsys.readouterr().err
     descend = Imitation._descend
 
     def interrupted(self: Imitation) -> None:

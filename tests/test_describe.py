@@ -12,7 +12,10 @@ from surgical_marl.cli.describe import shared_workspace
 from surgical_marl.cli.main import main
 
 
-def test_list_v_names_all_and_says_what_they_are(capsys: pytest.CaptureFixture[str]) -> None:
+def test_list_v_names_all_and_says_what_they_are(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "500")
     assert main(["list", "-v"]) == 0
     out = capsys.readouterr().out
     for name in (*list_scenes(), *list_arms(), "psm_0", "ecm_0", "reach"):

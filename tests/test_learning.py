@@ -252,7 +252,7 @@ def test_a_nan_loss_stops(tmp_path: Path, fakes: list[Any], monkeypatch: pytest.
     assert read_checkpoint(tmp_path / "run")["iteration"] == 0
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2])
 def test_a_signal_ends_the_iteration_and_saves(
     number: int,
     tmp_path: Path,
@@ -272,6 +272,7 @@ def test_a_signal_ends_the_iteration_and_saves(
     with pytest.raises((KeyboardInterrupt, SystemExit)) as stopped:
         train.train(replace(SMALL, checkpoint_every=50), out=tmp_path / "run")
     assert stopped.type is (KeyboardInterrupt if number == signal.SIGINT else SystemExit)
+    assert number == signal.SIGINT or stopped.value.code == 128 + number
     assert signal.getsignal(number) is before
     assert read_checkpoint(tmp_path / "run")["iteration"] == 3
     told = capsys.readouterr().err
@@ -298,7 +299,7 @@ def test_folders_that_cannot_be_used(tmp_path: Path, fakes: list[Any]) -> None:
         (SMALL, {"out": run}, "already holds a run"),
         (SMALL, {"out": tmp_path / "file" / "run"}, "cannot write"),
         (SMALL, {"out": tmp_path / "new", "resume": tmp_path / "empty"}, "not a run folder"),
-        (replace(SMALL, iterations=1), {"out": tmp_path / "new", "resume": run}, "already has 1 iterations"),
+        (replace(SMALL, iterations=1), {"out": tmp_path / "new", "resume": run}, "already has 1 iteration:"),
         (replace(SMALL, num_envs=8), {"out": run, "resume": run}, "num_envs 32"),
         (replace(SMALL, **OPTIONS[1]), {"out": run, "resume": run}, "normalise_values False"),
         (replace(SMALL, **OPTIONS[2]), {"out": run, "resume": run}, "constraint.cost 'none'"),

@@ -35,8 +35,13 @@ def test_a_file_gets_lines_and_few_of_them(capsys: pytest.CaptureFixture[str]) -
     count("evaluating")
     lines = capsys.readouterr().err.splitlines(keepends=True)
     assert len(lines) == 2 and not any("\r" in line for line in lines)
-    assert lines[0].startswith("evaluating: 0 of 3 step") and lines[1].startswith("evaluating: 3 of 3 step")
+    assert lines[0].startswith("evaluating: 0 of 3 steps,") and lines[1].startswith("evaluating: 3 of 3 steps,")
     assert lines[1].endswith("error 2 mm\n")
+
+
+def test_one_is_not_counted_as_many(capsys: pytest.CaptureFixture[str]) -> None:
+    progress(1, "frame").close()
+    assert capsys.readouterr().err.startswith("0 of 1 frame,")
 
 
 FIGURES = "error 0.24 mm, success 100%, collision 0%, 1,234,567 steps/s"

@@ -51,4 +51,4 @@ def test_a_video_is_made_with_a_bar_and_one_thread_of_torch(
     finally:
         torch.set_num_threads(usual)
     assert path.is_file() and set(threads) == {1}
-    assert capsys.readouterr().err.splitlines()[-1].startswith("filming: 10 of 10 frame")
+    assert capsys.readouterr().err.splitlines()[-1].startswith("filming: 10 of 10 frames")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 
-from surgical_marl.content import list_arms, list_objects, list_scenes
+from surgical_marl.content import list_arms, list_objects, list_policies, list_scenes
 from surgical_marl.plugins.algorithms import ALGORITHMS, list_algorithms
 from surgical_marl.plugins.tasks import TASKS, list_tasks
 from surgical_marl.robots.arm import load_arm
@@ -15,8 +15,8 @@ from surgical_marl.scenes.shared_workspace import shared_workspace
 
 
 def describe(kind: str) -> str:
-    """Return the names of one kind of content, with the facts that help to choose among them."""
-    lines = {
+    """Return the names of one kind of content, with the facts that help to choose among them, in lines."""
+    entries = {
         "tasks": lambda: [_task(name) for name in list_tasks()],
         "scenes": lambda: [_scene(load_scene(name)) for name in list_scenes()],
         "arms": lambda: [_arm(name) for name in list_arms()],
@@ -24,7 +24,7 @@ def describe(kind: str) -> str:
         "algorithms": lambda: [_algorithm(name) for name in list_algorithms()],
         "policies": _policies,
     }[kind]()
-    return "\n".join(lines)
+    return "\n".join(entries)
 
 
 def _scene(scene: Scene) -> str:
@@ -59,9 +59,9 @@ def _object(name: str) -> str:
 
 
 def _policies() -> list[str]:
-    from surgical_marl.evaluation.card import table  # imports torch
+    from surgical_marl.evaluation.card import facts  # imports torch
 
-    return table().splitlines()
+    return [f"{name}\n    {facts(name)}" for name in list_policies()]
 
 
 def _task(name: str) -> str:

@@ -5,12 +5,12 @@ from __future__ import annotations
 # Only light imports here, as in main.py.
 import argparse
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
+from surgical_marl.cli.checks import check_file, check_level, check_names, check_policies, read_partners
 from surgical_marl.cli.flags import add_flags, task_help, whole
-from surgical_marl.content import BASELINES, PARTNERS, find, list_policies, list_scenes, unknown
-from surgical_marl.plugins.tasks import find_task, list_tasks
+from surgical_marl.content import BASELINES, PARTNERS, list_policies, list_scenes, unknown
+from surgical_marl.plugins.tasks import list_tasks
 from surgical_marl.runs.progress import preparing
 from surgical_marl.tasks.base.options import Options
 from surgical_marl.untrusted.files import is_file, is_folder, user_path
@@ -30,7 +30,7 @@ def add_eval(commands: Any) -> None:
     parser.add_argument(
         "--figure", type=user_path, metavar="FILE.png", help="success against threshold, and the errors"
     )
-    parser.set_defaults(command=_eval, name="eval")
+    parser.set_defaults(check=_check_eval, command=_eval, name="eval")
 
 
 def add_crossplay(commands: Any) -> None:
@@ -41,7 +41,7 @@ def add_crossplay(commands: Any) -> None:
     _add_options(parser)
     parser.add_argument("--json", action="store_true", help="one JSON object instead of tables")
     parser.add_argument("--figure", type=user_path, metavar="FILE.png", help="heat maps of the success")
-    parser.set_defaults(command=_crossplay, name="crossplay")
+    parser.set_defaults(check=_check_crossplay, command=_crossplay, name="crossplay")
 
 
 def add_report(commands: Any) -> None:
@@ -53,7 +53,7 @@ def add_report(commands: Any) -> None:
     parser.add_argument("--out", type=user_path, metavar="FILE.html", help=where)
     evaluate = "first play 200 episodes with each policy whose episodes are not kept"
     parser.add_argument("--evaluate", action="store_true", help=evaluate)
-    parser.set_defaults(command=_report, name="report")
+    parser.set_defaults(check=_check_report, command=_report, name="report")
 
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
@@ -66,29 +66,37 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=whole(0), default=0, metavar="S")
 
 
-def _eval(arguments: argparse.Namespace) -> None:
-    policies = arguments.policies
+def _check_eval(arguments: argparse.Namespace) -> None:
+    policies = arguments.policies or []
     baselines = [policy for policy in policies if policy in BASELINES]
     if baselines and len(policies) > 1:
         raise ValueError(f"{baselines[0]!r} is not a run of the same training: evaluate it alone")
-    _check(arguments, policies)
-    partners = _partners(arguments.partner)
-    _check_files(("--csv", arguments.csv, ".csv"), ("--figure", arguments.figure, ".png"))
+    arguments.partners = read_partners(arguments.partner)
+    check_file("--csv", arguments.csv, ".csv")
+    check_file("--figure", arguments.figure, ".png")
+    if arguments.against is not None and not is_file(arguments.against):
+        raise ValueError(f"cannot read --against {arguments.against}: there is no such file")
+    _check_played(arguments, policies)
 
+
+def _eval(arguments: argparse.Namespace) -> None:
+    policies = arguments.policies
     with preparing(f"the episodes of {', '.join(policies)}"):
         from surgical_marl.evaluation.asked import CHOSEN, OWN
         from surgical_marl.evaluation.command import play_all, read_result, report
 
         older = None if arguments.against is None else (str(arguments.against), read_result(arguments.against))
         asked = {key: getattr(arguments, key) for key in (*OWN, *CHOSEN)}
-        played = play_all(policies, asked, arguments.episodes, arguments.seed, partners)
+        played = play_all(policies, asked, arguments.episodes, arguments.seed, arguments.partners)
     print(report(played, older, arguments.json, arguments.csv, arguments.figure))
 
 
-def _crossplay(arguments: argparse.Namespace) -> None:
-    _check(arguments, arguments.teams)
-    _check_files(("--figure", arguments.figure, ".png"))
+def _check_crossplay(arguments: argparse.Namespace) -> None:
+    check_file("--figure", arguments.figure, ".png")
+    _check_played(arguments, arguments.teams or [])
 
+
+def _crossplay(arguments: argparse.Namespace) -> None:
     with preparing(f"the episodes of {', '.join(arguments.teams)}"):
         from surgical_marl.evaluation.asked import CHOSEN, OWN
         from surgical_marl.evaluation.crossplay import crossplay, report
@@ -98,12 +106,14 @@ def _crossplay(arguments: argparse.Namespace) -> None:
     print(report(result, arguments.json, arguments.figure))
 
 
-def _report(arguments: argparse.Namespace) -> None:
-    _check_files(("--out", arguments.out, ".html"))
-    for run in arguments.runs:
+def _check_report(arguments: argparse.Namespace) -> None:
+    check_file("--out", arguments.out, ".html")
+    for run in arguments.runs or ():
         if not (is_file(user_path(run)) or is_folder(user_path(run))) and run not in list_policies():
             raise unknown("run or policy", run, list_policies())
 
+
+def _report(arguments: argparse.Namespace) -> None:
     from surgical_marl.report.command import report
 
     with preparing("the report"):
@@ -111,36 +121,12 @@ def _report(arguments: argparse.Namespace) -> None:
     print(path)
 
 
-def _check(arguments: argparse.Namespace, policies: Sequence[str]) -> None:
+def _check_played(arguments: argparse.Namespace, policies: Sequence[str]) -> None:
     """Raise ValueError unless the task, the scene and the policies exist, and say what is played."""
-    trained = [policy for policy in policies if policy not in BASELINES]
-    if not trained and None in (arguments.task, arguments.scene):
-        good = f"--task ({', '.join(list_tasks())}) and --scene ({', '.join(list_scenes())})"
-        raise ValueError(f"{arguments.name} {policies[0]} needs {good}")
-    arguments.task = None if arguments.task is None else find_task(arguments.task)
-    if arguments.scene is not None:
-        find("scenes", arguments.scene)
-    for policy in trained:
-        if not is_folder(user_path(policy)) and policy not in list_policies():
-            raise unknown("run or policy", policy, [*list_policies(), *BASELINES])
-
-
-def _partners(given: Sequence[str]) -> dict[str, str]:
-    """Return agent -> policy of flags ROLE=POLICY."""
-    found: dict[str, str] = {}
-    for text in given:
-        role, _, policy = text.partition("=")
-        if not (role and policy):
-            raise ValueError(f"--partner must be ROLE=POLICY such as psm_0=frozen, not {text!r}")
-        if role in found:
-            raise ValueError(f"--partner names {role!r} twice")
-        if policy not in PARTNERS and not is_folder(user_path(policy)) and policy not in list_policies():
-            raise unknown("partner", policy, [*list_policies(), *PARTNERS])
-        found[role] = policy
-    return found
-
-
-def _check_files(*files: tuple[str, Path | None, str]) -> None:
-    for flag, path, suffix in files:
-        if path and not (path.suffix == suffix and is_folder(path.parent)):
-            raise ValueError(f"cannot write {flag} {path}: name a {suffix} file in a folder that exists")
+    check_names(arguments)
+    check_policies(policies)
+    if policies and set(policies) <= set(BASELINES):
+        check_level(arguments)
+        if None in (arguments.task, arguments.scene):
+            good = f"--task ({', '.join(list_tasks())}) and --scene ({', '.join(list_scenes())})"
+            raise ValueError(f"{arguments.name} {policies[0]} needs {good}")

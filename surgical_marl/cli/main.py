@@ -6,14 +6,19 @@ from __future__ import annotations
 # commands that need them.
 import argparse
 import contextlib
+import functools
+import logging
 import os
+import shutil
 import sys
+import textwrap
 import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
 from surgical_marl.cli.benching import add_bench
+from surgical_marl.cli.checks import check_level, check_names
 from surgical_marl.cli.evaluating import add_crossplay, add_eval, add_report
 from surgical_marl.cli.flags import add_flags, given, one_of, task_help
 from surgical_marl.cli.viewing import add_play, add_replay, add_view
@@ -22,9 +27,10 @@ from surgical_marl.engines.stages import told
 from surgical_marl.machine import lacks_memory
 from surgical_marl.plugins.algorithms import list_algorithms
 from surgical_marl.plugins.task_file import is_task_file, label
-from surgical_marl.plugins.tasks import find_task, list_tasks, scene_of
+from surgical_marl.plugins.tasks import TASKS, find_task, list_tasks, scene_of
+from surgical_marl.runs.process import lasting_streams, open_streams, use_utf8
 from surgical_marl.runs.progress import Compilations, preparing
-from surgical_marl.runs.settings import Settings
+from surgical_marl.runs.settings import Settings, check_overrides
 from surgical_marl.runtime import calm_threads, defer_compiler
 from surgical_marl.tasks.base.options import choices
 from surgical_marl.untrusted.files import user_path
@@ -50,35 +56,51 @@ def main(argv: Sequence[str] | None = None) -> int:
     The code is 0 for success, 1 if training diverged or `check` found something, 2 for bad input, and 130 if the user
     interrupted the command.
     """
-    code = 0
+    if argv is None:  # a program of its own, and not a call within another one
+        use_utf8()
+        open_streams()
     calm_threads()
     defer_compiler()
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # it warns of a home that it can't write to
+    with lasting_streams():
+        return _run(argv)
+
+
+def _run(argv: Sequence[str] | None) -> int:
     try:
         arguments = _parse(argv)
+        if "check" in arguments:
+            arguments.check(arguments)
+        if arguments.missing:
+            needs = " and ".join(arguments.missing)
+            raise ValueError(f"{arguments.name} needs {needs}; see surgical-marl {arguments.name} --help")
         with told(Compilations()):
-            code = arguments.command(arguments) or 0
+            code: int = arguments.command(arguments) or 0
         sys.stdout.flush()
+        return code
     except ValueError as error:
-        print(f"surgical-marl: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
+        return _refuse(error)
     except FloatingPointError as error:
-        print(f"surgical-marl: {error}", file=sys.stderr)
-        return 1
+        return _refuse(error, 1)
     except KeyboardInterrupt:
-        print("surgical-marl: interrupted", file=sys.stderr)
-        return 130
-    except BrokenPipeError:
-        # The reader (`| head`) is gone. Redirect stdout, so that Python's exit reports no error.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return _refuse("interrupted", 130)
     except OSError as error:  # a full disk, a folder that is read-only, a name that no file can have
         about = f"{shown(str(error.filename))}: " if error.filename is not None else ""
-        print(f"surgical-marl: {about}{error.strerror or error}", file=sys.stderr)
-        return 2
+        return _refuse(f"{about}{error.strerror or error}")
     except Exception as error:  # each library has its own for a lack of memory, which may be met when it is imported
         if not lacks_memory(error):
             raise
-        print("surgical-marl: there is not enough memory for that", file=sys.stderr)
-        return 2
+        return _refuse("there is not enough memory for that")
+
+
+def _refuse(why: object, code: int = 2) -> int:
+    """Say in one sentence on stderr why a command ends early, and return its exit code."""
+    try:
+        os.getcwd()
+        where = ""
+    except OSError:
+        where = " (the working folder does not exist any more: change to another one)"
+    print(f"surgical-marl: {' '.join(str(why).split())}{where}", file=sys.stderr)
     return code
 
 
@@ -90,6 +112,17 @@ class _Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         raise ValueError(f"{message}; see {self.prog} --help")
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
+        """Collect the names of required arguments that are not given in `missing`, instead of refusing all others."""
+        needed = [action for action in self._actions if action.required and action.dest != argparse.SUPPRESS]
+        for action in needed:
+            action.required = False
+        found, rest = super().parse_known_args(args, namespace)
+        missing = [action for action in needed if getattr(found, action.dest) is None]
+        names = [" ".join([*action.option_strings, str(action.metavar)]) for action in missing]
+        found.missing = [*getattr(found, "missing", []), *names]
+        return found, rest
 
 
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
@@ -130,7 +163,7 @@ def _parser() -> argparse.ArgumentParser:
     train.add_argument(
         "--resume", type=user_path, metavar="DIR", help="run folder to go on with, or to start in with TASK and --scene"
     )
-    train.set_defaults(command=_train, name="train")
+    train.set_defaults(check=_check_train, command=_train, name="train")
 
     add_eval(commands)
     add_crossplay(commands)
@@ -158,7 +191,7 @@ def _parser() -> argparse.ArgumentParser:
     scene.add_argument("--format", type=one_of(("mjcf",)), default="mjcf", metavar="mjcf", help="MuJoCo's XML")
     scene.add_argument("--out", type=user_path, metavar="FILE", help="default: <scene>.xml in the current folder")
     scene.add_argument("--control", type=one_of(_CONTROL), default=_CONTROL[0], metavar="|".join(_CONTROL))
-    scene.set_defaults(command=_export_scene, name="export scene")
+    scene.set_defaults(check=_check_export_scene, command=_export_scene, name="export scene")
     policy = kinds.add_parser("policy", help="a trained policy as a folder: ONNX, safetensors, evaluation, card, clip")
     policy.add_argument(
         "runs", nargs="+", metavar="RUN", help="run folders of one training, one a seed: the best is taken"
@@ -166,7 +199,7 @@ def _parser() -> argparse.ArgumentParser:
     policy.add_argument(
         "--out", type=user_path, required=True, metavar="DIR", help="the policy's folder, such as policies/NAME"
     )
-    policy.set_defaults(command=_export_policy, name="export policy")
+    policy.set_defaults(check=_check_export_policy, command=_export_policy, name="export policy")
 
     add_bench(commands)
     doctor = commands.add_parser("doctor", help="check this machine and this installation")
@@ -179,15 +212,23 @@ def _list(arguments: argparse.Namespace) -> None:
         from surgical_marl.cli.describe import describe
 
         if arguments.kind:
-            print(describe(arguments.kind))
+            print(_fitted(describe(arguments.kind)))
         else:
-            print("\n\n".join(f"{kind}\n{describe(kind) or '-'}" for kind in _LISTS))
+            print("\n\n".join(f"{kind}\n{_fitted(describe(kind)) or '-'}" for kind in _LISTS))
         return
     if arguments.kind:
         print("\n".join(_LISTS[arguments.kind]()))
         return
     for kind, names in _LISTS.items():
-        print(f"{kind:10} {', '.join(names()) or '-'}")
+        print(_fitted(f"{kind:10} {', '.join(names()) or '-'}"))
+
+
+def _fitted(text: str) -> str:
+    """Return lines as lines that the terminal has room for, or 80 columns where there is none; words stay whole."""
+    room = max(shutil.get_terminal_size().columns, 20)
+    fill = functools.partial(textwrap.fill, width=room, break_long_words=False, break_on_hyphens=False)
+    lines = text.splitlines()
+    return "\n".join(fill(line, subsequent_indent=" " * (len(line) - len(line.lstrip()) + 4)) for line in lines)
 
 
 def _check(arguments: argparse.Namespace) -> int:
@@ -218,56 +259,72 @@ def _check_task(arguments: argparse.Namespace) -> int:
     return 1 if finding else 0
 
 
+def _check_export_policy(arguments: argparse.Namespace) -> None:
+    for run in arguments.runs or ():
+        find("policies", run)
+
+
 def _export_policy(arguments: argparse.Namespace) -> None:
     from surgical_marl.evaluation.export import export_policy
 
     print(export_policy(arguments.runs, arguments.out))
 
 
-def _export_scene(arguments: argparse.Namespace) -> None:
-    source = find("scenes", arguments.source)
-    out = arguments.out or Path(f"{source.stem}.xml")
-    if out.exists():
-        raise ValueError(f"{out} exists already: name another file with --out")
+def _check_export_scene(arguments: argparse.Namespace) -> None:
+    if arguments.source is not None:
+        source = find("scenes", arguments.source)
+        arguments.out = arguments.out or Path(f"{source.stem}.xml")
+    if arguments.out is not None and arguments.out.exists():
+        raise ValueError(f"{arguments.out} exists already: name another file with --out")
 
-    from surgical_marl.files import write_atomic
+
+def _export_scene(arguments: argparse.Namespace) -> None:
+    from surgical_marl.files import write_text
     from surgical_marl.scenes.load import load_scene
     from surgical_marl.scenes.mjcf import mjcf
 
-    text = mjcf(load_scene(source, arguments.control))
+    text = mjcf(load_scene(find("scenes", arguments.source), arguments.control))
     try:
-        write_atomic(out, lambda path: path.write_text(text))
+        write_text(arguments.out, text)
     except OSError as error:
-        raise ValueError(f"cannot write {out}: {error.strerror}") from None
-    print(out)
+        raise ValueError(f"cannot write {arguments.out}: {error.strerror}") from None
+    print(arguments.out)
 
 
-def _doctor(arguments: argparse.Namespace) -> None:
-    from surgical_marl.cli.doctor import report
+def _doctor(arguments: argparse.Namespace) -> int:
+    from surgical_marl.cli.doctor import report, verdict
 
-    for what, finding in report():
-        print(f"{what:16} {finding}", flush=True)
+    findings = []
+    for finding in report():
+        print(f"{finding.what:16} {finding.text}", flush=True)
+        findings.append(finding)
+    text, code = verdict(findings)
+    print(f"{'verdict':16} {text}")
+    return code
+
+
+def _check_train(arguments: argparse.Namespace) -> None:
+    check_names(arguments)
+    if arguments.task is not None and arguments.scene is None and not arguments.resume:
+        arguments.scene = TASKS.load(arguments.task).default_scene
+    if not arguments.resume and None in (arguments.task, arguments.scene):
+        check_level(arguments)
+        check_overrides(_overrides(arguments))
+        raise ValueError(f"train needs TASK ({', '.join(list_tasks())}) and --scene ({', '.join(list_scenes())})")
+
+
+def _overrides(arguments: argparse.Namespace) -> list[str]:
+    return [*(f"{key}={value}" for key, value in given(arguments, Settings).items()), *arguments.overrides]
 
 
 def _train(arguments: argparse.Namespace) -> None:
-    arguments.task = None if arguments.task is None else find_task(arguments.task)
-    if arguments.task is not None and arguments.scene is None and not arguments.resume:
-        from surgical_marl.plugins.tasks import TASKS
-
-        arguments.scene = TASKS.load(arguments.task).default_scene
-    if arguments.scene is not None:
-        find("scenes", arguments.scene)
-    if not arguments.resume and None in (arguments.task, arguments.scene):
-        raise ValueError(f"train needs TASK ({', '.join(list_tasks())}) and --scene ({', '.join(list_scenes())})")
-    flags = [f"{key}={value}" for key, value in given(arguments, Settings).items()]
-
     from surgical_marl.learning.distributed import claim_gpu, is_first
     from surgical_marl.runs.content import scene_label
     from surgical_marl.runs.folder import has_begun, read_settings
     from surgical_marl.runs.identity import setting
     from surgical_marl.runs.settings import load_config
 
-    overrides, resume = [*flags, *arguments.overrides], arguments.resume
+    overrides, resume = _overrides(arguments), arguments.resume
     claim_gpu("cpu" if "device=cpu" in overrides else "auto")  # first, because looking for a GPU starts CUDA
     in_place = resume and (arguments.out or resume).resolve() == resume.resolve()
     if in_place and None not in (arguments.task, arguments.scene) and not has_begun(resume):

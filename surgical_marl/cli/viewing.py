@@ -10,12 +10,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from surgical_marl.cli.checks import check_file, check_level, check_names, check_policies
 from surgical_marl.cli.flags import add_flags, task_help, whole
-from surgical_marl.content import BASELINES, find, list_policies, list_scenes, unknown
-from surgical_marl.plugins.tasks import find_task
+from surgical_marl.content import BASELINES, find, list_scenes
+from surgical_marl.plugins.tasks import TASKS
+from surgical_marl.runs.process import ending_signals
 from surgical_marl.runs.progress import preparing
 from surgical_marl.tasks.base.options import Options
-from surgical_marl.untrusted.files import is_file, is_folder, user_path
+from surgical_marl.untrusted.files import is_file, user_path
+from surgical_marl.untrusted.values import plural
 
 _OWN = ("control", "knowledge", "messages", "difficulty", "start", "goals")
 
@@ -29,7 +32,7 @@ def add_view(commands: Any) -> None:
     parser.add_argument(
         "--record", type=user_path, metavar="DIR", help="keep what was done, for `surgical-marl replay`"
     )
-    parser.set_defaults(command=_view, name="view")
+    parser.set_defaults(check=_check_shown, command=_view, name="view")
 
 
 def add_play(commands: Any) -> None:
@@ -45,7 +48,7 @@ def add_play(commands: Any) -> None:
     what = "pixels of the picture of one environment (default: 480x360, and less in a grid)"
     parser.add_argument("--size", type=_size, metavar="WxH", help=what)
     parser.add_argument("--plain", action="store_true", help="without words in the picture")
-    parser.set_defaults(command=_play, name="play")
+    parser.set_defaults(check=_check_play, command=_play, name="play")
 
 
 def add_replay(commands: Any) -> None:
@@ -53,7 +56,7 @@ def add_replay(commands: Any) -> None:
     parser = commands.add_parser("replay", help="step a recording of the viewer, or towards a fault, again")
     what = "what `surgical-marl view --record` wrote, or a fault-*.npz of a run folder: where numbers became NaN"
     parser.add_argument("file", type=user_path, metavar="FILE.npz", help=what)
-    parser.set_defaults(command=_replay, name="replay")
+    parser.set_defaults(check=_check_replay, command=_replay, name="replay")
 
 
 def _add_what(parser: argparse.ArgumentParser) -> None:
@@ -79,7 +82,7 @@ def _view(arguments: argparse.Namespace) -> None:
     import threading
 
     end = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in ending_signals():
         signal.signal(number, lambda *_: end.set())
     viewer.run(end)
 
@@ -115,10 +118,6 @@ def _play(arguments: argparse.Namespace) -> None:
 def _film(arguments: argparse.Namespace) -> Path:
     """Write the film that is asked for, and return its path."""
     settings, who = _settings(arguments)
-    if arguments.out.suffix not in (".mp4", ".gif", ".webp") or not is_folder(arguments.out.parent):
-        raise ValueError(
-            f"cannot write --out {arguments.out}: name an .mp4, .gif or .webp file in a folder that exists"
-        )
 
     from surgical_marl.runs.environment import make_env
     from surgical_marl.view.film import Look, camera_of, film
@@ -153,9 +152,6 @@ def _number(text: str) -> float:
 
 
 def _replay(arguments: argparse.Namespace) -> int:
-    if not is_file(arguments.file):
-        raise ValueError(f"there is no file {arguments.file}")
-
     with preparing(f"the steps of {arguments.file}"):
         from surgical_marl.runs.fault import read_fault
         from surgical_marl.view.take import replay
@@ -163,12 +159,13 @@ def _replay(arguments: argparse.Namespace) -> int:
         if (fault := read_fault(arguments.file)) is not None:
             return _reproduce(arguments.file, *fault)
         found = replay(arguments.file)
+    steps = f"{found.steps} {plural(found.steps, 'step')}"
     if found.differs_at is None:
-        print(f"{arguments.file}: {found.steps} steps, the same numbers")
+        print(f"{arguments.file}: {steps}, the same numbers")
         return 0
     changed = f"; versions have changed: {', '.join(found.versions)}" if found.versions else ""
     print(
-        f"{arguments.file}: {found.steps} steps, other numbers from step {found.differs_at} on, positions by up to "
+        f"{arguments.file}: {steps}, other numbers from step {found.differs_at} on, positions by up to "
         f"{found.largest:.3g}{changed}"
     )
     return 1
@@ -185,40 +182,51 @@ def _reproduce(file: Path, about: Any, arrays: Any) -> int:
         print("\n".join(f"  {place}" for place in found.places))
         return 0
     changed = f"; versions have changed: {', '.join(found.versions)}" if found.versions else ""
-    print(f"all numbers stay finite in {found.steps} steps, on {found.device} (found on {about['device']}){changed}")
+    steps = f"{found.steps} {plural(found.steps, 'step')}"
+    print(f"all numbers stay finite in {steps}, on {found.device} (found on {about['device']}){changed}")
     return 1
 
 
-def _settings(arguments: argparse.Namespace) -> tuple[Any, str | None]:
-    """Return the settings of what is shown, and who moves the arms; ValueError if it does not exist or fit together."""
-    # for policies that need torch: with few environments its threads wait for each other longer than they compute
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
-    arguments.task = find_task(arguments.task)
-    if arguments.scene is not None:
-        find("scenes", arguments.scene)
-    who = arguments.policy
-    if who is not None and who not in BASELINES:
-        arguments.scene = _scene_of(arguments, who)
-    if arguments.scene is None:
-        from surgical_marl.plugins.tasks import TASKS
+def _check_play(arguments: argparse.Namespace) -> None:
+    check_file("--out", arguments.out, ".mp4", ".gif", ".webp")
+    _check_shown(arguments)
 
-        arguments.scene = TASKS.load(arguments.task).default_scene
+
+def _check_shown(arguments: argparse.Namespace) -> None:
+    """Raise ValueError unless task, scene and policy exist and fit together; fill in the scene if it is not given."""
+    check_names(arguments)
+    if arguments.policy is not None:
+        check_policies([arguments.policy])
+    if arguments.task is None:
+        check_level(arguments)
+        return
+    if arguments.policy not in (None, *BASELINES):
+        arguments.scene = _scene_of(arguments, arguments.policy)
+    arguments.scene = arguments.scene or TASKS.load(arguments.task).default_scene
     if arguments.scene is None:
+        check_level(arguments)
         raise ValueError(f"{arguments.name} {arguments.task} needs --scene ({', '.join(list_scenes())})")
 
+
+def _check_replay(arguments: argparse.Namespace) -> None:
+    if arguments.file is not None and not is_file(arguments.file):
+        raise ValueError(f"there is no file {arguments.file}")
+
+
+def _settings(arguments: argparse.Namespace) -> tuple[Any, str | None]:
+    """Return the settings of what is shown, and who moves the arms; ValueError if they don't fit together."""
+    # for policies that need torch: with few environments its threads wait for each other longer than they compute
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
     from surgical_marl.evaluation.asked import common_settings
 
     asked = {key: getattr(arguments, key) for key in ("task", "scene", *_OWN)}
-    settings = common_settings([who or "zero"], {**asked, "goals": asked["goals"] or "training"})
+    settings = common_settings([arguments.policy or "zero"], {**asked, "goals": asked["goals"] or "training"})
 
-    return replace(settings, seed=arguments.seed), who
+    return replace(settings, seed=arguments.seed), arguments.policy
 
 
 def _scene_of(arguments: argparse.Namespace, who: str) -> str:
     """Return the scene of a run or policy; ValueError if it is of another task or scene than the arguments say."""
-    if who not in list_policies() and not is_folder(user_path(who)):
-        raise unknown("run or policy", who, [*list_policies(), *BASELINES])
-
     from surgical_marl.runs.content import scene_label
     from surgical_marl.runs.folder import read_settings
 

@@ -33,7 +33,8 @@ def common_settings(policies: Sequence[str], asked: Mapping[str, str | None]) ->
     for policy, other in settings.items():
         for key in (*OWN, *CHOSEN, "max_steps"):
             if (theirs := setting(other, key)) != (ours := setting(first, key)):
-                raise ValueError(f"{policy} has {key} {theirs!r} and {name} has {ours!r}: they can't be compared")
+                advice = f"choose one for all with --{key}" if key in CHOSEN else "they can't be compared"
+                raise ValueError(f"{policy} has {key} {theirs!r} and {name} has {ours!r}: {advice}")
     for policy in trained:
         check_trained(find("policies", policy))
     if "oracle" in policies:

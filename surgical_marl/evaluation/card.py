@@ -78,8 +78,14 @@ def misses(result: Mapping[str, Any]) -> list[str]:
     return found
 
 
+def facts(policy: str) -> str:
+    """Return what the table says of a shipped policy, as one line of text."""
+    cells = zip(COLUMNS, _row(find("policies", policy)), strict=True)
+    return "; ".join(f"{column}: {cell}" for column, cell in list(cells)[1:] if cell != "-")
+
+
 def table() -> str:
-    """Return the table of all shipped policies in Markdown, as `surgical-marl list policies -v` prints it."""
+    """Return the table of all shipped policies in Markdown."""
     rows = [_row(find("policies", name)) for name in list_policies()]
     widths = [max(map(len, column)) for column in zip(COLUMNS, *rows, strict=True)]
     lines = [COLUMNS, tuple("-" * width for width in widths), *rows]

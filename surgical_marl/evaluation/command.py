@@ -12,7 +12,7 @@ from surgical_marl.evaluation.asked import common_settings, find_policy
 from surgical_marl.evaluation.episodes import EPISODES, write_played
 from surgical_marl.evaluation.evaluate import MAX_BATCH, Played, difference, play, summarise
 from surgical_marl.evaluation.report import ABOUT, format_table, write_csv
-from surgical_marl.files import write_atomic
+from surgical_marl.files import write_text
 from surgical_marl.policies.policy import load_policy
 from surgical_marl.policies.team import Team, check_partners
 from surgical_marl.runs.environment import make_env
@@ -106,7 +106,7 @@ def judge(run: Path) -> None:
     result = {**summarise([played]), **({"iteration": int(rows[-1]["iteration"])} if rows else {})}
     text = json.dumps(result, indent=2) + "\n"
     write_played(run / EPISODES, played)
-    write_atomic(run / RESULT, lambda path: path.write_text(text))
+    write_text(run / RESULT, text)
     print(format_table(result), flush=True)
 
     from surgical_marl.view.record import record

@@ -16,7 +16,7 @@ from surgical_marl.content import find
 from surgical_marl.evaluation.card import CARD, CLIP, EVALUATION, card, misses, worst_median
 from surgical_marl.evaluation.command import play_all
 from surgical_marl.evaluation.evaluate import summarise
-from surgical_marl.files import write_atomic
+from surgical_marl.files import write_text
 from surgical_marl.plugins.task_file import label
 from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.policies.actor import load_actor
@@ -99,8 +99,8 @@ def evaluate_again(folder: Path) -> None:
     before = read_json(path)
     (played,) = play_all([str(folder)], {}, EPISODES, SEED).values()
     found = {"policy": folder.name, **summarise([played]), "seeds": before["seeds"], "also": _also(str(folder))}
-    write_atomic(path, lambda part: part.write_text(_compact(found)))
-    write_atomic(folder / CARD, lambda part: part.write_text(card(folder, folder.name)))
+    write_text(path, _compact(found))
+    write_text(folder / CARD, card(folder, folder.name))
 
 
 def _compact(evaluation: dict[str, Any]) -> str:
@@ -135,13 +135,13 @@ def _fill(folder: Path, run: Path, settings: Settings, evaluation: dict[str, Any
     for name, model in actor.models.items():
         write_onnx(folder / f"{name}{SUFFIX}", model, layout.pictures[name])
     scene = stored_scene(copy_content(settings.scene, folder), folder)
-    (folder / CONFIG).write_text(config_text(settings, {"scene": scene, **read_origin(run)}))
+    write_text(folder / CONFIG, config_text(settings, {"scene": scene, **read_origin(run)}))
     shutil.copyfile(run / METRICS, folder / METRICS)
-    (folder / EVALUATION).write_text(_compact(evaluation))
+    (folder / EVALUATION).write_text(_compact(evaluation), encoding="utf-8")
     draw_curve(folder, f"{label(settings.task)} in {Path(settings.scene).stem}, {settings.algo}, seed {settings.seed}")
     print("recording a clip", file=sys.stderr)
     try:
         record(env, load_policy(run, env), folder / CLIP, small=True)
     except (OSError, RuntimeError) as error:
         print(f"surgical-marl: no clip, since this machine cannot make one: {error}", file=sys.stderr)
-    (folder / CARD).write_text(card(folder, evaluation["policy"]))
+    (folder / CARD).write_text(card(folder, evaluation["policy"]), encoding="utf-8")

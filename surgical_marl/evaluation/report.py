@@ -80,7 +80,7 @@ def write_csv(path: Path, results: Sequence[Mapping[str, Any]]) -> None:
     rows = [_csv_row(result, agent) for result in results for agent in (None, *result["agents"])]
 
     def write(temporary: Path) -> None:
-        with temporary.open("w", newline="") as file:
+        with temporary.open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, rows[0].keys())
             writer.writeheader()
             writer.writerows(rows)

@@ -55,11 +55,11 @@ class Log:
         self._columns = training.columns
         self._files = ExitStack()
         self._files.enter_context(_quiet_threads())
-        self._csv = self._files.enter_context((out / METRICS).open("a", newline=""))
+        self._csv = self._files.enter_context((out / METRICS).open("a", newline="", encoding="utf-8"))
         board = SummaryWriter(str(out / "tensorboard"), purge_step=training.iteration + 1)
         self._board = self._files.enter_context(board)
         total, begun = training.settings.iterations, training.iteration
-        self._bar = self._files.enter_context(progress(total, "it", begun=begun))
+        self._bar = self._files.enter_context(progress(total, "iteration", begun=begun))
 
     def __enter__(self) -> Log:
         return self

@@ -56,8 +56,12 @@ from surgical_marl.runs.folder import (
 )
 from surgical_marl.runs.identity import identity
 from surgical_marl.runs.lock import LOCK, owned
+from surgical_marl.runs.process import ending_signals, lasting_streams
 from surgical_marl.runs.settings import Settings
+from surgical_marl.untrusted.values import plural
 
+_AGAIN = signal.SIGINT, signal.SIGTERM
+"""Signals that a person sends again."""
 MOST_FAULTS = 10
 """Files of faults in a run folder."""
 
@@ -99,15 +103,17 @@ def train(settings: Settings, *, out: Path, resume: Path | None = None) -> Path:
         ValueError: the folder cannot be used or written, another process trains in it, the settings do not fit the run
             to resume, or so many environments do not fit into memory.
         FloatingPointError: training produced NaN; the last good checkpoint is kept, and `diverged.json` says where.
-        KeyboardInterrupt, SystemExit: after Ctrl-C or SIGTERM, when the checkpoint is written.
+        KeyboardInterrupt, SystemExit: after Ctrl-C, or SIGTERM, SIGHUP, SIGUSR1 or SIGUSR2, when the checkpoint is
+            written.
     """
-    with distributed.joined(settings.device), ExitStack() as closing:
+    with lasting_streams(), distributed.joined(settings.device), ExitStack() as closing:
         out = Path(distributed.agreed(str(out)))  # its name may hold the time
         if distributed.rank() == 0 and _same(out, resume):
             closing.enter_context(owned(out))  # before it is read
         state = None if resume is None else _read_resumed(settings, Path(resume), _same(out, resume))
         if state is not None and state["iteration"] == settings.iterations:
-            _say(f"the run in {out} has its {settings.iterations} iterations: to go on, ask for more")
+            count = f"{settings.iterations} {plural(settings.iterations, 'iteration')}"
+            _say(f"the run in {out} has its {count}: to go on, ask for more")
             return out
         rows = read_metrics(Path(resume)) if resume is not None and state is not None else []
         with _storing(out), _claimed(out, resume, settings, closing) as scene:
@@ -275,9 +281,8 @@ def _read_resumed(settings: Settings, run: Path, goes_on: bool) -> dict[str, Any
         return None
     state = read_checkpoint(run)
     if state["iteration"] > settings.iterations or (state["iteration"] == settings.iterations and not goes_on):
-        raise ValueError(
-            f"the run in {run} already has {state['iteration']} iterations: ask for more than {settings.iterations}"
-        )
+        done = f"{state['iteration']} {plural(state['iteration'], 'iteration')}"
+        raise ValueError(f"the run in {run} already has {done}: ask for more than {settings.iterations}")
     steps = state["iteration"] * settings.num_envs * settings.steps_per_iteration
     # a checkpoint of an older version lacks these two
     state = {"processes": 1, "env_steps": steps, **state}
@@ -310,29 +315,36 @@ def _say(what: str, by: int = 0) -> None:
 
 @contextmanager
 def _signals(training: Trainer, out: Path) -> Iterator[list[int]]:
-    """Collect Ctrl-C and SIGTERM, so that the iteration ends and is saved, or before the first one a step of imitation.
+    """Collect the signals that would end this process, so that the iteration ends and is saved.
 
-    A second signal stops a single process at once. It does not stop one of several processes, because the others would
-    wait for it.
+    Before the first iteration a step of imitation takes its place. A second Ctrl-C or SIGTERM stops a single process at
+    once. It does not stop one of several processes, because the others would wait for it. SIGHUP may come twice where a
+    terminal is closed, from the system and from the shell.
     """
     received: list[int] = []
     if threading.current_thread() is not threading.main_thread():  # only the main thread may set handlers
         yield received
         return
-    old = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    old = ending_signals()
 
     def receive(number: int, _: FrameType | None) -> None:
         received.append(number)
         training.stop_wanted = True
-        if distributed.size() == 1:
-            for each, handler in old.items():
-                signal.signal(each, handler)
+        if distributed.size() > 1:
+            return
+        again = ""
+        if number in _AGAIN:
+            again = " (again to stop at once)"
+            for each in _AGAIN:
+                signal.signal(each, old[each])
+        if len(received) == 1:
             run, after = shlex.quote(str(out)), "" if training.imitating else " after this iteration"
-            tqdm.write(
-                f"surgical-marl: stopping{after} (again to stop at once); `surgical-marl train --resume "
-                f"{run}` goes on, `surgical-marl report {run}` shows what there is",
-                file=sys.stderr,
-            )
+            with suppress(RuntimeError):  # in the middle of another write
+                tqdm.write(
+                    f"surgical-marl: stopping{after}{again}; `surgical-marl train --resume {run}` goes on, "
+                    f"`surgical-marl report {run}` shows what there is",
+                    file=sys.stderr,
+                )
 
     for number in old:
         signal.signal(number, receive)

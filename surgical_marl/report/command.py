@@ -63,7 +63,7 @@ def _check(path: Path) -> None:
     if is_folder(path) or not is_folder(path.parent):
         raise ValueError(f"cannot write {path}: name a .html file in a folder that exists")
     if path.is_file():
-        with path.open(errors="replace") as file:
+        with path.open(encoding="utf-8", errors="replace") as file:
             if f'content="{GENERATOR}"' not in file.read(2000):
                 raise ValueError(f"{path} exists and is not a report: name another file with --out")
 

@@ -215,4 +215,4 @@ def _template() -> jinja2.Template:
 
 
 def _file(name: str) -> str:
-    return Path(__file__).with_name(name).read_text()
+    return Path(__file__).with_name(name).read_text(encoding="utf-8")

@@ -20,6 +20,7 @@ from surgical_marl.evaluation.evaluate import Played
 from surgical_marl.runs.content import found_scene, scene_label
 from surgical_marl.runs.folder import CHECKPOINT, CONFIG, DIVERGED, METRICS, holds_weights, read_metrics
 from surgical_marl.untrusted.files import is_file, is_folder
+from surgical_marl.untrusted.values import plural
 from surgical_marl.yaml_file import load_yaml
 
 NOTES = ("versions", "origin")
@@ -155,7 +156,7 @@ def _status(folder: Path, config: Mapping[str, Any], columns: Mapping[str, np.nd
         return False, "Unfinished: no iteration is done yet."
     if isinstance(wanted, int) and done < wanted:
         return False, f"Unfinished: {done:,}{of} iterations are done. It was stopped, or is still running."
-    return True, f"Finished: {done:,} iterations."
+    return True, f"Finished: {done:,} {plural(done, 'iteration')}."
 
 
 def _last(columns: Mapping[str, np.ndarray], name: str) -> int:

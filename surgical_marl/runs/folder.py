@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import Any
 
 from surgical_marl.content import find, list_policies
-from surgical_marl.files import is_temporary, write_atomic
+from surgical_marl.files import is_temporary, write_atomic, write_text
 from surgical_marl.runs.content import stored_scene
 from surgical_marl.runs.lock import LOCK
 from surgical_marl.runs.settings import Settings, config_text, read_config
@@ -104,8 +104,7 @@ def write_config(run: Path, settings: Settings) -> None:
         "started": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
     }
     scene = stored_scene(settings.scene, run)
-    text = config_text(settings, {"scene": scene, "versions": versions, "origin": origin})
-    write_atomic(run / CONFIG, lambda path: path.write_text(text))
+    write_text(run / CONFIG, config_text(settings, {"scene": scene, "versions": versions, "origin": origin}))
 
 
 def read_origin(run: Path) -> dict[str, dict[str, str | None]]:
@@ -146,7 +145,7 @@ def check_trained(run: Path) -> None:
 
 def write_divergence(run: Path, divergence: Mapping[str, Any]) -> None:
     """Write `diverged.json`."""
-    write_atomic(run / DIVERGED, lambda path: path.write_text(json.dumps(divergence, indent=2) + "\n"))
+    write_text(run / DIVERGED, json.dumps(divergence, indent=2) + "\n")
 
 
 def format_row(row: Mapping[str, float]) -> list[str]:
@@ -165,7 +164,10 @@ def read_metrics(run: Path) -> list[dict[str, float]]:
         return []
     check_file(run / METRICS, MAX_METRICS)
     rows: list[dict[str, float]] = []
-    with (run / METRICS).open(newline="", errors="replace") as file, contextlib.suppress(ValueError, csv.Error):
+    with (
+        (run / METRICS).open(newline="", encoding="utf-8", errors="replace") as file,
+        contextlib.suppress(ValueError, csv.Error),
+    ):
         for row in csv.DictReader(line for line in file if line.endswith("\n")):
             if None in row:  # cells without a column
                 break
@@ -177,7 +179,7 @@ def write_metrics(run: Path, columns: Iterable[str], rows: Iterable[Mapping[str,
     """Replace `metrics.csv`. A column that a row lacks is empty there."""
 
     def write(path: Path) -> None:
-        with path.open("w", newline="") as file:
+        with path.open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
             writer.writerow(names := list(columns))
             writer.writerows(format_row({name: row.get(name, math.nan) for name in names}) for row in rows)
@@ -197,6 +199,6 @@ def _commit() -> str | None:
         return None
     command = ["git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]
     try:
-        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+        return subprocess.run(command, capture_output=True, encoding="utf-8", check=True, timeout=10).stdout.strip()
     except (OSError, subprocess.SubprocessError):
         return None

@@ -14,6 +14,8 @@ from typing import Any, TextIO
 from tqdm import tqdm
 
 from surgical_marl.engines.stages import DONE, FAILED
+from surgical_marl.files import has_temporary_caches
+from surgical_marl.untrusted.values import plural
 
 EVERY = 30.0
 """Seconds between the lines of a bar that goes to a file or a pipe."""
@@ -23,7 +25,6 @@ PAUSE = 2.0
 """Seconds between lines on a compilation that go to a file or a pipe, at least."""
 TICK = 0.5
 """Seconds after which the line on a compilation changes in a terminal."""
-_KEPT = "a second start takes it from the cache"
 _waiting: list[threading.Timer] = []
 """What `preparing` would say."""
 SHORT = 20
@@ -43,7 +44,7 @@ def progress(total: int, unit: str, what: str = "", begun: int = 0, leave: bool 
 
     Args:
         total: how many there are to do.
-        unit: what is counted, such as "step".
+        unit: what is counted, one of it, such as "step".
         what: what is done, before the bar, or on a line above it if it is longer than `SHORT`.
         begun: how many are done already.
         leave: whether the bar stays when it is closed.
@@ -51,7 +52,7 @@ def progress(total: int, unit: str, what: str = "", begun: int = 0, leave: bool 
     _hush()
     options: dict[str, Any] = {
         "total": total,
-        "unit": unit,
+        "unit": plural(total, unit),
         "desc": f"{what}: " if what else None,
         "initial": begun,
         "leave": leave,
@@ -115,13 +116,13 @@ class Compilations:
             if stage in (DONE, FAILED):
                 self._ended.set()
                 self._title = ""
-                took = f"surgical-marl: compiled {title} in {now - self._begun:.0f} s; {_KEPT}\n"
+                took = f"surgical-marl: compiled {title} in {now - self._begun:.0f} s{_kept()}\n"
                 _write(("\r\x1b[K" if live else "") + (took if stage == DONE else ""))
             elif live:
                 self._draw()
             elif now - self._said >= PAUSE:
                 self._said = now
-                _write(f"surgical-marl: compiling {title}: {stage}{f'; {_KEPT}' if first else ''}\n")
+                _write(f"surgical-marl: compiling {title}: {stage}{_kept() if first else ''}\n")
 
     def _tick(self, ended: threading.Event) -> None:
         while not ended.wait(TICK):
@@ -134,6 +135,11 @@ class Compilations:
         line = f"surgical-marl: compiling, {time.monotonic() - self._begun:.0f} s, {self._stage}: {self._title}"
         room = max(_columns() - 1, 10)
         _write(f"\r\x1b[K{line if len(line) <= room else line[: room - 3] + '...'}")
+
+
+def _kept() -> str:
+    """Return what becomes of a compilation, unless it is lost."""
+    return "" if has_temporary_caches() else "; a second start takes it from the cache"
 
 
 def _columns() -> int:

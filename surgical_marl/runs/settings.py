@@ -236,6 +236,11 @@ def load_config(task: str, scene: str, overrides: Iterable[str] = ()) -> Setting
     return settings
 
 
+def check_overrides(overrides: Iterable[str]) -> None:
+    """Raise ValueError for overrides that are wrong whatever the task and the scene are (see `load_config`)."""
+    ALGORITHMS.check(_build(_override({}, overrides)).algo)
+
+
 def own_sections(task: str, kind: str) -> list[str]:
     """Return the names for which a task's file has settings of their own, of the kind "difficulties" or "starts"."""
     return list(_read_task(task).get(kind) or {})

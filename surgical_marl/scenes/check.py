@@ -30,6 +30,7 @@ from surgical_marl.scenes.scene import Scene
 from surgical_marl.scenes.timing import TIMESTEP
 from surgical_marl.untrusted.files import is_file, is_folder, user_path
 from surgical_marl.untrusted.schema import Faults
+from surgical_marl.untrusted.values import plural
 from surgical_marl.yaml_file import read_yaml
 
 REACH = 0.001
@@ -81,7 +82,7 @@ def _sum_up_object(path: Path) -> str:
 
 
 def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}{'s' * (number != 1)}"
+    return f"{number} {plural(number, noun)}"
 
 
 def _find(source: str | Path) -> dict[str, Path]:

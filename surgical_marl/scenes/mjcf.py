@@ -1,6 +1,6 @@
 """Writes a scene as MJCF for plain MuJoCo: one text whose model steps as `Scene.model` does.
 
-    Path("psm.xml").write_text(mjcf(load_scene("psm")))
+    Path("psm.xml").write_text(mjcf(load_scene("psm")), encoding="utf-8")
     model = mujoco.MjModel.from_xml_path("psm.xml")
 
 The text is written from the compiled model with all digits, because `MjSpec.to_xml` rounds to six. Meshes are included

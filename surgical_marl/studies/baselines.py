@@ -41,7 +41,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("tasks", nargs="*", type=one_of(list_tasks()), metavar="TASK", help="all if none is named")
     parser.add_argument("--only", nargs="+", type=one_of(list_scenes()), metavar="SCENE", help="these scenes alone")
     arguments = parser.parse_args(argv)
-    before = HASHES.read_text()
+    before = HASHES.read_text(encoding="utf-8")
     comments = [line for line in before.splitlines() if line.startswith("#")]
     hashes = parse_yaml(before)
     for task in arguments.tasks or list_tasks():
@@ -55,7 +55,7 @@ def main(argv: list[str] | None = None) -> int:
                 hashes.setdefault(start, {}).setdefault(task, {})[scene] = result["goal_set"]
             for columns, alike in groupby(rows, lambda row: columns_of(row[2])):
                 print(f"{task} from {start}:\n\n{table(columns, alike)}", flush=True)
-    HASHES.write_text("\n".join([*comments, dump_yaml(hashes)]))
+    HASHES.write_text("\n".join([*comments, dump_yaml(hashes)]), encoding="utf-8")
     return 0
 
 

@@ -66,7 +66,7 @@ def arm_picture(name: str, folder: Path) -> Picture:
     """Draw one arm above the field, from so far that all of it is seen; `folder` gets the scene."""
     path = folder / f"{name}.yaml"
     position = [0.0, 0.0, 0.15] if load_arm(name).remote_center else [-0.52, 0.0, -0.03]
-    path.write_text(f"arms: {{{name}_0: {{arm: {name}, position: {position}}}}}\n")
+    path.write_text(f"arms: {{{name}_0: {{arm: {name}, position: {position}}}}}\n", encoding="utf-8")
     scene = load_scene(path)
     data = _at_home(scene)
     parts = data.geom_xpos[scene.model.geom_group == VISUAL_GROUP]
@@ -177,7 +177,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         captions[task] = clip(task, path)
         print(path, flush=True)
     if not only:
-        (arguments.results / "gallery.md").write_text(page(captions))
+        (arguments.results / "gallery.md").write_text(page(captions), encoding="utf-8")
         print(arguments.results / "gallery.md")
     return 0
 

@@ -118,7 +118,7 @@ def cases(folder: Path) -> dict[str, Callable[[], Any]]:
 
 
 def _text(folder: Path, name: str, text: str, read: Callable[[Path], Any]) -> Callable[[], Any]:
-    (folder / name).write_text(text)
+    (folder / name).write_text(text, encoding="utf-8")
     return lambda: read(folder / name)
 
 
@@ -135,8 +135,8 @@ def _chain(folder: Path, links: int, shapes: int) -> Path:
         urdf += f'<origin xyz="0 0 0.05"/><parent link="l{k - 1}"/><child link="l{k}"/>{LIMIT}'
         urdf += '<axis xyz="0 1 0"/></joint>'
         drives += f"  j{k}: {{stiffness: 10, damping: 1, speed: 1}}\n" if links < 1000 else ""
-    (folder / "chain.urdf").write_text(f'<robot name="chain">{urdf}</robot>')
-    (folder / "arm.yaml").write_text(f"urdf: chain.urdf\ntool_tip: l{links}\njoints:\n{drives}")
+    (folder / "chain.urdf").write_text(f'<robot name="chain">{urdf}</robot>', encoding="utf-8")
+    (folder / "arm.yaml").write_text(f"urdf: chain.urdf\ntool_tip: l{links}\njoints:\n{drives}", encoding="utf-8")
     return folder
 
 

@@ -229,7 +229,7 @@ def _write_wild(folder: Path, scene: str) -> Path:
     about, path = read_yaml(find("scenes", scene)), folder / f"{scene}-wild.yaml"
     ranges = [WILD_OBJECTS, WILD_IN_PLACE] if load_scene(scene).free_objects else [{}]
     for objects in ranges:
-        path.write_text(dump_yaml({**about, "randomisation": WILD | objects}))
+        path.write_text(dump_yaml({**about, "randomisation": WILD | objects}), encoding="utf-8")
         try:
             load_scene(str(path))
             break

@@ -307,5 +307,5 @@ def env_of(objects: Sequence[str], arms: int = 1) -> Watched:
     places = [f"  {Path(o).stem}: {{object: {o}, position: [{0.1 * i}, 0.3, 0.0]}}" for i, o in enumerate(objects)]
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "psm_in_the_air.yaml"
-        path.write_text("\n".join(["arms:", *ARMS[arms - 1], "objects:", *places]))
+        path.write_text("\n".join(["arms:", *ARMS[arms - 1], "objects:", *places]), encoding="utf-8")
         return Watched(path)

@@ -97,7 +97,7 @@ class Process:
         self.face, self._out, self._device = face, out, device
         command = [sys.executable, "-m", "surgical_marl.studies.soak_faces", face, "--out", str(out)]
         own = {"OMP_NUM_THREADS": "1", **os.environ}  # torch's threads wait for each other by spinning
-        with (out / f"{face}.log").open("w") as log:
+        with (out / f"{face}.log").open("w", encoding="utf-8") as log:
             self._process = subprocess.Popen([*command, "--device", device], stdout=log, stderr=log, env=own)
         os.sched_setaffinity(self._process.pid, cores)
 
@@ -122,8 +122,8 @@ class Process:
         if self._process.poll() is not None:
             raise ValueError(f"{self.face} has ended: {self._out / self.face}.log says why")
         own = Path("/proc", str(self._process.pid))
-        status = dict(line.split(":", 1) for line in (own / "status").read_text().splitlines())
-        times = (own / "stat").read_text().rpartition(")")[2].split()[11:13]  # user, system
+        status = dict(line.split(":", 1) for line in (own / "status").read_text(encoding="utf-8").splitlines())
+        times = (own / "stat").read_text(encoding="utf-8").rpartition(")")[2].split()[11:13]  # user, system
         return Sample(
             self.face,
             round(time.monotonic() - began, 3),
@@ -144,7 +144,7 @@ class Process:
 def gpu_memory(process: int) -> float:
     """Return the memory of all GPUs that a process has, in MB; not a number where nvidia-smi does not say it."""
     command = ["nvidia-smi", "--query-compute-apps=pid,used_gpu_memory", "--format=csv,noheader,nounits"]
-    said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    said = subprocess.run(command, capture_output=True, encoding="utf-8", check=True).stdout
     rows = [line.split(",") for line in said.splitlines()]
     own = [float(used) for number, used in rows if number.strip() == str(process) and used.strip().isdigit()]
     return sum(own) if own else math.nan
@@ -158,7 +158,7 @@ def soak(faces: Sequence[str], out: Path, minutes: float, seconds: float, device
     """
     processes: list[Process] = []
     cores = sorted(os.sched_getaffinity(0))
-    with (out / CSV).open("x", newline="") as file:
+    with (out / CSV).open("x", newline="", encoding="utf-8") as file:
         rows = csv.writer(file)
         rows.writerow(Sample._fields)
         try:
@@ -190,7 +190,7 @@ def soak(faces: Sequence[str], out: Path, minutes: float, seconds: float, device
 def read(path: Path) -> dict[str, Any]:
     """Return the samples by face, as record arrays. A row that was cut short is left out."""
     found: dict[str, list[Sample]] = {}
-    with path.open(newline="") as file:
+    with path.open(newline="", encoding="utf-8") as file:
         for row in csv.DictReader(line for line in file if line.endswith("\n")):
             numbers: list[Any] = [float(row[name]) for name in Sample._fields[1:]]
             found.setdefault(row["face"], []).append(Sample(row["face"], *numbers))

@@ -16,7 +16,7 @@ from matplotlib.ticker import EngFormatter, PercentFormatter
 
 from surgical_marl.evaluation.interval import interval, over_seeds
 from surgical_marl.evaluation.metrics import SUCCESS_MM, Metric, metrics, success
-from surgical_marl.files import write_atomic
+from surgical_marl.files import write_atomic, write_text
 from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.runs.folder import read_metrics, read_origin, read_settings
 from surgical_marl.studies.study_cells import CELLS, QUESTIONS
@@ -41,13 +41,13 @@ def report(jobs: Sequence[Job], out: Path, results: Path) -> None:
         raise ValueError(f"{out} holds no run that was played: nothing to report")
     order, page, numbers = list(CELLS), results / "study.md", results / "study.json"
     groups = groupby(sorted(jobs, key=lambda job: (order.index(job.cell), job.seed)), key=lambda job: job.cell)
-    rows = {row["cell"]: row for row in (json.loads(numbers.read_text()) if numbers.is_file() else [])}
+    rows = {row["cell"]: row for row in (json.loads(numbers.read_text(encoding="utf-8")) if numbers.is_file() else [])}
     rows |= {cell: describe(list(members), out) for cell, members in groups}
     found = [rows[name] for name in order if name in rows]
-    write_atomic(numbers, lambda path: path.write_text(json.dumps(found, indent=1) + "\n"))
+    write_text(numbers, json.dumps(found, indent=1) + "\n")
     write_atomic(results / "study.csv", lambda path: _write_csv(path, found))
     draw(found, results / "study.png")
-    text = page.read_text() if page.is_file() else f"{BEGIN}\n{END}\n"
+    text = page.read_text(encoding="utf-8") if page.is_file() else f"{BEGIN}\n{END}\n"
     before, _, rest = text.partition(BEGIN)
     after = rest.partition(END)[2]
     parts = ["![success and collisions while training](study.png)"]
@@ -55,7 +55,7 @@ def report(jobs: Sequence[Job], out: Path, results: Path) -> None:
         title = QUESTIONS[CELLS[members[0]["cell"]].question]
         parts += [f"### {title}", about(members), final_table(members), broken_table(members)]
     tables = "\n\n".join([BEGIN, *parts, END])
-    write_atomic(page, lambda path: path.write_text(before + tables + after))
+    write_text(page, before + tables + after)
 
 
 def _by_question(found: Sequence[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
@@ -267,7 +267,7 @@ def _markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def _write_csv(path: Path, found: Sequence[dict[str, Any]]) -> None:
-    with path.open("w", newline="") as file:
+    with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(["cell", "seed", *FINAL])
         for each in found:

@@ -108,7 +108,7 @@ def work(part: str, job: Job, out: Path, overrides: list[str]) -> tuple[Job, str
     """Do one part of a job in a process of its own; return the job and what went wrong, "" if nothing did."""
     log = out / f"{job}.log"
     # otherwise progress bars of several runs would overwrite each other
-    with log.open("a") as file, contextlib.redirect_stderr(file):
+    with log.open("a", encoding="utf-8") as file, contextlib.redirect_stderr(file):
         try:
             learn(job, out, overrides) if part == "train" else play(job, out)
         except (ValueError, FloatingPointError) as error:

@@ -36,7 +36,7 @@ from surgical_marl import machine
 from surgical_marl.bench.solve import Goal, Solution, solve
 from surgical_marl.bench.workload import Workload
 from surgical_marl.cli.flags import whole
-from surgical_marl.files import write_atomic
+from surgical_marl.files import write_atomic, write_text
 from surgical_marl.learning.room import in_memory
 from surgical_marl.runs.environment import make_env
 from surgical_marl.runs.settings import Settings, load_config
@@ -237,7 +237,7 @@ def write(search: Search, results: Path) -> None:
     trials = search.done()
 
     def table(path: Path) -> None:
-        with path.open("w", newline="") as file:
+        with path.open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
             names = [knob.setting for knob in search.knobs.values()]
             writer.writerow(["trial", "state", "seconds", "missing", *names])
@@ -276,7 +276,7 @@ def main(argv: list[str] | None = None) -> int:
         return 1
     found = search.confirm()
     text = json.dumps(found, indent=1) + "\n"
-    write_atomic(search.results / f"{search.name}.json", lambda path: path.write_text(text))
+    write_text(search.results / f"{search.name}.json", text)
     print(text, end="")
     return 0
 

@@ -58,6 +58,11 @@ def listed(names: Iterable[Any], most: int = 40) -> str:
     return ", ".join(first) + (f" and {more:,} more" if more else "")
 
 
+def plural(count: float, noun: str) -> str:
+    """Return a regular noun as it stands after a count: "frame" after 1, "frames" after any other."""
+    return noun if count == 1 else f"{noun}s"
+
+
 def check_count(count: int, most: int, what: str, where: object) -> None:
     """Raise ValueError if there are more than `most` of something."""
     if count > most:

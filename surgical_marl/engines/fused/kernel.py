@@ -23,7 +23,7 @@ from surgical_marl.cache import locked
 from surgical_marl.engines.fused.preludes import CPU, CUDA, LANES, UNDEFINE, is_long
 from surgical_marl.engines.stages import Stage, unsaid
 from surgical_marl.engines.stepper import MOST_KEPT
-from surgical_marl.files import write_atomic
+from surgical_marl.files import writable, write_text
 from surgical_marl.runtime import cache_dir, prepare_warp
 
 wp = prepare_warp()
@@ -61,7 +61,7 @@ def compile_kernels(
     module.options.update(enable_backward=False, cpu_compiler_flags=FLAGS)
     made = _made(digest, sources, module, max_registers)
     # Warp itself does not protect a module from two processes that compile it at the same time
-    with locked(cache_dir() / "kernels" / module.name), _checked(module.name):
+    with locked(_records() / module.name), _checked(module.name):
         if not _folders(module.name):
             stage("compiling the C code")
         module.load(wp.get_device(device), block_dim=WIDE if cuda else 1)
@@ -104,18 +104,23 @@ def _checked(module: str) -> Iterator[None]:
     Files are damaged if their digest has changed. Warp itself would load a damaged file. The loading of the module
     belongs inside this context; after it, a digest of the files is recorded.
     """
-    record = cache_dir() / "kernels" / f"{module}.sha256"
+    record = _records() / f"{module}.sha256"
     folders = _folders(module)
     with contextlib.suppress(OSError):
-        if record.read_text() != _digest(folders):
+        if record.read_text(encoding="utf-8") != _digest(folders):
             for folder in folders:
                 shutil.rmtree(folder, ignore_errors=True)
     yield
     with contextlib.suppress(OSError):
         digest = _digest(_folders(module))
-        if not record.exists() or record.read_text() != digest:
+        if not record.exists() or record.read_text(encoding="utf-8") != digest:
             record.parent.mkdir(parents=True, exist_ok=True)
-            write_atomic(record, lambda path: path.write_text(digest))
+            write_text(record, digest)
+
+
+def _records() -> Path:
+    """Return the folder of locks and digests of modules."""
+    return writable(cache_dir() / "kernels")
 
 
 def _folders(module: str) -> list[Path]:
@@ -185,7 +190,7 @@ def load_for_gpu(kernel: Any) -> None:
 
     Warp itself does not protect a module from two processes that compile it at the same time.
     """
-    with locked(cache_dir() / "kernels" / kernel.module.name):
+    with locked(_records() / kernel.module.name):
         kernel.module.load(wp.get_device("cuda"))
 
 
