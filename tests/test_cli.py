@@ -259,3 +259,8 @@ def test_a_reader_that_leaves_is_no_error() -> None:
         process.stdout.close()
         assert process.stderr.read() == b""
     assert process.returncode == 0
+
+
+def test_teams_of_two_difficulties_can_be_given_one(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["crossplay", "reach-bimanual_psm", "reach-bimanual_psm-crossing"]) == 2
+    assert "choose one for all with --difficulty\n" in capsys.readouterr().err
