@@ -9,7 +9,7 @@ import numpy as np
 from surgical_marl.envs.env import Env
 from surgical_marl.robots.arm import Arm
 from surgical_marl.robots.inverse_kinematics import inverse_kinematics
-from surgical_marl.runtime import jax
+from surgical_marl.runtime import jax, jax_scope
 from surgical_marl.scenes.scene import Mount
 
 DRAWS = 128
@@ -42,6 +42,7 @@ def out_of_reach(env: Env) -> str | None:
     return None
 
 
+@jax_scope()
 def _draw(env: Env) -> np.ndarray:
     """Return the targets at the start of `DRAWS` episodes, [DRAWS, arms, 3], m, each in its arm's base frame."""
     keys = np.random.default_rng(0).integers(0, 2**32, (DRAWS, 2), np.uint32)
