@@ -233,6 +233,7 @@ def test_lists_fit_the_terminal(
     argv: list[str], columns: int, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLUMNS", str(columns))
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
     assert main(argv) == 0
     lines = capsys.readouterr().out.splitlines()
     assert max(map(len, lines)) > columns / 3

@@ -29,6 +29,7 @@ from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.envs.env import Env
 from surgical_marl.envs.state import Carry
 from surgical_marl.interfaces.registration import register_task
+from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.tasks.reach import Task as Reach
 
 
@@ -176,6 +177,13 @@ def define(value: float) -> None:
     register_task("cell", cell["Task"])
 
 
+@pytest.fixture
+def registered(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Forget what a test registers."""
+    monkeypatch.setattr(TASKS, "_registered", dict(TASKS._registered))
+
+
+@pytest.mark.usefixtures("registered")
 def test_a_task_that_is_defined_again_has_a_kernel_of_its_own() -> None:
     bodies = []
     for value in (1.0, 2.0):
@@ -185,6 +193,7 @@ def test_a_task_that_is_defined_again_has_a_kernel_of_its_own() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("registered")
 @pytest.mark.parametrize("engine", ["fused", "mjx"])
 def test_a_task_that_is_defined_again_plays_its_new_reward(engine: str) -> None:
     rewards = []

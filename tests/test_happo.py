@@ -208,6 +208,8 @@ def test_a_policy_of_own_networks_loads_without_its_algorithm(tmp_path: Path) ->
     run(replace(SMALL, algo="happo", iterations=1), folder)
     config = folder / CONFIG
     config.write_text(config.read_text().replace("algo: happo", "algo: not_installed_here"))
+    checkpoint = torch.load(folder / "checkpoint.pt", weights_only=True)
+    torch.save({**checkpoint, "of": {**checkpoint["of"], "algo": "not_installed_here"}}, folder / "checkpoint.pt")
     env: Any = FakeEnv(COUNTS, SIZES, num_envs=4)
     observations, *_ = env.reset(0)
     actor, layout = load_actor(folder, env)

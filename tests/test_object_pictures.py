@@ -181,11 +181,15 @@ def test_films_show_objects_where_they_are(env: BatchedEnv, monkeypatch: pytest.
     still = zero_policy(env)
     film: list[Any] = list(record.frames(env, still, episodes=2, seed=0))
     env.reset(seed=0)
+    env.autoreset = False
     poses = []
-    for step in range(2 * STEPS):
+    for step in range(1, 2 * STEPS + 1):
+        env.step(STILL)
         if step % 2 == 0:
             poses.append(env.object_poses)
-        env.step(STILL)
+        if step == STEPS:
+            env.reset()
+    env.autoreset = True
     assert len(film) == len(poses) == STEPS
     assert all(bluest(env, *pair) for pair in zip(film, poses, strict=True))
     np.testing.assert_array_equal(film[0], film[STEPS // 2])  # the next episode begins

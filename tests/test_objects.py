@@ -272,7 +272,7 @@ def test_lists_name_objects(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["list", "objects"]) == 0
     assert capsys.readouterr().out.split() == sm.list_objects()
     assert main(["list", "objects", "-v"]) == 0
-    said = capsys.readouterr().out
+    said = " ".join(capsys.readouterr().out.split())
     assert all(load_object(name).description in said for name in sm.list_objects())
 
 

@@ -217,7 +217,7 @@ def test_weights_that_are_not_data_or_not_of_this_scene_are_refused(runs: list[s
 
     weights.write_bytes(data)
     (out / "config.yaml").write_text((out / "config.yaml").read_text().replace("- 16", "- 8"))
-    with pytest.raises(ValueError, match=r"not of the network in its config\.yaml"):
+    with pytest.raises(ValueError, match=r"is of network\.hidden \[16\], and not of \(8,\)"):
         load_policy(out, env)
 
 

@@ -3,8 +3,7 @@
     python docs/examples/jax_ppo.py [steps] [seed]     (--quick: a short run, to see that it works)
 
 Needs nothing but this package. The arm ends within 0.6 mm of its target (the median) after 2,000,000 steps.
-Observations fill a small part of their bounds, so they are divided by what is seen of their spread; rewards are scaled
-to order one.
+Observations are in SI units, so they are divided by what is seen of their spread; rewards are scaled to order one.
 """
 
 import sys
@@ -17,7 +16,7 @@ from surgical_marl.runtime import jax, jnp
 
 AGENT, ENVS, ROLLOUT, EPOCHS, MINIBATCHES, UNITS = "psm_0", 256, 32, 4, 8, (64, 64)
 GAMMA, LAMBDA, CLIP, RATE, LARGEST, ENTROPY = 0.98, 0.95, 0.2, 1e-3, 0.5, 1e-3
-ENV = sm.jax_env("reach", scene="psm")
+ENV = sm.jax_env("reach", scene="psm", observations="si")
 
 Transition = namedtuple("Transition", "seen action chance value reward done error")
 Learner = namedtuple("Learner", "weights mean square count scale")  # mean and square of gradients are Adam's

@@ -220,7 +220,8 @@ def _list(arguments: argparse.Namespace) -> None:
         print("\n".join(_LISTS[arguments.kind]()))
         return
     for kind, names in _LISTS.items():
-        print(_fitted(f"{kind:10} {', '.join(names()) or '-'}"))
+        line = f"{kind:10} {', '.join(names()) or '-'}"
+        print(_fitted(line) if sys.stdout.isatty() else line)  # programs read a line for each kind
 
 
 def _fitted(text: str) -> str:
