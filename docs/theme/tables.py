@@ -172,7 +172,7 @@ def results() -> str:
 
 
 class Card:
-    """What the files of a shipped policy say about its training: means over seeds, with 95 % intervals."""
+    """The training of a shipped policy, from its files: means over seeds, with 95 % intervals."""
 
     def __init__(self, name: str) -> None:
         folder = find("policies", name)

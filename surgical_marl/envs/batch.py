@@ -149,7 +149,7 @@ class BatchedEnv:
 
     @property
     def autoreset(self) -> bool:
-        """Whether a step that ends an episode also begins the next one, which is so unless it is set to False.
+        """True where a step that ends an episode begins the next one too; it can be set to False.
 
         Without it an environment stays where its episode ended, and can be looked at there, until `reset`. A step
         before that goes on from there, and has `truncated` again after the time limit.

@@ -81,7 +81,7 @@ class Metric(NamedTuple):
     extreme: bool = False
     """Whether the metric is the worst value seen, for which a bootstrap can't give an interval."""
     share: bool = False
-    """Whether each value is from 0 to 1, so that the metric is a share of episodes or of their steps."""
+    """True if each value is from 0 to 1, so that the metric is a share of episodes or of their steps."""
 
 
 def measure(trajectory: Trajectory, dt: float, following: bool) -> dict[str, np.ndarray]:

@@ -36,7 +36,7 @@ class LimitInSpec:
 
     @property
     def spec(self) -> EnvSpec | None:
-        """How to make the same again, from any working folder."""
+        """The recipe for the same environment, from any working folder."""
         return self._spec
 
     @spec.setter
