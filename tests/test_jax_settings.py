@@ -1,4 +1,4 @@
-"""What a user sets in JAX changes neither what is computed nor whether it works."""
+"""Settings of JAX that a user has changed alter neither what is computed nor whether it works."""
 
 from __future__ import annotations
 
