@@ -40,7 +40,7 @@ docs: $(SITE_READY)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 gallery: $(READY)
-	$(BIN)/python -m surgical_marl.studies.gallery --results docs $(ARGS)
+	$(BIN)/python -m docs.studies.gallery --results docs $(ARGS)
 
 audit: $(SUPPLY_READY)
 	@$(BIN)/python .ci/audit.py $(ARGS)

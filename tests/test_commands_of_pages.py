@@ -114,7 +114,7 @@ def run_all(found: list[list[str]], folder: Path, trained: Callable[[str], Path]
         ("surgical-marl eval reach-psm --episodes 1000", "--episodes 8"),
         ("surgical-marl bench view --scene psm", "--seconds 1"),
         ("surgical-marl view reach --scene psm", "--port 0"),
-        ("python -m surgical_marl.studies.grasping --arms 1", "--seconds 1 --grasps 1 --objects needle_sh"),
+        ("python -m docs.studies.grasping --arms 1", "--seconds 1 --grasps 1 --objects needle_sh"),
         ("python policies/train_all.py --evaluate", "--seeds 1 --jobs 1 --only reach-psm"),
         ("python docs/examples/random_agents.py", ""),
         ("pytest tests/test_cli.py -k list", "--collect-only --quiet"),
@@ -141,7 +141,7 @@ def test_a_training_is_made_small_and_imitates_only_if_it_did() -> None:
     [
         ("pip install onnxruntime", "network"),
         ("make lock", "make lock" if not (Path(sys.prefix) / ".ready-for-supply").exists() else "servers"),
-        ("python -m surgical_marl.studies.stability", None),
+        ("python -m docs.studies.stability", None),
     ],
 )
 def test_what_cannot_run_here_is_said(command: str, word: str | None) -> None:

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import surgical_marl as sm
+from docs.studies.command import run
+from docs.studies.failures import Found, _places, look, main, table
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.policies.policy import load_policy
-from surgical_marl.studies.command import run
-from surgical_marl.studies.failures import Found, _places, look, main, table
 
 
 def test_a_policy_that_never_moves_fails_and_the_oracle_does_not() -> None:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from docs.studies.numbers import fuzz
 from surgical_marl.cli.main import main
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.learning import train, trainer
@@ -21,7 +22,6 @@ from surgical_marl.runs.checkpoint import read_checkpoint, write_checkpoint
 from surgical_marl.runs.fault import read_fault
 from surgical_marl.runs.folder import read_metrics
 from surgical_marl.runs.settings import NetworkSettings, PPOSettings, Settings
-from surgical_marl.studies.numbers import fuzz
 
 SMALL = Settings(
     "reach", "psm", engine="fused", device="cpu", num_envs=16, steps_per_iteration=4, iterations=3, checkpoint_every=1,

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import surgical_marl as sm
-from surgical_marl.studies import gallery
+from docs.studies import gallery
 
 DOCS = Path(__file__).parents[1] / "docs"
 

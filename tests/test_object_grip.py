@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 import surgical_marl as sm
+from docs.studies.shaking import CLOSING, Grasps
 from surgical_marl.physics import together
 from surgical_marl.physics.simulator import Simulator
-from surgical_marl.studies.shaking import CLOSING, Grasps
 
 STEPS = 240
 FRICTIONS = (0.12, 0.18, 0.25)

@@ -13,6 +13,9 @@ import numpy as np
 import pytest
 import yaml
 
+from docs.studies.grasping import Held, judge
+from docs.studies.plain_mujoco import IMPRATIO, TOLERANCE
+from docs.studies.shaking import CHUNK, OBJECTS, Grasps
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.envs.env import Env
 from surgical_marl.physics import together
@@ -21,9 +24,6 @@ from surgical_marl.physics.together import Objects
 from surgical_marl.policies.oracle import oracle
 from surgical_marl.robots.rotation import quaternion, turned
 from surgical_marl.scenes.mjcf import mjcf
-from surgical_marl.studies.grasping import Held, judge
-from surgical_marl.studies.plain_mujoco import IMPRATIO, TOLERANCE
-from surgical_marl.studies.shaking import CHUNK, OBJECTS, Grasps
 from tests.helpers.falling import DT, Falling, Trace, random_turns, thrown, wide_pad
 
 INSERTION = 2

@@ -9,9 +9,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from surgical_marl.studies import plain_mujoco
-from surgical_marl.studies.grasping import angle
-from surgical_marl.studies.shaking import CHUNK, CLOSING, OBJECTS, Grasps, Seen
+from docs.studies import plain_mujoco
+from docs.studies.grasping import angle
+from docs.studies.shaking import CHUNK, CLOSING, OBJECTS, Grasps, Seen
 
 SPEED = 0.5
 """Share of full speed at which arms move: at full speed steps of 2.5 ms alone put an arm 0.3 mm elsewhere."""

@@ -13,13 +13,13 @@ import mujoco
 import numpy as np
 import pytest
 
+from docs.studies.energy import energy_drift
 from surgical_marl import load_arm, load_scene
 from surgical_marl.physics.simulator import Simulator
 from surgical_marl.robots.arm import CONTROL_MODES
 from surgical_marl.scenes.placing import scenes_without_objects
 from surgical_marl.scenes.scene import Scene
 from surgical_marl.scenes.timing import DECIMATION, TIMESTEP
-from surgical_marl.studies.energy import energy_drift
 from tests.helpers.rollouts import read_state, roll_out
 
 SCENES = scenes_without_objects()

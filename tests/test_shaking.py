@@ -7,9 +7,9 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
-from surgical_marl.studies import shaking
-from surgical_marl.studies.grasping import hold, judge
-from surgical_marl.studies.shaking import Grasps
+from docs.studies import shaking
+from docs.studies.grasping import hold, judge
+from docs.studies.shaking import Grasps
 
 
 @pytest.mark.slow

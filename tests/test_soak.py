@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from surgical_marl.studies import soak
-from surgical_marl.studies.command import run
+from docs.studies import soak
+from docs.studies.command import run
 
 HOURS = np.linspace(0.0, 4.0, 200)
 

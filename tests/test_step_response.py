@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from docs.studies.step_response import SHARE, WRIST, Linear, identified, simulated_response
 from surgical_marl import load_arm
 from surgical_marl.robots.arm import Joint
-from surgical_marl.studies.step_response import SHARE, WRIST, Linear, identified, simulated_response
 
 JOINTS = load_arm("psm").actuated[:6]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -14,13 +15,14 @@ import numpy as np
 import pytest
 import torch
 
+from docs.studies import study, study_cells, study_report, study_runs
 from surgical_marl.learning import train
 from surgical_marl.policies.acting import forget
 from surgical_marl.runs import environment
 from surgical_marl.runs.folder import write_config, write_metrics
 from surgical_marl.runs.settings import Settings, load_config
-from surgical_marl.studies import study, study_cells, study_report, study_runs
 
+ROOT = Path(__file__).parents[1]
 MEASURES = ("error", "held", "squared", "distance", "center", "path", "time", "smoothness", "action_change")
 
 
@@ -129,8 +131,9 @@ def test_what_is_wrong_with_one_run_stops_no_other(tmp_path: Path) -> None:
     ],
 )
 def test_bad_input_ends_in_one_sentence(script: str, argv: list[str], words: str, tmp_path: Path) -> None:
-    command = [sys.executable, "-m", f"surgical_marl.studies.{script}", *argv, "--out", "out"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    command = [sys.executable, "-m", f"docs.studies.{script}", *argv, "--out", "out"]
+    env = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True)
     assert done.returncode == 2 and words in done.stderr and "Traceback" not in done.stderr
 
 

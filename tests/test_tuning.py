@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
+from docs.studies import tuning
 from surgical_marl import machine
 from surgical_marl.runs.settings import Settings, load_config
-from surgical_marl.studies import tuning
 
 
 @pytest.mark.parametrize(

@@ -128,7 +128,7 @@ def _python(words: list[str]) -> argparse.ArgumentParser | None:
     """Return the parser of a Python program of this project; None if it has none, or is another's."""
     while words[0] == "-X":
         words = words[2:]
-    if words[0] == "-m" and words[1].partition(".")[0] in ("surgical_marl", "tests"):
+    if words[0] == "-m" and words[1].partition(".")[0] in ("surgical_marl", "docs", "tests"):
         spec = importlib.util.find_spec(words[1])
         assert spec and spec.origin, words[1]
         file = Path(spec.origin)

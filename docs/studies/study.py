@@ -1,8 +1,8 @@
 """Where teamwork pays, for docs/study.md: trains cells with several seeds, evaluates, takes arms away, reports.
 
-    python -m surgical_marl.studies.study                 # all of it; a second call goes on where the first stopped
-    python -m surgical_marl.studies.study --cells one-0-mappo one-4-mappo iterations=400     # some, on a CPU, say
-    python -m surgical_marl.studies.study --only report --results docs     # tables and figures of what there is
+    python -m docs.studies.study                 # all of it; a second call goes on where the first stopped
+    python -m docs.studies.study --cells one-0-mappo one-4-mappo iterations=400     # some, on a CPU, say
+    python -m docs.studies.study --only report --results docs     # tables and figures of what there is
 
 A cell is a task, a scene and settings (`study_cells.py`). Every cell and seed is a run of its own, as `surgical-marl
 train` makes it, in a folder of --out. Runs and plays that are there are not made again. A report keeps the rows of
@@ -18,10 +18,10 @@ import sys
 from functools import partial
 from pathlib import Path
 
+from docs.studies.command import make_parser, parse_with_settings, run
+from docs.studies.study_cells import CELLS, find_cell
+from docs.studies.study_runs import PLAYED, Job, work
 from surgical_marl.cli.flags import whole
-from surgical_marl.studies.command import make_parser, parse_with_settings, run
-from surgical_marl.studies.study_cells import CELLS, find_cell
-from surgical_marl.studies.study_runs import PLAYED, Job, work
 
 PARTS = ("train", "play", "report")
 
@@ -45,7 +45,7 @@ def main(argv: list[str] | None = None) -> int:
             pool.close()
             pool.join()
     if "report" in arguments.only:
-        from surgical_marl.studies.study_report import report
+        from docs.studies.study_report import report
 
         report([job for job in jobs if (arguments.out / str(job) / PLAYED).is_file()], arguments.out, results)
     return 1 if failed else 0

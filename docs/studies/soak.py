@@ -1,8 +1,8 @@
 """Trains and steps each face for hours, and says whether memory and speed stay, and handles and threads are freed.
 
-    python -m surgical_marl.studies.soak --minutes 240           # soak.csv, and at the end soak.png and a table
-    python -m surgical_marl.studies.soak --report                # these two of what there is, also meanwhile
-    python -m surgical_marl.studies.soak --device cuda --at-once --minutes 10       # on a GPU, a core for each face
+    python -m docs.studies.soak --minutes 240           # soak.csv, and at the end soak.png and a table
+    python -m docs.studies.soak --report                # these two of what there is, also meanwhile
+    python -m docs.studies.soak --device cuda --at-once --minutes 10       # on a GPU, a core for each face
 
 Each face is a process of its own (`soak_faces.py`). They take turns of --turn seconds, one at a time, and are stopped
 between them. After each turn its process is looked at from outside: memory that is its own (`RssAnon`), memory of a
@@ -29,9 +29,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from docs.studies.command import make_parser, run
+from docs.studies.soak_faces import ALL, COUNT, counted
 from surgical_marl.cli.flags import whole
-from surgical_marl.studies.command import make_parser, run
-from surgical_marl.studies.soak_faces import ALL, COUNT, counted
 
 CSV, FIGURE = "soak.csv", "soak.png"
 WARM = 0.25
@@ -95,7 +95,7 @@ class Process:
 
     def __init__(self, face: str, out: Path, device: str, cores: Collection[int]) -> None:
         self.face, self._out, self._device = face, out, device
-        command = [sys.executable, "-m", "surgical_marl.studies.soak_faces", face, "--out", str(out)]
+        command = [sys.executable, "-m", "docs.studies.soak_faces", face, "--out", str(out)]
         own = {"OMP_NUM_THREADS": "1", **os.environ}  # torch's threads wait for each other by spinning
         with (out / f"{face}.log").open("w", encoding="utf-8") as log:
             self._process = subprocess.Popen([*command, "--device", device], stdout=log, stderr=log, env=own)

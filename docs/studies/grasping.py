@@ -2,7 +2,7 @@
 
 One arm moves at random at full speed. Two arms that hold one object pull and turn at random against each other.
 
-Run: python -m surgical_marl.studies.grasping --grasps 1000 --seconds 10 --arms 1
+Run: python -m docs.studies.grasping --grasps 1000 --seconds 10 --arms 1
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
+from docs.studies.command import make_parser, run
+from docs.studies.plain_mujoco import play_in_jaws
+from docs.studies.shaking import CHUNK, CLOSING, OBJECTS, Grasps, Seen
 from surgical_marl.cli.flags import whole
-from surgical_marl.studies.command import make_parser, run
-from surgical_marl.studies.plain_mujoco import play_in_jaws
-from surgical_marl.studies.shaking import CHUNK, CLOSING, OBJECTS, Grasps, Seen
 
 SLIP, TURN = 2e-4, np.radians(1.0)
 """An object that has moved or turned further than this in a jaw has slipped, m and rad."""

@@ -1,6 +1,6 @@
 """Kinetic energy of every scene's arms that coast without actuators, friction and limits: the error of the integrator.
 
-Run: python -m surgical_marl.studies.energy --results docs; it writes docs/energy.png.
+Run: python -m docs.studies.energy --results docs; it writes docs/energy.png.
 """
 
 from __future__ import annotations
@@ -8,10 +8,10 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
+from docs.studies.command import results_folder
 from surgical_marl import list_scenes, load_scene
 from surgical_marl.scenes.scene import Scene
 from surgical_marl.scenes.timing import TIMESTEP
-from surgical_marl.studies.command import results_folder
 
 
 def energy_drift(scene: Scene, seconds: float = 2.0, timestep: float | None = None) -> tuple[np.ndarray, np.ndarray]:

@@ -1,7 +1,7 @@
 """Measure the policies that need no learning on every scene, for the tables in docs/evaluation.md.
 
-    python -m surgical_marl.studies.baselines                           # all of them
-    python -m surgical_marl.studies.baselines reach track --only psm    # some tasks, some scenes
+    python -m docs.studies.baselines                           # all of them
+    python -m docs.studies.baselines reach track --only psm    # some tasks, some scenes
 
 It prints a table for each task, or two if only some of its scenes have objects. It writes the hashes of the goals to
 `surgical_marl/evaluation/goal_sets.yaml`, so what is committed must not change without a reason.
@@ -16,12 +16,12 @@ from pathlib import Path
 from typing import Any
 
 import surgical_marl.evaluation.goal_set
+from docs.studies.command import make_parser, run
 from surgical_marl.cli.flags import one_of
 from surgical_marl.content import BASELINES, list_scenes
 from surgical_marl.evaluation.command import play_all
 from surgical_marl.evaluation.evaluate import summarise
 from surgical_marl.plugins.tasks import TASKS, list_tasks, scenes_for
-from surgical_marl.studies.command import make_parser, run
 from surgical_marl.yaml_file import dump_yaml, parse_yaml
 
 HASHES = Path(surgical_marl.evaluation.goal_set.__file__).with_name("goal_sets.yaml")

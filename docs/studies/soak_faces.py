@@ -1,6 +1,6 @@
 """What a soak steps: a training, each face, and environments that are made and closed, each without an end.
 
-    python -m surgical_marl.studies.soak_faces gymnasium --out runs/soak
+    python -m docs.studies.soak_faces gymnasium --out runs/soak
 
 Each is a process of its own. It counts its steps in a file that is mapped into memory, so that counting costs nothing.
 """

@@ -1,6 +1,6 @@
 """Steps all scenes with extreme actions, gains, payloads, objects and control steps, and looks for what must not be.
 
-Run: python -m surgical_marl.studies.numbers --steps 10000000 --seed 0
+Run: python -m docs.studies.numbers --steps 10000000 --seed 0
 
 Every scene is stepped as it ships; and "wild": gains, damping and friction off by 90 %, masses of 0.5 kg at the tool
 tips, backlash, noise and latency, objects of other size, mass and friction. A wild scene's control step is 1, 4 or 20

@@ -1,6 +1,6 @@
 """Where the arms of a policy fail: at a joint's limit, near a singularity, or elsewhere.
 
-    python -m surgical_marl.studies.failures RUN_OR_POLICY [--start random] [--episodes 4000]
+    python -m docs.studies.failures RUN_OR_POLICY [--start random] [--episodes 4000]
 
 It plays held-out episodes of `reach`, `track` or `follow_path` and prints a table. Each row of the table of goals
 counts once, however often it is drawn. Where targets move, postures up to the first miss are looked at, otherwise the
@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from docs.studies.command import make_parser, run
 from surgical_marl.cli.flags import whole
 from surgical_marl.evaluation.asked import common_settings, find_policy
 from surgical_marl.evaluation.evaluate import MAX_BATCH
 from surgical_marl.evaluation.goal_set import episode_seed
 from surgical_marl.policies.policy import load_policy
 from surgical_marl.runs.environment import make_env
-from surgical_marl.studies.command import make_parser, run
 
 if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv

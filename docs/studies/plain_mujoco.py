@@ -8,10 +8,10 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from docs.studies.shaking import Grasps, in_jaws
 from surgical_marl.robots.rotation import matrix_of
 from surgical_marl.scenes.mjcf import mjcf
 from surgical_marl.scenes.timing import DECIMATION
-from surgical_marl.studies.shaking import Grasps, in_jaws
 
 FINE = 10
 """Steps of C MuJoCo in one of ours."""

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from surgical_marl.studies.study_cells import find_cell
+from docs.studies.study_cells import find_cell
 
 EPISODES = 200
 WHEN = 0.3

@@ -1,6 +1,6 @@
 """Draw every arm, object and scene, film every task, and write the page that shows them all.
 
-Run: python -m surgical_marl.studies.gallery --results docs; it writes docs/gallery.md, docs/images/ and each arm's
+Run: python -m docs.studies.gallery --results docs; it writes docs/gallery.md, docs/images/ and each arm's
 preview.png. Clips show the policy that ships for the scene of a task with the most arms, or the oracle where none
 ships. `--only NAME ...` draws what has these names alone, and leaves the page.
 """
@@ -19,6 +19,7 @@ import mujoco
 import numpy as np
 from PIL import Image
 
+from docs.studies.command import make_parser, run
 from surgical_marl import (
     list_arms,
     list_objects,
@@ -34,7 +35,6 @@ from surgical_marl.robots.spec import VISUAL_GROUP
 from surgical_marl.scenes.objects import Placement
 from surgical_marl.scenes.placing import add_objects, scenes_without_objects
 from surgical_marl.scenes.scene import Scene
-from surgical_marl.studies.command import make_parser, run
 from surgical_marl.view.camera import best_view
 from surgical_marl.view.drawn import Extra
 from surgical_marl.view.lighting import PLAIN

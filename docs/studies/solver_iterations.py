@@ -1,6 +1,6 @@
 """How many solver iterations a physics step needs: one step of `Simulator`, against C MuJoCo's converged one.
 
-Run: python -m surgical_marl.studies.solver_iterations
+Run: python -m docs.studies.solver_iterations
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import jax
 import mujoco
 import numpy as np
 
+from docs.studies.command import make_parser
 from surgical_marl import load_scene
 from surgical_marl.physics import dynamics, joined, solver
 from surgical_marl.physics.dynamics import Physics
@@ -18,7 +19,6 @@ from surgical_marl.physics.simulator import Simulator
 from surgical_marl.physics.views import Touch
 from surgical_marl.scenes.scene import Scene
 from surgical_marl.scenes.timing import DECIMATION
-from surgical_marl.studies.command import make_parser
 
 STEPS, SAMPLES = 5000, 2000
 TOUCHING = ((2, 6), (3, 6), (4, 6), (6, 4), (6, 6), (10, 20))

@@ -1,9 +1,9 @@
 """Searches the settings that reach the frozen evaluation's success soonest, with Optuna: docs/tuning.md, configs/.
 
     pip install -c constraints.txt -e '.[tune]'
-    python -m surgical_marl.studies.tuning --scene psm --trials 100     # a second call goes on where the first stopped
-    python -m surgical_marl.studies.tuning --scene psm --timeout 480 --out runs/small network.hidden=[128,128]
-    python -m surgical_marl.studies.tuning --task needle_pick --scene psm_needle --success 0.97 --seeds 1
+    python -m docs.studies.tuning --scene psm --trials 100     # a second call goes on where the first stopped
+    python -m docs.studies.tuning --scene psm --timeout 480 --out runs/small network.hidden=[128,128]
+    python -m docs.studies.tuning --task needle_pick --scene psm_needle --success 0.97 --seeds 1
 
 What is tuned are seconds of learning as `surgical-marl bench solve` counts them, without imports and compilation. All
 trials run in one process, one after the other, so that engines compile once and trials don't share the device. Several
@@ -32,6 +32,7 @@ from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
 from optuna.trial import FrozenTrial, TrialState
 
+from docs.studies.command import make_parser, parse_with_settings, run
 from surgical_marl import machine
 from surgical_marl.bench.solve import Goal, Solution, solve
 from surgical_marl.bench.workload import Workload
@@ -40,7 +41,6 @@ from surgical_marl.files import write_atomic, write_text
 from surgical_marl.learning.room import in_memory
 from surgical_marl.runs.environment import make_env
 from surgical_marl.runs.settings import Settings, load_config
-from surgical_marl.studies.command import make_parser, parse_with_settings, run
 
 FRESH = 1000
 """Seeds from here on are not used by the search."""

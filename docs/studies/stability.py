@@ -1,6 +1,6 @@
 """Sweeps of docs/physics.md: how large a physics step may be.
 
-Run: python -m surgical_marl.studies.stability
+Run: python -m docs.studies.stability
 """
 
 from __future__ import annotations
@@ -8,9 +8,9 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
+from docs.studies.command import make_parser
 from surgical_marl import load_scene
 from surgical_marl.scenes.scene import Scene
-from surgical_marl.studies.command import make_parser
 
 CONTROL = 0.02
 SECONDS = 10.0

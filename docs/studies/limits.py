@@ -1,6 +1,6 @@
 """Measures what the largest files that are read take, and files just beyond the limits (docs/reliability.md).
 
-    python -m surgical_marl.studies.limits
+    python -m docs.studies.limits
 
 Each file is read in a process of its own, which has imported what it needs and has empty caches.
 """
@@ -20,13 +20,13 @@ from typing import Any
 import numpy as np
 import trimesh  # noqa: F401  # so that its import is not measured
 
+from docs.studies.command import make_parser
 from surgical_marl.robots.arm import load_arm
 from surgical_marl.robots.mesh import MAX_MESH, MAX_TEXT, read_mesh
 from surgical_marl.robots.spec import build_spec
 from surgical_marl.runs.settings import read_config
 from surgical_marl.scenes.load import load_scene
 from surgical_marl.scenes.objects import load_object
-from surgical_marl.studies.command import make_parser
 from surgical_marl.untrusted.arrays import read_npz
 from surgical_marl.yaml_file import MAX_YAML, read_yaml
 

@@ -14,13 +14,13 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, PercentFormatter
 
+from docs.studies.study_cells import CELLS, QUESTIONS
+from docs.studies.study_runs import PLAYED, WHEN, Job
 from surgical_marl.evaluation.interval import interval, over_seeds
 from surgical_marl.evaluation.metrics import SUCCESS_MM, Metric, metrics, success
 from surgical_marl.files import write_atomic, write_text
 from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.runs.folder import read_metrics, read_origin, read_settings
-from surgical_marl.studies.study_cells import CELLS, QUESTIONS
-from surgical_marl.studies.study_runs import PLAYED, WHEN, Job
 
 COLORS = ("#1f6f8b", "#b23a48", "#7a7a7a", "#c98a1b")
 FINAL = (f"success_{SUCCESS_MM}mm", f"team_success_{SUCCESS_MM}mm", "median_error_mm", "collision_rate")

@@ -1,6 +1,6 @@
 """Each joint's response to a small step of its target, beside that of the identified linear model.
 
-Run: python -m surgical_marl.studies.step_response --results docs; it writes docs/step_response.png.
+Run: python -m docs.studies.step_response --results docs; it writes docs/step_response.png.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ import mujoco
 import numpy as np
 from mujoco import rollout
 
+from docs.studies.command import results_folder
 from surgical_marl import load_scene
 from surgical_marl.robots.arm import Joint
 from surgical_marl.scenes.timing import TIMESTEP
-from surgical_marl.studies.command import results_folder
 
 SHARE = 0.5
 """Size of the step as a share of the one that needs full effort; below that the controller is linear."""

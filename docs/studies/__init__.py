@@ -1,0 +1,1 @@
+"""Measurements and pictures for the pages of docs/, each a command: `python -m docs.studies.<name> --help`."""
