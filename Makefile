@@ -62,7 +62,7 @@ lock: $(SUPPLY_READY)
 coverage: export COVERAGE_FILE := $(CURDIR)/build/coverage/data
 coverage: $(QUALITY_READY)
 	rm -rf build/coverage && mkdir -p build/coverage
-	-$(BIN)/coverage run -m pytest --deselect tests/test_reliability.py::$(FULL_DISK) $(ARGS)
+	-$(BIN)/coverage run -m pytest --deselect tests/project/test_reliability.py::$(FULL_DISK) $(ARGS)
 	-$(BIN)/coverage combine --quiet
 	$(BIN)/coverage report | tee build/coverage/report.txt
 

@@ -26,8 +26,12 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 PYTHONS = ("3.11", "3.12", "3.13")
 NAMES = ("jax", "torch", "pettingzoo", "gymnasium")
-WITHOUT_TORCH = ("tests/test_public_surface.py::test_a_seed_leads_to_the_numbers_that_it_led_to",)
-WITH_TORCH = ("tests/test_public_surface.py", "tests/test_determinism.py", "tests/test_learning.py")
+WITHOUT_TORCH = ("tests/project/test_public_surface.py::test_a_seed_leads_to_the_numbers_that_it_led_to",)
+WITH_TORCH = (
+    "tests/project/test_public_surface.py",
+    "tests/project/test_determinism.py",
+    "tests/learning/test_learning.py",
+)
 
 
 def allowed() -> dict[str, str]:

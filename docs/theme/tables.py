@@ -4,7 +4,8 @@
 
 A table stands between `<!-- table: NAME -->` and `<!-- end of table -->`. A picture docs/images/<kind>/<name>.webp
 is shown in the row of its arm, object, scene or task. A figure stands between `<!-- figure: NAME -->` and
-`<!-- end -->`: one of docs/figures.yaml, or one that is counted here. `tests/test_site.py` holds the pages to both.
+`<!-- end -->`: one of docs/figures.yaml, or one that is counted here. `tests/docs/test_site.py` holds the pages
+to both.
 """
 
 from __future__ import annotations

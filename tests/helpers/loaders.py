@@ -1,7 +1,7 @@
 """All that reads files of strangers, each as a call on the bytes of one file, with good files to begin with.
 
 `tests/helpers/fuzzing.py` looks for files that end in another error than one sentence, or take too much. Those that
-once did are in `tests/corpus/`, by loader, and `tests/test_corpus.py` reads them again.
+once did are in `tests/corpus/`, by loader, and `tests/untrusted/test_corpus.py` reads them again.
 """
 
 from __future__ import annotations
@@ -46,10 +46,11 @@ from surgical_marl.scenes.objects import load_object
 from surgical_marl.untrusted.arrays import read_npz
 from surgical_marl.view import take
 from surgical_marl.yaml_file import parse_yaml
+from tests.helpers import ROOT
 from tests.helpers.run_folders import evaluate, make_run, played, standard
 from tests.helpers.samples import ARM, CABLES, DAE, JAW, OBJ, OBJECT, SCENE, SCENE_OF_TWO, SETTINGS, SPHERES, TINY, URDF
 
-CORPUS = Path(__file__).parents[1] / "corpus"
+CORPUS = ROOT / "tests" / "corpus"
 """Files that once ended in another error, or took too much: one folder for each loader."""
 
 

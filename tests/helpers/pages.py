@@ -8,13 +8,12 @@ import builtins
 import re
 import shlex
 from collections.abc import Iterator
-from pathlib import Path
 from typing import NamedTuple
 
 from surgical_marl.cli import main as cli
 from surgical_marl.plugins.tasks import TASKS, scenes_for
+from tests.helpers import ROOT
 
-ROOT = Path(__file__).parents[2]
 PATTERNS = ("README.md", "docs/**/*.md", "arms/*/README.md", "policies/**/README.md")
 PAGES = sorted({path for pattern in PATTERNS for path in ROOT.glob(pattern)})
 

@@ -30,8 +30,8 @@ import surgical_marl as sm
 from surgical_marl.cli import main as cli
 from surgical_marl.plugins.tasks import TASKS, scenes_for
 from surgical_marl.runs.settings import Settings
+from tests.helpers import ROOT
 
-ROOT = Path(__file__).parents[2]
 FILE = ROOT / "tests/public_surface.json"
 STEPS = 20
 """Steps after which the numbers of an environment are compared again."""
