@@ -18,7 +18,7 @@ from surgical_marl.bench.rivals import RIVALS, Contender
 from surgical_marl.bench.workload import Workload
 from surgical_marl.content import unknown
 from surgical_marl.engines.choose import Engine, make_engine
-from surgical_marl.engines.fused.order import control_steps
+from surgical_marl.engines.fused.env_sorting import control_steps
 from surgical_marl.envs.batch import BatchedEnv
 
 ENGINES = ("fused", "mjx", *RIVALS)

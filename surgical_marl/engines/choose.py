@@ -66,7 +66,7 @@ def make_engine(env: Stepper, num_envs: int, engine: str = "auto", device: str =
             _say("warp-lang is not installed")
         else:
             from surgical_marl.engines.fused.engine import FusedEngine
-            from surgical_marl.engines.fused.traced import Unsupported
+            from surgical_marl.engines.fused.symbolic_array import Unsupported
 
             try:
                 return FusedEngine(env, num_envs, device)

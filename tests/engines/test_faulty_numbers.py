@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from surgical_marl.engines.fused.guard import Guard
+from surgical_marl.engines.fused.finite_check import FiniteCheck
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.envs.batch_step import BatchStep
 
@@ -95,14 +95,14 @@ def test_the_kernel_of_a_gpu_does_what_numpy_does(part: str) -> None:
         env = BatchedEnv("reach", "psm", num_envs=N, engine="fused", device="cpu")
         env.reset(seed=0)
         poisoned(env, part, BAD)
-        guard: Guard = env.engine.guard  # type: ignore[attr-defined]
-        own, steps = guard.on_device(), []
+        check: FiniteCheck = env.engine.finite_check  # type: ignore[attr-defined]
+        own, steps = check.on_device(), []
         for _ in range(3):
             env.engine.step(still(env))
             if kernel:
-                guard.launch(env.max_steps, own)
-            codes = own[-1].copy() if kernel else guard.check(env.max_steps).copy()
-            arrays = {name: guard._arrays.fields(name).copy() for name in ("state", "outs", "counts", "flags")}
+                check.launch(env.max_steps, own)
+            codes = own[-1].copy() if kernel else check.check(env.max_steps).copy()
+            arrays = {name: check._arrays.fields(name).copy() for name in ("state", "outs", "counts", "flags")}
             steps.append({"codes": codes, **arrays})
         found.append(steps)
     for one, other in zip(*found, strict=True):

@@ -14,11 +14,11 @@ import numpy as np
 
 from surgical_marl.engines.fused import engine, kernel
 from surgical_marl.engines.fused.arrays import make_arrays
+from surgical_marl.engines.fused.compiler import Fields, interpret, tables, trace
 from surgical_marl.engines.fused.emit import Emitter
 from surgical_marl.engines.fused.graph import Graph
-from surgical_marl.engines.fused.load import load_source
-from surgical_marl.engines.fused.preludes import CUDA
-from surgical_marl.engines.fused.translate import Fields, interpret, tables, trace
+from surgical_marl.engines.fused.macros import CUDA
+from surgical_marl.engines.fused.source_cache import load_source
 
 Stores = list[tuple[str, int, int]]
 

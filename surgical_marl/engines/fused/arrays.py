@@ -11,11 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from surgical_marl.engines.fused import reorder
+from surgical_marl.engines.fused.env_sorting import EnvOrder, permuted, prepare_permute, slowest_first
 from surgical_marl.engines.fused.kernel import multiprocessors
-from surgical_marl.engines.fused.order import Order, slowest_first
-from surgical_marl.engines.fused.preludes import LANES
-from surgical_marl.engines.fused.program import Leaf, Source
+from surgical_marl.engines.fused.kernel_layout import Leaf, Source
+from surgical_marl.engines.fused.macros import LANES
 from surgical_marl.machine import free_memory
 from surgical_marl.runtime import prepare_warp
 
@@ -44,7 +43,7 @@ class Arrays(ABC):
     """
 
     device: str
-    order: Order | None = None
+    order: EnvOrder | None = None
 
     def __init__(self, source: Source, tables: dict[str, np.ndarray], stride: int, num_envs: int) -> None:
         self.num_envs, self.stride = num_envs, stride
@@ -99,7 +98,7 @@ class Arrays(ABC):
         """Return the columns in the order of what they had to do, most first. The arguments are as above."""
 
     def sort_columns(self, every: int, shares: int, split: bool = False) -> None:
-        """Sort columns from time to time (`order.py`).
+        """Sort columns from time to time (`env_sorting.py`).
 
         Args:
             every: control steps after which they are sorted.
@@ -107,7 +106,7 @@ class Arrays(ABC):
             split: whether the first groups on a GPU are split, so that the slowest ones come first.
         """
         kept = [self.fields(name) for name in _KEPT]
-        self.order = Order(self._numbers, kept, partial(self._argsort, shares, split), every, self._recording)
+        self.order = EnvOrder(self._numbers, kept, partial(self._argsort, shares, split), every, self._recording)
 
     @property
     def envs(self) -> Any:
@@ -281,7 +280,7 @@ class CudaArrays(Arrays):
         if not self.order:
             rows.copy_(values)
         elif rows.dtype == torch.float32:  # actions, in each step
-            reorder.reordered(values.to(rows), self.order.envs, out=rows)
+            permuted(values.to(rows), self.order.envs, out=rows)
         else:
             torch.index_select(values.to(rows), 1, self.order.envs, out=rows)
 
@@ -294,12 +293,12 @@ class CudaArrays(Arrays):
 
     def read_tree(self, tree: dict[str, Any], library: str) -> dict[str, Any]:
         found = {name: self._by_environment(self.fields(name)) for name in ("flags", "counts")}
-        outs = reorder.reordered(self.fields("outs"), self.order.columns) if self.order else self.fields("outs")
+        outs = permuted(self.fields("outs"), self.order.columns) if self.order else self.fields("outs")
         return self._cut(tree, {"outs": outs, **found}, library)
 
     def sort_columns(self, every: int, shares: int, split: bool = False) -> None:
         super().sort_columns(every, shares, split)
-        reorder.prepare()
+        prepare_permute()
 
     def _by_environment(self, rows: Any) -> Any:
         """As in `CpuArrays`."""

@@ -14,11 +14,11 @@ import numpy as np
 
 from surgical_marl.engines.fused.emit_arrays import TYPES, ArrayEmitter
 from surgical_marl.engines.fused.graph import Branch, Graph, Loop, Value
-from surgical_marl.engines.fused.interleaving import interleave
+from surgical_marl.engines.fused.macros import WAYS, fenced, is_long, large_branches
 from surgical_marl.engines.fused.memory_order import order_memory
-from surgical_marl.engines.fused.preludes import WAYS, fenced, is_long, large_branches
 from surgical_marl.engines.fused.schedule import Scheduler
-from surgical_marl.engines.fused.sharing import share_memory
+from surgical_marl.engines.fused.stack_allocation import share_memory
+from surgical_marl.engines.fused.vector_layout import interleave
 
 LARGE = 500
 """Least number of operations in a branch whose inputs are hidden from the compiler (`HIDEF`), or in a branch or a round

@@ -11,8 +11,8 @@ from itertools import groupby
 
 import numpy as np
 
+from surgical_marl.engines.fused.array_view import split, view
 from surgical_marl.engines.fused.graph import Graph, Value
-from surgical_marl.engines.fused.memory import split, view
 from surgical_marl.engines.fused.schedule import Schedule
 
 LEAST_RUN = 4

@@ -6,7 +6,7 @@
     engine.outcome("torch")["rewards"]
 
 The state of all environments stays in arrays on the device, [field, column], between steps. Which environment is in
-which column may change (`order.py`).
+which column may change (`env_sorting.py`).
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from typing import Any
 import numpy as np
 
 from surgical_marl.engines.fused.arrays import make_arrays
-from surgical_marl.engines.fused.guard import Guard
+from surgical_marl.engines.fused.env_sorting import sorted_every
+from surgical_marl.engines.fused.finite_check import FiniteCheck
 from surgical_marl.engines.fused.kernel import compile_kernels, has_cuda
-from surgical_marl.engines.fused.load import load_source
-from surgical_marl.engines.fused.order import sorted_every
-from surgical_marl.engines.fused.preludes import LANES
-from surgical_marl.engines.fused.program import Source
+from surgical_marl.engines.fused.kernel_layout import Source
+from surgical_marl.engines.fused.macros import LANES
+from surgical_marl.engines.fused.source_cache import load_source
 from surgical_marl.engines.fused.threefry import episode_keys
 from surgical_marl.engines.stages import compiling
 from surgical_marl.engines.stepper import Stepper
@@ -58,7 +58,7 @@ class FusedEngine:
         self._leaves = {**carry, **flatten(self.source.moved, ".moved")}
         self._stride = -(-num_envs // LANES) * LANES
         self._arrays = make_arrays(self.device, self.source, self._filled_tables(), self._stride, num_envs)
-        self._guard: Guard | None = None
+        self._finite_check: FiniteCheck | None = None
         vectors = self._stride // LANES
         shares = min(cores(), max(1, num_envs // LEAST_SHARE)) if self.device == "cpu" else 1
         edges = [round(vectors * k / shares) * LANES for k in range(shares + 1)]
@@ -104,17 +104,17 @@ class FusedEngine:
             self._launch("step")
 
     @property
-    def guard(self) -> Guard:
+    def finite_check(self) -> FiniteCheck:
         """What finds environments that are not finite; made when first needed."""
-        if self._guard is None:
+        if self._finite_check is None:
             carry = {name: self._leaves[name] for name in self.carry_shapes}
-            self._guard = Guard(self.source, carry, self._arrays)
-        return self._guard
+            self._finite_check = FiniteCheck(self.source, carry, self._arrays)
+        return self._finite_check
 
     @property
     def fault_places(self) -> list[str]:
         """Names of the places where a fault can be, by code (see `surgical_marl/engines/faults.py`)."""
-        return self.guard.names
+        return self.finite_check.names
 
     def end_faulty(self, limit: int, library: str) -> Any:
         """End the episode of every environment that the last step left NaN or infinite; call it before `outcome`.
@@ -130,11 +130,11 @@ class FusedEngine:
         Returns:
             Code of the fault in each environment, [N] int32; -1 where there is none.
         """
-        return self._arrays.presented(self.guard.check(limit), library)
+        return self._arrays.presented(self.finite_check.check(limit), library)
 
     def expect_end(self, leaving: np.ndarray) -> None:
         """Take note of the environments, [N] bool, whose next step ends an episode because of an older fault."""
-        self.guard.clear(leaving)
+        self.finite_check.clear(leaving)
 
     def outcome(self, library: str) -> dict[str, Any]:
         """Return what the last step or reset led to: fields of the environment's `State` as dicts of dicts.

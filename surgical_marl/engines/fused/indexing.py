@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
+from surgical_marl.engines.fused.array_view import View, depth, pack, unpack, view
+from surgical_marl.engines.fused.elementwise import convert
 from surgical_marl.engines.fused.graph import Graph, Value
-from surgical_marl.engines.fused.memory import View, depth, pack, unpack, view
 from surgical_marl.engines.fused.operations import KIND_OF
-from surgical_marl.engines.fused.scalars import convert
-from surgical_marl.engines.fused.traced import Symbolic, Table, Traced, lift
+from surgical_marl.engines.fused.symbolic_array import AnyArray, SymbolicArray, Table, values_of
 
 LEAST_TABLE = 16
 """Least number of constants, or of real values, that are looked up in memory instead of being selected one by one."""
@@ -26,7 +26,7 @@ Places = list[np.ndarray]
 """For each axis of an array, where on it each element of a result comes from."""
 
 
-def gather(g: Graph, shape: Any, params: Any, operand: Traced | Table, indices: Traced) -> Traced:
+def gather(g: Graph, shape: Any, params: Any, operand: AnyArray | Table, indices: AnyArray) -> AnyArray:
     """Do what `lax.gather` does."""
     numbers, sizes = params["dimension_numbers"], params["slice_sizes"]
     grid = np.indices(shape)
@@ -35,10 +35,10 @@ def gather(g: Graph, shape: Any, params: Any, operand: Traced | Table, indices: 
     place = _windows(shape, operand, numbers.collapsed_slice_dims, numbers.operand_batching_dims, windows)
     for axis, start in zip(numbers.operand_batching_dims, numbers.start_indices_batching_dims, strict=True):
         place[axis] = place[axis] + batch[start]
-    raw = indices.ids if isinstance(indices, Symbolic) else indices
+    raw = indices.ids if isinstance(indices, SymbolicArray) else indices
     starts = {axis: np.broadcast_to(raw[(*batch, k)], shape) for k, axis in enumerate(numbers.start_index_map)}
     fill = _fill(g, params, operand) if "fill" in str(params["mode"]).lower() else None
-    if isinstance(indices, Symbolic):
+    if isinstance(indices, SymbolicArray):
         return _choose(g, operand, sizes, place, starts, fill)
     inside = np.ones(shape, bool)
     for axis, start in starts.items():
@@ -46,40 +46,42 @@ def gather(g: Graph, shape: Any, params: Any, operand: Traced | Table, indices: 
         inside &= (start >= 0) & (start <= last)
         place[axis] = place[axis] + np.clip(start.astype(int), 0, last)
     found = _take(g, operand, place)
-    return found if fill is None or inside.all() else Symbolic(np.where(inside, lift(g, found), fill))
+    return found if fill is None or inside.all() else SymbolicArray(np.where(inside, values_of(g, found), fill))
 
 
-def dynamic_slice(g: Graph, shape: Any, params: Any, operand: Traced | Table, *starts: Traced) -> Traced:
+def dynamic_slice(g: Graph, shape: Any, params: Any, operand: AnyArray | Table, *starts: AnyArray) -> AnyArray:
     """Do what `lax.dynamic_slice` does."""
     place, moving = list(np.indices(shape)), {}
     for axis, start in enumerate(starts):
-        if isinstance(start, Symbolic):
+        if isinstance(start, SymbolicArray):
             moving[axis] = np.broadcast_to(start.ids, shape)
         else:
             place[axis] = place[axis] + int(np.clip(int(start), 0, operand.shape[axis] - shape[axis]))
     return _choose(g, operand, shape, place, moving, None) if moving else _take(g, operand, place)
 
 
-def dynamic_update_slice(g: Graph, shape: Any, params: Any, operand: Traced, update: Traced, *starts: Traced) -> Traced:
+def dynamic_update_slice(
+    g: Graph, shape: Any, params: Any, operand: AnyArray, update: AnyArray, *starts: AnyArray
+) -> AnyArray:
     """Do what `lax.dynamic_update_slice` does."""
-    out, new = lift(g, operand).copy(), lift(g, update)
-    if any(isinstance(start, Symbolic) for start in starts) and (out.size >= LEAST_TABLE or depth(g, out)):
+    out, new = values_of(g, operand).copy(), values_of(g, update)
+    if any(isinstance(start, SymbolicArray) for start in starts) and (out.size >= LEAST_TABLE or depth(g, out)):
         grid: Places = [np.array(axis) for axis in np.indices(new.shape)]
         corners = {}
         for axis, start in enumerate(starts):
-            if isinstance(start, Symbolic):
+            if isinstance(start, SymbolicArray):
                 corners[axis] = np.broadcast_to(start.ids, new.shape)
             else:
                 grid[axis] = grid[axis] + int(np.clip(int(start), 0, shape[axis] - new.shape[axis]))
         return _write(g, out, grid, corners, new, clip=True)
     lasts = [size - length for size, length in zip(shape, new.shape, strict=True)]
-    corner = [_bounded(g, int(lift(g, start)), last) for start, last in zip(starts, lasts, strict=True)]
+    corner = [_bounded(g, int(values_of(g, start)), last) for start, last in zip(starts, lasts, strict=True)]
     for at in _corners(g, corner, lasts):
         here = _all_equal(g, corner, at)
         window = tuple(slice(a, a + n) for a, n in zip(at, new.shape, strict=True))
         pairs = zip(out[window].ravel().tolist(), new.ravel().tolist(), strict=True)
         out[window] = np.array([g.select(here, *pair) for pair in pairs], np.int32).reshape(new.shape)
-    return Symbolic(out)
+    return SymbolicArray(out)
 
 
 def scatter(
@@ -87,15 +89,15 @@ def scatter(
     g: Graph,
     shape: Any,
     params: Any,
-    operand: Traced,
-    indices: Traced,
-    updates: Traced,
-) -> Traced:
+    operand: AnyArray,
+    indices: AnyArray,
+    updates: AnyArray,
+) -> AnyArray:
     """`lax.scatter` and its kin. A window that is not all inside is left out, or moved there.
 
     If all windows are promised to be inside, nothing looks whether they are.
     """
-    numbers, new = params["dimension_numbers"], lift(g, updates)
+    numbers, new = params["dimension_numbers"], values_of(g, updates)
     grid = np.indices(new.shape)
     batch = [grid[axis] for axis in range(new.ndim) if axis not in numbers.update_window_dims]
     windows = [grid[axis] for axis in numbers.update_window_dims]
@@ -103,10 +105,10 @@ def scatter(
     for axis, start in zip(numbers.operand_batching_dims, numbers.scatter_indices_batching_dims, strict=True):
         place[axis] = place[axis] + batch[start]
     clip, promised = ("clip" in str(params["mode"]).lower(), "promise" in str(params["mode"]).lower())
-    if isinstance(indices, Symbolic):
+    if isinstance(indices, SymbolicArray):
         axes = numbers.scatter_dims_to_operand_dims
         starts = {axis: np.broadcast_to(indices.ids[(*batch, k)], new.shape) for k, axis in enumerate(axes)}
-        return _write(g, lift(g, operand), place, starts, new, clip, combine, promised)
+        return _write(g, values_of(g, operand), place, starts, new, clip, combine, promised)
     inside = np.ones(new.shape, bool)
     for k, axis in enumerate(numbers.scatter_dims_to_operand_dims):
         start, last = indices[(*batch, k)].astype(int), shape[axis] - 1 - place[axis].max(initial=0)
@@ -114,14 +116,14 @@ def scatter(
             start = np.clip(start, 0, last)
         inside &= (start >= 0) & (start <= last)
         place[axis] = place[axis] + start
-    out = lift(g, operand).copy()
+    out = values_of(g, operand).copy()
     for element in zip(*np.nonzero(inside), strict=True) if new.ndim else [()] * int(inside):
         target = tuple(axis[element] for axis in place)
         out[target] = combine(g, int(out[target]), int(new[element]))
-    return Symbolic(out)
+    return SymbolicArray(out)
 
 
-def _windows(shape: Any, operand: Traced | Table, dropped: Any, batched: Any, windows: Places) -> Places:
+def _windows(shape: Any, operand: AnyArray | Table, dropped: Any, batched: Any, windows: Places) -> Places:
     """Places within the window of each element; its axes are those that are neither dropped nor batched."""
     kept = [axis for axis in range(len(operand.shape)) if axis not in dropped and axis not in batched]
     place = [np.zeros(shape, int) for _ in operand.shape]
@@ -130,12 +132,12 @@ def _windows(shape: Any, operand: Traced | Table, dropped: Any, batched: Any, wi
     return place
 
 
-def _take(g: Graph, operand: Traced | Table, place: Places) -> Traced:
-    if isinstance(operand, Symbolic):
-        return Symbolic(np.asarray(operand.ids[tuple(place)]))
+def _take(g: Graph, operand: AnyArray | Table, place: Places) -> AnyArray:
+    if isinstance(operand, SymbolicArray):
+        return SymbolicArray(np.asarray(operand.ids[tuple(place)]))
     if isinstance(operand, Table):
         found = [look_up(g, operand, [int(axis[at]) for axis in place], {}) for at in np.ndindex(place[0].shape)]
-        return Symbolic(np.array(found, np.int32).reshape(place[0].shape))
+        return SymbolicArray(np.array(found, np.int32).reshape(place[0].shape))
     return np.asarray(operand[tuple(place)])
 
 
@@ -143,8 +145,8 @@ def _take(g: Graph, operand: Traced | Table, place: Places) -> Traced:
 
 
 def _choose(
-    g: Graph, operand: Traced | Table, sizes: Any, place: Places, starts: dict[int, np.ndarray], fill: Value | None
-) -> Symbolic:
+    g: Graph, operand: AnyArray | Table, sizes: Any, place: Places, starts: dict[int, np.ndarray], fill: Value | None
+) -> SymbolicArray:
     """Return the elements of `operand` at `place + starts`, where the starts are values.
 
     A window has the size `sizes`. If it is not all inside the operand, its elements are `fill`. Without a `fill` the
@@ -155,7 +157,7 @@ def _choose(
     if isinstance(operand, Table) or (isinstance(operand, np.ndarray) and operand.size >= LEAST_TABLE):
         find = partial(look_up, g, operand)
     else:
-        find = partial(_read_or_choose, g, lift(g, operand), lasts)
+        find = partial(_read_or_choose, g, values_of(g, operand), lasts)
     out = []
     for element in np.ndindex(shape):
         moving, valid = {}, g.true
@@ -165,7 +167,7 @@ def _choose(
                 valid = g.logic("and", valid, g.compare("eq", int(start[element]), moving[axis]))
         value = find([int(axis[element]) for axis in place], moving)
         out.append(value if fill is None else g.select(valid, fill, value))
-    return Symbolic(np.array(out, np.int32).reshape(shape))
+    return SymbolicArray(np.array(out, np.int32).reshape(shape))
 
 
 def look_up(g: Graph, operand: np.ndarray | Table, fixed: list[int], moving: dict[int, Value]) -> Value:
@@ -182,10 +184,10 @@ def look_up(g: Graph, operand: np.ndarray | Table, fixed: list[int], moving: dic
     return convert(g, g.lookup(number, flat), kind)
 
 
-def elements_of(g: Graph, table: Table) -> Symbolic:
+def elements_of(g: Graph, table: Table) -> SymbolicArray:
     """Return the elements of a table; what is not used costs nothing."""
     ids = [look_up(g, table, list(place), {}) for place in np.ndindex(table.shape)]
-    return Symbolic(np.array(ids, np.int32).reshape(table.shape))
+    return SymbolicArray(np.array(ids, np.int32).reshape(table.shape))
 
 
 def _read_or_choose(
@@ -240,9 +242,9 @@ def _like(g: Graph, value: Value, number: int) -> Value:
     return g.constant(g.dtype(value)(number))
 
 
-def _fill(g: Graph, params: Any, operand: Traced | Table) -> Value:
+def _fill(g: Graph, params: Any, operand: AnyArray | Table) -> Value:
     """Return the value that stands for elements outside the operand."""
-    dtype = np.dtype(g.dtype(int(operand.ids.flat[0])) if isinstance(operand, Symbolic) else operand.dtype)
+    dtype = np.dtype(g.dtype(int(operand.ids.flat[0])) if isinstance(operand, SymbolicArray) else operand.dtype)
     given = params.get("fill_value")
     if given is None:
         limits = np.iinfo(dtype) if dtype.kind in "iu" else None
@@ -262,7 +264,7 @@ def _write(
     clip: bool,
     combine: Callable[[Graph, Value, Value], Value] = lambda g, old, new: new,
     promised: bool = False,
-) -> Symbolic:
+) -> SymbolicArray:
     """Return an array in memory with the values `new` put at `place + starts`.
 
     A window that is not all inside is moved there if `clip`, and left out otherwise. `promised` says that all are.
@@ -288,4 +290,4 @@ def _write(
         old = g.read(arrays[column], index)
         value = g.select(valid, old, combine(g, old, int(new[element])))
         arrays[column] = g.put(arrays[column], index, [value])
-    return Symbolic(unpack(g, arrays, ids.shape, axes))
+    return SymbolicArray(unpack(g, arrays, ids.shape, axes))

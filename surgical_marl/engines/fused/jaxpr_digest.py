@@ -14,7 +14,7 @@ import jax
 import numpy as np
 from jax.extend import core
 
-from surgical_marl.engines.fused.translate import Function
+from surgical_marl.engines.fused.compiler import Function
 
 
 def jaxpr_digest(functions: Mapping[str, Function]) -> str:

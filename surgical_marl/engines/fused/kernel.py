@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from surgical_marl.cache import locked
-from surgical_marl.engines.fused.preludes import CPU, CUDA, LANES, UNDEFINE, is_long
+from surgical_marl.engines.fused.macros import CPU, CUDA, LANES, UNDEFINE, is_long
 from surgical_marl.engines.stages import Stage, unsaid
 from surgical_marl.engines.stepper import MOST_KEPT
 from surgical_marl.files import writable, write_text

@@ -13,23 +13,32 @@ from typing import Any
 import numpy as np
 
 from surgical_marl.engines.fused import elementary, linear
+from surgical_marl.engines.fused.array_view import unpack
+from surgical_marl.engines.fused.elementwise import ELEMENTWISE, bitcast, convert, extreme, logic, round_
 from surgical_marl.engines.fused.graph import Graph, Value
 from surgical_marl.engines.fused.indexing import dynamic_slice, dynamic_update_slice, gather, scatter
-from surgical_marl.engines.fused.memory import unpack
 from surgical_marl.engines.fused.operations import FOLD
-from surgical_marl.engines.fused.scalars import ELEMENTWISE, bitcast, convert, extreme, logic, round_
+from surgical_marl.engines.fused.symbolic_array import (
+    AnyArray,
+    Rule,
+    SymbolicArray,
+    Unsupported,
+    array_of,
+    each,
+    kind_of,
+    values_of,
+)
 from surgical_marl.engines.fused.threefry import threefry
-from surgical_marl.engines.fused.traced import Rule, Symbolic, Traced, Unsupported, each, kind_of, lift, lower
 
 
-def _convert(g: Graph, shape: Any, params: Any, x: Traced) -> Traced:
+def _convert(g: Graph, shape: Any, params: Any, x: AnyArray) -> AnyArray:
     dtype = np.dtype(params["new_dtype"])
     if isinstance(x, np.ndarray) and not (x.dtype.kind == "f" and dtype.kind in "iu"):
         return x.astype(dtype)
     return each(partial(convert, to=kind_of(dtype)), g, shape, x)
 
 
-def _bitcast(g: Graph, shape: Any, params: Any, x: Traced) -> Traced:
+def _bitcast(g: Graph, shape: Any, params: Any, x: AnyArray) -> AnyArray:
     if isinstance(x, np.ndarray):
         return np.asarray(x.view(params["new_dtype"]))
     return each(partial(bitcast, to=kind_of(params["new_dtype"])), g, shape, x)
@@ -41,9 +50,9 @@ def _bitcast(g: Graph, shape: Any, params: Any, x: Traced) -> Traced:
 def _move(function: Callable[..., np.ndarray]) -> Rule:
     """Return a rule that only moves elements, as `function(shape, params, array)` does."""
 
-    def rule(g: Graph, shape: Any, params: Any, x: Traced, *rest: Traced) -> Traced:
-        if isinstance(x, Symbolic):
-            return Symbolic(np.asarray(function(shape, params, x.ids)))
+    def rule(g: Graph, shape: Any, params: Any, x: AnyArray, *rest: AnyArray) -> AnyArray:
+        if isinstance(x, SymbolicArray):
+            return SymbolicArray(np.asarray(function(shape, params, x.ids)))
         return np.asarray(function(shape, params, np.asarray(x)))
 
     return rule
@@ -63,30 +72,30 @@ def _slice(shape: Any, params: Any, x: np.ndarray) -> np.ndarray:
 
 
 def _join(function: Callable[..., np.ndarray]) -> Rule:
-    def rule(g: Graph, shape: Any, params: Any, *xs: Traced) -> Traced:
-        if any(isinstance(x, Symbolic) for x in xs):
-            return Symbolic(function(params, [lift(g, x) for x in xs]))
+    def rule(g: Graph, shape: Any, params: Any, *xs: AnyArray) -> AnyArray:
+        if any(isinstance(x, SymbolicArray) for x in xs):
+            return SymbolicArray(function(params, [values_of(g, x) for x in xs]))
         return function(params, [np.asarray(x) for x in xs])
 
     return rule
 
 
-def _split(g: Graph, shape: Any, params: Any, x: Traced) -> list[Traced]:
+def _split(g: Graph, shape: Any, params: Any, x: AnyArray) -> list[AnyArray]:
     ends = np.cumsum(params["sizes"])[:-1]
-    if isinstance(x, Symbolic):
-        return [Symbolic(part) for part in np.split(x.ids, ends, params["axis"])]
+    if isinstance(x, SymbolicArray):
+        return [SymbolicArray(part) for part in np.split(x.ids, ends, params["axis"])]
     return list(np.split(x, ends, params["axis"]))
 
 
-def _unstack(g: Graph, shape: Any, params: Any, x: Traced) -> list[Traced]:
-    array = x.ids if isinstance(x, Symbolic) else x
+def _unstack(g: Graph, shape: Any, params: Any, x: AnyArray) -> list[AnyArray]:
+    array = x.ids if isinstance(x, SymbolicArray) else x
     parts = [array.take(k, params["axis"]) for k in range(array.shape[params["axis"]])]
-    return [Symbolic(np.asarray(part)) if isinstance(x, Symbolic) else part for part in parts]
+    return [SymbolicArray(np.asarray(part)) if isinstance(x, SymbolicArray) else part for part in parts]
 
 
-def _pad(g: Graph, shape: Any, params: Any, x: Traced, value: Traced) -> Traced:
-    symbolic = isinstance(x, Symbolic) or isinstance(value, Symbolic)
-    source, fill = (lift(g, x), lift(g, value)) if symbolic else (np.asarray(x), np.asarray(value))
+def _pad(g: Graph, shape: Any, params: Any, x: AnyArray, value: AnyArray) -> AnyArray:
+    symbolic = isinstance(x, SymbolicArray) or isinstance(value, SymbolicArray)
+    source, fill = (values_of(g, x), values_of(g, value)) if symbolic else (np.asarray(x), np.asarray(value))
     out = np.broadcast_to(fill, shape).copy()
     target, taken = [], []
     for size, (low, _, gap), length in zip(source.shape, params["padding_config"], shape, strict=True):
@@ -95,41 +104,41 @@ def _pad(g: Graph, shape: Any, params: Any, x: Traced, value: Traced) -> Traced:
         target.append(place[inside])
         taken.append(np.flatnonzero(inside))
     out[np.ix_(*target)] = source[np.ix_(*taken)]
-    return Symbolic(out) if symbolic else out
+    return SymbolicArray(out) if symbolic else out
 
 
-def _iota(g: Graph, shape: Any, params: Any) -> Traced:
+def _iota(g: Graph, shape: Any, params: Any) -> AnyArray:
     middle = [1] * len(shape)
     middle[params["dimension"]] = shape[params["dimension"]]
     return np.broadcast_to(np.arange(shape[params["dimension"]]).reshape(middle), shape)
 
 
-def _empty(g: Graph, shape: Any, params: Any) -> Traced:
+def _empty(g: Graph, shape: Any, params: Any) -> AnyArray:
     """Return arrays that hold nothing yet, along the first axis."""
     length, size = shape[0] if shape else 1, int(np.prod(shape[1:], dtype=int))
     kind = f"{kind_of(params['dtype'])}{length}"
-    return Symbolic(unpack(g, [g.fresh("room", kind=kind) for _ in range(size)], shape, min(len(shape), 1)))
+    return SymbolicArray(unpack(g, [g.fresh("room", kind=kind) for _ in range(size)], shape, min(len(shape), 1)))
 
 
 # -- random numbers
 
 
-def _threefry(g: Graph, shape: Any, params: Any, *xs: Traced) -> list[Traced]:
+def _threefry(g: Graph, shape: Any, params: Any, *xs: AnyArray) -> list[AnyArray]:
     number = lambda k: g.constant(np.uint32(k))  # noqa: E731
 
     def rotate(word: Value, distance: int) -> Value:
         left, right = g.binary("shl", word, number(distance)), g.binary("shr", word, number(32 - distance))
         return g.logic("or", left, right)
 
-    columns = [np.broadcast_to(lift(g, x), shape).ravel().tolist() for x in xs]
+    columns = [np.broadcast_to(values_of(g, x), shape).ravel().tolist() for x in xs]
     pairs = [
         threefry((k0, k1), (c0, c1), g.add, partial(g.logic, "xor"), rotate, number)
         for k0, k1, c0, c1 in zip(*columns, strict=True)
     ]
-    return [Symbolic(np.array(half, np.int32).reshape(shape)) for half in zip(*pairs, strict=True)]
+    return [SymbolicArray(np.array(half, np.int32).reshape(shape)) for half in zip(*pairs, strict=True)]
 
 
-def _iota_pair(g: Graph, shape: Any, params: Any) -> list[Traced]:
+def _iota_pair(g: Graph, shape: Any, params: Any) -> list[AnyArray]:
     """Return the high and the low words of each element's number."""
     count = np.arange(int(np.prod(shape)), dtype=np.uint32).reshape(shape)
     return [np.zeros_like(count), count]
@@ -197,7 +206,7 @@ _KNOWN: dict[str, Callable[..., Any]] = {
 """Those that numpy computes on whole arrays as the graph would element by element."""
 
 
-def apply(g: Graph, name: str, avals: list[Any], params: dict[str, Any], xs: list[Traced]) -> list[Traced]:
+def apply(g: Graph, name: str, avals: list[Any], params: dict[str, Any], xs: list[AnyArray]) -> list[AnyArray]:
     """Return the results of a primitive.
 
     Raises:
@@ -206,16 +215,16 @@ def apply(g: Graph, name: str, avals: list[Any], params: dict[str, Any], xs: lis
     shape, dtype = avals[0].shape, avals[0].dtype
     if all(0 in aval.shape for aval in avals):
         return [np.zeros(aval.shape, aval.dtype) for aval in avals]
-    if name in _KNOWN and not any(isinstance(x, Symbolic) for x in xs):
+    if name in _KNOWN and not any(isinstance(x, SymbolicArray) for x in xs):
         with np.errstate(all="ignore"):
             return [np.broadcast_to(np.asarray(_KNOWN[name](*xs), dtype), shape)]
     if name in ELEMENTWISE:
-        return [lower(g, each(ELEMENTWISE[name], g, shape, *xs).ids, dtype)]
+        return [array_of(g, each(ELEMENTWISE[name], g, shape, *xs).ids, dtype)]
     if name not in RULES:
         raise Unsupported(f"the primitive {name}")
     results = RULES[name](g, shape, params, *xs)
     results = results if isinstance(results, list) else [results]
     return [
-        lower(g, x.ids, aval.dtype) if isinstance(x, Symbolic) else np.asarray(x, aval.dtype)
+        array_of(g, x.ids, aval.dtype) if isinstance(x, SymbolicArray) else np.asarray(x, aval.dtype)
         for x, aval in zip(results, avals, strict=True)
     ]

@@ -12,7 +12,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from surgical_marl.engines.fused.graph import Branch, Graph, Loop, Value
-from surgical_marl.engines.fused.takeover import Places, Takeovers
+from surgical_marl.engines.fused.inplace import Places, Takeovers
 
 GIVEN = ("phi", "counter")
 """Values that are there at the start of a round of their loop."""

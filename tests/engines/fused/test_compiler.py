@@ -17,8 +17,8 @@ from jax import lax
 
 from surgical_marl.engines.fused import emit, kernel
 from surgical_marl.engines.fused.emit import Emitter
-from surgical_marl.engines.fused.preludes import CUDA, STRETCH, UNDEFINE
-from surgical_marl.engines.fused.traced import Unsupported
+from surgical_marl.engines.fused.macros import CUDA, STRETCH, UNDEFINE
+from surgical_marl.engines.fused.symbolic_array import Unsupported
 from tests.helpers.fused_blocks import all_blocks, random_arrays
 from tests.helpers.fused_kernels import gpu_code, make_stores, run, worked
 from tests.helpers.fused_programs import several
@@ -187,7 +187,7 @@ def changed(count: int, x: Any, which: Any) -> Any:
 
 def test_threads_wait_for_each_other_only_where_all_come_by(monkeypatch: pytest.MonkeyPatch) -> None:
     """A thread that waits in a branch, or in a round that others don't make, would wait for ever."""
-    monkeypatch.setattr("surgical_marl.engines.fused.preludes.BRANCHES", 2)
+    monkeypatch.setattr("surgical_marl.engines.fused.macros.BRANCHES", 2)
 
     def long(x: Any) -> Any:
         return lax.cond(x > 0, lambda: sum(jnp.sin(k * x) for k in range(1, 40)), lambda: x)
@@ -274,7 +274,7 @@ def test_a_scan_that_is_to_be_unrolled_is() -> None:
 
 def test_code_for_cuda_compiles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every macro of the prelude, by NVRTC, which needs no GPU."""
-    monkeypatch.setattr("surgical_marl.engines.fused.preludes.BRANCHES", 0)
+    monkeypatch.setattr("surgical_marl.engines.fused.macros.BRANCHES", 0)
     monkeypatch.setattr(emit, "APART", 0)
     code = body(everything, random_arrays(0), vector=False)
     used = set(re.findall(r"\w+", code))

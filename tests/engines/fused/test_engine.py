@@ -18,7 +18,7 @@ import pytest
 from surgical_marl.content import list_scenes
 from surgical_marl.engines.choose import make_engine
 from surgical_marl.engines.fused.engine import FusedEngine, flatten
-from surgical_marl.engines.fused.load import load_source
+from surgical_marl.engines.fused.source_cache import load_source
 from surgical_marl.engines.fused.threefry import episode_keys
 from surgical_marl.engines.mjx import MjxEngine
 from surgical_marl.envs.batch import BatchedEnv

@@ -19,10 +19,10 @@ from hypothesis import strategies as st
 
 from surgical_marl import cache
 from surgical_marl.bench.physics import bare_state
-from surgical_marl.engines.fused import load
+from surgical_marl.engines.fused.compiler import trace
+from surgical_marl.engines.fused import source_cache
 from surgical_marl.engines.fused.jaxpr_digest import jaxpr_digest
-from surgical_marl.engines.fused.load import load_source
-from surgical_marl.engines.fused.translate import trace
+from surgical_marl.engines.fused.source_cache import load_source
 from surgical_marl.engines.stages import unsaid
 from surgical_marl.engines.stepper import representative
 from surgical_marl.envs.batch import BatchedEnv
@@ -110,9 +110,9 @@ def test_a_kernel_computes_what_code_computes_now(
     monkeypatch.setattr(cache, "cache_dir", lambda: tmp_path)
     monkeypatch.setattr(sys, "argv", ["program"])
     made: list[None] = []
-    make = load._make
-    monkeypatch.setattr(load, "_make", lambda *arguments: (made.append(None), make(*arguments))[1])
-    load._make.__module__ = load.__name__
+    make = source_cache._make
+    monkeypatch.setattr(source_cache, "_make", lambda *arguments: (made.append(None), make(*arguments))[1])
+    source_cache._make.__module__ = source_cache.__name__
 
     def source(value: float) -> str:
         found = load_source(Stepper(way(value)), vector=False)  # type: ignore[arg-type]
@@ -146,7 +146,7 @@ def test_equal_functions_have_equal_digests_and_others_do_not(numbers: list[floa
 DIGEST = """
 import jax, jax.numpy as jnp, numpy as np
 from surgical_marl.engines.fused.jaxpr_digest import jaxpr_digest
-from surgical_marl.engines.fused.translate import trace
+from surgical_marl.engines.fused.compiler import trace
 step = lambda x: jax.nn.relu(x @ np.eye(3, dtype=np.float32)).sum() + jax.random.uniform(jax.random.PRNGKey(3))
 print(jaxpr_digest({"step": trace(step, jax.ShapeDtypeStruct((3,), np.float32))}))
 """
@@ -213,6 +213,6 @@ def test_a_helper_in_another_folder_counts(tmp_path: Path, monkeypatch: pytest.M
         importlib.invalidate_caches()
         sys.modules.pop("helper_elsewhere", None)
         helper = importlib.import_module("helper_elsewhere")
-        functions = load._trace(Stepper(helper.add), unsaid)  # type: ignore[arg-type]
+        functions = source_cache._trace(Stepper(helper.add), unsaid)  # type: ignore[arg-type]
         found.append(jaxpr_digest(functions))
     assert found[0] != found[1]

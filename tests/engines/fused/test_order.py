@@ -10,15 +10,14 @@ import numpy as np
 import pytest
 import torch
 
-from surgical_marl.engines.fused import engine, kernel, order
+from surgical_marl.engines.fused import engine, env_sorting, kernel
 from surgical_marl.engines.fused.arrays import make_arrays
+from surgical_marl.engines.fused.compiler import tables
 from surgical_marl.engines.fused.emit import Emitter
+from surgical_marl.engines.fused.env_sorting import AT_ONCE, WORTH, permuted, slowest_first
 from surgical_marl.engines.fused.kernel import BLOCK
-from surgical_marl.engines.fused.load import load_source
-from surgical_marl.engines.fused.order import WORTH, slowest_first
-from surgical_marl.engines.fused.preludes import AMOUNT, BRANCHES
-from surgical_marl.engines.fused.reorder import AT_ONCE, reordered
-from surgical_marl.engines.fused.translate import tables
+from surgical_marl.engines.fused.macros import AMOUNT, BRANCHES
+from surgical_marl.engines.fused.source_cache import load_source
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.envs.env import Env
 from tests.helpers.actions import random_actions
@@ -120,9 +119,9 @@ def test_columns_are_copied_into_another_order(device: str, fields: int) -> None
     rng = np.random.default_rng(fields)
     source, columns = rng.random((fields, N + 3), np.float32), rng.permutation(N).astype(np.int32)
     rows, at = torch.from_numpy(source).to(device)[:, :N], torch.from_numpy(columns).to(device)
-    assert np.array_equal(reordered(rows, at).cpu(), source[:, columns])
+    assert np.array_equal(permuted(rows, at).cpu(), source[:, columns])
     other = torch.zeros(fields, N + 3, device=device)
-    reordered(rows.t().contiguous().t(), at, out=other[:, 1 : N + 1])
+    permuted(rows.t().contiguous().t(), at, out=other[:, 1 : N + 1])
     assert np.array_equal(other.cpu(), np.pad(source[:, columns], ((0, 0), (1, 2))))
 
 
@@ -134,19 +133,19 @@ def test_what_is_recorded_begins_with_sorting() -> None:
         sorted_at.append(step)
         return np.arange(3)
 
-    columns = order.Order(np.arange(3), [], argsort, 8, lambda: step in recorded)
+    columns = env_sorting.EnvOrder(np.arange(3), [], argsort, 8, lambda: step in recorded)
     for step in range(40):  # noqa: B007
         columns.renew()
     assert sorted_at == [1, 5, 13, 20, 28, 36]
 
 
 def test_environments_are_sorted_where_neighbours_wait_for_each_other(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(order, "multiprocessors", lambda: 132)
+    monkeypatch.setattr(env_sorting, "multiprocessors", lambda: 132)
     none, (short, long, longer) = [""], (["WORK(9)"] * branches for branches in (1, BRANCHES, WORTH))
     few, many = 4096, 8192  # of 32 a group
 
     def every(code: list[str], device: str, num_envs: int) -> int:
-        return order.sorted_every(code, device, num_envs, decimation=8)
+        return env_sorting.sorted_every(code, device, num_envs, decimation=8)
 
     assert [every(none, "cuda", many), every(short, "cuda", few), every(short, "cuda", many)] == [0, 0, 16]
     assert [every(long, "cuda", few), every(long, "cuda", many), every(longer, "cuda", few)] == [0, 4, 4]
@@ -157,8 +156,8 @@ def test_environments_are_sorted_where_neighbours_wait_for_each_other(monkeypatc
 def test_on_a_cpu_only_arms_with_objects_are_sorted() -> None:
     """Three arms alone are twice as fast where their results need not be copied."""
     arms, objects = (load_source(Env("reach", scene), vector=True) for scene in ("trimanual_psm_ecm", "psm_needle"))
-    assert not order.sorted_every(arms.bodies.values(), "cpu", 4096, decimation=8)
-    assert order.sorted_every(objects.bodies.values(), "cpu", 4096, decimation=8)
+    assert not env_sorting.sorted_every(arms.bodies.values(), "cpu", 4096, decimation=8)
+    assert env_sorting.sorted_every(objects.bodies.values(), "cpu", 4096, decimation=8)
 
 
 def test_idle_multiprocessors_take_halves_of_groups() -> None:

@@ -17,9 +17,9 @@ from jax import lax
 from jax.extend.core import Primitive, primitives
 
 from surgical_marl.engines.fused import emit
+from surgical_marl.engines.fused.jaxpr_interpreter import JaxprInterpreter
 from surgical_marl.engines.fused.primitives import ELEMENTWISE, RULES
-from surgical_marl.engines.fused.trace import Tracer
-from surgical_marl.engines.fused.traced import Symbolic
+from surgical_marl.engines.fused.symbolic_array import SymbolicArray
 from tests.helpers.fused_blocks import all_blocks, random_arrays
 from tests.helpers.fused_kernels import gpu_code, make_stores, run
 from tests.helpers.fused_programs import STRUCTURES, programs, several
@@ -76,14 +76,14 @@ def test_programs(written: list[list[Any]]) -> None:
 def seen(monkeypatch: pytest.MonkeyPatch) -> set[str]:
     """Names of the primitives that are traced for something that is not known."""
     names: set[str] = set()
-    original = Tracer._equation
+    original = JaxprInterpreter._equation
 
-    def recorded(self: Tracer, equation: Any, xs: list[Any]) -> list[Any]:
-        if not xs or any(isinstance(x, Symbolic) for x in xs):
+    def recorded(self: JaxprInterpreter, equation: Any, xs: list[Any]) -> list[Any]:
+        if not xs or any(isinstance(x, SymbolicArray) for x in xs):
             names.add(equation.primitive.name)
         return original(self, equation, xs)
 
-    monkeypatch.setattr(Tracer, "_equation", recorded)
+    monkeypatch.setattr(JaxprInterpreter, "_equation", recorded)
     return names
 
 

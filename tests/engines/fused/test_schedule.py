@@ -15,10 +15,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from jax import lax
 
+from surgical_marl.engines.fused.compiler import interpret, trace
 from surgical_marl.engines.fused.graph import Branch, Graph, Loop
 from surgical_marl.engines.fused.schedule import Schedule, Scheduler
-from surgical_marl.engines.fused.traced import Table
-from surgical_marl.engines.fused.translate import interpret, trace
+from surgical_marl.engines.fused.symbolic_array import Table
 from tests.helpers.fused_blocks import all_blocks, random_arrays
 from tests.helpers.fused_kernels import make_stores
 from tests.helpers.fused_programs import programs, several

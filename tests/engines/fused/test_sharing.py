@@ -9,8 +9,8 @@ from itertools import count
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from surgical_marl.engines.fused.interleaving import interleave
-from surgical_marl.engines.fused.sharing import share_memory
+from surgical_marl.engines.fused.stack_allocation import share_memory
+from surgical_marl.engines.fused.vector_layout import interleave
 
 Code = list[str]
 ROUNDS = 2

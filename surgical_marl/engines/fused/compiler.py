@@ -13,10 +13,10 @@ from surgical_marl.engines.faults import checked
 from surgical_marl.engines.fused.emit import Emitter, Watch, table_offsets
 from surgical_marl.engines.fused.graph import Graph, Value
 from surgical_marl.engines.fused.indexing import LEAST_TABLE, elements_of
+from surgical_marl.engines.fused.jaxpr_interpreter import JaxprInterpreter
+from surgical_marl.engines.fused.kernel_layout import Leaf, Source
 from surgical_marl.engines.fused.operations import KINDS
-from surgical_marl.engines.fused.program import Leaf, Source
-from surgical_marl.engines.fused.trace import Tracer
-from surgical_marl.engines.fused.traced import Table, Traced, lift, lower
+from surgical_marl.engines.fused.symbolic_array import AnyArray, Table, array_of, values_of
 from surgical_marl.engines.stages import Stage
 from surgical_marl.engines.stepper import Stepper
 
@@ -131,13 +131,13 @@ def make_source(functions: dict[str, Function], parameters: Any, vector: bool, s
     )
 
 
-def _parameters(graph: Graph, parameters: Any) -> tuple[list[Traced | Table], dict[str, Leaf]]:
+def _parameters(graph: Graph, parameters: Any) -> tuple[list[AnyArray | Table], dict[str, Leaf]]:
     """Return what stands for the parameters while tracing, and where each is in the joined tables.
 
     A parameter of fewer than `LEAST_TABLE` numbers becomes values. A larger one stays a table, whose elements are
     looked up where they are needed.
     """
-    given: list[Traced | Table] = []
+    given: list[AnyArray | Table] = []
     places: dict[str, Leaf] = {}
     for path, value in jax.tree_util.tree_flatten_with_path(parameters)[0]:
         value = np.asarray(value)
@@ -155,7 +155,7 @@ def _tree(tree: Any) -> dict[str, Any]:
 
 
 def interpret(
-    graph: Graph, function: Function, arguments: tuple[Any, ...], given: Sequence[Traced | Table] = ()
+    graph: Graph, function: Function, arguments: tuple[Any, ...], given: Sequence[AnyArray | Table] = ()
 ) -> list[list[Value]]:
     """Run a traced function on trees of `Leaf`s.
 
@@ -171,13 +171,13 @@ def interpret(
     Raises:
         Unsupported: for something that has no kernel code, with the line of the source that uses it.
     """
-    inputs: list[Traced] = []
+    inputs: list[AnyArray] = []
     for leaf in jax.tree.leaves(arguments):
         kind = KINDS[leaf.dtype]
         ids = [graph.node("load", leaf.buffer, leaf.first + k, kind=kind) for k in range(leaf.size)]
-        inputs.append(lower(graph, np.array(ids, np.int32).reshape(leaf.shape), np.dtype(leaf.dtype)))
-    outputs = Tracer(graph).run(function.jaxpr, [*inputs, *given])
-    return [lift(graph, x).ravel().tolist() for x in outputs]
+        inputs.append(array_of(graph, np.array(ids, np.int32).reshape(leaf.shape), np.dtype(leaf.dtype)))
+    outputs = JaxprInterpreter(graph).run(function.jaxpr, [*inputs, *given])
+    return [values_of(graph, x).ravel().tolist() for x in outputs]
 
 
 def tables(graph: Graph) -> dict[str, np.ndarray]:

@@ -1,11 +1,10 @@
-"""Which environments run side by side.
+"""Sorts environments by the branches that they take, to keep warps and vectors from diverging.
 
-Threads of a GPU go through the code in groups of 32, and a CPU's vectors hold 8 environments. Such a group goes through
-every branch, and every round of a loop, that one of them needs. What an environment has to do is about the same for
-many steps: an arm that holds something goes on to hold it. So those that took the same of the longest branches, and had
-as much to do in them, are put next to each other: the columns of the arrays change places, as neighbours are read
-together fastest from where they lie together in memory.
-An environment's results do not depend on its column.
+A warp of a GPU (32 threads) and a vector of a CPU (8 lanes) execute every branch, and every round of a loop, that one
+of their environments needs. An environment takes about the same branches for many steps: an arm that holds something
+goes on to hold it. So kernels note in `work` which branches each environment took and how much there was to do, and
+from time to time the columns of the arrays are sorted by that. The data itself moves, because neighbouring threads
+read neighbouring memory fastest. An environment's results do not depend on its column.
 """
 
 from __future__ import annotations
@@ -13,8 +12,11 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 from typing import Any
 
-from surgical_marl.engines.fused.kernel import BLOCK, multiprocessors
-from surgical_marl.engines.fused.preludes import AMOUNT, LANES, is_long, large_branches
+from surgical_marl.engines.fused.kernel import BLOCK, load_for_gpu, multiprocessors, torch_stream
+from surgical_marl.engines.fused.macros import AMOUNT, LANES, is_long, large_branches
+from surgical_marl.runtime import prepare_warp
+
+wp = prepare_warp()
 
 SELDOM, OFTEN = 128, 32
 """Physics steps after which environments are sorted: often where code is long. An environment that begins an
@@ -24,6 +26,13 @@ WORTH = 12
 """Fewest large branches for which sorting is worth it on a CPU, whose results have to be copied then, and on a GPU that
 has a multiprocessor for each group: nothing waits there beside the slowest one. Arms alone have 9 at most, arms with
 objects 17 and more."""
+
+AT_ONCE = 8
+"""Numbers that a thread loads before it stores any, so that it waits for memory once for all of them."""
+
+_numbers: Any = wp.types.vector(length=AT_ONCE, dtype=wp.float32)
+_rows: Any = wp.array2d(dtype=wp.float32)
+_wholes: Any = wp.array(dtype=wp.int32)
 
 
 def control_steps(decimation: int, every: int = SELDOM) -> int:
@@ -58,7 +67,7 @@ def slowest_first(work: Any, columns: Any) -> Any:
     return columns
 
 
-class Order:
+class EnvOrder:
     """Which environment is in which column.
 
     Args:
@@ -99,3 +108,41 @@ class Order:
             array[:] = array[:, new]
         self.envs[:] = self.envs[new]
         self.columns[self.envs] = self._numbers
+
+
+# -- copies of arrays whose columns are permuted: faster than torch's own where there are many rows
+
+
+def permuted(rows: Any, columns: Any, out: Any = None) -> Any:
+    """Return a copy of float32 rows [fields, N] whose column c is column `columns[c]`, int32, on their device.
+
+    If there is an `out`, of the same shape, the copy is written there.
+    """
+    import torch
+
+    out = torch.empty(rows.shape, dtype=rows.dtype, device=rows.device) if out is None else out
+    wp.launch(
+        _permute,
+        dim=(-(-rows.shape[0] // AT_ONCE), rows.shape[1]),
+        inputs=[wp.from_torch(x) for x in (rows, columns, out)],
+        device=rows.device.type,
+        stream=torch_stream() if rows.is_cuda else None,
+    )
+    return out
+
+
+def prepare_permute() -> None:
+    """Compile the copy for the GPU, before a CUDA graph is captured."""
+    load_for_gpu(_permute)
+
+
+@wp.kernel(enable_backward=False)
+def _permute(source: _rows, columns: _wholes, target: _rows) -> None:
+    group, c = wp.tid()
+    at = columns[c]
+    first, last = group * AT_ONCE, source.shape[0] - 1
+    numbers = _numbers()
+    for k in range(AT_ONCE):
+        numbers[k] = source[wp.min(first + k, last), at]
+    for k in range(AT_ONCE):
+        target[wp.min(first + k, last), c] = numbers[k]

@@ -15,14 +15,22 @@ import jax
 import numpy as np
 from jax.extend import core, random, source_info_util
 
-from surgical_marl.engines.fused.carry import State
+from surgical_marl.engines.fused.array_view import depth, pack, unpack
+from surgical_marl.engines.fused.elementwise import convert
 from surgical_marl.engines.fused.graph import Branch, Graph, Loop, Value
 from surgical_marl.engines.fused.indexing import elements_of
-from surgical_marl.engines.fused.memory import depth, pack, unpack
+from surgical_marl.engines.fused.loop_state import LoopState
 from surgical_marl.engines.fused.primitives import apply
-from surgical_marl.engines.fused.rows import Writer, reader
-from surgical_marl.engines.fused.scalars import convert
-from surgical_marl.engines.fused.traced import Symbolic, Table, Traced, Unsupported, dtype_of, lift, lower
+from surgical_marl.engines.fused.scan_io import RowWriter, row_reader
+from surgical_marl.engines.fused.symbolic_array import (
+    AnyArray,
+    SymbolicArray,
+    Table,
+    Unsupported,
+    array_of,
+    dtype_of,
+    values_of,
+)
 
 _INSIDE = {
     "jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr", "remat": "jaxpr",
@@ -32,26 +40,26 @@ _INSIDE = {
 """Primitives that call a function, and the parameter that holds it."""
 
 
-class Tracer:
+class JaxprInterpreter:
     """Runs jaxprs on traced arrays; nodes go into `graph`."""
 
     def __init__(self, graph: Graph) -> None:
         self.graph = graph
         self._around = 0  # the loops that are being traced, as bits
         self._place: tuple[int, ...] = ()  # of the equation that is being traced, in the function
-        self._states: dict[tuple[int, ...], State] = {}  # of the loop at each place, when it was last traced
+        self._states: dict[tuple[int, ...], LoopState] = {}  # of the loop at each place, when it was last traced
 
-    def run(self, closed: Any, args: Sequence[Any], part: int = 0) -> list[Traced]:
+    def run(self, closed: Any, args: Sequence[Any], part: int = 0) -> list[AnyArray]:
         """Return the results of a closed jaxpr: a `part`, such as a side or a round, of the equation being traced.
 
         Raises:
             Unsupported: there is no rule for something in it. The error names the line of the source.
         """
         jaxpr, consts = getattr(closed, "jaxpr", closed), getattr(closed, "consts", ())
-        known: dict[Any, Traced] = dict(zip(jaxpr.constvars, map(np.asarray, consts), strict=True))
+        known: dict[Any, AnyArray] = dict(zip(jaxpr.constvars, map(np.asarray, consts), strict=True))
         known.update(zip(jaxpr.invars, args, strict=True))
 
-        def read(variable: Any) -> Traced:
+        def read(variable: Any) -> AnyArray:
             if isinstance(variable, core.Literal):
                 aval: Any = variable.aval
                 return np.asarray(variable.val, aval.dtype)
@@ -70,7 +78,7 @@ class Tracer:
         self._place = around
         return [read(variable) for variable in jaxpr.outvars]
 
-    def _equation(self, equation: Any, xs: list[Traced]) -> list[Traced]:
+    def _equation(self, equation: Any, xs: list[AnyArray]) -> list[AnyArray]:
         name, params = equation.primitive.name, equation.params
         if name in _INSIDE:
             return self.run(params[_INSIDE[name]], xs)
@@ -88,7 +96,7 @@ class Tracer:
         if name.startswith("random_"):
             return [self._random(name, equation, xs)]
         avals = [variable.aval for variable in equation.outvars]
-        if name in ("sort", "argsort") and not any(isinstance(x, Symbolic) for x in xs):
+        if name in ("sort", "argsort") and not any(isinstance(x, SymbolicArray) for x in xs):
             found = equation.primitive.bind(*xs, **params)
             return [np.asarray(x) for x in (found if equation.primitive.multiple_results else [found])]
         if any(map(_is_key, avals)):
@@ -97,39 +105,43 @@ class Tracer:
             xs = [elements_of(self.graph, x) if isinstance(x, Table) else x for x in xs]
         return apply(self.graph, name, avals, params, xs)
 
-    def _keys(self, name: str, avals: list[Any], params: Any, xs: list[Traced], are_keys: list[bool]) -> list[Traced]:
+    def _keys(
+        self, name: str, avals: list[Any], params: Any, xs: list[AnyArray], are_keys: list[bool]
+    ) -> list[AnyArray]:
         """Move random keys with a primitive. The words of a key are the last axis of its array."""
         raw = [jax.ShapeDtypeStruct(aval.shape, np.uint32) for aval in avals]
-        keys = [lift(self.graph, x) for x, is_key in zip(xs, are_keys, strict=True) if is_key]
+        keys = [values_of(self.graph, x) for x, is_key in zip(xs, are_keys, strict=True) if is_key]
         moved = []
         for word in range(keys[0].shape[-1]):
-            parts = iter([Symbolic(key[..., word]) for key in keys])
+            parts = iter([SymbolicArray(key[..., word]) for key in keys])
             inputs = [next(parts) if is_key else x for x, is_key in zip(xs, are_keys, strict=True)]
             moved.append(apply(self.graph, name, raw, params, inputs))
-        return [Symbolic(np.stack([lift(self.graph, x) for x in parts], -1)) for parts in zip(*moved, strict=True)]
+        return [
+            SymbolicArray(np.stack([values_of(self.graph, x) for x in parts], -1)) for parts in zip(*moved, strict=True)
+        ]
 
     # -- branches
 
-    def _cond(self, branches: Any, which: Traced, xs: list[Traced]) -> list[Traced]:
+    def _cond(self, branches: Any, which: AnyArray, xs: list[AnyArray]) -> list[AnyArray]:
         g = self.graph
-        if not isinstance(which, Symbolic):
+        if not isinstance(which, SymbolicArray):
             return self._side(branches, min(max(int(which), 0), len(branches) - 1), xs)
         index = int(which.ids)
         if len(branches) > 2:  # one against the rest, and so on
             first = g.compare("le", index, g.constant(np.int32(0)))
-            rest = Symbolic(np.array(g.sub(index, g.constant(np.int32(1))), np.int32))
+            rest = SymbolicArray(np.array(g.sub(index, g.constant(np.int32(1))), np.int32))
             return self._branch(first, lambda: self._cond(branches[1:], rest, xs), lambda: self._side(branches, 0, xs))
         return self._branch(
             convert(g, index, "b"), lambda: self._side(branches, 0, xs), lambda: self._side(branches, 1, xs)
         )
 
-    def _side(self, branches: Any, which: int, xs: list[Traced]) -> list[Traced]:
+    def _side(self, branches: Any, which: int, xs: list[AnyArray]) -> list[AnyArray]:
         """Return the results of one of the branches. As a part it counts from the last, as the first are split off."""
         return self.run(branches[which], xs, which - len(branches))
 
     def _branch(
-        self, condition: Value, other: Callable[[], list[Traced]], chosen: Callable[[], list[Traced]]
-    ) -> list[Traced]:
+        self, condition: Value, other: Callable[[], list[AnyArray]], chosen: Callable[[], list[AnyArray]]
+    ) -> list[AnyArray]:
         g = self.graph
         if condition < 0:
             return chosen() if g.constants[~condition] else other()
@@ -140,13 +152,13 @@ class Tracer:
             g.close_scope()
         branch = Branch(condition)
         g.groups.append(branch)
-        pairs = [(lift(g, a), lift(g, b)) for a, b in zip(*results, strict=True)]
+        pairs = [(values_of(g, a), values_of(g, b)) for a, b in zip(*results, strict=True)]
         axes = [max(depth(g, side) for side in pair) for pair in pairs]  # what one of them has in memory stays there
         packed = [[pack(g, side, n) for side in pair] for pair, n in zip(pairs, axes, strict=True)]
         known: dict[tuple[Value, Value], Value] = {}
         merged = [[self._merge(branch, known, *both) for both in zip(*sides, strict=True)] for sides in packed]
         unpacked = [unpack(g, outs, x.shape, n) for outs, x, n in zip(merged, results[0], axes, strict=True)]
-        return [lower(g, ids, dtype_of(g, x)) for ids, x in zip(unpacked, results[0], strict=True)]
+        return [array_of(g, ids, dtype_of(g, x)) for ids, x in zip(unpacked, results[0], strict=True)]
 
     def _merge(self, branch: Branch, known: dict[tuple[Value, Value], Value], other: Value, chosen: Value) -> Value:
         """Return the value that is `chosen` or `other`. A pair that is `known` has one already."""
@@ -162,7 +174,7 @@ class Tracer:
 
     # -- loops
 
-    def _scan(self, params: Any, xs: list[Traced]) -> list[Traced]:
+    def _scan(self, params: Any, xs: list[AnyArray]) -> list[AnyArray]:
         body, length = params["jaxpr"], params["length"]
         if "ft_in" in params:  # from JAX 0.11 on
             constants, carry, rows = map(list, params["ft_in"].update(xs).unpack())
@@ -172,13 +184,13 @@ class Tracer:
         carried, outvars = len(carry), getattr(body, "jaxpr", body).outvars
         written = len(outvars) - carried
         if length > params["unroll"]:
-            readers = [reader(self.graph, x) for x in rows]
+            readers = [row_reader(self.graph, x) for x in rows]
 
-            def round_(carry: list[Traced], at: Value) -> list[Traced]:
+            def round_(carry: list[AnyArray], at: Value) -> list[AnyArray]:
                 return self.run(body, [*constants, *carry, *(row(at) for row in readers)])
 
             return self._loop(carry, round_, length=length, rows=len(rows) + written, backwards=params["reverse"])
-        collected: list[list[Traced]] = [[] for _ in range(written)]
+        collected: list[list[AnyArray]] = [[] for _ in range(written)]
         for i in range(length)[:: -1 if params["reverse"] else 1]:
             out = self.run(body, [*constants, *carry, *(_row(self.graph, x, i) for x in rows)], i)
             carry = out[:carried]
@@ -191,37 +203,37 @@ class Tracer:
         ]
         return [*carry, *stacks]
 
-    def _stack(self, column: list[Traced], aval: Any) -> Traced:
+    def _stack(self, column: list[AnyArray], aval: Any) -> AnyArray:
         if not column:
             return np.zeros((0, *aval.shape), aval.dtype)
-        if any(isinstance(value, Symbolic) for value in column):
-            return Symbolic(np.stack([lift(self.graph, value) for value in column]))
+        if any(isinstance(value, SymbolicArray) for value in column):
+            return SymbolicArray(np.stack([values_of(self.graph, value) for value in column]))
         return np.stack(column)  # type: ignore[arg-type]
 
-    def _while(self, params: Any, xs: list[Traced]) -> list[Traced]:
+    def _while(self, params: Any, xs: list[AnyArray]) -> list[AnyArray]:
         tested, used = params["cond_nconsts"], params["body_nconsts"]
         test_constants, constants, carry = xs[:tested], xs[tested : tested + used], xs[tested + used :]
         test, body = params["cond_jaxpr"], params["body_jaxpr"]
 
-        def condition(c: list[Traced]) -> Traced:
+        def condition(c: list[AnyArray]) -> AnyArray:
             return self.run(test, test_constants + c, -1)[0]
 
         return self._loop(carry, lambda c, _: self.run(body, constants + c), condition)
 
     def _loop(
         self,
-        carry: list[Traced],
-        body: Callable[[list[Traced], Value], list[Traced]],
-        condition: Callable[[list[Traced]], Traced] | None = None,
+        carry: list[AnyArray],
+        body: Callable[[list[AnyArray], Value], list[AnyArray]],
+        condition: Callable[[list[AnyArray]], AnyArray] | None = None,
         length: int = 0,
         rows: int = 0,
         backwards: bool = False,
-    ) -> list[Traced]:
+    ) -> list[AnyArray]:
         """Return the carry after the last round, and the rows that the body returns after its carry.
 
         `rows` is how many arrays have rows that the body reads or writes.
         """
-        g, state = self.graph, State(self.graph, carry, self._states.get(self._place))
+        g, state = self.graph, LoopState(self.graph, carry, self._states.get(self._place))
         self._states[self._place] = state
         while True:
             # unknown while the loop is tried: what a round changes
@@ -238,18 +250,18 @@ class Tracer:
             if not state.changed(found[: len(carry)]):
                 break
         if going is not None:
-            loop.condition = int(lift(g, going))
+            loop.condition = int(values_of(g, going))
             if loop.condition < 0 and g.constants[~loop.condition]:
                 raise Unsupported("a loop that never ends")
         state.close(loop, found[: len(carry)])
-        writer = Writer(g, number, before, found[len(carry) :])
+        writer = RowWriter(g, number, before, found[len(carry) :])
         for k, phi in enumerate(loop.phis):
             loop.outs.append(g.fresh("out", number, k, kind=g.kinds[phi]))
         return [*state.leave(loop), *writer.leave()]
 
     # -- random numbers
 
-    def _random(self, name: str, equation: Any, xs: list[Traced]) -> Traced:
+    def _random(self, name: str, equation: Any, xs: list[AnyArray]) -> AnyArray:
         """JAX's own definition of the operation on raw keys, traced. Keys are their raw words."""
         params, out = equation.params, equation.outvars[0].aval
         if name in ("random_wrap", "random_unwrap"):
@@ -275,7 +287,7 @@ class Tracer:
             raise Unsupported(f"the primitive {name}")
         return self.run(jax.make_jaxpr(function)(*shapes), xs)[0]
 
-    def _unsigned(self, x: Traced) -> Traced:
+    def _unsigned(self, x: AnyArray) -> AnyArray:
         aval = jax.ShapeDtypeStruct(x.shape, np.uint32)
         return apply(self.graph, "convert_element_type", [aval], {"new_dtype": np.uint32}, [x])[0]
 
@@ -303,7 +315,7 @@ def _is_key(aval: Any) -> bool:
     return bool(jax.dtypes.issubdtype(aval.dtype, jax.dtypes.prng_key))
 
 
-def _row(g: Graph, x: Traced | Table, i: int) -> Traced:
+def _row(g: Graph, x: AnyArray | Table, i: int) -> AnyArray:
     if isinstance(x, Table):
-        return reader(g, x)(g.constant(np.int32(i)))
-    return Symbolic(x.ids[i]) if isinstance(x, Symbolic) else x[i]
+        return row_reader(g, x)(g.constant(np.int32(i)))
+    return SymbolicArray(x.ids[i]) if isinstance(x, SymbolicArray) else x[i]

@@ -11,7 +11,7 @@ from surgical_marl.engines.fused.graph import Graph, Value
 from surgical_marl.engines.fused.operations import DTYPES, KIND_OF
 
 
-class Symbolic:
+class SymbolicArray:
     """An array whose elements are values of a graph: `ids` int32 of its shape."""
 
     __slots__ = ("ids",)
@@ -36,10 +36,10 @@ class Table:
         self.number, self.shape, self.dtype = number, shape, dtype
 
 
-Traced = np.ndarray | Symbolic
+AnyArray = np.ndarray | SymbolicArray
 """A numpy array if all its elements are known."""
 
-Rule = Callable[..., Traced | list[Traced]]
+Rule = Callable[..., AnyArray | list[AnyArray]]
 """What a primitive does: rule(graph, shape of the result, parameters, *operands)."""
 
 
@@ -63,16 +63,16 @@ def kind_of(dtype: Any) -> str:
     return KIND_OF[dtype]
 
 
-def dtype_of(graph: Graph, array: Traced | Table) -> Any:
+def dtype_of(graph: Graph, array: AnyArray | Table) -> Any:
     """Return the dtype of a traced array; float32 if it is empty."""
-    if not isinstance(array, Symbolic):
+    if not isinstance(array, SymbolicArray):
         return array.dtype
     return DTYPES[graph.kind(int(array.ids.flat[0]))] if array.ids.size else np.float32
 
 
-def lift(graph: Graph, array: Traced | Table) -> np.ndarray:
+def values_of(graph: Graph, array: AnyArray | Table) -> np.ndarray:
     """Return the values of a traced array, whether they are known or not."""
-    if isinstance(array, Symbolic):
+    if isinstance(array, SymbolicArray):
         return array.ids
     if isinstance(array, Table):
         raise Unsupported("more of a table than a look-up")
@@ -82,17 +82,17 @@ def lift(graph: Graph, array: Traced | Table) -> np.ndarray:
     return np.array(flat, np.int32).reshape(array.shape)
 
 
-def lower(graph: Graph, ids: np.ndarray, dtype: Any) -> Traced:
-    """Return a numpy array if all values are constants, and otherwise a `Symbolic`."""
+def array_of(graph: Graph, ids: np.ndarray, dtype: Any) -> AnyArray:
+    """Return a numpy array if all values are constants, and otherwise a `SymbolicArray`."""
     if ids.size and ids.max() >= 0:
-        return Symbolic(ids)
+        return SymbolicArray(ids)
     flat = [graph.constants[~i] for i in ids.ravel().tolist()]
     return np.array(flat, np.dtype(dtype)).reshape(ids.shape)
 
 
-def each(function: Callable[..., Value], g: Graph, shape: tuple[int, ...], *arrays: Traced) -> Symbolic:
+def each(function: Callable[..., Value], g: Graph, shape: tuple[int, ...], *arrays: AnyArray) -> SymbolicArray:
     """`function(graph, *values)` of the elements, which are broadcast to `shape`."""
-    lifted = [lift(g, array) for array in arrays]
+    lifted = [values_of(g, array) for array in arrays]
     columns = [(x if x.shape == shape else np.broadcast_to(x, shape)).ravel().tolist() for x in lifted]
     flat = [function(g, *elements) for elements in zip(*columns, strict=True)]
-    return Symbolic(np.array(flat, np.int32).reshape(shape))
+    return SymbolicArray(np.array(flat, np.int32).reshape(shape))

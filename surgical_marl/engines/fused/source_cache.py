@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from surgical_marl.cache import cached, is_shipped
-from surgical_marl.engines.fused.program import TREES, Leaf, Source
+from surgical_marl.engines.fused.kernel_layout import TREES, Leaf, Source
 from surgical_marl.engines.stages import Stage, unsaid
 from surgical_marl.engines.stepper import Stepper, describe
 from surgical_marl.runtime import jax_scope, no_collection
@@ -42,7 +42,7 @@ def load_source(env: Stepper, vector: bool, stage: Stage = unsaid) -> Source:
 
 @jax_scope()
 def _trace(env: Stepper, stage: Stage) -> dict[str, Any]:
-    from surgical_marl.engines.fused.translate import trace_environment  # imports JAX
+    from surgical_marl.engines.fused.compiler import trace_environment  # imports JAX
 
     # what tracing makes stays: to look for garbage among it takes a fifth of the time
     with no_collection():
@@ -52,7 +52,7 @@ def _trace(env: Stepper, stage: Stage) -> dict[str, Any]:
 @jax_scope()
 def _make(functions: dict[str, Any], parameters: Any, vector: bool, stage: Stage) -> np.ndarray:
     """Return a source as bytes."""
-    from surgical_marl.engines.fused.translate import make_source  # imports JAX
+    from surgical_marl.engines.fused.compiler import make_source  # imports JAX
 
     with no_collection():
         source = make_source(functions, parameters, vector, stage)

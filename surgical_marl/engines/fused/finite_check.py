@@ -15,7 +15,7 @@ import numpy as np
 from surgical_marl.engines.faults import FINE, NEXT, checked, is_reward, places
 from surgical_marl.engines.fused.arrays import Arrays
 from surgical_marl.engines.fused.kernel import load_for_gpu, torch_stream
-from surgical_marl.engines.fused.program import Leaf, Source
+from surgical_marl.engines.fused.kernel_layout import Leaf, Source
 from surgical_marl.runtime import prepare_warp
 
 wp = prepare_warp()
@@ -27,7 +27,7 @@ _RESULT, _REWARD, _NEXT = 0, 1, 2
 """Kinds of results: any, a reward, one that the next step depends on."""
 
 
-class Guard:
+class FiniteCheck:
     """The check of all environments of an engine.
 
     Args:

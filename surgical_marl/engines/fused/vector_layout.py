@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping, Sequence
 
-from surgical_marl.engines.fused.sharing import DECLARED, names_at_unknown_places
+from surgical_marl.engines.fused.stack_allocation import DECLARED, names_at_unknown_places
 
 WIDTHS = 4, 2
 """How many arrays lie side by side. Those that find no three others may find one."""

@@ -11,31 +11,31 @@ from collections.abc import Callable
 
 import numpy as np
 
+from surgical_marl.engines.fused.array_view import View, depth, unpack, view
 from surgical_marl.engines.fused.graph import Graph, Loop, Value
 from surgical_marl.engines.fused.indexing import look_up
-from surgical_marl.engines.fused.memory import View, depth, unpack, view
-from surgical_marl.engines.fused.traced import Symbolic, Table, Traced, dtype_of, lift, lower
+from surgical_marl.engines.fused.symbolic_array import AnyArray, SymbolicArray, Table, array_of, dtype_of, values_of
 
-Row = Callable[[Value], Traced]
+Row = Callable[[Value], AnyArray]
 """The row of an array at a place that may not be known while tracing."""
 
 _Element = Callable[[Value], Value]
 
 
-def reader(g: Graph, rows: Traced | Table) -> Row:
+def row_reader(g: Graph, rows: AnyArray | Table) -> Row:
     """Return how the rows of an array are read. Values are put into memory here, before the loop that reads them."""
     shape = rows.shape[1:]
     dtype = dtype_of(g, rows)
-    if isinstance(rows, Symbolic):
+    if isinstance(rows, SymbolicArray):
         elements = [_of_values(g, rows, place) for place in np.ndindex(shape)]
     elif isinstance(rows, Table):
         elements = [_of_table(g, rows, place) for place in np.ndindex(shape)]
     else:
         elements = [_of_constants(g, rows, place) for place in np.ndindex(shape)]
 
-    def row(at: Value) -> Traced:
+    def row(at: Value) -> AnyArray:
         ids = [element(at) for element in elements]
-        return lower(g, np.array(ids, np.int32).reshape(shape), dtype)
+        return array_of(g, np.array(ids, np.int32).reshape(shape), dtype)
 
     return row
 
@@ -55,7 +55,7 @@ def _of_constants(g: Graph, rows: np.ndarray, place: tuple[int, ...]) -> _Elemen
     return _of_table(g, rows, place)
 
 
-def _of_values(g: Graph, rows: Symbolic, place: tuple[int, ...]) -> _Element:
+def _of_values(g: Graph, rows: SymbolicArray, place: tuple[int, ...]) -> _Element:
     """Where they are in memory, or else in an array made of them.
 
     The array holds more than the loop's own rows if there are rows within rows, which another loop may read.
@@ -73,13 +73,13 @@ def _of_values(g: Graph, rows: Symbolic, place: tuple[int, ...]) -> _Element:
     return lambda at: found.at(g, [at])
 
 
-class Writer:
+class RowWriter:
     """Puts the rows of a loop into memory. `rows` are its values of one row of each array.
 
     Values below `before` are older than the loop, and so are the same in all rows.
     """
 
-    def __init__(self, g: Graph, number: int, before: Value, rows: list[Traced]) -> None:
+    def __init__(self, g: Graph, number: int, before: Value, rows: list[AnyArray]) -> None:
         self._g, self._number, self._before, self._rows = g, number, before, rows
         self._written: dict[tuple[Value, ...], int] = {}
         """What is put into an array in each round, and which of the loop's phis that array is."""
@@ -93,9 +93,9 @@ class Writer:
         assert isinstance(loop, Loop)
         return loop
 
-    def _columns(self, row: Traced) -> list[tuple[Value, ...]]:
+    def _columns(self, row: AnyArray) -> list[tuple[Value, ...]]:
         """Return what goes into one array each: an element, or all elements of an array in memory."""
-        ids = lift(self._g, row)
+        ids = values_of(self._g, row)
         size = int(np.prod(ids.shape[: depth(self._g, ids)], dtype=int))
         return [tuple(column) for column in ids.reshape(size, -1).T.tolist()]
 
@@ -108,14 +108,14 @@ class Writer:
         loop.starts.append(g.fresh("room", kind=kind))
         loop.nexts.append(g.put(phi, g.mul(g.constant(np.int32(len(values))), loop.counter), list(values)))
 
-    def leave(self) -> list[Traced]:
+    def leave(self) -> list[AnyArray]:
         """Return all rows of each array."""
         return [self._stacked(row) for row in self._rows]
 
-    def _stacked(self, row: Traced) -> Traced:
+    def _stacked(self, row: AnyArray) -> AnyArray:
         columns, length = [self._all(values) for values in self._columns(row)], self._loop().length
         together = np.array(columns, np.int32).reshape(len(columns), -1 if columns else length).T
-        return lower(self._g, together.reshape(length, *row.shape), dtype_of(self._g, row))
+        return array_of(self._g, together.reshape(length, *row.shape), dtype_of(self._g, row))
 
     def _all(self, values: tuple[Value, ...]) -> list[Value]:
         loop = self._loop()

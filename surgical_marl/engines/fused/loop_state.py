@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from surgical_marl.engines.fused.array_view import depth, pack, unpack
 from surgical_marl.engines.fused.graph import Graph, Loop, Value
-from surgical_marl.engines.fused.memory import depth, pack, unpack
-from surgical_marl.engines.fused.traced import Traced, dtype_of, lift, lower
+from surgical_marl.engines.fused.symbolic_array import AnyArray, array_of, dtype_of, values_of
 
 
-class State:
+class LoopState:
     """The carry of a loop that is traced again and again, until it is known what a round changes.
 
     What no round changes is not carried. An array of which a round makes one in memory is carried there.
@@ -17,7 +17,7 @@ class State:
     up and do not multiply.
     """
 
-    def __init__(self, g: Graph, carry: list[Traced], last: State | None = None) -> None:
+    def __init__(self, g: Graph, carry: list[AnyArray], last: LoopState | None = None) -> None:
         self._g, self._carry = g, carry
         self._dtypes = [dtype_of(g, x) for x in carry]
         self._axes: list[int] = list(last._axes) if last else [0] * len(carry)
@@ -28,15 +28,15 @@ class State:
         )
         self._values: list[list[Value]] = []
 
-    def _packed(self, k: int, x: Traced) -> list[Value]:
-        return pack(self._g, lift(self._g, x), self._axes[k])
+    def _packed(self, k: int, x: AnyArray) -> list[Value]:
+        return pack(self._g, values_of(self._g, x), self._axes[k])
 
-    def _arrays(self, values: list[list[Value]]) -> list[Traced]:
+    def _arrays(self, values: list[list[Value]]) -> list[AnyArray]:
         g, shapes = self._g, [x.shape for x in self._carry]
         unpacked = [unpack(g, *one) for one in zip(values, shapes, self._axes, strict=True)]
-        return [lower(g, ids, dtype) for ids, dtype in zip(unpacked, self._dtypes, strict=True)]
+        return [array_of(g, ids, dtype) for ids, dtype in zip(unpacked, self._dtypes, strict=True)]
 
-    def enter(self, loop: Loop, number: int) -> list[Traced]:
+    def enter(self, loop: Loop, number: int) -> list[AnyArray]:
         """Return the carry at the start of a round."""
         g = self._g
         self._values = [list(starts) for starts in self._starts]
@@ -48,7 +48,7 @@ class State:
                     loop.starts.append(start)
         return self._arrays(self._values)
 
-    def changed(self, nexts: list[Traced]) -> bool:
+    def changed(self, nexts: list[AnyArray]) -> bool:
         """Whether a round changes more than was known; now it is known."""
         found = False
         for k, x in enumerate(nexts):
@@ -57,19 +57,19 @@ class State:
             found = found or bool(changes)
             for j in changes:
                 varying[j] = True
-            if not self._axes[k] and any(varying) and (axes := depth(self._g, lift(self._g, x))):
+            if not self._axes[k] and any(varying) and (axes := depth(self._g, values_of(self._g, x))):
                 self._axes[k], found = axes, True
                 self._starts[k] = self._packed(k, self._carry[k])
                 self._varying[k] = [False] * len(self._starts[k])
         return found
 
-    def close(self, loop: Loop, nexts: list[Traced]) -> None:
+    def close(self, loop: Loop, nexts: list[AnyArray]) -> None:
         """Say what each round makes of the carry."""
         for k, x in enumerate(nexts):
             new, varying = self._packed(k, x), self._varying[k]
             loop.nexts.extend(value for value, varies in zip(new, varying, strict=True) if varies)
 
-    def leave(self, loop: Loop) -> list[Traced]:
+    def leave(self, loop: Loop) -> list[AnyArray]:
         """Return the carry after the last round."""
         after = dict(zip(loop.phis, loop.outs, strict=True))
         return self._arrays([[after.get(value, value) for value in values] for values in self._values])

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from surgical_marl.engines.fused.elementwise import convert
 from surgical_marl.engines.fused.graph import Graph, Value
-from surgical_marl.engines.fused.scalars import convert
 
 
 @dataclass(frozen=True)
