@@ -19,8 +19,8 @@ from hypothesis import strategies as st
 
 from surgical_marl import cache
 from surgical_marl.bench.physics import bare_state
-from surgical_marl.engines.fused.compiler import trace
 from surgical_marl.engines.fused import source_cache
+from surgical_marl.engines.fused.compiler import trace
 from surgical_marl.engines.fused.jaxpr_digest import jaxpr_digest
 from surgical_marl.engines.fused.source_cache import load_source
 from surgical_marl.engines.stages import unsaid
