@@ -39,7 +39,7 @@ def edited(monkeypatch: pytest.MonkeyPatch, file: str) -> None:
         ("robots/inverse_kinematics.py", True),
         ("scenes/contacts.py", True),
         ("tasks/base/workspace.py", True),
-        ("physics/solver.py", True),
+        ("physics/solver/constraint_rows.py", True),
         ("cli/describe.py", False),
         ("learning/trainer.py", False),
     ],

@@ -22,8 +22,8 @@ from surgical_marl.bench.physics import bare_state
 from surgical_marl.engines.choose import Engine, make_engine
 from surgical_marl.envs.env import Env
 from surgical_marl.envs.state import Carry, State
-from surgical_marl.physics.bodies import rotation
-from surgical_marl.physics.dynamics import Physics
+from surgical_marl.physics.systems.dynamics import Physics
+from surgical_marl.physics.systems.rigid_bodies import rotation
 from surgical_marl.robots.rotation import quaternion
 from surgical_marl.scenes.grasps import Jaw
 

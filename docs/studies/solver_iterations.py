@@ -13,10 +13,12 @@ import numpy as np
 
 from docs.studies.command import make_parser
 from surgical_marl import load_scene
-from surgical_marl.physics import dynamics, joined, solver
-from surgical_marl.physics.dynamics import Physics
+from surgical_marl.physics import joined
+from surgical_marl.physics.outputs import Touch
 from surgical_marl.physics.simulator import Simulator
-from surgical_marl.physics.views import Touch
+from surgical_marl.physics.solver import constraint_rows
+from surgical_marl.physics.systems import dynamics
+from surgical_marl.physics.systems.dynamics import Physics
 from surgical_marl.scenes.scene import Scene
 from surgical_marl.scenes.timing import DECIMATION
 
@@ -129,7 +131,7 @@ def apart() -> None:
         scene = load_scene(name)
         states, velocities = random_states(scene)
         for sweeps, (iterations, line_search) in APART:
-            solver.SWEEPS, dynamics.ITERATIONS = sweeps, (iterations, line_search)
+            constraint_rows.SWEEPS, dynamics.ITERATIONS = sweeps, (iterations, line_search)
             velocity, _ = step(scene, states, touching=False)
             off = (np.abs(velocity - velocities) / speeds(scene)).max(1)
             print(f"| {name} | {sweeps} | {iterations} | {line_search} | {shares(off)} |")

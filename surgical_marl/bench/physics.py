@@ -10,8 +10,8 @@ from jax import Array
 
 from surgical_marl.envs.env import Env
 from surgical_marl.envs.state import Carry, State
-from surgical_marl.physics.dynamics import Physics
-from surgical_marl.physics.views import Contacts
+from surgical_marl.physics.outputs import Contacts
+from surgical_marl.physics.systems.dynamics import Physics
 
 
 class PhysicsAlone(Env):

@@ -28,7 +28,7 @@ from surgical_marl.envs.free_objects import FreeObjects
 from surgical_marl.envs.meant_for import meant_for
 from surgical_marl.envs.observations import each, with_vector
 from surgical_marl.envs.seeds import check_seed, is_whole, keys_of
-from surgical_marl.physics.views import Contacts
+from surgical_marl.physics.outputs import Contacts
 from surgical_marl.scenes.poses import Poses
 
 if TYPE_CHECKING:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-from surgical_marl.physics.views import Contacts
+from surgical_marl.physics.outputs import Contacts
 
 
 class BatchStep(NamedTuple):

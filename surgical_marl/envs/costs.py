@@ -15,7 +15,7 @@ from surgical_marl.runtime import jnp
 if TYPE_CHECKING:
     from jax import Array
 
-    from surgical_marl.physics.views import ArmView
+    from surgical_marl.physics.outputs import ArmView
     from surgical_marl.robots.arm import Arm
 
 NEAR = 0.005

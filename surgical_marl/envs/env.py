@@ -36,9 +36,9 @@ from surgical_marl.tasks.base.world import World
 if TYPE_CHECKING:
     from jax import Array
 
+    from surgical_marl.physics.outputs import ArmView, Contacts
     from surgical_marl.physics.plant import Plant
     from surgical_marl.physics.simulator import Simulator
-    from surgical_marl.physics.views import ArmView, Contacts
 
 HIDDEN, NOISE, PLACES = 2**31 - 1, 2**31 - 2, 2**31 - 3
 """Folded into an episode's key for the draws of a scene's randomisation, so that they are independent of a task's

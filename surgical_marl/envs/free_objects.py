@@ -34,7 +34,7 @@ class FreeObjects:
         """Return which arms hold which objects, [N, k, arms] bool."""
         if not self.count:
             return np.zeros((num_envs, 0, self._arms), bool)
-        from surgical_marl.physics.handling import DWELL
+        from surgical_marl.physics.contact.contact_model import DWELL
 
         return np.asarray(engine.read(HELD, "numpy") >= np.float32(DWELL))
 

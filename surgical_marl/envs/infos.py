@@ -12,7 +12,7 @@ from surgical_marl.runtime import jnp
 if TYPE_CHECKING:
     from jax import Array
 
-    from surgical_marl.physics.views import ArmView
+    from surgical_marl.physics.outputs import ArmView
     from surgical_marl.scenes.scene import Scene
     from surgical_marl.tasks.base.task import Task
     from surgical_marl.tasks.base.world import World

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 if TYPE_CHECKING:
     from jax import Array
 
-    from surgical_marl.physics.dynamics import Physics
+    from surgical_marl.physics.outputs import ArmView, Contacts
     from surgical_marl.physics.plant import Hidden
-    from surgical_marl.physics.views import ArmView, Contacts
+    from surgical_marl.physics.systems.dynamics import Physics
 
 
 class Carry(NamedTuple):

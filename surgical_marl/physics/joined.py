@@ -11,13 +11,13 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 from jax import Array
 
-from surgical_marl.physics.arm_forces import ArmForces, changes, relaxed
-from surgical_marl.physics.collision import Pairs
-from surgical_marl.physics.dynamics import Dynamics, Physics
-from surgical_marl.physics.factor import packed
-from surgical_marl.physics.kind import Kind
-from surgical_marl.physics.solver import JointRows, Rows, rows_of, solve
-from surgical_marl.physics.views import Touch
+from surgical_marl.physics.contact.arm_contacts import Pairs
+from surgical_marl.physics.outputs import Touch
+from surgical_marl.physics.solver.cholesky import packed
+from surgical_marl.physics.solver.constraint_rows import JointRows, Rows, rows_of, solve
+from surgical_marl.physics.systems.arm_forces import ArmForces, changes, relaxed
+from surgical_marl.physics.systems.arms import Kind
+from surgical_marl.physics.systems.dynamics import Dynamics, Physics
 
 ITERATIONS = (6, 6)
 """Most Newton steps, and line search steps in each: see docs/physics.md."""

@@ -21,10 +21,10 @@ import mujoco
 import numpy as np
 from jax import Array
 
-from surgical_marl.physics.bodies import product
+from surgical_marl.physics.outputs import ArmView, Contacts, ObjectView
+from surgical_marl.physics.randomisation import Factors
 from surgical_marl.physics.simulator import Physics, Simulator
-from surgical_marl.physics.variation import Factors
-from surgical_marl.physics.views import ArmView, Contacts, ObjectView
+from surgical_marl.physics.systems.rigid_bodies import product
 from surgical_marl.scenes.poses import Pose
 
 Views = dict[str, ArmView]

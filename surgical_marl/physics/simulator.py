@@ -20,13 +20,13 @@ import numpy as np
 from jax import Array
 
 from surgical_marl.content import unknown
-from surgical_marl.physics.collision import Pairs
-from surgical_marl.physics.dynamics import Dynamics, Physics
+from surgical_marl.physics.contact.arm_contacts import Pairs
 from surgical_marl.physics.joined import Joined
-from surgical_marl.physics.kind import Kind
+from surgical_marl.physics.outputs import ArmView, Contacts, ObjectView, Touch
+from surgical_marl.physics.randomisation import Factors
+from surgical_marl.physics.systems.arms import Kind
+from surgical_marl.physics.systems.dynamics import Dynamics, Physics
 from surgical_marl.physics.together import Together
-from surgical_marl.physics.variation import Factors
-from surgical_marl.physics.views import ArmView, Contacts, ObjectView, Touch
 from surgical_marl.scenes.poses import Pose
 from surgical_marl.scenes.scene import Scene, payload_body
 from surgical_marl.scenes.timing import DECIMATION

@@ -15,23 +15,23 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from surgical_marl.physics.arm_forces import ArmForces, apart, padded
-from surgical_marl.physics.bodies import Bodies, Masses, free_acceleration, inertias, moved, rotation
-from surgical_marl.physics.collision import Pairs
-from surgical_marl.physics.dynamics import Dynamics, Physics
-from surgical_marl.physics.handling import DWELL, Fingers, Grips, Handling
-from surgical_marl.physics.impedance import response
-from surgical_marl.physics.kind import Kind
-from surgical_marl.physics.newton import Newton
-from surgical_marl.physics.placed import Joints
-from surgical_marl.physics.problem import Contacts, Pressed, Problem
-from surgical_marl.physics.rest import settled
-from surgical_marl.physics.rows import absent
-from surgical_marl.physics.solver import JointRows, Rows
-from surgical_marl.physics.tables import Tables
-from surgical_marl.physics.touching import Finder, Slots
-from surgical_marl.physics.variation import Factors, grown, varied
-from surgical_marl.physics.views import Handled, ObjectView, Touch
+from surgical_marl.physics.contact.arm_contacts import Pairs
+from surgical_marl.physics.contact.broadphase import Joints
+from surgical_marl.physics.contact.contact_model import DWELL, Fingers, Grips, Handling
+from surgical_marl.physics.contact.contact_pairs import Tables
+from surgical_marl.physics.contact.detection import Finder, Slots
+from surgical_marl.physics.outputs import Handled, ObjectView, Touch
+from surgical_marl.physics.randomisation import Factors, grown, varied
+from surgical_marl.physics.solver.constraint_rows import JointRows, Rows
+from surgical_marl.physics.solver.newton import Newton
+from surgical_marl.physics.solver.problem import Contacts, Pressed, Problem
+from surgical_marl.physics.solver.solref import response
+from surgical_marl.physics.systems.arm_forces import ArmForces, apart, padded
+from surgical_marl.physics.systems.arms import Kind
+from surgical_marl.physics.systems.dynamics import Dynamics, Physics
+from surgical_marl.physics.systems.rigid_bodies import Bodies, Masses, free_acceleration, inertias, moved, rotation
+from surgical_marl.physics.systems.sleeping import settled
+from surgical_marl.physics.tree_utils import absent
 from surgical_marl.robots.rotation import quaternion
 
 if TYPE_CHECKING:

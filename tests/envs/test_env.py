@@ -12,7 +12,7 @@ import pytest
 
 from surgical_marl import list_scenes
 from surgical_marl.envs.batch import BatchedEnv
-from surgical_marl.physics.collision import SLOTS
+from surgical_marl.physics.contact.arm_contacts import SLOTS
 from surgical_marl.physics.simulator import Physics
 from surgical_marl.scenes.timing import DECIMATION, TIMESTEP
 from tests.helpers.actions import random_actions

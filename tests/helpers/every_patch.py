@@ -11,13 +11,13 @@ import numpy as np
 from jax import Array
 from scipy.spatial.transform import Rotation
 
-from surgical_marl.physics.patches import TILT, TILT_IN_JAW, Patch, find_patch
-from surgical_marl.physics.placed import Placed, Places, Way
-from surgical_marl.physics.shapes import between_segments, on_plate
+from surgical_marl.physics.contact.broadphase import Placed, Places, Way
+from surgical_marl.physics.contact.contact_pairs import Meeting
+from surgical_marl.physics.contact.contact_patch import TILT, TILT_IN_JAW, Patch, find_patch
+from surgical_marl.physics.contact.detection import AHEAD
+from surgical_marl.physics.contact.shapes import between_segments, on_plate
 from surgical_marl.physics.simulator import Physics
-from surgical_marl.physics.tables import Meeting
 from surgical_marl.physics.together import Together
-from surgical_marl.physics.touching import AHEAD
 from surgical_marl.scenes.scene import Scene
 
 UNEVEN = 0.03

@@ -12,11 +12,12 @@ import numpy as np
 import yaml
 
 import surgical_marl as sm
-from surgical_marl.physics import rest, together
-from surgical_marl.physics.bodies import Bodies, rotation
-from surgical_marl.physics.collision import Pairs
-from surgical_marl.physics.dynamics import Dynamics
+from surgical_marl.physics import together
+from surgical_marl.physics.contact.arm_contacts import Pairs
 from surgical_marl.physics.simulator import Simulator
+from surgical_marl.physics.systems import sleeping
+from surgical_marl.physics.systems.dynamics import Dynamics
+from surgical_marl.physics.systems.rigid_bodies import Bodies, rotation
 from surgical_marl.physics.together import Objects, Together
 
 DT = 0.0025
@@ -56,7 +57,7 @@ class Falling:
         return jax.tree.map(lambda x: jnp.repeat(x[None], count, 0), start)
 
     def play(
-        self, objects: Objects, seconds: float, gravity: np.ndarray = DOWN, slow: float = rest.SLOW
+        self, objects: Objects, seconds: float, gravity: np.ndarray = DOWN, slow: float = sleeping.SLOW
     ) -> tuple[Objects, Trace]:
         """Return the objects after a time, and what they did. With `slow` 0 m/s nothing counts as at rest."""
         each = jnp.broadcast_to(jnp.asarray(gravity, jnp.float32), (len(objects.bodies.position), 3))
@@ -70,7 +71,7 @@ class Falling:
             bodies, depth = objects.bodies, self.depth(objects)
             return objects, Trace(bodies.position, bodies.quaternion, bodies.velocity, depth)
 
-        with patch.object(together, "GRAVITY", gravity), patch.object(rest, "SLOW", slow):
+        with patch.object(together, "GRAVITY", gravity), patch.object(sleeping, "SLOW", slow):
             return jax.lax.scan(step, objects, None, length=steps)
 
     def depth(self, objects: Objects) -> Any:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from surgical_marl.physics.rows import room
+from surgical_marl.physics.tree_utils import room
 from tests.helpers.fused_rows import ROWS
 
 COUNT = 21

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from surgical_marl.physics.views import ArmView, Handled, ObjectView
+from surgical_marl.physics.outputs import ArmView, Handled, ObjectView
 from surgical_marl.scenes.load import load_scene
 from surgical_marl.scenes.poses import Pose
 from surgical_marl.tasks.base.grips import bars

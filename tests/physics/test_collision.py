@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from surgical_marl.physics.collision import SLOTS, Pairs
+from surgical_marl.physics.contact.arm_contacts import SLOTS, Pairs
 
 SEEDS = st.integers(0, 2**32 - 1)
 SHAPES = [("capsule", 0.010, 0.15), ("capsule", 0.004, 0.05), ("sphere", 0.02, 0.0), ("sphere", 0.005, 0.0)]

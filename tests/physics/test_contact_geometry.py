@@ -13,10 +13,8 @@ import pytest
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from surgical_marl.physics.collision import SLOTS, Pairs
-from surgical_marl.physics.cone import Cone, Stuck, between, curvature, nearest, parting, stretched, wrench
-from surgical_marl.physics.factor import packed
-from surgical_marl.physics.patches import (
+from surgical_marl.physics.contact.arm_contacts import SLOTS, Pairs
+from surgical_marl.physics.contact.contact_patch import (
     ALIKE,
     ASIDE,
     AWAY,
@@ -28,8 +26,28 @@ from surgical_marl.physics.patches import (
     no_patch,
     tangents,
 )
-from surgical_marl.physics.rows import row_of
-from surgical_marl.physics.shapes import EVEN, NEAR, Plate, Points, Segments, between_segments, on_plate, plate_of_box
+from surgical_marl.physics.contact.friction_cone import (
+    Cone,
+    Stuck,
+    between,
+    curvature,
+    nearest,
+    parting,
+    stretched,
+    wrench,
+)
+from surgical_marl.physics.contact.shapes import (
+    EVEN,
+    NEAR,
+    Plate,
+    Points,
+    Segments,
+    between_segments,
+    on_plate,
+    plate_of_box,
+)
+from surgical_marl.physics.solver.cholesky import packed
+from surgical_marl.physics.tree_utils import row_of
 from tests.physics.test_search import drawn
 
 COUNT = 200

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from surgical_marl.physics.dynamics import Dynamics
-from surgical_marl.physics.impedance import response
+from surgical_marl.physics.solver.solref import response
+from surgical_marl.physics.systems.dynamics import Dynamics
 
 POWERS = st.sampled_from([1.0, 2.0, 3.5])
 REFERENCES = st.one_of(

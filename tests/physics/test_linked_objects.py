@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from jax import Array
 
-from surgical_marl.physics import elimination
-from surgical_marl.physics.cone import between, curvature
-from surgical_marl.physics.factor import cholesky, packed
+from surgical_marl.physics.contact.friction_cone import between, curvature
+from surgical_marl.physics.solver import schur
+from surgical_marl.physics.solver.cholesky import cholesky, packed
 from tests.helpers.falling import DT, Falling, random_turns, thrown
 from tests.physics.test_random_objects import random_objects
 from tests.physics.test_search import drawn, forces
@@ -61,7 +61,7 @@ def test_objects_are_eliminated_as_from_a_dense_matrix(linked: list[tuple[int, i
     ways = np.linalg.solve(dense, force.ravel() - wide @ arms.ravel()).reshape(OBJECTS, 6)
     single = lambda array: jnp.asarray(array, jnp.float32)  # noqa: E731
 
-    def compared(found: elimination.Eliminated, back: Array, joined: bool) -> None:
+    def compared(found: schur.Eliminated, back: Array, joined: bool) -> None:
         np.testing.assert_allclose(back, ways, rtol=2e-3, atol=2e-3)
         left = np.asarray(found.wide)[: OBJECTS * ARMS].reshape(OBJECTS, ARMS, 6, JOINTS)
         if not joined:
@@ -74,10 +74,10 @@ def test_objects_are_eliminated_as_from_a_dense_matrix(linked: list[tuple[int, i
     cross = np.where(np.triu(np.ones((OBJECTS, OBJECTS)), 1)[..., None, None], blocks, np.nan)
     met = np.full(((OBJECTS + 1) * ARMS, 6, JOINTS), np.nan)
     met[: OBJECTS * ARMS][touched.ravel()] = coupling[touched]
-    given = elimination.Blocks(own, single(cross.ravel())), single(force), single(met), jnp.asarray(touched)
+    given = schur.Blocks(own, single(cross.ravel())), single(force), single(met), jnp.asarray(touched)
     for joined in {True, bool(linked)}:
-        found = elimination.eliminate(*given, jnp.bool_(joined))
-        compared(found, elimination.ways(found, single(arms), given[3], jnp.bool_(joined)), joined)
+        found = schur.eliminate(*given, jnp.bool_(joined))
+        compared(found, schur.ways(found, single(arms), given[3], jnp.bool_(joined)), joined)
 
 
 def test_the_curvature_between_two_bodies_is_how_the_force_on_one_falls_with_the_other_s_acceleration() -> None:

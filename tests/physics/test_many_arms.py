@@ -12,7 +12,7 @@ import yaml
 from surgical_marl.bench.physics import PhysicsAlone
 from surgical_marl.engines.choose import make_engine
 from surgical_marl.envs.env import Env
-from surgical_marl.physics.collision import AT_ONCE, SLOTS
+from surgical_marl.physics.contact.arm_contacts import AT_ONCE, SLOTS
 
 ARMS, RADIUS, COUNT = 6, 0.16, 48
 

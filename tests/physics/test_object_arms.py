@@ -13,9 +13,9 @@ from surgical_marl.bench.grasping import grasps
 from surgical_marl.bench.physics import PhysicsAlone
 from surgical_marl.engines.choose import make_engine
 from surgical_marl.envs.env import Env
-from surgical_marl.physics.arm_forces import ArmForces
-from surgical_marl.physics.factor import packed
-from surgical_marl.physics.solver import rows_of, solve
+from surgical_marl.physics.solver.cholesky import packed
+from surgical_marl.physics.solver.constraint_rows import rows_of, solve
+from surgical_marl.physics.systems.arm_forces import ArmForces
 
 COUNT, STEPS, SEEN = 64, 48, 8
 

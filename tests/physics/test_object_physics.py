@@ -19,7 +19,7 @@ from docs.studies.shaking import CHUNK, OBJECTS, Grasps
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.envs.env import Env
 from surgical_marl.physics import together
-from surgical_marl.physics.handling import FASTEST
+from surgical_marl.physics.contact.contact_model import FASTEST
 from surgical_marl.physics.together import Objects
 from surgical_marl.policies.oracle import oracle
 from surgical_marl.robots.rotation import quaternion, turned

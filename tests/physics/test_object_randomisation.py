@@ -14,10 +14,10 @@ import yaml
 from surgical_marl.bench.grasping import grasps
 from surgical_marl.content import find
 from surgical_marl.envs.batch import BatchedEnv
+from surgical_marl.physics.contact.contact_pairs import Tables
 from surgical_marl.physics.plant import Hidden, Plant
+from surgical_marl.physics.randomisation import Factors, varied
 from surgical_marl.physics.simulator import Simulator
-from surgical_marl.physics.tables import Tables
-from surgical_marl.physics.variation import Factors, varied
 from surgical_marl.scenes.load import load_scene
 from tests.helpers.falling import Falling
 from tests.helpers.object_parity import Beside

@@ -8,9 +8,9 @@ import numpy as np
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
-from surgical_marl.physics.patches import BLEND, TILT_IN_JAW, Patch, find_patch
-from surgical_marl.physics.rows import row_of
-from surgical_marl.physics.shapes import NEAR, Plate, Points, Segments, between_segments, on_plate
+from surgical_marl.physics.contact.contact_patch import BLEND, TILT_IN_JAW, Patch, find_patch
+from surgical_marl.physics.contact.shapes import NEAR, Plate, Points, Segments, between_segments, on_plate
+from surgical_marl.physics.tree_utils import row_of
 
 HALF, THICK, WIRE = np.array([0.0042, 0.0018]), 0.0006, 0.0005
 """A jaw's plate and a wire, m."""

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from surgical_marl.physics import rest
-from surgical_marl.physics.placed import Ball, Placed
-from surgical_marl.physics.rest import Company, company
-from surgical_marl.physics.shapes import Segments
+from surgical_marl.physics.contact.broadphase import Ball, Placed
+from surgical_marl.physics.contact.shapes import Segments
+from surgical_marl.physics.systems import sleeping
+from surgical_marl.physics.systems.sleeping import Company, company
 from tests.helpers.falling import Falling, Trace, random_turns, thrown, wide_pad
 
 
@@ -23,7 +23,7 @@ def blocks(tmp_path_factory: pytest.TempPathFactory) -> Falling:
     return Falling(folder, {"pad": wide_pad(folder), **places})
 
 
-def second(blocks: Falling, objects: Any, slow: float = rest.SLOW) -> tuple[Any, Trace]:
+def second(blocks: Falling, objects: Any, slow: float = sleeping.SLOW) -> tuple[Any, Trace]:
     """What eight environments do in a second: one number and one time, so that one step is compiled."""
     return blocks.play(objects, 1.0, slow=slow)
 

@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from surgical_marl.physics.rows import picked, row_of
+from surgical_marl.physics.tree_utils import picked, row_of
 
 shapes = st.lists(st.lists(st.integers(1, 3), max_size=2).map(tuple), min_size=1, max_size=3)
 

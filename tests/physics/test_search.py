@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from surgical_marl.physics.cone import (
+from surgical_marl.physics.contact.friction_cone import (
     Cone,
     Forces,
     Springs,
@@ -20,8 +20,8 @@ from surgical_marl.physics.cone import (
     stretched,
     wrench,
 )
-from surgical_marl.physics.factor import packed
-from surgical_marl.physics.search import ENOUGH, search
+from surgical_marl.physics.solver.cholesky import packed
+from surgical_marl.physics.solver.line_search import ENOUGH, search
 
 POINTS = 4
 

@@ -20,9 +20,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from surgical_marl import load_scene
-from surgical_marl.physics import solver
-from surgical_marl.physics.dynamics import ITERATIONS
-from surgical_marl.physics.solver import JointRows, Rows, relax, solve
+from surgical_marl.physics.solver import constraint_rows
+from surgical_marl.physics.solver.constraint_rows import JointRows, Rows, relax, solve
+from surgical_marl.physics.systems.dynamics import ITERATIONS
 
 SEEDS = st.integers(0, 2**32 - 1)
 JOINTS, CONTACTS = 5, 2
@@ -103,7 +103,7 @@ def compiled_relax(sweeps: int, relaxation: float) -> Callable[..., np.ndarray]:
     compiled = jax.jit(lambda *arguments: relax(*arguments))
 
     def run(p: Problem, start: np.ndarray) -> np.ndarray:
-        with patch.object(solver, "SWEEPS", sweeps), patch.object(solver, "RELAXATION", relaxation):
+        with patch.object(constraint_rows, "SWEEPS", sweeps), patch.object(constraint_rows, "RELAXATION", relaxation):
             return np.asarray(compiled(p.mass, p.smooth, p.joints, start))
 
     return run
@@ -128,12 +128,12 @@ def test_an_exact_sweep_never_raises_the_cost(seed: int) -> None:
 @given(SEEDS)
 def test_the_sweeps_that_ship_come_nearer_to_the_minimum(seed: int) -> None:
     p = problem(seed)
-    found = compiled_relax(solver.SWEEPS, solver.RELAXATION)(p, p.start)
+    found = compiled_relax(constraint_rows.SWEEPS, constraint_rows.RELAXATION)(p, p.start)
     least = cost(p, compiled_relax(500, 1.0)(p, p.start))
     assert cost(p, found) - least <= 0.01 * (cost(p, p.start) - least) + 1e-5 * abs(least)
 
 
-@pytest.mark.parametrize("relaxation", [1.0, solver.RELAXATION])
+@pytest.mark.parametrize("relaxation", [1.0, constraint_rows.RELAXATION])
 @settings(max_examples=100, deadline=None)
 @given(seed=SEEDS)
 def test_many_sweeps_end_at_the_minimum(relaxation: float, seed: int) -> None:
@@ -241,7 +241,7 @@ def test_an_arm_accelerates_as_in_c_mujoco(name: str, seed: int) -> None:
     p = mujoco_problem(model, data, 2 * model.nv)
     exact, _ = compiled_solve(p.mass, p.smooth, p.rows, p.start, 30, 20)
     assert far_off(model, velocity, np.asarray(exact), data.qacc) < 1e-4
-    start = compiled_relax(solver.SWEEPS, solver.RELAXATION)(p, p.start)
+    start = compiled_relax(constraint_rows.SWEEPS, constraint_rows.RELAXATION)(p, p.start)
     quick, _ = compiled_solve(p.mass, p.smooth, p.rows, start, *ITERATIONS)
     assert far_off(model, velocity, np.asarray(quick), data.qacc) < 1e-3
 
@@ -278,7 +278,7 @@ def test_a_step_by_blocks_is_a_step_of_the_whole(seed: int) -> None:
     gives = rng.choice([0.0, 1.0, 100.0], len(jacobian))
     excess = rng.normal(size=n)
     whole = np.linalg.solve(mass + jacobian.T @ (gives[:, None] * jacobian), excess)
-    found = solver._newton_step(
+    found = constraint_rows._newton_step(
         *(np.float32(x) for x in (mass, jacobian, gives, excess)), [np.arange(n).reshape(-1, 4)]
     )
     np.testing.assert_allclose(found, whole, atol=1e-4 * np.abs(whole).max())

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 import yaml
 
-from surgical_marl.physics.collision import Pairs
-from surgical_marl.physics.dynamics import Dynamics
-from surgical_marl.physics.placed import Places
-from surgical_marl.physics.shapes import on_plate
+from surgical_marl.physics.contact.arm_contacts import Pairs
+from surgical_marl.physics.contact.broadphase import Places
+from surgical_marl.physics.contact.detection import AHEAD, MARGIN, NEAR, NEAREST, Slots
+from surgical_marl.physics.contact.shapes import on_plate
 from surgical_marl.physics.simulator import Physics, Simulator
+from surgical_marl.physics.systems.dynamics import Dynamics
 from surgical_marl.physics.together import Together
-from surgical_marl.physics.touching import AHEAD, MARGIN, NEAR, NEAREST, Slots
 from surgical_marl.robots.rotation import matrix_of
 from surgical_marl.scenes.load import load_scene
 from surgical_marl.scenes.mjcf import mjcf

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 
 from surgical_marl import load_scene
-from surgical_marl.physics.collision import Pairs
-from surgical_marl.physics.dynamics import Dynamics
+from surgical_marl.physics.contact.arm_contacts import Pairs
+from surgical_marl.physics.systems.dynamics import Dynamics
 from surgical_marl.robots.inverse_kinematics import inverse_kinematics
 from surgical_marl.scenes.contacts import collision_geoms, neighbours
 from surgical_marl.scenes.placing import scenes_without_objects

@@ -13,7 +13,7 @@ import yaml
 
 import surgical_marl as sm
 from surgical_marl.cli.main import main
-from surgical_marl.physics.touching import SLOTS
+from surgical_marl.physics.contact.detection import SLOTS
 from surgical_marl.scenes.check import check
 from surgical_marl.scenes.crowding import crowd
 from tests.helpers.falling import Falling

@@ -18,7 +18,7 @@ from surgical_marl.content import content_dir
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.envs.env import Env
 from surgical_marl.evaluation.evaluate import evaluate
-from surgical_marl.physics.views import Handled, ObjectView
+from surgical_marl.physics.outputs import Handled, ObjectView
 from surgical_marl.policies.oracle import oracle
 from surgical_marl.policies.policy import load_policy, zero_policy
 from surgical_marl.tasks.base.grips import frames

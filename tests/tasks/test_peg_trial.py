@@ -16,7 +16,7 @@ from surgical_marl.engines.choose import make_engine
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.envs.env import Env
 from surgical_marl.evaluation.evaluate import evaluate
-from surgical_marl.physics.views import Handled, ObjectView
+from surgical_marl.physics.outputs import Handled, ObjectView
 from surgical_marl.policies.policy import load_policy
 from surgical_marl.scenes.object_contacts import RESTING, distances
 from surgical_marl.scenes.poses import Pose

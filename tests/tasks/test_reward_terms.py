@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from surgical_marl.envs import costs as safety
-from surgical_marl.physics.views import ObjectView
+from surgical_marl.physics.outputs import ObjectView
 from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.robots.arm import load_arm
 from surgical_marl.scenes.load import load_scene

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from surgical_marl.physics.views import ObjectView
+from surgical_marl.physics.outputs import ObjectView
 from surgical_marl.runtime import jnp
 from surgical_marl.scenes.objects import Object
 from surgical_marl.scenes.scene import Mount

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 if TYPE_CHECKING:
     from jax import Array
 
-    from surgical_marl.physics.views import ArmView, ObjectView
+    from surgical_marl.physics.outputs import ArmView, ObjectView
 
 
 class World(NamedTuple):

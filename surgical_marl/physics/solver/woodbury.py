@@ -16,9 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from surgical_marl.physics.factor import back, cholesky, forward
-from surgical_marl.physics.search import search
-from surgical_marl.physics.solver import JointRows, Rows, giving, rows_of, unbounded_forces
+from surgical_marl.physics.solver.cholesky import back, cholesky, forward
+from surgical_marl.physics.solver.constraint_rows import JointRows, Rows, giving, rows_of, unbounded_forces
+from surgical_marl.physics.solver.line_search import search
 
 
 class Own(NamedTuple):

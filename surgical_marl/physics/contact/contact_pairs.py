@@ -12,10 +12,10 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from surgical_marl.physics.bodies import Masses
-from surgical_marl.physics.collision import moved_bodies
-from surgical_marl.physics.patches import AWAY
-from surgical_marl.physics.shapes import Plate, Segments, plate_of_box
+from surgical_marl.physics.contact.arm_contacts import moved_bodies
+from surgical_marl.physics.contact.contact_patch import AWAY
+from surgical_marl.physics.contact.shapes import Plate, Segments, plate_of_box
+from surgical_marl.physics.systems.rigid_bodies import Masses
 from surgical_marl.robots.spec import COLLISION_GROUP, PAD_GROUP
 from surgical_marl.scenes.objects import JAW, LINK, Placement, Surface
 

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from surgical_marl.physics.factor import back, cholesky, forward, packed
-from surgical_marl.physics.rows import absent, put
+from surgical_marl.physics.solver.cholesky import back, cholesky, forward, packed
+from surgical_marl.physics.tree_utils import absent, put
 
 
 class Eliminated(NamedTuple):

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from surgical_marl.physics.bodies import Masses
-from surgical_marl.physics.tables import Tables
+from surgical_marl.physics.contact.contact_pairs import Tables
+from surgical_marl.physics.systems.rigid_bodies import Masses
 
 LENGTHS = "start", "end", "middle", "radius", "around", "bound", "centers"
 """Tables of lengths of objects, [k, ...]."""

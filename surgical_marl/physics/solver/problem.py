@@ -8,9 +8,9 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from surgical_marl.physics.cone import Cone, Forces, Springs, Stuck
-from surgical_marl.physics.rows import Listed
-from surgical_marl.physics.solver import JointRows, Rows
+from surgical_marl.physics.contact.friction_cone import Cone, Forces, Springs, Stuck
+from surgical_marl.physics.solver.constraint_rows import JointRows, Rows
+from surgical_marl.physics.tree_utils import Listed
 
 
 class Contact(NamedTuple):

@@ -18,8 +18,8 @@ import mujoco
 import numpy as np
 from jax import Array
 
-from surgical_marl.physics.impedance import response
-from surgical_marl.physics.solver import JointRows, Rows, relax, solve, solve_positive
+from surgical_marl.physics.solver.constraint_rows import JointRows, Rows, relax, solve, solve_positive
+from surgical_marl.physics.solver.solref import response
 from surgical_marl.runtime import prepare_mjx
 
 ITERATIONS = (1, 1)

@@ -13,10 +13,10 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from surgical_marl.physics.arms import Arms
-from surgical_marl.physics.cone import Forces, Parting, Stuck, falls, nearest, presses, stretched
-from surgical_marl.physics.problem import Contacts, Point, Pressed, Problem
-from surgical_marl.physics.rows import Listed, put, room, row_of
+from surgical_marl.physics.contact.friction_cone import Forces, Parting, Stuck, falls, nearest, presses, stretched
+from surgical_marl.physics.solver.arm_newton import Arms
+from surgical_marl.physics.solver.problem import Contacts, Point, Pressed, Problem
+from surgical_marl.physics.tree_utils import Listed, put, room, row_of
 
 TOLERANCE = 3e-3
 """Force of a contact that a Newton step did not foresee, as a share of the largest normal force on the same object, at

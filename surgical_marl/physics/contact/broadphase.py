@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from surgical_marl.physics.bodies import Bodies, rotation
-from surgical_marl.physics.rows import row_of
-from surgical_marl.physics.shapes import Plate, Points, Segments, between_segments, in_frame
-from surgical_marl.physics.tables import Tables
+from surgical_marl.physics.contact.contact_pairs import Tables
+from surgical_marl.physics.contact.shapes import Plate, Points, Segments, between_segments, in_frame
+from surgical_marl.physics.systems.rigid_bodies import Bodies, rotation
+from surgical_marl.physics.tree_utils import row_of
 
 
 class Way(NamedTuple):

@@ -15,15 +15,15 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from surgical_marl.physics import elimination
-from surgical_marl.physics.along import Base, look_ahead, set_out
-from surgical_marl.physics.arms import Arms, Left
-from surgical_marl.physics.cone import Parting, parting
-from surgical_marl.physics.problem import Point, Problem, Solution
-from surgical_marl.physics.rows import filled
-from surgical_marl.physics.search import ENOUGH, search
-from surgical_marl.physics.sums import Sums
-from surgical_marl.physics.twists import Twists
+from surgical_marl.physics.contact.friction_cone import Parting, parting
+from surgical_marl.physics.contact.relative_motion import Twists
+from surgical_marl.physics.solver import schur
+from surgical_marl.physics.solver.arm_newton import Arms, Left
+from surgical_marl.physics.solver.hessian import Sums
+from surgical_marl.physics.solver.line_search import ENOUGH, search
+from surgical_marl.physics.solver.newton_line import Base, look_ahead, set_out
+from surgical_marl.physics.solver.problem import Point, Problem, Solution
+from surgical_marl.physics.tree_utils import filled
 
 PASSES, ALONE = 12, 24
 """Newton steps at most, with arms and of objects alone, whose steps are short. A GPU waits for the last one of its
@@ -109,14 +109,14 @@ class Newton:
         """
         k, linked = self._objects, sums.linked
         touched = sums.met.reshape(k + 1, len(self._dofs))[:k]
-        blocks = elimination.Blocks(sums.object[:k], sums.cross)
-        gone = elimination.eliminate(blocks, sums.force[:k], sums.coupling, touched, linked)
+        blocks = schur.Blocks(sums.object[:k], sums.cross)
+        gone = schur.eliminate(blocks, sums.force[:k], sums.coupling, touched, linked)
         found = here.arms
         if len(self._dofs):
             on = touched | (linked & touched.any(0))  # what an object touches moves those that it touches
             left = Left(sums.arm, sums.on_arm, sums.arm_force, gone.half, gone.wide, on)
             found = self._ways(problem, here.arms, left, first)
-        return Point(found, elimination.ways(gone, found, touched, linked))
+        return Point(found, schur.ways(gone, found, touched, linked))
 
     def _ways(self, problem: Problem, here: Array, left: Left, first: Array) -> Array:
         """Return the ways [a, m] of arms: of each alone, of those that one object joins, or of all at once."""

@@ -19,8 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from surgical_marl.physics.rows import put, room, row_of
-from surgical_marl.physics.shapes import Points
+from surgical_marl.physics.contact.shapes import Points
+from surgical_marl.physics.tree_utils import put, room, row_of
 
 POINTS = 4
 """Points of a patch."""

@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from surgical_marl.physics.dynamics import ITERATIONS
-from surgical_marl.physics.factor import packed
-from surgical_marl.physics.solver import JointRows, relax, rows_of, solve, solve_positive
+from surgical_marl.physics.solver.cholesky import packed
+from surgical_marl.physics.solver.constraint_rows import JointRows, relax, rows_of, solve, solve_positive
+from surgical_marl.physics.systems.dynamics import ITERATIONS
 
 
 class ArmForces(NamedTuple):

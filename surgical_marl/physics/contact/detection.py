@@ -14,13 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from surgical_marl.physics.bodies import Bodies
-from surgical_marl.physics.patches import BLEND, TILT, TILT_IN_JAW, Patch, find_patch, no_patch
-from surgical_marl.physics.placed import Ball, Joints, Placed, Places, Way, between_balls
-from surgical_marl.physics.rest import Company, company, moving
-from surgical_marl.physics.rows import Listed, put, room, row_of
-from surgical_marl.physics.shapes import Points, Segments, between_segments, on_plate
-from surgical_marl.physics.tables import Meeting, Tables
+from surgical_marl.physics.contact.broadphase import Ball, Joints, Placed, Places, Way, between_balls
+from surgical_marl.physics.contact.contact_pairs import Meeting, Tables
+from surgical_marl.physics.contact.contact_patch import BLEND, TILT, TILT_IN_JAW, Patch, find_patch, no_patch
+from surgical_marl.physics.contact.shapes import Points, Segments, between_segments, on_plate
+from surgical_marl.physics.systems.rigid_bodies import Bodies
+from surgical_marl.physics.systems.sleeping import Company, company, moving
+from surgical_marl.physics.tree_utils import Listed, put, room, row_of
 from surgical_marl.scenes.object_contacts import SLOTS
 
 NEAREST = 16

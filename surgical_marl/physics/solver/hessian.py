@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from surgical_marl.physics.along import Base
-from surgical_marl.physics.cone import Forces, between, curvature, wrench
-from surgical_marl.physics.factor import packed
-from surgical_marl.physics.problem import Contact, Problem
-from surgical_marl.physics.rows import absent, add, put, row_of
-from surgical_marl.physics.twists import moved_cone
+from surgical_marl.physics.contact.friction_cone import Forces, between, curvature, wrench
+from surgical_marl.physics.contact.relative_motion import moved_cone
+from surgical_marl.physics.solver.cholesky import packed
+from surgical_marl.physics.solver.newton_line import Base
+from surgical_marl.physics.solver.problem import Contact, Problem
+from surgical_marl.physics.tree_utils import absent, add, put, row_of
 
 _WHOLE = packed(6)
 
@@ -31,7 +31,7 @@ class Sums(NamedTuple):
     object: Array
     """By how much those on objects do, with their masses, lower halves, [k + 1, 21]."""
     cross: Array
-    """Of objects with each other: see `elimination.Blocks`."""
+    """Of objects with each other: see `schur.Blocks`."""
     coupling: Array
     """Of object o and arm i in row a o + i, [(k + 1) a, 6, m]; nothing where they were not met."""
     met: Array

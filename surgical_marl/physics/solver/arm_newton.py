@@ -14,10 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from surgical_marl.physics.bridge import Bridge, Own
-from surgical_marl.physics.factor import packed
-from surgical_marl.physics.problem import Problem
-from surgical_marl.physics.solver import JointRows, Rows, row_forces, rows_of, solve
+from surgical_marl.physics.solver.cholesky import packed
+from surgical_marl.physics.solver.constraint_rows import JointRows, Rows, row_forces, rows_of, solve
+from surgical_marl.physics.solver.problem import Problem
+from surgical_marl.physics.solver.woodbury import Bridge, Own
 
 ITERATIONS = (6, 4)
 """Newton steps for arms alone at most, and line search steps in each, while contacts are linear functions."""

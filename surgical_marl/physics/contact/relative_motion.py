@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from surgical_marl.physics.cone import Cone
-from surgical_marl.physics.problem import Contact
+from surgical_marl.physics.contact.friction_cone import Cone
+from surgical_marl.physics.solver.problem import Contact
 
 
 class Twists:

@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 from jax import Array
 
-from surgical_marl.physics.tiles import Tiles
+from surgical_marl.physics.contact.arm_pairs import Tiles
 from surgical_marl.scenes.geometry import Capsule, axis_gap
 
 SLOTS = 6

@@ -9,15 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from surgical_marl.physics.bodies import Bodies, carried, conjugate, product, rotation, turn, turned
-from surgical_marl.physics.cone import Cone, Forces, Springs, Stuck, nearest, presses
-from surgical_marl.physics.patches import AWAY, Patch
-from surgical_marl.physics.placed import Joints
-from surgical_marl.physics.problem import Contact, Contacts, Pressed
-from surgical_marl.physics.rows import Listed, picked, put, room, row_of
-from surgical_marl.physics.tables import Tables
-from surgical_marl.physics.touching import AHEAD, MARGIN, Slots
-from surgical_marl.physics.twists import Twists, bends
+from surgical_marl.physics.contact.broadphase import Joints
+from surgical_marl.physics.contact.contact_pairs import Tables
+from surgical_marl.physics.contact.contact_patch import AWAY, Patch
+from surgical_marl.physics.contact.detection import AHEAD, MARGIN, Slots
+from surgical_marl.physics.contact.friction_cone import Cone, Forces, Springs, Stuck, nearest, presses
+from surgical_marl.physics.contact.relative_motion import Twists, bends
+from surgical_marl.physics.solver.problem import Contact, Contacts, Pressed
+from surgical_marl.physics.systems.rigid_bodies import Bodies, carried, conjugate, product, rotation, turn, turned
+from surgical_marl.physics.tree_utils import Listed, picked, put, room, row_of
 
 DAMPING = 5e-3
 """Damping of a contact in the normal direction, s: this times its stiffness, N s/m."""

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from surgical_marl.physics.arm_forces import ArmForces
-from surgical_marl.physics.dynamics import Dynamics, Physics
+from surgical_marl.physics.systems.arm_forces import ArmForces
+from surgical_marl.physics.systems.dynamics import Dynamics, Physics
 from surgical_marl.scenes.build import alone
 from surgical_marl.scenes.scene import Scene
 

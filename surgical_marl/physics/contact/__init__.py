@@ -1,0 +1,1 @@
+"""Contact: shapes, collision detection, contact patches, Coulomb friction, grips."""

@@ -1,0 +1,1 @@
+"""Things that move: arms, rigid bodies, and systems of plug-ins."""
