@@ -262,7 +262,7 @@ def check_module(module: str, argv: list[str]) -> None:
         check_surgical_marl(argv)
         return
     assert importlib.util.find_spec(module), module
-    if module.startswith("surgical_marl.") and argv:
+    if module.startswith(("surgical_marl.", "docs.")) and argv:
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(argparse.ArgumentParser, "parse_args", parse_and_stop)
             with pytest.raises(Ready):
