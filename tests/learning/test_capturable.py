@@ -47,13 +47,6 @@ class Unwatched(FakeEnv):
             return super().step(actions)
 
 
-def test_waiting_is_seen() -> None:
-    with Waits() as waits:
-        x = torch.ones(3)
-        x[x > 0].sum().item()
-    assert len(waits.found) == 2
-
-
 @pytest.mark.parametrize("algo", list_algorithms())
 @pytest.mark.parametrize("options", [*OPTIONS, ALL])
 def test_nothing_waits_and_all_stays_in_place(

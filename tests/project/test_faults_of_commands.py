@@ -9,19 +9,14 @@ from __future__ import annotations
 
 import os
 import random
-import subprocess
-import sys
-import time
 from collections import Counter
 from pathlib import Path
 
 import pytest
 
-from tests.helpers.clock import DAY, can_jump, jump, own_clock
 from tests.helpers.command_faults import (
     COMMANDS,
     FAULTS,
-    Ended,
     broken,
     clear,
     full,
@@ -91,44 +86,6 @@ def test_commands_meet_faults_at_random_moments(tmp_path: Path) -> None:
     for (name, fault, how), times in sorted(count.items()):
         print(f"| {name} | {fault} | {how} | {times} |")
     assert not failed, "\n".join(failed)
-
-
-def test_what_a_fault_leaves_is_judged(tmp_path: Path) -> None:
-    """Files that are cut short, a traceback and a wrong exit code are found."""
-    (tmp_path / "a.html").write_text("<html>")
-    assert broken(tmp_path, "report", tmp_path) == ["a.html: it is cut short"]
-    (tmp_path / "a.csv").write_text("a,b\n1,")
-    (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n")
-    assert len(broken(tmp_path, "eval", tmp_path)) == 2
-    (tmp_path / "a.html").write_text("<html></html>\n")
-    assert broken(tmp_path, "report", tmp_path) == []
-    assert said_well("full disk", Ended(2, "surgical-marl: a.html: No space left on device", 1.0))
-    assert not said_well("full disk", Ended(1, "Traceback (most recent call last)", 1.0))
-    assert not said_well("full disk", Ended(2, "Traceback (most recent call last)", 1.0))
-    assert said_well("SIGKILL", Ended(-9, "", 1.0)) and not said_well("SIGTERM", Ended(1, "", 1.0))
-    assert not said_well("clock", Ended(2, "surgical-marl: the clock is wrong", 1.0))
-
-
-def test_a_clock_jumps_for_one_process_alone(tmp_path: Path) -> None:
-    if not can_jump():
-        pytest.skip("there is no C compiler")
-    own, began = own_clock(tmp_path / "clock"), time.time()
-    say = "print(time.time(), time.monotonic(), flush=True)"
-    code = f"import time; {say}; input(); {say}"
-    with subprocess.Popen(
-        [sys.executable, "-c", code],
-        env={**os.environ, **own},
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    ) as process:
-        assert process.stdout is not None
-        first = process.stdout.readline()
-        jump(tmp_path / "clock", -400 * DAY)
-        second, _ = process.communicate("\n")
-    day, duration = (float(b) - float(a) for a, b in zip(first.split(), second.split(), strict=True))
-    assert 0 <= duration < 60 and abs(day + 400 * DAY) < 60
-    assert abs(float(first.split()[0]) - began) < 60 and time.time() >= began
 
 
 def test_a_scene_whose_disk_is_full_is_written_when_there_is_room(tmp_path: Path) -> None:
