@@ -1,14 +1,18 @@
-"""The command line: what it prints, and how it takes bad input."""
+"""The command line: what it prints, how it takes bad input, and what it says where memory is lacking."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from surgical_marl import list_arms, list_scenes, load_scene
+from surgical_marl.cli import main as program
+from surgical_marl.cli.describe import shared_workspace
 from surgical_marl.cli.doctor import Finding, chain_seconds
 from surgical_marl.cli.main import main
 from tests.helpers import ROOT
@@ -264,3 +268,74 @@ def test_a_reader_that_leaves_is_no_error() -> None:
 def test_teams_of_two_difficulties_can_be_given_one(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["crossplay", "reach-bimanual_psm", "reach-bimanual_psm-crossing"]) == 2
     assert "choose one for all with --difficulty\n" in capsys.readouterr().err
+
+
+def test_list_v_names_all_and_says_what_they_are(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "500")
+    assert main(["list", "-v"]) == 0
+    out = capsys.readouterr().out
+    for name in (*list_scenes(), *list_arms(), "psm_0", "ecm_0", "reach"):
+        assert f"{name} " in out
+    clearance, pairs = load_scene("bimanual_psm"), len(load_scene("bimanual_psm").pairs)
+    home = {agent: mount.arm.home for agent, mount in clearance.mounts.items()}
+    assert f"{pairs} pairs of shapes can touch, {1000 * float(clearance.clearance(home)):.0f} mm apart at home" in out
+    assert "% of an arm's workspace shared" in out
+
+
+def test_the_shared_workspace_is_all_none_or_between(tmp_path: Path) -> None:
+    def shared(x: float) -> float:
+        path = tmp_path / f"at{x}.yaml"
+        path.write_text(f"arms:\n  psm_0: {{arm: psm}}\n  psm_1: {{arm: psm, position: [{x}, 0, 0]}}\n")
+        return shared_workspace(load_scene(path))
+
+    assert shared(0.0) > 0.99
+    assert shared(5.0) == 0.0
+    assert shared(0.0) > shared(0.1) > shared(0.3) > 0.0
+    assert np.isnan(shared_workspace(load_scene("psm")))
+
+
+@pytest.mark.parametrize("name", [name for name in list_scenes() if len(load_scene(name).agents) > 1])
+def test_arms_of_a_scene_share_a_workspace(name: str) -> None:
+    assert shared_workspace(load_scene(name)) > 0.5
+
+
+def chained() -> None:
+    try:
+        raise OSError("libwarp.so: failed to map segment from shared object")
+    except OSError as error:
+        raise RuntimeError("cannot load the library") from error
+
+
+def raising(error: Exception) -> Callable[[], None]:
+    def fail() -> None:
+        raise error
+
+    return fail
+
+
+@pytest.mark.parametrize(
+    "fail",
+    [
+        chained,
+        raising(MemoryError()),
+        raising(RuntimeError("std::bad_alloc")),
+        raising(Exception("Could not allocate memory")),
+        raising(RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: you tried 8 bytes")),
+        raising(ImportError("libx.so: cannot allocate memory in static TLS block")),
+        raising(RuntimeError("can't start new thread")),
+    ],
+)
+def test_a_lack_of_memory_is_one_sentence(
+    fail: Callable[[], None], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(program, "_parse", lambda argv: fail())
+    assert program.main([]) == 2
+    assert capsys.readouterr().err == "surgical-marl: there is not enough memory for that\n"
+
+
+def test_other_errors_stay_what_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(program, "_parse", lambda argv: raising(RuntimeError("a fault of ours"))())
+    with pytest.raises(RuntimeError, match="a fault of ours"):
+        program.main([])

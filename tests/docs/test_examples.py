@@ -1,16 +1,17 @@
-"""Every example runs, in a short mode: `main` of each takes how much it does as its first argument.
-
-Those for JAX are tested in `test_examples_jax.py`.
-"""
+"""Every example runs, in a short mode: `main` takes how much it does, those for JAX take `--quick`."""
 
 from __future__ import annotations
 
 import importlib.util
 import json
 import math
+import re
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from tests.helpers import ROOT
@@ -81,3 +82,21 @@ def test_the_notebook_runs_in_jupyter(tmp_path: Path) -> None:
 def test_the_notebook_is_kept_without_outputs() -> None:
     cells = json.loads((EXAMPLES / "quickstart.ipynb").read_text())["cells"]
     assert not any(cell.get("outputs") or cell.get("execution_count") for cell in cells)
+
+
+def run(name: str, pattern: str) -> list[float]:
+    """Run an example as a user does, and return the numbers that it prints where the pattern has its group."""
+    done = subprocess.run([sys.executable, EXAMPLES / name, "--quick"], capture_output=True, text=True, timeout=600)
+    assert done.returncode == 0, done.stderr
+    return [float(number) for number in re.findall(pattern, done.stdout)]
+
+
+def test_a_trajectory_is_optimised_by_gradient() -> None:
+    errors = run("jax_trajectory.py", r"ends ([\d.]+) mm")
+    assert errors[0] > 20 and errors[-1] < 2
+
+
+@pytest.mark.slow
+def test_ppo_earns_more_than_at_first() -> None:
+    rewards = run("jax_ppo.py", r"reward (-?[\d.]+)")
+    assert np.mean(rewards[-3:]) > np.mean(rewards[:3]) + 0.1

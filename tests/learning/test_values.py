@@ -1,4 +1,4 @@
-"""Value normalisation against a computation by hand, and what it is for: rewards of any unit."""
+"""Normalised values and observations, against computations by hand; rewards of any unit are learned alike."""
 
 from __future__ import annotations
 
@@ -7,9 +7,12 @@ from typing import Any
 
 import pytest
 import torch
+from tensordict import TensorDict
 
 from surgical_marl.learning.algorithm import Algorithm
+from surgical_marl.learning.normaliser import share_normalisers
 from surgical_marl.learning.values import DECAY, LEAST_STD, ValueScale
+from surgical_marl.policies.networks import make_model
 from tests.learning.test_mappo import SETTINGS, build, gradients, roll_out
 
 NORMALISED = replace(SETTINGS, ppo=replace(SETTINGS.ppo, normalise_values=True))
@@ -111,3 +114,21 @@ def test_what_was_learned_is_saved() -> None:
     place = other.scale.mean.data_ptr()
     other.load(algorithm.save())
     assert torch.equal(other.scale.mean, algorithm.scale.mean) and other.scale.mean.data_ptr() == place
+
+
+@pytest.mark.parametrize("learns", [False, True])
+@pytest.mark.parametrize("recurrent", ["none", "gru"])
+def test_what_is_far_off_the_mean_is_limited(learns: bool, recurrent: str) -> None:
+    observations = TensorDict({"state": torch.randn(64, 3)}, batch_size=[64])
+    network = make_model(observations, ["state"], 2, recurrent=recurrent, hidden_dims=[8], obs_normalization=True)
+    if learns:
+        share_normalisers(network)
+        network.update_normalization(observations)
+
+    def outputs(away: float) -> torch.Tensor:
+        memory = torch.zeros(1, *network.memory_shape) if recurrent != "none" else None
+        with torch.no_grad():
+            return network(TensorDict({"state": torch.full((1, 3), away)}, batch_size=[1]), None, memory)
+
+    assert torch.equal(outputs(50.0), outputs(5000.0))
+    assert not torch.equal(outputs(5.0), outputs(50.0))

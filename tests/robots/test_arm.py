@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import runpy
 import shutil
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from surgical_marl import list_arms, load_arm
 from surgical_marl.robots.arm import Arm
 from surgical_marl.robots.spec import GEAR, build_spec
 from surgical_marl.scenes.timing import TIMESTEP
+from tests.helpers import ROOT
 
 PSM = load_arm("psm")
 HALF = np.pi / 2
@@ -311,3 +313,30 @@ def test_bad_arm_yaml_is_one_sentence(tmp_path: Path, old: str, new: str, words:
     with pytest.raises(ValueError, match=words) as error:
         load_arm(folder)
     assert "\n" not in str(error.value)
+
+
+ARMS = ROOT / "arms"
+
+
+@pytest.fixture(scope="module")
+def texts() -> dict[str, str]:
+    """What the generator writes, run as `python arms/build` runs it, but without writing."""
+    return runpy.run_path(str(ARMS / "build"), run_name="build")["texts"]()
+
+
+def test_files_are_what_the_generator_writes(texts: dict[str, str]) -> None:
+    assert sorted(texts) == list_arms()
+    for name, text in texts.items():
+        # Bytes, not text: a file with other line ends or another encoding is another file.
+        assert (ARMS / name / f"{name}.urdf").read_bytes() == text.encode(), f"run `python arms/build`: {name} differs"
+
+
+@pytest.mark.parametrize("name", list_arms())
+def test_arm_loads_with_its_home_inside_the_limits(name: str) -> None:
+    arm = load_arm(name)
+    assert arm.urdf.name == name
+    assert arm.description and (arm.folder / "README.md").is_file()
+    assert np.all((arm.lower <= arm.home) & (arm.home <= arm.upper))
+    # A target may not outrun the joint that follows it.
+    assert all(0 < joint.drive.speed <= joint.velocity for joint in arm.joints)
+    assert build_spec(arm).compile().nu == len(arm.joints) + len(arm.cables)

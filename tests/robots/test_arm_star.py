@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
 import re
-import sys
 from itertools import combinations
 
 import mujoco
@@ -178,11 +176,3 @@ def test_capsules_are_clear_of_each_other() -> None:
         mujoco.mj_kinematics(model, data)
         for one, other in zip(CHAIN, CHAIN[2:], strict=False):
             assert least_distance(model, data, one, other) > 0.002, (one, other)
-
-
-def test_urdf_is_what_the_build_writes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(STAR.folder.parent / "build"))
-    for name in ("star", "robot"):
-        monkeypatch.delitem(sys.modules, name, raising=False)
-    text = importlib.import_module("star").build()["star"]
-    assert (STAR.folder / "star.urdf").read_bytes() == text.encode()

@@ -6,15 +6,11 @@ from functools import cache
 from types import SimpleNamespace
 from typing import Any, cast
 
-import gymnasium
 import mujoco
 import numpy as np
 import pytest
-import yaml
-from pettingzoo.test import parallel_api_test
 
 import surgical_marl as sm
-from surgical_marl.content import content_dir
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.envs.env import Env
 from surgical_marl.evaluation.evaluate import evaluate
@@ -363,13 +359,6 @@ def test_the_oracle_shows_work_with_objects(scene: str) -> None:
     assert found["success_rate"] >= 0.95 and found["in_view_rate"] >= 0.99 and found["object_in_view_rate"] >= 0.99
 
 
-def test_the_settings_list_every_weight_as_the_task_has_it() -> None:
-    settings = yaml.safe_load((content_dir("configs") / f"{TASK}.yaml").read_text())
-    for scene in SCENES:
-        weights = settings["reward"] | settings["scenes"][scene]["reward"]
-        assert weights == dict(Env(TASK, scene).task.weights)
-
-
 @pytest.mark.parametrize(
     ("scene", "options", "words"),
     [
@@ -385,14 +374,3 @@ def test_bad_options_are_one_sentence(scene: str, options: dict[str, Any], words
     with pytest.raises(ValueError, match=words) as caught:
         sm.parallel_env(TASK, scene=scene, **options)
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.slow
-def test_interfaces_accept_it() -> None:
-    parallel_api_test(sm.parallel_env(TASK, scene=SCENE), num_cycles=30)
-    joint = gymnasium.make("surgical_marl/CameraAssist-v0")
-    observed, _ = joint.reset(seed=0)
-    assert joint.observation_space.contains(observed)
-    info = joint.step(np.zeros(18, np.float32))[-1]["agents"]
-    assert {"in_view", "object_in_view", "centre_error", "camera_travel", "stage_found"} <= info[CAMERA].keys()
-    assert {"in_view", "tip_error"} <= info["psm_0"].keys()

@@ -6,14 +6,10 @@ from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
-import gymnasium
 import numpy as np
 import pytest
-import yaml
-from pettingzoo.test import parallel_api_test
 
 import surgical_marl as sm
-from surgical_marl.content import content_dir
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.envs.env import Env
 from surgical_marl.evaluation.evaluate import evaluate
@@ -147,11 +143,6 @@ def test_only_a_useful_grip_is_rewarded(number: int, counts: bool) -> None:
     assert (away < 1e-6) == counts and 0.02 - float(terms["meet"]) == pytest.approx(away, abs=1e-6)
 
 
-def test_the_settings_list_every_weight_as_the_task_has_it() -> None:
-    settings = yaml.safe_load((content_dir("configs") / f"{TASK}.yaml").read_text())
-    assert settings["reward"] == dict(env().task.weights)
-
-
 def test_a_scene_with_one_jaw_does_not_do() -> None:
     with pytest.raises(ValueError, match=r"'psm_needle' has 1 \(choose from bimanual_psm_needle, trimanual"):
         sm.parallel_env(TASK, scene="psm_needle")
@@ -183,18 +174,6 @@ def test_neither_arm_does_it_alone(frozen: str) -> None:
     found = evaluate(many, lambda seen: {**rest(seen), **moved(seen)}, 1000, 0)
     assert found["success_rate"] == 0 and found["stages"]["received"] == 0
     assert (found["stages"]["lifted"] > 0.9) == (frozen == "psm_1")
-
-
-@pytest.mark.slow
-def test_interfaces_accept_it() -> None:
-    parallel_api_test(sm.parallel_env(TASK, scene=SCENE), num_cycles=30)
-    joint = gymnasium.make("surgical_marl/NeedleHandover-v0")
-    observed, _ = joint.reset(seed=0)
-    assert joint.observation_space.contains(observed)
-    info = joint.step(np.zeros(14, np.float32))[-1]
-    assert {"goal_error", "drop", "holding", "stage_passed"} <= info.keys()
-    single = gymnasium.make("surgical_marl/NeedleHandover-v0", agent="psm_1", teammates={"psm_0": "oracle"})
-    assert single.observation_space.contains(single.reset(seed=0)[0])
 
 
 @pytest.mark.slow

@@ -8,10 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 
 import surgical_marl as sm
-from surgical_marl.content import content_dir
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.envs.env import Env
 from surgical_marl.evaluation.evaluate import evaluate
@@ -167,11 +165,6 @@ def test_rewards_are_of_each_stage_once() -> None:
     assert {name for name, done in task.reached(again)["psm_0"].items() if done} >= {"received", "passed", "over"}
     low = world(0.0, 0.0, SECOND, SECOND)
     assert not task.reached(low)["psm_0"]["over"]
-
-
-def test_the_settings_list_every_weight_as_the_task_has_it() -> None:
-    settings = yaml.safe_load((content_dir("configs") / f"{TASK}.yaml").read_text())
-    assert settings["reward"] == dict(env().task.weights)
 
 
 def test_a_scene_without_pegs_does_not_do() -> None:

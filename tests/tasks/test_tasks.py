@@ -213,10 +213,12 @@ def test_an_action_is_compared_with_the_one_before_it_in_its_episode() -> None:
             last[agent] = np.where(ended, 0.0, action)
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", sm.list_tasks())
 def test_the_settings_list_every_weight_as_the_task_has_it(task: str) -> None:
     settings = yaml.safe_load((content_dir("configs") / f"{task}.yaml").read_text())
-    assert settings["reward"] == dict(Env(task, "psm").task.weights)
+    own = {scene: found["reward"] for scene, found in (settings.get("scenes") or {}).items() if "reward" in found}
+    for scene in own or [scene_of(task)]:
+        assert settings["reward"] | own.get(scene, {}) == dict(Env(task, scene).task.weights)
 
 
 def test_each_cost_counts_one_broken_limit() -> None:

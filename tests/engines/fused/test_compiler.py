@@ -313,7 +313,7 @@ UNSUPPORTED: dict[str, tuple[str, Callable[[Any], Any]]] = {
 def test_an_error_names_what_and_where(name: str) -> None:
     """The line in this file, not one in JAX or of what called it."""
     what, function = UNSUPPORTED[name]
-    with pytest.raises(Unsupported, match=rf"{what}.* at .*test_fused_compiler\.py:\d+") as caught:
+    with pytest.raises(Unsupported, match=rf"{what}.* at .*test_compiler\.py:\d+") as caught:
         make_stores(function, (np.zeros((1, 3), np.float32),))
     line = int(re.search(r"\.py:(\d+)", caught.value.place)[1])  # type: ignore[index]
     start = function.__code__.co_firstlineno

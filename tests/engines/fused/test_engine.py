@@ -35,7 +35,7 @@ ULPS = 10
 
 # XLA takes 12 s to compile the reference for a small scene and a minute for a large one. `make test` takes one of each
 # kind: arms that touch, each way of control, goals at rest and paths. `pytest -m slow` takes all others. Until then the
-# star's acceleration is compared with C MuJoCo's in test_solver, every primitive with JAX's in test_fused_primitives.
+# star's acceleration is compared with C MuJoCo's in test_solver, every primitive with JAX's in test_primitives.
 PLAYED = [(task, scene) for task in list_tasks() for scene in TASKS.load(task).scenes or list_scenes()]
 ALL = [(task, scene, control) for task, scene in PLAYED for control in CONTROL_MODES]
 QUICK = [("psm", "position"), ("bimanual_psm", "position"), ("ecm", "velocity"), ("ecm", "torque")]
@@ -209,7 +209,7 @@ class Sorting(Env):
 def test_what_it_cannot_take_is_named(capsys: pytest.CaptureFixture[str]) -> None:
     """With the line that uses it; `auto` then runs MJX, and says so."""
     env = Sorting("reach", "ecm")
-    with pytest.raises(ValueError, match=r"engine 'fused' can't run reach on ecm: .*sort.*test_fused_engine\.py:\d+"):
+    with pytest.raises(ValueError, match=r"engine 'fused' can't run reach on ecm: .*sort.*test_engine\.py:\d+"):
         make_engine(env, 1, "fused", "cpu")
     assert make_engine(env, 1, "auto", "cpu").name == "mjx"
     assert "engine mjx instead of fused: reach on ecm uses" in capsys.readouterr().err
