@@ -96,6 +96,10 @@ def test_the_curvature_between_two_bodies_is_how_the_force_on_one_falls_with_the
     assert slipping == {(False, True), (True, True), (True, False)}
 
 
+COUNT, STEPS = 16, 10
+"""Of all plays, so that one is compiled."""
+
+
 @pytest.fixture(scope="module")
 def two(tmp_path_factory: pytest.TempPathFactory) -> Falling:
     """Objects of 3 g and 0.15 g over a fixed one."""
@@ -113,8 +117,9 @@ def test_a_light_object_that_strikes_a_heavy_one_leaves_the_sum_of_momentum(two:
             [-0.11420292, 0.06757019, -0.22336657, -0.6129833, -5.54218, -7.6091914],
         ]
     ]
-    start = thrown(two.begin(1), position=position, quaternion=turns, velocity=velocity)
-    _, path = two.play(start, DT)
+    each = {"position": position, "quaternion": turns, "velocity": velocity}
+    start = thrown(two.begin(COUNT), **{name: np.repeat(value, COUNT, 0) for name, value in each.items()})
+    _, path = two.play(start, STEPS * DT)
     assert all(np.isfinite(part).all() for part in path)
     pushed = path.velocity[0, 0, :, :3] - np.array(velocity)[0, :, :3] - DT * np.array([0, 0, -9.81])
     given = two.masses.mass[:, None] * pushed
@@ -125,16 +130,16 @@ def test_a_light_object_that_strikes_a_heavy_one_leaves_the_sum_of_momentum(two:
 def test_what_one_object_loses_another_gains(two: Falling) -> None:
     """Thrown at each other at random, far from anything else."""
     rng = np.random.default_rng(1)
-    position = np.full((16, 2, 3), 0.5)
-    away = rng.standard_normal((16, 3))
+    position = np.full((COUNT, 2, 3), 0.5)
+    away = rng.standard_normal((COUNT, 3))
     position[:, 1] += 0.009 * away / np.linalg.norm(away, axis=-1, keepdims=True)
-    velocity = rng.uniform(-1, 1, (16, 2, 6)) * ([0.3] * 3 + [12.0] * 3)
-    start = thrown(two.begin(16), position=position, quaternion=random_turns(rng, 16, 2), velocity=velocity)
-    _, path = two.play(start, 10 * DT)
-    mass, t = two.masses.mass[:, None], DT * np.arange(1, 11)[:, None]
+    velocity = rng.uniform(-1, 1, (COUNT, 2, 6)) * ([0.3] * 3 + [12.0] * 3)
+    start = thrown(two.begin(COUNT), position=position, quaternion=random_turns(rng, COUNT, 2), velocity=velocity)
+    _, path = two.play(start, STEPS * DT)
+    mass, t = two.masses.mass[:, None], DT * np.arange(1, STEPS + 1)[:, None]
     momentum = (mass * path.velocity[..., :3]).sum(2) - (mass * velocity[:, None, :, :3]).sum(2)
     momentum -= mass.sum() * np.array([0, 0, -9.81]) * t
-    pushed = path.velocity[:, -1, :, :3] - velocity[..., :3] - DT * 10 * np.array([0, 0, -9.81])
+    pushed = path.velocity[:, -1, :, :3] - velocity[..., :3] - DT * STEPS * np.array([0, 0, -9.81])
     struck = np.abs(pushed[:, 1]).max(-1) > 0.02
     assert struck.sum() >= 4
     assert np.abs(momentum[struck]).max() < 0.01 * np.abs(mass[1] * pushed[struck, 1]).max()

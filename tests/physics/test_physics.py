@@ -23,6 +23,7 @@ from surgical_marl.scenes.timing import DECIMATION, TIMESTEP
 from tests.helpers.rollouts import read_state, roll_out
 
 SCENES = scenes_without_objects()
+SEVERAL = [name for name in SCENES if len(load_scene(name).agents) > 1]
 STEPS, EPISODES = 10_000, 20
 
 
@@ -57,8 +58,14 @@ def play(scene: Scene, episodes: int, steps: int, seed: int = 0) -> Iterator[tup
         yield qpos, qvel
 
 
-@pytest.mark.parametrize("control", CONTROL_MODES)
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize(
+    ("name", "control"),
+    [
+        pytest.param(name, control, marks=[pytest.mark.slow] * (name in SEVERAL and control != "position"))
+        for name in SCENES
+        for control in CONTROL_MODES
+    ],
+)
 def test_limits_hold_at_full_effort(name: str, control: str) -> None:
     """10,000 control steps without NaN or warning; joints come to their stops, and in no physics step does one pass a
     limit of the URDF by 1 % of its range."""

@@ -147,7 +147,7 @@ def run(lines: Code) -> Iterator[tuple[int, int | None]]:
         at += 1
 
 
-@settings(max_examples=500)
+@settings(max_examples=150)
 @given(codes())
 def test_every_read_sees_the_write_that_it_saw_before(lines: Code) -> None:
     for changed in (share_memory(lines), interleave(lines), share_memory(interleave(lines))):
