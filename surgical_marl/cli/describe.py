@@ -6,6 +6,8 @@ import inspect
 
 from surgical_marl.content import list_arms, list_objects, list_policies, list_scenes
 from surgical_marl.plugins.algorithms import ALGORITHMS, list_algorithms
+from surgical_marl.plugins.controls import CONTROLS, list_controls
+from surgical_marl.plugins.registry import Registry
 from surgical_marl.plugins.tasks import TASKS, list_tasks
 from surgical_marl.robots.arm import load_arm
 from surgical_marl.scenes.load import load_scene
@@ -21,7 +23,8 @@ def describe(kind: str) -> str:
         "scenes": lambda: [_scene(load_scene(name)) for name in list_scenes()],
         "arms": lambda: [_arm(name) for name in list_arms()],
         "objects": lambda: [_object(name) for name in list_objects()],
-        "algorithms": lambda: [_algorithm(name) for name in list_algorithms()],
+        "controls": lambda: [_documented(CONTROLS, name) for name in list_controls()],
+        "algorithms": lambda: [_documented(ALGORITHMS, name) for name in list_algorithms()],
         "policies": _policies,
     }[kind]()
     return "\n".join(entries)
@@ -71,10 +74,10 @@ def _task(name: str) -> str:
         return f"{name:14} {error}"
 
 
-def _algorithm(name: str) -> str:
-    """Return the description of an algorithm, or why it can't be imported."""
+def _documented(registry: Registry, name: str) -> str:
+    """Return the first line of the docstring of a registry's class, or why it can't be imported."""
     try:
-        documentation = inspect.getdoc(ALGORITHMS.load(name)) or ""
+        documentation = inspect.getdoc(registry.load(name)) or ""
     except ValueError as error:
         return f"{name:14} {error}"
     return f"{name:14} {documentation.partition(chr(10))[0]}"

@@ -26,13 +26,14 @@ from surgical_marl.content import find, list_arms, list_objects, list_policies, 
 from surgical_marl.engines.stages import told
 from surgical_marl.machine import lacks_memory
 from surgical_marl.plugins.algorithms import list_algorithms
+from surgical_marl.plugins.controls import list_controls
 from surgical_marl.plugins.task_file import is_task_file, label
 from surgical_marl.plugins.tasks import TASKS, find_task, list_tasks, scene_of
+from surgical_marl.robots.arm import CONTROL_MODES
 from surgical_marl.runs.process import lasting_streams, open_streams, use_utf8
 from surgical_marl.runs.progress import Compilations, preparing
 from surgical_marl.runs.settings import Settings, check_overrides
 from surgical_marl.runtime import calm_threads, defer_compiler
-from surgical_marl.tasks.base.options import choices
 from surgical_marl.untrusted.files import user_path
 from surgical_marl.untrusted.values import shown
 
@@ -41,11 +42,11 @@ _LISTS = {
     "scenes": list_scenes,
     "arms": list_arms,
     "objects": list_objects,
+    "controls": list_controls,
     "algorithms": list_algorithms,
     "policies": list_policies,
 }
 
-_CONTROL = choices("control")
 _TAKE_SETTINGS = ("train", "bench train", "bench solve")
 """Commands that take `key=value`."""
 
@@ -190,7 +191,8 @@ def _parser() -> argparse.ArgumentParser:
     scene.add_argument("source", metavar="NAME_OR_PATH", help="a scene's name or .yaml file")
     scene.add_argument("--format", type=one_of(("mjcf",)), default="mjcf", metavar="mjcf", help="MuJoCo's XML")
     scene.add_argument("--out", type=user_path, metavar="FILE", help="default: <scene>.xml in the current folder")
-    scene.add_argument("--control", type=one_of(_CONTROL), default=_CONTROL[0], metavar="|".join(_CONTROL))
+    modes = "|".join(CONTROL_MODES)
+    scene.add_argument("--control", type=one_of(CONTROL_MODES), default=CONTROL_MODES[0], metavar=modes)
     scene.set_defaults(check=_check_export_scene, command=_export_scene, name="export scene")
     policy = kinds.add_parser("policy", help="a trained policy as a folder: ONNX, safetensors, evaluation, card, clip")
     policy.add_argument(

@@ -19,6 +19,7 @@ import numpy as np
 from gymnasium import spaces
 
 from surgical_marl.cache import cached
+from surgical_marl.control.controller import Controller, actuators_of
 from surgical_marl.engines.stepper import describe
 from surgical_marl.envs.infos import infos
 from surgical_marl.envs.knowledge import Knowledge
@@ -64,12 +65,13 @@ class Env:
         self.options: Options = make_options(task, scene, options)
         self.task_name = self.options.task
         task_class = TASKS.load(self.task_name)
-        self.scene = load_scene(self.options.scene, self.options.control)
+        self.scene = load_scene(self.options.scene, actuators_of(self.options.control))
         self.task: Task = task_class(self.scene, self.options)
         self.max_steps = self.options.max_steps or self.task.max_steps
         self.agents = self.scene.agents
         self.decimation = self.options.decimation
         self.control_dt = self.decimation * self.scene.model.opt.timestep
+        self.controller = Controller(self.scene, self.options.control, dt=self.control_dt)
         chosen = {**self.scene.observe, **self.options.observe}
         for agent in chosen:
             if agent not in self.agents:
@@ -83,9 +85,9 @@ class Env:
         self.observed = {a: Observed(self.task, own, chosen.get(a), self.scaled) for a, own in known.items()}
 
     @property
-    def _joints(self) -> list[int]:
-        """How many joints of each arm an action commands."""
-        return [len(mount.arm.actuated) for mount in self.scene.mounts.values()]
+    def _sizes(self) -> list[int]:
+        """The length of each agent's action without a message."""
+        return [self.controller.num_actions(agent) for agent in self.agents]
 
     @property
     def title(self) -> str:
@@ -126,14 +128,14 @@ class Env:
         model = np.empty(mujoco.mj_sizeModel(self.scene.model), np.uint8)
         mujoco.mj_saveModel(self.scene.model, None, model)
         observed = {agent: (seen.names, seen.stated) for agent, seen in self.observed.items()}
-        how = (self.scene.control, self.decimation, self.scene.randomisation, self.options.start, self.scaled)
+        how = (self.options.control, self.decimation, self.scene.randomisation, self.options.start, self.scaled)
         about = f"{self.task_name} {self.task.constants} {how} {observed} {self.messages}"
         return self.scene.fingerprint + about.encode() + model.tobytes()
 
     @property
     def classes(self) -> tuple[type, ...]:
         """Classes whose code a step runs."""
-        return type(self), type(self.task)
+        return type(self), type(self.task), *self.controller.classes
 
     @cached_property
     def parameters(self) -> dict[str, Any]:
@@ -163,18 +165,18 @@ class Env:
         """The physics with motors and encoders, randomised as the scene says."""
         from surgical_marl.physics.plant import Plant
 
-        return Plant(self.simulator)
+        return Plant(self.simulator, self.controller)
 
     def num_actions(self, agent: str) -> int:
         """Return the length of an agent's action.
 
-        An action has one number for each actuated joint, in joint order. The last one, if the arm has a jaw, is the
-        jaw's command: open (> 0) or closed. The numbers of a message follow, if there are `messages`.
+        An action is the numbers of the agent's terms (`action_terms`). Those of a message follow, if there are
+        `messages`.
         """
-        return self._joints[self.agents.index(agent)] + self.messages
+        return self.controller.num_actions(agent) + self.messages
 
     def action_space(self, agent: str) -> spaces.Box:
-        """[-1, 1] for every actuated joint, and every number of a message."""
+        """[-1, 1] for every number of the terms, and of a message."""
         return spaces.Box(-1.0, 1.0, (self.num_actions(agent),), np.float32)
 
     def observation_space(self, agent: str) -> spaces.Box:
@@ -232,7 +234,7 @@ class Env:
         task, *_ = self._bound(parameters)
         actions, messages = self._part(actions)
         commanded = jnp.clip(jnp.concatenate([actions[agent] for agent in self.agents]), -1.0, 1.0)
-        physics, hidden = self.plant.command(carry.physics, carry.hidden, actions)
+        physics, hidden, told = self.plant.command(carry.physics, carry.hidden, actions)
         physics, contacts, arms = self.plant.advance(physics, hidden)
         goal = task.advance(carry.goal, self.control_dt)
         tips = jnp.stack([view.tool_tip for view in arms.values()])
@@ -240,7 +242,7 @@ class Env:
             physics=physics, hidden=hidden, goal=goal, tips=tips, steps=carry.steps + 1, messages=messages,
             actions=commanded,
         )  # fmt: skip
-        return Moved(after, carry.tips, contacts, arms, commanded - carry.actions)
+        return Moved(after, carry.tips, contacts, arms, commanded - carry.actions, told)
 
     def _part(self, actions: dict[str, Array]) -> tuple[dict[str, Array], Any]:
         """Return what actions command the joints, and the messages in them as in `Carry`."""
@@ -255,7 +257,7 @@ class Env:
         task, max_steps, autoreset = self._bound(parameters)
         carry, contacts = moved.carry, moved.contacts
         arms = {agent: moved.arms[agent] for agent in self.agents}  # JAX sorts them by name
-        objects, ends = self.plant.objects(carry.physics, carry.hidden), np.cumsum(self._joints)[:-1]
+        objects, ends = self.plant.objects(carry.physics, carry.hidden), np.cumsum(self._sizes)[:-1]
         changes = dict(zip(self.agents, jnp.split(moved.changes, ends), strict=True))
         world = World(arms, carry.goal, sensed, objects, changes=changes)
         terms = task.rewards(world)
@@ -308,7 +310,7 @@ class Env:
         tips = jnp.stack([view.tool_tip for view in arms.values()])
         goal = task.remember(World(arms, start.goal, self._unsensed(), self.plant.objects(physics, hidden)))
         silence = jnp.zeros((len(self.agents), self.messages)) if self.messages else ()
-        rest = jnp.zeros(sum(self._joints))
+        rest = jnp.zeros(sum(self._sizes))
         return Carry(physics, goal, key, episode, jnp.int32(0), tips, hidden, silence, rest), contacts, arms
 
     def _observe(

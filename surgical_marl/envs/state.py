@@ -27,7 +27,7 @@ class Carry(NamedTuple):
     messages: Any = ()
     """What each arm said in the last step, [arms, K]; () without messages."""
     actions: Any = ()
-    """What the joints of all arms were commanded in the last step, in [-1, 1]; zeros at the start of an episode."""
+    """The actions of all arms in the last step without messages, in [-1, 1]; zeros at the start of an episode."""
 
 
 class State(NamedTuple):
@@ -67,3 +67,5 @@ class Moved(NamedTuple):
     arms: dict[str, ArmView]
     changes: Array
     """How the actions of all arms differ from the last ones."""
+    told: dict[str, dict[str, Array]]
+    """What action terms tell of the step, by agent and name of an entry of `infos`."""

@@ -1,8 +1,8 @@
 """The true state of arms, which physics moves, and the measured state, which policies observe.
 
-    plant = Plant(simulator)
+    plant = Plant(simulator, controller)
     hidden = plant.start(key)
-    physics, hidden = plant.command(plant.at_rest(hidden), hidden, actions)
+    physics, hidden, infos = plant.command(plant.at_rest(hidden), hidden, actions)
     physics, contacts, views = plant.advance(physics, hidden)
     seen = plant.measure(physics, hidden, contacts, views, key)
 
@@ -21,6 +21,7 @@ import mujoco
 import numpy as np
 from jax import Array
 
+from surgical_marl.control.controller import Controller
 from surgical_marl.physics.outputs import ArmView, Contacts, ObjectView
 from surgical_marl.physics.randomisation import Factors
 from surgical_marl.physics.simulator import Physics, Simulator
@@ -57,8 +58,8 @@ class Hidden(NamedTuple):
 class Plant:
     """A simulator behind motors, encoders and a network that are not ideal."""
 
-    def __init__(self, simulator: Simulator) -> None:
-        self._simulator, self._ranges = simulator, simulator.scene.randomisation
+    def __init__(self, simulator: Simulator, controller: Controller) -> None:
+        self._simulator, self._controller, self._ranges = simulator, controller, simulator.scene.randomisation
         model = simulator.scene.model
         exact = np.zeros(model.nq, bool)
         exact[simulator.address[simulator.jaws]] = True
@@ -93,7 +94,7 @@ class Plant:
             latency=jax.random.randint(next(keys), (), 0, r.latency + 1),
             motor=(simulator.home if qpos is None else simulator.at(qpos)).ctrl
             + believed,  # so that the arms stay where they are
-            pending=jnp.zeros((r.latency, sum(len(mount.arm.actuated) for mount in scene.mounts.values()))),
+            pending=jnp.zeros((r.latency, sum(map(self._controller.num_actions, scene.agents)))),
             objects=self._factors(jax.random.fold_in(key, len(Hidden._fields))),
         )
 
@@ -142,24 +143,25 @@ class Plant:
 
     def command(
         self, physics: Physics, hidden: Hidden | None, actions: dict[str, Array]
-    ) -> tuple[Physics, Hidden | None]:
-        """Return the state and the hidden values after actions have set the commands.
+    ) -> tuple[Physics, Hidden | None, dict[str, dict[str, Array]]]:
+        """Return the state and the hidden values after actions have set the commands, and infos of the action terms.
 
         The actions command the motors, at once or after the latency. The motors move the targets of the joints.
         """
         simulator = self._simulator
         if hidden is None:
-            return simulator.command(physics, actions), None
+            ctrl, infos = self._controller.command(physics.ctrl, physics.qpos, actions)
+            return physics._replace(ctrl=ctrl), None, infos
         actions, pending = self._delay(actions, hidden)
         read = physics.qpos + hidden.offset + self._play(physics, hidden)
-        motor = simulator.command(physics._replace(ctrl=hidden.motor), actions, read).ctrl
+        motor, infos = self._controller.command(hidden.motor, read, actions)
         hidden = hidden._replace(motor=motor, pending=pending)
         if not self._backlash.any():
-            return physics._replace(ctrl=motor), hidden
+            return physics._replace(ctrl=motor), hidden, infos
         # a joint's target moves once the motor has crossed the play
         half, target = hidden.backlash[simulator.address] / 2, motor[simulator.drives]
         target = jnp.clip(physics.ctrl[simulator.drives], target - half, target + half)
-        return physics._replace(ctrl=jnp.matmul(simulator.moment, target)), hidden
+        return physics._replace(ctrl=jnp.matmul(simulator.moment, target)), hidden, infos
 
     def advance(self, physics: Physics, hidden: Hidden | None) -> tuple[Physics, Contacts, Views]:
         """Advance physics by one control step, as `Simulator.advance` does, with the drawn values in place."""

@@ -1,7 +1,7 @@
 """The physics of a scene in pure JAX, for one environment: commands in, newest state and contacts out.
 
     simulator = Simulator(load_scene("bimanual_psm"))
-    physics = simulator.command(simulator.home, actions)
+    physics = simulator.home._replace(ctrl=commands)         # [nu], those of `surgical_marl.control`
     physics, contacts, views = simulator.advance(physics)
 
 docs/physics.md says how a step is computed and compares it with C MuJoCo.
@@ -79,30 +79,6 @@ class Simulator:
         if self.scene.control != "position":
             joints = joints * self.jaws  # a jaw is under position control in every mode
         return self.moment @ joints
-
-    def command(self, physics: Physics, actions: dict[str, Array], measured: Array | None = None) -> Physics:
-        """Return the physics with the next command of every actuator.
-
-        Commands start from the joints' positions, or from `measured` [nq] if it is given. A jaw moves to open or closed
-        at its speed, whatever the control mode. A cable follows the commands of its joints.
-
-        A position target leads its joint by no more than full effort at full speed takes. Without this limit, the
-        target of a joint that is held in place would move further and further ahead, and the joint would race after it
-        once free.
-        """
-        ctrl, own = physics.ctrl[self.drives], jnp.zeros(self.scene.model.nu, jnp.float32)
-        for agent in self.scene.agents:
-            own = own.at[self._actuators[agent]].set(jnp.clip(actions[agent], -1.0, 1.0))
-        action = own[self._leaders]
-        reach = self._speed * np.float32(self.control_dt)
-        if self.scene.control == "position":
-            now = (physics.qpos if measured is None else measured)[self.address]
-            lead = jnp.clip(ctrl + action * reach - now, -self._lead, self._lead)
-            command = jnp.clip(now + lead, self._low, self._high)
-        else:
-            command = action * (self._speed if self.scene.control == "velocity" else self._effort)
-        jaw = ctrl + jnp.clip(jnp.where(action > 0, self._open, self._closed) - ctrl, -reach, reach)
-        return physics._replace(ctrl=jnp.matmul(self.moment, jnp.where(self.jaws, jaw, command)))
 
     def advance(self, physics: Physics) -> tuple[Physics, Contacts, dict[str, ArmView]]:
         """Advance physics by one control step, and return it with the contacts and views at its end.
@@ -246,30 +222,20 @@ class Simulator:
         return views
 
     def _index_joints(self) -> None:
-        """Index each agent's joints and sites in the model's arrays, and scale actions to commands."""
+        """Index each agent's joints, actuators and sites in the model's arrays."""
         scene, model = self.scene, self.scene.model
         names = [model.actuator(i).name for i in range(model.nu)]
         # actuators of joints are in the URDF's order, `qpos` is in that of the tree
         self.drives = np.flatnonzero(model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT)
         self.address = model.jnt_qposadr[model.actuator_trnid[self.drives, 0]]
         self.moment = np.asarray(scene.moment[:, self.address], np.float32)
-        rows = [
-            (names.index(f"{agent}/{joint.leader}"), bool(arm.jaw and joint.leader == arm.jaw.joint), joint, arm.jaw)
-            for agent, arm in ((agent, mount.arm) for agent, mount in scene.mounts.items())
-            for joint in arm.joints
-        ]
-        single = np.float32
-        self._leaders, self.jaws = np.array([row[0] for row in rows]), np.array([row[1] for row in rows])
-        self._speed = np.array([joint.drive.speed for _, _, joint, _ in rows], single)
-        self._effort = np.array([joint.effort for _, _, joint, _ in rows], single)
-        # gains on a joint that moves alone: its own and those of its cables
-        gains = np.array([model.actuator_gainprm[:, 0], -model.actuator_biasprm[:, 2]], single)
-        stiffness, damping = gains @ self.moment**2
-        self._lead = (self._effort + damping * self._speed) / stiffness
-        self._low = np.array([joint.lower for _, _, joint, _ in rows], single)
-        self._high = np.array([joint.upper for _, _, joint, _ in rows], single)
-        self._open = np.array([jaw.open if is_jaw and jaw else 0.0 for _, is_jaw, _, jaw in rows], single)
-        self._closed = np.array([jaw.closed if is_jaw and jaw else 0.0 for _, is_jaw, _, jaw in rows], single)
+        self.jaws = np.array(
+            [
+                bool(mount.arm.jaw and joint.leader == mount.arm.jaw.joint)
+                for mount in scene.mounts.values()
+                for joint in mount.arm.joints
+            ]
+        )
         self._joints = {agent: scene.qpos_index(agent) for agent in scene.agents}
         self._actuators = {
             agent: np.array([names.index(f"{agent}/{joint.name}") for joint in mount.arm.actuated])

@@ -14,7 +14,9 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_type_hints
 
 from surgical_marl.content import absolute, as_name
+from surgical_marl.plugins.controls import CONTROLS
 from surgical_marl.plugins.task_file import absolute as absolute_task
+from surgical_marl.plugins.task_file import is_task_file
 from surgical_marl.scenes.timing import DECIMATION
 from surgical_marl.untrusted.schema import Checked, choice, number
 
@@ -29,7 +31,7 @@ class Options(Checked):
     Attributes:
         task: a name of `list_tasks()`, or a task file, `my_task.py` or `my_task.py:Escort`.
         scene: a name of `list_scenes()` or the path of a scene file, which becomes absolute.
-        control: what an action commands: "position" moves position targets, "velocity" and "torque" command those.
+        control: a name of `list_controls()`: what an action commands (docs/control.md).
         difficulty: a level of the task; the docstring of the task says what each level is.
         goals: "training", or "held_out" for goals of evaluations, which training never draws.
         start: "home", or "random" for a collision-free posture that is drawn anew in each episode, if the task has such
@@ -52,7 +54,7 @@ class Options(Checked):
 
     task: str = "reach"
     scene: str = "bimanual_psm"
-    control: Literal["position", "velocity", "torque"] = choice("position", "what an action commands")
+    control: str = choice("position", "what an action commands")
     difficulty: str = choice("default", "how far, how fast, how crowded: a level of the task")
     goals: Literal["training", "held_out"] = choice("training", "which goals episodes are drawn from")
     start: Literal["home", "random"] = choice("home", "postures that episodes begin with")
@@ -67,6 +69,8 @@ class Options(Checked):
     def __post_init__(self) -> None:
         super().__post_init__()
         object.__setattr__(self, "task", absolute_task(self.task))
+        if not is_task_file(self.task):  # a task file may register a control of its own
+            CONTROLS.check(self.control)
         object.__setattr__(self, "scene", absolute("scenes", self.scene))
 
     def of_environment(self) -> dict[str, Any]:

@@ -1,0 +1,1 @@
+"""Actions: numbers of an agent become commands of its arm's actuators."""

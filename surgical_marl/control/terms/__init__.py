@@ -1,0 +1,1 @@
+"""The controls that ship, a module each; the module's name is the control's."""
