@@ -35,6 +35,7 @@ from typing import TYPE_CHECKING, Any
 from surgical_marl.content import list_arms, list_objects, list_policies, list_scenes
 from surgical_marl.interfaces.registration import register_ids, register_task
 from surgical_marl.plugins.algorithms import list_algorithms, register_algorithm
+from surgical_marl.plugins.controls import list_controls, register_control
 from surgical_marl.plugins.tasks import list_tasks, module_name
 from surgical_marl.runtime import note_forks
 
@@ -72,6 +73,7 @@ __all__ = [
     "jax_env",
     "list_algorithms",
     "list_arms",
+    "list_controls",
     "list_objects",
     "list_policies",
     "list_scenes",
@@ -81,6 +83,7 @@ __all__ = [
     "load_scene",
     "parallel_env",
     "register_algorithm",
+    "register_control",
     "register_task",
 ]
 

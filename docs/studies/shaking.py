@@ -93,7 +93,7 @@ class Watched(Env):
     def step(self, carry: Carry, actions: dict[str, Array], parameters: Any = None) -> State:
         """Do one control step."""
         simulator = self.simulator
-        physics = simulator.command(carry.physics, actions)
+        physics = self.controller.apply(carry.physics, actions)
 
         def substep(state: tuple[Physics, Array, Array], _: None) -> tuple[tuple[Physics, Array, Array], None]:
             physics, overlap, struck = state

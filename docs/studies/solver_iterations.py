@@ -13,6 +13,7 @@ import numpy as np
 
 from docs.studies.command import make_parser
 from surgical_marl import load_scene
+from surgical_marl.control.controller import Controller
 from surgical_marl.physics import joined
 from surgical_marl.physics.outputs import Touch
 from surgical_marl.physics.simulator import Simulator
@@ -35,7 +36,7 @@ def states_in_contact(scene: Scene) -> tuple[Physics, np.ndarray, np.ndarray]:
     pairs = zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)
     index = {frozenset(pair): i for i, pair in enumerate(pairs)}
     simulated = Simulator(scene)
-    command, now = jax.jit(simulated.command), simulated.home
+    command, now = jax.jit(Controller(scene, dt=simulated.control_dt).apply), simulated.home
     data.qpos[:] = scene.home
     before, velocities, forces, wrench = [], [], [], np.zeros(6)
     for step in range(STEPS):

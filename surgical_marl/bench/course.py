@@ -15,6 +15,7 @@ from surgical_marl.bench.grasping import Starts, grasps
 from surgical_marl.bench.physics import PhysicsAlone
 from surgical_marl.bench.playing import played, policy_of
 from surgical_marl.bench.workload import DISTINCT, Workload
+from surgical_marl.control.controller import Controller, actuators_of
 from surgical_marl.engines.choose import make_engine
 from surgical_marl.envs.env import Env
 from surgical_marl.physics.simulator import Simulator
@@ -74,10 +75,11 @@ def make_course(workload: Workload) -> Course:
     import jax
 
     player = policy_of(workload) if workload.motion == "policy" else None  # refused before anything is compiled
-    scene = load_scene(workload.scene, workload.control)
+    scene = load_scene(workload.scene, actuators_of(workload.control))
     rng, n = np.random.default_rng(workload.seed), min(workload.distinct, max(workload.count, DISTINCT))
     simulator = Simulator(scene, HOLD)
-    command = jax.jit(jax.vmap(simulator.command))
+    controller = Controller(scene, workload.control, dt=simulator.control_dt)
+    command = jax.jit(jax.vmap(controller.apply))
     roll = _by_engine(workload, n) if scene.objects else partial(_by_mujoco, scene.model)
     now = jax.tree.map(lambda x: np.repeat(np.asarray(x)[None], n, 0), simulator.home)
     if player:
@@ -86,7 +88,7 @@ def make_course(workload: Workload) -> Course:
         now = jax.tree.unflatten(jax.tree.structure(now), parts)
     else:
         move = lambda now, action: roll(command(now, action))  # noqa: E731
-        now, actions = _drawn(scene, workload.motion, now, rng, jax.vmap(simulator.at), move)
+        now, actions = _drawn(controller, workload.motion, now, rng, jax.vmap(simulator.at), move)
     start, commands = jax.tree.map(np.asarray, now), []
     for action in actions:
         now = command(now, action)
@@ -98,13 +100,13 @@ def make_course(workload: Workload) -> Course:
 
 
 def _drawn(
-    scene: Scene, motion: str, now: Any, rng: np.random.Generator, at: Any, move: Callable[[Any, Any], Any]
+    controller: Controller, motion: str, now: Any, rng: np.random.Generator, at: Any, move: Callable[[Any, Any], Any]
 ) -> tuple[Any, list[dict[str, np.ndarray]]]:
     """Return the states [n, ...] to which random actions lead from `now`, and the actions of a course from there.
 
     `at` returns the states of arms at rest at some qpos; `move` makes a control step.
     """
-    n = len(now.qpos)
+    scene, n = controller.scene, len(now.qpos)
     closed, share = [], np.ones((n, 1), np.float32)
     if motion == "grasp":
         closed, starts = graspers(scene), grasps(scene, min(n, DISTINCT), rng)
@@ -113,7 +115,7 @@ def _drawn(
         share = np.where(starts.arms[:, None] > 1, GENTLE, share)
 
     def draw() -> dict[str, np.ndarray]:
-        drawn = {a: share * rng.uniform(-1, 1, (n, len(m.arm.actuated))) for a, m in scene.mounts.items()}
+        drawn = {a: share * rng.uniform(-1, 1, (n, controller.num_actions(a))) for a in scene.agents}
         for agent in closed:
             drawn[agent][:, -1] = -1.0
         return {agent: values.astype(np.float32) for agent, values in drawn.items()}

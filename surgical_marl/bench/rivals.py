@@ -17,6 +17,7 @@ from mujoco import rollout
 from surgical_marl.bench.clock import Clock, cpu_clock
 from surgical_marl.bench.course import HOLD, LAPS, Course, full_state, tile, with_objects
 from surgical_marl.bench.workload import Workload
+from surgical_marl.control.controller import actuators_of
 from surgical_marl.machine import cores
 from surgical_marl.runtime import prepare_mjx, prepare_warp
 from surgical_marl.scenes.load import load_scene
@@ -102,7 +103,7 @@ RIVALS: dict[str, Callable[[Workload, Course], Contender]] = {"mujoco": c_mujoco
 
 def _exported(workload: Workload, course: Course) -> tuple[mujoco.MjModel, np.ndarray]:
     """Return the model of a workload's scene, and the states [n, 1 + nq + nv] at the start of a course."""
-    scene = load_scene(workload.scene, workload.control)
+    scene = load_scene(workload.scene, actuators_of(workload.control))
     if not scene.objects:
         return scene.model, full_state(course.qpos, course.qvel)
     return mujoco.MjModel.from_xml_string(mjcf(scene)), full_state(*with_objects(scene, course))

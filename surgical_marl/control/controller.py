@@ -10,7 +10,7 @@ a jaw.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
@@ -34,6 +34,7 @@ class Controller:
         frame: the frame that actions refer to.
 
     Attributes:
+        scene: the arms.
         terms: agent -> name -> term, in the order of the agent's action.
 
     Raises:
@@ -42,7 +43,7 @@ class Controller:
 
     def __init__(self, scene: Scene, control: str = "position", *, dt: float, frame: str = "base") -> None:
         self.terms = {agent: _terms(scene, agent, control, dt, frame) for agent in scene.agents}
-        self._scene = scene
+        self.scene = scene
         names = [scene.model.actuator(i).name for i in range(scene.model.nu)]
         self._qpos = {agent: scene.qpos_index(agent) for agent in scene.agents}
         self._ctrl = {
@@ -95,16 +96,20 @@ class Controller:
             joints.append(self._with_followers(agent, own))
         return jnp.matmul(self._moment, jnp.concatenate(joints)), infos
 
+    def apply(self, physics: Any, actions: Mapping[str, Array]) -> Any:
+        """Return a state of `Simulator` with the next commands of all actuators."""
+        return physics._replace(ctrl=self.command(physics.ctrl, physics.qpos, actions)[0])
+
     def _with_followers(self, agent: str, commands: Array) -> Array:
         """Return the commands of all moving joints of an arm from those of its actuated joints, [n].
 
         A joint that mimics another gets the command of that joint, times the multiplier.
         """
-        arm = self._scene.mounts[agent].arm
+        arm = self.scene.mounts[agent].arm
         names = [joint.name for joint in arm.actuated]
         leaders = np.array([names.index(joint.leader) for joint in arm.joints])
         factors = np.array([joint.multiplier for joint in arm.joints], np.float32)
-        by_position = arm.moves_jaw[leaders] | (self._scene.control == "position")
+        by_position = arm.moves_jaw[leaders] | (self.scene.control == "position")
         offsets = np.array([joint.offset for joint in arm.joints], np.float32) * by_position
         found = commands[leaders]
         return found if (factors == 1).all() and not offsets.any() else found * factors + offsets

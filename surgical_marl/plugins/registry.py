@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import pkgutil
+import sys
 from collections.abc import Callable
-from functools import cache, cached_property, partial
+from functools import cached_property, lru_cache, partial
 from importlib import import_module
-from importlib.metadata import EntryPoint, EntryPoints, entry_points
+from importlib.metadata import EntryPoint, entry_points
 from typing import Any, NamedTuple
 
 from surgical_marl.content import unknown
@@ -108,7 +109,7 @@ class Registry:
 
     @cached_property
     def _points(self) -> list[EntryPoint]:
-        return list(_installed().select(group=self.group))
+        return list(_installed(tuple(sys.path)).select(group=self.group))
 
     def _load_shipped(self, name: str) -> type:
         module, base = import_module(f"{self.package}.{name}"), self._base()
@@ -117,9 +118,9 @@ class Registry:
         return cls
 
 
-@cache
-def _installed() -> EntryPoints:
-    """Return the entry points of all installed packages. Reading them takes as long for one group as for all."""
+@lru_cache(maxsize=1)
+def _installed(path: tuple[str, ...]) -> Any:
+    """Return the entry points of all packages on a path. Reading them takes as long for one group as for all."""
     return entry_points()
 
 

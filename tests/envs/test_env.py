@@ -16,6 +16,7 @@ from surgical_marl.physics.contact.arm_contacts import SLOTS
 from surgical_marl.physics.simulator import Physics
 from surgical_marl.scenes.timing import DECIMATION, TIMESTEP
 from tests.helpers.actions import random_actions
+from tests.helpers.commands import commander
 
 SCENES = ("psm", "bimanual_psm")
 
@@ -196,7 +197,7 @@ def settle(env: Any, data: mujoco.MjData, start: dict[str, np.ndarray]) -> Any:
 def compiled(scene: str) -> tuple[Any, Any, Any]:
     """An `Env`, and commands and a control step of its physics by MJX, which take up to a minute to compile."""
     env = batched(scene).env
-    return env, jax.jit(env.simulator.command), jax.jit(env.simulator.advance)
+    return env, jax.jit(commander(env.simulator)), jax.jit(env.simulator.advance)
 
 
 def rollout(scene: str, steps: int, model: Any = None, start: dict[str, np.ndarray] | None = None) -> tuple[Any, ...]:

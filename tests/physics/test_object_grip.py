@@ -16,6 +16,7 @@ import surgical_marl as sm
 from docs.studies.shaking import CLOSING, Grasps
 from surgical_marl.physics import together
 from surgical_marl.physics.simulator import Simulator
+from tests.helpers.commands import commander
 
 STEPS = 240
 FRICTIONS = (0.12, 0.18, 0.25)
@@ -94,8 +95,10 @@ def test_a_finger_pressed_on_something_stops_there(
     joints = [joint.name for joint in scene.mounts["psm_0"].arm.actuated]
     down = jnp.zeros(len(joints)).at[joints.index("insertion")].set(1.0).at[-1].set(-1.0)
 
+    command = commander(simulator)
+
     def step(physics: Any, _: None) -> Any:
-        physics, _, views = simulator.advance(simulator.command(physics, {"psm_0": down}))
+        physics, _, views = simulator.advance(command(physics, {"psm_0": down}))
         return physics, (
             objects.depths(physics)[on_arm].max(),
             views["psm_0"].bump_force,

@@ -13,6 +13,7 @@ import yaml
 
 from surgical_marl.bench.grasping import grasps
 from surgical_marl.content import find
+from surgical_marl.control.controller import Controller
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.physics.contact.contact_pairs import Tables
 from surgical_marl.physics.plant import Hidden, Plant
@@ -33,7 +34,8 @@ def scene_file(folder: Path, randomisation: str) -> str:
 
 
 def drawn(folder: Path, randomisation: str, count: int = 500) -> tuple[Plant, Hidden]:
-    plant = Plant(Simulator(load_scene(scene_file(folder, randomisation))))
+    simulator = Simulator(load_scene(scene_file(folder, randomisation)))
+    plant = Plant(simulator, Controller(simulator.scene, dt=simulator.control_dt))
     return plant, jax.jit(jax.vmap(plant.start))(jax.vmap(jax.random.PRNGKey)(jnp.arange(count)))
 
 

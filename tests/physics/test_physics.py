@@ -15,11 +15,13 @@ import pytest
 
 from docs.studies.energy import energy_drift
 from surgical_marl import load_arm, load_scene
+from surgical_marl.control.controller import Controller
 from surgical_marl.physics.simulator import Simulator
 from surgical_marl.robots.arm import CONTROL_MODES
 from surgical_marl.scenes.placing import scenes_without_objects
 from surgical_marl.scenes.scene import Scene
 from surgical_marl.scenes.timing import DECIMATION, TIMESTEP
+from tests.helpers.commands import commander
 from tests.helpers.rollouts import read_state, roll_out
 
 SCENES = scenes_without_objects()
@@ -46,7 +48,8 @@ def play(scene: Scene, episodes: int, steps: int, seed: int = 0) -> Iterator[tup
     actions = {
         agent: np.float32([[sides() for _ in range(count)] for _ in range(episodes)]) for agent, count in joints.items()
     }
-    command = jax.jit(jax.vmap(lambda physics, qpos, action: simulator.command(physics._replace(qpos=qpos), action)))
+    of_one = commander(simulator)
+    command = jax.jit(jax.vmap(lambda physics, qpos, action: of_one(physics._replace(qpos=qpos), action)))
     physics = jax.tree.map(lambda part: jnp.tile(part, (episodes, 1)), simulator.home)
     qpos = np.tile(scene.home, (episodes, 1, 1))
     for step in range(steps):
@@ -112,7 +115,7 @@ def test_a_commanded_velocity_is_reached_and_held(name: str) -> None:
     simulator = Simulator(scene)
     damping = -scene.model.actuator_biasprm[:, 2]
     yields = np.linalg.inv(scene.moment.T * damping @ scene.moment)
-    command, physics = jax.jit(simulator.command), simulator.home
+    command, physics = jax.jit(commander(simulator)), simulator.home
     for i, joint in enumerate(arm.actuated):
         if arm.jaw and joint.name == arm.jaw.joint:
             continue
@@ -142,7 +145,7 @@ def test_a_commanded_torque_accelerates_as_newton_says(name: str) -> None:
         data.qpos[:] = scene.home
         action = np.zeros(len(arm.actuated), np.float32)
         action[i] = -0.3
-        data.ctrl[:] = simulator.command(simulator.home, {agent: action}).ctrl
+        data.ctrl[:] = commander(simulator)(simulator.home, {agent: action}).ctrl
         mujoco.mj_forward(model, data)
         mass = np.zeros((model.nv, model.nv))
         mujoco.mj_fullM(model, data, mass)
@@ -189,8 +192,9 @@ def test_a_urdf_may_list_its_joints_in_any_order(tmp_path: Path) -> None:
         physics = simulator.home
         np.testing.assert_allclose(arm.home[[j.name for j in arm.actuated].index("insertion")], 0.1)
         for _ in range(20):
-            values = np.array([action.get(joint.name, 0.0) for joint in arm.actuated], np.float32)
-            physics = simulator.command(physics._replace(qpos=jnp.asarray(data.qpos, jnp.float32)), {agent: values})
+            order = np.concatenate([term.joints for term in Controller(scene, dt=0.02).terms[agent].values()])
+            values = np.array([action.get(arm.actuated[joint].name, 0.0) for joint in order], np.float32)
+            physics = commander(simulator)(physics._replace(qpos=jnp.asarray(data.qpos, jnp.float32)), {agent: values})
             data.ctrl[:] = physics.ctrl
             mujoco.mj_step(scene.model, data, DECIMATION)
         mujoco.mj_kinematics(scene.model, data)

@@ -14,6 +14,7 @@ import pytest
 from surgical_marl import load_scene
 from surgical_marl.content import find
 from surgical_marl.physics.simulator import Simulator
+from tests.helpers.commands import commander
 
 HEAVIER = 3.0
 
@@ -47,7 +48,7 @@ def test_arms_of_one_name_move_by_their_own_models(control: str, tmp_path: Path)
     assert scene.types == {"ecm": ("ecm_0",), "ecm-2": ("ecm_1",)}
     simulator = Simulator(scene, decimation=1)
     action = {agent: np.full(4, 0.5, np.float32) for agent in scene.agents}
-    start = simulator.command(simulator.home, action)
+    start = commander(simulator)(simulator.home, action)
     physics, *_ = jax.jit(simulator.advance)(start)
     data = mujoco.MjData(scene.model)
     data.qpos[:], data.ctrl[:] = scene.home, start.ctrl

@@ -16,6 +16,7 @@ from surgical_marl.policies.team import Team
 from surgical_marl.policies.teammates import Teammates
 from surgical_marl.scenes.load import load_scene
 from surgical_marl.view.hand import Hand
+from tests.helpers.commands import commander
 
 
 @cache
@@ -37,15 +38,15 @@ def test_a_jaw_stays_where_it_is_commanded_to_be(control: str, opening: int) -> 
     """To within one step's way, and exactly where it is open or closed. Two numbers of each action are a message."""
     made = simulator(control)
     scene, arm = made.scene, made.scene.mounts["psm_0"].arm
-    env = commanded(made.home, made)
+    env, command = commanded(made.home, made), commander(made)
     for _ in range(opening):
-        env.physics = made.command(env.physics, {"psm_0": np.ones(7, np.float32) * arm.moves_jaw})
+        env.physics = command(env.physics, {"psm_0": np.ones(7, np.float32) * arm.moves_jaw})
     before, still = np.asarray(env.physics.ctrl), Frozen(env, ["psm_0"])
     reach = made.control_dt * arm.speed[arm.moves_jaw][0] * (opening not in (0, 40))
     for _ in range(9):
         action = still({"psm_0": np.zeros((1, 3))})["psm_0"]
         assert action.shape == (1, 9) and action.dtype == np.float32 and not action[:, 7:].any()
-        env.physics, env.steps = made.command(env.physics, {"psm_0": action[0, :7]}), env.steps + 1
+        env.physics, env.steps = command(env.physics, {"psm_0": action[0, :7]}), env.steps + 1
         np.testing.assert_allclose(env.physics.ctrl, before, atol=reach + 1e-6)
         jaw = scene.model.actuator("psm_0/jaw_left").id
         others = np.delete(env.physics.ctrl - before, [jaw, jaw + 1])

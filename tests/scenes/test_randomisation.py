@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from surgical_marl.content import find
+from surgical_marl.control.controller import Controller
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.envs.env import Env
 from surgical_marl.physics.plant import Plant
@@ -37,7 +38,8 @@ def scene_file(folder: Path, randomisation: str, name: str = "psm") -> str:
 
 
 def plant_of(path: str, control: str = "position") -> Plant:
-    return Plant(Simulator(load_scene(path, control)))
+    simulator = Simulator(load_scene(path, control))
+    return Plant(simulator, Controller(simulator.scene, control, dt=simulator.control_dt))
 
 
 def drawn(plant: Plant, count: int = 500) -> Any:
