@@ -15,9 +15,9 @@ import numpy as np
 from surgical_marl.engines.fused import engine, kernel
 from surgical_marl.engines.fused.arrays import make_arrays
 from surgical_marl.engines.fused.compiler import Fields, interpret, tables, trace
-from surgical_marl.engines.fused.emit import Emitter
 from surgical_marl.engines.fused.graph import Graph
 from surgical_marl.engines.fused.macros import CUDA
+from surgical_marl.engines.fused.pipeline import Program, compile_program
 from surgical_marl.engines.fused.source_cache import load_source
 
 Stores = list[tuple[str, int, int]]
@@ -90,7 +90,7 @@ def worked(function: Callable[..., Any], *columns: Any) -> np.ndarray:
 
 def _launched(function: Callable[..., Any], columns: Any, in_place: bool) -> tuple[Any, Any]:
     graph, stores, layout, inputs, outputs = make_stores(function, columns, in_place)
-    body = Emitter(graph, stores, vector=kernel.LANES > 1).body()
+    body = compile_program(Program(graph, stores, vector=kernel.LANES > 1)).text
     compiled = kernel.compile_kernels({"run": body}, "cpu")["run"]
     count = len(jax.tree.leaves(columns)[0])
     stride = -(-count // kernel.LANES) * kernel.LANES

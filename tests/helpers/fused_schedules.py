@@ -11,7 +11,9 @@ import numpy as np
 
 from surgical_marl.engines.fused.graph import Branch, Graph, Loop, Value
 from surgical_marl.engines.fused.operations import DTYPES, FOLD
-from surgical_marl.engines.fused.schedule import Schedule, Scheduler
+from surgical_marl.engines.fused.pipeline import PASSES, Program
+from surgical_marl.engines.fused.schedule import Schedule
+from surgical_marl.engines.fused.verify import check_schedule
 from tests.helpers.fused_kernels import make_stores
 
 
@@ -74,13 +76,13 @@ def compute(g: Graph, node: Value, read: Callable[[Value], Any], loads: Mapping[
         return g.tables[args[0]][int(read(args[1]))]
     if op == "select":
         return read(args[2]) if read(args[0]) else read(args[1])
-    if op == "room":
+    if op == "empty":
         return np.zeros(int(g.kinds[node][1:]), DTYPES[g.kinds[node][0]])
     if op == "array":
         return np.array([read(value) for value in args])
     if op == "read":
         return read(args[0])[int(read(args[1]))]
-    if op == "put":
+    if op == "update":
         start, values = int(read(args[1])), [read(value) for value in args[2:]]
         return np.concatenate([read(args[0])[:start], values, read(args[0])[start + len(values) :]])
     with np.errstate(all="ignore"):
@@ -109,7 +111,7 @@ class Scheduled:
             return known[value] if value >= 0 else self.graph.constants[~value]
 
         for kind, item in self.plan.regions[number].items:
-            if kind == "node" and item in self.plan.takers:
+            if kind == "node" and item in self.plan.in_place:
                 array, index, *values = map(read, self.graph.args[item])
                 array[int(index) : int(index) + len(values)] = values
                 known[item] = array
@@ -123,19 +125,22 @@ class Scheduled:
         return True
 
     def _branch(self, number: int, branch: Branch, known: Any, read: Callable[[Value], Any]) -> None:
-        wanted, taken = self.plan.alive[number], bool(read(branch.condition))
+        wanted, taken = self.plan.live[number], bool(read(branch.condition))
         values, found = (branch.chosen if taken else branch.others), {}
         region = self.plan.inside[number][0 if taken else 1]
         self._region(region, known.new_child(), lambda k, read: found.__setitem__(k, read(values[wanted[k]])))
         found = {branch.outs[j]: found[k] for k, j in enumerate(wanted)}
         # what is left where it is, is what the array's memory now holds; all else is in memory of the branch
         known.update(
-            {out: read(self.plan.kept[out]) if out in self.plan.kept else np.array(new) for out, new in found.items()}
+            {
+                out: read(self.plan.merged[out]) if out in self.plan.merged else np.array(new)
+                for out, new in found.items()
+            }
         )
 
     def _loop(self, number: int, loop: Loop, known: Any, read: Callable[[Value], Any]) -> None:
-        wanted, tested, count = self.plan.alive[number], loop.condition is not None, 0
-        taken = [loop.outs[j] in self.plan.takers for j in wanted]
+        wanted, tested, count = self.plan.live[number], loop.condition is not None, 0
+        taken = [loop.outs[j] in self.plan.in_place for j in wanted]
         starts = [read(loop.starts[j]) for j in wanted]
         values = [start if takes else np.array(start) for start, takes in zip(starts, taken, strict=True)]
         while tested or count < loop.length:
@@ -159,6 +164,15 @@ class Scheduled:
         known.update({loop.outs[j]: value for j, value in zip(wanted, values, strict=True)})
 
 
+def schedule_of(graph: Graph, results: list[Value]) -> Schedule:
+    """The schedule of values that are stored in fields of a buffer, after all passes before code is made."""
+    program = Program(graph, [("outs", k, value) for k, value in enumerate(results)], vector=False)
+    for one in PASSES[: [one.on for one in PASSES].index("code")]:
+        one.run(program)
+    check_schedule(graph, program.schedule, results)
+    return program.schedule
+
+
 def assert_schedule_is_right(function: Callable[..., Any], *columns: Any) -> None:
     """For the first environment of columns [N, ...] it gives what the graph says, and computes everything once."""
     graph, stores, _, inputs, _ = make_stores(function, columns)
@@ -168,7 +182,7 @@ def assert_schedule_is_right(function: Callable[..., Any], *columns: Any) -> Non
         for k, element in enumerate(column[0].ravel())
     }
     values = [value for _, _, value in stores]
-    plan = Scheduler(graph, values).run()
+    plan = schedule_of(graph, values)
     computed = Counter(item for region in plan.regions for item in region.items if item[0] != "result")
     assert set(computed.values()) <= {1}
     direct = Direct(graph, loads)

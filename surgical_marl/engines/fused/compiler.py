@@ -10,12 +10,14 @@ import numpy as np
 from jax.extend import core
 
 from surgical_marl.engines.faults import checked
-from surgical_marl.engines.fused.emit import Emitter, Watch, table_offsets
 from surgical_marl.engines.fused.graph import Graph, Value
 from surgical_marl.engines.fused.indexing import LEAST_TABLE, elements_of
+from surgical_marl.engines.fused.instrumentation import Watch
 from surgical_marl.engines.fused.jaxpr_interpreter import JaxprInterpreter
 from surgical_marl.engines.fused.kernel_layout import Leaf, Source
+from surgical_marl.engines.fused.lower import table_offsets
 from surgical_marl.engines.fused.operations import KINDS
+from surgical_marl.engines.fused.pipeline import CSE, Program, compile_program, switched_off
 from surgical_marl.engines.fused.symbolic_array import AnyArray, Table, array_of, values_of
 from surgical_marl.engines.stages import Stage
 from surgical_marl.engines.stepper import Stepper
@@ -73,7 +75,7 @@ def trace_environment(env: Stepper, stage: Stage) -> dict[str, Function]:
     return {"reset": reset, "move": move, "finish": finish}
 
 
-def make_source(functions: dict[str, Function], parameters: Any, vector: bool, stage: Stage) -> Source:
+def make_source(functions: dict[str, Function], parameters: Any, vector: bool, stage: Stage, title: str = "") -> Source:
     """Return the source of an environment's kernels.
 
     Args:
@@ -81,11 +83,12 @@ def make_source(functions: dict[str, Function], parameters: Any, vector: bool, s
         parameters: the environment's, a tree of numpy arrays.
         vector: whether the kernels are for a CPU, with vectors.
         stage: is told the stages in which the source is made.
+        title: of the environment, for the names of dumps.
 
     Raises:
         Unsupported: for something that has no kernel code, with the line of the source that uses it.
     """
-    fields, graph = Fields(), Graph()
+    fields, graph = Fields(), Graph(cse=CSE not in switched_off())
     given, places = _parameters(graph, parameters)
     carry = fields.place(functions["reset"].result.carry, "state")
     one = "move" if "move" in functions else "step"
@@ -113,12 +116,14 @@ def make_source(functions: dict[str, Function], parameters: Any, vector: bool, s
     watched = [*jax.tree.leaves(carry), *(leaf for _, leaf in checked(results))]
     reals = [leaf for leaf in watched if leaf.dtype == "float32"]
     watch = Watch(frozenset(place for leaf in reals for place in _places(leaf)), fault.first)
-    bodies = {}
+    compiled = {}
     for name, values in {**kernels, "reset": first}.items():
         stage(f"scheduling the {name}")
-        bodies[name] = _body(graph, stored.get(name, leaves), values, vector, watch)
+        stores = _stores(graph, stored.get(name, leaves), values)
+        compiled[name] = compile_program(Program(graph, stores, vector, watch), f"{title}.{name}" if title else name)
     return Source(
-        bodies=bodies,
+        bodies={name: one.text for name, one in compiled.items()},
+        large_branches=sum(one.large_branches for one in compiled.values()),
         tables=tables(graph),
         sizes=fields.sizes,
         carry=results.pop("carry"),
@@ -188,14 +193,14 @@ def tables(graph: Graph) -> dict[str, np.ndarray]:
     }
 
 
-def _body(graph: Graph, leaves: list[Leaf], values: list[list[Value]], vector: bool, watch: Watch) -> str:
-    """C that stores the values of each leaf in its fields. What is stored where it was loaded from needs no store."""
+def _stores(graph: Graph, leaves: list[Leaf], values: list[list[Value]]) -> list[tuple[str, int, Value]]:
+    """Return the stores of each leaf's values in its fields. A value that was loaded from there needs none."""
     stores: dict[tuple[str, int], Value] = {}
     for leaf, elements in zip(leaves, values, strict=True):
         for place, value in zip(_places(leaf), elements, strict=True):
             if value < 0 or graph.ops[value] != "load" or graph.args[value] != place:
                 stores[place] = value
-    return Emitter(graph, [(*place, value) for place, value in stores.items()], vector, watch).body()
+    return [(*place, value) for place, value in stores.items()]
 
 
 def _places(leaf: Leaf) -> list[tuple[str, int]]:

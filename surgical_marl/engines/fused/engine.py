@@ -52,7 +52,9 @@ class FusedEngine:
         self.device = ("cuda" if has_cuda() else "cpu") if device == "auto" else device
         with compiling(f"{env.title} ({self.name}, {self.device})") as stage:
             self.source: Source = load_source(env, vector=self.device == "cpu", stage=stage)
-            self._kernels = compile_kernels(self.source.bodies, self.device, num_envs, stage=stage)
+            self._kernels = compile_kernels(
+                self.source.bodies, self.device, num_envs, large_branches=self.source.large_branches, stage=stage
+            )
         carry = flatten(self.source.carry)
         self.carry_shapes = {name: leaf.shape for name, leaf in carry.items()}
         self._leaves = {**carry, **flatten(self.source.moved, ".moved")}
@@ -65,7 +67,7 @@ class FusedEngine:
         self._shares = [(a, b - a) for a, b in pairwise(edges)]
         if shares == 1:
             self._shares = [(0, num_envs if self.device == "cuda" else self._stride)]
-        if every := sorted_every(self.source.bodies.values(), self.device, num_envs, env.decimation):
+        if every := sorted_every(self.source.large_branches, self.device, num_envs, env.decimation):
             self._arrays.sort_columns(every, shares, any(kernel.split for kernel in self._kernels.values()))
         self._pool: ThreadPoolExecutor | None = None
         self._process = 0

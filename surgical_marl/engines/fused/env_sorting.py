@@ -9,11 +9,11 @@ read neighbouring memory fastest. An environment's results do not depend on its 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from typing import Any
 
 from surgical_marl.engines.fused.kernel import BLOCK, load_for_gpu, multiprocessors, torch_stream
-from surgical_marl.engines.fused.macros import AMOUNT, LANES, is_long, large_branches
+from surgical_marl.engines.fused.macros import AMOUNT, LANES, is_long
 from surgical_marl.runtime import prepare_warp
 
 wp = prepare_warp()
@@ -40,17 +40,16 @@ def control_steps(decimation: int, every: int = SELDOM) -> int:
     return max(1, every // decimation)
 
 
-def sorted_every(code: Collection[str], device: str, num_envs: int, decimation: int) -> int:
+def sorted_every(large_branches: int, device: str, num_envs: int, decimation: int) -> int:
     """Return after how many control steps environments are sorted; 0 for never.
 
-    What has no large branches is never sorted, and what has few only among many environments of a GPU.
+    Code without large branches is never sorted, and code with few only among many environments of a GPU.
     """
-    branches = large_branches(code)
-    if num_envs <= LANES or not branches:
+    if num_envs <= LANES or not large_branches:
         return 0
-    if branches < WORTH and (device == "cpu" or num_envs <= BLOCK * multiprocessors()):
+    if large_branches < WORTH and (device == "cpu" or num_envs <= BLOCK * multiprocessors()):
         return 0
-    return control_steps(decimation, OFTEN if is_long(code) else SELDOM)
+    return control_steps(decimation, OFTEN if is_long(large_branches) else SELDOM)
 
 
 def slowest_first(work: Any, columns: Any) -> Any:

@@ -4,7 +4,7 @@ A value is an int. A negative one is a constant, `constants[~value]`; others are
 reads and a kind, one of "f" (float32), "i" (int32), "u" (uint32), "b" (bool). Equal nodes are made once. Branches and
 loops are groups, whose results are nodes that name the group. `schedule.py` decides where a node is computed.
 
-An array in memory is a value too, of the kind "f64" if it holds 64 floats. Nothing changes an array: `put` makes
+An array in memory is a value too, of the kind "f64" if it holds 64 floats. Nothing changes an array: `update` makes
 another one. `emit.py` gives both the same place in memory if nothing else reads the first.
 
 Simplifications assume finite numbers: 0 * x is 0 even if x might be infinite, zero has no sign, and only `x != x` and
@@ -56,7 +56,9 @@ class Loop:
 class Graph:
     """Nodes of one program. Methods named like operations make them, simplified."""
 
-    def __init__(self) -> None:
+    def __init__(self, cse: bool = True) -> None:
+        self.cse = cse
+        """Whether equal nodes are made once: common subexpression elimination, by hash consing."""
         self.ops: list[str] = []
         self.args: list[tuple[Any, ...]] = []
         self.kinds: list[str] = []
@@ -95,7 +97,7 @@ class Graph:
     def node(self, op: str, *args: Any, kind: str) -> Value:
         """Return a node as it is, not simplified; equal nodes are shared."""
         key, known = (op, kind, *args), self._loads if op == "load" else self._known
-        found = known.get(key)
+        found = known.get(key) if self.cse or op == "load" else None
         if found is None:
             found = known[key] = self.fresh(op, *args, kind=kind)
         return found
@@ -335,9 +337,9 @@ class Graph:
         """Return an array that holds these values."""
         return self.node("array", *values, kind=f"{self.kind(values[0])}{len(values)}")
 
-    def put(self, array: Value, index: Value, values: list[Value]) -> Value:
+    def update(self, array: Value, index: Value, values: list[Value]) -> Value:
         """Return an array that holds `values` from `index` on; the index must be in range."""
-        return self.node("put", array, index, *values, kind=self.kinds[array])
+        return self.node("update", array, index, *values, kind=self.kinds[array])
 
     def read(self, array: Value, index: Value) -> Value:
         """`array[index]`; the index must be in range."""

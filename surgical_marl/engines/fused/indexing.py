@@ -289,5 +289,5 @@ def _write(
         )
         old = g.read(arrays[column], index)
         value = g.select(valid, old, combine(g, old, int(new[element])))
-        arrays[column] = g.put(arrays[column], index, [value])
+        arrays[column] = g.update(arrays[column], index, [value])
     return SymbolicArray(unpack(g, arrays, ids.shape, axes))

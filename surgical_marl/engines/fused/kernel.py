@@ -43,16 +43,23 @@ def compile_kernels(
     bodies: dict[str, str],
     device: str,
     num_envs: int = 0,
+    large_branches: int = 0,
     max_registers: int | None = None,
     stage: Stage = unsaid,
 ) -> dict[str, Kernel]:
-    """Compile C function bodies into kernels by name, in one module, for about so many environments.
+    """Compile C function bodies into kernels by name, in one module. Warp keeps compiled modules in its cache on disk.
 
-    Warp keeps compiled modules in its cache on disk. `stage` is told if there is none of these bodies.
+    Args:
+        bodies: C by the name of the kernel.
+        device: "cpu" or "cuda".
+        num_envs: about how many environments there will be.
+        large_branches: of the bodies (`Source`).
+        max_registers: most registers of a thread on a GPU, None for CUDA's own limit.
+        stage: is told if the cache has none of these bodies.
     """
     cuda = device == "cuda"
     block, split = BLOCK, 0
-    if cuda and is_long(bodies.values()):
+    if cuda and is_long(large_branches):
         block, split = block_of(num_envs, multiprocessors()), split_of(num_envs, multiprocessors())
     prelude = CUDA if cuda else CPU
     sources = tuple((name, f"{prelude}\n{body}\n{UNDEFINE}\n") for name, body in bodies.items())

@@ -41,6 +41,8 @@ class Source:
 
     bodies: dict[str, str]
     """C by the name of the kernel: "reset" and "step", or "move" and "finish" instead of that."""
+    large_branches: int
+    """In how many places of the kernels environments differ in how much they have to do."""
     tables: dict[str, np.ndarray]
     """All constant tables of a dtype, one after the other: "float32" and "int32"."""
     sizes: dict[str, int]

@@ -1,4 +1,4 @@
-"""The macros under the code that `emit.py` writes: scalars for CUDA, vectors of environments for Clang.
+"""The macros of printed code: scalars for CUDA, vectors of environments for Clang.
 
 Division and square root are CUDA's approximate ones, right to two units in the last place. They take numbers below
 2^-126 for 0, which saves the scaling of such numbers: one instruction in twenty of a physics step. That division gives
@@ -19,16 +19,14 @@ number of multiprocessors.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 LANES = 8
 """Environments in a vector on a CPU: 32 bytes of float32, an AVX register, and what `gatherd_d256` loads at once."""
 BRANCHES = 8
 """So many large branches make code long: all threads of a block should be at the same place of it."""
 AMOUNT_BITS = 17
 """Of `work`, for how much there was to do."""
-WAYS = 31 - AMOUNT_BITS
-"""Most branches that are told apart: the other bits of an int32, but for its sign."""
+PATHS = 31 - AMOUNT_BITS
+"""Most paths that are told apart: the other bits of an int32, but for its sign."""
 AMOUNT = 2**AMOUNT_BITS - 1
 """The bits of `work` that say how much there was to do."""
 PATIENCE = 2_000_000
@@ -37,30 +35,11 @@ ROUND = 2**20
 """Times that all blocks come by until they are counted from 0 again."""
 FEW = 64
 """So many threads in a block at most wait for other blocks. More of them keep a multiprocessor busy while some wait."""
-STRETCH = 120
-"""Statements between two fences. Clang's scheduler took 33 of 50 s for six arms without any, and takes 3 s."""
 
 
-def fenced(code: Iterable[str]) -> list[str]:
-    """Return code for a CPU, given as its statements, with fences."""
-    lines: list[str] = []
-    last = 0
-    for line in code:
-        lines.append(line)
-        if len(lines) - last > STRETCH and line.endswith(";"):
-            lines.append("FENCE")
-            last = len(lines)
-    return lines
-
-
-def large_branches(code: Iterable[str]) -> int:
-    """Return in how many places of some code environments differ in how much they have to do."""
-    return sum(part.count("WORK(") for part in code)
-
-
-def is_long(code: Iterable[str]) -> bool:
-    """Whether code is so long that it matters which of it neighbours need at the same time."""
-    return large_branches(code) >= BRANCHES
+def is_long(large_branches: int) -> bool:
+    """Return whether code with so many large branches is long: it matters which of it neighbours run at a time."""
+    return large_branches >= BRANCHES
 
 
 _WORKED = f"""
@@ -233,8 +212,6 @@ typedef unsigned char C __attribute__((ext_vector_type(SM_W)));
 #define FLOAT(x) ((F)(x))
 #define WORK(n,c) work_+=(c)&SPLATI(n);
 #define WAY(n,c) ways_|=(c)&SPLATI(1<<n);
-#define TOGETHER
-#define PACE
 #define FENCE __atomic_signal_fence(__ATOMIC_SEQ_CST);
 """
     + _WORKED

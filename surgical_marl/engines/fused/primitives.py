@@ -117,7 +117,7 @@ def _empty(g: Graph, shape: Any, params: Any) -> AnyArray:
     """Return arrays that hold nothing yet, along the first axis."""
     length, size = shape[0] if shape else 1, int(np.prod(shape[1:], dtype=int))
     kind = f"{kind_of(params['dtype'])}{length}"
-    return SymbolicArray(unpack(g, [g.fresh("room", kind=kind) for _ in range(size)], shape, min(len(shape), 1)))
+    return SymbolicArray(unpack(g, [g.fresh("empty", kind=kind) for _ in range(size)], shape, min(len(shape), 1)))
 
 
 # -- random numbers

@@ -105,8 +105,8 @@ class RowWriter:
         kind, self._written[values] = f"{g.kind(values[0])}{len(values) * loop.length}", len(loop.phis)
         phi = g.fresh("phi", self._number, len(loop.phis), kind=kind)
         loop.phis.append(phi)
-        loop.starts.append(g.fresh("room", kind=kind))
-        loop.nexts.append(g.put(phi, g.mul(g.constant(np.int32(len(values))), loop.counter), list(values)))
+        loop.starts.append(g.fresh("empty", kind=kind))
+        loop.nexts.append(g.update(phi, g.mul(g.constant(np.int32(len(values))), loop.counter), list(values)))
 
     def leave(self) -> list[AnyArray]:
         """Return all rows of each array."""

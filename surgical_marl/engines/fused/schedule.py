@@ -12,10 +12,12 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from surgical_marl.engines.fused.graph import Branch, Graph, Loop, Value
-from surgical_marl.engines.fused.inplace import Places, Takeovers
+from surgical_marl.engines.fused.inplace import InPlace, Places
 
 GIVEN = ("phi", "counter")
 """Values that are there at the start of a round of their loop."""
+ALL_LOOPS = -1
+"""Bits of all loops: what may depend on any of them."""
 
 
 @dataclass
@@ -35,72 +37,67 @@ class Region:
 
 @dataclass
 class Schedule:
-    """Region 0 is the program; its results are the stores."""
+    """A graph with its values in regions, in order. Region 0 is the program; its results are the stores."""
 
     regions: list[Region]
     inside: dict[int, tuple[int, ...]]
     """Group -> the regions in it: of a loop its body, of a branch the chosen and the other side."""
-    alive: dict[int, list[int]]
+    live: dict[int, list[int]]
     """Group -> which of its outs (or phis) are needed."""
     outside: dict[int, list[Value]]
     """Group -> the values from around it that it reads."""
-    replaced: set[Value]
-    """Arrays whose memory something else takes over."""
-    takers: set[Value]
-    """The `put`s that take over the memory of the array they change, as all else that reads it comes before."""
-    kept: dict[Value, Value]
-    """Out of a branch -> the array whose memory it takes over: both sides leave it there, changed or not."""
-    given: dict[Value, Value]
-    """Empty array in a side of a branch -> the out of the branch that it becomes there, and whose memory it gets."""
+    overwritten: set[Value]
+    """Arrays that something else overwrites."""
+    in_place: set[Value]
+    """Updates, and outs of loops, that overwrite the array that they change: all else that reads it comes before."""
+    merged: dict[Value, Value]
+    """Out of a branch -> the array that it overwrites: both sides leave it in place, changed or not."""
+    destination: dict[Value, Value]
+    """Empty array in a side of a branch -> the out of the branch whose memory it gets, as it becomes that there."""
 
 
 class Scheduler:
-    """Makes a `Schedule` of the values `results`."""
+    """Makes a `Schedule` of the values `results`, step by step: see `pipeline.py`.
+
+    To make one leaves out all that nothing needs (dead code).
+    """
 
     def __init__(self, graph: Graph, results: list[Value]) -> None:
         self.graph, self.results = graph, results
         self.regions = [Region(-1, 0, -1)]
         self.inside: dict[int, tuple[int, ...]] = {}
         self._owner: dict[int, int] = {}  # region -> group
-        self.place: dict[Value, int] = {}
-        self.group_place: dict[int, int] = {}
-        self.alive = self._find_alive()
-        self._depend()
-        self._begins = self._find_begins()
+        self.region_of: dict[Value, int] = {}
+        self.region_of_group: dict[int, int] = {}
+        self.loops: dict[Value, int] = {}
+        self.group_loops: dict[int, int] = {}
+        self.pressure: dict[Value, int] = {}
+        self.in_place: InPlace | None = None
+        self.live = self._find_live()
 
-    def run(self) -> Schedule:
-        self._place_all()
-        places = Places(self.place, self.group_place, self.inside, self.alive, self._owner)
-        taken = Takeovers(self.graph, self.needed, places)
-        self._before = taken.before
-        self._measure()
-        self._outside: dict[int, list[Value]] = {}
-        self._members: dict[int, list[Value]] = {}
-        for value in self.needed:
-            if self.graph.ops[value] not in GIVEN:
-                self._members.setdefault(self.place[value], []).append(value)
-        for number in range(len(self.regions)):
-            self._order(number)
+    def schedule(self) -> Schedule:
+        """Return what was found."""
+        found = self.in_place
         return Schedule(
             self.regions,
             self.inside,
-            self.alive,
-            {n: self._all_reads(n) for n in self.inside},
-            taken.replaced,
-            taken.takers,
-            taken.kept,
-            taken.given,
+            self.live,
+            {number: self._all_reads(number) for number in self.inside},
+            found.overwritten if found else set(),
+            found.in_place if found else set(),
+            found.merged if found else {},
+            found.destination if found else {},
         )
 
     # -- what is needed
 
-    def _find_alive(self) -> dict[int, list[int]]:
+    def _find_live(self) -> dict[int, list[int]]:
         g, seen = self.graph, set()
-        alive: dict[int, set[int]] = {}
+        live: dict[int, set[int]] = {}
         stack = [value for value in self.results if value >= 0]
 
         def group_result(number: int, k: int) -> None:
-            group, wanted = g.groups[number], alive.setdefault(number, set())
+            group, wanted = g.groups[number], live.setdefault(number, set())
             if k in wanted:
                 return
             wanted.add(k)
@@ -120,22 +117,24 @@ class Scheduler:
             else:
                 stack.extend(g.reads(value))
         self.needed = sorted(seen)
-        return {number: sorted(wanted) for number, wanted in alive.items()}
+        return {number: sorted(wanted) for number, wanted in live.items()}
 
     def _group_reads(self, number: int) -> Iterable[Value]:
         """All that a group is given, from before it or within it."""
-        group, wanted = self.graph.groups[number], self.alive[number]
+        group, wanted = self.graph.groups[number], self.live[number]
         sides = (group.chosen, group.others) if isinstance(group, Branch) else (group.starts, group.nexts)
         for values in sides:
             yield from (values[k] for k in wanted if values[k] >= 0)
         if group.condition is not None and group.condition >= 0:
             yield group.condition
 
-    def _depend(self) -> None:
-        """Which loops each value depends on, as bits."""
+    def find_invariants(self) -> None:
+        """Find which loops each value depends on, as bits: `place` puts it outside of the others.
+
+        before: for(int r3=0;r3<8;++r3){ F v5=SQRT(v4); v6=v6*v5; }
+        after:  F v5=SQRT(v4); for(int r3=0;r3<8;++r3){ v6=v6*v5; }
+        """
         g = self.graph
-        self.loops: dict[Value, int] = {}
-        self.group_loops: dict[int, int] = {}
         for value in self.needed:
             op = g.ops[value]
             if op in GIVEN:
@@ -163,13 +162,18 @@ class Scheduler:
         starts: set[Value] = set()
         for number, group in enumerate(g.groups):
             if isinstance(group, Loop):
-                starts.update(group.starts[k] for k in self.alive.get(number, ()))
+                starts.update(group.starts[k] for k in self.live.get(number, ()))
         return {value for value in starts if value >= 0 and len(g.kinds[value]) > 1}
 
     # -- where
 
-    def _place_all(self) -> None:
-        g = self.graph
+    def place(self) -> None:
+        """Place each value in the innermost region that holds all its uses.
+
+        before: F v5=SQRT(v4); if(ANY(v3)){ v6=v5; }else{ v6=v4; }
+        after:  if(ANY(v3)){ F v5=SQRT(v4); v6=v5; }else{ v6=v4; }
+        """
+        g, begins = self.graph, self._find_begins()
         for value in self.results:
             self._use(value, 0)
         for value in reversed(self.needed):
@@ -178,29 +182,29 @@ class Scheduler:
                 continue
             if op == "out":
                 number = g.args[value][0]
-                if number not in self.group_place:
-                    self._place_group(number)
+                if number not in self.region_of_group:
+                    self._place_group(number, begins)
                 continue
-            region = self.place[value]
-            # to keep what is in memory in registers too would need many of them, and a room is best near what fills it
-            if op not in ("read", "room"):
-                region = self._hoist(region, self.loops[value])
-            self.place[value] = region
+            region = self.region_of[value]
+            # an array's elements would need registers outside of the loop; an empty array is best near what fills it
+            if op not in ("read", "empty"):
+                region = self._hoist(region, self.loops.get(value, ALL_LOOPS))
+            self.region_of[value] = region
             for read in g.reads(value):
                 self._use(read, region)
 
-    def _place_group(self, number: int) -> None:
+    def _place_group(self, number: int, begins: set[Value]) -> None:
         group = self.graph.groups[number]
-        outs = [group.outs[k] for k in self.alive[number] if group.outs[k] in self.place]
-        region = self.place[outs[0]]
+        outs = [group.outs[k] for k in self.live[number] if group.outs[k] in self.region_of]
+        region = self.region_of[outs[0]]
         for out in outs[1:]:
-            region = self._common(region, self.place[out])
+            region = self._common(region, self.region_of[out])
         # an array that a loop will change is made near that loop: one from outside would be copied again and again
-        if not (isinstance(group, Branch) and self._begins.intersection(outs)):
-            region = self._hoist(region, self.group_loops[number])
-        self.group_place[number] = region
-        for k in self.alive[number]:
-            self.place[group.outs[k]] = region
+        if not (isinstance(group, Branch) and begins.intersection(outs)):
+            region = self._hoist(region, self.group_loops.get(number, ALL_LOOPS))
+        self.region_of_group[number] = region
+        for k in self.live[number]:
+            self.region_of[group.outs[k]] = region
         inner = [len(self.regions) + k for k in range(2 if isinstance(group, Branch) else 1)]
         self.inside[number] = tuple(inner)
         depth = self.regions[region].depth + 1
@@ -208,20 +212,20 @@ class Scheduler:
             loop = number if isinstance(group, Loop) else self.regions[region].loop
             self._owner[len(self.regions)] = number
             self.regions.append(Region(region, depth, loop))
-        for k in self.alive[number]:
+        for k in self.live[number]:
             if isinstance(group, Branch):
                 self._use(group.chosen[k], inner[0])
                 self._use(group.others[k], inner[1])
             else:
                 self._use(group.starts[k], region)
                 self._use(group.nexts[k], inner[0])
-                self.place[group.phis[k]] = inner[0]
+                self.region_of[group.phis[k]] = inner[0]
         if group.condition is not None:
             self._use(group.condition, region if isinstance(group, Branch) else inner[0])
 
     def _use(self, value: Value, region: int) -> None:
         if value >= 0 and self.graph.ops[value] not in GIVEN:
-            self.place[value] = self._common(self.place[value], region) if value in self.place else region
+            self.region_of[value] = self._common(self.region_of[value], region) if value in self.region_of else region
 
     def _common(self, a: int, b: int) -> int:
         regions = self.regions
@@ -238,49 +242,55 @@ class Scheduler:
             loop = self.regions[region].loop
             if loop < 0 or loops >> loop & 1:
                 return region
-            region = self.group_place[loop]
+            region = self.region_of_group[loop]
 
     # -- in what order
 
-    def _measure(self) -> None:
-        """Estimate how many values are alive at once while each is computed (Sethi-Ullman number)."""
+    def find_pressure(self) -> None:
+        """Estimate how many registers each value takes to compute (Sethi-Ullman number): `order` begins with the most.
+
+        before: F v5=v1; F v6=v1*v2; F v7=v6*v3; F v8=v5+v7;
+        after:  F v6=v1*v2; F v7=v6*v3; F v5=v1; F v8=v5+v7;
+        """
         g = self.graph
-        self.room: dict[Value, int] = {}
         for value in self.needed:
             op = g.ops[value]
             if op == "out":
                 reads = [read for read in self._group_reads(g.args[value][0]) if read < value]
             else:
                 reads = g.reads(value)
-            needs = sorted((self.room.get(read, 1) for read in reads[:8]), reverse=True)
-            self.room[value] = max([need + k for k, need in enumerate(needs)], default=1)
+            needs = sorted((self.pressure.get(read, 1) for read in reads[:8]), reverse=True)
+            self.pressure[value] = max([need + k for k, need in enumerate(needs)], default=1)
+
+    def order(self) -> None:
+        """Put the values of each region into order: depth first from its results, each operand right before its use."""
+        self._outside: dict[int, list[Value]] = {}
+        self._members: dict[int, list[Value]] = {}
+        for value in self.needed:
+            if self.graph.ops[value] not in GIVEN:
+                self._members.setdefault(self.region_of[value], []).append(value)
+        for number in range(len(self.regions)):
+            self._order(number)
+
+    def find_in_place(self) -> None:
+        """Find arrays that can be changed in place. See `inplace.py`."""
+        places = Places(self.region_of, self.region_of_group, self.inside, self.live, self._owner)
+        self.in_place = InPlace(self.graph, self.needed, places)
 
     def _order(self, number: int) -> None:
         region, results = self.regions[number], self._region_results(number)
         done: set[tuple[str, int]] = set()
         for k, result in enumerate(results):
-            if result >= 0 and self._here(result, number):
+            if result >= 0 and self.is_in(result, number):
                 self._visit(number, result, done)
             region.items.append(("result", k))
-        if number == 0:
-            self._store_early(region, results)
-
-    def _store_early(self, region: Region, results: list[Value]) -> None:
-        """Put each store right behind what computes its value, which then needs no register any more."""
-        waiting: dict[tuple[str, int], list[tuple[str, int]]] = {}
-        for k, result in enumerate(results):
-            if result >= 0 and self._here(result, 0):
-                waiting.setdefault(self._item(result), []).append(("result", k))
-        early = {item for group in waiting.values() for item in group}
-        items = [item for item in region.items if item not in early]
-        region.items = [item for one in items for item in (one, *waiting.get(one, ()))]
 
     def _region_results(self, number: int) -> list[Value]:
         if number == 0:
             return self.results
         for group_number, inner in self.inside.items():
             if number in inner:
-                group, wanted = self.graph.groups[group_number], self.alive[group_number]
+                group, wanted = self.graph.groups[group_number], self.live[group_number]
                 if isinstance(group, Branch):
                     side = group.chosen if number == inner[0] else group.others
                     return [side[k] for k in wanted]
@@ -289,7 +299,7 @@ class Scheduler:
         raise AssertionError(number)
 
     def _visit(self, region: int, value: Value, done: set[tuple[str, int]]) -> None:
-        items, stack = self.regions[region].items, [(self._item(value), False)]
+        items, stack = self.regions[region].items, [(self.item(value), False)]
         while stack:
             item, ready = stack.pop()
             if item in done:
@@ -299,31 +309,37 @@ class Scheduler:
                 items.append(item)
                 continue
             stack.append((item, True))
-            reads = [read for read in self._item_reads(item) if self._here(read, region)]
+            reads = [read for read in self._item_reads(item) if self.is_in(read, region)]
             # The highest pressure is popped, and so computed, first. A group that only has to come first may stand here
             # as a result that nobody needs, of which no pressure is known.
-            reads.sort(key=lambda read: self.room.get(read, 1))
-            stack.extend((self._item(read), False) for read in reads if self._item(read) not in done)
+            reads.sort(key=lambda read: self.pressure.get(read, 1))
+            stack.extend((self.item(read), False) for read in reads if self.item(read) not in done)
 
-    def _here(self, value: Value, region: int) -> bool:
-        return self.graph.ops[value] not in GIVEN and self.place[value] == region
+    def is_in(self, value: Value, region: int) -> bool:
+        """Return whether a value is computed in a region."""
+        return self.graph.ops[value] not in GIVEN and self.region_of[value] == region
 
-    def _item(self, value: Value) -> tuple[str, int]:
+    def item(self, value: Value) -> tuple[str, int]:
+        """Return the item of a region that computes a value: the group if the value is one of its outs."""
         return ("group", self.graph.args[value][0]) if self.graph.ops[value] == "out" else ("node", value)
 
     def _item_reads(self, item: tuple[str, int]) -> list[Value]:
         kind, number = item
         if kind == "group":
-            first = self.graph.groups[number].outs[self.alive[number][0]]
-            return [*self._all_reads(number), *self._before.get(first, [])]
-        return self.graph.reads(number) + self._before.get(number, [])
+            first = self.graph.groups[number].outs[self.live[number][0]]
+            return [*self._all_reads(number), *self._before(first)]
+        return self.graph.reads(number) + self._before(number)
+
+    def _before(self, value: Value) -> list[Value]:
+        """Return what must come before a value that overwrites an array, besides its operands."""
+        return self.in_place.before.get(value, []) if self.in_place else []
 
     def _all_reads(self, number: int) -> list[Value]:
         """Return what a group and everything in it read from outside the group."""
         if number in self._outside:
             return self._outside[number]
         found: dict[Value, None] = dict.fromkeys(self._group_reads(number))
-        depth = self.regions[self.group_place[number]].depth
+        depth = self.regions[self.region_of_group[number]].depth
         for inner in self.inside[number]:
             for value in self._members.get(inner, []):
                 reads = self._all_reads(self.graph.args[value][0]) if self.graph.ops[value] == "out" else None
@@ -331,7 +347,7 @@ class Scheduler:
         outside = [
             value
             for value in found
-            if self.graph.ops[value] not in GIVEN and self.regions[self.place[value]].depth <= depth
+            if self.graph.ops[value] not in GIVEN and self.regions[self.region_of[value]].depth <= depth
         ]
         self._outside[number] = outside
         return outside

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from surgical_marl.cache import cached, is_shipped
 from surgical_marl.engines.fused.kernel_layout import TREES, Leaf, Source
+from surgical_marl.engines.fused.options import read_options
 from surgical_marl.engines.stages import Stage, unsaid
 from surgical_marl.engines.stepper import Stepper, describe
 from surgical_marl.runtime import jax_scope, no_collection
@@ -19,21 +21,30 @@ def load_source(env: Stepper, vector: bool, stage: Stage = unsaid) -> Source:
     """Return the source of an environment's kernels: for a CPU, with vectors, or for CUDA.
 
     The source is kept on disk. For an environment of this package alone, the key is the code of the package and the
-    environment's content. Code of somebody else can depend on anything, so it is traced, which takes seconds, and what
-    it computes is the key. `stage` is told the stages in which the source is made.
+    environment's content. Code of somebody else can depend on anything, so it is traced, which takes seconds, and the
+    jaxpr is the key. A dump (`options.py`) needs the compiler to run, so then nothing is read from disk.
+
+    Args:
+        env: the environment.
+        vector: whether the kernels are for a CPU.
+        stage: is told the stages in which the source is made.
 
     Raises:
         Unsupported: the environment can't be traced.
+        ValueError: the environment variable of the passes names one that is not there.
     """
-    about = f"vector={vector} {describe(env.parameters)}"
-    if is_shipped(*env.classes):
-        made = cached("fused", lambda: _make(_trace(env, stage), env.parameters, vector, stage), about, env.content,
-                      classes=env.classes)  # fmt: skip
+    options = read_options()
+    about = f"vector={vector} {describe(env.parameters)} {options.switches}"
+    make = partial(_make, env.parameters, vector, stage, env.title)
+    if options.dump:
+        made = make(_trace(env, stage))
+    elif is_shipped(*env.classes):
+        made = cached("fused", lambda: make(_trace(env, stage)), about, env.content, classes=env.classes)
     else:
         from surgical_marl.engines.fused.jaxpr_digest import jaxpr_digest  # imports JAX
 
-        functions, parameters = _trace(env, stage), env.parameters
-        made = cached("fused", lambda: _make(functions, parameters, vector, stage), about, jaxpr_digest(functions))
+        functions = _trace(env, stage)
+        made = cached("fused", lambda: make(functions), about, jaxpr_digest(functions))
     found = json.loads(made.tobytes())
     tables = {dtype: np.array(table, dtype) for dtype, table in found.pop("tables").items()}
     trees = {name: _leaves(found.pop(name)) for name in TREES}
@@ -50,12 +61,12 @@ def _trace(env: Stepper, stage: Stage) -> dict[str, Any]:
 
 
 @jax_scope()
-def _make(functions: dict[str, Any], parameters: Any, vector: bool, stage: Stage) -> np.ndarray:
+def _make(parameters: Any, vector: bool, stage: Stage, title: str, functions: dict[str, Any]) -> np.ndarray:
     """Return a source as bytes."""
     from surgical_marl.engines.fused.compiler import make_source  # imports JAX
 
     with no_collection():
-        source = make_source(functions, parameters, vector, stage)
+        source = make_source(functions, parameters, vector, stage, title)
     return np.frombuffer(json.dumps(asdict(source), default=np.ndarray.tolist).encode(), np.uint8)
 
 

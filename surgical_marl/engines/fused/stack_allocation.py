@@ -1,31 +1,25 @@
-"""Lets arrays of a function share memory if they are never needed at the same time.
+"""Lets arrays of a kernel share memory where they are never live at the same time.
 
-A compiler gives each array of a function memory of its own, for the whole function. Most of it would hold what nobody
-reads any more, in the way of what is needed in caches.
+A C compiler gives each array memory of its own for the whole function, most of which would hold dead numbers, in the
+way of live ones in caches.
 """
 
 from __future__ import annotations
 
-import re
-from collections.abc import Sequence
 from typing import NamedTuple
 
-DECLARED = re.compile(r"([FIUB]) ([vnw]\d+)\[(\d+)\];")
-"""The declaration of an array: its type, name and size."""
-_NAME = re.compile(r"\b[vnw]\d+\b")
-_FIXED = re.compile(r"\b[vnw]\d+\[[\d+*()k-]*\]")
-"""An element at a known place; `k` counts in short loops, which compilers unroll."""
+from surgical_marl.engines.fused import instructions as ir
 
 
 class _Loop(NamedTuple):
-    """A loop: its first line, and the loops around it, outermost first."""
+    """A loop: its first and its last instruction."""
 
     start: int
-    around: tuple[_Loop, ...]
+    end: int
 
 
 class _Array(NamedTuple):
-    """An array, and the lines from and up to which its memory must be its own."""
+    """An array, and the first and last instruction between which it is live."""
 
     name: str
     kind: str
@@ -34,78 +28,79 @@ class _Array(NamedTuple):
     last: int
 
 
-def share_memory(lines: Sequence[str]) -> list[str]:
-    """Return code in which arrays share memory; those that do are declared at its beginning.
+def share_memory(code: ir.Code) -> ir.Code:
+    """Give arrays that are never live at the same time one memory, which is declared at the beginning.
 
-    Arrays whose elements are all at known places stay as they are: a compiler keeps those in registers.
+    Arrays whose elements are all at known indices stay as they are: a compiler keeps those in registers.
+
+    before: F v1[9]; ...uses of v1... F v2[5]; ...uses of v2...
+    after:  ALIGNED F v1[9]; ...uses of v1... ...uses of v1...
     """
-    lines = "\n".join(lines).split("\n")
-    arrays = _arrays(lines)
-    names, declared = _assign(arrays)
-    kept = (line for line in lines if not ((found := DECLARED.fullmatch(line)) and found[2] in names))
-    return declared + [_NAME.sub(lambda name: names.get(name[0], name[0]), line) for line in kept]
+    names, memory = _assign(_arrays(code))
+
+    def renamed(operand: ir.Operand) -> ir.Operand:
+        if isinstance(operand, ir.Element | ir.Gather) and operand.array in names:
+            return operand._replace(array=names[operand.array])
+        return operand
+
+    left = (one for one in code if not (isinstance(one, ir.Declare) and one.name in names))
+    return [*memory, *(ir.rewritten(one, renamed) for one in left)]
 
 
-def names_at_unknown_places(line: str) -> set[str]:
-    """Return the names in a line of code, but for arrays whose elements there are at known places."""
-    return set(_NAME.findall(_FIXED.sub("", line)))
-
-
-def _arrays(lines: list[str]) -> list[_Array]:
-    """Return all arrays of which some element is at a place that is not known."""
-    declared, uses, moving = {}, dict[str, tuple[int, int]](), set[str]()
-    for at, line in enumerate(lines):
-        if match := DECLARED.fullmatch(line):
-            declared[match[2]] = at, match[1], int(match[3])
-            continue
-        names = [name for name in _NAME.findall(line) if name in declared]
-        for name in names:
-            uses[name] = uses.get(name, (at, at))[0], at
-        if names:
-            moving |= names_at_unknown_places(line)
-    loops, ends = _loops(lines)
-    found = []
-    for name in declared.keys() & uses.keys() & moving:
-        (at, kind, size), (first, last) = declared[name], uses[name]
+def _arrays(code: ir.Code) -> list[_Array]:
+    """Return all arrays of which some element is at an index that is not known, and where they are live."""
+    declared, uses = dict[str, tuple[int, ir.Declare]](), dict[str, tuple[int, int]]()
+    for at, one in enumerate(code):
+        if isinstance(one, ir.Declare):
+            declared[one.name] = at, one
+        for operand in ir.operands(one):
+            for part in ir.parts(operand):
+                if isinstance(part, ir.Element | ir.Gather):
+                    uses[part.array] = uses.get(part.array, (at, at))[0], at
+    around, found = _loops_around(code), []
+    for name in declared.keys() & uses.keys() & ir.arrays_at_unknown_places(code):
+        (at, one), (first, last) = declared[name], uses[name]
         # what a round of a loop leaves in an array from outside of the loop may be read in the next one
-        before, after = (next((loop for loop in loops[use] if loop.start > at), None) for use in (first, last))
-        first, last = before.start if before else first, ends[after.start] if after else last
-        found.append(_Array(name, kind, size, first, last))
+        before, after = (next((loop for loop in around[use] if loop.start > at), None) for use in (first, last))
+        first, last = before.start if before else first, after.end if after else last
+        found.append(_Array(name, one.kind, one.size, first, last))
     return found
 
 
-def _loops(lines: list[str]) -> tuple[list[tuple[_Loop, ...]], dict[int, int]]:
-    """Return the loops around each line, outermost first, and the last line of each loop by its first one."""
-    around, ends, stack = [], {}, list[_Loop | None]()
-    inside: tuple[_Loop, ...] = ()
-    for at, line in enumerate(lines):
-        around.append(inside)
-        for brace in re.findall("[{}]", line):
-            if brace == "{":
-                loop = _Loop(at, inside) if line.startswith("for(") else None
-                stack.append(loop)
-                inside += (loop,) if loop else ()
-            elif (loop := stack.pop()) is not None:
-                ends[loop.start], inside = at, loop.around
-    return around, ends
+def _loops_around(code: ir.Code) -> list[tuple[_Loop, ...]]:
+    """Return the loops around each instruction, outermost first."""
+    ends, stack = dict[int, int](), list[int]()
+    for at, one in enumerate(code):
+        if isinstance(one, ir.OPENS):
+            stack.append(at)
+        elif isinstance(one, ir.End):
+            ends[stack.pop()] = at
+    around, inside = [], list[tuple[_Loop, ...]]([()])
+    for at, one in enumerate(code):
+        if isinstance(one, ir.End):
+            inside.pop()
+        around.append(inside[-1])
+        if isinstance(one, ir.OPENS):
+            inside.append(inside[-1] if isinstance(one, ir.If) else (*inside[-1], _Loop(at, ends[at])))
+    return around
 
 
-def _assign(arrays: list[_Array]) -> tuple[dict[str, str], list[str]]:
+def _assign(arrays: list[_Array]) -> tuple[dict[str, str], list[ir.Declare]]:
     """Return the name of the memory that each array gets, and the declarations of all memory.
 
-    The largest arrays come first, and each gets the smallest memory that is free.
+    The largest arrays come first, and each gets the smallest memory that is free: best fit, decreasing.
     """
-    names, rooms = {}, list[list[_Array]]()
+    names, memories = dict[str, str](), list[list[_Array]]()
     for array in sorted(arrays, key=lambda array: (-array.size, array.first, array.name)):
-        free = (room for room in rooms if room[0].kind == array.kind and not _meets(room, array))
-        room = min(free, key=lambda room: room[0].size, default=None)
-        if room is None:
-            rooms.append(room := [])
-        room.append(array)
-        names[array.name] = room[0].name
-    return names, [f"ALIGNED {room[0].kind} {room[0].name}[{room[0].size}];" for room in rooms]
+        free = (memory for memory in memories if memory[0].kind == array.kind and not _meets(memory, array))
+        memory = min(free, key=lambda memory: memory[0].size, default=None)
+        if memory is None:
+            memories.append(memory := [])
+        memory.append(array)
+        names[array.name] = memory[0].name
+    return names, [ir.Declare(first.name, first.kind, first.size, aligned=True) for first, *_ in memories]
 
 
-def _meets(room: list[_Array], array: _Array) -> bool:
-    """Whether any of the arrays in some memory is needed at the same time as another one."""
-    return any(array.first <= other.last and other.first <= array.last for other in room)
+def _meets(memory: list[_Array], array: _Array) -> bool:
+    """Whether any of the arrays in some memory is live at the same time as another one."""
+    return any(array.first <= other.last and other.first <= array.last for other in memory)

@@ -1,83 +1,87 @@
-"""Lets arrays that are used side by side lie side by side, number by number, in code for a GPU.
-
-One instruction moves up to four numbers that are neighbours in memory. A loop that reads number i of twelve arrays
-needs three of them if these arrays lie side by side by fours, and twelve if they lie one behind the other.
-"""
+"""Interleaves arrays that are used side by side, so that a GPU moves several of their elements by one instruction."""
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 
-from surgical_marl.engines.fused.stack_allocation import DECLARED, names_at_unknown_places
+from surgical_marl.engines.fused import instructions as ir
 
 WIDTHS = 4, 2
-"""How many arrays lie side by side. Those that find no three others may find one."""
-_USED = re.compile(r"\b([vn]\d+)\[((?:[^][]|\[[^][]*\])+)\](=)?")
-"""An element of an array, and what follows where it is stored."""
-_ENDS = "for(", "if(", "}"
-"""How lines begin that code does not simply run through."""
+"""How many arrays are interleaved: an instruction moves up to four neighbours in memory. Arrays that find no three
+others may find one."""
 
 
-def interleave(lines: Sequence[str]) -> list[str]:
-    """Return code in which arrays of real numbers lie side by side.
+def interleave(code: ir.Code) -> ir.Code:
+    """Interleave arrays of floats, by fours or twos, that straight code reads, or stores, at the same index.
 
-    Arrays whose elements are all at known places stay as they are: a compiler keeps those in registers.
+    Arrays whose elements are all at known indices stay as they are: a compiler keeps those in registers.
+
+    before: F v1[9]; F v2[9]; ... v1[r3]=v7; v2[r3]=v8;
+    after:  F w0[18]; ... w0[2*(r3)+0]=v7; w0[2*(r3)+1]=v8;
     """
-    lines = "\n".join(lines).split("\n")
-    arrays = _arrays(lines)
-    rows = {name: (f"w{k}", row) for k, row in enumerate(_rows(lines, arrays)) for name in row}
+    arrays = _arrays(code)
+    memory = {name: (f"w{k}", row) for k, row in enumerate(_rows(code, arrays)) for name in row}
 
-    def moved(use: re.Match[str]) -> str:
-        name, index, stored = use.groups("")
-        if name not in rows:
-            return use[0]
-        memory, row = rows[name]
-        return f"{memory}[{len(row)}*({index})+{row.index(name)}]{stored}"
+    def moved(operand: ir.Operand) -> ir.Operand:
+        if not isinstance(operand, ir.Element) or operand.array not in memory:
+            return operand
+        name, row = memory[operand.array]
+        return operand._replace(array=name, width=len(row), lane=row.index(operand.array))
 
-    found, declared = [], set[str]()
-    for line in lines:
-        declaration = DECLARED.fullmatch(line)
-        if declaration is None or declaration[2] not in rows:
-            found.append(line if declaration else _USED.sub(moved, line))
+    found: ir.Code = []
+    declared = set[str]()
+    for one in code:
+        if not isinstance(one, ir.Declare) or one.name not in memory:
+            found.append(ir.rewritten(one, moved))
             continue
-        memory, row = rows[declaration[2]]
-        if memory not in declared:
-            _, size = arrays[row[0]]
-            found.append(f"F {memory}[{len(row) * size}];")
-            declared.add(memory)
+        name, row = memory[one.name]
+        if name not in declared:
+            found.append(ir.Declare(name, one.kind, len(row) * one.size))
+            declared.add(name)
     return found
 
 
-def _arrays(lines: Sequence[str]) -> dict[str, tuple[int, int]]:
-    """Return the arrays that may be moved: name -> the block that declares it, and its size.
+def _arrays(code: ir.Code) -> dict[str, tuple[int, int]]:
+    """Return the arrays that may be interleaved: name -> the block that declares it, and its size.
 
-    Arrays that differ in either can't lie side by side.
+    Only arrays that agree in both can be interleaved.
     """
-    moving = {name for line in lines for name in names_at_unknown_places(line)}
+    unknown = ir.arrays_at_unknown_places(code)
     arrays, blocks = dict[str, tuple[int, int]](), [0]
-    for at, line in enumerate(lines, 1):
-        if (found := DECLARED.fullmatch(line)) and found[1] == "F" and found[2] in moving:
-            arrays[found[2]] = blocks[-1], int(found[3])
-        for brace in re.findall("[{}]", line):
-            blocks = [*blocks, at] if brace == "{" else blocks[:-1]
+    for at, one in enumerate(code, 1):
+        if isinstance(one, ir.Declare) and one.kind == "f" and one.name in unknown:
+            arrays[one.name] = blocks[-1], one.size
+        if isinstance(one, ir.End | ir.Else):
+            blocks.pop()
+        if isinstance(one, (*ir.OPENS, ir.Else)):
+            blocks.append(at)
     return arrays
 
 
-def _rows(lines: Sequence[str], arrays: Mapping[str, tuple[int, int]]) -> Iterator[tuple[str, ...]]:
-    """Yield arrays that are to lie side by side: code reads, or stores, elements of them one after the other."""
-    taken, used = set[str](), [line for line in lines if not DECLARED.fullmatch(line)]
+def _rows(code: ir.Code, arrays: Mapping[str, tuple[int, int]]) -> Iterator[tuple[str, ...]]:
+    """Yield arrays to interleave: straight code uses elements of them one after the other."""
+    taken = set[str]()
     for width in WIDTHS:
-        waiting = dict[tuple[str, str, tuple[int, int]], list[str]]()
-        for line in used:
-            if line.startswith(_ENDS):
+        waiting = dict[tuple[object, ...], list[str]]()
+        for one in code:
+            if isinstance(one, ir.CONTROL):
                 waiting.clear()
                 continue
-            for name, index, stored in _USED.findall(line):
+            for element, stored in _elements(one):
+                name = element.array
                 if name not in arrays or name in taken:
                     continue
-                row = waiting.setdefault((index, stored, arrays[name]), [])
+                row = waiting.setdefault((element._replace(array=""), stored, arrays[name]), [])
                 row[:] = [other for other in row if other not in taken and other != name] + [name]
                 if len(row) == width:
                     yield tuple(row)
                     taken.update(row)
+
+
+def _elements(one: ir.Instruction) -> Iterator[tuple[ir.Element, bool]]:
+    """Yield the elements of arrays in an instruction, and whether they are stored."""
+    target = one.target if isinstance(one, ir.Assign) else None
+    for operand in ir.operands(one):
+        for part in ir.parts(operand):
+            if isinstance(part, ir.Element):
+                yield part, part is target

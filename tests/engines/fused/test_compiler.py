@@ -15,9 +15,10 @@ import numpy as np
 import pytest
 from jax import lax
 
-from surgical_marl.engines.fused import emit, kernel
-from surgical_marl.engines.fused.emit import Emitter
-from surgical_marl.engines.fused.macros import CUDA, STRETCH, UNDEFINE
+from surgical_marl.engines.fused import instrumentation, kernel
+from surgical_marl.engines.fused.hints import FENCE_DISTANCE
+from surgical_marl.engines.fused.macros import CUDA, UNDEFINE
+from surgical_marl.engines.fused.pipeline import Program, compile_program
 from surgical_marl.engines.fused.symbolic_array import Unsupported
 from tests.helpers.fused_blocks import all_blocks, random_arrays
 from tests.helpers.fused_kernels import gpu_code, make_stores, run, worked
@@ -28,7 +29,7 @@ RNG = np.random.default_rng(2)
 
 def body(function: Callable[..., Any], *columns: Any, vector: bool) -> str:
     graph, stores, *_ = make_stores(function, columns)
-    return Emitter(graph, stores, vector).body()
+    return compile_program(Program(graph, stores, vector)).text
 
 
 def test_code_for_cuda_knows_no_vectors() -> None:
@@ -96,7 +97,7 @@ def test_long_code_for_a_cpu_has_fences() -> None:
 
     cuda, cpu = (body(function, np.ones(3, np.float32), vector=vector) for vector in (False, True))
     stretches = [part.count(";") for part in cpu.split("FENCE")]
-    assert len(stretches) > 10 and max(stretches) <= STRETCH + 5
+    assert len(stretches) > 10 and max(stretches) <= FENCE_DISTANCE + 5
     assert "FENCE" not in cuda
 
 
@@ -230,8 +231,8 @@ def test_loops_and_branches_change_arrays_in_place() -> None:
 
 def test_environments_that_take_one_way_come_before_those_that_take_another(monkeypatch: pytest.MonkeyPatch) -> None:
     """And then by how much they had to do. Only sides of branches that are long, with all in them, are ways."""
-    monkeypatch.setattr(emit, "LARGE", 8)
-    monkeypatch.setattr(emit, "APART", 60)
+    monkeypatch.setattr(instrumentation, "LARGE", 8)
+    monkeypatch.setattr(instrumentation, "LARGE_PATH", 60)
 
     def long(x: Any) -> Any:
         inner = lambda y: lax.cond(y > 0.5, lambda y: rounds(y, 3, 30), lambda y: rounds(y, 3, 31), y)  # noqa: E731
@@ -275,7 +276,7 @@ def test_a_scan_that_is_to_be_unrolled_is() -> None:
 def test_code_for_cuda_compiles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every macro of the prelude, by NVRTC, which needs no GPU."""
     monkeypatch.setattr("surgical_marl.engines.fused.macros.BRANCHES", 0)
-    monkeypatch.setattr(emit, "APART", 0)
+    monkeypatch.setattr(instrumentation, "LARGE_PATH", 0)
     code = body(everything, random_arrays(0), vector=False)
     used = set(re.findall(r"\w+", code))
     assert not [name for name in re.findall("^#define (\\w+)", CUDA, re.M) if name not in used]

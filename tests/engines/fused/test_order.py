@@ -13,10 +13,10 @@ import torch
 from surgical_marl.engines.fused import engine, env_sorting, kernel
 from surgical_marl.engines.fused.arrays import make_arrays
 from surgical_marl.engines.fused.compiler import tables
-from surgical_marl.engines.fused.emit import Emitter
 from surgical_marl.engines.fused.env_sorting import AT_ONCE, WORTH, permuted, slowest_first
 from surgical_marl.engines.fused.kernel import BLOCK
 from surgical_marl.engines.fused.macros import AMOUNT, BRANCHES
+from surgical_marl.engines.fused.pipeline import Program, compile_program
 from surgical_marl.engines.fused.source_cache import load_source
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.envs.env import Env
@@ -141,11 +141,11 @@ def test_what_is_recorded_begins_with_sorting() -> None:
 
 def test_environments_are_sorted_where_neighbours_wait_for_each_other(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(env_sorting, "multiprocessors", lambda: 132)
-    none, (short, long, longer) = [""], (["WORK(9)"] * branches for branches in (1, BRANCHES, WORTH))
+    none, short, long, longer = 0, 1, BRANCHES, WORTH
     few, many = 4096, 8192  # of 32 a group
 
-    def every(code: list[str], device: str, num_envs: int) -> int:
-        return env_sorting.sorted_every(code, device, num_envs, decimation=8)
+    def every(branches: int, device: str, num_envs: int) -> int:
+        return env_sorting.sorted_every(branches, device, num_envs, decimation=8)
 
     assert [every(none, "cuda", many), every(short, "cuda", few), every(short, "cuda", many)] == [0, 0, 16]
     assert [every(long, "cuda", few), every(long, "cuda", many), every(longer, "cuda", few)] == [0, 4, 4]
@@ -156,8 +156,8 @@ def test_environments_are_sorted_where_neighbours_wait_for_each_other(monkeypatc
 def test_on_a_cpu_only_arms_with_objects_are_sorted() -> None:
     """Three arms alone are twice as fast where their results need not be copied."""
     arms, objects = (load_source(Env("reach", scene), vector=True) for scene in ("trimanual_psm_ecm", "psm_needle"))
-    assert not env_sorting.sorted_every(arms.bodies.values(), "cpu", 4096, decimation=8)
-    assert env_sorting.sorted_every(objects.bodies.values(), "cpu", 4096, decimation=8)
+    assert not env_sorting.sorted_every(arms.large_branches, "cpu", 4096, decimation=8)
+    assert env_sorting.sorted_every(objects.large_branches, "cpu", 4096, decimation=8)
 
 
 def test_idle_multiprocessors_take_halves_of_groups() -> None:
@@ -183,7 +183,7 @@ def test_every_column_is_run_once_where_groups_are_split(split: int) -> None:
     with gpu_code():
         begin = np.zeros((count, 1), np.float32)
         graph, stores, layout, leaf, _ = make_stores(lambda x: x + 1, (begin,), in_place=True)
-        made = kernel.compile_kernels({"run": Emitter(graph, stores, vector=False).body()}, "cpu")["run"]
+        made = kernel.compile_kernels({"run": compile_program(Program(graph, stores, vector=False)).text}, "cpu")["run"]
         arrays = make_arrays("cpu", SimpleNamespace(sizes=layout.sizes), tables(graph), count, count)
         inputs = [*arrays.all, count, 0, 1, split]
         kernel.wp.launch(made._kernel, count + split * BLOCK, inputs, device="cpu", block_dim=1)

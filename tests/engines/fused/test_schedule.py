@@ -17,19 +17,19 @@ from jax import lax
 
 from surgical_marl.engines.fused.compiler import interpret, trace
 from surgical_marl.engines.fused.graph import Branch, Graph, Loop
-from surgical_marl.engines.fused.schedule import Schedule, Scheduler
+from surgical_marl.engines.fused.schedule import Schedule
 from surgical_marl.engines.fused.symbolic_array import Table
 from tests.helpers.fused_blocks import all_blocks, random_arrays
 from tests.helpers.fused_kernels import make_stores
 from tests.helpers.fused_programs import programs, several
-from tests.helpers.fused_schedules import Scheduled, assert_schedule_is_right
+from tests.helpers.fused_schedules import Scheduled, assert_schedule_is_right, schedule_of
 
 
 def schedule(function: Callable[..., Any], *arguments: Any) -> tuple[Graph, Schedule]:
     """Of a function of float32 scalars, or of columns."""
     columns = arguments or (np.zeros(1, np.float32),) * function.__code__.co_argcount
     graph, stores, *_ = make_stores(function, columns)
-    return graph, Scheduler(graph, [value for _, _, value in stores]).run()
+    return graph, schedule_of(graph, [value for _, _, value in stores])
 
 
 def where(graph: Graph, plan: Schedule, op: str) -> list[int]:
@@ -107,7 +107,7 @@ def test_what_no_result_needs_is_left_out() -> None:
 
     graph, plan = schedule(function)
     assert not any(where(graph, plan, op) for op in ("tan", "acos", "asin"))
-    assert {len(wanted) for wanted in plan.alive.values()} == {1}
+    assert {len(wanted) for wanted in plan.live.values()} == {1}
 
 
 @pytest.mark.parametrize("side", ["same", "put", "loop", "other"])
@@ -131,7 +131,7 @@ def test_a_branch_changes_an_array_where_it_is(side: str, condition: float) -> N
         *rng.normal(size=(2, 1, 5)).astype(np.float32),
     )  # fmt: skip
     _, plan = schedule(function, *columns)
-    assert len(plan.kept) == (side != "other")
+    assert len(plan.merged) == (side != "other")
     assert_schedule_is_right(function, *columns)
 
 
@@ -158,7 +158,7 @@ def test_what_was_read_of_an_array_is_read_before_it_changes() -> None:
     for sign, late in product((1.0, -1.0), (False, True)):
         columns = np.full(1, sign, np.float32), *COLUMNS[1:]
         _, plan = schedule(partial(function, late=late), *columns)
-        assert len(plan.kept) != late
+        assert len(plan.merged) != late
         assert_schedule_is_right(partial(function, late=late), *columns)
 
 
@@ -171,7 +171,7 @@ def test_a_loop_begins_with_an_array_that_nobody_reads_any_more() -> None:
 
     for late in (False, True):
         graph, plan = schedule(partial(function, late=late), *COLUMNS)
-        assert any(graph.ops[value] == "out" for value in plan.takers) != late
+        assert any(graph.ops[value] == "out" for value in plan.in_place) != late
         assert_schedule_is_right(partial(function, late=late), *COLUMNS)
 
 
@@ -185,7 +185,7 @@ def test_a_loop_reads_an_array_before_it_changes() -> None:
         return array.at[i].set(x), total
 
     _, plan = schedule(function, *COLUMNS)
-    assert plan.replaced
+    assert plan.overwritten
     assert_schedule_is_right(function, *COLUMNS)
 
 
@@ -195,7 +195,7 @@ def test_the_sides_of_a_branch_fill_its_result() -> None:
 
     graph, plan = schedule(function, *COLUMNS)
     (branch,) = (group for group in graph.groups if isinstance(group, Branch))
-    assert list(plan.given.values()) == 2 * [branch.outs[0]]
+    assert list(plan.destination.values()) == 2 * [branch.outs[0]]
     assert_schedule_is_right(function, *COLUMNS)
 
 
@@ -248,7 +248,7 @@ def test_rows_of_parameters() -> None:
     ]
     leaves = interpret(g, trace(function, shapes), (), tables)
     results = [value for leaf in leaves for value in leaf]
-    plan = Scheduler(g, results).run()
+    plan = schedule_of(g, results)
     assert sum(len(region.items) for region in plan.regions) < 250
     found = Scheduled(g, plan, {}).results(results)
     expected = [np.ravel(leaf) for leaf in jax.tree.leaves(function((jnp.asarray(values), jnp.asarray(truths))))]
