@@ -1,4 +1,4 @@
-"""Arrays in memory, as traced functions see them: elements that are reads of one array, at places that follow a rule.
+"""Arrays in memory, as jaxprs see them: elements that are reads of one array, at places that follow a rule.
 
 There is no class for such an array. Its elements are values like all others, so slices, transposes and arguments of
 functions need no rules of their own. Where it counts, at a gather, at rows that a loop reads and at what branches and

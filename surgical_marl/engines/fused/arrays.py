@@ -39,7 +39,7 @@ class Arrays(ABC):
 
     Its last but one is `work`, how much the environment in each column had to do. `order` says which environment that
     is; if it is None, columns are in the order of the environments' numbers. The last one is `pace`, as blocks of
-    threads keep it (`preludes.py`).
+    threads keep it (`macros.py`).
     """
 
     device: str

@@ -1,4 +1,4 @@
-"""Translates an environment's functions to kernels in C: traces them, lays out their arrays and writes the code."""
+"""Compiles an environment's functions to kernels in C: traces them, lays out their arrays and runs all passes."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from surgical_marl.engines.stages import Stage
 from surgical_marl.engines.stepper import Stepper
 
 BUFFERS = {"f": "outs", "i": "counts", "u": "counts", "b": "flags"}
-"""Where results of each kind go unless they belong to the state."""
+"""Buffers of results by their kind, of results that are not part of the state."""
 
 
 class Fields:
-    """Gives out fields. `sizes` are how many each array has by now."""
+    """Allocates fields of the buffers. `sizes` are how many each array has by now."""
 
     def __init__(self) -> None:
         self.sizes = {"state": 0, "counts": 0, "actions": 0, "outs": 0, "flags": 0}
@@ -35,6 +35,10 @@ class Fields:
     def place(self, tree: Any, reals: str) -> Any:
         """Return a tree of `Leaf`s for a tree of arrays or their shapes; float32 goes to the array `reals`."""
         return jax.tree.map(lambda x: self.leaf(x.shape, np.dtype(x.dtype).name, reals), tree)
+
+    def actions(self, shapes: dict[str, Any]) -> dict[str, Leaf]:
+        """Return a `Leaf` for each shape, in their order, in the array "actions"."""
+        return {name: self.leaf(x.shape, "float32", "actions") for name, x in shapes.items()}
 
     def leaf(self, shape: tuple[int, ...], dtype: str, reals: str) -> Leaf:
         buffer = reals if dtype == "float32" else BUFFERS[KINDS[dtype]]
@@ -61,17 +65,18 @@ def trace(function: Callable[..., Any], *arguments: Any) -> Function:
 
 def trace_environment(env: Stepper, stage: Stage) -> dict[str, Function]:
     """Trace an environment's functions: "reset", and "step" or "move" and "finish"."""
-    real = lambda *shape: jax.ShapeDtypeStruct(shape, np.float32)  # noqa: E731
     parameters = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), env.parameters)
     key, number = jax.ShapeDtypeStruct((2,), np.uint32), jax.ShapeDtypeStruct((), np.int32)
     stage("tracing the reset")
     reset = trace(env.reset, key, number, parameters)
-    actions = {agent: real(env.num_actions(agent)) for agent in env.agents}
+    actions = {agent: jax.ShapeDtypeStruct((env.num_actions(agent),), np.float32) for agent in env.agents}
     stage("tracing the step")
     if not env.pauses:
         return {"reset": reset, "step": trace(env.step, reset.result.carry, actions, parameters)}
     move = trace(env.move, reset.result.carry, actions, parameters)
-    finish = trace(env.finish, move.result, {name: real() for name in env.senses}, parameters)
+    finish = trace(
+        env.finish, move.result, {name: jax.ShapeDtypeStruct((), np.float32) for name in env.senses}, parameters
+    )
     return {"reset": reset, "move": move, "finish": finish}
 
 
@@ -92,10 +97,9 @@ def make_source(functions: dict[str, Function], parameters: Any, vector: bool, s
     given, places = _parameters(graph, parameters)
     carry = fields.place(functions["reset"].result.carry, "state")
     one = "move" if "move" in functions else "step"
-    leaves_of = lambda shapes: {name: fields.leaf(x.shape, "float32", "actions") for name, x in shapes.items()}  # noqa: E731
-    actions, moved, sensed = leaves_of(functions[one].arguments[1]), dict[str, Any](), dict[str, Leaf]()
+    actions, moved, sensed = fields.actions(functions[one].arguments[1]), dict[str, Any](), dict[str, Leaf]()
     if one == "move":
-        sensed = leaves_of(functions["finish"].arguments[1])
+        sensed = fields.actions(functions["finish"].arguments[1])
     stage("interpreting the step")
     kernels = {one: interpret(graph, functions[one], (carry, actions), given)}
     if one == "move":

@@ -1,4 +1,4 @@
-"""What JAX's element-wise primitives do to values."""
+"""The rules of JAX's element-wise primitives, for the values of one element."""
 
 from __future__ import annotations
 

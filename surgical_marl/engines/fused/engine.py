@@ -14,6 +14,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -107,7 +108,7 @@ class FusedEngine:
 
     @property
     def finite_check(self) -> FiniteCheck:
-        """What finds environments that are not finite; made when first needed."""
+        """Return the check for numbers that are not finite, made when it is first needed."""
         if self._finite_check is None:
             carry = {name: self._leaves[name] for name in self.carry_shapes}
             self._finite_check = FiniteCheck(self.source, carry, self._arrays)
@@ -121,13 +122,13 @@ class FusedEngine:
     def end_faulty(self, limit: int, library: str) -> Any:
         """End the episode of every environment that the last step left NaN or infinite; call it before `outcome`.
 
-        Its episode is terminated, its rewards are 0, and so are observations that are not finite. If its state is at
-        fault, it has reached `limit` steps, so that the next step begins a new episode, and what that step returns
-        besides is no new fault. Nothing waits for a GPU, and a CUDA graph can hold it.
+        The episode is terminated. Its rewards, and observations that are not finite, become 0. If numbers of the state
+        are at fault, the environment's count of steps is set to `limit`, so that the next step resets it; faults in the
+        results of that step are not reported again. It does not wait for a GPU, and can be part of a CUDA graph.
 
         Args:
             limit: steps after which an episode ends.
-            library: of what is returned.
+            library: of the returned array: "numpy", "torch" or "jax".
 
         Returns:
             Code of the fault in each environment, [N] int32; -1 where there is none.
@@ -135,22 +136,22 @@ class FusedEngine:
         return self._arrays.presented(self.finite_check.check(limit), library)
 
     def expect_end(self, leaving: np.ndarray) -> None:
-        """Take note of the environments, [N] bool, whose next step ends an episode because of an older fault."""
+        """Say which environments, [N] bool, the next step resets because of a fault: it is not reported again."""
         self.finite_check.clear(leaving)
 
     def outcome(self, library: str) -> dict[str, Any]:
-        """Return what the last step or reset led to: fields of the environment's `State` as dicts of dicts.
+        """Return the results of the last step or reset: fields of the environment's `State` as dicts of dicts.
 
-        The arrays are [N, ...] of "numpy", "torch" or "jax", and the next step leaves them as they are. In a CUDA graph
-        a replay overwrites those that were made while it was captured.
+        The arrays are [N, ...] of "numpy", "torch" or "jax". Later steps do not change them, but each replay of a CUDA
+        graph overwrites the arrays that were made while it was captured.
         """
         return self._arrays.read_tree(self.source.results, library)
 
     def read(self, name: str, library: str) -> Any:
-        """Return a copy, [N, ...], of a part of the `Carry` or of what has moved.
+        """Return a copy, [N, ...], of a part of the state.
 
-        A part of the `Carry` has a name in `carry_shapes`. A part of what has moved has a name as in
-        ".moved.carry.physics.qpos".
+        A part of the `Carry` has a name in `carry_shapes`; a part of the state between `move` and `finish` has one such
+        as ".moved.carry.physics.qpos".
         """
         return self._arrays.read(self._leaves[name], library)
 
@@ -177,11 +178,11 @@ class FusedEngine:
 
     def _launch(self, name: str) -> None:
         self._arrays.renew()
-        launch = lambda share: self._kernels[name].launch(self._arrays.all, self._stride, *share)  # noqa: E731
+        launch = partial(self._kernels[name].launch, self._arrays.all, self._stride)
         if len(self._shares) == 1:
-            launch(self._shares[0])
+            launch(*self._shares[0])
         else:
-            list(self._threads().map(launch, self._shares))
+            list(self._threads().map(launch, *zip(*self._shares, strict=True)))
 
     def _threads(self) -> ThreadPoolExecutor:
         """Return the threads of this process: one that was forked has none of its parent's."""

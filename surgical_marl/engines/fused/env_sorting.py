@@ -67,7 +67,7 @@ def slowest_first(work: Any, columns: Any) -> Any:
 
 
 class EnvOrder:
-    """Which environment is in which column.
+    """The permutation of the columns: which environment is in which.
 
     Args:
         numbers: 0, 1, ... [N] int32, of the library that the arrays are of.

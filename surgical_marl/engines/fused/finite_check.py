@@ -1,8 +1,8 @@
-"""Finds environments that are not finite after a step, and ends their episodes, in the arrays that the kernels left.
+"""Ends the episodes of environments whose state or results are NaN or infinite after a step.
 
-The kernels themselves notice that a number is not finite when they store it, and set a flag of the environment
-(`Source.fault`). Here only environments with that flag are looked at. On a GPU this is one kernel, which can be part of
-a CUDA graph, and nothing waits for it.
+Kernels set a flag of the environment (`Source.fault`) when they store a number that is not finite: see `check_finite` in
+`instrumentation.py`. Here the environments with that flag are looked at. On a GPU this is one kernel, which can be part
+of a CUDA graph, and nothing waits for it.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class FiniteCheck:
         self._ends = [source.results[name].first for name in ("terminated", "truncated")]
         self._flag = source.fault.first
         self._flags = arrays.rows(source.fault)[0]
-        # Where the next step will end an episode that was told to end: its numbers are no new fault.
+        # Environments that the next step resets because of a fault that was reported: it is not reported again.
         self._leaving, self._waiting = np.zeros(arrays.num_envs, np.int32), False
         self._fine = np.full(arrays.num_envs, FINE, np.int32)
         self._none = np.zeros(0, np.int64)
@@ -61,7 +61,7 @@ class FiniteCheck:
             load_for_gpu(_check)  # here, before a CUDA graph is captured
 
     def clear(self, leaving: np.ndarray) -> None:
-        """Take note of the environments, [N] bool, that the next step ends because of an older fault."""
+        """Say which environments, [N] bool, the next step resets because of a fault that was reported."""
         self._leaving[:], self._waiting = leaving, bool(leaving.any())
         if self._arrays.device == "cuda":
             self._own[-2].copy_(self._arrays.constant(self._leaving))

@@ -1,11 +1,11 @@
-"""The scalar program of the fused engine: a graph of values, simplified while it is built.
+"""The first IR of the fused engine: a graph of values, simplified while it is built.
 
 A value is an int. A negative one is a constant, `constants[~value]`; others are nodes: an operation, the values it
 reads and a kind, one of "f" (float32), "i" (int32), "u" (uint32), "b" (bool). Equal nodes are made once. Branches and
 loops are groups, whose results are nodes that name the group. `schedule.py` decides where a node is computed.
 
 An array in memory is a value too, of the kind "f64" if it holds 64 floats. Nothing changes an array: `update` makes
-another one. `emit.py` gives both the same place in memory if nothing else reads the first.
+another one. `inplace.py` gives both the same place in memory if nothing else reads the first.
 
 Simplifications assume finite numbers: 0 * x is 0 even if x might be infinite, zero has no sign, and only `x != x` and
 `isfinite` detect NaN.
@@ -58,7 +58,7 @@ class Graph:
 
     def __init__(self, cse: bool = True) -> None:
         self.cse = cse
-        """Whether equal nodes are made once: common subexpression elimination, by hash consing."""
+        """True if equal nodes are made once: common subexpression elimination, by hash consing."""
         self.ops: list[str] = []
         self.args: list[tuple[Any, ...]] = []
         self.kinds: list[str] = []
@@ -68,7 +68,7 @@ class Graph:
         self.inputs: set[int] = set()
         """Tables whose values are not known while tracing: parameters."""
         self.views: dict[tuple[Any, ...], Any] = {}
-        """What `memory.view` has found of values."""
+        """The results of `array_view.view`."""
         self._constant_ids: dict[tuple[str, Any], Value] = {}
         self._table_numbers: dict[tuple[str, bytes], int] = {}
         self._known: dict[tuple[Any, ...], Value] = {}
@@ -279,7 +279,7 @@ class Graph:
         return self.binary(op, a, b)
 
     def _is_beyond(self, op: str, constant: Value, value: Value) -> bool:
-        """Whether a value is never less (of "min"; of "max", more) than a constant, as it was clipped there."""
+        """Return whether a value was clipped at a constant, or beyond: "min" or "max" with the constant is no change."""
         if self.ops[value] != {"min": "max", "max": "min"}[op]:
             return False
         limit, bounds = self.constants[~constant], [self.constants[~a] for a in self.args[value] if a < 0]

@@ -1,7 +1,7 @@
-"""Gather, scatter and slices at traced places, as arithmetic on indices.
+"""Gather, scatter and slices at computed places, as arithmetic on indices.
 
-Indices that are known while tracing cost nothing: elements are moved. Another index becomes a lookup if the array is a
-table of constants or in memory, or else a selection among the elements that it may point to.
+Indices that are known while compiling cost nothing: elements are moved. Another index becomes a lookup if the array is
+a table of constants or in memory, or else a selection among the elements that it may point to.
 """
 
 from __future__ import annotations

@@ -21,7 +21,7 @@ from surgical_marl.engines.fused.graph import Branch, Graph, Loop, Value
 
 @dataclass
 class Places:
-    """Where everything is computed: see `Scheduler`."""
+    """The regions in which values and groups are computed: see `Scheduler`."""
 
     of: dict[Value, int]
     """Value -> its region."""
@@ -33,7 +33,7 @@ class Places:
 
 
 class InPlace:
-    """Which arrays are overwritten in place, and what that demands of the order.
+    """The arrays that are overwritten in place, and what that demands of the order.
 
     Attributes:
         overwritten, in_place, merged, destination: as in `Schedule`.

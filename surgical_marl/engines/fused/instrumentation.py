@@ -16,7 +16,7 @@ LARGE_PATH = 1500
 
 
 class Watch(NamedTuple):
-    """Which stored numbers must be finite, and where it is noted that one was not."""
+    """The stored numbers that must be finite, and the flag that is set when one is not."""
 
     fields: frozenset[tuple[str, int]]
     """(buffer, field) of each number."""

@@ -1,4 +1,4 @@
-"""A hash of traced functions: equal for functions that compute the same in the same way.
+"""A hash of jaxprs: equal for functions that compute the same in the same way.
 
 It reads what the compiler reads, so it can be the key of what the compiler makes: the operations in their order, with
 their parameters, shapes and types, and every constant with its numbers. Names and lines of source files do not count.

@@ -1,4 +1,4 @@
-"""Traces a JAX function into a `Graph`: its jaxpr is run on arrays of values.
+"""Interprets jaxprs on arrays of values of a `Graph`: abstract interpretation.
 
 Nested functions are inlined. A branch (`lax.cond`, `lax.switch`) stays a branch. It shares no computed values with the
 code around it, so that only its operands have to be kept for it. A loop (`lax.scan`, `lax.while_loop`) stays a loop,
@@ -41,16 +41,16 @@ _INSIDE = {
 
 
 class JaxprInterpreter:
-    """Runs jaxprs on traced arrays; nodes go into `graph`."""
+    """Interprets jaxprs, equation by equation; nodes go into `graph`."""
 
     def __init__(self, graph: Graph) -> None:
         self.graph = graph
-        self._around = 0  # the loops that are being traced, as bits
-        self._place: tuple[int, ...] = ()  # of the equation that is being traced, in the function
-        self._states: dict[tuple[int, ...], LoopState] = {}  # of the loop at each place, when it was last traced
+        self._around = 0  # the loops that are being interpreted, as bits
+        self._place: tuple[int, ...] = ()  # of the equation that is being interpreted, in the function
+        self._states: dict[tuple[int, ...], LoopState] = {}  # of the loop at each place, when it was last interpreted
 
     def run(self, closed: Any, args: Sequence[Any], part: int = 0) -> list[AnyArray]:
-        """Return the results of a closed jaxpr: a `part`, such as a side or a round, of the equation being traced.
+        """Return the results of a closed jaxpr: a `part`, such as a side or a round, of the equation being interpreted.
 
         Raises:
             Unsupported: there is no rule for something in it. The error names the line of the source.
@@ -262,7 +262,7 @@ class JaxprInterpreter:
     # -- random numbers
 
     def _random(self, name: str, equation: Any, xs: list[AnyArray]) -> AnyArray:
-        """JAX's own definition of the operation on raw keys, traced. Keys are their raw words."""
+        """Interpret JAX's own definition of the operation on raw keys. Keys are their raw words."""
         params, out = equation.params, equation.outvars[0].aval
         if name in ("random_wrap", "random_unwrap"):
             return xs[0]
@@ -278,10 +278,10 @@ class JaxprInterpreter:
             shapes = [jax.ShapeDtypeStruct(words, np.uint32), jax.ShapeDtypeStruct((), np.uint32)]
             xs = [xs[0], self._unsigned(xs[1])]
         elif name == "random_split":
-            function = lambda key: implementation.split(key, params["shape"])  # noqa: E731
+            function = partial(_of_key, implementation.split, params["shape"])
             shapes = [jax.ShapeDtypeStruct(words, np.uint32)]
         elif name == "random_bits":
-            function = lambda key: implementation.random_bits(key, params["bit_width"], params["shape"])  # noqa: E731
+            function = partial(_of_key, implementation.random_bits, params["bit_width"], params["shape"])
             shapes = [jax.ShapeDtypeStruct(words, np.uint32)]
         else:
             raise Unsupported(f"the primitive {name}")
@@ -306,9 +306,14 @@ def _expanded(primitive: Any) -> Any:
 
 @cache
 def _key_kinds() -> dict[Any, Any]:
-    """How the random keys of each dtype are drawn from."""
+    """Return JAX's implementation of random numbers for each dtype of keys."""
     kinds = (random.threefry_prng_impl, random.rbg_prng_impl, random.unsafe_rbg_prng_impl)
     return {jax.eval_shape(partial(jax.random.key, 0, impl=kind)).dtype: kind for kind in kinds}
+
+
+def _of_key(function: Callable[..., Any], *more: Any) -> Any:
+    """Call a function with a key, given last, as its first argument."""
+    return function(more[-1], *more[:-1])
 
 
 def _is_key(aval: Any) -> bool:

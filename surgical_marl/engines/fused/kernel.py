@@ -131,7 +131,10 @@ def _records() -> Path:
 
 
 def _folders(module: str) -> list[Path]:
-    """Where Warp keeps a module, without the folders `..._p<process>_t<thread>` in which processes still compile it."""
+    """Return the folders of a module in Warp's cache, without those in which processes still compile it.
+
+    Those are called `..._p<process>_t<thread>`.
+    """
     return [
         path
         for path in Path(wp.config.kernel_cache_dir).glob(f"wp_{module}_*")
@@ -214,5 +217,5 @@ def multiprocessors() -> int:
 
 
 def has_cuda() -> bool:
-    """Whether Warp finds a CUDA device."""
+    """Return whether Warp finds a CUDA device."""
     return bool(wp.is_cuda_available())

@@ -53,9 +53,9 @@ class Source:
     results: dict[str, Any]
     """Leaves of the rest of the `State`."""
     parameters: dict[str, Any]
-    """Where each parameter stands in the tables, by its path: leaves whose buffer is "float32" or "int32"."""
+    """Places of parameters in the tables, by their paths: leaves whose buffer is "float32" or "int32"."""
     moved: dict[str, Any]
     """Leaves of the state between both halves of a step, and of the `sensed` numbers; none if a step is one kernel."""
     sensed: dict[str, Any]
     fault: Leaf
-    """Whether a number that must be finite (`faults.checked`) was not, when a kernel stored it. Kernels only set it."""
+    """A flag that kernels set, and never clear, when they store a NaN or infinity that `faults.checked` forbids."""

@@ -1,4 +1,4 @@
-"""What a loop carries from round to round: values, and arrays in memory."""
+"""The state that a loop carries from round to round: values, and arrays in memory."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from surgical_marl.engines.fused.symbolic_array import AnyArray, array_of, dtype
 
 
 class LoopState:
-    """The carry of a loop that is traced again and again, until it is known what a round changes.
+    """The carry of a loop: a fixed point, found by interpreting the body until no more of the carry changes.
 
-    What no round changes is not carried. An array of which a round makes one in memory is carried there.
+    At first no value is taken to change. A value that a round changes becomes a phi, and the body is interpreted again.
+    Values that no round changes are not carried. An array that a round puts into memory is carried in memory.
 
-    A loop within a loop is traced anew in each trial of the outer one. As the outer one changes at least as much as in
-    its trial before, so does the inner one: it begins with what its `last` state found. So trials of nested loops add
-    up and do not multiply.
+    A loop within a loop is interpreted anew in each trial of the outer one. It begins with what its `last` trial found,
+    as it changes at least as much as then. So trials of nested loops add up and do not multiply.
     """
 
     def __init__(self, g: Graph, carry: list[AnyArray], last: LoopState | None = None) -> None:
@@ -49,7 +49,7 @@ class LoopState:
         return self._arrays(self._values)
 
     def changed(self, nexts: list[AnyArray]) -> bool:
-        """Whether a round changes more than was known; now it is known."""
+        """Return whether a round changes more than was known, and take note of it."""
         found = False
         for k, x in enumerate(nexts):
             new, varying = self._packed(k, x), self._varying[k]

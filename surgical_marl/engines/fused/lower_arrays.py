@@ -50,7 +50,7 @@ class ArrayLowering:
                 self._waiting.setdefault(value, []).append((node, k))
 
     def is_operand(self, read: Value) -> bool:
-        """Whether a read is an operand wherever it is used: at a known index of an array that does not change."""
+        """Return whether a read needs no instruction: it is at a known index of an array that does not change."""
         array, index = self.graph.args[read]
         return bool(index < 0) and array not in self.schedule.overwritten
 

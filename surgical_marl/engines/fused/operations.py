@@ -32,7 +32,7 @@ FOLD: dict[str, Callable[..., Any]] = {
     "f2u": lambda a: a.astype(np.uint32), "i2u": lambda a: a.astype(np.uint32), "u2i": lambda a: a.astype(np.int32),
     "bits": lambda a: a.view(np.uint32), "float": lambda a: a.view(np.float32),
 }  # fmt: skip
-"""What each operation does to constants: numpy, in the operands' own type."""
+"""Operations on constants, for folding: by numpy, in the operands' own type."""
 
 RESULT = {name: "b" for name in ("lt", "le", "gt", "ge", "eq", "ne", "isfinite")} | {
     "f2i": "i", "u2i": "i", "i2f": "f", "u2f": "f", "float": "f", "f2u": "u", "i2u": "u", "bits": "u",

@@ -17,7 +17,7 @@ PASSES, VERIFY, DUMP = "SURGICAL_MARL_PASSES", "SURGICAL_MARL_VERIFY", "SURGICAL
 
 
 class Options(NamedTuple):
-    """How to compile."""
+    """The settings of the compiler."""
 
     switches: tuple[str, ...]
     """As in "-interleave", sorted."""

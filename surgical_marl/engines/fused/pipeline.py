@@ -31,9 +31,9 @@ class Program:
     stores: Stores
     """Buffer, field and value of each result. Buffers are names of parameters."""
     vector: bool
-    """Whether it is for a CPU, with vectors of environments."""
+    """True for a CPU, with vectors of environments, False for CUDA."""
     watch: Watch | None = None
-    """Which results must be finite; None for no check."""
+    """The results that must be finite; None for no check."""
     scheduler: schedule.Scheduler = field(init=False)
     schedule: schedule.Schedule = field(init=False)
     code: Code = field(default_factory=list)
@@ -53,7 +53,7 @@ class Pass(NamedTuple):
     target: str = ""
     """ "cpu" or "cuda" if it is for one of them only."""
     required: bool = False
-    """Whether programs would be wrong without it, so that it has no switch."""
+    """True if programs would be wrong without it: it has no switch then."""
 
 
 def _dead_code(program: Program) -> None:

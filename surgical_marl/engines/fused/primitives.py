@@ -1,4 +1,4 @@
-"""What each JAX primitive does to traced arrays.
+"""The rules of JAX's primitives: from operands, arrays of values, to results.
 
 Arithmetic goes element by element through the graph (`scalars.py`, `linear.py`); primitives that move elements are
 numpy indexing on the values (here and in `indexing.py`).
@@ -124,7 +124,8 @@ def _empty(g: Graph, shape: Any, params: Any) -> AnyArray:
 
 
 def _threefry(g: Graph, shape: Any, params: Any, *xs: AnyArray) -> list[AnyArray]:
-    number = lambda k: g.constant(np.uint32(k))  # noqa: E731
+    def number(k: int) -> Value:
+        return g.constant(np.uint32(k))
 
     def rotate(word: Value, distance: int) -> Value:
         left, right = g.binary("shl", word, number(distance)), g.binary("shr", word, number(32 - distance))
@@ -203,7 +204,7 @@ _KNOWN: dict[str, Callable[..., Any]] = {
         "and", "or", "xor", "not",
     )
 } | {"select_n": lambda which, *cases: np.choose(which.astype(int), cases, mode="clip"), "add_any": np.add}  # fmt: skip
-"""Those that numpy computes on whole arrays as the graph would element by element."""
+"""Primitives that numpy computes on whole arrays as the graph would element by element."""
 
 
 def apply(g: Graph, name: str, avals: list[Any], params: dict[str, Any], xs: list[AnyArray]) -> list[AnyArray]:

@@ -56,7 +56,7 @@ def _of_constants(g: Graph, rows: np.ndarray, place: tuple[int, ...]) -> _Elemen
 
 
 def _of_values(g: Graph, rows: SymbolicArray, place: tuple[int, ...]) -> _Element:
-    """Where they are in memory, or else in an array made of them.
+    """Read rows from the array in memory that they are in, or from a new array made of them.
 
     The array holds more than the loop's own rows if there are rows within rows, which another loop may read.
     """
@@ -82,7 +82,7 @@ class RowWriter:
     def __init__(self, g: Graph, number: int, before: Value, rows: list[AnyArray]) -> None:
         self._g, self._number, self._before, self._rows = g, number, before, rows
         self._written: dict[tuple[Value, ...], int] = {}
-        """What is put into an array in each round, and which of the loop's phis that array is."""
+        """Values that are put into an array in each round -> the number of the array among the loop's phis."""
         for row in rows:
             for values in self._columns(row):
                 if values and max(values) >= before and values not in self._written:

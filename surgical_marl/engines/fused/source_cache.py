@@ -1,4 +1,4 @@
-"""Loads programs from the cache on disk, or makes them."""
+"""Loads the source of kernels from the cache on disk, or compiles it."""
 
 from __future__ import annotations
 

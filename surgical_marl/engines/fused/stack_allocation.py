@@ -102,5 +102,5 @@ def _assign(arrays: list[_Array]) -> tuple[dict[str, str], list[ir.Declare]]:
 
 
 def _meets(memory: list[_Array], array: _Array) -> bool:
-    """Whether any of the arrays in some memory is live at the same time as another one."""
+    """Return whether some array in a memory is live at the same time as another array."""
     return any(array.first <= other.last and other.first <= array.last for other in memory)

@@ -1,4 +1,4 @@
-"""The arrays that a function is traced with: known ones, and ones whose elements are values of a graph."""
+"""The arrays that jaxprs are interpreted on: known ones, and ones whose elements are values of a graph."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ AnyArray = np.ndarray | SymbolicArray
 """A numpy array if all its elements are known."""
 
 Rule = Callable[..., AnyArray | list[AnyArray]]
-"""What a primitive does: rule(graph, shape of the result, parameters, *operands)."""
+"""The rule of a primitive: rule(graph, shape of the result, parameters, *operands) gives its results."""
 
 
 class Unsupported(ValueError):
@@ -64,14 +64,14 @@ def kind_of(dtype: Any) -> str:
 
 
 def dtype_of(graph: Graph, array: AnyArray | Table) -> Any:
-    """Return the dtype of a traced array; float32 if it is empty."""
+    """Return the dtype of an array; float32 if it is empty."""
     if not isinstance(array, SymbolicArray):
         return array.dtype
     return DTYPES[graph.kind(int(array.ids.flat[0]))] if array.ids.size else np.float32
 
 
 def values_of(graph: Graph, array: AnyArray | Table) -> np.ndarray:
-    """Return the values of a traced array, whether they are known or not."""
+    """Return the values of an array: of a known one they are constants."""
     if isinstance(array, SymbolicArray):
         return array.ids
     if isinstance(array, Table):

@@ -7,8 +7,8 @@ from collections.abc import Iterator, Mapping
 from surgical_marl.engines.fused import instructions as ir
 
 WIDTHS = 4, 2
-"""How many arrays are interleaved: an instruction moves up to four neighbours in memory. Arrays that find no three
-others may find one."""
+"""Numbers of arrays that are interleaved: an instruction moves up to four neighbours in memory. Arrays that find no
+three others may find one."""
 
 
 def interleave(code: ir.Code) -> ir.Code:
