@@ -200,7 +200,7 @@ def run(code: ir.Code) -> Iterator[tuple[int, int | None]]:
         step += 1
 
 
-@settings(max_examples=300)
+@settings(max_examples=100)
 @given(codes())
 def test_every_read_sees_the_write_that_it_saw_before(code: ir.Code) -> None:
     for changed in (shared(code), interleaved(code), shared(interleave(code))):
