@@ -1,8 +1,8 @@
 """Ends the episodes of environments whose state or results are NaN or infinite after a step.
 
-Kernels set a flag of the environment (`Source.fault`) when they store a number that is not finite: see `check_finite` in
-`instrumentation.py`. Here the environments with that flag are looked at. On a GPU this is one kernel, which can be part
-of a CUDA graph, and nothing waits for it.
+Kernels set a flag of the environment (`Source.fault`) when they store a number that is not finite (`check_finite` in
+`instrumentation.py`). Here the environments with that flag are looked at. On a GPU this is one kernel, which can be
+part of a CUDA graph, and nothing waits for it.
 """
 
 from __future__ import annotations

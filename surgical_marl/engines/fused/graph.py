@@ -279,7 +279,7 @@ class Graph:
         return self.binary(op, a, b)
 
     def _is_beyond(self, op: str, constant: Value, value: Value) -> bool:
-        """Return whether a value was clipped at a constant, or beyond: "min" or "max" with the constant is no change."""
+        """Return whether a value was clipped so that its "min" or "max" with a constant is the constant."""
         if self.ops[value] != {"min": "max", "max": "min"}[op]:
             return False
         limit, bounds = self.constants[~constant], [self.constants[~a] for a in self.args[value] if a < 0]
