@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, PercentFormatter
 
 from docs.studies.study_cells import CELLS, QUESTIONS
-from docs.studies.study_runs import PLAYED, WHEN, Job
+from docs.studies.study_runs import PLAYED, Job
 from surgical_marl.evaluation.interval import interval, over_seeds
 from surgical_marl.evaluation.metrics import SUCCESS_MM, Metric, metrics, success
 from surgical_marl.files import write_atomic, write_text
@@ -24,6 +24,8 @@ from surgical_marl.runs.folder import read_metrics, read_origin, read_settings
 
 COLORS = ("#1f6f8b", "#b23a48", "#7a7a7a", "#c98a1b")
 FINAL = (f"success_{SUCCESS_MM}mm", f"team_success_{SUCCESS_MM}mm", "median_error_mm", "collision_rate")
+BOUNDED = (FINAL[0], "collision_rate")
+"""The metrics that the page gives with their intervals; study.json has all."""
 BROKEN = ("untouched", "frozen", "oracle")
 LEVEL = 0.8
 """Level of training's own success for which the table gives samples and seconds."""
@@ -49,13 +51,16 @@ def report(jobs: Sequence[Job], out: Path, results: Path) -> None:
     draw(found, results / "study.png")
     text = page.read_text(encoding="utf-8") if page.is_file() else f"{BEGIN}\n{END}\n"
     before, _, rest = text.partition(BEGIN)
-    after = rest.partition(END)[2]
+    write_text(page, before + tables(found) + rest.partition(END)[2])
+
+
+def tables(found: Sequence[dict[str, Any]]) -> str:
+    """Return the part of study.md that is made of rows of study.json, with its markers."""
     parts = ["![success and collisions while training](study.png)"]
     for members in _by_question(found).values():
         title = QUESTIONS[CELLS[members[0]["cell"]].question]
         parts += [f"### {title}", about(members), final_table(members), broken_table(members)]
-    tables = "\n\n".join([BEGIN, *parts, END])
-    write_text(page, before + tables + after)
+    return "\n\n".join([BEGIN, *parts, END])
 
 
 def _by_question(found: Sequence[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
@@ -188,22 +193,26 @@ def final_table(found: Sequence[dict[str, Any]]) -> str:
     rows = []
     for each in found:
         samples, seconds = (each["curves"][axis]["reached"] for axis in ("samples", "seconds"))
-        cells = [_cell(each[name], name) for name in FINAL]
+        cells = [_cell(each[name] if name in BOUNDED else each[name][:1], name) for name in FINAL]
         cells += ["-" if samples is None else f"{samples / 1e6:.3g}", "-" if seconds is None else f"{seconds:.3g}"]
         rows.append(
-            [f"`{each['scene']}`", f"`{CELLS[each['cell']].label()}`", *cells, _cell(each["seconds"], "seconds")]
+            [f"`{each['scene']}`", f"`{CELLS[each['cell']].label()}`", *cells, _cell(each["seconds"][:1], "seconds")]
         )
     return _markdown(head, rows)
 
 
 def broken_table(found: Sequence[dict[str, Any]]) -> str:
-    """Return what breaks when an arm is taken from its policy, as a Markdown table."""
-    head = ["scene", "settings", f"one arm, after {WHEN:g} s", "other arms", "that arm", "collisions"]
+    """Return how the other arms do when each arm in turn is taken from its policy, as a Markdown table."""
+    ways = {"frozen": "one frozen", "oracle": "one moved by the oracle"}
+    head = ["scene", "settings", *(cell for way in ways.values() for cell in (f"other arms, {way}", "collisions"))]
     rows = [
-        [f"`{each['scene']}`", f"`{CELLS[each['cell']].label()}`", {"oracle": "moved by the oracle"}.get(what, what)]
-        + [_cell(numbers[name], "rate") for name in ("others", "itself", "collisions")]
+        [f"`{each['scene']}`", f"`{CELLS[each['cell']].label()}`"]
+        + [
+            _cell(each["broken"].get(way, {}).get(name, [None])[:most], "rate")  # "-" if nobody played it
+            for way in ways
+            for name, most in (("others", 3), ("collisions", 1))
+        ]
         for each in found
-        for what, numbers in each["broken"].items()
     ]
     return _markdown(head, rows)
 
@@ -258,8 +267,8 @@ def _value(metric: Metric, run: int) -> float:
 def _cell(numbers: Sequence[float | None], name: str) -> str:
     rate = name.startswith(("success", "team", "collision", "rate"))
     show: Callable[[float], str] = (lambda x: f"{x:.1%}") if rate else (lambda x: f"{x:.3g}")
-    value, low, high = (None if x is None else show(x) for x in numbers)
-    return f"{value}" if low is None else f"{value} ({low} to {high})"
+    value, *bounds = ("-" if x is None else show(x) for x in numbers)
+    return f"{value} ({' to '.join(bounds)})" if None not in numbers[1:] and bounds else value
 
 
 def _markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

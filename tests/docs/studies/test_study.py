@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -66,7 +67,8 @@ def test_tables_and_files(runs: Path) -> None:
     assert text.startswith("before\n") and text.endswith("after\n") and "old" not in text
     assert f"10 iterations; trained on {first['trained_on']}, played on a CPU." in text
     assert "| `bimanual_psm` | `algo=mappo` | 75.0% (" in text
-    assert "| `bimanual_psm` | `algo=joint` | frozen | 75.0% (" in text
+    assert "other arms, one frozen | collisions |" in text and "| `bimanual_psm` | `algo=joint` | 75.0% (" in text
+    assert re.search(r"`algo=joint` \| 75\.0% \([^|]*\| 100\.0% \|", text), "others beside a frozen arm, and collisions"
     assert (first["algo"], second["algo"], first["seeds"]) == ("mappo", "joint", [0, 1])
     assert [each["success_2mm"] for each in first["by_seed"]] == [0.5, 1.0]
     assert first["seconds"][0] == 15.0 and first["samples"] == 1000.0
