@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from surgical_marl.scenes.objects import load_object
     from surgical_marl.tasks.base.task import Task, TipTask
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 _LAZY = {
     "BatchedEnv": "surgical_marl.envs.batch",

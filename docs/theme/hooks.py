@@ -14,7 +14,7 @@ from typing import Any
 from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).parents[2]
-CARDS = ("arms/*/README.md", "policies/README.md", "policies/*/README.md", "CHANGELOG.md")
+CARDS = ("arms/*/README.md", "policies/README.md", "policies/*/README.md", "CHANGELOG.md", "CONTRIBUTING.md")
 SHOWN = (".png", ".webp", ".gif", ".mp4")
 """What the folder of a card holds for the eye."""
 LINK = re.compile(r"^```.*?^```|(!?)\[([^\]]*)\]\(([^)\s]+)\)|`[^`\n]+`", re.DOTALL | re.MULTILINE)

@@ -14,7 +14,7 @@ from surgical_marl.cli import main as cli
 from surgical_marl.plugins.tasks import TASKS, scenes_for
 from tests.helpers import ROOT
 
-PATTERNS = ("README.md", "docs/**/*.md", "arms/*/README.md", "policies/**/README.md")
+PATTERNS = ("README.md", "CONTRIBUTING.md", "docs/**/*.md", "arms/*/README.md", "policies/**/README.md")
 PAGES = sorted({path for pattern in PATTERNS for path in ROOT.glob(pattern)})
 
 PROGRAMS = ("surgical-marl", "python", "python3", "make", "pip", "pytest", "torchrun")

@@ -15,8 +15,10 @@ import zipfile
 from pathlib import Path
 
 import pytest
+import yaml
 from hatchling.builders.wheel import WheelBuilder
 
+import surgical_marl as sm
 from surgical_marl import runtime
 from tests.helpers import ROOT
 
@@ -47,7 +49,13 @@ def test_a_wheel_carries_code_and_content(tmp_path: Path) -> None:
         "surgical_marl/content/configs/reach.yaml",
     } <= names
     roots = {name.split("/")[0] for name in names}
-    assert roots == {"surgical_marl", "surgical_marl-0.1.0.dist-info"}
+    assert roots == {"surgical_marl", f"surgical_marl-{sm.__version__}.dist-info"}
+
+
+def test_citation_and_changelog_have_the_version_of_the_package() -> None:
+    cited = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))["version"]
+    newest = re.search(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)
+    assert newest and {cited, newest[1]} == {sm.__version__}
 
 
 def test_an_editable_install_carries_no_copy(tmp_path: Path) -> None:
