@@ -14,7 +14,7 @@ from surgical_marl.engines.fused.graph import Graph, Value
 from surgical_marl.engines.fused.indexing import LEAST_TABLE, elements_of
 from surgical_marl.engines.fused.instrumentation import Watch
 from surgical_marl.engines.fused.jaxpr_interpreter import JaxprInterpreter
-from surgical_marl.engines.fused.kernel_layout import Leaf, Source
+from surgical_marl.engines.fused.kernel_layout import BUFFERS, Leaf, Source
 from surgical_marl.engines.fused.lower import table_offsets
 from surgical_marl.engines.fused.operations import KINDS
 from surgical_marl.engines.fused.pipeline import CSE, Program, compile_program, switched_off
@@ -22,7 +22,7 @@ from surgical_marl.engines.fused.symbolic_array import AnyArray, Table, array_of
 from surgical_marl.engines.stages import Stage
 from surgical_marl.engines.stepper import Stepper
 
-BUFFERS = {"f": "outs", "i": "counts", "u": "counts", "b": "flags"}
+RESULTS = {"f": "outs", "i": "counts", "u": "counts", "b": "flags"}
 """Buffers of results by their kind, of results that are not part of the state."""
 
 
@@ -30,7 +30,7 @@ class Fields:
     """Allocates fields of the buffers. `sizes` are how many each array has by now."""
 
     def __init__(self) -> None:
-        self.sizes = {"state": 0, "counts": 0, "actions": 0, "outs": 0, "flags": 0}
+        self.sizes = dict.fromkeys(BUFFERS, 0)
 
     def place(self, tree: Any, reals: str) -> Any:
         """Return a tree of `Leaf`s for a tree of arrays or their shapes; float32 goes to the array `reals`."""
@@ -41,7 +41,7 @@ class Fields:
         return {name: self.leaf(x.shape, "float32", "actions") for name, x in shapes.items()}
 
     def leaf(self, shape: tuple[int, ...], dtype: str, reals: str) -> Leaf:
-        buffer = reals if dtype == "float32" else BUFFERS[KINDS[dtype]]
+        buffer = reals if dtype == "float32" else RESULTS[KINDS[dtype]]
         leaf = Leaf(buffer, self.sizes[buffer], tuple(shape), dtype)
         self.sizes[buffer] += leaf.size
         return leaf

@@ -13,6 +13,8 @@ from typing import Any
 
 import numpy as np
 
+BUFFERS = ("state", "counts", "actions", "outs", "flags")
+"""Arrays of environments that kernels work on: see `kernel.py`."""
 TREES = ("carry", "actions", "results", "parameters", "moved", "sensed", "fault")
 
 

@@ -65,6 +65,10 @@ def _order(program: Program) -> None:
     program.schedule = program.scheduler.schedule()
 
 
+def _store_late(program: Program) -> None:
+    store_late(program.graph, program.schedule, program.stores)
+
+
 def _lower(program: Program) -> None:
     program.code = lower(program.graph, program.schedule, program.stores, program.vector)
 
@@ -95,12 +99,7 @@ PASSES = (
     Pass("order", _order, "schedule", required=True),
     Pass("store_early", lambda program: store_early(program.scheduler), "schedule"),
     Pass("load_early", lambda program: load_early(program.graph, program.schedule), "schedule"),
-    Pass(
-        "store_late",
-        lambda program: store_late(program.graph, program.schedule, program.stores),
-        "schedule",
-        required=True,
-    ),
+    Pass("store_late", _store_late, "schedule", required=True),
     Pass("lower", _lower, "code", required=True),
     Pass("check_finite", _check_finite, "code", required=True),
     Pass("count_work", _code(count_work), "code"),

@@ -6,9 +6,8 @@ from collections.abc import Iterator
 
 from surgical_marl.engines.fused import instructions as ir
 from surgical_marl.engines.fused.graph import Branch, Graph, Loop, Value
+from surgical_marl.engines.fused.kernel_layout import BUFFERS
 from surgical_marl.engines.fused.schedule import Schedule
-
-BUFFERS = ("state", "counts", "actions", "outs", "flags")
 
 
 class Malformed(AssertionError):
