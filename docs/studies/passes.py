@@ -1,0 +1,85 @@
+"""Measures what each pass of the fused engine's compiler saves: kernels without it take turns with those that have all.
+
+Run: python -m docs.studies.passes --scene bimanual_psm_needle --task needle_handover --motion grasp
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from docs.studies.command import make_parser
+from surgical_marl.bench.clock import race
+from surgical_marl.bench.contenders import clock_of
+from surgical_marl.bench.course import Course, make_course, tile
+from surgical_marl.bench.workload import Workload
+from surgical_marl.engines.fused.options import PASSES
+from surgical_marl.engines.fused.pipeline import CSE
+from surgical_marl.engines.fused.pipeline import PASSES as ALL
+from surgical_marl.envs.batch import BatchedEnv
+
+
+def on_device(values: np.ndarray, workload: Workload) -> Any:
+    """Return values of each environment of a course, repeated for all, as an array of the device."""
+    tiled = tile(values, workload.count)
+    if workload.where == "cpu":
+        return tiled
+    import torch
+
+    return torch.from_numpy(tiled).cuda()
+
+
+def batch_without(name: str, workload: Workload, course: Course) -> BatchedEnv:
+    """Return environments at the start of a course, compiled without a pass; "" is for none."""
+    os.environ[PASSES] = f"-{name}" if name else ""
+    arrays: Any = "torch" if workload.where == "cuda" else "numpy"
+    given = workload.of_environment()
+    batch = BatchedEnv(**given, num_envs=workload.count, engine="fused", device=workload.where, arrays=arrays)
+    batch.reset(seed=0)
+    for part, values in course.parts.items():
+        batch.engine.write(part, on_device(values, workload))
+    steps = np.random.default_rng(0).integers(0, batch.max_steps, workload.distinct, dtype=np.int32)
+    batch.steps = on_device(steps, workload)  # otherwise all episodes would end in the same step
+    return batch
+
+
+def passes_on(target: str) -> list[str]:
+    """Return the passes that can be left out for "cpu" or "cuda"."""
+    return [CSE, *(one.name for one in ALL if not one.required and one.target in ("", target))]
+
+
+def measure(workload: Workload, names: Sequence[str], repeats: int) -> dict[str, float]:
+    """Return how much longer an environment step takes without each pass, as a share of the step with all."""
+    course = make_course(workload)
+    actions = [{agent: on_device(rows, workload) for agent, rows in lap.items()} for lap in course.actions]
+    batches = {}
+    for name in ("", *names):
+        print(f"compiling without {name or 'none'}", file=sys.stderr, flush=True)
+        batches[name] = batch_without(name, workload, course)
+    took = race({name: clock_of(batch, actions) for name, batch in batches.items()}, repeats=repeats)
+    return {name: took[name] / took[""] - 1 for name in names}
+
+
+def main() -> None:
+    """Print a row for each pass."""
+    parser = make_parser(__doc__)
+    parser.add_argument("--scene", default="psm")
+    parser.add_argument("--task", default="reach")
+    parser.add_argument("--motion", default="random")
+    parser.add_argument("--num-envs", type=int)
+    parser.add_argument("--device", default="auto")
+    parser.add_argument("--repeats", type=int, default=10)
+    parser.add_argument("--only", nargs="*", help="passes (default: all of the device)")
+    a = parser.parse_args()
+    workload = Workload(task=a.task, scene=a.scene, motion=a.motion, num_envs=a.num_envs, device=a.device, decimation=8)
+    print(f"| pass | more time without it, `{a.scene}` on {workload.where} |\n|---|---|")
+    for name, more in measure(workload, a.only or passes_on(workload.where), a.repeats).items():
+        print(f"| `{name}` | {more:+.1%} |")
+
+
+if __name__ == "__main__":
+    main()
