@@ -111,3 +111,25 @@ def test_the_site_loads_nothing_from_elsewhere() -> None:
     assert "font: false" in settings and "://" not in settings and "analytics" not in settings
     theme = [path for path in (ROOT / "docs" / "theme").iterdir() if path.suffix in (".css", ".js")]
     assert len(theme) == 2 and not any("://" in path.read_text(encoding="utf-8") for path in theme)
+
+
+def test_files_and_modules_that_pages_name_exist() -> None:
+    """Files are named from the top of the repository, those of the package from its own top too."""
+    places = (ROOT, ROOT / "surgical_marl")
+    tops = "|".join(sorted(path.name for place in places for path in place.iterdir() if path.is_dir()))
+    for page in PAGES:
+        text = FENCE.sub("", page.read_text(encoding="utf-8"))
+        files = re.findall(rf"`((?:{tops})/[\w./-]+\.(?:py|ya?ml|md))`", text)
+        modules = re.findall(r"`((?:surgical_marl|docs\.studies)(?:\.[a-z]\w*)+)(?:\.[A-Z]\w*)*`", text)
+        missing = [name for name in files if not any((place / name).exists() for place in places)]
+        missing += [name for name in modules if not is_module_or_in_one(name)]
+        assert not missing, f"{page.relative_to(ROOT)} names {', '.join(missing)}, which is not there"
+
+
+def is_module_or_in_one(name: str) -> bool:
+    """Return whether a dotted name is a module or a folder, a name in one's text, or a task's such as reach_v0."""
+    path, parent = ROOT.joinpath(*name.split(".")), ROOT.joinpath(*name.split(".")[:-1])
+    if path.is_dir() or path.with_suffix(".py").is_file() or re.fullmatch(r"\w+_v\d+", path.name):
+        return True
+    source = parent / "__init__.py" if parent.is_dir() else parent.with_suffix(".py")
+    return source.is_file() and path.name in source.read_text(encoding="utf-8")
