@@ -26,7 +26,7 @@ class Registry:
 
     Args:
         noun: word for one of the classes, for messages.
-        package: the package of the shipped classes: for each name a module with one subclass of `base`.
+        package: the package of the shipped classes: for each name a module or folder with one subclass of `base`.
         group: the entry-point group in which an installed package declares its classes as `name = "module:Class"`.
         base: "module:Class", which all of them are subclasses of.
     """
@@ -93,7 +93,7 @@ class Registry:
 
     def _sources(self) -> dict[str, list[Source]]:
         found: dict[str, list[Source]] = {}
-        for name in self._shipped:
+        for name in self.shipped:
             found.setdefault(name, []).append(Source("surgical-marl", partial(self._load_shipped, name)))
         for point in self._points:
             where = f"the package {point.dist.name}" if point.dist else point.value
@@ -103,9 +103,10 @@ class Registry:
         return found
 
     @cached_property
-    def _shipped(self) -> list[str]:
+    def shipped(self) -> list[str]:
+        """Names of the classes of this package."""
         modules = pkgutil.iter_modules(import_module(self.package).__path__)
-        return [module.name for module in modules if not module.ispkg and not module.name.startswith("_")]
+        return [module.name for module in modules if not self.base.startswith(f"{self.package}.{module.name}.")]
 
     @cached_property
     def _points(self) -> list[EntryPoint]:
@@ -113,8 +114,8 @@ class Registry:
 
     def _load_shipped(self, name: str) -> type:
         module, base = import_module(f"{self.package}.{name}"), self._base()
-        own = [each for each in vars(module).values() if isinstance(each, type) and each.__module__ == module.__name__]
-        (cls,) = (each for each in own if issubclass(each, base))
+        classes = (each for each in vars(module).values() if isinstance(each, type) and issubclass(each, base))
+        (cls,) = (each for each in classes if f"{each.__module__}.".startswith(f"{module.__name__}."))
         return cls
 
 

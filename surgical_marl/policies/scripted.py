@@ -10,8 +10,8 @@ import numpy as np
 
 from surgical_marl.envs.observations import proprioception
 from surgical_marl.policies.convert import like, to_numpy
-from surgical_marl.tasks.base.grips import frames, joints_at, tool_of
-from surgical_marl.tasks.base.script import Snapshot, Step, Wish
+from surgical_marl.tasks.base.grasp_poses import frames, joints_at, tool_of
+from surgical_marl.tasks.base.oracle_script import Snapshot, Step, Wish
 
 if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv

@@ -1,1 +1,1 @@
-"""The tasks, one module each; a module is the page of its task."""
+"""The tasks, one module or folder each; its docstring is the page of the task."""

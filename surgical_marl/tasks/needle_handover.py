@@ -34,7 +34,7 @@ from surgical_marl.cache import cached
 from surgical_marl.robots.rotation import quaternion
 from surgical_marl.runtime import jax, jnp
 from surgical_marl.scenes.poses import Pose
-from surgical_marl.tasks.base.grips import (
+from surgical_marl.tasks.base.grasp_poses import (
     bar,
     bars,
     drawn_about,
@@ -47,9 +47,9 @@ from surgical_marl.tasks.base.grips import (
     tool_of,
     tool_poses,
 )
-from surgical_marl.tasks.base.lying import lying
 from surgical_marl.tasks.base.object_task import FAR, NEAR, Best, Now, ObjectTask, known
-from surgical_marl.tasks.base.script import EARLY, Snapshot, Step, Wish
+from surgical_marl.tasks.base.oracle_script import EARLY, Snapshot, Step, Wish
+from surgical_marl.tasks.base.resting_poses import resting_poses
 from surgical_marl.tasks.base.task import Start
 from surgical_marl.tasks.base.terms import Picture, Term
 from surgical_marl.tasks.base.workspace import choose
@@ -299,7 +299,7 @@ class Task(ObjectTask):
         end = END * pointing[:2] / np.linalg.norm(pointing[:2])
 
         def batch(_: bool) -> tuple[np.ndarray, np.ndarray]:
-            place = lying(scene, self.object, ROWS, middle[:2] - end, level.spread, rng)
+            place = resting_poses(scene, self.object, ROWS, middle[:2] - end, level.spread, rng)
             starts = frames(*place)
             tools = from_above(first, *bar(starts, self._item, self.grips[0]), 0.0)
             q, good = joints_at(first, tools)

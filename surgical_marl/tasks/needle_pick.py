@@ -32,7 +32,7 @@ from surgical_marl.cache import cached
 from surgical_marl.robots.rotation import quaternion
 from surgical_marl.runtime import jax
 from surgical_marl.scenes.poses import Pose
-from surgical_marl.tasks.base.grips import (
+from surgical_marl.tasks.base.grasp_poses import (
     bar,
     bars,
     drawn_about,
@@ -43,9 +43,9 @@ from surgical_marl.tasks.base.grips import (
     lowest_bar,
     moved,
 )
-from surgical_marl.tasks.base.lying import lying
 from surgical_marl.tasks.base.object_task import NEAR, ObjectGoal, ObjectTask
-from surgical_marl.tasks.base.script import EARLY, Snapshot, Step, Wish
+from surgical_marl.tasks.base.oracle_script import EARLY, Snapshot, Step, Wish
+from surgical_marl.tasks.base.resting_poses import resting_poses
 from surgical_marl.tasks.base.task import Start
 from surgical_marl.tasks.base.workspace import choose
 
@@ -152,7 +152,7 @@ class Task(ObjectTask):
         middles, _ = bars(self._item)
 
         def batch(_: bool) -> tuple[np.ndarray, np.ndarray]:
-            place = lying(scene, self.object, ROWS, middle, self.level.spread, rng)
+            place = resting_poses(scene, self.object, ROWS, middle, self.level.spread, rng)
             starts, number = frames(*place), rng.integers(len(middles) // 4, -(-3 * len(middles) // 4), ROWS)
             tools = from_above(mount, *bar(starts, self._item, number), 0.0)
             q, good = joints_at(mount, tools)

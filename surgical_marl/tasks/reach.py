@@ -31,7 +31,7 @@ import numpy as np
 from surgical_marl.runtime import jax
 from surgical_marl.tasks.base.crossing import crossing_table
 from surgical_marl.tasks.base.options import Options
-from surgical_marl.tasks.base.script import Snapshot, Step, Wish
+from surgical_marl.tasks.base.oracle_script import Snapshot, Step, Wish
 from surgical_marl.tasks.base.task import Goal, Level, Start, TipTask
 from surgical_marl.tasks.base.workspace import MANY_STARTS, TABLE_SIZE, start_table, target_table
 

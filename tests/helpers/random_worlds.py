@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from surgical_marl.physics.outputs import ArmView, Handled, ObjectView
 from surgical_marl.scenes.load import load_scene
 from surgical_marl.scenes.poses import Pose
-from surgical_marl.tasks.base.grips import bars
+from surgical_marl.tasks.base.grasp_poses import bars
 from surgical_marl.tasks.base.object_task import Best, ObjectGoal, ObjectTask
 from surgical_marl.tasks.base.options import Options
 from surgical_marl.tasks.base.task import Start

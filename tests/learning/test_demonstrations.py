@@ -26,7 +26,7 @@ from surgical_marl.runs.checkpoint import read_checkpoint
 from surgical_marl.runs.environment import make_env
 from surgical_marl.runs.folder import read_metrics
 from surgical_marl.runs.settings import ImitationSettings, NetworkSettings, OracleStatesSettings, Settings
-from surgical_marl.tasks.base.script import Step, Wish
+from surgical_marl.tasks.base.oracle_script import Step, Wish
 
 SETTINGS = Settings(
     task="reach", scene="psm", num_envs=64, iterations=4, steps_per_iteration=4, device="cpu",

@@ -17,8 +17,7 @@ from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 
 from surgical_marl.interfaces.rsl_rl import RslRlVecEnv
-from surgical_marl.learning.algorithm import Algorithm
-from surgical_marl.learning.algorithms.mappo import MAPPO
+from surgical_marl.learning.algorithms.mappo import MAPPO, Algorithm
 from surgical_marl.learning.configuration import rsl_rl_config
 from surgical_marl.plugins.algorithms import ALGORITHMS
 from surgical_marl.policies.layout import Layout

@@ -17,11 +17,11 @@ from surgical_marl.evaluation.evaluate import evaluate
 from surgical_marl.physics.outputs import Handled, ObjectView
 from surgical_marl.policies.oracle import oracle
 from surgical_marl.policies.policy import load_policy, zero_policy
-from surgical_marl.tasks.base.grips import frames
-from surgical_marl.tasks.base.viewing import CLOSE, FARTHEST, FILL, NEAREST, Eye
+from surgical_marl.tasks.base.grasp_poses import frames
 from surgical_marl.tasks.base.workspace import CLEARANCE
 from surgical_marl.tasks.base.world import World
-from surgical_marl.tasks.camera_assist import SEARCH, ViewGoal
+from surgical_marl.tasks.camera_assist.eye import CLOSE, FARTHEST, FILL, NEAREST, Eye
+from surgical_marl.tasks.camera_assist.task import SEARCH, ViewGoal
 from tests.helpers.actions import random_actions
 
 TASK, SCENE, CAMERA, TOOLS = "camera_assist", "trimanual_psm_ecm", "ecm_0", ("psm_0", "psm_1")

@@ -17,8 +17,8 @@ from surgical_marl.policies.policy import zero_policy
 from surgical_marl.robots.inverse_kinematics import inverse_kinematics
 from surgical_marl.scenes.scene import Scene
 from surgical_marl.tasks.base.crossing import APART, BEYOND, FARTHEST, NEAREST, PASS, crossing_table, shaft
-from surgical_marl.tasks.base.grips import tool_of
-from surgical_marl.tasks.base.script import Snapshot
+from surgical_marl.tasks.base.grasp_poses import tool_of
+from surgical_marl.tasks.base.oracle_script import Snapshot
 from surgical_marl.tasks.base.workspace import CLEARANCE
 
 PAIR = ("psm_0", "psm_1")

@@ -18,9 +18,9 @@ from surgical_marl.policies.oracle import oracle
 from surgical_marl.policies.policy import load_policy, zero_policy
 from surgical_marl.scenes.object_contacts import RESTING, distances
 from surgical_marl.scenes.poses import Pose
-from surgical_marl.tasks.base.grips import bar
-from surgical_marl.tasks.base.lying import LOOSE
+from surgical_marl.tasks.base.grasp_poses import bar
 from surgical_marl.tasks.base.object_task import Best
+from surgical_marl.tasks.base.resting_poses import LOOSE
 from surgical_marl.tasks.base.world import World
 from surgical_marl.tasks.needle_handover import END, OUT, HandoverGoal, Team
 

@@ -18,9 +18,9 @@ from surgical_marl.physics.outputs import Handled, ObjectView
 from surgical_marl.policies.policy import load_policy
 from surgical_marl.scenes.object_contacts import RESTING, distances
 from surgical_marl.scenes.poses import Pose
-from surgical_marl.tasks.base.grips import bars, frames, joints_at, tool_of, tool_poses
-from surgical_marl.tasks.base.lying import LOOSE, lying
+from surgical_marl.tasks.base.grasp_poses import bars, frames, joints_at, tool_of, tool_poses
 from surgical_marl.tasks.base.object_task import LIFT, LOST, Best, ObjectGoal
+from surgical_marl.tasks.base.resting_poses import LOOSE, resting_poses
 from surgical_marl.tasks.base.task import PRECISION
 from surgical_marl.tasks.base.world import World
 from surgical_marl.tasks.needle_pick import HIGH, LOW
@@ -85,7 +85,7 @@ def test_a_tool_grips_across_a_bar() -> None:
 def test_where_nothing_lies_is_said() -> None:
     scene = env().scene
     with pytest.raises(ValueError, match="'needle' lies at rest in hardly any place within 5 mm of"):
-        lying(scene, "needle", 8, np.array([0.3, 0.0]), 0.005, np.random.default_rng(0))
+        resting_poses(scene, "needle", 8, np.array([0.3, 0.0]), 0.005, np.random.default_rng(0))
 
 
 def world(known: Env, error: Any, force: float, holding: bool, best: Best, row: int = 5, angle: float = 0.0) -> World:

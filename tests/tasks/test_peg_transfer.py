@@ -18,12 +18,12 @@ from surgical_marl.policies.oracle import oracle
 from surgical_marl.policies.policy import load_policy, zero_policy
 from surgical_marl.scenes.object_contacts import RESTING, distances
 from surgical_marl.scenes.poses import Pose
-from surgical_marl.tasks.base.blocks import find_pegs, gripping, upright
-from surgical_marl.tasks.base.grips import tool_of
+from surgical_marl.tasks.base.grasp_poses import tool_of
 from surgical_marl.tasks.base.object_task import Best
-from surgical_marl.tasks.base.peg_script import ABOVE_WALL, PAST
 from surgical_marl.tasks.base.world import World
-from surgical_marl.tasks.peg_transfer import CLEAR, SHIFT, PegGoal, Team
+from surgical_marl.tasks.peg_transfer.blocks import find_pegs, gripping, upright
+from surgical_marl.tasks.peg_transfer.script import ABOVE_WALL, PAST
+from surgical_marl.tasks.peg_transfer.task import CLEAR, SHIFT, PegGoal, Team
 
 TASK, SCENE = "peg_transfer", "bimanual_psm_pegs"
 ROW = 5

@@ -20,9 +20,9 @@ from surgical_marl.physics.outputs import Handled, ObjectView
 from surgical_marl.policies.policy import load_policy
 from surgical_marl.scenes.object_contacts import RESTING, distances
 from surgical_marl.scenes.poses import Pose
-from surgical_marl.tasks.base.peg_trial import APART
 from surgical_marl.tasks.base.world import World
-from surgical_marl.tasks.peg_transfer import LOOSE
+from surgical_marl.tasks.peg_transfer.starts import APART
+from surgical_marl.tasks.peg_transfer.task import LOOSE
 
 TASK, SCENE = "peg_transfer", "bimanual_psm_pegs"
 BLUE, RED = "block_blue", "block_red"

@@ -9,7 +9,7 @@ import numpy as np
 
 from surgical_marl.plugins.task_file import label
 from surgical_marl.runtime import jnp
-from surgical_marl.tasks.base.grips import bars, frames
+from surgical_marl.tasks.base.grasp_poses import bars, frames
 from surgical_marl.tasks.base.object_terms import PARTS
 from surgical_marl.tasks.base.task import PRECISION, Task
 from surgical_marl.tasks.base.terms import Picture, Term

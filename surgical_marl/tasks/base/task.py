@@ -21,7 +21,7 @@ from surgical_marl.runtime import jax, jnp
 from surgical_marl.scenes.poses import Pose
 from surgical_marl.tasks.base.object_terms import object_terms
 from surgical_marl.tasks.base.options import Options
-from surgical_marl.tasks.base.script import Snapshot, Step, Wish
+from surgical_marl.tasks.base.oracle_script import Snapshot, Step, Wish
 from surgical_marl.tasks.base.terms import Picture, Term, arm_terms, picture_terms
 from surgical_marl.tasks.base.world import World
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from surgical_marl.robots.rotation import quaternion
 from surgical_marl.scenes.scene import Mount, Scene
-from surgical_marl.tasks.base.grips import DOWN, frames, tool_of, tool_poses
+from surgical_marl.tasks.base.grasp_poses import DOWN, frames, tool_of, tool_poses
 
 OUT = 0.0009
 """How far outside the bar the middle between the fingers is before they close, m: the inner one is near the peg."""

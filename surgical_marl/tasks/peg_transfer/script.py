@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from surgical_marl.tasks.base.blocks import gripping, upright
-from surgical_marl.tasks.base.grips import joints_at, moved, tool_of
-from surgical_marl.tasks.base.script import EARLY, Snapshot, Step, Wish
+from surgical_marl.tasks.base.grasp_poses import joints_at, moved, tool_of
+from surgical_marl.tasks.base.oracle_script import EARLY, Snapshot, Step, Wish
+from surgical_marl.tasks.peg_transfer.blocks import gripping, upright
 
 if TYPE_CHECKING:
     from surgical_marl.scenes.scene import Mount, Scene

@@ -7,19 +7,14 @@ does not count: tools are thin.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from surgical_marl.runtime import jnp
 from surgical_marl.scenes.scene import Mount
-from surgical_marl.tasks.base.object_task import FAR
-from surgical_marl.tasks.base.terms import About, Term
-from surgical_marl.tasks.base.world import World
 
 if TYPE_CHECKING:
-    from jax import Array
+    pass
 
 NEAREST = 0.02
 """Least distance along the view at which a point is in view, m: `match_image` keeps as far away from what it sees."""
@@ -126,41 +121,3 @@ class Eye:
         off, depth = self.aim((places - origin[..., None, :]) @ axes)
         errors = np.concatenate([off, weight * depth[..., None]], -1)
         return errors[0], np.moveaxis((errors[1:] - errors[0]) / SMALL, 0, -1)
-
-
-class Sights(NamedTuple):
-    """What an endoscope sees of places by name."""
-
-    place: dict[str, Array]
-    """In its frame, m, [3] each."""
-    visible: dict[str, Array]
-    """Whether each is in view, [] bool."""
-    origin: Array
-    """Of its frame in the world, m, [3]."""
-
-
-def hidden(term: Term, sights: Callable[[World], Sights], needs: tuple[str, ...]) -> Term:
-    """Return a term that is 0 unless all of some places are in view."""
-
-    def read(world: World) -> Array:
-        visible = sights(world).visible
-        return jnp.where(jnp.stack([visible[name] for name in needs]).all(), term.read(world), 0.0)
-
-    return Term(read, np.minimum(term.low, 0.0), np.maximum(term.high, 0.0), term.about)
-
-
-def seen_places(sights: Callable[[World], Sights], *names: str, always: bool = False, about: About = "object") -> Term:
-    """Return a term of places in the endoscope's frame, m, each with a flag that it is in view, [4 each].
-
-    Places out of view are zeros, but not if they are `always` known. What a camera shows is `about` objects, unless it
-    is a goal.
-    """
-
-    def read(world: World) -> Array:
-        place, visible, _ = sights(world)
-        shown = [place[n] if always else jnp.where(visible[n], place[n], 0.0) for n in names]
-        flags = [visible[name].astype(jnp.float32) for name in names]
-        return jnp.concatenate([jnp.append(p, flag) for p, flag in zip(shown, flags, strict=True)])
-
-    low, high = np.tile([-FAR, -FAR, -FAR, 0.0], len(names)), np.tile([FAR, FAR, FAR, 1.0], len(names))
-    return Term(read, low, high, about)

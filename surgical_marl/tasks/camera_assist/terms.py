@@ -7,14 +7,17 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from surgical_marl.tasks.base.terms import Picture, Term
-from surgical_marl.tasks.base.viewing import Eye, Sights, hidden, seen_places
+from surgical_marl.runtime import jnp
+from surgical_marl.tasks.base.object_task import FAR
+from surgical_marl.tasks.base.terms import About, Picture, Term
+from surgical_marl.tasks.camera_assist.eye import Eye
 
 if TYPE_CHECKING:
     from jax import Array
 
     from surgical_marl.scenes.scene import Scene
     from surgical_marl.tasks.base.world import World
+
 
 GOAL = "goal"
 """Name of the place where an object should be."""
@@ -80,3 +83,41 @@ class Shown(NamedTuple):
         touch = dict.fromkeys(("to_object", "to_useful"), (agent, self.object))
         goal = dict.fromkeys(("target", "target_rotation"), (GOAL,))
         return {**found, **touch, **goal, "to_target": (self.object, GOAL), "others_hold": (self.object,)}
+
+
+class Sights(NamedTuple):
+    """What an endoscope sees of places by name."""
+
+    place: dict[str, Array]
+    """In its frame, m, [3] each."""
+    visible: dict[str, Array]
+    """Whether each is in view, [] bool."""
+    origin: Array
+    """Of its frame in the world, m, [3]."""
+
+
+def hidden(term: Term, sights: Callable[[World], Sights], needs: tuple[str, ...]) -> Term:
+    """Return a term that is 0 unless all of some places are in view."""
+
+    def read(world: World) -> Array:
+        visible = sights(world).visible
+        return jnp.where(jnp.stack([visible[name] for name in needs]).all(), term.read(world), 0.0)
+
+    return Term(read, np.minimum(term.low, 0.0), np.maximum(term.high, 0.0), term.about)
+
+
+def seen_places(sights: Callable[[World], Sights], *names: str, always: bool = False, about: About = "object") -> Term:
+    """Return a term of places in the endoscope's frame, m, each with a flag that it is in view, [4 each].
+
+    Places out of view are zeros, but not if they are `always` known. What a camera shows is `about` objects, unless it
+    is a goal.
+    """
+
+    def read(world: World) -> Array:
+        place, visible, _ = sights(world)
+        shown = [place[n] if always else jnp.where(visible[n], place[n], 0.0) for n in names]
+        flags = [visible[name].astype(jnp.float32) for name in names]
+        return jnp.concatenate([jnp.append(p, flag) for p, flag in zip(shown, flags, strict=True)])
+
+    low, high = np.tile([-FAR, -FAR, -FAR, 0.0], len(names)), np.tile([FAR, FAR, FAR, 1.0], len(names))
+    return Term(read, low, high, about)

@@ -38,16 +38,15 @@ import numpy as np
 from surgical_marl.cache import cached
 from surgical_marl.runtime import jax, jnp
 from surgical_marl.scenes.poses import Pose
-from surgical_marl.tasks.base.blocks import OUT, find_pegs, side_pegs
-from surgical_marl.tasks.base.grasp_terms import grasp_terms
-from surgical_marl.tasks.base.grips import frames
+from surgical_marl.tasks.base.grasp_poses import frames
 from surgical_marl.tasks.base.object_task import NEAR, Best, Now, ObjectTask
-from surgical_marl.tasks.base.object_terms import AT_HAND, PARTS, object_terms
-from surgical_marl.tasks.base.peg_places import draw_moves, draw_turns, goals_in_turn
-from surgical_marl.tasks.base.peg_script import SETTINGS, Transfer
-from surgical_marl.tasks.base.peg_trial import APART, POOL, Trial, Turns
-from surgical_marl.tasks.base.script import Snapshot, Step
+from surgical_marl.tasks.base.object_terms import AT_HAND, PARTS, grasp_terms, object_terms
+from surgical_marl.tasks.base.oracle_script import Snapshot, Step
 from surgical_marl.tasks.base.task import Start
+from surgical_marl.tasks.peg_transfer.blocks import OUT, find_pegs, side_pegs
+from surgical_marl.tasks.peg_transfer.script import SETTINGS, Transfer
+from surgical_marl.tasks.peg_transfer.starts import APART, POOL, draw_moves, draw_turns, goals_in_turn
+from surgical_marl.tasks.peg_transfer.trial import Trial, Turns
 
 if TYPE_CHECKING:
     from jax import Array

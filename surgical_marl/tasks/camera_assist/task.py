@@ -30,6 +30,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -38,23 +39,30 @@ from surgical_marl.cache import cached
 from surgical_marl.robots.inverse_kinematics import inverse_kinematics
 from surgical_marl.runtime import jax, jnp
 from surgical_marl.tasks import reach
-from surgical_marl.tasks.base.assist_terms import GOAL, Shown
-from surgical_marl.tasks.base.assisting import ROWS, draw_postures, find_roles, later, of_work, visible_targets, work_in
-from surgical_marl.tasks.base.grips import bars
+from surgical_marl.tasks.base.grasp_poses import bars
 from surgical_marl.tasks.base.object_task import FAR, ObjectTask
 from surgical_marl.tasks.base.options import Options
-from surgical_marl.tasks.base.script import Snapshot, Step, Wish
+from surgical_marl.tasks.base.oracle_script import Snapshot, Step, Wish
 from surgical_marl.tasks.base.task import Start
 from surgical_marl.tasks.base.task import Task as BaseTask
 from surgical_marl.tasks.base.terms import Picture, Term
-from surgical_marl.tasks.base.viewing import Eye, Sights
 from surgical_marl.tasks.base.workspace import TIME
+from surgical_marl.tasks.camera_assist.eye import Eye
+from surgical_marl.tasks.camera_assist.starts import (
+    ROWS,
+    draw_postures,
+    find_roles,
+    visible_targets,
+    work_in,
+)
+from surgical_marl.tasks.camera_assist.terms import GOAL, Shown, Sights
 
 if TYPE_CHECKING:
     from jax import Array
 
     from surgical_marl.scenes.scene import Scene
     from surgical_marl.tasks.base.world import World
+
 
 SEARCH = TIME
 """Time in which the endoscope may look for the tools, s, unless it sees all before: as arms may take in `reach`."""
@@ -359,3 +367,20 @@ class Task(BaseTask):
 def _at_most(value: Array, limit: float) -> Array:
     """Return a value, and the limit where it is larger, or where the physics has failed."""
     return jnp.where(value < limit, value, limit)
+
+
+def of_work(goal: Any) -> SimpleNamespace:
+    """Return the goals of the work, from the fields of this task's goals."""
+    own = {name.removeprefix("work."): value for name, value in vars(goal).items() if name.startswith("work.")}
+    return SimpleNamespace(**own)
+
+
+def later(step: Step) -> Step:
+    """Return a step of the work as one of this task, which has another step before and goals of its own."""
+
+    def inside(call: Any) -> Any:
+        return lambda seen: call(seen._replace(goal=of_work(seen.goal)))
+
+    good, before = None if step.good is None else inside(step.good), step.back
+    back = (lambda seen: inside(before)(seen) + 1) if callable(before) else before + 1
+    return step._replace(plan=inside(step.plan), good=good, back=back)

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-from typing import Any
-
 import numpy as np
 
 from surgical_marl.robots.inverse_kinematics import inverse_kinematics
 from surgical_marl.scenes.scene import Scene
 from surgical_marl.tasks import needle_handover, peg_transfer, reach
-from surgical_marl.tasks.base.grips import tool_of
-from surgical_marl.tasks.base.script import Step
+from surgical_marl.tasks.base.grasp_poses import tool_of
 from surgical_marl.tasks.base.task import Task
-from surgical_marl.tasks.base.viewing import Eye
 from surgical_marl.tasks.base.workspace import CLEARANCE, PATH_POINTS, choose
+from surgical_marl.tasks.camera_assist.eye import Eye
 
 ROWS = 2048
 """Number of postures of the endoscope at the start, and of goals of `reach`."""
@@ -112,20 +108,3 @@ def visible_targets(scene: Scene, camera: str, tools: tuple[str, ...], targets: 
             "back or the arms' workspace points together"
         )
     return targets[np.resize(rows, ROWS)]
-
-
-def of_work(goal: Any) -> SimpleNamespace:
-    """Return the goals of the work, from the fields of this task's goals."""
-    own = {name.removeprefix("work."): value for name, value in vars(goal).items() if name.startswith("work.")}
-    return SimpleNamespace(**own)
-
-
-def later(step: Step) -> Step:
-    """Return a step of the work as one of this task, which has another step before and goals of its own."""
-
-    def inside(call: Any) -> Any:
-        return lambda seen: call(seen._replace(goal=of_work(seen.goal)))
-
-    good, before = None if step.good is None else inside(step.good), step.back
-    back = (lambda seen: inside(before)(seen) + 1) if callable(before) else before + 1
-    return step._replace(plan=inside(step.plan), good=good, back=back)

@@ -14,7 +14,9 @@ LOOSE = 5e-5
 MOST_BATCHES = 8
 
 
-def lying(scene: Scene, name: str, count: int, centre: np.ndarray, spread: float, rng: np.random.Generator) -> Pose:
+def resting_poses(
+    scene: Scene, name: str, count: int, centre: np.ndarray, spread: float, rng: np.random.Generator
+) -> Pose:
     """Return places [count] of a free object, on the same fixed thing as in the scene's own place, which is level.
 
     The object is turned about the vertical at random, and lies on its other side in half of the draws, if it is so

@@ -1,0 +1,1 @@
+from surgical_marl.tasks.camera_assist.task import Task as Task

@@ -1,0 +1,1 @@
+from surgical_marl.tasks.peg_transfer.task import Task as Task
