@@ -16,11 +16,11 @@ from surgical_marl.robots.arm import load_arm
 from surgical_marl.scenes.load import load_scene
 from surgical_marl.tasks.base import object_task
 from surgical_marl.tasks.base.object_task import ObjectTask
-from surgical_marl.tasks.base.object_terms import grasp_terms
 from surgical_marl.tasks.base.options import Options
 from surgical_marl.tasks.base.task import Goal, Level, Start, Task, TipTask
 from surgical_marl.tasks.base.terms import arm_terms, picture_terms, read_vector, slices
 from surgical_marl.tasks.base.world import World
+from surgical_marl.tasks.peg_transfer.blocks import grasp_terms
 from tests.helpers.random_worlds import NEEDLE, ONE, THREE, TWO, WORLDS, Bring, bars_of, bring, drawn, tool
 
 

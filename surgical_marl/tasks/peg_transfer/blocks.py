@@ -1,14 +1,25 @@
-"""Blocks that stand on pegs, on the host: where they are, and how a jaw grips them, a finger between block and peg."""
+"""Blocks that stand on pegs: where they are, how a jaw grips them with a finger between block and peg, grip terms."""
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from surgical_marl.physics.outputs import ObjectView
 from surgical_marl.robots.rotation import quaternion
+from surgical_marl.runtime import jnp
+from surgical_marl.scenes.objects import Object
 from surgical_marl.scenes.scene import Mount, Scene
 from surgical_marl.tasks.base.grasp_poses import DOWN, frames, tool_of, tool_poses
+from surgical_marl.tasks.base.object_task import FAR
+from surgical_marl.tasks.base.terms import Term
+from surgical_marl.tasks.base.world import World
+
+if TYPE_CHECKING:
+    from jax import Array
+
 
 OUT = 0.0009
 """How far outside the bar the middle between the fingers is before they close, m: the inner one is near the peg."""
@@ -67,3 +78,36 @@ def side_pegs(scene: Scene, agent: str, moved: Collection[str]) -> np.ndarray:
     taken = [place.position for name, place in scene.free_objects.items() if name not in moved]
     good = [away(mounts[agent].position) < away(other.position) for other in jaws]
     return pegs[np.all([*good, *(away(place) > 0.01 for place in taken)], axis=0)]
+
+
+def grasp_terms(mount: Mount, agent: str, item: Object, body: Callable[[World], ObjectView]) -> dict[str, Term]:
+    """Return `to_grasp` and `grasp_axis`, [3] each, in an arm's base frame and SI units.
+
+    The bar at hand is the one that is most along the tool's x axis, of those with a site `grasp_0`, `grasp_1`, ...
+    `to_grasp` is the way from the tool tip to its middle, `grasp_axis` its direction: the one that is less than a right
+    angle from the tool's x axis. Which bar that is jumps as the block is turned; a network that has only the block's
+    pose brings the tool between two of them (docs/tuning.md).
+
+    Args:
+        mount: the arm.
+        agent: its name.
+        item: the object.
+        body: returns where the object is in a world.
+    """
+    sites = [site for name, site in item.sites.items() if name.startswith("grasp_")]
+    middles, axes = (np.array(part, np.float32) for part in zip(*sites, strict=True))
+    turn, origin = mount.rotation.astype(np.float32), mount.position.astype(np.float32)
+
+    def grasp(world: World) -> tuple[Array, Array]:
+        here, view = body(world), world.arms[agent]
+        along = axes[:, :, 0] @ (turn.T @ here.rotation).T
+        share = along @ view.tool_axes[:, 0]
+        best = jnp.argmax(jnp.abs(share))
+        places = here.position + here.size * middles @ here.rotation.T - origin
+        return (places @ turn)[best] - view.tool_tip, jnp.where(share[best] < 0, -along[best], along[best])
+
+    far, one = np.full(3, FAR), np.ones(3)
+    return {
+        "to_grasp": Term(lambda world: grasp(world)[0], -far, far, "object"),
+        "grasp_axis": Term(lambda world: grasp(world)[1], -one, one, "object"),
+    }

@@ -40,10 +40,10 @@ from surgical_marl.runtime import jax, jnp
 from surgical_marl.scenes.poses import Pose
 from surgical_marl.tasks.base.grasp_poses import frames
 from surgical_marl.tasks.base.object_task import NEAR, Best, Now, ObjectTask
-from surgical_marl.tasks.base.object_terms import AT_HAND, PARTS, grasp_terms, object_terms
+from surgical_marl.tasks.base.object_terms import AT_HAND, PARTS, object_terms
 from surgical_marl.tasks.base.oracle_script import Snapshot, Step
 from surgical_marl.tasks.base.task import Start
-from surgical_marl.tasks.peg_transfer.blocks import OUT, find_pegs, side_pegs
+from surgical_marl.tasks.peg_transfer.blocks import OUT, find_pegs, grasp_terms, side_pegs
 from surgical_marl.tasks.peg_transfer.script import SETTINGS, Transfer
 from surgical_marl.tasks.peg_transfer.starts import APART, POOL, draw_moves, draw_turns, goals_in_turn
 from surgical_marl.tasks.peg_transfer.trial import Trial, Turns
