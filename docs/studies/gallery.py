@@ -158,7 +158,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     every = {*list_arms(), *list_objects(), *list_scenes(), *list_tasks()}
     if unknown := sorted(only - every):
         raise ValueError(f"nothing is called {', '.join(unknown)}: there are {', '.join(sorted(every))}")
-    wanted = lambda names: [name for name in names if not only or name in only]  # noqa: E731
+
+    def wanted(names: Sequence[str]) -> list[str]:
+        return [name for name in names if not only or name in only]
+
     with tempfile.TemporaryDirectory() as folder:
         for name in wanted(list_arms()):
             path = load_arm(name).folder / "preview.png"

@@ -142,7 +142,10 @@ def figures(name: str, arms: int, held: Held, mujoco: bool = False) -> dict[str,
     kept, theirs = ~held.struck & ~held.dropped, held.moved_in_mujoco
     if not kept.any():
         raise ValueError(f"no grasp of {name} holds it: all {len(kept)} drop it, or strike it with the wrist")
-    spread = lambda values, digits: [round(float(np.quantile(values[kept], q)), digits) for q in (0.95, 1.0)]  # noqa: E731
+
+    def spread(values: np.ndarray, digits: int) -> list[float]:
+        return [round(float(np.quantile(values[kept], q)), digits) for q in (0.95, 1.0)]
+
     found: dict[str, object] = {
         "object": name,
         "arms": arms,

@@ -83,7 +83,10 @@ class Floors:
     def __init__(self, scene: Scene) -> None:
         model, data = scene.model, mujoco.MjData(scene.model)
         mujoco.mj_kinematics(model, data)
-        of = lambda name: [g for g in range(model.ngeom) if model.geom_bodyid[g] == model.body(name).id]  # noqa: E731
+
+        def of(name: str) -> list[int]:
+            return [g for g in range(model.ngeom) if model.geom_bodyid[g] == model.body(name).id]
+
         fixed = [g for name in scene.objects if name not in scene.free_objects for g in of(name)]
         boxes = [g for g in fixed if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_BOX]
         self._centers, self._sizes = data.geom_xpos[boxes], model.geom_size[boxes]

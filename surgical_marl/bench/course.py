@@ -87,8 +87,14 @@ def make_course(workload: Workload) -> Course:
         parts, actions = played(player, workload, n, LAPS, paths, rng)
         now = jax.tree.unflatten(jax.tree.structure(now), parts)
     else:
-        move = lambda now, action: roll(command(now, action))  # noqa: E731
-        now, actions = _drawn(controller, workload.motion, now, rng, jax.vmap(simulator.at), move)
+        now, actions = _drawn(
+            controller,
+            workload.motion,
+            now,
+            rng,
+            jax.vmap(simulator.at),
+            lambda now, action: roll(command(now, action)),
+        )
     start, commands = jax.tree.map(np.asarray, now), []
     for action in actions:
         now = command(now, action)

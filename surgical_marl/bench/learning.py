@@ -91,7 +91,10 @@ def measure(settings: Settings, seconds: float = clock.SECONDS, repeats: int = c
 def _alone(env: BatchedEnv, seconds: float, repeats: int) -> float:
     """Return the seconds of a step without learning, from where the environments are, by random actions to and fro."""
     shapes = {agent: (env.num_envs, *(env.action_space(agent).shape or ())) for agent in env.agents}
-    draw = lambda shape: 2 * torch.rand(shape, device=env.device) - 1  # noqa: E731
+
+    def draw(shape: tuple[int, ...]) -> torch.Tensor:
+        return 2 * torch.rand(shape, device=env.device) - 1
+
     half = [{agent: draw(shape) for agent, shape in shapes.items()} for _ in range(LAPS // 2)]
     back = [{agent: -action for agent, action in actions.items()} for actions in half[::-1]]
     return clock.race({"env": clock_of(env, half + back)}, seconds, repeats)["env"]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import time
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import Any
 
 import mujoco
@@ -71,7 +72,7 @@ def measure_rendering(
     options: dict[str, Any] = {"width": size, "height": size, "channels": channels, "stereo": stereo}
     endoscope = Endoscope(drawn, count, where, **options)
     qpos = torch.from_numpy(_postures(drawn, count)).to(where)
-    render = lambda: endoscope.render(qpos)  # noqa: E731
+    render = partial(endoscope.render, qpos)
     timer = clock.cuda_clock(render, CYCLE) if where == "cuda" else clock.cpu_clock(render)
     took = clock.race({"render": timer}, seconds, repeats)["render"]
     return Rendering(count * len(endoscope.eyes) / took, count, where, **options)

@@ -106,7 +106,10 @@ def measure(trajectory: Trajectory, dt: float, following: bool) -> dict[str, np.
     judged = going if following else going & (step > lengths - max(1, round(HOLD / dt)))
     held = _largest(error, judged)
     last_miss = np.maximum(_largest(step, going & trajectory.missed), 0)
-    final = lambda values: np.take_along_axis(values, lengths[None] - 1, 0)[0]  # noqa: E731
+
+    def final(values: np.ndarray) -> np.ndarray:
+        return np.take_along_axis(values, lengths[None] - 1, 0)[0]
+
     moves = np.linalg.norm(np.diff(trajectory.tip, axis=0), axis=-1)
     moves = np.where(going[1:], moves, 0.0)
     settled = going[1:] & ~trajectory.missed[:-1]

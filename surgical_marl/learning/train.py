@@ -11,6 +11,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -237,8 +238,7 @@ def _iterate(training: Trainer, out: Path) -> None:
     """Do all iterations that are left, with their metrics and checkpoints, or stop after one that a signal ended."""
     settings = training.settings
     with Log(training, out) if distributed.rank() == 0 else nullcontext() as log:
-        keep = lambda fault: _keep_fault(training, out, fault)  # noqa: E731
-        reports = Reports(training, log.write if log else lambda row: None, keep)
+        reports = Reports(training, log.write if log else lambda row: None, partial(_keep_fault, training, out))
         done = False
         try:
             while not done:

@@ -177,7 +177,10 @@ class _Tool:
 
 def _rows(snapshot: Snapshot, rows: np.ndarray) -> Snapshot:
     """Return some environments of a snapshot."""
-    some = lambda of: {name: value[rows] for name, value in of.items()}  # noqa: E731
+
+    def some(of: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        return {name: value[rows] for name, value in of.items()}
+
     goal = SimpleNamespace(**some(vars(snapshot.goal)))
     objects, qpos = some(snapshot.objects), some(snapshot.qpos)
     return Snapshot(some(snapshot.tools), objects, some(snapshot.held), goal, qpos)

@@ -43,7 +43,10 @@ def box_of(place: Callable[[np.ndarray], np.ndarray], joints: Box) -> Box:
     sides = len(place(joints.low))
     ways = np.concatenate([np.eye(sides), -np.eye(sides)])
     q = np.random.default_rng(0).uniform(*joints, (len(ways), STARTS, len(joints.low)))
-    far = lambda q: np.einsum("ws...x,wx->ws...", place(q), ways)  # noqa: E731
+
+    def far(q: np.ndarray) -> np.ndarray:
+        return np.asarray(np.einsum("ws...x,wx->ws...", place(q), ways))
+
     for _ in range(SWEEPS):
         for joint, values in enumerate(np.linspace(*joints, POINTS).T):
             tried = np.repeat(q[:, :, None], POINTS + 1, 2)

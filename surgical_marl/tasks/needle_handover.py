@@ -137,7 +137,10 @@ class Task(ObjectTask):
         team, first, second = world.goal.team, now.held[self.picker], now.held[self.presenter]
         away, there = self._to_useful(world, self.presenter), self._usefully(now) & (now.lift >= 1.0)
         way = known(jnp.sqrt(jnp.sum(away * away)))
-        single = lambda x: x.astype(jnp.float32)  # noqa: E731
+
+        def single(x: Array) -> Array:
+            return x.astype(jnp.float32)
+
         return Team(
             jnp.where(team.meet < 0, way, jnp.where(first | second, jnp.minimum(team.meet, way), team.meet)),
             jnp.maximum(team.receive, single(first & second & there)),

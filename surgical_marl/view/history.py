@@ -77,7 +77,10 @@ class History:
 
 def summary(info: Mapping[str, Any], index: int = 0) -> list[str]:
     """Return what an agent's infos of a step say in short: error, stages, and what went wrong."""
-    read = lambda name: float(np.asarray(info[name])[index])  # noqa: E731
+
+    def read(name: str) -> float:
+        return float(np.asarray(info[name])[index])
+
     words = [f"{1000 * read(name):.2f} mm" for name in ERRORS if name in info][:1]
     done = [name.removeprefix("stage_") for name in info if name.startswith("stage_") and read(name)]
     if done:

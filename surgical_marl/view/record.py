@@ -103,8 +103,7 @@ def _poses(
 ) -> Iterator[Pose]:
     """Yield the poses that the pictures of `frames` show."""
     every, steps = _every(env), _steps(env, episodes)
-    begin = lambda _, ended: forget(policy, ended)  # noqa: E731
-    for step, (_, ended) in enumerate(played(env, policy, begin, steps, seed), 1):
+    for step, (_, ended) in enumerate(played(env, policy, lambda _, ended: forget(policy, ended), steps, seed), 1):
         if step % every == 0 or ended[0]:
             yield picture.pose()
 

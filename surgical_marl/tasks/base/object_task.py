@@ -151,7 +151,10 @@ class ObjectTask(Task):
         """Return what is measured in a world."""
         world = self.at_hand(world)
         body, goal = world.objects[self.object], world.goal
-        place = lambda points: body.position + body.size * points @ body.rotation.T  # noqa: E731
+
+        def place(points: np.ndarray) -> Array:
+            return body.position + body.size * points @ body.rotation.T
+
         reach, part, held, touched = {}, {}, {}, {}
         for agent, view in world.arms.items():
             mount, handled = self.scene.mounts[agent], view.handles[self.object]
@@ -176,7 +179,10 @@ class ObjectTask(Task):
     def better(self, best: Best, now: Now) -> Best:
         """Return the best so far with what is measured now."""
         presents = self.presents(now)
-        least = lambda value, before: jnp.where(presents, jnp.minimum(value, before), before)  # noqa: E731
+
+        def least(value: Array, before: Array) -> Array:
+            return jnp.where(presents, jnp.minimum(value, before), before)
+
         return Best(
             jnp.minimum(best.reach, now.reach[self.picker]),
             jnp.maximum(best.grasp, now.held[self.picker].astype(jnp.float32)),
@@ -252,7 +258,9 @@ class ObjectTask(Task):
         """
         mount, name = self.scene.mounts[agent], self.object
         turn, origin = mount.rotation.astype(np.float32), mount.position.astype(np.float32)
-        local = lambda point: (point - origin) @ turn  # noqa: E731
+
+        def local(point: Array) -> Array:
+            return (point - origin) @ turn
 
         def target(world: World) -> Array:
             return local(self.tables["points"][world.goal.row])

@@ -75,7 +75,10 @@ def curvature(control: np.ndarray, fine: int = 4) -> np.ndarray:
     """Return the greatest curvature of each curve, 1/m, [...], at `fine` points a segment."""
     curve, u = _curve(control), np.arange(0, control.shape[-2] - 3, 1 / fine)
     first, second = curve(u, 1), curve(u, 2)
-    dot = lambda a, b: np.einsum("...i,...i", a, b)  # noqa: E731
+
+    def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return np.asarray(np.einsum("...i,...i", a, b))
+
     squared = np.maximum(dot(first, first), 1e-18)
     across = np.maximum(squared * dot(second, second) - dot(first, second) ** 2, 0)  # the cross product's square
     return np.asarray(np.sqrt(across / squared**3).max(-1))

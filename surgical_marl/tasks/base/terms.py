@@ -90,8 +90,13 @@ def arm_terms(scene: Scene, agent: str) -> dict[str, Term]:
     speed = 2 * np.array([joint.velocity for joint in arm.actuated])
     furthest = np.array([max(joint.velocity, joint.effort, joint.upper) for joint in arm.actuated])
     commands = joints if scene.control == "position" else (-furthest, furthest)
-    of: Callable[[str], Callable[[World], Array]] = lambda name: lambda world: getattr(world.arms[agent], name)  # noqa: E731
-    single: Callable[[str], Callable[[World], Array]] = lambda name: lambda world: of(name)(world)[None]  # noqa: E731
+
+    def of(name: str) -> Callable[[World], Array]:
+        return lambda world: getattr(world.arms[agent], name)
+
+    def single(name: str) -> Callable[[World], Array]:
+        return lambda world: of(name)(world)[None]
+
     terms = {
         "qpos": Term(of("qpos"), *joints, "arm"),
         "qvel": Term(of("qvel"), -speed, speed, "arm"),

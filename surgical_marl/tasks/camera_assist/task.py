@@ -28,7 +28,7 @@ Difficulty    that of the work; and how far the endoscope is turned away at the 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -139,7 +139,10 @@ class Task(BaseTask):
             self.work.tables["targets"] = seen
         else:
             self._middle = bars(scene.objects[self.object].object)[0].mean(0).astype(np.float32)
-        draw = lambda: draw_postures(scene, camera, tools, self.level.turn, self.level.sees, self.seed)  # noqa: E731
+
+        def draw() -> np.ndarray:
+            return draw_postures(scene, camera, tools, self.level.turn, self.level.sees, self.seed)
+
         tables = {f"work_{name}": table for name, table in self.work.tables.items()}
         self.tables = {"postures": cached("camera_assist", draw, camera, *about), **tables}
 
@@ -288,7 +291,10 @@ class Task(BaseTask):
 
     def terms(self, agent: str) -> dict[str, Term | Picture]:
         """Return the terms of the work, hidden from tools out of view, and those of the view."""
-        inside = lambda read: lambda world: read(self._inside(world))  # noqa: E731
+
+        def inside(read: Callable[[World], Array]) -> Callable[[World], Array]:
+            return lambda world: read(self._inside(world))
+
         terms = self.work.terms(agent)
         work = {n: t._replace(read=inside(t.read)) if isinstance(t, Term) else t for n, t in terms.items()}
         return self._shown.to_tool(agent, work) if agent in self.tools else {**work, **self._views()}

@@ -73,7 +73,10 @@ def side_pegs(scene: Scene, agent: str, moved: Collection[str]) -> np.ndarray:
     `moved` are the blocks that do not stay.
     """
     pegs, mounts = find_pegs(scene, "peg_transfer"), scene.mounts
-    away = lambda place: np.linalg.norm((pegs - place)[:, :2], axis=-1)  # noqa: E731
+
+    def away(place: np.ndarray) -> np.ndarray:
+        return np.asarray(np.linalg.norm((pegs - place)[:, :2], axis=-1))
+
     jaws = [own for name, own in mounts.items() if name != agent and own.arm.jaw]
     taken = [place.position for name, place in scene.free_objects.items() if name not in moved]
     good = [away(mounts[agent].position) < away(other.position) for other in jaws]

@@ -172,7 +172,10 @@ class Transfer:
     def _lower(self) -> tuple[Step, ...]:
         """Return how the taker puts the block on the peg of its goal, and lets go."""
         agent = self.taker
-        over = lambda seen, height: self._goals(seen)[:, :3, 3] + np.array([0.0, 0.0, height])  # noqa: E731
+
+        def over(seen: Snapshot, height: float) -> np.ndarray:
+            return self._goals(seen)[:, :3, 3] + np.array([0.0, 0.0, height])
+
         return (
             Step(lambda seen: self._carry(seen, over(seen, RAISE)), wait=0.1, pace=0.5),
             Step(lambda seen: self._carry(seen, over(seen, RAISE / 2)), pace=0.3),

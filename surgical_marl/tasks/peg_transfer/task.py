@@ -49,8 +49,11 @@ from surgical_marl.tasks.peg_transfer.starts import APART, POOL, draw_moves, dra
 from surgical_marl.tasks.peg_transfer.trial import Trial, Turns
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from jax import Array
 
+    from surgical_marl.physics.outputs import ObjectView
     from surgical_marl.scenes.scene import Scene
     from surgical_marl.tasks.base.options import Options
     from surgical_marl.tasks.base.terms import Picture, Term
@@ -301,16 +304,22 @@ class Task(ObjectTask):
 
     def terms(self, agent: str) -> dict[str, Term | Picture]:
         """Return the terms of every task with objects and of the grip; at `hard` also those of the block in turn."""
-        body = lambda world: self.at_hand(world).objects[self.object]  # noqa: E731
+
+        def body(world: World) -> ObjectView:
+            return self.at_hand(world).objects[self.object]
+
         found = {**super().terms(agent), **grasp_terms(self.scene.mounts[agent], agent, self._item, body)}
         if self.turns is None:
             return found
         own = object_terms(self.scene, agent)
         for part in PARTS:
             term = own[f"{self.object}_{part}"]
-            read = lambda world, term=term: term.read(self.at_hand(world))  # noqa: E731
-            found[f"{self.called}_{part}"] = term._replace(read=read)
+            found[f"{self.called}_{part}"] = term._replace(read=self._read_at_hand(term))
         return found
+
+    def _read_at_hand(self, term: Term) -> Callable[[World], Array]:
+        """Return what reads a term of the block whose turn it is."""
+        return lambda world: term.read(self.at_hand(world))
 
     def observes(self, agent: str) -> tuple[str, ...]:
         """Return the terms of every such task, and after `to_object` those of the grip, if the arm has a jaw."""
