@@ -9,6 +9,7 @@ import os
 import platform
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,12 @@ def machine() -> dict[str, Any]:
     """Return `cpu`, `threads` and `gpu` of this machine; `gpu` is None without one."""
     names = _values("/proc/cpuinfo", "model name")
     return {"cpu": names[0] if names else platform.processor() or platform.machine(), "threads": cores(), "gpu": _gpu()}
+
+
+def describe_machine(found: Mapping[str, Any] | None = None) -> str:
+    """Return one line about this machine, or about another one if `found` is what `machine` returned there."""
+    found = found or machine()
+    return f"{found['cpu']}, {found['threads']} threads" + (f"; {found['gpu']}" if found["gpu"] else "")
 
 
 def free_memory(device: str) -> int | None:

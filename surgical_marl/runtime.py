@@ -39,6 +39,14 @@ _KNOWN = {FLAG: ((0, 7), (0, 11)), THREADS_FLAG: ((0, 7), (0, 12))}
 _LEAST_THREADS = 8
 
 
+def package_version() -> str:
+    """Return the version of this package; "not installed" in a checkout that only `PYTHONPATH` names."""
+    try:
+        return importlib.metadata.version("surgical-marl")
+    except importlib.metadata.PackageNotFoundError:
+        return "not installed"
+
+
 def cache_dir() -> Path:
     """Return the folder of this package's caches, on Linux `~/.cache/surgical-marl` or below `$XDG_CACHE_HOME`."""
     return platformdirs.user_cache_path("surgical-marl", appauthor=False)

@@ -20,7 +20,7 @@ from surgical_marl.evaluation.asked import common_settings, find_policy
 from surgical_marl.evaluation.evaluate import MAX_BATCH
 from surgical_marl.evaluation.goal_set import episode_seed
 from surgical_marl.policies.policy import load_policy
-from surgical_marl.runs.environment import make_env
+from surgical_marl.runs.settings import make_env
 
 if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv

@@ -44,8 +44,8 @@ def play(job: Job, out: Path) -> None:
     from surgical_marl.machine import machine
     from surgical_marl.policies.oracle import oracle
     from surgical_marl.policies.policy import load_policy, zero_policy
-    from surgical_marl.runs.environment import make_env
     from surgical_marl.runs.folder import METRICS, read_settings
+    from surgical_marl.runs.settings import make_env
 
     run = out / str(job)
     done = run / PLAYED

@@ -39,8 +39,7 @@ from surgical_marl.bench.workload import Workload
 from surgical_marl.cli.flags import whole
 from surgical_marl.files import write_atomic, write_text
 from surgical_marl.learning.room import in_memory
-from surgical_marl.runs.environment import make_env
-from surgical_marl.runs.settings import Settings, load_config
+from surgical_marl.runs.settings import Settings, load_config, make_env
 
 FRESH = 1000
 """Seeds from here on are not used by the search."""

@@ -11,9 +11,8 @@ import mujoco
 import numpy as np
 from mujoco import rollout
 
-from surgical_marl.bench.grasping import Starts, grasps
 from surgical_marl.bench.physics import PhysicsAlone
-from surgical_marl.bench.playing import played, policy_of
+from surgical_marl.bench.starts import Starts, grasps, played, policy_of
 from surgical_marl.bench.workload import DISTINCT, Workload
 from surgical_marl.control.controller import Controller, actuators_of
 from surgical_marl.engines.choose import make_engine
@@ -32,7 +31,7 @@ LAPS = 4
 _AWAY = {"random": 50, "rough": 25, "grasp": 25}
 """Control steps before the start, 1 and 0.5 s. random: a new action every control step, as when training begins. rough:
 one action all the time, so that arms cross their ranges, and each other's way. grasp: jaws close on objects and carry
-them. Where a policy plays, `bench/playing.py` says when it stops."""
+them. Where a policy plays, `bench/starts.py` says when it stops."""
 GENTLE = 0.05
 """Share of their speed at which two arms move that hold one object: faster, one would tear it from the other."""
 

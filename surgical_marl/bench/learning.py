@@ -20,10 +20,11 @@ from surgical_marl.bench import clock, sim
 from surgical_marl.bench.contenders import clock_of
 from surgical_marl.bench.course import LAPS
 from surgical_marl.bench.stopwatch import STARTING, Stopwatch, rows
-from surgical_marl.bench.text import aligned, describe_machine
 from surgical_marl.envs.batch import BatchedEnv
+from surgical_marl.evaluation.report import aligned
 from surgical_marl.learning.room import in_memory
 from surgical_marl.learning.train import make_training
+from surgical_marl.machine import describe_machine
 from surgical_marl.plugins.task_file import label
 from surgical_marl.runs.settings import Settings
 from surgical_marl.scenes.timing import TIMESTEP

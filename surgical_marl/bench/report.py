@@ -10,10 +10,10 @@ from typing import Any
 
 from surgical_marl.bench.course import Course, make_course
 from surgical_marl.bench.sim import SWEEP, Point, Speed, measure, sweep
-from surgical_marl.bench.text import aligned, describe_machine
 from surgical_marl.bench.workload import Workload
+from surgical_marl.evaluation.report import aligned
 from surgical_marl.files import write_atomic
-from surgical_marl.machine import machine
+from surgical_marl.machine import describe_machine, machine
 from surgical_marl.plugins.task_file import label
 
 QUOTED = {

@@ -21,18 +21,18 @@ from typing import Any
 
 from surgical_marl import machine
 from surgical_marl.bench.stopwatch import STARTING, Stopwatch, rows
-from surgical_marl.bench.text import aligned, describe_machine
 from surgical_marl.evaluation.evaluate import Played, play
 from surgical_marl.evaluation.goal_set import is_standard
 from surgical_marl.evaluation.metrics import SUCCESS_MM, metrics
+from surgical_marl.evaluation.report import aligned
 from surgical_marl.learning.room import in_memory
 from surgical_marl.learning.train import make_training
 from surgical_marl.learning.trainer import Trainer
+from surgical_marl.machine import describe_machine
 from surgical_marl.plugins.task_file import label
 from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.policies.actor import acting_policy
-from surgical_marl.runs.environment import make_env
-from surgical_marl.runs.settings import Settings
+from surgical_marl.runs.settings import Settings, make_env
 
 EPISODES, SEED = 200, 0
 """Episodes and seed of the standard goal sets."""

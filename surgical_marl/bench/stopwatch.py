@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator
-from typing import Any
 
 import torch
 
+from surgical_marl.learning.reporter import Mark, mark, seconds_between
 from surgical_marl.learning.trainer import Trainer
 
 STARTING = 2
@@ -22,16 +21,14 @@ class Stopwatch:
 
     def __init__(self, training: Trainer) -> None:
         self._cuda = str(training.env.device).startswith("cuda")
-        self._marks: dict[str, list[tuple[Any, Any]]] = {}
+        self._marks: dict[str, list[tuple[Mark, Mark]]] = {}
         for name in ("rollout", "update"):
             setattr(training, name, self._timed(name, getattr(training, name)))
 
     def seconds(self, name: str) -> list[float]:
         """Of each "rollout" or "update" so far. Waits for the device."""
         self.wait()
-        if self._cuda:
-            return [start.elapsed_time(end) / 1e3 for start, end in self._marks[name]]
-        return [end - start for start, end in self._marks[name]]
+        return [seconds_between(*marks) for marks in self._marks[name]]
 
     def wait(self) -> None:
         """Wait until all work so far is done."""
@@ -42,18 +39,11 @@ class Stopwatch:
         marks = self._marks[name] = []
 
         def run() -> None:
-            start = self._mark()
+            start = mark(self._cuda)
             work()
-            marks.append((start, self._mark()))
+            marks.append((start, mark(self._cuda)))
 
         return run
-
-    def _mark(self) -> Any:
-        if not self._cuda:
-            return time.perf_counter()
-        event = torch.cuda.Event(enable_timing=True)
-        event.record()
-        return event
 
 
 def rows(training: Trainer) -> Iterator[dict[str, float]]:

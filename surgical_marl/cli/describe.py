@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import inspect
+from itertools import permutations
 
+import numpy as np
+
+from surgical_marl.cache import cached
 from surgical_marl.content import list_arms, list_objects, list_policies, list_scenes
 from surgical_marl.plugins.algorithms import ALGORITHMS, list_algorithms
 from surgical_marl.plugins.controls import CONTROLS, list_controls
 from surgical_marl.plugins.registry import Registry
 from surgical_marl.plugins.tasks import TASKS, list_tasks
 from surgical_marl.robots.arm import load_arm
+from surgical_marl.robots.inverse_kinematics import inverse_kinematics
 from surgical_marl.scenes.load import load_scene
 from surgical_marl.scenes.objects import load_object
 from surgical_marl.scenes.scene import Scene
-from surgical_marl.scenes.shared_workspace import shared_workspace
 
 
 def describe(kind: str) -> str:
@@ -81,3 +85,27 @@ def _documented(registry: Registry, name: str) -> str:
     except ValueError as error:
         return f"{name:14} {error}"
     return f"{name:14} {documentation.partition(chr(10))[0]}"
+
+
+SAMPLES = 500
+REACHED = 1e-3
+"""A point counts as reached when inverse kinematics comes this close, m."""
+
+
+def shared_workspace(scene: Scene) -> float:
+    """Return the share of points within one arm's reach that another arm reaches too: the mean over all pairs of arms.
+
+    Points are tool tips at random joint positions. NaN for a single arm.
+    """
+    return float(cached("shared", lambda: np.array(_shared(scene)), scene.fingerprint))
+
+
+def _shared(scene: Scene) -> float:
+    rng, shares = np.random.default_rng(0), []
+    for one, other in permutations(scene.mounts.values(), 2):
+        q = rng.uniform(one.arm.lower, one.arm.upper, (SAMPLES, len(one.arm.lower)))
+        world = one.arm.forward_kinematics(q)[:, :3, 3] @ one.rotation.T + one.position
+        target = (world - other.position) @ other.rotation
+        tip = other.arm.forward_kinematics(inverse_kinematics(other.arm, target, starts=4))[:, :3, 3]
+        shares.append(np.mean(np.linalg.norm(tip - target, axis=-1) < REACHED))
+    return float(np.mean(shares)) if shares else np.nan

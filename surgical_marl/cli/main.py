@@ -33,7 +33,7 @@ from surgical_marl.robots.arm import CONTROL_MODES
 from surgical_marl.runs.process import lasting_streams, open_streams, use_utf8
 from surgical_marl.runs.progress import Compilations, preparing
 from surgical_marl.runs.settings import Settings, check_overrides
-from surgical_marl.runtime import calm_threads, defer_compiler
+from surgical_marl.runtime import calm_threads, defer_compiler, package_version
 from surgical_marl.untrusted.files import user_path
 from surgical_marl.untrusted.values import shown
 
@@ -142,7 +142,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
 
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(prog="surgical-marl", description="Surgical robot arms that learn together.")
-    parser.add_argument("--version", action="version", version=f"%(prog)s {_version()}")
+    parser.add_argument("--version", action="version", version=f"%(prog)s {package_version()}")
     commands = parser.add_subparsers(metavar="COMMAND")
 
     train = commands.add_parser(
@@ -346,7 +346,7 @@ def _train(arguments: argparse.Namespace) -> None:
     from surgical_marl.files import remove_temporaries
     from surgical_marl.learning.train import train
     from surgical_marl.report.command import report_run
-    from surgical_marl.runs.lock import owned
+    from surgical_marl.runs.folder import owned
 
     try:
         title = f"{label(settings.task)} on {Path(settings.scene).stem}"
@@ -369,15 +369,6 @@ def _train(arguments: argparse.Namespace) -> None:
 def _run_folder(settings: Any) -> Path:
     name = f"{label(settings.task)}-{Path(settings.scene).stem}-{settings.algo}-seed{settings.seed}"
     return Path("runs") / f"{name}-{time.strftime('%Y%m%d-%H%M%S')}"
-
-
-def _version() -> str:
-    import importlib.metadata
-
-    try:
-        return importlib.metadata.version("surgical-marl")
-    except importlib.metadata.PackageNotFoundError:
-        return "not installed"
 
 
 if __name__ == "__main__":

@@ -119,7 +119,7 @@ def _film(arguments: argparse.Namespace) -> Path:
     """Write the film that is asked for, and return its path."""
     settings, who = _settings(arguments)
 
-    from surgical_marl.runs.environment import make_env
+    from surgical_marl.runs.settings import make_env
     from surgical_marl.view.film import Look, camera_of, film
     from surgical_marl.view.movers import Movers, first
 

@@ -15,8 +15,8 @@ from surgical_marl.evaluation.report import ABOUT, format_table, write_csv
 from surgical_marl.files import write_text
 from surgical_marl.policies.policy import load_policy
 from surgical_marl.policies.team import Team, check_partners
-from surgical_marl.runs.environment import make_env
 from surgical_marl.runs.folder import read_metrics, read_settings
+from surgical_marl.runs.settings import make_env
 from surgical_marl.untrusted.files import MAX_JSON, check_file, read_json
 from surgical_marl.untrusted.values import as_number
 

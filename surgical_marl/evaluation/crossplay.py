@@ -14,10 +14,11 @@ from surgical_marl.evaluation.asked import common_settings, find_policy
 from surgical_marl.evaluation.evaluate import MAX_BATCH, Played, play
 from surgical_marl.evaluation.interval import interval
 from surgical_marl.evaluation.metrics import Metric
+from surgical_marl.evaluation.report import aligned
 from surgical_marl.files import write_atomic
 from surgical_marl.policies.oracle import oracle
 from surgical_marl.policies.team import Team
-from surgical_marl.runs.environment import make_env
+from surgical_marl.runs.settings import make_env
 from surgical_marl.scenes.load import load_scene
 
 if TYPE_CHECKING:
@@ -129,14 +130,14 @@ def format_table(result: Mapping[str, Any]) -> str:
     for role, rows in result["matrices"].items():
         head = [f"{role} is of", *result["teams"]]
         lines = [[team, *map(_text, row)] for team, row in zip(result["teams"], rows, strict=True)]
-        parts.append(_columns([head, *lines]))
+        parts.append("\n".join(aligned([head, *lines])))
     lines = [
         [f"{team}, {role}", *map(_text, cells.values())]
         for team, roles in result["partners"].items()
         for role, cells in roles.items()
     ]
     whos = next(iter(next(iter(result["partners"].values())).values()))
-    parts.append(_columns([["team, and role of the partner", *whos], *lines]))
+    parts.append("\n".join(aligned([["team, and role of the partner", *whos], *lines])))
     parts.append("each cell: team success, others' success if there is a partner, collision rate")
     return "\n\n".join(parts)
 
@@ -144,13 +145,6 @@ def format_table(result: Mapping[str, Any]) -> str:
 def _text(cell: Mapping[str, float]) -> str:
     names = ("team_success", "others_success", "collision_rate")
     return " ".join(f"{cell[name]:.1%}" for name in names if name in cell)
-
-
-def _columns(rows: Sequence[Sequence[str]]) -> str:
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return "\n".join(
-        "  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]).rstrip() for row in rows
-    )
 
 
 def _draw(path: Path, result: Mapping[str, Any]) -> None:

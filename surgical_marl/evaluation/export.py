@@ -25,10 +25,9 @@ from surgical_marl.policies.policy import load_policy
 from surgical_marl.policies.weights import write_weights
 from surgical_marl.runs.content import copy_content, stored_scene
 from surgical_marl.runs.curve import draw_curve
-from surgical_marl.runs.environment import make_env
 from surgical_marl.runs.folder import CONFIG, METRICS, read_origin, read_settings
 from surgical_marl.runs.identity import identity, setting
-from surgical_marl.runs.settings import Settings, config_text
+from surgical_marl.runs.settings import Settings, config_text, make_env
 from surgical_marl.untrusted.files import read_json
 from surgical_marl.view.record import record
 

@@ -48,9 +48,21 @@ def format_table(result: Mapping[str, Any], others: Mapping[str, Mapping[str, An
         others: further columns to show beside it, metrics by title; if None, one column for each agent.
     """
     rows = _rows(result, result["agents"] if others is None else others)
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = ("  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]).rstrip() for row in rows)
-    return "\n".join([_describe(result), *lines])
+    return "\n".join([_describe(result), *aligned(rows)])
+
+
+def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return rows of cells, the first one a head, as lines of columns; those of numbers are aligned to the right."""
+    columns = list(zip(*rows, strict=True))
+    adjusts = [
+        str.rjust if all(cell == "-" or cell.lstrip("-")[:1].isdigit() for cell in column[1:]) else str.ljust
+        for column in columns
+    ]
+    widths = [max(map(len, column)) for column in columns]
+    return [
+        "  ".join(adjust(cell, width) for adjust, cell, width in zip(adjusts, row, widths, strict=True)).rstrip()
+        for row in rows
+    ]
 
 
 def _describe(result: Mapping[str, Any]) -> str:

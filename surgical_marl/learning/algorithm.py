@@ -19,9 +19,8 @@ from torch import Tensor, nn
 from surgical_marl.interfaces.rsl_rl import RslRlVecEnv
 from surgical_marl.learning import distributed
 from surgical_marl.learning.constraint import Constraint
-from surgical_marl.learning.normaliser import share_normalisers
+from surgical_marl.learning.statistics import ValueScale, share_normalisers
 from surgical_marl.learning.storage import MultiAgentStorage
-from surgical_marl.learning.values import ValueScale
 from surgical_marl.policies.layout import Grouping
 from surgical_marl.policies.networks import MultiAgentActor, MultiAgentModel, make_actor, make_model
 from surgical_marl.policies.recurrent import Memory

@@ -30,9 +30,8 @@ from surgical_marl.plugins.task_file import label
 from surgical_marl.policies.actor import acting_policy
 from surgical_marl.policies.layout import Layout
 from surgical_marl.policies.oracle import oracle
-from surgical_marl.runs.environment import make_env
 from surgical_marl.runs.progress import progress
-from surgical_marl.runs.settings import Settings
+from surgical_marl.runs.settings import Settings, make_env
 
 if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv

@@ -39,16 +39,17 @@ from surgical_marl.runs.checkpoint import (
     write_environments,
 )
 from surgical_marl.runs.content import CONTENT, copy_content
-from surgical_marl.runs.environment import make_env
 from surgical_marl.runs.fault import write_fault
 from surgical_marl.runs.folder import (
     CHECKPOINT,
     CONFIG,
     DIVERGED,
+    LOCK,
     check_writable,
     claim_folder,
     has_begun,
     holds_weights,
+    owned,
     read_metrics,
     read_settings,
     write_config,
@@ -56,9 +57,8 @@ from surgical_marl.runs.folder import (
     write_metrics,
 )
 from surgical_marl.runs.identity import identity
-from surgical_marl.runs.lock import LOCK, owned
 from surgical_marl.runs.process import ending_signals, lasting_streams
-from surgical_marl.runs.settings import Settings
+from surgical_marl.runs.settings import Settings, make_env
 from surgical_marl.untrusted.values import plural
 
 _AGAIN = signal.SIGINT, signal.SIGTERM

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from surgical_marl.envs.observations import proprioception
-from surgical_marl.policies.convert import like, to_numpy
+from surgical_marl.policies.acting import like, to_numpy
 
 if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv

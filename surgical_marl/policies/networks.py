@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 from rsl_rl.models import MLPModel
+from rsl_rl.modules import EmpiricalNormalization
 from rsl_rl.modules.distribution import GaussianDistribution
 from tensordict import TensorDict
 from torch import Tensor, nn
@@ -14,12 +15,22 @@ from torch import Tensor, nn
 from surgical_marl.policies.attention import AttentionModel, find_entities
 from surgical_marl.policies.encoder import ENCODER, PICTURES, PictureModel
 from surgical_marl.policies.layout import Layout
-from surgical_marl.policies.normaliser import LimitedNormaliser
+from surgical_marl.policies.plain import FURTHEST
 from surgical_marl.policies.recurrent import RecurrentModel, RecurrentPictureModel
 from surgical_marl.runs.settings import NetworkSettings
 
 if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv
+
+
+class LimitedNormaliser(EmpiricalNormalization):
+    """rsl_rl's normaliser, with limited results."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return normalised observations, within `FURTHEST` of 0."""
+        normalised: Tensor = super().forward(x)
+        return normalised.clamp(-FURTHEST, FURTHEST)
+
 
 # A small last layer starts every arm near its rest, which is where exploration is safe and
 # gradients are largest.

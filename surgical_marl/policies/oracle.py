@@ -16,7 +16,7 @@ import numpy as np
 
 from surgical_marl.envs.observations import proprioception
 from surgical_marl.plugins.task_file import label
-from surgical_marl.policies.convert import like, to_numpy
+from surgical_marl.policies.acting import like, to_numpy
 from surgical_marl.policies.scripted import Scripted, without_words
 from surgical_marl.robots.inverse_kinematics import inverse_kinematics
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surgical_marl.envs.observations import proprioception
-from surgical_marl.policies.convert import like
+from surgical_marl.policies.acting import like
 from surgical_marl.policies.layout import Layout
 from surgical_marl.runs.settings import NetworkSettings
 

@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from surgical_marl.envs.observations import proprioception
-from surgical_marl.policies.acting import Policy, forget
-from surgical_marl.policies.convert import like
+from surgical_marl.policies.acting import Policy, forget, like
 from surgical_marl.policies.layout import fitting_layout
 from surgical_marl.policies.oracle import oracle
 from surgical_marl.policies.plain import PlainNetwork, PlainPolicy, is_plain

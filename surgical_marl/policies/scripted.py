@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from surgical_marl.envs.observations import proprioception
-from surgical_marl.policies.convert import like, to_numpy
+from surgical_marl.policies.acting import like, to_numpy
 from surgical_marl.tasks.base.grasp_poses import frames, joints_at, tool_of
 from surgical_marl.tasks.base.oracle_script import Snapshot, Step, Wish
 

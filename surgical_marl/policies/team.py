@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from surgical_marl.content import BASELINES, PARTNERS, unknown
-from surgical_marl.policies.acting import forget
-from surgical_marl.policies.convert import like, to_numpy
+from surgical_marl.policies.acting import forget, like, to_numpy
 from surgical_marl.policies.frozen import Frozen
 from surgical_marl.policies.oracle import oracle
 from surgical_marl.policies.policy import load_policy

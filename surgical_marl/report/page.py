@@ -3,22 +3,30 @@
 from __future__ import annotations
 
 import base64
+import shlex
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jinja2
 from markupsafe import Markup
 
-import surgical_marl
 from surgical_marl.plugins.task_file import label
 from surgical_marl.plugins.tasks import TASKS
-from surgical_marl.report import judged, repeat, tables, training
+from surgical_marl.report import judged, tables, training
 from surgical_marl.report.charts import COLORS, Chart, Drawing
 from surgical_marl.report.groups import Group, group
-from surgical_marl.report.run import Run
+from surgical_marl.report.run import Run, flatten
+from surgical_marl.runs.folder import read_settings
+from surgical_marl.runs.settings import config_text, load_config
+from surgical_marl.runtime import package_version
 from surgical_marl.untrusted.markup import whole
+from surgical_marl.yaml_file import dump_yaml, parse_yaml
+
+_USUAL = {"device": "auto", "difficulty": "default", "start": "home"}
+"""What a command need not say of the settings that choose which defaults hold."""
+
 
 GENERATOR = "surgical-marl report"
 """What marks a file as one of ours, which may be replaced."""
@@ -61,7 +69,7 @@ def render(runs: Sequence[Run]) -> str:
     sections = [*_evaluation(drawing, groups), *_training(drawing, groups), *_settings(groups)]
     page = _template().render(
         generator=GENERATOR,
-        version=surgical_marl.__version__,
+        version=package_version(),
         made=time.strftime("%Y-%m-%d %H:%M %Z"),
         heading=heading,
         about=_about(str(task)),
@@ -171,8 +179,10 @@ def _commands(runs: Sequence[Run]) -> list[tuple[str, list[str], str]]:
         elif commit.endswith("-dirty"):
             note = f"Its code had changes beside commit {commit.removesuffix('-dirty')}."
         else:
-            note, checkout = "", [repeat.quote("git", "checkout", commit)]
-        found.append((run.name, [*checkout, repeat.train_command(run), repeat.eval_command(run)], note))
+            note, checkout = "", [shlex.join(["git", "checkout", commit])]
+        found.append(
+            (run.name, [*checkout, train_command(run), shlex.join(["surgical-marl", "eval", run.given])], note)
+        )
     return found
 
 
@@ -216,3 +226,37 @@ def _template() -> jinja2.Template:
 
 def _file(name: str) -> str:
     return Path(__file__).with_name(name).read_text(encoding="utf-8")
+
+
+def train_command(run: Run) -> str:
+    """Return the `surgical-marl train` that has exactly the settings of a run.
+
+    It names each setting that differs from the defaults of its task and scene, be it those for a CPU or for a GPU.
+    """
+    task, scene, settings = str(run.config["task"]), str(run.config["scene"]), _settings_of(run)
+    try:
+        sections = [f"{name}={settings[name]}" for name in ("difficulty", "start")]
+        both = [
+            flatten(parse_yaml(config_text(load_config(task, scene, [*sections, f"device={device}"]), {})))
+            for device in ("cpu", "cuda")
+        ]
+    except (ValueError, KeyError):  # a task, or settings, that are not of this installation
+        both = []
+    if scene != run.scene:  # a copy in the folder
+        scene = str(Path(run.given) / scene)
+    command = ["surgical-marl", "train", task, "--scene", scene, "--seed", run.seed]
+    for name, value in settings.items():
+        usual = bool(both) and all(name in defaults and defaults[name] == value for defaults in both)
+        if name in _USUAL:  # the defaults above are those of the run's own level and start, on two devices
+            usual = value == _USUAL[name]
+        if not usual and name not in ("task", "scene", "seed"):
+            command.append(f"{name}={dump_yaml(value, flow=True)}")
+    return shlex.join(command)
+
+
+def _settings_of(run: Run) -> dict[str, Any]:
+    """Return a run's settings by dotted name, with those that an older version did not write."""
+    try:
+        return flatten(parse_yaml(config_text(read_settings(run.folder), {})))
+    except (ValueError, TypeError):
+        return dict(run.config)

@@ -23,8 +23,7 @@ from surgical_marl.engines.faults import checked
 from surgical_marl.envs.fault_place import fault_place
 from surgical_marl.files import write_atomic
 from surgical_marl.runs.content import found_scene, stored_scene
-from surgical_marl.runs.environment import make_env
-from surgical_marl.runs.settings import Settings
+from surgical_marl.runs.settings import Settings, make_env
 from surgical_marl.runtime import has_cuda
 from surgical_marl.untrusted.arrays import read_npz
 from surgical_marl.untrusted.values import check_count, one_line, shown

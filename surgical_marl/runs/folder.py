@@ -1,7 +1,7 @@
 """The files of a run folder, and how they are read and written, but for its checkpoint (`runs/checkpoint.py`).
 
-A run folder holds `config.yaml`, `checkpoint.pt`, `metrics.csv`, `curve.png`, `tensorboard/` and `train.lock`
-(`surgical_marl/runs/lock.py`), and a user's own scene in `content/` (`surgical_marl/runs/content.py`). What is made of
+A run folder holds `config.yaml`, `checkpoint.pt`, `metrics.csv`, `curve.png`, `tensorboard/` and `train.lock`,
+and a user's own scene in `content/` (`surgical_marl/runs/content.py`). What is made of
 them at the end, `eval.json`, `episodes.npz`, `video.mp4` and `report.html`, is written elsewhere. If there were several
 processes, `environments-*.pt` of the other ranks are beside the checkpoint. If training diverged, there is also
 `diverged.json`; if environments became NaN, `fault-*.npz` (`surgical_marl/runs/fault.py`).
@@ -22,7 +22,7 @@ import platform
 import subprocess
 import tempfile
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
@@ -30,11 +30,15 @@ from typing import Any
 from surgical_marl.content import find, list_policies
 from surgical_marl.files import is_temporary, write_atomic, write_text
 from surgical_marl.runs.content import stored_scene
-from surgical_marl.runs.lock import LOCK
 from surgical_marl.runs.settings import Settings, config_text, read_config
 from surgical_marl.untrusted.files import MB, check_file, is_file, user_path
 from surgical_marl.untrusted.values import listed, shown
 from surgical_marl.yaml_file import read_yaml
+
+LOCK = "train.lock"
+"""An empty file that stays in the folder. The system's lock on it ends with the process that holds it, however that
+ends."""
+
 
 CONFIG, CHECKPOINT, METRICS, CURVE = "config.yaml", "checkpoint.pt", "metrics.csv", "curve.png"
 DIVERGED = "diverged.json"
@@ -202,3 +206,28 @@ def _commit() -> str | None:
         return subprocess.run(command, capture_output=True, encoding="utf-8", check=True, timeout=10).stdout.strip()
     except (OSError, subprocess.SubprocessError):
         return None
+
+
+@contextlib.contextmanager
+def owned(run: Path) -> Iterator[None]:
+    """Hold the lock of a run folder.
+
+    Where there is no folder yet, or the system can't lock files in it, nothing is locked.
+
+    Raises:
+        ValueError: another process holds it.
+    """
+    from filelock import FileLock, Timeout
+
+    lock = FileLock(run / LOCK)
+    with contextlib.ExitStack() as held:
+        try:
+            lock.acquire(timeout=0)
+            held.callback(lock.release)
+        except Timeout:
+            raise ValueError(
+                f"{run} is in use: another process trains in it; wait until it ends, or name another folder"
+            ) from None
+        except (OSError, NotImplementedError):
+            pass
+        yield

@@ -8,11 +8,12 @@ from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from functools import reduce
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, ClassVar, Literal, get_type_hints
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_type_hints
 
 from surgical_marl.content import as_name, content_dir, find, list_configs
 from surgical_marl.engines.choose import DeviceName, EngineName
 from surgical_marl.plugins.algorithms import ALGORITHMS
+from surgical_marl.plugins.task_file import check_allowed
 from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.runs.content import found_scene
 from surgical_marl.runtime import has_cuda
@@ -20,6 +21,10 @@ from surgical_marl.tasks.base.options import Options
 from surgical_marl.untrusted.schema import Checked, Place, as_mapping, check, choice, fields_of, number
 from surgical_marl.untrusted.values import shown
 from surgical_marl.yaml_file import dump_yaml, load_yaml, parse_yaml
+
+if TYPE_CHECKING:
+    from surgical_marl.envs.batch import BatchedEnv
+
 
 SECTIONS = ("scenes", "difficulties", "starts")
 """Sections of a task's file: settings for a scene, for a level of difficulty, and for where episodes start."""
@@ -369,3 +374,17 @@ def _suggestion(name: str, known: list[str]) -> str:
 def _build(values: Mapping[str, Any]) -> Settings:
     sections = {name: kind(**values.get(name, {})) for name, kind in _sections().items()}
     return Settings(**{**values, **sections})
+
+
+def make_env(settings: Settings, num_envs: int | None = None, arrays: str = "torch") -> BatchedEnv:
+    """Make the environment of a run; `num_envs` replaces the setting."""
+    from surgical_marl.envs.batch import BatchedEnv  # it imports JAX
+
+    check_allowed(settings.task)  # the settings may be a stranger's
+    return BatchedEnv(
+        **settings.of_environment(),
+        num_envs=num_envs or settings.num_envs,
+        engine=settings.engine,
+        device=settings.device,
+        arrays=arrays,
+    )

@@ -11,8 +11,7 @@ import numpy as np
 from surgical_marl.cache import cached
 from surgical_marl.robots.rotation import quaternion
 from surgical_marl.robots.spec import COLLISION_GROUP, build_spec
-from surgical_marl.scenes.randomisation import Randomisation
-from surgical_marl.scenes.scene import Mount, Scene, payload_body
+from surgical_marl.scenes.scene import Mount, Randomisation, Scene, payload_body
 from surgical_marl.scenes.timing import TIMESTEP
 
 

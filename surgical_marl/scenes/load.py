@@ -25,8 +25,7 @@ from surgical_marl.scenes.build import build_scene, cached_model, compile_scene,
 from surgical_marl.scenes.contacts import contact_pairs
 from surgical_marl.scenes.object_contacts import check_apart
 from surgical_marl.scenes.placing import MAX_OBJECTS, PlacementEntry, add_objects, read_placements
-from surgical_marl.scenes.randomisation import Randomisation
-from surgical_marl.scenes.scene import Mount, Scene
+from surgical_marl.scenes.scene import Mount, Randomisation, Scene
 from surgical_marl.scenes.surroundings import TissueEntry, View, add_surroundings, add_tissue
 from surgical_marl.untrusted.markup import check_name
 from surgical_marl.untrusted.schema import Place, Vector, angles, check, lengths, number, several

@@ -11,9 +11,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from surgical_marl.view.colours import visual_rgba
 from surgical_marl.view.lighting import GLOW, GRAIN
-from surgical_marl.view.shading import GAMMA, PLASTIC, Material, materials
+from surgical_marl.view.shading import GAMMA, PLASTIC, Material, materials, visual_rgba
 from surgical_marl.view.tracer import PLANE, Shape, World, wp
 from surgical_marl.vision.raycaster import GROUPS, KINDS, corner_normals, warp_mesh
 from surgical_marl.vision.rays import CAPSULE, CYLINDER, ELLIPSOID, FAR, MESH

@@ -18,9 +18,9 @@ from surgical_marl.machine import cores
 from surgical_marl.policies.acting import forget
 from surgical_marl.runs.progress import progress
 from surgical_marl.view.camera import best_view, task_places
-from surgical_marl.view.colours import GOAL_RADIUS, goal_colour
 from surgical_marl.view.drawn import Sphere
 from surgical_marl.view.render import Renderer, View
+from surgical_marl.view.shading import GOAL_RADIUS, goal_colour
 from surgical_marl.view.stage import paint, stage
 from surgical_marl.view.video import write_video
 

@@ -17,12 +17,15 @@ from typing import Any
 import numpy as np
 
 from surgical_marl.runs.content import copy_content
-from surgical_marl.runs.environment import make_env
-from surgical_marl.runs.settings import Settings
+from surgical_marl.runs.settings import Settings, make_env
 from surgical_marl.view.history import History
 from surgical_marl.view.moment import Moment, Observer
 from surgical_marl.view.movers import Movers, choices, first
 from surgical_marl.view.take import MOST_ENVS, MOST_STEPS, Take
+
+MOST = 20
+"""Steps at most at a time: who falls behind runs slower."""
+
 
 TRAIL = 100
 """Steps that trails show."""
@@ -152,3 +155,41 @@ class Session:
             number = 1 + max((int(path.stem[5:]) for path in self._record.glob("take-[0-9]*.npz")), default=0)
             self._take.write(self._record / f"take-{number:04}.npz")
         self._take = Take(self.env, self.settings, self.seed, self.movers.who)
+
+
+class Pace:
+    """The clock of simulated time.
+
+    Args:
+        dt: simulated time of a step, s.
+    """
+
+    def __init__(self, dt: float) -> None:
+        self.dt = dt
+        self.speed = 1.0
+        """Simulated seconds a second."""
+        self.paused = False
+        self._last: float | None = None
+        self._owed = 0.0
+        self._single = 0
+
+    def step_once(self) -> None:
+        """Let one step be due although time stands still."""
+        self._single += 1
+
+    def forgive(self) -> None:
+        """Forget the steps that are due but were not done: they take longer than there is time."""
+        self._owed = 0.0
+
+    def due(self, now: float) -> int:
+        """Return how many steps to do at a time in s that never runs back."""
+        passed = 0.0 if self._last is None else now - self._last
+        self._last = now
+        single, self._single = self._single, 0
+        if self.paused:
+            self._owed = 0.0
+            return single
+        self._owed += passed * self.speed / self.dt
+        steps = min(int(self._owed), MOST)
+        self._owed = min(self._owed - steps, 1.0)
+        return steps + single

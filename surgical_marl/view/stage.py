@@ -12,10 +12,9 @@ import numpy as np
 
 from surgical_marl.robots.spec import VISUAL_GROUP
 from surgical_marl.scenes.scene import Mount, Scene
-from surgical_marl.view.colours import AGENTS, visual_rgba
 from surgical_marl.view.drawn import Extra
 from surgical_marl.view.lighting import DRAPE, FLOOR, PLAIN
-from surgical_marl.view.shading import CLOTH, GAMMA, PLASTIC, Material, material, named
+from surgical_marl.view.shading import AGENTS, CLOTH, GAMMA, PLASTIC, Material, material, named, visual_rgba
 from surgical_marl.view.tracer import PLANE
 from surgical_marl.vision.rays import BOX, CYLINDER, ELLIPSOID
 

@@ -25,9 +25,8 @@ import numpy as np
 
 from surgical_marl.files import write_atomic
 from surgical_marl.runs.content import stored_scene
-from surgical_marl.runs.environment import make_env
 from surgical_marl.runs.fault import PACKAGES, changed_versions, made_in
-from surgical_marl.runs.settings import Settings
+from surgical_marl.runs.settings import Settings, make_env
 from surgical_marl.untrusted.arrays import read_npz
 from surgical_marl.untrusted.values import check_count, shown
 

@@ -11,9 +11,8 @@ from mujoco import rollout
 
 from surgical_marl.bench import contenders
 from surgical_marl.bench.course import HOLD, LAPS, full_state, make_course
-from surgical_marl.bench.grasping import grasps
 from surgical_marl.bench.physics import PhysicsAlone
-from surgical_marl.bench.playing import NOISE, played
+from surgical_marl.bench.starts import NOISE, grasps, played
 from surgical_marl.bench.workload import DISTINCT, Workload
 from surgical_marl.engines.choose import make_engine
 from surgical_marl.envs.batch import BatchedEnv

@@ -23,9 +23,8 @@ from surgical_marl.learning.trainer import Trainer
 from surgical_marl.policies.networks import MultiAgentActor, actor_config
 from surgical_marl.policies.scripted import Scripted
 from surgical_marl.runs.checkpoint import read_checkpoint
-from surgical_marl.runs.environment import make_env
 from surgical_marl.runs.folder import read_metrics
-from surgical_marl.runs.settings import ImitationSettings, NetworkSettings, OracleStatesSettings, Settings
+from surgical_marl.runs.settings import ImitationSettings, NetworkSettings, OracleStatesSettings, Settings, make_env
 from surgical_marl.tasks.base.oracle_script import Step, Wish
 
 SETTINGS = Settings(

@@ -18,8 +18,7 @@ from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.interfaces.rsl_rl import RslRlVecEnv
 from surgical_marl.learning import distributed, train
 from surgical_marl.learning.algorithm import Algorithm
-from surgical_marl.learning.configuration import rsl_rl_config
-from surgical_marl.learning.trainer import Trainer
+from surgical_marl.learning.trainer import Trainer, rsl_rl_config
 from surgical_marl.plugins.algorithms import ALGORITHMS
 from surgical_marl.runs.checkpoint import read_checkpoint
 from surgical_marl.runs.folder import read_metrics

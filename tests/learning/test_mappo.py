@@ -18,7 +18,7 @@ from tensordict import TensorDict
 
 from surgical_marl.interfaces.rsl_rl import RslRlVecEnv
 from surgical_marl.learning.algorithms.mappo import MAPPO, Algorithm
-from surgical_marl.learning.configuration import rsl_rl_config
+from surgical_marl.learning.trainer import rsl_rl_config
 from surgical_marl.plugins.algorithms import ALGORITHMS
 from surgical_marl.policies.layout import Layout
 from surgical_marl.runs.settings import NetworkSettings, PPOSettings, Settings

@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from surgical_marl.bench.grasping import grasps
 from surgical_marl.bench.physics import PhysicsAlone
+from surgical_marl.bench.starts import grasps
 from surgical_marl.engines.choose import make_engine
 from surgical_marl.envs.env import Env
 from surgical_marl.physics.solver.cholesky import packed

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import yaml
 
-from surgical_marl.bench.grasping import grasps
+from surgical_marl.bench.starts import grasps
 from surgical_marl.content import find
 from surgical_marl.control.controller import Controller
 from surgical_marl.envs.batch import BatchedEnv

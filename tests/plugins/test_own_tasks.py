@@ -23,8 +23,7 @@ from surgical_marl.learning import train
 from surgical_marl.plugins import task_file
 from surgical_marl.plugins.tasks import TASKS, find_task, module_name
 from surgical_marl.report.page import _about
-from surgical_marl.runs.environment import make_env
-from surgical_marl.runs.settings import Settings, config_text, load_config, read_config
+from surgical_marl.runs.settings import Settings, config_text, load_config, make_env, read_config
 from surgical_marl.scenes.load import load_scene
 from tests.helpers.pages import ROOT, pieces
 

@@ -98,7 +98,7 @@ import pettingzoo
 from surgical_marl import salute_v0
 from surgical_marl.interfaces.registration import PACKAGE
 from surgical_marl.policies.policy import load_policy
-from surgical_marl.runs.environment import make_env
+from surgical_marl.runs.settings import make_env
 from surgical_marl.runs.folder import read_metrics, read_settings
 
 for make in (

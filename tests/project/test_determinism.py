@@ -15,9 +15,8 @@ from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.evaluation.evaluate import evaluate
 from surgical_marl.learning import train
 from surgical_marl.policies.policy import load_policy
-from surgical_marl.runs.environment import make_env
 from surgical_marl.runs.folder import read_metrics
-from surgical_marl.runs.settings import Settings
+from surgical_marl.runs.settings import Settings, make_env
 from tests.helpers.devices import needs_cuda
 from tests.helpers.processes import answer
 from tests.helpers.runs import SMALL, same_state

@@ -22,8 +22,7 @@ from surgical_marl.files import remove_temporaries
 from surgical_marl.learning import train
 from surgical_marl.runs import checkpoint
 from surgical_marl.runs.checkpoint import read_checkpoint
-from surgical_marl.runs.folder import read_metrics
-from surgical_marl.runs.lock import LOCK, owned
+from surgical_marl.runs.folder import LOCK, owned, read_metrics
 from tests.helpers.processes import end, start, start_together
 from tests.helpers.runs import LONG, SMALL, run, run_or_resume, same_state
 

@@ -11,7 +11,7 @@ import pytest
 from surgical_marl.cli.main import main
 from surgical_marl.content import find, list_policies
 from surgical_marl.report import command
-from surgical_marl.report.repeat import train_command
+from surgical_marl.report.page import train_command
 from surgical_marl.report.run import read_run
 from surgical_marl.runs.folder import CONFIG, read_settings
 from surgical_marl.runs.settings import Settings, load_config

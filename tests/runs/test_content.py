@@ -24,9 +24,10 @@ from surgical_marl.learning import train
 from surgical_marl.policies.policy import load_policy
 from surgical_marl.policies.team import check_same
 from surgical_marl.report.groups import group
-from surgical_marl.report.repeat import train_command
+from surgical_marl.report.page import train_command
 from surgical_marl.report.run import read_run
-from surgical_marl.runs import content, environment
+from surgical_marl.runs import content
+from surgical_marl.runs import settings as settings_module
 from surgical_marl.runs.checkpoint import read_checkpoint
 from surgical_marl.runs.fault import made_in, write_fault
 from surgical_marl.runs.folder import CHECKPOINT, CONFIG, read_settings
@@ -94,8 +95,8 @@ def reached(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         found.append(content.scene_label(options["scene"]))
         raise ValueError("far enough")
 
-    monkeypatch.setattr(environment, "BatchedEnv", stop)
-    monkeypatch.setattr(train, "make_env", environment.make_env)
+    monkeypatch.setattr("surgical_marl.envs.batch.BatchedEnv", stop)
+    monkeypatch.setattr(train, "make_env", settings_module.make_env)
     return found
 
 

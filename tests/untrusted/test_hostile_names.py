@@ -26,7 +26,7 @@ from surgical_marl.runs.settings import Settings
 from surgical_marl.scenes.load import load_scene
 from surgical_marl.scenes.objects import load_object
 from surgical_marl.untrusted.markup import as_code, as_html, as_link, as_markdown, check_name
-from surgical_marl.view.browser.text import status
+from surgical_marl.view.browser.panel import status
 from surgical_marl.view.movers import Movers
 from tests.helpers.run_folders import evaluate, make_run, played
 from tests.report.test_report import Page

@@ -15,9 +15,8 @@ from surgical_marl.scenes.objects import load_object
 from surgical_marl.scenes.scene import Scene
 from surgical_marl.scenes.shapes import MATERIALS
 from surgical_marl.view.camera import best_view, seen
-from surgical_marl.view.colours import AGENTS, TEAM, goal_colour
 from surgical_marl.view.render import Renderer, View
-from surgical_marl.view.shading import GAMMA, LOOKS, RUBBER, STEEL, material, materials
+from surgical_marl.view.shading import AGENTS, GAMMA, LOOKS, RUBBER, STEEL, TEAM, goal_colour, material, materials
 from surgical_marl.view.stage import TABLE, paint, stage
 from surgical_marl.vision.endoscope import Endoscope
 from tests.scenes.test_objects import FILE, SCENE

@@ -20,13 +20,12 @@ from surgical_marl.content import find
 from surgical_marl.robots.rotation import turned
 from surgical_marl.runs.settings import Settings
 from surgical_marl.view.browser.gate import open_server
-from surgical_marl.view.browser.text import status
+from surgical_marl.view.browser.nodes import Paths
+from surgical_marl.view.browser.panel import status
 from surgical_marl.view.hand import Hand
 from surgical_marl.view.history import History, summary
 from surgical_marl.view.moment import Near, Observer
-from surgical_marl.view.pace import MOST, Pace
-from surgical_marl.view.paths import Paths
-from surgical_marl.view.session import Session
+from surgical_marl.view.session import MOST, Pace, Session
 from surgical_marl.view.take import read_take, replay
 
 SETTINGS = Settings(task="reach", scene="bimanual_psm", seed=3, max_steps=60)

@@ -5,19 +5,27 @@ Nodes are made once for a session and then moved. Several environments stand sid
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import trimesh
 
+from surgical_marl.runtime import jnp
+from surgical_marl.tasks.base.path_task import PathTask
 from surgical_marl.tasks.base.task import APPROACH
 from surgical_marl.view.browser.shapes import body_glb
-from surgical_marl.view.colours import AGENTS, GOAL_RADIUS
 from surgical_marl.view.moment import Moment, Push
-from surgical_marl.view.paths import Paths
 from surgical_marl.view.session import Session
-from surgical_marl.view.shading import materials
+from surgical_marl.view.shading import AGENTS, GOAL_RADIUS, materials
 from surgical_marl.view.stage import paint
+
+if TYPE_CHECKING:
+    from surgical_marl.envs.batch import BatchedEnv
+
+
+POINTS = 120
+"""Points of a path that is drawn."""
+
 
 RED, GREY, GOLD = np.array([226, 40, 40]), np.array([120, 130, 140]), np.array([226, 168, 20])
 PARTS = ("targets", "paths", "trails", "trocars", "contacts", "grips", "distance")
@@ -239,3 +247,26 @@ def _set(handle: Any, points: np.ndarray, colours: np.ndarray) -> None:
 def _fading(rgb: np.ndarray, age: np.ndarray) -> np.ndarray:
     """Return the colours of the pieces of a trail, [n, 2, 3], pale where it is old; age [n, 1, 1] from 0 to 1."""
     return np.broadcast_to(_FADED + age * (rgb - _FADED), (len(age), 2, 3)).astype(np.uint8)
+
+
+class Paths:
+    """The paths of the episodes of N environments; computed again only where a new episode has another path."""
+
+    def __init__(self, env: BatchedEnv) -> None:
+        self._mounts = list(env.scene.mounts.values())
+        self._times = np.linspace(0, env.max_steps * env.control_dt, POINTS, dtype=np.float32)
+        self._known: dict[int, np.ndarray] = {}
+
+    def read(self, env: BatchedEnv) -> np.ndarray | None:
+        """Return the paths of all arms' targets, [N, POINTS, arms, 3], m; None for a task whose targets follow none."""
+        task = env.task
+        if not isinstance(task, PathTask):
+            return None
+        rows = [int(row) for row in env.goal.row]
+        self._known = {row: self._known[row] if row in self._known else self._path(task, row) for row in rows}
+        return np.stack([self._known[row] for row in rows])
+
+    def _path(self, task: PathTask, row: int) -> np.ndarray:
+        own: np.ndarray = np.asarray(task.along(jnp.int32(row), jnp.asarray(self._times)))
+        placed = [own[:, arm] @ mount.rotation.T + mount.position for arm, mount in enumerate(self._mounts)]
+        return np.stack(placed, 1)

@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from surgical_marl.content import list_scenes
+from surgical_marl.plugins.task_file import label
 from surgical_marl.plugins.tasks import TASKS, list_tasks
+from surgical_marl.untrusted.markup import as_html
+from surgical_marl.untrusted.values import one_line
 from surgical_marl.view.browser.nodes import PARTS, Nodes
-from surgical_marl.view.browser.text import status
-from surgical_marl.view.pace import Pace
-from surgical_marl.view.session import Session
+from surgical_marl.view.history import summary
+from surgical_marl.view.session import Pace, Session
 from surgical_marl.view.take import MOST_ENVS
+
+_WHOLE = "font-size:0.8em;padding:0 1em 0.8em;overflow-wrap:anywhere"
+_CELL = "padding:1px 8px 1px 0;vertical-align:top"
+
 
 GO, STEP, RESET = "Pause / go on", "One step", "Reset"
 LONGEST = 3600.0
@@ -84,8 +92,8 @@ class Panel:
             self._session.reset(int(self._seed.value))
 
         acts = {GO: turn, STEP: single, RESET: begin}
-        for (label, act), key in zip(acts.items(), ("space", "N", "R"), strict=True):
-            gui.add_command(label, hotkey=key).on_trigger(self._then(act))
+        for (name, act), key in zip(acts.items(), ("space", "N", "R"), strict=True):
+            gui.add_command(name, hotkey=key).on_trigger(self._then(act))
         buttons.on_click(self._then(lambda: acts[buttons.value]()))
         speed.on_update(self._then(lambda: setattr(pace, "speed", float(speed.value))))
         self._seed.on_update(self._then(begin))
@@ -128,3 +136,19 @@ class Panel:
                 self._ask(act)
 
         return callback
+
+
+def status(session: Session, paused: bool = False) -> str:
+    """Return what the first environment is at, as HTML: its time, and errors, stages and contacts of all agents."""
+    env = session.env
+    names = [as_html(one_line(name)) for name in (label(env.task_name), env.scene.name, session.settings.difficulty)]
+    step, dt = int(np.asarray(env.steps)[0]), env.control_dt
+    time = f"{step * dt:.2f} of {env.max_steps * dt:.0f} s, seed {session.seed}{', paused' if paused else ''}"
+    rows = "".join(_row(agent, session.infos[agent]) for agent in env.agents if agent in session.infos)
+    head = f"<b>{names[0]}</b> on <b>{names[1]}</b>, {names[2]}"
+    return f'<div style="{_WHOLE}">{head}<br/>{time}<table>{rows}</table></div>'
+
+
+def _row(agent: str, info: Mapping[str, Any]) -> str:
+    cells = [agent, ", ".join(summary(info)) or "-"]
+    return "<tr>" + "".join(f'<td style="{_CELL}">{as_html(cell)}</td>' for cell in cells) + "</tr>"

@@ -11,8 +11,7 @@ import trimesh
 from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
-from surgical_marl.view.colours import visual_rgba
-from surgical_marl.view.shading import GAMMA, Material
+from surgical_marl.view.shading import GAMMA, Material, visual_rgba
 
 _VISIBLE = 2
 """The last group of visual geoms."""

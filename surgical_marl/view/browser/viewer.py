@@ -25,8 +25,7 @@ from surgical_marl.view.browser.nodes import Nodes
 from surgical_marl.view.browser.panel import Choice, Panel
 from surgical_marl.view.browser.pictures import Pictures
 from surgical_marl.view.browser.plots import Plots
-from surgical_marl.view.pace import Pace
-from surgical_marl.view.session import Session
+from surgical_marl.view.session import Pace, Session
 
 FPS = 30.0
 """Times a second that the scene is drawn."""

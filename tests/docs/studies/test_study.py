@@ -19,7 +19,7 @@ import torch
 from docs.studies import study, study_cells, study_report, study_runs
 from surgical_marl.learning import train
 from surgical_marl.policies.acting import forget
-from surgical_marl.runs import environment
+from surgical_marl.runs import settings as settings_module
 from surgical_marl.runs.folder import write_config, write_metrics
 from surgical_marl.runs.settings import Settings, load_config
 
@@ -94,7 +94,7 @@ def test_what_is_played_are_goals_that_training_never_drew(runs: Path, monkeypat
     def make_env(settings: Settings, num_envs: int) -> None:
         raise ValueError(f"{num_envs} episodes of {settings.goals} goals")
 
-    monkeypatch.setattr(environment, "make_env", make_env)
+    monkeypatch.setattr(settings_module, "make_env", make_env)
     job = study_runs.Job("reach-bimanual_psm-mappo", 0)
     (runs / str(job) / study_runs.PLAYED).unlink()
     with pytest.raises(ValueError, match="200 episodes of held_out goals"):

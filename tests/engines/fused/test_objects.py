@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from surgical_marl.bench.grasping import grasps
+from surgical_marl.bench.starts import grasps
 from tests.helpers.fused_kernels import gpu_code
 from tests.helpers.object_parity import Beside
 

@@ -1,4 +1,4 @@
-"""Value normalisation: the critic predicts returns of unit variance, whatever the reward's unit."""
+"""Running statistics: of observations, and of returns, so that a critic predicts values of unit variance."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from surgical_marl.learning import distributed
+from surgical_marl.policies.networks import LimitedNormaliser
 
 DECAY = 0.99
 """Decay of the weights of older iterations: the statistics are of about the last hundred iterations."""
@@ -51,3 +52,27 @@ class ValueScale(nn.Module):
     def restore(self, predicted: Tensor) -> Tensor:
         """Return what the critic predicts, `[..., W]`, in units of reward."""
         return predicted * self.std + self.mean
+
+
+class Normaliser(LimitedNormaliser):
+    """A normaliser with an update in place that a CUDA graph can repeat."""
+
+    def update(self, x: Tensor) -> None:
+        """Learn from the batches `[B, d]` of all processes while training."""
+        if not self.training:
+            return
+        count = x.shape[0] * distributed.size()
+        var, mean = distributed.var_mean(x, dim=0)
+        self.count += count
+        rate = count / self.count
+        ahead = mean - self._mean
+        self._mean += rate * ahead
+        self._var += rate * (var - self._var + ahead * (mean - self._mean))
+        self._std.copy_(self._var.sqrt())
+
+
+def share_normalisers(network: nn.Module) -> None:
+    """Replace every normaliser of observations in a network that is to learn by a `Normaliser`."""
+    for model in network.modules():
+        if getattr(model, "obs_normalization", False):
+            model.obs_normalizer = Normaliser(model.obs_dim)
