@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jinja2
 from markupsafe import Markup
 
 from surgical_marl.plugins.task_file import label
@@ -21,13 +20,14 @@ from surgical_marl.report.run import Run, flatten
 from surgical_marl.runs.folder import read_settings
 from surgical_marl.runs.settings import config_text, load_config
 from surgical_marl.runtime import package_version
-from surgical_marl.untrusted.markup import whole
+from surgical_marl.untrusted.markup import template, whole
 from surgical_marl.yaml_file import dump_yaml, parse_yaml
 
 _USUAL = {"device": "auto", "difficulty": "default", "start": "home"}
 """What a command need not say of the settings that choose which defaults hold."""
 
 
+FOLDER = Path(__file__).parent
 GENERATOR = "surgical-marl report"
 """What marks a file as one of ours, which may be replaced."""
 CLIP_LIMIT = 4_000_000
@@ -67,7 +67,7 @@ def render(runs: Sequence[Run]) -> str:
     heading = f"{label(str(task))} in {', '.join(scenes)}"
     drawing = Drawing()
     sections = [*_evaluation(drawing, groups), *_training(drawing, groups), *_settings(groups)]
-    page = _template().render(
+    page = template(FOLDER / "page.html").render(
         generator=GENERATOR,
         version=package_version(),
         made=time.strftime("%Y-%m-%d %H:%M %Z"),
@@ -81,7 +81,7 @@ def render(runs: Sequence[Run]) -> str:
         sections=sections,
         commands=_commands(runs),
         colors=COLORS,
-        style=Markup(_file("page.css")),
+        style=Markup((FOLDER / "page.css").read_text(encoding="utf-8")),
     )
     return whole(page)  # a folder's name may hold bytes that are no text
 
@@ -214,18 +214,6 @@ def video_address(path: Path) -> Markup:
     """Return a video as the address of an HTML page that needs no file: a data URI."""
     kind = {".webm": "video/webm", ".gif": "image/gif"}.get(path.suffix, "video/mp4")
     return Markup(f"data:{kind};base64,{base64.b64encode(path.read_bytes()).decode()}")
-
-
-def _template() -> jinja2.Template:
-    """Return the page's template, which escapes everything that is not `Markup`."""
-    environment = jinja2.Environment(
-        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    return environment.from_string(_file("page.html"))
-
-
-def _file(name: str) -> str:
-    return Path(__file__).with_name(name).read_text(encoding="utf-8")
 
 
 def train_command(run: Run) -> str:

@@ -7,11 +7,16 @@ from __future__ import annotations
 
 import html
 import re
+import shlex
 import unicodedata
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 from surgical_marl.untrusted.values import shown
+
+if TYPE_CHECKING:
+    import jinja2
 
 _SPECIAL = re.compile(r"(?<![^\W_])_|_(?![^\W_])|[\\`*\[\]<>|~$&]")
 """What Markdown would read as more than a letter; an underline within a word is one."""
@@ -45,6 +50,25 @@ def as_link(name: str) -> str:
 def whole(text: Any) -> str:
     """Return a text that can be written in UTF-8: "?" stands for each byte of a file's name that is no text."""
     return str(text).encode(errors="replace").decode()
+
+
+def template(path: Path) -> jinja2.Template:
+    """Return a template of Jinja. In an .html file it escapes everything that is not `Markup`.
+
+    Filters are `md` and `code`, for texts in Markdown as `as_markdown` and `as_code` return them, and `shell` for a
+    word of a command line. A name that a template reads and nobody gave is an error.
+    """
+    import jinja2
+
+    environment = jinja2.Environment(
+        autoescape=path.suffix == ".html",
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    environment.filters |= {"md": as_markdown, "code": as_code, "shell": shlex.quote}
+    return environment.from_string(path.read_text(encoding="utf-8"))
 
 
 def check_name(name: str, what: str) -> None:
