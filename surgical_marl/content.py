@@ -1,4 +1,4 @@
-"""Where the swappable content lives: arms, scenes, objects, configs and policies, by name or by path.
+"""Find the swappable content: arms, scenes, objects, configs and policies, by name or by path.
 
 Shipped content is at the top of the repository. An installed package adds its own content in folders of the same names,
 and registers itself with an entry point: `my_package = "my_package"` in the group `surgical_marl.content`.

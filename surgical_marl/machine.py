@@ -43,7 +43,7 @@ _SIGNS = (
     "out of memory", "can't allocate memory", "cannot allocate memory", "could not allocate memory",
     "not enough memory", "resource_exhausted", "bad_alloc", "failed to map segment", "can't start new thread",
 )  # fmt: skip
-"""What errors of libraries, of C++, of the linker and of threads say of a lack of memory."""
+"""Words in errors of libraries, C++, the linker and threads that mean a lack of memory."""
 
 
 def lacks_memory(error: BaseException | None) -> bool:

@@ -1,4 +1,4 @@
-"""How JAX is started: compile cache, precision, and workarounds for faults of XLA on CPUs."""
+"""Start JAX with a compile cache, full precision, and workarounds for faults of XLA on CPUs."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def cache_dir() -> Path:
 
 
 def knows_flag(flag: str = FLAG) -> bool:
-    """Whether the installed jaxlib accepts a flag, without importing it."""
+    """Return whether the installed jaxlib accepts a flag, without importing it."""
     try:
         version = importlib.metadata.version("jaxlib")
     except importlib.metadata.PackageNotFoundError:

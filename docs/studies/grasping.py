@@ -57,12 +57,12 @@ class Moved(NamedTuple):
 
     @property
     def lost(self) -> np.ndarray:
-        """Whether they moved so far that they count as dropped, bool."""
+        """True if they moved so far that they count as dropped, bool."""
         return ~(self.far < LOST)
 
     @property
     def slipped(self) -> np.ndarray:
-        """Whether they slipped, bool."""
+        """True if they slipped, bool."""
         return (self.slip > SLIP) | (self.turn > TURN)
 
 
@@ -77,11 +77,11 @@ class Held(NamedTuple):
     dropped: np.ndarray
     """bool"""
     struck: np.ndarray
-    """Whether the wrist of an arm struck the object, bool: then it may well slip."""
+    """True if the wrist of an arm struck the object, bool: then it may well slip."""
 
     @property
     def slipped(self) -> np.ndarray:
-        """Whether objects slipped that were neither dropped nor struck, bool."""
+        """True if objects slipped that were neither dropped nor struck, bool."""
         return self.moved.slipped & ~self.dropped & ~self.struck
 
 

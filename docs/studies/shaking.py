@@ -61,11 +61,11 @@ class Seen(NamedTuple):
     force: Any
     """Normal forces of the two fingers, N, [..., a, 2]."""
     holding: Any
-    """Whether the arm holds it, [..., a]."""
+    """True if the arm holds it, [..., a]."""
     overlap: Any
     """The deepest overlap with fingers in all physics steps of the control step, m, [...]."""
     struck: Any
-    """Whether another part of an arm was at the object in one of these steps, [...] bool."""
+    """True if another part of an arm was at the object in one of these steps, [...] bool."""
     place: Any
     """Centre of mass in the world, m, [..., 3]."""
     command: Any

@@ -61,7 +61,7 @@ class Sample(NamedTuple):
 
 
 class Trend(NamedTuple):
-    """A line through values over time."""
+    """Linear trend of samples over time, with the 95 % interval of its slope."""
 
     mean: float
     slope: float
@@ -71,7 +71,12 @@ class Trend(NamedTuple):
     """95 % interval of the slope."""
 
     def verdict(self, tolerance: float) -> str:
-        """Return "flat" if the whole interval is within a share of the mean, and else whether it has a sign."""
+        """Return "flat", "grows", "falls" or "not known yet".
+
+        Args:
+            tolerance: the trend is flat if the interval of the slope is within this share of the mean an hour.
+                Otherwise it grows or falls if the interval does not hold 0.
+        """
         within = tolerance * abs(self.mean)
         if -within <= self.low and self.high <= within:
             return "flat"

@@ -1,4 +1,4 @@
-"""Engines, ready to be timed."""
+"""Prepare engines for timing: compile them, put them at the start of a course, and return their clocks."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def prepare(engine: str, workload: Workload, course: Course) -> Contender:
 
 
 def _batched(name: str, workload: Workload, course: Course) -> Contender:
-    """One of this package's engines: a `BatchedEnv`, as a user would step it, and its physics alone."""
+    """Prepare an engine of this package: a `BatchedEnv`, stepped as a user would, and its physics alone."""
     count, cuda = workload.count, workload.where == "cuda"
     library = "jax" if name == "mjx" else "torch" if cuda else "numpy"
     give = {"jax": _jax if cuda else np.asarray, "torch": _torch, "numpy": np.asarray}[library]
@@ -90,7 +90,7 @@ def clock_of(batch: BatchedEnv, actions: list[Any]) -> Clock:
 
 
 def _beginning(step: Callable[[], None], begin: Callable[[], None], every: int) -> Callable[[], None]:
-    """Return a step before which environments are put where they started, each time after `every` so many."""
+    """Return a step that puts environments back to their starts before every `every`-th call."""
     turn = itertools.count()
 
     def begun() -> None:
@@ -102,14 +102,14 @@ def _beginning(step: Callable[[], None], begin: Callable[[], None], every: int) 
 
 
 def _clock(step: Callable[[], None], engine: Engine, cycle: int) -> Clock:
-    """Return the clock of a step that repeats itself after so many."""
+    """Return the clock of a step, whose work repeats after `cycle` calls."""
     if engine.device == "cuda" and engine.name == "fused":
         return cuda_clock(step, cycle)
     return cpu_clock(step, lambda: _wait(engine))
 
 
 def _cycle(lap: int, decimation: int) -> int:
-    """Return after how many steps, of some laps, environments have been sorted as often as in any long run."""
+    """Return the calls after which laps end and environments were sorted as often as in a long run."""
     return math.lcm(lap, control_steps(decimation))
 
 

@@ -44,7 +44,7 @@ class Course(NamedTuple):
     qvel: np.ndarray
     ctrl: np.ndarray
     commands: np.ndarray
-    """What the actions command, [LAPS, n, nu]."""
+    """Commands of the actions to the actuators, [LAPS, n, nu]."""
     actions: list[dict[str, np.ndarray]]
     """Agent -> [n, its actions], LAPS of them."""
     touching: float
@@ -150,7 +150,7 @@ def _grasping(now: Any, starts: Starts, at: Any) -> Any:
 
 
 def tile(values: np.ndarray, num_envs: int) -> np.ndarray:
-    """Rows over and over: [n, ...] -> [num_envs, ...]."""
+    """Return rows over and over: [n, ...] -> [num_envs, ...]."""
     return np.ascontiguousarray(values[np.arange(num_envs) % len(values)])
 
 
@@ -166,7 +166,7 @@ def with_objects(scene: Scene, course: Course) -> tuple[np.ndarray, np.ndarray]:
 
 
 def full_state(qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
-    """C MuJoCo's state [n, 1 + nq + nv], at time 0."""
+    """Return C MuJoCo's state [n, 1 + nq + nv] at time 0."""
     return np.concatenate([np.zeros((len(qpos), 1)), qpos, qvel], 1)
 
 
@@ -196,7 +196,7 @@ def _by_engine(workload: Workload, count: int) -> Callable[[Any], Any]:
 
 
 def _by_mujoco(model: Any, now: Any) -> Any:
-    """HOLD physics steps of C MuJoCo."""
+    """Make HOLD physics steps of C MuJoCo."""
     state = full_state(now.qpos, now.qvel)
     data = mujoco.MjData(model)
     found, _ = rollout.rollout(model, data, state, np.asarray(now.ctrl, float)[:, None], nstep=HOLD)

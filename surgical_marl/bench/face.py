@@ -1,4 +1,4 @@
-"""What the PettingZoo face adds to a step of the engine below it.
+"""Measure the time that the PettingZoo interface adds to a step of the engine below it.
 
 measure_face("reach", "psm", num_envs=1024).share
 """
@@ -27,7 +27,7 @@ class Face:
     engine_s: float
     """Of the engine alone, which reads no results: the median of all pairs, as in all that follows."""
     added_s: float
-    """What the face takes more."""
+    """Additional time of the interface, s."""
     share: float
     """The same as a share of what the engine takes."""
     num_envs: int | None
@@ -64,7 +64,7 @@ def measure_face(
 
 
 def run(task: str, scene: str, num_envs: int | None, as_json: bool) -> str:
-    """All of `surgical-marl bench face`: a sentence, or JSON."""
+    """Run `surgical-marl bench face`; return its sentence, or JSON."""
     found = measure_face(task, scene, num_envs)
     if as_json:
         return json.dumps(asdict(found))

@@ -58,13 +58,13 @@ class Speed(sim.Speed):
 
 
 def run(settings: Settings, as_json: bool = False) -> str:
-    """All of `surgical-marl bench train`: the text of its table or JSON."""
+    """Run `surgical-marl bench train`; return the text of its table, or JSON."""
     speed = measure(settings)
     return json.dumps(asdict(speed)) if as_json else table(settings, speed)
 
 
 def measure(settings: Settings, seconds: float = clock.SECONDS, repeats: int = clock.REPEATS) -> Speed:
-    """Trains for `repeats` times `seconds` at least, of which the best counts; then steps the same environments alone.
+    """Train for `repeats` times `seconds` at least, of which the best counts; then step the same environments alone.
 
     The actor imitates nobody before, however the settings are: that takes minutes, and changes no speed.
 
@@ -129,7 +129,7 @@ def _learn(settings: Settings, seconds: float, repeats: int) -> tuple[BatchedEnv
 
 
 def table(settings: Settings, speed: Speed) -> str:
-    """For people, in the form of the paper's Table II."""
+    """Return the text of a table in the form of the paper's Table II."""
     where = f"{speed.num_envs} envs, {speed.device}, {speed.engine} engine"
     measured = [
         ("acting and learning", speed.train_env_steps_per_s, where),

@@ -1,4 +1,4 @@
-"""What a drawing of the viewer costs: one environment with its policy, and a client that takes all that is sent.
+"""Cost of a drawing of the viewer: one environment with its policy, and a client that takes all that is sent.
 
 measure_page("reach", "bimanual_psm", 20.0).ms_per_drawing
 """
@@ -30,11 +30,11 @@ class Page:
     drawings_per_s: float
     """`surgical-marl view` wants 30; the clock on the wall tells, so other programs matter."""
     kilobytes_per_drawing: float
-    """What the client takes."""
+    """Size of what the server sends."""
     grown_mb: float
     """Memory that the process took on meanwhile, MB."""
     mover: str
-    """Who moves the arms."""
+    """Movers of the arms."""
 
 
 def measure_page(task: str, scene: str, seconds: float) -> Page:
@@ -66,7 +66,7 @@ def measure_page(task: str, scene: str, seconds: float) -> Page:
 
 
 def run(task: str, scene: str, seconds: float, as_json: bool) -> str:
-    """All of `surgical-marl bench view`: a sentence, or JSON."""
+    """Run `surgical-marl bench view`; return its sentence, or JSON."""
     found = measure_page(task, scene, seconds)
     if as_json:
         return json.dumps(asdict(found))

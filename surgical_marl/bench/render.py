@@ -105,7 +105,7 @@ def measure_pictures(
 
 
 def run_pictures(scene: str, as_json: bool) -> str:
-    """All of `surgical-marl bench render --of scene`: a sentence, or JSON."""
+    """Run `surgical-marl bench render --of scene`; return its sentence, or JSON."""
     found = measure_pictures(scene)
     if as_json:
         return json.dumps(asdict(found))
@@ -113,7 +113,7 @@ def run_pictures(scene: str, as_json: bool) -> str:
 
 
 def run(scene: str, num_envs: int | None, device: str, as_json: bool) -> str:
-    """All of `surgical-marl bench render`: a sentence, or JSON."""
+    """Run `surgical-marl bench render`; return its sentence, or JSON."""
     found = measure_rendering(scene, num_envs, device)
     if as_json:
         return json.dumps(asdict(found))

@@ -1,4 +1,4 @@
-"""What was measured, as a table, as JSON and as a picture."""
+"""Results of `bench sim` as a table, as JSON and as a picture."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def run(
     as_json: bool = False,
     out: Path | None = None,
 ) -> str:
-    """All of `surgical-marl bench sim`: the text of its table or JSON."""
+    """Run `surgical-marl bench sim`; return the text of its table, or JSON."""
     if sweeping:
         counts = [count for count in SWEEP if count <= (workload.num_envs or SWEEP[-1])]
         points, title = [], f"{label(workload.task)} on {workload.scene}; {describe_machine()}"
@@ -58,7 +58,7 @@ def run(
 
 
 def ratios(speeds: Mapping[str, Speed]) -> dict[str, dict[str, float]]:
-    """How many times as fast the fused engine is: {"physics": {"mujoco": ..., "mjx": ...}, "env": {"mjx": ...}}."""
+    """Return the speed of the fused engine over that of each other one, as {"physics": {"mujoco": ...}, "env": ...}."""
     found: dict[str, dict[str, float]] = {"physics": {}, "env": {}}
     fused = speeds.get("fused")
     for name, speed in speeds.items():
@@ -72,7 +72,7 @@ def ratios(speeds: Mapping[str, Speed]) -> dict[str, dict[str, float]]:
 def summary(
     workload: Workload, course: Course, speeds: Mapping[str, Speed], left_out: Mapping[str, str]
 ) -> dict[str, Any]:
-    """All of a run that times several engines, for JSON."""
+    """Return the results of a run that times several engines, for JSON."""
     return {
         "task": workload.task,
         "scene": workload.scene,
@@ -93,7 +93,7 @@ def sweep_summary(workload: Workload, points: Iterable[Point]) -> dict[str, Any]
 
 
 def table(found: Mapping[str, Any]) -> str:
-    """`summary` for people, in the form of the paper's Table I."""
+    """Return what `summary` returned as a text table, in the form of the paper's Table I."""
     rows = [(name, "a step of its own", speed, "quoted") for name, speed in found["quoted"].items()]
     for speed in found["engines"]:
         where = f"{speed['num_envs']} envs, {speed['device']}, first step after {speed['compile_s']:.1f} s"

@@ -1,4 +1,4 @@
-"""Throughput of the engines, of C MuJoCo and of MuJoCo Warp, in physics steps and in environment steps.
+"""Measure the throughput of the engines, of C MuJoCo and of MuJoCo Warp, in physics and environment steps.
 
     speeds, left_out = measure(Workload("reach", "psm", num_envs=4096), ("fused", "mjx", "mujoco"))
     speeds["fused"].physics_steps_per_s / speeds["mujoco"].physics_steps_per_s
@@ -32,7 +32,7 @@ LONGEST = 10.0
 
 @dataclass(frozen=True)
 class Speed:
-    """What an engine does in a second."""
+    """Speed of an engine."""
 
     physics_steps_per_s: float
     env_steps_per_s: float | None
@@ -58,7 +58,7 @@ def measure(
     seconds: float = clock.SECONDS,
     repeats: int = clock.REPEATS,
 ) -> tuple[dict[str, Speed], dict[str, str]]:
-    """Speeds by engine, and why an engine is left out.
+    """Return speeds by engine, and for each engine that is left out the reason.
 
     Raises:
         ValueError: the one engine asked for can't run here, or has no room.
@@ -106,7 +106,7 @@ def _time(workload: Workload, contenders: dict[str, Contender], seconds: float, 
 
 
 class Point(NamedTuple):
-    """One of a sweep."""
+    """A point of a sweep."""
 
     speed: Speed
     bytes_per_env: int | None
@@ -120,7 +120,7 @@ def sweep(
     seconds: float = clock.SECONDS,
     repeats: int = 3,
 ) -> Iterator[Point]:
-    """Speeds against the number of environments, on every device of this machine or the one that is asked for.
+    """Yield speeds against the number of environments, on every device of this machine or on one.
 
     An engine ends where the next number has no room or would take too long a step, and says so.
     """

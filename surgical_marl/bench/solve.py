@@ -1,4 +1,4 @@
-"""How long it takes to learn a task: seconds until the frozen evaluation shows success.
+"""Measure the time to learn a task: seconds until the frozen evaluation shows success.
 
 Where tool tips have targets, success is a tip that stays within 2 mm of its own. In other tasks it is what the task
 calls success.
@@ -72,7 +72,7 @@ class Exam:
     median_error_mm: float
     goal_set: str
     standard: bool
-    """Whether this is the goal set that this version publishes."""
+    """True if this is the goal set that this version publishes."""
 
     @property
     def success(self) -> float:
@@ -81,7 +81,7 @@ class Exam:
 
     @property
     def what(self) -> str:
-        """What those arms do, for people."""
+        """The success that counts, in words."""
         return f"within {SUCCESS_MM} mm" if self.judged_by == WITHIN else "successful"
 
     def passes(self, goal: Goal) -> bool:
@@ -181,7 +181,7 @@ def solve(
 
 
 def _times(began: float, entered: float, made: float, watch: Stopwatch, examining: float) -> Times:
-    """Of what went on from `began` until now: imports until `entered`, then environments until `made`."""
+    """Return the seconds from `began` until now by part: imports until `entered`, then environments until `made`."""
     whole = time.perf_counter() - began
     rollout, update = (watch.seconds(name) for name in ("rollout", "update"))
     times = Times(

@@ -82,7 +82,7 @@ many, hold one object: a handover. In all others one arm does."""
 
 
 class Starts(NamedTuple):
-    """Where n environments begin."""
+    """Start states of n environments."""
 
     qpos: np.ndarray
     """[n, nq]"""
@@ -91,7 +91,7 @@ class Starts(NamedTuple):
     quaternion: np.ndarray
     """Of the free objects, [n, k, 4]."""
     arms: np.ndarray
-    """How many arms' jaws are around the first object, [n]."""
+    """Number of jaws around the first object, [n]."""
 
 
 def grasps(scene: Scene, count: int, rng: np.random.Generator) -> Starts:

@@ -17,7 +17,7 @@ NUM_ENVS = {"cpu": 4096, "cuda": 131072}
 DISTINCT = 256
 """Default number of environments that differ."""
 BENCHED = ("all", "fused", "mjx", "mujoco", "mujoco_warp")
-"""What `bench sim` can time: this package's engines, C MuJoCo and MuJoCo Warp."""
+"""Simulators that `bench sim` can time: this package's engines, C MuJoCo and MuJoCo Warp."""
 
 
 @dataclass(frozen=True)

@@ -55,7 +55,7 @@ class Played(NamedTuple):
     measures: dict[str, np.ndarray]
     """[E, A] each, see `surgical_marl.evaluation.metrics.measure`."""
     follows: bool = False
-    """Whether the task's goals move."""
+    """True if the task's goals move."""
     stages: tuple[str, ...] = ()
     """Stages of the task, in order."""
 

@@ -9,12 +9,12 @@ from typing import NamedTuple
 import numpy as np
 
 HOLD = 0.2
-"""How long before the end of an episode the tip must stay near its goal, s."""
+"""Time at the end of an episode in which the tip must stay near its goal, s."""
 THRESHOLDS_MM = (1, 2, 5)
 SUCCESS_MM = 2
 """The threshold of team success, and of the time to success where tool tips have targets."""
 DROP = "drop"
-"""Whether an object was dropped or lost in a step, in `infos` of tasks with objects."""
+"""True if an object was dropped or lost in a step, in `infos` of tasks with objects."""
 TERMS = ("reward_", "cost")
 """Prefixes of the names of reward terms and costs in `infos`."""
 STAGE = "stage_"
@@ -36,7 +36,7 @@ VIEWED = {
 }
 """Infos of what an endoscope sees, whose mean over the steps that are not `SEARCHING` counts, likewise."""
 SEARCHING = "searching"
-"""Whether an endoscope may still look for what it is to show, in `infos` of tasks with such a search."""
+"""True if an endoscope may still look for what it is to show, in `infos` of tasks with such a search."""
 TRAVEL = {"camera_travel": ("camera_travel_mm", 1000.0)}
 """Infos of how far something moved in a step, whose sum counts, likewise."""
 PEAK = {"contact_force": ("peak_force_n", 1.0)}
@@ -79,7 +79,7 @@ class Metric(NamedTuple):
     reduce: Callable[[np.ndarray], np.ndarray]
     """[..., n] -> [...]"""
     extreme: bool = False
-    """Whether the metric is the worst value seen, for which a bootstrap can't give an interval."""
+    """True if the metric is the worst value seen, for which a bootstrap can't give an interval."""
     share: bool = False
     """True if each value is from 0 to 1, so that the metric is a share of episodes or of their steps."""
 

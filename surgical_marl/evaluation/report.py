@@ -30,7 +30,7 @@ ABOUT = (
 
 
 class Evaluation(dict[str, Any]):
-    """What `evaluate` returns: a dict that a notebook shows as a table."""
+    """Result of `evaluate`: a dict that a notebook shows as a table."""
 
     def _repr_html_(self) -> str:
         head, *rows = _rows(self, self["agents"])
@@ -122,7 +122,7 @@ KINDS = {
     "smoothness": "spectral arc length",
     "action_change": "rms at the goal, of -1 to 1",
 }
-"""What metrics without a unit are, by how their names begin; the first that fits counts."""
+"""Kinds of metrics without a unit, by the beginning of their names; the first that fits counts."""
 
 
 def title(name: str) -> str:

@@ -11,7 +11,7 @@ from surgical_marl.learning import distributed
 from surgical_marl.policies.layout import Layout
 
 METRICS = ("cost_rate", "lagrange_multiplier")
-"""What `Constraint.metrics` returns."""
+"""Names of the values of `Constraint.metrics`."""
 
 
 class Constraint(nn.Module):

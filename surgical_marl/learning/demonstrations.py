@@ -71,7 +71,7 @@ def check_demonstrations(settings: Settings) -> None:
 
 
 class Demonstrations:
-    """What is kept of the oracle's episodes, on the device of a run.
+    """Pairs of the oracle's episodes, on the device of a run.
 
     Args:
         settings: the run. The oracle plays its task, with the goals of training.
@@ -204,7 +204,7 @@ def _record(env: BatchedEnv) -> dict[str, np.ndarray]:
 
 
 class _Disturbance:
-    """What is added to actions: random numbers that change slowly, but nothing for jaws and messages."""
+    """Noise on actions: random numbers that change slowly, none for jaws and messages."""
 
     def __init__(self, env: BatchedEnv, rng: np.random.Generator) -> None:
         self._rng = rng

@@ -37,7 +37,7 @@ def claim_gpu(device: str) -> None:
 
 
 def is_first() -> bool:
-    """Whether this is rank 0, before and after processes are `joined` as well."""
+    """Return whether this is rank 0, before and after processes are `joined` as well."""
     return int(os.environ.get("RANK", 0)) == 0
 
 

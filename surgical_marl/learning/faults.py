@@ -63,7 +63,7 @@ class Diverged(FloatingPointError):
 
     @property
     def summary(self) -> dict[str, Any]:
-        """All of it, as JSON can hold it."""
+        """Return it as values that JSON can hold."""
         rate = self.learning_rate if math.isfinite(self.learning_rate) else None
         return {"iteration": self.iteration, "not_finite": self.found, "learning_rate": rate}
 

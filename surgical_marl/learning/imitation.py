@@ -53,7 +53,7 @@ class Imitation:
         self._batch_size, device = batch_size, demonstrations.actions.device
         self._rounds, self._asked = rounds, 0
         self._off: Tensor | None = None
-        """How far the actor is off, added up from pair to pair, [n]."""
+        """Errors of the actor, added up from pair to pair, [n]."""
         self._step, self._loss = torch.zeros((), device=device), torch.zeros((), device=device)
         self._rate = torch.tensor(RATE, device=device)
         weights = [weight for name, weight in actor.named_parameters() if "distribution" not in name]
@@ -150,7 +150,7 @@ class Imitation:
 
 
 class ImitationLoss:
-    """How unlikely the oracle's actions are, as a loss beside that of reinforcement learning.
+    """Negative log-likelihood of the oracle's actions, as a loss beside that of reinforcement learning.
 
     It keeps an actor from forgetting states that it seldom comes to (A. Rajeswaran et al., 2018, arXiv 1709.10087,
     equation 3, with a weight that stays the same). Standard deviations do not learn from it.

@@ -1,4 +1,4 @@
-"""What an iteration reports: put together on the device, copied to the host, and read there."""
+"""Report of an iteration: put together on the device, copied to the host, and read there."""
 
 from __future__ import annotations
 

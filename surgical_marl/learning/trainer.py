@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 _DAMAGED = (KeyError, TypeError, AttributeError, IndexError)
-"""What Python raises for a checkpoint in which something is of another type."""
+"""Errors that Python raises for a checkpoint in which something is of another type."""
 OWN = ("env", "collided", "random", "random_cuda")
 """Parts of `Trainer.state` that belong to one process alone: of its environments, and its random numbers."""
 
@@ -115,7 +115,7 @@ class Trainer:
 
     @property
     def imitating(self) -> bool:
-        """Whether the actor has yet to imitate the oracle before the first iteration, or to go on with it."""
+        """True if the actor has yet to imitate the oracle before the first iteration, or to go on with it."""
         return self._imitation is not None and self.iteration == 0 and self._imitation.done < self._imitation.steps
 
     def imitate(self) -> bool:

@@ -38,7 +38,7 @@ class Oracle(Protocol):
     """A policy, and where it waits."""
 
     waits: np.ndarray
-    """Whether its tools wait for time to pass in an environment, [N] bool."""
+    """True if its tools wait for time to pass in an environment, [N] bool."""
 
     def __call__(self, observations: Mapping[str, Any]) -> dict[str, Any]:
         """Return what agents do."""

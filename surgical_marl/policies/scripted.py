@@ -46,7 +46,7 @@ class Scripted:
         self._left = np.zeros(env.num_envs, int)
         """Control steps until the next one is planned."""
         self._pauses = np.array([round(step.wait / env.control_dt) for step in steps])
-        """How many of these each step waits."""
+        """Number of control steps that each step waits."""
         self._paces = np.array([step.pace for step in steps])
         self.waits = np.zeros(env.num_envs, bool)
 
@@ -122,7 +122,7 @@ def without_words(env: BatchedEnv, moves: np.ndarray) -> np.ndarray:
 
 
 class _Tool:
-    """Where the tool of an agent goes."""
+    """Path of an agent's tool."""
 
     def __init__(self, env: BatchedEnv, agent: str) -> None:
         self.mount = env.scene.mounts[agent]

@@ -1,4 +1,4 @@
-"""Who moves the arms that a learner does not move.
+"""Teammates: policies of the arms that a learner does not move.
 
 mates = Teammates(env, {"psm_0": "reach-bimanual_psm", "ecm_0": "frozen"})
 mates.seed(0)                              # random ones play the same again

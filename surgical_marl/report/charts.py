@@ -26,7 +26,7 @@ from matplotlib.ticker import EngFormatter, FuncFormatter, LogLocator, MaxNLocat
 WIDTH, HEIGHT = 360, 200
 """Size of a chart in pixels of the page: as wide as a phone, so that its text is not shrunk there."""
 COLORS, DASHES = 6, ("-", (0, (5, 2)), (0, (1, 1.5)), (0, (6, 2, 1, 2)))
-"""How many colours the style sheet has; further series have the same colours and other dashes."""
+"""Number of colours of the style sheet; further series have the same colours and other dashes."""
 INK, GRID = "#010101", "#020202"
 _SERIES = "#0300{:02x}"
 _REFERENCE = re.compile(r"^#(\S+)$|url\(#([^)]+)\)")
@@ -60,7 +60,7 @@ class Chart:
 
 
 class Scale(NamedTuple):
-    """How the numbers of an axis are written and spaced."""
+    """Format and spacing of the numbers of an axis."""
 
     write: Callable[[float], str]
     limits: tuple[float, float] | None = None
@@ -76,7 +76,7 @@ class Line(NamedTuple):
     band: tuple[np.ndarray, np.ndarray] | None = None
     thin: Sequence[tuple[np.ndarray, np.ndarray]] = ()
     steps: bool = False
-    """Whether y is constant from each x to the next, as in a histogram."""
+    """True if y is constant from each x to the next, as in a histogram."""
 
 
 def plain(value: float) -> str:
@@ -96,7 +96,7 @@ NUMBER = Scale(plain)
 
 
 class Text(NamedTuple):
-    """What stands beside a picture: title, a description in sentences, the legend, and its data as a table."""
+    """A picture with its title, a description in sentences, the legend, and its data as a table."""
 
     title: str
     description: str

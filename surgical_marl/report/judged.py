@@ -28,7 +28,7 @@ class Series(NamedTuple):
 
 
 class Histogram(NamedTuple):
-    """What to count: a measure in a unit that people read."""
+    """A measure to count, in a unit that people read."""
 
     measure: str
     unit: float

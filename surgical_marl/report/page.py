@@ -24,12 +24,12 @@ from surgical_marl.untrusted.markup import template, whole
 from surgical_marl.yaml_file import dump_yaml, parse_yaml
 
 _USUAL = {"device": "auto", "difficulty": "default", "start": "home"}
-"""What a command need not say of the settings that choose which defaults hold."""
+"""Usual values of the settings that choose the defaults: a command need not name them."""
 
 
 FOLDER = Path(__file__).parent
 GENERATOR = "surgical-marl report"
-"""What marks a file as one of ours, which may be replaced."""
+"""Mark of a report in its file: such a file may be replaced."""
 CLIP_LIMIT = 4_000_000
 """The largest video that is put into the page, in bytes; it grows by a third there."""
 CLIPS = 6
@@ -53,7 +53,7 @@ class Section(NamedTuple):
     charts: Sequence[Chart] = ()
     tables: Sequence[tables.Table] = ()
     folded: bool = False
-    """Whether its tables are opened by the reader."""
+    """True if its tables are opened by the reader."""
 
 
 def render(runs: Sequence[Run]) -> str:

@@ -1,4 +1,4 @@
-"""What a report says about one run, read from its folder; nothing is played or trained."""
+"""Read all that a report says about one run from its folder; nothing is played or trained."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Run:
     name: str
     """Its folder's name."""
     given: str
-    """What it was called on the command line."""
+    """Its name on the command line."""
     folder: Path
     config: Mapping[str, Any]
     """Dotted name -> setting."""

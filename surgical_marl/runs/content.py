@@ -36,7 +36,7 @@ class _Part(NamedTuple):
     user: str
     """The agent, or the object's name in the scene."""
     path: Path
-    """Where it is."""
+    """Its path."""
 
 
 def copy_content(scene: str, folder: Path) -> str:

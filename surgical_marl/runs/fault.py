@@ -40,16 +40,16 @@ _KNOWN = {"environment", "engine", "device", "seed", "index", "place", "versions
 
 
 class Reproduced(NamedTuple):
-    """What came of stepping towards a fault again."""
+    """Outcome of stepping towards a fault again."""
 
     steps: int
     """All steps of the file."""
     at: int | None
     """The first step, from 0, after which a number is not finite; None if all stay finite."""
     places: list[str]
-    """Where they are then, in the order in which faults spread."""
+    """Their places then, in the order in which faults spread."""
     told: str
-    """What the file says: seed, environment and place."""
+    """Facts in the file: seed, environment and place."""
     device: str
     versions: list[str]
     """Packages that have another version than when the fault was found."""

@@ -1,4 +1,4 @@
-"""What takes long: a bar or a line that changes in a terminal, a widget in a notebook, at times a line elsewhere."""
+"""Progress of long work: a bar or a line that changes in a terminal, a widget in a notebook, lines elsewhere."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ PAUSE = 2.0
 TICK = 0.5
 """Seconds after which the line on a compilation changes in a terminal."""
 _waiting: list[threading.Timer] = []
-"""What `preparing` would say."""
+"""Pending sentences of `preparing`."""
 SHORT = 20
 """Characters of what is done for which there is room before a bar in a terminal; what is longer stands above it."""
 _NUMBERS = "{n_fmt}/{total_fmt} [{elapsed}<{remaining}{postfix}]"

@@ -189,7 +189,7 @@ class Settings(Options):
 
     @property
     def shown_by_oracle(self) -> bool:
-        """Whether the oracle's episodes have a part in learning: as starts, or to be imitated."""
+        """True if the oracle's episodes have a part in learning: as starts, or to be imitated."""
         return self.oracle_states.rate > 0 or self.imitation.steps > 0 or self.imitation.weight > 0
 
     def in_training(self) -> Settings:

@@ -1,4 +1,4 @@
-"""Which collision geoms of a scene can touch: found from the joint limits, not listed by hand.
+"""Find the pairs of collision geoms of a scene that can touch, from the joint limits.
 
 Every pair is checked in every physics step, so a scene has only the pairs that can meet. Two geoms of two arms are a
 pair unless they are proven to stay apart in all postures (`separation.py`). So are two geoms of one arm, unless they

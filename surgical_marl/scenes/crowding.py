@@ -1,4 +1,4 @@
-"""Counts how many contacts of objects a scene may need at one time, to say where slots may run out."""
+"""Count the contacts of objects that a scene may need at one time, to say where slots may run out."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from surgical_marl.scenes.scene import Scene
 from surgical_marl.scenes.timing import TIMESTEP
 
 FALL, LOOK = 1.0, 0.5
-"""How long objects fall, and how long their contacts are then counted, s: a pile needs about as long to come to
+"""Time in which objects fall, and time in which contacts are then counted, s: a pile needs about as long to come to
 rest."""
 JAW = 4
 """Contacts that the work of a jaw adds: both fingers touch an object, and what this lies on."""
 
 
 class Crowd(NamedTuple):
-    """How many contacts of objects there are at one time. Each is between two bodies."""
+    """Numbers of contacts of objects at one time. Each contact is between two bodies."""
 
     resting: int
     """Once all free objects have fallen, with the arms at home."""

@@ -43,7 +43,7 @@ class Segment(NamedTuple):
     """The segment of a capsule. Of a sphere, which has none, all but the start is zero."""
 
     start: Any
-    """Where it begins, m, [..., 3]."""
+    """Its first point, m, [..., 3]."""
     extent: Any
     """The way from its start to its end, m, [..., 3]."""
     dual: Any

@@ -1,4 +1,4 @@
-"""Where grasps begin: an arm's open jaw around an object, without touching it.
+"""Draw starts of grasps: an arm's open jaw around an object, without touching it.
 
 jaw = Jaw(scene, "psm_0")
 grasp = jaw.draw("needle", scene.objects["needle"].object.sites["grasp"], rng)
@@ -23,7 +23,7 @@ from surgical_marl.scenes.scene import Scene
 GAP = 3e-5
 """Between each pad and the object, m."""
 DEPTHS = 0.006, 0.009
-"""How far from the jaw's hinge an object is grasped, m."""
+"""Distances from the jaw's hinge at which an object is grasped, m."""
 APART = 1e-3
 """Least distance of two arms that hold one object, m."""
 CENTRINGS = 5
@@ -35,7 +35,7 @@ WRIST = [4, 5]
 STOPS = 9
 """Positions of each of them, from end to end, that are looked at."""
 ROOM = 1e-3
-"""How near an object may come to the wrist there, m. Between two such positions it moves by about as much."""
+"""Least distance of an object from the wrist there, m. Between two such positions it moves by about as much."""
 ACROSS = np.stack([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]], 1)
 """Axes of a wire across the jaw, by the axes of the jaw's link: x along the wire."""
 

@@ -1,4 +1,4 @@
-"""Which shapes of a scene touch an object, and how: found by what they are, not by their names.
+"""Find the shapes of a scene that can touch an object, and the friction between them, without names.
 
 An object can touch every arm and every other object, except that fixed objects touch neither each other nor what no
 force moves, such as the base of an arm. The plates of a jaw stand for their fingers; elsewhere the shapes are those
@@ -29,7 +29,7 @@ DRAWS = 64
 FAR = 0.05
 """Distance of objects and arms up to which it is measured, m."""
 RESTING = 1e-5
-"""What lies on something at the start may reach this deep into it, m: numbers in files are rounded."""
+"""Largest overlap of an object with its support at the start, m: numbers in files are rounded."""
 
 
 class Touch(NamedTuple):

@@ -41,7 +41,7 @@ GEOMS = {
 
 @dataclass(frozen=True)
 class Surface:
-    """How something feels to what touches it."""
+    """Contact properties of a surface."""
 
     sliding: float
     """Coefficient of sliding friction."""
@@ -69,7 +69,7 @@ class Object:
     name: str
     description: str
     free: bool
-    """Whether it moves; otherwise it is fixed in the world."""
+    """True if it moves; otherwise it is fixed in the world."""
     mass: float
     """kg; 0 if the object is fixed."""
     center: np.ndarray
@@ -89,7 +89,7 @@ class Object:
 
     @property
     def surface(self) -> Surface:
-        """How it feels to what touches it."""
+        """Its contact properties."""
         return Surface(*self.friction, self.stiffness)
 
     def height(self, rotation: np.ndarray) -> float:

@@ -1,4 +1,4 @@
-"""Where free objects are: the pose of one, and those of many environments in arrays of numpy or torch."""
+"""Poses of free objects: of one, and of many environments in arrays of numpy or torch."""
 
 from __future__ import annotations
 

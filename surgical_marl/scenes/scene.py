@@ -55,7 +55,7 @@ class Randomisation:
     object_shift: float = number(0.0, 0.0, LARGEST, unit="m")
     """Free objects begin up to this far from their place, m, along the world's x and y each."""
     object_turn: float = number(0.0, 0.0, LARGEST, unit="rad")
-    """They begin turned about the vertical by up to this, rad."""
+    """Largest turn of free objects about the vertical at the start, rad."""
     object_size: float = number(0.0, 0.0, SHARE)
     """All their lengths are off by up to this share. Mass grows with their cube, unless `object_mass` is given."""
     object_mass: float = number(0.0, 0.0, SHARE)

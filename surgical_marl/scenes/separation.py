@@ -24,9 +24,9 @@ box takes longer."""
 BOXES = 400_000
 """Boxes of the longest search. Pairs of the shipped scenes take up to 313,000, one or two seconds."""
 WALKERS, STEPS = 32, 40
-"""How many of the nearest postures of a search a descent starts from, and how many steps it takes."""
+"""Number of the nearest postures of a search from which a descent starts, and number of its steps."""
 HALVINGS, FEW_HALVINGS, MANY = 8, 4, 16
-"""How often a geom's range is halved to find the ball in which the geom stays, and how often if it has many joints."""
+"""Number of halvings of a geom's range to find the ball in which it stays, and their number if it has many joints."""
 
 
 @dataclass(frozen=True)

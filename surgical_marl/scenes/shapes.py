@@ -21,7 +21,7 @@ from surgical_marl.untrusted.values import SHORTEST, check_count
 MAX_SHAPES = 400
 """Shapes of an object, each capsule of an arc counted."""
 Material = Literal["steel", "paint", "plastic", "rubber", "cloth", "tissue"]
-"""What a file may say that something is made of, for pictures for people alone."""
+"""Materials that a file may name, for pictures for people alone."""
 MATERIALS: tuple[str, ...] = get_args(Material)
 GREY: Vector = (0.7, 0.7, 0.72)
 """The colour of what has none."""

@@ -24,7 +24,7 @@ TISSUE_SHAPES = {
 
 @dataclass(frozen=True)
 class View:
-    """Where the overview camera stands, and the point that it looks at, in the world."""
+    """Place of the overview camera, and the point that it looks at, in the world."""
 
     position: Vector = lengths((0.0, 0.75, 0.40))
     target: Vector = lengths((0.0, 0.0, 0.07))

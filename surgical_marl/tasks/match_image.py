@@ -201,7 +201,7 @@ def hidden_postures(scene: Scene, agent: str, extent: float, seed: int = 0) -> n
 
 
 def _sees(scene: Scene, agent: str, qpos: np.ndarray, tissue: np.ndarray) -> bool:
-    """Whether enough tissue is in view of the left eye, and nothing too near."""
+    """Return whether enough tissue is in view of the left eye, and nothing too near."""
     data, count = mujoco.MjData(scene.model), RAYS * RAYS
     data.qpos[:] = qpos
     mujoco.mj_kinematics(scene.model, data)

@@ -65,9 +65,9 @@ if TYPE_CHECKING:
 ROWS = 2048
 """Number of starts and goals."""
 END = 0.155
-"""How far the middles of the two ends are from the middle between the arms, m."""
+"""Distances of the middles of the two ends from the middle between the arms, m."""
 OUT = 0.02
-"""How far starts and goals are out of the other arm's reach, at least, m: more than a needle is wide."""
+"""Least distance of starts and goals from the other arm's reach, m: more than a needle is wide."""
 HEIGHT = 0.06
 """Of the exchange above the pad, m."""
 BACK, DEEP, AWAY = 0.015, 0.003, 0.025

@@ -62,8 +62,8 @@ LOW, HIGH = 0.012, 0.05
 SAFE = 0.012
 """Least height of the whole needle above the pad at a goal, m: it is lifted there."""
 ABOVE, PRESS, RAISE = 0.01, 0.0019, 0.02
-"""How far the oracle's tool tip stops above the wire, goes past it, and lifts it, m. A wire that lies on a pad is at
-the round ends of the fingers. They have to dent the pad, so that their flat faces hold it."""
+"""Distances by which the oracle's tool tip stops above the wire, goes past it, and lifts it, m. A wire on a pad
+is at the round ends of the fingers. They have to dent the pad, so that their flat faces hold it."""
 
 
 class PickLevel(NamedTuple):
@@ -72,9 +72,9 @@ class PickLevel(NamedTuple):
     spread: float
     """Greatest distance of the needle and of the goal from the middle of the workspace, m."""
     lean: float
-    """How far a tool that presents the needle may lean from the vertical, rad."""
+    """Largest angle between the vertical and a tool that presents the needle, rad."""
     oriented: bool
-    """Whether the goal has an orientation."""
+    """True if the goal has an orientation."""
 
 
 class Task(ObjectTask):

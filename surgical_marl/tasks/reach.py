@@ -51,7 +51,7 @@ class RowGoal(NamedTuple):
     """The goal of an episode to which a way of the joints is known."""
 
     targets: Array
-    """Where the tool tips should be, [arms, 3], m, each in its arm's base frame."""
+    """Return the targets of the tool tips, [arms, 3], m, each in its arm's base frame."""
     row: Array
     """Row of the tables."""
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     import jinja2
 
 _SPECIAL = re.compile(r"(?<![^\W_])_|_(?![^\W_])|[\\`*\[\]<>|~$&]")
-"""What Markdown would read as more than a letter; an underline within a word is one."""
+"""Characters that Markdown would read as more than a letter; an underline within a word is a letter."""
 _NO_NAME = ("Cc", "Cs", "Zl", "Zp")
 """Categories of Unicode: control characters, bytes that are no text, ends of lines and paragraphs."""
 

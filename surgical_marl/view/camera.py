@@ -1,4 +1,4 @@
-"""Where to look at a scene from: the direction in which arms and objects hide the least of what matters.
+"""Choose the view of a scene: the direction in which arms and objects hide the least of what matters.
 
     view = best_view(scene)
     Renderer(scene.model).render(data, view)
@@ -27,7 +27,7 @@ _POSTURES = 6
 _NEAR = 0.15
 """Part of every joint's range about home that postures are drawn from."""
 _AROUND = 0.03
-"""How far from the point in front of an arm its targets are looked for, m."""
+"""Distance from the point in front of an arm within which its targets are looked for, m."""
 _SLACK = 0.012
 """A point counts as seen if what a ray meets is at most so far in front of it, m: it may lie within a tool."""
 _FILLED, _LEAST = 0.75, 0.5
@@ -37,7 +37,7 @@ _TABLES = {"points": 3, "starts": 7}
 _PLACES = 16
 """Rows of a task's tables that are looked at, about."""
 _TURNED, _CLOSE = 0.25, 0.5
-"""What it costs to look from the other side than the scene's own camera, and if something close by is all one sees."""
+"""Costs of a view from the other side than the scene's own camera, and of one that something close by fills."""
 _GROUPS = np.array([1, 1, 1, 0, 0, 0], np.uint8)
 
 

@@ -42,7 +42,7 @@ class Extra(NamedTuple):
     """Its axes as columns, [3, 3]."""
     material: Material
     casts: bool = True
-    """Whether it throws a shadow."""
+    """True if it throws a shadow."""
 
 
 class Drawn:
@@ -94,7 +94,7 @@ class Drawn:
 
     @property
     def count(self) -> int:
-        """How many shapes there are without balls."""
+        """Number of shapes without balls."""
         return len(self._shapes)
 
     def at(

@@ -48,7 +48,7 @@ Picture = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class Look:
-    """How a film looks.
+    """Style of a film.
 
     Attributes:
         grid: rows and columns of environments.
@@ -97,7 +97,7 @@ class Look:
 
 
 class Shot(NamedTuple):
-    """What a frame shows of one environment."""
+    """Content of a frame of one environment."""
 
     pose: Pose
     words: list[str]

@@ -24,7 +24,7 @@ POSED = 6
 
 
 class Hand:
-    """What a person wants of one arm, the same in all environments, as a policy of that arm.
+    """A person's wishes for one arm, the same in all environments, as a policy of that arm.
 
     Commands go straight to the wanted joint positions, at the joints' speeds.
 
@@ -47,7 +47,7 @@ class Hand:
         self._arm = self.mount.arm
         self._pace = env.control_dt * self._arm.speed
         self.jaw = self._arm.moves_jaw
-        """Which joints open the jaw, [n] bool."""
+        """True for joints that open the jaw, [n] bool."""
         self.jaw_open = False
         self.q = np.array(self._arm.home, float)
         """Wanted joint positions, [n]."""

@@ -1,4 +1,4 @@
-"""What happened lately in one environment, for plots: errors, distances, forces, grips, terms of the reward."""
+"""History of one environment, for plots: errors, distances, forces, grips, terms of the reward."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 ERRORS = ("tip_error", "goal_error")
 """Infos of how far a tool tip, or an object, is from its goal, m: the first that there is counts."""
 REWARD = "reward_"
-"""How infos of terms of the reward begin."""
+"""Beginning of the names of infos of reward terms."""
 GRIP = ("force", "holding", "slip")
 """Infos of each arm's grip on each free object, `<object>_<one of these>`: N, whether it is held, m."""
 

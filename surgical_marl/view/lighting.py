@@ -1,4 +1,4 @@
-"""How a point of a surface looks: patterns of materials, a room to be mirrored, soft shadows of convex shapes.
+"""Light a point of a surface: patterns of materials, a room to be mirrored, soft shadows of convex shapes.
 
 Functions of Warp for the kernels of `view/tracer.py`. Colours are linear light.
 """

@@ -1,4 +1,4 @@
-"""What there is to see of N environments at one moment, as numbers: no drawing, no browser.
+"""One moment of N environments as numbers, for any drawing.
 
     moment = Observer(env.scene).look(env)
     moment.nearest[0]                       # the shortest line between two arms of the first environment
@@ -64,7 +64,7 @@ class Moment(NamedTuple):
     objects: np.ndarray
     """Origins of free objects, [N, k, 3]."""
     held: np.ndarray
-    """Which arms hold which free objects, [N, k, arms] bool."""
+    """True where an arm holds a free object, [N, k, arms] bool."""
     marks: np.ndarray
     """Places that the task marks as goals, [N, marks, 3]."""
     nearest: list[Near | None]

@@ -1,4 +1,4 @@
-"""Who moves each arm: a policy that ships, a run, the oracle, nobody, or a person.
+"""Movers of arms: a policy that ships, a run, the oracle, nobody, or a person.
 
 movers = Movers(env, "reach-bimanual_psm")
 movers.set("psm_1", "you", observations)
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 YOU = "you"
 """A person moves the arm."""
 SIMPLE = ("oracle", "zero", FROZEN, "random")
-"""Who can move an arm without learning."""
+"""Movers that need no learning."""
 
 
 class Movers:

@@ -21,10 +21,10 @@ COARSE = wp.constant(2)
 
 @wp.struct
 class Pixels:
-    """What rays through the middles of pixels have found."""
+    """Hits of rays through the middles of pixels."""
 
     depths: wp.array2d[float]
-    """How far they go, m, [height, width], as all but the light."""
+    """Their lengths, m, [height, width], as all but the light."""
     normals: wp.array2d[wp.vec3]
     """Of what they meet."""
     sides: wp.array2d[int]

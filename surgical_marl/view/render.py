@@ -35,9 +35,9 @@ _FAR, _SKY_FAR = 1e6, 0.2
 """Distance of what hides the sky at most, in extents of the model."""
 _LAMP_TILES, _SKY_TILES = 128, 96
 _LIT = 1.6
-"""How far from the model's middle shadows reach, in its extents."""
+"""Reach of shadows from the model's middle, in its extents."""
 _LAMP_MARGIN, _SKY_MARGIN = 0.02, 0.05
-"""How far a half shadow reaches beyond a shape, of the extent; what is farther is cut off."""
+"""Reach of a half shadow beyond a shape, as a share of the extent; the rest is cut off."""
 
 
 @dataclass(frozen=True)

@@ -64,7 +64,7 @@ class Session:
         self.seed = settings.seed
         self.observations: Any = self.env.reset(self.seed)[0]
         self.choices = choices(self.env, further)
-        """Who can move the arms."""
+        """Movers of the arms."""
         self.movers = Movers(self.env, first(self.env) if who is None else who)
         self.choices += [name for name in dict.fromkeys(self.movers.who.values()) if name not in self.choices]
         self.history = History(self.env.agents, self.env.control_dt, objects=list(self.env.scene.free_objects))

@@ -1,4 +1,4 @@
-"""What geoms of a model are made of: colours in linear light, gloss and patterns, as a file or their colours say."""
+"""Materials of geoms of a model: colours in linear light, gloss and patterns; colours of agents and goals."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ _STILL = 1
 
 
 class Material(NamedTuple):
-    """What a surface is made of."""
+    """Material of a surface."""
 
     colour: Array
     """Linear light, [3]."""

@@ -1,4 +1,4 @@
-"""What stands around a scene in pictures for people: a draped table, a floor, stands under boards, booms for arms.
+"""Surroundings of a scene in pictures for people: a draped table, a floor, stands under boards, booms for arms.
 
     Renderer(scene.model, stage=stage(scene), paint=paint(scene))
 
@@ -27,10 +27,10 @@ _HEIGHT = 0.9
 _EDGE = 0.12
 """From the middle of an arm's foot to the edge of the table, m."""
 _BED = 0.075
-"""How far the mound under tissue reaches beyond the middles of the pieces, m."""
+"""Reach of the mound under tissue beyond the middles of the pieces, m."""
 _BOOM, _BOOM_RADIUS = 1.5, 0.045
 _INSET = 0.006
-"""How far a stand's sides are within those of the board on it, m."""
+"""Distance of a stand's sides from those of the board on it, inwards, m."""
 
 
 def stage(scene: Scene) -> list[Extra]:

@@ -1,4 +1,4 @@
-"""What was done in the viewer, as a file that can be stepped again to the same numbers.
+"""Takes of the viewer: files that can be stepped again to the same numbers.
 
 `surgical-marl view --record DIR` writes takes, and `surgical-marl replay FILE` steps one again. A take is an npz file:
 
@@ -91,7 +91,7 @@ class Take:
 
 
 class Replayed(NamedTuple):
-    """What came of stepping a take again."""
+    """Outcome of stepping a take again."""
 
     steps: int
     differs_at: int | None

@@ -39,14 +39,14 @@ class Eye:
     columns: wp.int32
     rows: wp.int32
     left: wp.float32
-    """Where the picture's left edge is at distance 1."""
+    """Place of the picture's left edge at distance 1."""
     top: wp.float32
     spread: wp.float32
     """Radius of a lamp over its distance; 0 for a camera."""
     far: wp.float32
     """Height above a point from which on nothing throws a shadow there, m; shadows grow weaker until there."""
     margin: wp.float32
-    """How much larger shapes count, m: so far a half shadow may reach beyond them."""
+    """Margin of shapes, m: so far a half shadow may reach beyond them."""
     first: wp.int32
     """Row of the lists of shapes that belongs to its first tile."""
 
@@ -62,7 +62,7 @@ class Shape:
     """Of a ball about the shape's origin that holds it."""
     place: wp.vec3
     viewer: wp.vec3
-    """Where the picture is seen from, in the shape's frame."""
+    """The viewpoint, in the shape's frame."""
     near: wp.float32
     """From there to the ball about the shape, m; below 0 inside it."""
     bottom: wp.float32
@@ -72,7 +72,7 @@ class Shape:
     back: wp.mat33
     """From the world's frame to the shape's."""
     shadow_kind: wp.int32
-    """What stands for the shape where it throws a shadow; -1 if it throws none."""
+    """Number of the shape that throws its shadow; -1 if it throws none."""
     shadow_size: wp.vec3
     breadth: wp.vec2
     """Half width and half length as seen from the side."""
@@ -104,7 +104,7 @@ class World:
     listed: wp.array2d[wp.uint16]
     """Shapes that rays through a tile may meet [tiles, shapes], of all eyes."""
     counts: wp.array[int]
-    """How many they are [tiles]."""
+    """Their number, [tiles]."""
 
 
 @wp.func

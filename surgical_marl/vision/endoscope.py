@@ -180,7 +180,7 @@ class Endoscope:
 
 
 def _is_tensor(values: Any) -> bool:
-    """Whether values are a tensor of torch, which is not imported to find out."""
+    """Return whether values are a tensor of torch, without importing torch."""
     torch = sys.modules.get("torch")
     return torch is not None and bool(torch.is_tensor(values))
 

@@ -106,7 +106,7 @@ class Kinematics:
             raise ValueError("pictures need a scene whose joints are hinges and slides, and whose cameras are fixed")
         self.qpos = wp.zeros((num_envs, model.nq), dtype=float)
         self.origins, self.turns = (wp.zeros((num_envs, model.nmocap), dtype=dtype) for dtype in (wp.vec3, wp.vec4))
-        """Where free objects are, in the order of mocap bodies; quaternions w, x, y, z."""
+        """Poses of free objects, in the order of mocap bodies; quaternions w, x, y, z."""
         self._objects = wp.array(np.flatnonzero(model.body_mocapid >= 0), dtype=int)
         tables = (model.qpos0, model.body_parentid, model.body_pos, model.body_quat, model.body_jntadr,
                   model.body_jntnum, model.jnt_type, model.jnt_pos, model.jnt_axis)  # fmt: skip

@@ -1,4 +1,4 @@
-"""Where a jaw can grip an object of wires or bars, on the host: poses of tools and the joint positions for them.
+"""Grasp poses of objects of wires or bars, on the host: poses of tools and the joint positions for them.
 
 A grip is a number of a capsule of the object. The tool's y axis, along which its fingers close, is across the capsule,
 and the z axis, along which they point, is as near to a wanted direction as that allows.

@@ -58,16 +58,16 @@ class ObjectGoal(NamedTuple):
 
 
 class Now(NamedTuple):
-    """What an object task measures in a world, [] each."""
+    """Measurements of an object task in a world, [] each."""
 
     reach: dict[str, Array]
     """Distance of each tool tip from the object's nearest bar, m."""
     part: dict[str, Array]
     """Number of that bar."""
     held: dict[str, Array]
-    """Whether each arm holds the object."""
+    """True if each arm holds the object."""
     touched: dict[str, Array]
-    """Whether fingers of each arm touch it."""
+    """True if fingers of each arm touch it."""
     lift: Array
     """Its height, from 0 to 1 at `LIFT`."""
     error: Array
@@ -75,7 +75,7 @@ class Now(NamedTuple):
     angle: Array
     """Angle by which it is turned away from the goal, rad."""
     dropped: Array
-    """Whether it was lifted before, and no finger touches it now, or it is lost."""
+    """True if it was lifted before, and no finger touches it now, or it is lost."""
 
 
 class ObjectTask(Task):
@@ -103,7 +103,7 @@ class ObjectTask(Task):
         super().__init__(scene, options)
         self.object = find_object(scene, label(options.task), (self.point,), self.scenes or ())
         self.called = self.object
-        """What the terms about it begin with that agents observe."""
+        """Beginning of the names of the observation terms about it."""
         holders = [agent for agent, mount in scene.mounts.items() if mount.arm.jaw and len(mount.arm.jaw.pads) == 2]
         if len(holders) != self.hands:
             raise ValueError(
@@ -118,11 +118,11 @@ class ObjectTask(Task):
         self._point = item.sites[self.point][0].astype(np.float32)
         self._sites = np.array([place for place, _ in item.sites.values()], np.float32)
         self.oriented = bool(self.level.oriented)
-        """Whether the goal has an orientation."""
+        """True if the goal has an orientation."""
 
     @property
     def constants(self) -> tuple[Any, ...]:
-        """Whether the goal has an orientation, and the arms that pick and present."""
+        """True if the goal has an orientation, and the arms that pick and present."""
         return self.oriented, self.picker, self.presenter
 
     def _set_tables(self, starts: np.ndarray, goals: np.ndarray) -> None:

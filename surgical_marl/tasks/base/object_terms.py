@@ -24,9 +24,9 @@ SPINNING = 500.0
 FURTHEST = 0.1
 """Bound of an observed slip, m."""
 PARTS = ("position", "rotation", "velocity", "grip")
-"""What can be known of an object."""
+"""Names of the terms about an object."""
 AT_HAND = "object"
-"""How observation terms call the object to be moved now, where a task moves several objects in turn."""
+"""Name in observation terms of the object to be moved now, where a task moves several objects in turn."""
 
 
 def object_terms(scene: Scene, agent: str) -> dict[str, Term]:

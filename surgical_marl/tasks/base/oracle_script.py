@@ -1,4 +1,4 @@
-"""A script: how arms can do a task with objects step by step, for the oracle that shows that the task can be done.
+"""Scripts of the oracle: how arms do a task with objects step by step, which shows that it can be done.
 
 A task that has one returns its steps from `Task.script`. They read what the simulation knows, and are computed on the
 host for many environments at once. `surgical_marl/policies/scripted.py` moves the arms.
@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 EARLY = -0.06
-"""When a jaw begins to close, as a step's `wait`, s: its tool is still 1 to 3 mm from the end of its way then.
+"""Time at which a jaw begins to close, as a step's `wait`, s: its tool is then 1 to 3 mm from the end of its way.
 
 If it closed at the end, an actor that imitates the script would stop a little before that, with an open jaw.
 """
@@ -26,7 +26,7 @@ class Snapshot(NamedTuple):
     objects: Mapping[str, np.ndarray]
     """Pose of each free object, [n, 4, 4]."""
     held: Mapping[str, np.ndarray]
-    """Which free objects each agent holds, [n, k] bool."""
+    """True for the free objects that each agent holds, [n, k] bool."""
     goal: Any
     """Fields of the goal, [n, ...] each."""
     qpos: Mapping[str, np.ndarray]
@@ -34,16 +34,16 @@ class Snapshot(NamedTuple):
 
 
 class Wish(NamedTuple):
-    """What an agent should do in n environments."""
+    """Command to an agent in n environments."""
 
     tool: np.ndarray | None = None
-    """Where its tool tip should be, world, [n, 4, 4]; None to stay where it was sent last."""
+    """Target pose of its tool tip, world, [n, 4, 4]; None to stay where it was sent last."""
     opens: float = 0.0
-    """How far the jaw opens, as a share of its way; at 0 it closes, and then presses."""
+    """Opening of the jaw, as a share of its way; at 0 it closes, and then presses."""
     joints: np.ndarray | None = None
-    """Where its joints should be instead, [n, joints]."""
+    """Target positions of its joints instead, [n, joints]."""
     from_home: bool = False
-    """Whether inverse kinematics starts from home, and not from where the joints were sent last."""
+    """True if inverse kinematics starts from home, and not from where the joints were sent last."""
 
 
 class Step(NamedTuple):

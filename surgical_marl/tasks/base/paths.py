@@ -45,7 +45,7 @@ circle in `DURATION` takes 1.3 rad/s."""
 SLOWEST = 0.5
 """Share of the greatest speed that the slowest of these paths has."""
 AWAY = 0.25
-"""How far from home a joint of a random start posture is at most, as a share of its range."""
+"""Largest distance from home of a joint of a random start posture, as a share of its range."""
 
 Draw = Callable[[np.random.Generator, int, np.ndarray, Level], np.ndarray]
 

@@ -1,4 +1,4 @@
-"""Places in which a free object lies at rest, drawn on the host."""
+"""Draw poses in which a free object lies at rest, on the host."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from surgical_marl.scenes.poses import Pose
 from surgical_marl.scenes.scene import Scene
 
 LOOSE = 5e-5
-"""What lies on something is nowhere further from it than this, m."""
+"""Largest gap between an object at rest and its support, m."""
 MOST_BATCHES = 8
 
 

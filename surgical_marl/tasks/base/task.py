@@ -49,7 +49,7 @@ class Start(NamedTuple):
     qpos: Array | None = None
     """Joint positions of the whole scene, [nq]; None if every episode starts at home."""
     poses: Mapping[str, Pose] = {}
-    """Where free objects lie at rest, by name, without overlaps. Others begin where the scene places them."""
+    """Poses of free objects at rest, by name, without overlaps. Others begin where the scene places them."""
 
 
 class Level(NamedTuple):
@@ -62,7 +62,7 @@ class Level(NamedTuple):
     speed: float = 0.0
     """Greatest speed of a target, m/s."""
     own_starts: bool = False
-    """Whether arms begin where the level says, which leaves no choice of a start."""
+    """True if arms begin where the level says, which leaves no choice of a start."""
 
 
 class Task:
@@ -96,13 +96,13 @@ class Task:
     stages: ClassVar[tuple[str, ...]] = ()
     """Stages on the way to success, in order."""
     follows: ClassVar[bool] = False
-    """Whether goals move. If so, every step of an episode counts in its evaluation, and not only the last ones."""
+    """True if goals move. If so, every step of an episode counts in its evaluation, and not only the last ones."""
     has_targets: ClassVar[bool] = False
-    """Whether `targets` says where tool tips should be."""
+    """True if `targets` gives places for tool tips."""
     attends: tuple[str, ...] = ()
     """Agents that follow no script but what the others do, as `attend` says."""
     wanted: ClassVar[Mapping[str, tuple[str, float]]] = {}
-    """What a trained policy should reach: metric -> ("below" or "at least", number)."""
+    """Goals of a trained policy: metric -> ("below" or "at least", number)."""
 
     def __init__(self, scene: Scene, options: Options) -> None:
         if options.difficulty not in self.levels:
@@ -125,7 +125,7 @@ class Task:
 
     @property
     def constants(self) -> tuple[Any, ...]:
-        """What the functions read from `self` beside `tables` and `weights`, if it differs between levels.
+        """Values that the functions read from `self` beside `tables` and `weights`, if they differ between levels.
 
         A kernel that was compiled for other constants does not serve the task.
         """
@@ -276,7 +276,7 @@ class Goal(NamedTuple):
     """The goal of a `TipTask`. A subclass may use a goal with more fields."""
 
     targets: Array
-    """Where the tool tips should be now, [arms, 3], m, each in its arm's base frame."""
+    """Return the targets of the tool tips now, [arms, 3], m, each in its arm's base frame."""
 
 
 class TipTask(Task):

@@ -46,7 +46,7 @@ STRONGEST = 100.0
 """Bound of an observed contact force, N."""
 EYES, CHANNELS = ("left", "right"), ("rgb", "depth")
 About = Literal["arm", "others", "object", "goal", "team_goal", "messages"]
-"""What a term tells: of the arm itself, of other arms, of objects and what cameras show; where this arm itself should
+"""Subject of a term: the arm itself, of other arms, of objects and what cameras show; where this arm itself should
 be, or what all arms are after together; what other arms said. Levels of knowledge go by it (`envs/knowledge.py`)."""
 
 
@@ -59,7 +59,7 @@ class Term(NamedTuple):
     """Least value, [d]: what is observed is clipped to the bounds."""
     high: np.ndarray
     about: About | None = None
-    """What it tells. A task whose terms don't say so can be played at knowledge "task" alone."""
+    """Subject of the term. A task whose terms don't say it can be played at knowledge "task" alone."""
 
 
 class Picture(NamedTuple):
@@ -75,7 +75,7 @@ class Picture(NamedTuple):
 
     @property
     def about(self) -> About:
-        """What it tells: a target picture the goal, any other one what the camera sees."""
+        """Subject of the picture: the goal for a target picture, the camera's view for any other."""
         return "object" if self.table is None else "goal"
 
 

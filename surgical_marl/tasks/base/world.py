@@ -22,6 +22,6 @@ class World(NamedTuple):
     objects: Mapping[str, ObjectView] = {}
     """The view of each free object of the scene."""
     messages: Array | tuple[()] = ()
-    """What each arm said in the last step, [arms, K]; () without messages, and where rewards are computed."""
+    """Message of each arm in the last step, [arms, K]; () without messages, and where rewards are computed."""
     changes: Mapping[str, Array] = {}
-    """How each agent's action differs from its last one, [n], without words; only where rewards are computed."""
+    """Each agent's action less its last one, [n], without messages; only where rewards are computed."""

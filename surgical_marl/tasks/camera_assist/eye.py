@@ -1,4 +1,4 @@
-"""What an endoscope sees: where points are in its picture, and postures in which it looks at them.
+"""The view of an endoscope: points in its picture, and postures in which it looks at them.
 
 The endoscope's frame is x left, y up, z along the view, as that of the ECM's tip. A point is in view if it is within
 the pictures of both eyes, and neither nearer than `NEAREST` nor farther away than `FARTHEST`. What is in front of it
@@ -21,7 +21,7 @@ NEAREST = 0.02
 FARTHEST = 0.3
 """Greatest one, m: there a pixel of a picture of 64 x 64 is 5.4 mm wide, more than half a tool's shaft of 8 mm."""
 CLOSE = 0.1
-"""What is nearest is at least so far away at a good distance, m: there a square picture of 60 degrees is 115 mm wide.
+"""Least distance of the nearest point in a good view, m: there a square picture of 60 degrees is 115 mm wide.
 Tools part faster than an endoscope draws back."""
 FILL = 0.6
 """At a good distance what is looked at fills this share of the picture, from its middle to its nearest edge."""

@@ -1,4 +1,4 @@
-"""Camera assistance on the host: who is the camera, where it starts, and which goals it can show."""
+"""Draw starts of camera assistance on the host: postures of the endoscope, and goals that it can show."""
 
 from __future__ import annotations
 

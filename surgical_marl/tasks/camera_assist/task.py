@@ -84,9 +84,9 @@ class Level(NamedTuple):
     """A level of difficulty."""
 
     turn: float
-    """How far the endoscope is turned away at the start, at most, rad."""
+    """Largest angle by which the endoscope is turned away at the start, rad."""
     sees: bool
-    """Whether it sees both tools at the start."""
+    """True if it sees both tools at the start."""
 
 
 class ViewGoal(NamedTuple):
@@ -101,7 +101,7 @@ class ViewGoal(NamedTuple):
     found: Array
     """1 once all was in view at once, []."""
     origin: Array
-    """Where the endoscope's tip was after the last step, world, m, [3]."""
+    """Place of the endoscope's tip after the last step, world, m, [3]."""
 
 
 class Task(BaseTask):
@@ -148,7 +148,7 @@ class Task(BaseTask):
 
     @property
     def constants(self) -> tuple[Any, ...]:
-        """Those of the work."""
+        """Constants of the tools' task, and its module."""
         return type(self.work).__module__, *self.work.constants
 
     def bound(self, weights: Mapping[str, Array], tables: Mapping[str, Array]) -> Any:
@@ -286,7 +286,7 @@ class Task(BaseTask):
 
     @property
     def _shown(self) -> Shown:
-        """What agents are shown, of this task's tables."""
+        """Observation terms of what the endoscope shows."""
         return Shown(self.scene, self.camera, self.tools, self.object, self._eye, self.sights)
 
     def terms(self, agent: str) -> dict[str, Term | Picture]:

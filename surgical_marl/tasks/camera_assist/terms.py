@@ -1,4 +1,4 @@
-"""What agents observe where an endoscope assists two tools: these only what it shows, and it where to look."""
+"""Observation terms of camera assistance: tools see what the endoscope shows, and the endoscope knows where to look."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ GOAL = "goal"
 
 
 class Shown(NamedTuple):
-    """What the endoscope shows of the tools' work, as terms."""
+    """Observation terms of what the endoscope shows of the tools' work."""
 
     scene: Scene
     camera: str
     """Its agent."""
     tools: tuple[str, ...]
     object: str | None
-    """What the tools move; None if each has a target for its tip."""
+    """Name of the object that the tools move; None if each has a target for its tip."""
     eye: Eye
     sights: Callable[[World], Sights]
     """Of tips by agent, objects by name, and of `GOAL`, or the target of a tool as `<agent>/target`."""
@@ -86,12 +86,12 @@ class Shown(NamedTuple):
 
 
 class Sights(NamedTuple):
-    """What an endoscope sees of places by name."""
+    """View of an endoscope: places by name, and which of them are visible."""
 
     place: dict[str, Array]
     """In its frame, m, [3] each."""
     visible: dict[str, Array]
-    """Whether each is in view, [] bool."""
+    """True if each is in view, [] bool."""
     origin: Array
     """Of its frame in the world, m, [3]."""
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 OUT = 0.0009
-"""How far outside the bar the middle between the fingers is before they close, m: the inner one is near the peg."""
+"""Distance outside the bar of the middle between the fingers before they close, m: the inner one is near the peg."""
 
 
 def upright(place: np.ndarray, yaw: np.ndarray) -> np.ndarray:

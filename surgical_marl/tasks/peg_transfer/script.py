@@ -1,4 +1,4 @@
-"""How arms bring a block from peg to peg, on the host: where it is handed over, and the oracle's script for that."""
+"""The oracle's script of peg transfer: how arms bring a block from peg to peg, and where they hand it over."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ if TYPE_CHECKING:
 ABOVE_WALL = 0.09
 """Height of the block's middle in the exchange, m in the world: its underside is 12 mm above the wall."""
 PAST, WIDE = 0.0025, 0.45
-"""How far the oracle's tool tip goes past the bar, m, and the share by which its jaw opens: one finger goes between bar
-and peg."""
+"""Distance by which the oracle's tool tip goes past the bar, m, and share by which its jaw opens: one finger goes
+between bar and peg."""
 OVER, RAISE, AWAY = 0.012, 0.030, 0.035
-"""How far the tool tip stops above the bar, how far it lifts the block, and how far an arm is from the wall before and
-after the exchange, m."""
+"""Height at which the tool tip stops above the bar, height by which it lifts the block, and distance from the wall
+before and after the exchange, m."""
 SIDE, NEXT = 150.0, -120.0
 """In the exchange a tool of the left grips the bar that is this way from the block's axis, degrees about z, and one of
 the right the next bar clockwise, at 30 degrees."""
 THERE = 0.004
-"""How near to the place of the exchange the block's middle is before the oracle's taker comes, m."""
+"""Largest distance of the block's middle from the place of the exchange when the oracle's taker comes, m."""
 SETTINGS = (ABOVE_WALL, PAST, WIDE, OVER, RAISE, AWAY, SIDE, NEXT)
 
 
 class Transfer:
-    """How one arm lifts a block off its peg, and it, or another arm that takes the block above the wall, places it.
+    """Script of one block: an arm lifts it off its peg, and it, or an arm that takes it above the wall, places it.
 
     Args:
         scene: the arms and the block.
@@ -73,7 +73,7 @@ class Transfer:
 
     @cached_property
     def place(self) -> np.ndarray:
-        """Where the block's middle is in the exchange, [3], m."""
+        """Place of the block's middle in the exchange, [3], m."""
         first, second = (self.scene.mounts[agent].position for agent in (self.giver, self.taker))
         return np.array([*((first + second) / 2)[:2], ABOVE_WALL])
 

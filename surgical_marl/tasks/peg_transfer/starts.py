@@ -1,4 +1,4 @@
-"""Where blocks stand when an episode or a turn begins, and where they have to go: drawn on the host, once."""
+"""Draw places of blocks at the start of an episode or a turn, and their goals: on the host, once."""
 
 from __future__ import annotations
 

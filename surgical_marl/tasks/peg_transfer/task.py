@@ -80,11 +80,11 @@ class PegLevel(NamedTuple):
     distance: float
     """Greatest distance of the goal from the start, m."""
     handover: bool
-    """Whether the goal is on the other side of the wall."""
+    """True if the goal is on the other side of the wall."""
     trial: bool = False
-    """Whether all blocks are moved in turn, there and back."""
+    """True if all blocks are moved in turn, there and back."""
     oriented: bool = False
-    """Whether the goal has an orientation."""
+    """True if the goal has an orientation."""
 
 
 class Team(NamedTuple):
@@ -160,7 +160,7 @@ class Task(ObjectTask):
 
     @property
     def constants(self) -> tuple[Any, ...]:
-        """Those of every such task, whether the block is handed over, and the blocks that are moved in turn."""
+        """Constants of every object task, whether the block is handed over, and the blocks that are moved in turn."""
         return *super().constants, self.level.handover, () if self.turns is None else self.turns.blocks
 
     def start(self, key: Array) -> Start:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class Trial(NamedTuple):
-    """What happened in a trial so far, [] each."""
+    """State of a trial so far, [] each."""
 
     score: Array
     """Points, float32."""

@@ -18,7 +18,7 @@ Ask = Callable[[Callable[[], None]], None]
 """Lets the thread that steps do something."""
 
 STEP = 0.002
-"""How far a key moves the tool tip, m."""
+"""Distance by which a key moves the tool tip, m."""
 KEYS = {
     "arrowleft": (-STEP, 0, 0), "arrowright": (STEP, 0, 0), "arrowup": (0, STEP, 0), "arrowdown": (0, -STEP, 0),
     "pageup": (0, 0, STEP), "pagedown": (0, 0, -STEP),
@@ -41,7 +41,7 @@ class Arms:
         self._folders: dict[str, Any] = {}
         self._controls: dict[str, Controls] = {}
         self._told = dict(session.movers.who)
-        """Who moves the arms as the menus were last told."""
+        """Movers of the arms as the menus show them."""
         with folder:
             for agent in session.env.agents:
                 self._folders[agent] = server.gui.add_folder(agent)
@@ -119,7 +119,7 @@ class Arms:
 
 
 class Controls:
-    """What a person moves one arm with."""
+    """Controls by which a person moves one arm."""
 
     def __init__(self, server: Any, folder: Any, hand: Hand, ask: Ask, number: int, offset: np.ndarray) -> None:
         self._hand, self._ask, self._offset = hand, ask, offset

@@ -1,4 +1,4 @@
-"""What the page shows in three dimensions: arms, objects, targets, trails, contacts, distances.
+"""Three-dimensional nodes of the page: arms, objects, targets, trails, contacts, distances.
 
 Nodes are made once for a session and then moved. Several environments stand side by side in one world.
 """
@@ -29,7 +29,7 @@ POINTS = 120
 
 RED, GREY, GOLD = np.array([226, 40, 40]), np.array([120, 130, 140]), np.array([226, 168, 20])
 PARTS = ("targets", "paths", "trails", "trocars", "contacts", "grips", "distance")
-"""What can be hidden, beside arms and objects."""
+"""Layers that can be hidden, beside arms and objects."""
 ROOM = 0.7
 """Between environments that stand side by side, m, beside what the frames of their bodies take."""
 _TIP_RADIUS = 0.0025
@@ -71,7 +71,7 @@ class Nodes:
         env = session.env
         first = session.moment()
         self.offsets = offsets(env.num_envs, ROOM + float(np.ptp(first.positions[..., 0])))
-        """Where environments stand, [N, 3], m."""
+        """Places of the environments, [N, 3], m."""
         self._paths = Paths(env)
         self._shown = dict.fromkeys(PARTS, True)
         self._trailed = -1

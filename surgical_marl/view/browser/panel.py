@@ -30,7 +30,7 @@ SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "4")
 
 @dataclass(frozen=True)
 class Choice:
-    """What the menus say is to be looked at."""
+    """The view that the menus choose."""
 
     task: str
     scene: str

@@ -21,7 +21,7 @@ class Curve(NamedTuple):
     colour: str
     values: np.ndarray
     shaded: bool = False
-    """Whether the area below it is filled instead."""
+    """True if the area below it is filled instead."""
 
 
 def curves(history: History) -> dict[str, list[Curve]]:

@@ -16,7 +16,7 @@ from surgical_marl.view.shading import GAMMA, Material, visual_rgba
 _VISIBLE = 2
 """The last group of visual geoms."""
 _METAL = 0.4
-"""How metallic steel is here, from 0 to 1. A full metal only mirrors the room, and would be black without one. A room,
+"""Metalness of steel here, from 0 to 1. A full metal only mirrors the room, and would be black without one. A room,
 as the environment maps of viser are, makes a browser without a GPU seven times as slow."""
 _CREASE = 0.6
 """Angle of two faces in rad from which on their edge is sharp."""

@@ -69,7 +69,7 @@ class Viewer:
             close_server(self.server)
             raise
         self.drawn = 0
-        """How many times the scene was drawn."""
+        """Number of drawings of the scene."""
 
     def run(self, until: Event) -> None:
         """Step and draw until an event is set; then write what was recorded, and stop the server."""
