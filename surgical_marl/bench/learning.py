@@ -12,6 +12,7 @@ import json
 import statistics
 import sys
 import time
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 
 import torch
@@ -19,15 +20,20 @@ import torch
 from surgical_marl.bench import clock, sim
 from surgical_marl.bench.contenders import clock_of
 from surgical_marl.bench.course import LAPS
-from surgical_marl.bench.stopwatch import STARTING, Stopwatch, rows
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.evaluation.report import aligned
+from surgical_marl.learning.reporter import Mark, mark, seconds_between
 from surgical_marl.learning.room import in_memory
 from surgical_marl.learning.train import make_training
+from surgical_marl.learning.trainer import Trainer
 from surgical_marl.machine import describe_machine
 from surgical_marl.plugins.task_file import label
 from surgical_marl.runs.settings import Settings
 from surgical_marl.scenes.timing import TIMESTEP
+
+STARTING = 2
+"""Iterations that take longer than the others: a CUDA graph is captured in the second."""
+
 
 QUOTED = {
     "SurRoL": 1_634,
@@ -157,3 +163,48 @@ def table(settings: Settings, speed: Speed) -> str:
             "quoted: Surgical Gym's paper (arXiv:2310.04676), Table II, on its authors' hardware; not measured here.",
         ]
     )
+
+
+class Stopwatch:
+    """Takes the time of each rollout and update of a training.
+
+    On a GPU it records CUDA events in the stream, so that nothing waits for the device.
+    """
+
+    def __init__(self, training: Trainer) -> None:
+        self._cuda = str(training.env.device).startswith("cuda")
+        self._marks: dict[str, list[tuple[Mark, Mark]]] = {}
+        for name in ("rollout", "update"):
+            setattr(training, name, self._timed(name, getattr(training, name)))
+
+    def seconds(self, name: str) -> list[float]:
+        """Of each "rollout" or "update" so far. Waits for the device."""
+        self.wait()
+        return [seconds_between(*marks) for marks in self._marks[name]]
+
+    def wait(self) -> None:
+        """Wait until all work so far is done."""
+        if self._cuda:
+            torch.cuda.synchronize()
+
+    def _timed(self, name: str, work: Callable[[], None]) -> Callable[[], None]:
+        marks = self._marks[name] = []
+
+        def run() -> None:
+            start = mark(self._cuda)
+            work()
+            marks.append((start, mark(self._cuda)))
+
+        return run
+
+
+def rows(training: Trainer) -> Iterator[dict[str, float]]:
+    """Yield the metrics of one iteration after the other, without end.
+
+    On a GPU a row is read when the next iteration is under way, as `train` does, so that the device always has
+    something to do.
+    """
+    ahead = training.iterate() if str(training.env.device).startswith("cuda") else None
+    while True:
+        report, ahead = (training.iterate(), None) if ahead is None else (ahead, training.iterate())
+        yield training.row(report)

@@ -20,7 +20,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 from surgical_marl import machine
-from surgical_marl.bench.stopwatch import STARTING, Stopwatch, rows
+from surgical_marl.bench.learning import STARTING, Stopwatch, rows
 from surgical_marl.evaluation.evaluate import Played, play
 from surgical_marl.evaluation.goal_set import is_standard
 from surgical_marl.evaluation.metrics import SUCCESS_MM, metrics

@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from surgical_marl.evaluation.asked import common_settings, find_policy
-from surgical_marl.evaluation.episodes import EPISODES, write_played
-from surgical_marl.evaluation.evaluate import MAX_BATCH, Played, difference, play, summarise
+from surgical_marl.evaluation.evaluate import EPISODES, MAX_BATCH, Played, difference, play, summarise, write_played
 from surgical_marl.evaluation.report import ABOUT, format_table, write_csv
 from surgical_marl.files import write_text
 from surgical_marl.policies.policy import load_policy

@@ -6,8 +6,10 @@ result = evaluate(env, load_policy("zero", env), episodes=200, seed=0)
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -31,11 +33,20 @@ from surgical_marl.evaluation.metrics import (
     metrics,
 )
 from surgical_marl.evaluation.report import Evaluation
+from surgical_marl.files import write_atomic
 from surgical_marl.policies.acting import forget
 from surgical_marl.runs.progress import progress
+from surgical_marl.untrusted.arrays import read_npz
 
 if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv
+
+
+EPISODES = "episodes.npz"
+MEASURES = ("error", "held", "squared", "distance", "center", "success", "collided", "time", "path", "smoothness",
+            "action_change")  # fmt: skip
+"""Measures of every task."""
+
 
 MAX_BATCH = 1024
 """Episodes run at once; make the environment with num_envs=min(episodes, MAX_BATCH)."""
@@ -227,3 +238,38 @@ def _kinematics(env: BatchedEnv, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarr
 def _numpy(values: Any, count: int) -> np.ndarray:
     """Return a copy of the first `count` values, since the engine may overwrite its own arrays later."""
     return np.array((values.cpu().numpy() if isinstance(values, torch.Tensor) else values)[:count])
+
+
+def write_played(path: Path, played: Played) -> None:
+    """Write episodes as an npz file of float32 arrays [E, A], one for each measure, and `about`, a text in JSON."""
+    about = json.dumps({
+        "about": played.about,
+        "agents": played.agents,
+        "follows": played.follows,
+        "stages": played.stages,
+    })  # fmt: skip
+    measures: dict[str, Any] = {name: values.astype(np.float32) for name, values in played.measures.items()}
+
+    def save(temporary: Path) -> None:
+        with temporary.open("wb") as file:  # a name without .npz would get one
+            np.savez_compressed(file, about=np.array(about), **measures)
+
+    write_atomic(path, save)
+
+
+def read_played(path: Path) -> Played:
+    """Read what `write_played` wrote, as float64. ValueError if the file is damaged or of another kind."""
+    try:
+        found = read_npz(path)
+        kept = json.loads(str(found.pop("about")))
+        agents = [str(agent) for agent in kept["agents"]]
+        measures = {name: values.astype(float) for name, values in found.items()}
+        shape = measures["error"].shape
+        if len(shape) != 2 or shape[1] != len(agents) or any(values.shape != shape for values in measures.values()):
+            raise ValueError(shape)
+        if not {*MEASURES} <= measures.keys():
+            raise ValueError(list(measures))
+        stages = tuple(str(stage) for stage in kept["stages"])
+        return Played(dict(kept["about"]), agents, measures, bool(kept["follows"]), stages)
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        raise ValueError(f"{path} is damaged, or not the episodes of an evaluation: evaluate the run again") from None

@@ -15,8 +15,7 @@ import numpy as np
 from surgical_marl.content import find
 from surgical_marl.evaluation.card import CLIP, EVALUATION
 from surgical_marl.evaluation.command import FILM, RESULT, read_result
-from surgical_marl.evaluation.episodes import EPISODES, read_played
-from surgical_marl.evaluation.evaluate import Played
+from surgical_marl.evaluation.evaluate import EPISODES, Played, read_played
 from surgical_marl.runs.content import found_scene, scene_label
 from surgical_marl.runs.folder import CHECKPOINT, CONFIG, DIVERGED, METRICS, holds_weights, read_metrics
 from surgical_marl.untrusted.files import is_file, is_folder

@@ -13,10 +13,10 @@ from typing import Any
 import pytest
 
 from surgical_marl import machine
-from surgical_marl.bench import course, solve, stopwatch
+from surgical_marl.bench import course, solve
 from surgical_marl.bench import learning as train
+from surgical_marl.bench.learning import STARTING
 from surgical_marl.bench.solve import Exam, Goal, Looks
-from surgical_marl.bench.stopwatch import STARTING
 from surgical_marl.cli.main import main
 from surgical_marl.learning import train as learning_train
 from surgical_marl.learning.imitation import Imitation
@@ -114,7 +114,7 @@ def test_the_policy_is_examined_as_it_is(fakes: None) -> None:
 
     def losses(examined: bool) -> list[float]:
         training, found = Trainer(SETTINGS, solve.make_env(SETTINGS)), []
-        for row, _ in zip(stopwatch.rows(training), range(3), strict=False):
+        for row, _ in zip(train.rows(training), range(3), strict=False):
             found.append(row["value_loss"])
             if examined:
                 solve.examine(training, other)
@@ -131,7 +131,7 @@ def test_starting_is_what_the_first_iterations_take_more() -> None:
 
 def test_a_stopwatch_times_each_rollout_and_update(fakes: None, monkeypatch: pytest.MonkeyPatch) -> None:
     training = Trainer(SETTINGS, solve.make_env(SETTINGS))
-    watch = stopwatch.Stopwatch(training)
+    watch = train.Stopwatch(training)
     ticks = count()
     monkeypatch.setattr("time.perf_counter", lambda: float(next(ticks)))
     for _ in range(3):

@@ -27,8 +27,7 @@ from surgical_marl import load_arm
 from surgical_marl.content import find
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.evaluation.command import read_result
-from surgical_marl.evaluation.episodes import EPISODES, read_played
-from surgical_marl.evaluation.evaluate import difference
+from surgical_marl.evaluation.evaluate import EPISODES, difference, read_played
 from surgical_marl.evaluation.report import format_table
 from surgical_marl.learning.train import _read_resumed, make_training
 from surgical_marl.policies.policy import load_policy

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from surgical_marl.evaluation.command import FILM, RESULT
-from surgical_marl.evaluation.episodes import EPISODES, write_played
-from surgical_marl.evaluation.evaluate import Played, summarise
+from surgical_marl.evaluation.evaluate import EPISODES, Played, summarise, write_played
 from surgical_marl.runs.folder import CHECKPOINT, CONFIG, METRICS, write_metrics
 from surgical_marl.runs.settings import Settings, config_text
 

@@ -16,7 +16,7 @@ import yaml
 
 import surgical_marl as sm
 from surgical_marl.evaluation.command import FILM, RESULT
-from surgical_marl.evaluation.episodes import EPISODES, read_played, write_played
+from surgical_marl.evaluation.evaluate import EPISODES, read_played, write_played
 from surgical_marl.evaluation.report import Evaluation
 from surgical_marl.report import judged, page, training
 from surgical_marl.report.charts import SHARE, Drawing, Text

@@ -21,7 +21,7 @@ import torch
 
 from surgical_marl.content import find
 from surgical_marl.evaluation.command import read_result
-from surgical_marl.evaluation.episodes import read_played
+from surgical_marl.evaluation.evaluate import read_played
 from surgical_marl.policies.actor import _read
 from surgical_marl.policies.weights import read_weights
 from surgical_marl.report.run import read_run

@@ -24,7 +24,7 @@ from safetensors.torch import save
 
 from surgical_marl import load_arm
 from surgical_marl.evaluation.command import read_result
-from surgical_marl.evaluation.episodes import read_played
+from surgical_marl.evaluation.evaluate import read_played
 from surgical_marl.policies.actor import _read
 from surgical_marl.report.run import read_run
 from surgical_marl.robots.mesh import read_mesh
