@@ -10,8 +10,7 @@ import torch
 from tensordict import TensorDict
 
 from surgical_marl.learning.algorithm import Algorithm
-from surgical_marl.learning.statistics import share_normalisers
-from surgical_marl.learning.statistics import DECAY, LEAST_STD, ValueScale
+from surgical_marl.learning.statistics import DECAY, LEAST_STD, ValueScale, share_normalisers
 from surgical_marl.policies.networks import make_model
 from tests.learning.test_mappo import SETTINGS, build, gradients, roll_out
 
