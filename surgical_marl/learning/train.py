@@ -87,6 +87,7 @@ def check_reach(settings: Settings) -> None:
     """
     if settings.task in TASKS.shipped:
         return
+    TASKS.check(settings.task)  # a file that only a run names must not run
     if (finding := out_of_reach(Env(**settings.of_environment()))) is not None:
         raise ValueError(finding)
 

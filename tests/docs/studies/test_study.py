@@ -23,7 +23,7 @@ from surgical_marl.runs import settings as settings_module
 from surgical_marl.runs.folder import write_config, write_metrics
 from surgical_marl.runs.settings import Settings, load_config
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[3]
 MEASURES = ("error", "held", "squared", "distance", "center", "path", "time", "smoothness", "action_change")
 
 
