@@ -29,7 +29,7 @@ from surgical_marl.plugins.algorithms import list_algorithms
 from surgical_marl.plugins.controls import list_controls
 from surgical_marl.plugins.task_file import is_task_file, label
 from surgical_marl.plugins.tasks import TASKS, find_task, list_tasks, scene_of
-from surgical_marl.robots.arm import CONTROL_MODES
+from surgical_marl.robots.drives import CONTROL_MODES
 from surgical_marl.runs.process import lasting_streams, open_streams, use_utf8
 from surgical_marl.runs.progress import Compilations, preparing
 from surgical_marl.runs.settings import Settings, check_overrides

@@ -29,7 +29,6 @@ from surgical_marl.untrusted.schema import REQUIRED, Faults, Place, check, colle
 from surgical_marl.untrusted.values import LONGEST, listed, shown
 from surgical_marl.yaml_file import read_yaml
 
-CONTROL_MODES = ("position", "velocity", "torque")
 MAX_JOINTS = 200
 """Joints of an `arm.yaml`, and cables."""
 

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from surgical_marl.untrusted.schema import REQUIRED, number
 from surgical_marl.untrusted.values import LARGEST, LEAST
 
+CONTROL_MODES = ("position", "velocity", "torque")
+
 
 @dataclass(frozen=True)
 class Drive:

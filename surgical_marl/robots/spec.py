@@ -16,9 +16,9 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from surgical_marl.robots.arm import CONTROL_MODES, Arm, Joint
+from surgical_marl.robots.arm import Arm, Joint
 from surgical_marl.robots.description import Link, Shape, Vector
-from surgical_marl.robots.drives import Cable, Drive
+from surgical_marl.robots.drives import CONTROL_MODES, Cable, Drive
 from surgical_marl.robots.mesh import read_mesh
 from surgical_marl.robots.rotation import quaternion
 

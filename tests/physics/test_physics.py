@@ -17,7 +17,7 @@ from docs.studies.energy import energy_drift
 from surgical_marl import load_arm, load_scene
 from surgical_marl.control.controller import Controller
 from surgical_marl.physics.simulator import Simulator
-from surgical_marl.robots.arm import CONTROL_MODES
+from surgical_marl.robots.drives import CONTROL_MODES
 from surgical_marl.scenes.placing import scenes_without_objects
 from surgical_marl.scenes.scene import Scene
 from surgical_marl.scenes.timing import DECIMATION, TIMESTEP

@@ -10,7 +10,7 @@ import pytest
 
 from surgical_marl import load_scene
 from surgical_marl.cli.main import main
-from surgical_marl.robots.arm import CONTROL_MODES
+from surgical_marl.robots.drives import CONTROL_MODES
 from surgical_marl.robots.spec import COLLISION_GROUP
 from surgical_marl.scenes.mjcf import mjcf
 from surgical_marl.scenes.placing import scenes_without_objects

@@ -24,7 +24,8 @@ from surgical_marl.engines.mjx import MjxEngine
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.envs.env import Env
 from surgical_marl.plugins.tasks import TASKS, list_tasks
-from surgical_marl.robots.arm import CONTROL_MODES, load_arm
+from surgical_marl.robots.arm import load_arm
+from surgical_marl.robots.drives import CONTROL_MODES
 from surgical_marl.tasks.base.path_task import PathTask
 from surgical_marl.tasks.base.paths import DURATION
 
