@@ -15,7 +15,7 @@ from surgical_marl.scenes.timing import TIMESTEP
 
 
 def energy_drift(scene: Scene, seconds: float = 2.0, timestep: float | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Time [T] in s and the relative change of kinetic energy since the start, [T].
+    """Return time [T] in s and the relative change of kinetic energy since the start, [T].
 
     The first three joints of every arm start at 15 % of their velocity limits.
     """

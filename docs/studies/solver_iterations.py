@@ -31,7 +31,7 @@ APART = ((0, (4, 4)), (0, (10, 10)), (3, (1, 1)), (4, (1, 1)), (6, (0, 0)), (6, 
 
 
 def states_in_contact(scene: Scene) -> tuple[Physics, np.ndarray, np.ndarray]:
-    """States of two arms driven into each other, and C MuJoCo's next velocity [S, nv] and contact forces [S, P]."""
+    """Return states of two arms in contact, and C MuJoCo's next velocity [S, nv] and contact forces [S, P]."""
     model, data, rng = scene.model, mujoco.MjData(scene.model), np.random.default_rng(0)
     pairs = zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)
     index = {frozenset(pair): i for i, pair in enumerate(pairs)}
@@ -91,12 +91,12 @@ def batch(states: list[Physics]) -> Physics:
 
 
 def speeds(scene: Scene) -> np.ndarray:
-    """Velocity limit of every joint, [nv]."""
+    """Return the velocity limit of every joint, [nv]."""
     return np.concatenate([[joint.velocity for joint in m.arm.joints] for m in scene.mounts.values()])
 
 
 def step(scene: Scene, states: Physics, touching: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Velocity [S, nv] and contact forces [S, P] after one physics step here."""
+    """Return velocity [S, nv] and contact forces [S, P] after one physics step here."""
     simulated = Simulator(scene)
 
     def advance(state: Physics) -> tuple[Physics, Touch]:

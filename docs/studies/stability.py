@@ -31,7 +31,7 @@ def prepared(scene: Scene, timestep: float, integrator: str = "implicitfast", ga
 
 
 def targets(scene: Scene, seed: int = 0) -> np.ndarray:
-    """Random walks of all position targets at full speed, and minutes pressed against limits: [steps, nu]."""
+    """Return random walks of all position targets at full speed, and minutes pressed against limits, [steps, nu]."""
     rng = np.random.default_rng(seed)
     speed = np.array([j.drive.speed for mount in scene.mounts.values() for j in mount.arm.joints])
     low, high = scene.model.jnt_range.T
@@ -45,7 +45,7 @@ def targets(scene: Scene, seed: int = 0) -> np.ndarray:
 
 
 def rollout(model: mujoco.MjModel, scene: Scene, ctrl: np.ndarray) -> tuple[np.ndarray, float]:
-    """Qpos at each control step, and the greatest share of a joint's range by which it passed a limit."""
+    """Return qpos at each control step, and the greatest share of a joint's range by which it passed a limit."""
     data = mujoco.MjData(model)
     data.qpos[:] = scene.home
     low, high = model.jnt_range.T

@@ -38,7 +38,7 @@ class Linear(NamedTuple):
     stiffness: np.ndarray
 
     def modes(self) -> tuple[np.ndarray, np.ndarray]:
-        """Natural frequency in rad/s and damping ratio of each joint if the others stood still, [n]."""
+        """Return natural frequency in rad/s and damping ratio of each joint if the others stood still, [n]."""
         inertia, damping, stiffness = (np.diag(part) for part in self[1:])
         return np.sqrt(stiffness / inertia), damping / (2 * np.sqrt(stiffness * inertia))
 

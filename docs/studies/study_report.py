@@ -108,7 +108,7 @@ def describe(jobs: Sequence[Job], out: Path) -> dict[str, Any]:
 
 
 def curve(runs: Sequence[Sequence[dict[str, float]]], axis: str) -> dict[str, Any]:
-    """Success and collisions of training against samples or seconds: means over the runs and their intervals."""
+    """Return success and collisions of training against samples or seconds: means over the runs and their intervals."""
     reached = [
         np.cumsum([row["seconds"] for row in run]) if axis == "seconds" else np.array([row["env_steps"] for row in run])
         for run in runs
@@ -146,7 +146,7 @@ def broken(played: Sequence[dict[str, np.ndarray]], agents: Sequence[str], what:
 
 
 def number(metric: Metric) -> list[float | None]:
-    """[value, low, high] of a 95 % interval."""
+    """Return [value, low, high] of a 95 % interval."""
     return [float(metric.reduce(metric.values.ravel())), *(interval(metric) or (None, None))]
 
 
@@ -218,7 +218,7 @@ def broken_table(found: Sequence[dict[str, Any]]) -> str:
 
 
 def draw(found: Sequence[dict[str, Any]], out: Path) -> None:
-    """Success against samples and seconds, and collisions: a row for a question and scene, a line for a cell."""
+    """Draw success against samples and seconds, and collisions: a row for a question and scene, a line for a cell."""
     places = list(dict.fromkeys((CELLS[each["cell"]].question, each["scene"]) for each in found))
     figure = Figure(figsize=(11, 2.9 * len(places)), layout="constrained")
     FigureCanvasAgg(figure)
@@ -249,7 +249,7 @@ def _was_played(played: Sequence[dict[str, np.ndarray]], what: str) -> bool:
 
 
 def _stacked(played: Sequence[dict[str, np.ndarray]], what: str) -> dict[str, np.ndarray]:
-    """Measures [R, E, A] of one way of playing."""
+    """Return measures [R, E, A] of one way of playing."""
     names = [name.partition("/")[2] for name in played[0] if name.startswith(f"{what}/")]
     return {name: np.stack([each[f"{what}/{name}"] for each in played]) for name in names}
 

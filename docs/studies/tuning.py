@@ -190,7 +190,7 @@ class Search:
             return None
 
     def best(self) -> float:
-        """Seconds of the best trial, the limit if there is none."""
+        """Return the seconds of the best trial, the limit if there is none."""
         return min((seconds for _, seconds in self.solved()), default=self.arguments.limit)
 
     def solved(self) -> list[tuple[int, float]]:
@@ -232,7 +232,7 @@ def _setting(settings: Settings, key: str) -> Any:
 
 
 def write(search: Search, results: Path) -> None:
-    """All trials as a table and a picture."""
+    """Write all trials as a table and a picture."""
     trials = search.done()
 
     def table(path: Path) -> None:

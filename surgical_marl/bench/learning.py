@@ -178,7 +178,7 @@ class Stopwatch:
             setattr(training, name, self._timed(name, getattr(training, name)))
 
     def seconds(self, name: str) -> list[float]:
-        """Of each "rollout" or "update" so far. Waits for the device."""
+        """Return the seconds of each "rollout" or "update" so far, in s; wait for the device."""
         self.wait()
         return [seconds_between(*marks) for marks in self._marks[name]]
 

@@ -61,7 +61,7 @@ def measure_rendering(
     seconds: float = clock.SECONDS,
     repeats: int = clock.REPEATS,
 ) -> Rendering:
-    """Pictures of [size, size] pixels of so many environments, from joint positions on the device to pictures there.
+    """Measure pictures/s of [size, size] pixels of `num_envs` environments, from joint positions on the device.
 
     Raises:
         ValueError: as `Endoscope`.
@@ -122,7 +122,7 @@ def run(scene: str, num_envs: int | None, device: str, as_json: bool) -> str:
 
 
 def _postures(scene: Scene, count: int) -> np.ndarray:
-    """Joint positions of the whole scene about home, [count, nq] float32."""
+    """Return joint positions of the whole scene about home, [count, nq] float32."""
     rng, found = np.random.default_rng(0), {}
     for agent, mount in scene.mounts.items():
         arm = mount.arm

@@ -117,7 +117,7 @@ class MjxEngine:
         self.carry_shapes = {name: leaf.shape for name, leaf in _paths(self._functions.carry).items()}
 
     def reset(self, seed: int, first: int = 0) -> None:
-        """First episodes. Environment i depends on `seed` and `first` + i alone, not on how many there are."""
+        """Begin the first episodes. Environment i depends on `seed` and `first` + i alone, not on their number."""
         self.begin(episode_keys(seed, self.num_envs, first), np.zeros(self.num_envs, np.int32))
 
     @jax_scope()
@@ -133,7 +133,7 @@ class MjxEngine:
 
     @jax_scope()
     def step(self, actions: dict[str, Any], sense: Callable[[], dict[str, Any]] | None = None) -> None:
-        """One control step of all environments.
+        """Make one control step of all environments.
 
         Args:
             actions: [N, n] by agent, of any array library.
@@ -233,7 +233,7 @@ class MjxEngine:
             return jax.block_until_ready(found) if self._shares > 1 else found
 
     def _take(self, values: Any) -> Array:
-        """Values of any array library, on the engine's device."""
+        """Return values of any array library on the engine's device."""
         if type(values).__module__.startswith("torch"):
             values = jax.dlpack.from_dlpack(values.detach().contiguous())
         return jax.device_put(values, self._on)
@@ -263,10 +263,10 @@ def find_device(device: str) -> Any:
 
 
 def _paths(tree: Any) -> dict[str, Any]:
-    """Leaves of a tree by their path, as in ".physics.qpos"."""
+    """Return the leaves of a tree by their path, as in ".physics.qpos"."""
     return {jax.tree_util.keystr(path): leaf for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]}
 
 
 def _floats(tree: Any) -> dict[str, Any]:
-    """Leaves of a tree that hold real numbers, by their path."""
+    """Return the leaves of a tree that hold real numbers, by their path."""
     return {name: leaf for name, leaf in _paths(tree).items() if jnp.issubdtype(leaf.dtype, jnp.floating)}

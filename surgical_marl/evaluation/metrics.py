@@ -222,7 +222,7 @@ def spectral_arc_length(speed: np.ndarray, dt: float) -> float:
 
 
 def _smoothness(speeds: np.ndarray, lengths: np.ndarray, dt: float) -> np.ndarray:
-    """[E, A] of the first `lengths` of the speeds [T, E, A] (m/s) of each episode; NaN for a tip that hardly moved."""
+    """Return [E, A] of the first `lengths` speeds [T, E, A] (m/s) of each episode; NaN for a tip that hardly moved."""
     found = np.full(speeds.shape[1:], np.nan)
     for episode, arm in np.argwhere(speeds.sum(0) * dt >= STILL):
         found[episode, arm] = spectral_arc_length(speeds[: lengths[episode], episode, arm], dt)

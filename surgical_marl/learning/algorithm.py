@@ -287,7 +287,7 @@ class Algorithm(PPO):
         return [*self.actor.parameters(), *self.critic.parameters()]
 
     def _values(self, obs: TensorDict) -> Tensor:
-        """Values of observations, in units of reward."""
+        """Return the values of observations, in units of reward."""
         with self.precision():
             return self.scale.restore(self.critic(obs, None, self.memory.critic))
 
@@ -300,7 +300,7 @@ class Algorithm(PPO):
         return torch.autocast("cuda" if self._cuda else "cpu", torch.bfloat16, enabled=enabled)
 
     def _adapt_rate(self, divergence: Tensor) -> None:
-        """rsl_rl's rule: slower above twice the wanted divergence, faster below half of it."""
+        """Adapt the learning rate as rsl_rl does: lower above twice the wanted divergence, higher below half of it."""
         low, high = LEARNING_RATE_RANGE
         slower = (self._rate / 1.5).clamp(min=low)
         faster = (self._rate * 1.5).clamp(max=high)
@@ -308,7 +308,7 @@ class Algorithm(PPO):
         self._rate.copy_(torch.where(divergence > self.desired_kl * 2, slower, rate))
 
     def save(self) -> dict[str, Any]:
-        """All that `load` needs to go on, as tensors and plain values."""
+        """Return all that `load` needs to go on, as tensors and plain values."""
         return {**super().save(), "options_state_dict": self.options.state_dict()}
 
     def load(

@@ -83,5 +83,5 @@ class Constraint(nn.Module):
         return (reward - self.multiplier * cost) / (1.0 + self.multiplier)
 
     def metrics(self) -> Tensor:
-        """`METRICS` of the last update, `[2]`."""
+        """Return `METRICS` of the last update, `[2]`."""
         return torch.stack([self.rate, self.multiplier])

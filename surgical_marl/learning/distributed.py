@@ -43,7 +43,7 @@ def is_first() -> bool:
 
 @contextmanager
 def joined(device: str) -> Iterator[None]:
-    """Within torchrun: the processes are one group while this lasts. `device` is "cpu", "cuda" or "auto"."""
+    """Join the processes of torchrun into one group in this block. `device` is "cpu", "cuda" or "auto"."""
     if int(os.environ.get("WORLD_SIZE", 1)) == 1 or dist.is_initialized():
         yield
         return
@@ -131,7 +131,7 @@ def wait() -> None:
 
 @contextmanager
 def in_turn() -> Iterator[None]:
-    """First the first process of each machine, then the others, which find in caches what that one compiled."""
+    """Run this block first in the first process of each machine, then in the others, whose caches it has filled."""
     first = int(os.environ.get("LOCAL_RANK", 0)) == 0
     if not first:
         wait()

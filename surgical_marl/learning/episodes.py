@@ -65,7 +65,7 @@ class Episodes:
         self.moved |= moved
 
     def _mean_terms(self, infos: Mapping[str, Mapping[str, Tensor]], rewards: Tensor) -> Tensor:
-        """Each reward term's part of the mean reward, `[T]`; an arm without a term has none of it."""
+        """Return each reward term's part of the mean reward, `[T]`; it is 0 for an arm without the term."""
         if not self.terms:
             return rewards.new_zeros(0)
         nothing = torch.zeros_like(rewards)

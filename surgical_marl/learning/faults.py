@@ -69,13 +69,13 @@ class Diverged(FloatingPointError):
 
 
 def find(values: Mapping[str, Mapping[str, float]]) -> dict[str, list[str]]:
-    """Names of what is not finite of each kind; kinds that are fine are left out."""
+    """Return the names of values that are not finite, by kind; kinds without any are left out."""
     bad = {kind: [name for name, value in named.items() if not math.isfinite(value)] for kind, named in values.items()}
     return {kind: bad[kind] for kind in KINDS if bad.get(kind)}
 
 
 def column_names(observations: TensorDict) -> list[str]:
-    """Names of what `mark_columns` returns, such as "psm[3]"."""
+    """Return the names of the columns that `mark_columns` marks, such as "psm[3]"."""
     return [f"{name}[{column}]" for name, group in _numbers(observations) for column in range(group.shape[-1])]
 
 
@@ -94,7 +94,7 @@ def mark_columns(stored: TensorDict, after: TensorDict) -> Tensor:
 
 
 def mark(parts: Iterable[Tensor]) -> Tensor:
-    """For each part: 0, or NaN if a value in it is not finite."""
+    """Return for each part 0, or NaN if a value in it is not finite."""
     return _mark(torch.stack([part.isfinite().all() for part in parts]))
 
 

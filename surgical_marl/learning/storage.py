@@ -73,7 +73,7 @@ class MultiAgentStorage(RolloutStorage):
         return torch.cat([torch.zeros_like(self.dones[:1]), self.dones[:-1]]).squeeze(-1).bool()
 
     def compute_returns(self, last_values: Tensor, gamma: float, lam: float) -> None:
-        """Generalised advantage estimation (Schulman et al. 2016, arXiv 1506.02438): `returns` of the full storage.
+        """Fill `returns` by generalised advantage estimation (Schulman et al. 2016, arXiv 1506.02438).
 
         Args:
             last_values: of the observations after the last step, as wide as values.

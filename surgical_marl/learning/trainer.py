@@ -185,7 +185,7 @@ class Trainer:
         return row
 
     def _rollout(self) -> None:
-        """`steps_per_iteration` steps of all environments, into the storage; then returns and advantages."""
+        """Step all environments `steps_per_iteration` times into the storage; then compute returns and advantages."""
         algorithm = self.algorithm
         algorithm.storage.clear()
         with torch.inference_mode():
@@ -264,7 +264,7 @@ class Trainer:
 
 
 def _widths(actor: Any, group: str) -> list[int]:
-    """Agents of a group, width of their observation and of their action."""
+    """Return the number of agents of a group, and the widths of their observation and of their action."""
     return [actor.counts[group], actor.models[group].obs_dim, actor.outputs[group]]
 
 

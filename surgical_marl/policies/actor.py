@@ -65,7 +65,7 @@ def acting_policy(actor: MultiAgentActor, layout: Layout, device: str) -> Policy
 
 
 def _read(folder: Path) -> tuple[dict[str, list[int]], dict[str, Tensor]]:
-    """Agents and widths of each group, and the state of the actor: of a policy that ships, or of a run."""
+    """Return agents and widths of each group, and the state of the actor, of a shipped policy or of a run."""
     if holds_weights(folder) and not (folder / CHECKPOINT).is_file():
         groups, weights = read_weights(folder)
         return groups, {name: torch.from_numpy(array) for name, array in weights.items()}

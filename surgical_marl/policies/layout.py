@@ -104,12 +104,12 @@ class Layout:
         return library.concatenate([stacked, library.broadcast_to(identity, (*stacked.shape[:-1], count))], -1)
 
     def split(self, actions: Any) -> dict[str, Any]:
-        """Flat joint action `[..., sum]` -> action of each arm `[..., a]`."""
+        """Split a flat joint action `[..., sum]` into the action of each arm, `[..., a]`."""
         spans = zip(self.agents, np.cumsum(self._widths).tolist(), self._widths, strict=True)
         return {agent: actions[..., end - width : end] for agent, end, width in spans}
 
     def rewards(self, rewards: Mapping[str, Any]) -> Any:
-        """Rewards of arms `[N]` -> of acting agents `[N, A]`; a joint agent gets the sum."""
+        """Return the rewards of acting agents `[N, A]` from those of arms, `[N]`; a joint agent gets the sum."""
         each = [rewards[agent] for agent in self.agents]
         stacked = _library(each[0]).stack(each, -1)
         return stacked.sum(-1)[..., None] if self.grouping == "joint" else stacked

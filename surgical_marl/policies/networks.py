@@ -118,7 +118,7 @@ class MultiAgentModel(nn.Module):
         return torch.cat([part.flatten(-2) for part in parts], -1)
 
     def _split(self, flat: Tensor) -> list[Tensor]:
-        """Flat `[N, sum]` -> one `[N, n, a]` for each type."""
+        """Split flat values `[N, sum]` into one array `[N, n, a]` for each type."""
         shapes = [(self.counts[name], self.outputs[name]) for name in self.outputs]
         parts = flat.split([count * width for count, width in shapes], -1)
         return [part.unflatten(-1, shape) for part, shape in zip(parts, shapes, strict=True)]
@@ -157,12 +157,12 @@ class MultiAgentActor(MultiAgentModel):
             model.distribution.update(model.mlp(model.get_latent(observations, masks, memory)))
 
     def get_output_log_prob(self, actions: Tensor) -> Tensor:
-        """Log-probability of flat actions `[N, sum]` under the last forward pass: `[N, A]`."""
+        """Return the log-probability of flat actions `[N, sum]` under the last forward pass, `[N, A]`."""
         parts = zip(self._models(), self._split(actions), strict=True)
         return torch.cat([model.get_output_log_prob(part) for model, part in parts], -1)
 
     def get_kl_divergence(self, old: tuple[Tensor, ...], new: tuple[Tensor, ...]) -> Tensor:
-        """KL(old || new) of each agent, `[N, A]`, from two `output_distribution_params`."""
+        """Return KL(old || new) of each agent, `[N, A]`, from two `output_distribution_params`."""
         old_parts = zip(*map(self._split, old), strict=True)
         new_parts = zip(*map(self._split, new), strict=True)
         parts = zip(self._models(), old_parts, new_parts, strict=True)
@@ -248,7 +248,7 @@ def make_actor(observations: TensorDict, env: BatchedEnv, layout: Layout, config
 
 
 def network_config(network: NetworkSettings) -> dict[str, Any]:
-    """Arguments of `make_model` for the networks that settings ask for."""
+    """Return the arguments of `make_model` for the networks that settings ask for."""
     return {
         "hidden_dims": list(network.hidden),
         "activation": network.activation,
@@ -258,7 +258,7 @@ def network_config(network: NetworkSettings) -> dict[str, Any]:
 
 
 def actor_config(network: NetworkSettings) -> dict[str, Any]:
-    """Arguments of `make_actor`, likewise. Critics have no attention: they see the state, which all agents share."""
+    """Return the arguments of `make_actor`, likewise. Critics have no attention: they see the state of all agents."""
     gaussian = {"class_name": Gaussian, "init_std": network.init_std, "std_type": "log"}
     heads = {"attention": network.attention} if network.attention else {}  # rsl_rl's own networks know of none
     return {**network_config(network), "distribution_cfg": gaussian, **heads}

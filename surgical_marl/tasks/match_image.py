@@ -167,12 +167,12 @@ class Task(TipTask):
         return [self.postures["hidden"][goal.row]]
 
     def _turn(self, q: Any) -> Any:
-        """Rotation of the tool tip's frame, [..., 3, 3], from joints [..., n]."""
+        """Return the rotation of the tool tip's frame, [..., 3, 3], at joint positions [..., n]."""
         return self._arm.forward_kinematics(q)[..., :3, :3]
 
 
 def hidden_postures(scene: Scene, agent: str, extent: float, seed: int = 0) -> np.ndarray:
-    """Postures that target pictures are taken from: `qpos` [POSTURES, nq], all arms but the agent's at home.
+    """Return postures for target pictures: `qpos` [POSTURES, nq], all arms but the agent's at home.
 
     Raises:
         ValueError: the scene has no tissue, or the agent can hardly see it.

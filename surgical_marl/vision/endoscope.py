@@ -159,7 +159,7 @@ class Endoscope:
             own.copy_(values if tensor else torch.from_numpy(np.array(values, np.float32)))
 
     def _empty(self, channel: str) -> Any:
-        """Pictures to draw on, [N * E, H, W] or with [3] colours; none of a channel that nobody asked for."""
+        """Return arrays to draw on, [N * E, H, W] or with [3] colours; none of a channel that nobody asked for."""
         envs, eyes, height, width = self._shape
         pictures = envs * eyes if channel in self.channels else 0
         shape = (pictures, height, width, *((3,) if channel == "rgb" else ()))
@@ -186,7 +186,7 @@ def _is_tensor(values: Any) -> bool:
 
 
 def _labels(scene: Scene) -> tuple[np.ndarray, tuple[str, ...]]:
-    """For `labels[segmentation]`: whose a geom is, int32 [ngeom + 1], the last for -1; and the names of the labels."""
+    """Return the label of each geom, int32 [ngeom + 1] with the last for -1, and the names of the labels."""
     names = ("nothing", "tissue", *scene.agents, *scene.objects)
     model = scene.model
     owners = [model.body(body).name.split("/")[0] for body in model.geom_bodyid]

@@ -120,7 +120,7 @@ def warp_mesh(model: mujoco.MjModel, mesh: int) -> Any:
 
 
 def corner_normals(model: mujoco.MjModel) -> np.ndarray:
-    """At the corners of every face of all meshes, [faces, 3, 3]: the vertex's, or the face's where that is far off."""
+    """Return normals at the corners of faces, [faces, 3, 3]: the vertex's, or the face's where that is far off."""
     found = np.zeros((max(len(model.mesh_face), 1), 3, 3), np.float32)
     for mesh in range(model.nmesh):
         rows = slice(model.mesh_faceadr[mesh], model.mesh_faceadr[mesh] + model.mesh_facenum[mesh])
