@@ -64,7 +64,7 @@ def measure(workload: Workload, names: Sequence[str], repeats: int) -> dict[str,
     return {name: took[name] / took[""] - 1 for name in names}
 
 
-def main() -> None:
+def main(argv: list[str] | None = None) -> None:
     """Print a row for each pass."""
     parser = make_parser(__doc__)
     parser.add_argument("--scene", default="psm")
@@ -74,7 +74,7 @@ def main() -> None:
     parser.add_argument("--device", default="auto")
     parser.add_argument("--repeats", type=int, default=10)
     parser.add_argument("--only", nargs="*", help="passes (default: all of the device)")
-    a = parser.parse_args()
+    a = parser.parse_args(argv)
     workload = Workload(task=a.task, scene=a.scene, motion=a.motion, num_envs=a.num_envs, device=a.device, decimation=8)
     print(f"| pass | more time without it, `{a.scene}` on {workload.where} |\n|---|---|")
     for name, more in measure(workload, a.only or passes_on(workload.where), a.repeats).items():
