@@ -25,8 +25,8 @@ _VIEWS = {"bool": np.bool_, "uint32": np.uint32}
 """Types of leaves that are not the type of their buffer: the same bits, seen as another type."""
 _KEPT = ("state", "counts", "flags")
 """Buffers that the next step reads. Only results are in "outs", which is where by far most of them are."""
-_ROOMS = 3
-"""Rooms for results that are kept to be used again: a loop holds the last step's results, and some hold two."""
+_RESULT_BUFFERS = 3
+"""Buffers of results that are kept to be used again: a loop holds the last step's results, and some hold two."""
 
 
 def make_arrays(device: str, source: Source, tables: dict[str, np.ndarray], stride: int, num_envs: int) -> Arrays:
@@ -38,7 +38,7 @@ class Arrays(ABC):
     """`all` is what `Kernel.launch` takes; columns from `num_envs` on are padding.
 
     Its last but one is `work`, how much the environment in each column had to do. `order` says which environment that
-    is; if it is None, columns are in the order of the environments' numbers. The last one is `pace`, as blocks of
+    is; if it is None, columns are in the order of the environments' numbers. The last one is `arrivals`, as blocks of
     threads keep it (`macros.py`).
     """
 
@@ -86,7 +86,7 @@ class Arrays(ABC):
         """Return an array [N] of the device as one of another library."""
 
     @abstractmethod
-    def renew(self) -> None:
+    def renew_results(self) -> None:
         """Make room for results, before a kernel is launched."""
 
     def _use(self, outs: Any, warp: Any) -> None:
@@ -143,14 +143,14 @@ class Arrays(ABC):
 class CpuArrays(Arrays):
     """numpy arrays.
 
-    Results are not copied, unless columns are sorted. A kernel writes them into a room that nobody holds an array of.
+    Results are not copied, unless columns are sorted. A kernel writes them into a buffer that is no array in use.
     """
 
     device = "cpu"
 
     def __init__(self, source: Source, tables: dict[str, np.ndarray], stride: int, num_envs: int) -> None:
         super().__init__(source, tables, stride, num_envs)
-        self._rooms: deque[_Room] = deque(maxlen=_ROOMS)
+        self._result_buffers: deque[_ResultBuffer] = deque(maxlen=_RESULT_BUFFERS)
 
     def _zeros(self, fields: int, stride: int, dtype: Any) -> Any:
         return np.zeros((fields, stride), dtype)
@@ -207,13 +207,13 @@ class CpuArrays(Arrays):
             for name, node in tree.items()
         }
 
-    def renew(self) -> None:
+    def renew_results(self) -> None:
         fields, stride = self._buffers.pop("outs").shape
-        room = next((room for room in self._rooms if room.is_free()), None)
-        if room is None:
-            room = _Room(self._zeros(fields, stride, _TYPES["outs"]))
-            self._rooms.append(room)
-        self._use(room.lend(), room.warp)
+        buffer = next((one for one in self._result_buffers if one.is_free()), None)
+        if buffer is None:
+            buffer = _ResultBuffer(self._zeros(fields, stride, _TYPES["outs"]))
+            self._result_buffers.append(buffer)
+        self._use(buffer.lend(), buffer.warp)
 
     def _present(self, leaf: Leaf, array: np.ndarray, library: str) -> Any:
         return self.presented(array.reshape(self.num_envs, *leaf.shape) if len(leaf.shape) > 1 else array, library)
@@ -230,7 +230,7 @@ class CpuArrays(Arrays):
         return array
 
 
-class _Room:
+class _ResultBuffer:
     """Memory that is lent as an array, again and again, but never while somebody holds that array or a part of it."""
 
     def __init__(self, memory: np.ndarray) -> None:
@@ -317,7 +317,7 @@ class CudaArrays(Arrays):
 
         return torch.cuda.is_current_stream_capturing()
 
-    def renew(self) -> None:
+    def renew_results(self) -> None:
         if self.order:
             return  # what is read is copied, to sort it
         import torch

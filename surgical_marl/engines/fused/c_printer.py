@@ -52,7 +52,7 @@ class CPrinter:
             case ir.Declare(name, kind, size, aligned):
                 return f"{'ALIGNED ' if aligned else ''}{TYPES[kind]} {name}[{size}];"
             case ir.Scatter(target, value):
-                return f"PUT({TYPES[target.kind]},{target.array},{self._within(target)},{text(value)})"
+                return f"SCATTER_ARRAY({TYPES[target.kind]},{target.array},{self._within(target)},{text(value)})"
             case ir.Store(buffer, field, kind, value):
                 return f"ST{kind.upper()}({buffer},{field},{text(value)});"
             case ir.If(condition):
@@ -78,7 +78,7 @@ class CPrinter:
             case ir.Work(size, active):
                 return f"WORK({size},{text(active)})"
             case ir.Path(number, active):
-                return f"WAY({number},{text(active)})"
+                return f"PATH({number},{text(active)})"
             case ir.CheckFinite(value):
                 # Adding 0 times each number leaves 0, or NaN if one of them was NaN or infinite.
                 return f"watch_+={text(value)}*SPLAT(0.0f);"
@@ -86,9 +86,9 @@ class CPrinter:
                 report = f"STB(flags,{field},LDB(flags,{field})|bad_)"
                 return f"B bad_=watch_!=SPLAT(0.0f);if(ANY(bad_)){{{report}}}"
             case ir.ReportWork():
-                return "STI(work,0,WORKED)"
+                return "STI(work,0,WORK_KEY)"
             case ir.Barrier(grid):
-                return "PACE" if grid else "TOGETHER"
+                return "GRID_BARRIER" if grid else "BLOCK_BARRIER"
             case ir.Fence():
                 return "FENCE"
         raise TypeError(one)
@@ -112,7 +112,7 @@ class CPrinter:
         if isinstance(one, ir.Call):
             return self._call(one)
         if isinstance(one, ir.Gather):
-            return f"AT({TYPES[one.kind]},{one.array},{self._within(one)})"
+            return f"GATHER_ARRAY({TYPES[one.kind]},{one.array},{self._within(one)})"
         if isinstance(one, int):
             return str(one) if one >= 0 else f"({one})"
         return literal(one)

@@ -95,7 +95,7 @@ class FusedEngine:
             sense: called after the physics, when `.moved` can be read; returns the sensed numbers, [N] each.
         """
         if self._arrays.order:
-            self._arrays.order.renew()
+            self._arrays.order.sort_if_due()
         for agent, action in actions.items():
             self._arrays.write(self.source.actions[agent], action)
         if self.env.pauses:
@@ -177,7 +177,7 @@ class FusedEngine:
         return filled
 
     def _launch(self, name: str) -> None:
-        self._arrays.renew()
+        self._arrays.renew_results()
         launch = partial(self._kernels[name].launch, self._arrays.all, self._stride)
         if len(self._shares) == 1:
             launch(*self._shares[0])

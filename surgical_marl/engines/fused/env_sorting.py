@@ -12,17 +12,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from surgical_marl.engines.fused.kernel import BLOCK, load_for_gpu, multiprocessors, torch_stream
-from surgical_marl.engines.fused.macros import AMOUNT, LANES, is_long
+from surgical_marl.engines.fused.kernel import LEAST_BLOCK, load_for_gpu, multiprocessors, torch_stream
+from surgical_marl.engines.fused.macros import LANES, WORK_MASK, is_long
 from surgical_marl.runtime import prepare_warp
 
 wp = prepare_warp()
 
-SELDOM, OFTEN = 128, 32
-"""Physics steps after which environments are sorted: often where code is long. An environment that begins an
-episode, or loses what it held, has other things to do than its neighbours from then on. In long code that costs more
-than sorting."""
-WORTH = 12
+INTERVAL, INTERVAL_OF_LONG_CODE = 128, 32
+"""Physics steps after which environments are sorted. An environment that begins an episode, or loses its object, has
+other things to do than its neighbours from then on, and in long code that costs more than sorting."""
+LEAST_BRANCHES = 12
 """Fewest large branches for which sorting is worth it on a CPU, whose results have to be copied then, and on a GPU that
 has a multiprocessor for each group: nothing waits there beside the slowest one. Arms alone have 9 at most, arms with
 objects 17 and more."""
@@ -35,7 +34,7 @@ _rows: Any = wp.array2d(dtype=wp.float32)
 _wholes: Any = wp.array(dtype=wp.int32)
 
 
-def control_steps(decimation: int, every: int = SELDOM) -> int:
+def control_steps(decimation: int, every: int = INTERVAL) -> int:
     """Return how many control steps of so many physics steps each take `every` physics steps."""
     return max(1, every // decimation)
 
@@ -47,21 +46,21 @@ def sorted_every(large_branches: int, device: str, num_envs: int, decimation: in
     """
     if num_envs <= LANES or not large_branches:
         return 0
-    if large_branches < WORTH and (device == "cpu" or num_envs <= BLOCK * multiprocessors()):
+    if large_branches < LEAST_BRANCHES and (device == "cpu" or num_envs <= LEAST_BLOCK * multiprocessors()):
         return 0
-    return control_steps(decimation, OFTEN if is_long(large_branches) else SELDOM)
+    return control_steps(decimation, INTERVAL_OF_LONG_CODE if is_long(large_branches) else INTERVAL)
 
 
 def slowest_first(work: Any, columns: Any) -> Any:
-    """Return columns [N] of a GPU, in groups of `BLOCK`, by the most that one of a group had to do: most first.
+    """Return columns [N] of a GPU, in groups of `LEAST_BLOCK`, by the most that one of a group had to do: most first.
 
     Args:
         work: what each had to do, torch tensor [N] int32, as kernels note it.
         columns: in the order of what they had to do, [N]. Within a group that stays.
     """
-    whole = len(columns) // BLOCK * BLOCK
-    groups = columns[:whole].view(-1, BLOCK)
-    most = (work[groups] & AMOUNT).amax(1)
+    whole = len(columns) // LEAST_BLOCK * LEAST_BLOCK
+    groups = columns[:whole].view(-1, LEAST_BLOCK)
+    most = (work[groups] & WORK_MASK).amax(1)
     columns[:whole] = groups[most.argsort(descending=True, stable=True)].reshape(-1)
     return columns
 
@@ -91,7 +90,7 @@ class EnvOrder:
         self._recording, self._recorded = recording, False
         self.envs, self.columns = numbers + 0, numbers + 0
 
-    def renew(self) -> None:
+    def sort_if_due(self) -> None:
         """Sort the columns if it is time, before a control step. The first one has nothing to sort by."""
         before, self._recorded = self._recorded, self._recording()
         if self._recorded and not before:

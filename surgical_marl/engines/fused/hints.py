@@ -63,7 +63,7 @@ def add_barriers(code: ir.Code) -> ir.Code:
     all threads come by are possible: outside of branches, and of loops whose number of rounds may differ.
 
     before: for(int r3=0;r3<8;++r3){ if(ANY(v7)){ ...800 instructions... } }
-    after:  for(int r3=0;r3<8;++r3){ PACE if(ANY(v7)){ ...800 instructions... } TOGETHER }
+    after:  for(int r3=0;r3<8;++r3){ GRID_BARRIER if(ANY(v7)){ ...800 instructions... } BLOCK_BARRIER }
     """
     return _with_barriers(code, loop=False)
 

@@ -9,7 +9,7 @@ An **operand** is one of
 | `str`: a register, or the counter of a loop | `v12`, `r3` |
 | a numpy scalar or an `int`: a constant | `SPLAT(0.5f)`, `7` |
 | `Element`: an element of a local array | `v4[2*(r3)+1]` |
-| `Gather`: as `Element`, but at an index that differs between the lanes of a vector | `AT(F,v4,WITHIN(v12,8))` |
+| `Gather`: as `Element`, at an index that differs between lanes | `GATHER_ARRAY(F,v4,WITHIN(v12,8))` |
 | `Call`: an operation on operands | `v12*v13` |
 
 Kinds are those of the graph: "f", "i", "u", "b". A register of the kind "int" is a plain C int, the same for all lanes.

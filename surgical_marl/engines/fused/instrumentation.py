@@ -43,11 +43,11 @@ def count_work(code: ir.Code) -> ir.Code:
     """Count the operations of the large blocks that each environment goes through. Environments are sorted by it.
 
     before: if(ANY(v7)){ ...612 operations... }
-    after:  if(ANY(v7)){ WORK(612,v7) ... } STI(work,0,WORKED)
+    after:  if(ANY(v7)){ WORK(612,v7) ... } STI(work,0,WORK_KEY)
 
-    One side of a branch that is very large is a path, which has a bit of its own: WAY(13,v7).
+    One side of a branch that is very large is a path, which has a bit of its own: PATH(13,v7).
     """
-    found: ir.Code = [ir.Define(name, "i", np.int32(0)) for name in ("work_", "ways_")]
+    found: ir.Code = [ir.Define(name, "i", np.int32(0)) for name in ("work_", "paths_")]
     blocks: list[tuple[tuple[ir.Operand, ...], ir.If | None, tuple[int, int] | None]] = []
     active: tuple[ir.Operand, ...] = ()
     paths = 0

@@ -28,7 +28,7 @@ from surgical_marl.runtime import cache_dir, prepare_warp
 
 wp = prepare_warp()
 
-BLOCK, WIDE = 32, 256
+LEAST_BLOCK, MOST_BLOCK = 32, 256
 """Fewest and most threads in a CUDA block."""
 FLAGS = "-march=native -ffp-contract=fast -fno-optimize-sibling-calls"
 """For Clang. Contraction: a * b + c is one rounding, as on a GPU. There are no calls to optimise, and looking for them
@@ -58,7 +58,7 @@ def compile_kernels(
         stage: is told if the cache has none of these bodies.
     """
     cuda = device == "cuda"
-    block, split = BLOCK, 0
+    block, split = LEAST_BLOCK, 0
     if cuda and is_long(large_branches):
         block, split = block_of(num_envs, multiprocessors()), split_of(num_envs, multiprocessors())
     prelude = CUDA if cuda else CPU
@@ -71,7 +71,7 @@ def compile_kernels(
     with locked(_records() / module.name), _checked(module.name):
         if not _folders(module.name):
             stage("compiling the C code")
-        module.load(wp.get_device(device), block_dim=WIDE if cuda else 1)
+        module.load(wp.get_device(device), block_dim=MOST_BLOCK if cuda else 1)
     return {name: Kernel(kernel, device, block, split) for name, kernel in made.items()}
 
 
@@ -80,16 +80,16 @@ def block_of(num_envs: int, multiprocessors: int) -> int:
 
     Threads of a block find each other's instructions in the cache, and with fewer blocks multiprocessors would be idle.
     """
-    return min(WIDE, max(BLOCK, 2 ** round(math.log2(max(num_envs / multiprocessors, 1)))))
+    return min(MOST_BLOCK, max(LEAST_BLOCK, 2 ** round(math.log2(max(num_envs / multiprocessors, 1)))))
 
 
 def split_of(num_envs: int, multiprocessors: int) -> int:
-    """Return how many of the first groups of `BLOCK` environments of long code become two blocks each.
+    """Return how many of the first groups of `LEAST_BLOCK` environments of long code become two blocks each.
 
     As many as there are multiprocessors that would be idle. All others wait for the slowest group, and half as many
     environments go through fewer branches that only some of them take.
     """
-    return max(0, min(multiprocessors - -(-num_envs // BLOCK), num_envs // BLOCK))
+    return max(0, min(multiprocessors - -(-num_envs // LEAST_BLOCK), num_envs // LEAST_BLOCK))
 
 
 @lru_cache(MOST_KEPT)
@@ -151,7 +151,7 @@ def _digest(folders: list[Path]) -> str:
 def _make(name: str, source: str, module: Any, max_registers: int | None = None) -> Any:
     def body(
         state: _reals, counts: _wholes, actions: _reals, outs: _reals, flags: _bytes, reals: _reals, wholes: _wholes,
-        work: _wholes, pace: _wholes, stride: int, t: int,
+        work: _wholes, arrivals: _wholes, stride: int, t: int,
     ) -> None: ...  # fmt: skip
 
     body.__qualname__ = body.__name__ = f"body_{name}"
@@ -159,14 +159,14 @@ def _make(name: str, source: str, module: Any, max_registers: int | None = None)
 
     def run(
         state: _reals, counts: _wholes, actions: _reals, outs: _reals, flags: _bytes, reals: _reals, wholes: _wholes,
-        work: _wholes, pace: _wholes, stride: int, start: int, lanes: int, split: int,
+        work: _wholes, arrivals: _wholes, stride: int, start: int, lanes: int, split: int,
     ) -> None:  # fmt: skip
         i = wp.tid()
-        block = i // BLOCK
-        if block < 2 * split and i % BLOCK >= BLOCK // 2:
+        block = i // LEAST_BLOCK
+        if block < 2 * split and i % LEAST_BLOCK >= LEAST_BLOCK // 2:
             return  # the first blocks have half as many environments
-        i -= wp.min(block, 2 * split) * (BLOCK // 2)
-        body(state, counts, actions, outs, flags, reals, wholes, work, pace, stride, start + i * lanes)
+        i -= wp.min(block, 2 * split) * (LEAST_BLOCK // 2)
+        body(state, counts, actions, outs, flags, reals, wholes, work, arrivals, stride, start + i * lanes)
 
     return wp.kernel(
         run, name=name, module=module, enable_backward=False, grid_stride=False, cuda_max_registers=max_registers
@@ -189,8 +189,8 @@ class Kernel:
             wp.launch(self._kernel, -(-count // LANES), [*inputs, LANES, 0], device=self._device, block_dim=1)
             return
         # compiled code is the same for blocks of all sizes, but Warp would compile it for each
-        threads, inputs = count + self.split * BLOCK, [*inputs, 1, self.split]
-        command = wp.launch(self._kernel, threads, inputs, device="cuda", block_dim=WIDE, record_cmd=True)
+        threads, inputs = count + self.split * LEAST_BLOCK, [*inputs, 1, self.split]
+        command = wp.launch(self._kernel, threads, inputs, device="cuda", block_dim=MOST_BLOCK, record_cmd=True)
         command.block_dim = self._block
         command.launch(torch_stream())
 

@@ -4,50 +4,48 @@ Division and square root are CUDA's approximate ones, right to two units in the 
 2^-126 for 0, which saves the scaling of such numbers: one instruction in twenty of a physics step. That division gives
 0 for a divisor above 2^126.
 
-`WORKED` is what there was to do: in its first bits which of the longest branches an environment took, then how much it
-was, as the exponent and twelve more bits of a float. Neighbours in this order go through the same code.
-`TOGETHER` lets the threads of a block wait for each other, so that they find each other's instructions in the cache. It
-stands where all of them come by, behind long branches and loops.
-`PACE` stands at the top of a long loop that all go through, as that over the physics steps of an environment step. All
-blocks wait for each other there too, if there is a multiprocessor for each of them: what these fetch, their neighbours
-find in the caches. Nothing but time depends on it, so none waits for more than `PATIENCE`: other programs may keep some
-blocks from running. `pace` counts all blocks that came by, and begins again after `ROUND` times all; behind it is the
-number of multiprocessors.
+`WORK_KEY` is what environments are sorted by: the paths that one took in the first bits, then how much there was to do,
+as the exponent and twelve more bits of a float.
+`BLOCK_BARRIER` lets the threads of a block wait for each other, to find each other's instructions in the cache.
+`GRID_BARRIER` lets all blocks wait for each other too, if there is a multiprocessor for each. Only time depends on it,
+so nothing waits longer than `BARRIER_TIMEOUT`: other programs may keep some blocks from running. `arrivals` is a
+counter of blocks, which wraps after `ARRIVALS_WRAP` times all, and the number of multiprocessors.
 `ALIGNED` arrays begin where four numbers can be moved by one instruction.
-`FENCE` keeps Clang from moving loads and stores past it, so that it does not compare each with all others of long code.
+`FENCE` is a place past which Clang moves no load and no store.
+`HIDEF` makes the C compiler take a register for a new value.
 """
 
 from __future__ import annotations
 
 LANES = 8
 """Environments in a vector on a CPU: 32 bytes of float32, an AVX register, and what `gatherd_d256` loads at once."""
-BRANCHES = 8
+LONG_CODE = 8
 """So many large branches make code long: all threads of a block should be at the same place of it."""
-AMOUNT_BITS = 17
+WORK_BITS = 17
 """Of `work`, for how much there was to do."""
-PATHS = 31 - AMOUNT_BITS
+PATHS = 31 - WORK_BITS
 """Most paths that are told apart: the other bits of an int32, but for its sign."""
-AMOUNT = 2**AMOUNT_BITS - 1
+WORK_MASK = 2**WORK_BITS - 1
 """The bits of `work` that say how much there was to do."""
-PATIENCE = 2_000_000
+BARRIER_TIMEOUT = 2_000_000
 """Cycles, about 1 ms: a physics step of any group of 32 takes less."""
-ROUND = 2**20
+ARRIVALS_WRAP = 2**20
 """Times that all blocks come by until they are counted from 0 again."""
-FEW = 64
+MOST_THREADS = 64
 """So many threads in a block at most wait for other blocks. More of them keep a multiprocessor busy while some wait."""
 
 
 def is_long(large_branches: int) -> bool:
     """Return whether code with so many large branches is long: it matters which of it neighbours run at a time."""
-    return large_branches >= BRANCHES
+    return large_branches >= LONG_CODE
 
 
-_WORKED = f"""
-#define WORKED ((ways_<<SPLATI({AMOUNT_BITS}))|MAXI(U2I(BITS(I2F(work_))>>SPLATU(11))-SPLATI(520192),SPLATI(0)))
+_WORK_KEY = f"""
+#define WORK_KEY ((paths_<<SPLATI({WORK_BITS}))|MAXI(U2I(BITS(I2F(work_))>>SPLATU(11))-SPLATI(520192),SPLATI(0)))
 """  # 520192 is what it would be for a work of 1
 CUDA = (
     f"""
-enum {{ FEW = {FEW}, PATIENCE = {PATIENCE}, ROUND = {ROUND} }};
+enum {{ MOST_THREADS = {MOST_THREADS}, BARRIER_TIMEOUT = {BARRIER_TIMEOUT}, ARRIVALS_WRAP = {ARRIVALS_WRAP} }};
 """
     """
 typedef float F; typedef int I; typedef unsigned int U; typedef bool B;
@@ -110,21 +108,21 @@ typedef float F; typedef int I; typedef unsigned int U; typedef bool B;
 #define HIDEI(x) asm volatile("":"+r"(x));
 #define HIDEU(x) asm volatile("":"+r"(x));
 #define WORK(n,c) work_+=n;
-#define WAY(n,c) ways_|=1<<n;
-#define TOGETHER __syncthreads();
-#define PACE \
-    if(gridDim.x<=(U)pace.data[1]&&blockDim.x<=FEW){ \
+#define PATH(n,c) paths_|=1<<n;
+#define BLOCK_BARRIER __syncthreads();
+#define GRID_BARRIER \
+    if(gridDim.x<=(U)arrivals.data[1]&&blockDim.x<=MOST_THREADS){ \
         if(threadIdx.x==0){ \
-            U*count_=(U*)pace.data,n_=atomicInc(count_,gridDim.x*ROUND-1),first_=n_/gridDim.x*gridDim.x; \
+            U*count_=(U*)arrivals.data,n_=atomicInc(count_,gridDim.x*ARRIVALS_WRAP-1),first_=n_/gridDim.x*gridDim.x; \
             long long since_=clock64(); \
             if(n_-first_<gridDim.x-1) \
-                while(*(volatile U*)count_-first_<gridDim.x&&clock64()-since_<PATIENCE); \
+                while(*(volatile U*)count_-first_<gridDim.x&&clock64()-since_<BARRIER_TIMEOUT); \
         } \
     } \
-    TOGETHER
+    BLOCK_BARRIER
 #define BITS(x) __float_as_uint(x)
 #define FLOAT(x) __uint_as_float(x)
-""" + _WORKED
+""" + _WORK_KEY
 )
 
 CPU = (
@@ -164,16 +162,16 @@ typedef unsigned char C __attribute__((ext_vector_type(SM_W)));
 #define GATHER(T,p,i) ((T)__builtin_ia32_gatherd_d256(I{},(const int*)(p),(i),SPLATI(-1),4))
 #define TABLEF(k,i) GATHER(F,reals.data+(k),i)
 #define TABLEI(k,i) GATHER(I,wholes.data+(k),i)
-#define AT(T,a,i) GATHER(T,a,(i)*SPLATI(SM_W)+LANE_NUMBERS)
+#define GATHER_ARRAY(T,a,i) GATHER(T,a,(i)*SPLATI(SM_W)+LANE_NUMBERS)
 #else
 #define TABLEF(k,i) ({I i_=(i);LANEWISE(F,reals.data[k+i_[l]]);})
 #define TABLEI(k,i) ({I i_=(i);LANEWISE(I,wholes.data[k+i_[l]]);})
-#define AT(T,a,i) ({I i_=(i);LANEWISE(T,a[i_[l]][l]);})
+#define GATHER_ARRAY(T,a,i) ({I i_=(i);LANEWISE(T,a[i_[l]][l]);})
 #endif
 #define ROWF(k,i) SPLAT(reals.data[k+(i)])
 #define ROWI(k,i) SPLATI(wholes.data[k+(i)])
 #define WITHIN(i,last) __builtin_elementwise_min(__builtin_elementwise_max((I)(i),SPLATI(0)),SPLATI(last))
-#define PUT(T,a,i,x) {I i_=(i);T r_=(x);EACH(a[i_[l]][l]=r_[l];)}
+#define SCATTER_ARRAY(T,a,i,x) {I i_=(i);T r_=(x);EACH(a[i_[l]][l]=r_[l];)}
 #define DIVF(a,b) ((a)/(b))
 #define DIVI(a,b) ((a)/(b))
 #define DIVU(a,b) ((a)/(b))
@@ -211,10 +209,10 @@ typedef unsigned char C __attribute__((ext_vector_type(SM_W)));
 #define BITS(x) ((U)(x))
 #define FLOAT(x) ((F)(x))
 #define WORK(n,c) work_+=(c)&SPLATI(n);
-#define WAY(n,c) ways_|=(c)&SPLATI(1<<n);
+#define PATH(n,c) paths_|=(c)&SPLATI(1<<n);
 #define FENCE __atomic_signal_fence(__ATOMIC_SEQ_CST);
 """
-    + _WORKED
+    + _WORK_KEY
 )
 
 MACROS = sorted(

@@ -188,7 +188,7 @@ def changed(count: int, x: Any, which: Any) -> Any:
 
 def test_threads_wait_for_each_other_only_where_all_come_by(monkeypatch: pytest.MonkeyPatch) -> None:
     """A thread that waits in a branch, or in a round that others don't make, would wait for ever."""
-    monkeypatch.setattr("surgical_marl.engines.fused.macros.BRANCHES", 2)
+    monkeypatch.setattr("surgical_marl.engines.fused.macros.LONG_CODE", 2)
 
     def long(x: Any) -> Any:
         return lax.cond(x > 0, lambda: sum(jnp.sin(k * x) for k in range(1, 40)), lambda: x)
@@ -200,9 +200,11 @@ def test_threads_wait_for_each_other_only_where_all_come_by(monkeypatch: pytest.
         """How many loops are around each place where threads wait."""
         around, found, last = [], [], ""
         for line in body(function, np.ones(3, np.float32), vector=False).splitlines():
-            if line in ("TOGETHER", "PACE"):
+            if line in ("BLOCK_BARRIER", "GRID_BARRIER"):
                 assert all(re.match(r"for\(int r\d+=0;r\d+<3;", head) for head in around)
-                assert (line == "PACE") == (bool(around) and last == around[-1]), "only at its top do all blocks wait"
+                assert (line == "GRID_BARRIER") == (bool(around) and last == around[-1]), (
+                    "only at its top do all blocks wait"
+                )
                 found.append(len(around))
             last = line
             if line.startswith("}"):
@@ -275,7 +277,7 @@ def test_a_scan_that_is_to_be_unrolled_is() -> None:
 
 def test_code_for_cuda_compiles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every macro of the prelude, by NVRTC, which needs no GPU."""
-    monkeypatch.setattr("surgical_marl.engines.fused.macros.BRANCHES", 0)
+    monkeypatch.setattr("surgical_marl.engines.fused.macros.LONG_CODE", 0)
     monkeypatch.setattr(instrumentation, "LARGE_PATH", 0)
     code = body(everything, random_arrays(0), vector=False)
     used = set(re.findall(r"\w+", code))

@@ -13,9 +13,9 @@ import torch
 from surgical_marl.engines.fused import engine, env_sorting, kernel
 from surgical_marl.engines.fused.arrays import make_arrays
 from surgical_marl.engines.fused.compiler import tables
-from surgical_marl.engines.fused.env_sorting import AT_ONCE, WORTH, permuted, slowest_first
-from surgical_marl.engines.fused.kernel import BLOCK
-from surgical_marl.engines.fused.macros import AMOUNT, BRANCHES
+from surgical_marl.engines.fused.env_sorting import AT_ONCE, LEAST_BRANCHES, permuted, slowest_first
+from surgical_marl.engines.fused.kernel import LEAST_BLOCK
+from surgical_marl.engines.fused.macros import LONG_CODE, WORK_MASK
 from surgical_marl.engines.fused.pipeline import Program, compile_program
 from surgical_marl.engines.fused.source_cache import load_source
 from surgical_marl.envs.batch import BatchedEnv
@@ -135,13 +135,13 @@ def test_what_is_recorded_begins_with_sorting() -> None:
 
     columns = env_sorting.EnvOrder(np.arange(3), [], argsort, 8, lambda: step in recorded)
     for step in range(40):  # noqa: B007
-        columns.renew()
+        columns.sort_if_due()
     assert sorted_at == [1, 5, 13, 20, 28, 36]
 
 
 def test_environments_are_sorted_where_neighbours_wait_for_each_other(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(env_sorting, "multiprocessors", lambda: 132)
-    none, short, long, longer = 0, 1, BRANCHES, WORTH
+    none, short, long, longer = 0, 1, LONG_CODE, LEAST_BRANCHES
     few, many = 4096, 8192  # of 32 a group
 
     def every(branches: int, device: str, num_envs: int) -> int:
@@ -165,28 +165,30 @@ def test_idle_multiprocessors_take_halves_of_groups() -> None:
 
 
 def test_the_slowest_groups_come_first_and_stay_as_they_are() -> None:
-    rng, count = np.random.default_rng(0), 5 * BLOCK + 7
-    work = torch.from_numpy((rng.integers(0, 2, count) << 17 | rng.integers(0, AMOUNT, count)).astype(np.int32))
+    rng, count = np.random.default_rng(0), 5 * LEAST_BLOCK + 7
+    work = torch.from_numpy((rng.integers(0, 2, count) << 17 | rng.integers(0, WORK_MASK, count)).astype(np.int32))
     before = torch.argsort(work, descending=True)
-    groups = before[: 5 * BLOCK].view(5, BLOCK).clone()
+    groups = before[: 5 * LEAST_BLOCK].view(5, LEAST_BLOCK).clone()
     after = slowest_first(work, before.clone())
-    assert torch.equal(after[5 * BLOCK :], before[5 * BLOCK :]) and not torch.equal(after, before)
-    slowest = [(work[group] & AMOUNT).max() for group in after[: 5 * BLOCK].view(5, BLOCK)]
+    assert torch.equal(after[5 * LEAST_BLOCK :], before[5 * LEAST_BLOCK :]) and not torch.equal(after, before)
+    slowest = [(work[group] & WORK_MASK).max() for group in after[: 5 * LEAST_BLOCK].view(5, LEAST_BLOCK)]
     assert slowest == sorted(slowest, reverse=True)
-    assert {tuple(group.tolist()) for group in after[: 5 * BLOCK].view(5, BLOCK)} == {tuple(g.tolist()) for g in groups}
+    assert {tuple(group.tolist()) for group in after[: 5 * LEAST_BLOCK].view(5, LEAST_BLOCK)} == {
+        tuple(g.tolist()) for g in groups
+    }
 
 
 @pytest.mark.parametrize("split", [0, 1, 2])
 def test_every_column_is_run_once_where_groups_are_split(split: int) -> None:
     """Code as for a GPU, on a CPU: each environment adds 1 to its number."""
-    count = 3 * BLOCK + 5
+    count = 3 * LEAST_BLOCK + 5
     with gpu_code():
         begin = np.zeros((count, 1), np.float32)
         graph, stores, layout, leaf, _ = make_stores(lambda x: x + 1, (begin,), in_place=True)
         made = kernel.compile_kernels({"run": compile_program(Program(graph, stores, vector=False)).text}, "cpu")["run"]
         arrays = make_arrays("cpu", SimpleNamespace(sizes=layout.sizes), tables(graph), count, count)
         inputs = [*arrays.all, count, 0, 1, split]
-        kernel.wp.launch(made._kernel, count + split * BLOCK, inputs, device="cpu", block_dim=1)
+        kernel.wp.launch(made._kernel, count + split * LEAST_BLOCK, inputs, device="cpu", block_dim=1)
     assert np.array_equal(arrays.read(leaf[0], "numpy"), begin + 1)
 
 

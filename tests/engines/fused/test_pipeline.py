@@ -45,7 +45,7 @@ def function(x: Any, which: Any) -> Any:
 def verified(monkeypatch: pytest.MonkeyPatch) -> None:
     """All branches count as large, all code as long, and the IR is checked after each pass."""
     monkeypatch.setenv(VERIFY, "1")
-    monkeypatch.setattr("surgical_marl.engines.fused.macros.BRANCHES", 0)
+    monkeypatch.setattr("surgical_marl.engines.fused.macros.LONG_CODE", 0)
     monkeypatch.setattr(hints, "LARGE", 0)
     for size in ("LARGE", "LARGE_PATH"):
         monkeypatch.setattr(instrumentation, size, 0)
