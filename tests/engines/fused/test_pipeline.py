@@ -70,6 +70,13 @@ def test_code_without_a_pass_is_other_code(name: str, monkeypatch: pytest.Monkey
     assert not (changed[0] and targets == {"cpu"}) and not (changed[1] and targets == {"cuda"})
 
 
+def test_paths_are_noted_only_where_work_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Otherwise C would use a register that nothing declares: a side of many small blocks is large, none of them is."""
+    assert "PATH(" in text(vector=False)
+    monkeypatch.setattr(instrumentation, "LARGE", 1000)
+    assert not any(word in text(vector=False) for word in ("PATH(", "WORK(", "paths_", "WORK_KEY"))
+
+
 def test_code_without_any_pass_computes_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     expected = jax.jit(jax.vmap(function))(*COLUMNS)
     monkeypatch.setenv(PASSES, ",".join(f"-{name}" for name in SWITCHES))
