@@ -91,6 +91,7 @@ def run(name: str, pattern: str) -> list[float]:
     return [float(number) for number in re.findall(pattern, done.stdout)]
 
 
+@pytest.mark.slow
 def test_a_trajectory_is_optimised_by_gradient() -> None:
     errors = run("jax_trajectory.py", r"ends ([\d.]+) mm")
     assert errors[0] > 20 and errors[-1] < 2

@@ -93,21 +93,14 @@ def fuzz(name: str, seconds: float, out: Path, seed: int) -> None:
     folder = Path(tempfile.mkdtemp())
     with atheris.instrument_imports(include=INSTRUMENTED):
         from tests.helpers import loaders
-    from tests.helpers.mutators import KINDS, mutated, parts
+    from tests.helpers.mutators import mutated, words_of
 
     found = loaders.loader(name, folder)
-    kinds = [KINDS[kind] for kind in found.kinds]
-    words: list[Any] = []
+    words = words_of(found.kinds, found.seeds)
     corpus = out / "corpus"
     corpus.mkdir(parents=True, exist_ok=True)
     for data in (*found.seeds, *(path.read_bytes() for path in sorted((loaders.CORPUS / name).glob("*")))):
         (corpus / hashlib.sha256(data).hexdigest()[:16]).write_bytes(data)
-    for data in found.seeds:
-        for kind in kinds:
-            try:
-                words += parts(kind.parse(data))
-            except Exception:  # a file of another kind
-                continue
     watched, began = Watched(found.read, out), time.process_time()
     limit = _memory("VmSize") + 4 * MOST_BYTES  # beyond it there is an error with a place, in a change too
     resource.setrlimit(resource.RLIMIT_AS, (limit, resource.getrlimit(resource.RLIMIT_AS)[1]))
@@ -116,7 +109,7 @@ def fuzz(name: str, seconds: float, out: Path, seed: int) -> None:
         rng = random.Random(number)
         if rng.random() < 0.85:
             try:
-                return mutated(rng.choice(kinds), data, rng, words)[:size]
+                return mutated(rng.choice(found.kinds), data, rng, words)[:size]
             except Exception:  # it is damaged, and so changed as bytes
                 pass
         return bytes(atheris.Mutate(data, size))

@@ -1,7 +1,7 @@
 """All that reads files of strangers, each as a call on the bytes of one file, with good files to begin with.
 
 `tests/helpers/fuzzing.py` looks for files that end in another error than one sentence, or take too much. Those that
-once did are in `tests/corpus/`, by loader, and `tests/untrusted/test_corpus.py` reads them again.
+once did are in `tests/corpus/`, by loader, and `tests/untrusted/test_fuzz.py` reads them again.
 """
 
 from __future__ import annotations

@@ -6,13 +6,15 @@ array that says it has other numbers than it has, two parts of the same name, a 
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import math
 import random
 import struct
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from itertools import product
 from typing import Any, NamedTuple
 from xml.etree.ElementTree import Element, tostring
 
@@ -42,16 +44,41 @@ class Kind(NamedTuple):
     write: Callable[[Any], bytes]
 
 
-def mutated(kind: Kind, data: bytes, rng: random.Random, words: list[Any]) -> bytes:
+def mutated(kind: str, data: bytes, rng: random.Random, words: list[Any]) -> bytes:
     """Return a file with some random changes of its tree; raises if it has none."""
-    tree = kind.parse(data)
+    tree = KINDS[kind].parse(data)
     for _ in range(rng.choice((1, 1, 1, 2, 3, 8))):
         tree = _changed(tree, rng, words)
-    return kind.write(tree)
+    return KINDS[kind].write(tree)
 
 
-def parts(tree: Any) -> list[Any]:
-    """Return all keys and leaves of a tree, for use in others."""
+def damaged(data: bytes, rng: random.Random) -> bytes:
+    """Return a file that may end early, with other bytes in some places."""
+    copy = bytearray(data)
+    for _ in range(rng.randrange(4)):
+        start = rng.randrange(len(data))
+        copy[start : start + rng.randint(1, 8)] = rng.randbytes(rng.randint(1, 8))
+    return bytes(copy[: rng.choice((len(copy), rng.randrange(len(copy) + 1)))])
+
+
+def changed(kinds: Sequence[str], data: bytes, rng: random.Random, words: list[Any]) -> bytes:
+    """Return a file with random changes: of its tree in most cases, or else of its bytes."""
+    if rng.random() < 0.75:
+        with contextlib.suppress(Exception):  # a tree that is not of this kind, or that nothing writes
+            return mutated(rng.choice(kinds), data, rng, words)
+    return damaged(data, rng)
+
+
+def words_of(kinds: Sequence[str], files: Sequence[bytes]) -> list[Any]:
+    """Return all keys and leaves of files, for use in others."""
+    words: list[Any] = []
+    for data, kind in product(files, kinds):
+        with contextlib.suppress(Exception):  # a file of another kind
+            words += _parts(KINDS[kind].parse(data))
+    return words
+
+
+def _parts(tree: Any) -> list[Any]:
     found = [key for path in places(tree) for key in path[-1:] if isinstance(key, str)]
     return found + [value for path in places(tree) if not isinstance(value := _at(tree, path), (dict, list))]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -155,12 +156,12 @@ def test_environments_that_are_alike_share_what_is_compiled() -> None:
     assert longer.max_steps == 50
 
 
-def test_a_task_that_is_defined_again_is_another(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As a notebook does it: the class has the name, module and options of the first."""
-
+@pytest.fixture
+def again(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], Any]:
+    """Define a task again, as a notebook does it: the class has the name, module and options of the first."""
     monkeypatch.setattr(TASKS, "_registered", {})
 
-    def again(gain: float) -> Any:
+    def define(gain: float) -> Any:
         class Again(TipTask):
             def rewards(self, world: Any) -> Any:
                 return {agent: {"gain": jnp.float32(gain)} for agent in world.arms}
@@ -171,11 +172,21 @@ def test_a_task_that_is_defined_again_is_another(monkeypatch: pytest.MonkeyPatch
                 return Start(Goal(jnp.zeros((1, 3))))
 
         sm.register_task("again", Again)
-        env: Any = sm.jax_env("again", scene="psm")
-        _, state = env.reset(jax.random.key(0))
-        return env.step(None, state, {"psm_0": jnp.zeros(7)})[2]["psm_0"]
+        return sm.jax_env("again", scene="psm")
 
-    assert (float(again(1.0)), float(again(2.0))) == (1.0, 2.0)
+    return define
+
+
+def test_a_task_that_is_defined_again_is_another(again: Callable[[float], Any]) -> None:
+    assert again(1.0)._functions is not again(2.0)._functions
+
+
+@pytest.mark.slow
+def test_a_task_that_is_defined_again_plays_its_new_reward(again: Callable[[float], Any]) -> None:
+    for gain in (1.0, 2.0):
+        env = again(gain)
+        _, state = env.reset(jax.random.key(0))
+        assert env.step(None, state, {"psm_0": jnp.zeros(7)})[2]["psm_0"] == gain
 
 
 def test_a_tip_at_its_target_has_a_finite_derivative() -> None:

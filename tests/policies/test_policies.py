@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import pickle
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -69,25 +71,43 @@ class OneEyedEnv(PictureEnv):
     seen = {"image": COLOURS}  # noqa: RUF012
 
 
-@pytest.fixture
-def fakes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Runs are trained, evaluated and exported on fake environments, and not filmed."""
+@contextlib.contextmanager
+def faked() -> Iterator[None]:
+    """Train, evaluate and export runs on fake environments, and film nothing."""
 
     def make_env(settings: Settings, num_envs: int | None = None) -> Any:
         return FakeEnv(COUNTS, SIZES, num_envs or settings.num_envs, max_steps=10)
 
-    for module in (train, command, export):
-        monkeypatch.setattr(module, "make_env", make_env)
-    monkeypatch.setattr(export, "record", lambda env, policy, path, small: path.write_bytes(b"film"))
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (train, command, export):
+            patch.setattr(module, "make_env", make_env)
+        patch.setattr(export, "record", lambda env, policy, path, small: path.write_bytes(b"film"))
+        yield
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+    """Runs of three seeds. Tests copy what they change."""
+    folder = tmp_path_factory.mktemp("runs")
+    with faked():
+        return [str(train.train(replace(SMALL, seed=seed), out=folder / f"seed{seed}")) for seed in (0, 1, 2)]
+
+
+@pytest.fixture(scope="module")
+def exported(trained: list[str], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The policy of these runs, likewise."""
+    with faked():
+        return export.export_policy(trained, tmp_path_factory.mktemp("policies") / "reach-fake")
 
 
 @pytest.fixture
-def runs(fakes: None, tmp_path: Path) -> list[str]:
-    return [str(train.train(replace(SMALL, seed=seed), out=tmp_path / f"seed{seed}")) for seed in (0, 1, 2)]
+def runs(trained: list[str]) -> Iterator[list[str]]:
+    with faked():
+        yield trained
 
 
-def test_an_export_is_the_best_of_its_seeds(runs: list[str], tmp_path: Path) -> None:
-    out = export.export_policy(runs, tmp_path / "policies" / "reach-fake")
+def test_an_export_is_the_best_of_its_seeds(exported: Path) -> None:
+    out = exported
     names = {"config.yaml", "metrics.csv", "curve.png", "evaluation.json", "README.md", "clip.mp4"}
     assert {path.name for path in out.iterdir()} == names | {
         f"{t}.{s}" for t in COUNTS for s in ("onnx", "safetensors")
@@ -116,15 +136,15 @@ def test_an_export_is_the_best_of_its_seeds(runs: list[str], tmp_path: Path) -> 
 
 
 def test_a_run_that_meets_its_goals_comes_before_one_that_is_more_exact(
-    runs: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    runs: list[str], exported: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    ordinary = json.loads((export.export_policy(runs, tmp_path / "a") / "evaluation.json").read_text())["seeds"]
+    ordinary = json.loads((exported / "evaluation.json").read_text())["seeds"]
     medians = {seed: card.worst_median(run) for seed, run in enumerate(ordinary["runs"])}
     least_exact = max(medians, key=medians.__getitem__)
     monkeypatch.setattr(
         export, "misses", lambda result: [] if card.worst_median(result) == medians[least_exact] else ["a goal"]
     )
-    found = json.loads((export.export_policy(runs, tmp_path / "b") / "evaluation.json").read_text())
+    found = json.loads((export.export_policy(runs, tmp_path / "new") / "evaluation.json").read_text())
     assert found["seeds"]["best"] == least_exact and card.worst_median(found) == medians[least_exact]
 
 
@@ -147,14 +167,14 @@ def test_where_points_are_made_the_way_that_is_left_at_the_end_is_no_error() -> 
     assert export._rank(better) < export._rank(worse)
 
 
-def test_what_is_exported_acts_and_measures_as_the_run(runs: list[str], tmp_path: Path) -> None:
-    out = export.export_policy(runs[:1], tmp_path / "policy")
+def test_what_is_exported_acts_and_measures_as_the_run(runs: list[str], exported: Path) -> None:
     env: Any = FakeEnv(COUNTS, SIZES, num_envs=8)
     observations, *_ = env.reset(0)
-    before, after = load_policy(runs[0], env)(observations), load_policy(out, env)(observations)
+    published = command.read_result(exported / "evaluation.json")
+    run = runs[published["seeds"]["best"]]
+    before, after = load_policy(run, env)(observations), load_policy(exported, env)(observations)
     assert all(torch.equal(before[agent], after[agent]) for agent in env.agents)
-    published = command.read_result(out / "evaluation.json")
-    played = command.play_all([str(out)], dict.fromkeys(("task", "scene", "control", "difficulty")), 200, 0)
+    played = command.play_all([str(exported)], dict.fromkeys(("task", "scene", "control", "difficulty")), 200, 0)
     again = json.loads(command.report(played, ("published", published), True, None, None))
     assert set(again["against"]["difference"].values()) <= {0.0, None}
 
@@ -169,7 +189,7 @@ def test_runs_that_are_no_policy_together(runs: list[str], tmp_path: Path) -> No
         ([str(tmp_path / "full")], "new", "not a run folder"),
         ([*runs, "nothing"], "new", "unknown run or policy 'nothing'"),
         (runs, "full", "exists already"),
-        (runs, "seed0/config.yaml/new", "cannot write"),
+        (runs, "same/config.yaml/new", "cannot write"),
     ):
         with pytest.raises(ValueError, match=message):
             export.export_policy(several, tmp_path / out)
@@ -188,13 +208,17 @@ def test_a_machine_without_films_leaves_the_clip_out(
     assert "no clip, since this machine cannot make one: ffmpeg" in capsys.readouterr().err
 
 
-def test_weights_that_are_not_data_or_not_of_this_scene_are_refused(runs: list[str], tmp_path: Path) -> None:
-    out = export.export_policy(runs[:1], tmp_path / "policy")
+def test_weights_that_are_not_data_or_not_of_this_scene_are_refused(
+    runs: list[str], exported: Path, tmp_path: Path
+) -> None:
+    out, run = (shutil.copytree(folder, tmp_path / Path(folder).name) for folder in (exported, runs[0]))
     env: Any = FakeEnv(COUNTS, SIZES)
     with pytest.raises(ValueError, match=r"trained in scene 'trimanual_psm_ecm'.*1 psm of 6 observations"):
         load_policy(out, FakeEnv({"psm": 1}, SIZES))  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="exported policy, which can be evaluated but not resumed"):
-        train.train(SMALL, out=out, resume=out)
+        train.train(
+            replace(SMALL, seed=command.read_result(out / "evaluation.json")["seeds"]["best"]), out=out, resume=out
+        )
 
     class Trap:
         def __reduce__(self) -> Any:
@@ -210,9 +234,9 @@ def test_weights_that_are_not_data_or_not_of_this_scene_are_refused(runs: list[s
     torch.save(Trap(), weights)
     with pytest.raises(ValueError, match="only one that is loaded"):
         load_policy(out, env)
-    torch.save(Trap(), Path(runs[0]) / "checkpoint.pt")
+    torch.save(Trap(), run / "checkpoint.pt")
     with pytest.raises(ValueError, match="damaged"):
-        load_policy(runs[0], env)
+        load_policy(str(run), env)
     assert not (tmp_path / "sprung").exists()
 
     weights.write_bytes(data)
@@ -303,8 +327,8 @@ def test_the_example_acts_without_torch(tmp_path: Path) -> None:
     assert errors.startswith("{'psm_0': '") and " mm', 'psm_1': '" in errors and torch_imported == "False"
 
 
-def test_policies_are_listed_by_what_they_do(runs: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    export.export_policy(runs, tmp_path / "policies" / "reach-fake")
+def test_policies_are_listed_by_what_they_do(exported: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shutil.copytree(exported, tmp_path / "policies" / "reach-fake")
     monkeypatch.setattr(content, "content_dir", lambda kind: tmp_path / kind)
     (tmp_path / "policies" / "unfinished").mkdir()
     assert content.list_policies() == ["reach-fake"]

@@ -81,7 +81,7 @@ def test_its_intervals_have_a_width_and_its_card_is_of_its_files(name: str) -> N
     assert card(POLICIES / name, name) == (POLICIES / name / "README.md").read_text()
 
 
-@pytest.mark.parametrize("name", ["reach-psm", "reach-bimanual_psm"])
+@pytest.mark.parametrize("name", ["reach-psm", pytest.param("reach-bimanual_psm", marks=pytest.mark.slow)])
 def test_its_numbers_come_out_again(name: str) -> None:
     if name not in list_policies():
         pytest.skip(f"{name} does not ship yet")

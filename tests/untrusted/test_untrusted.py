@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 import surgical_marl as sm
 from surgical_marl.cli.main import main
@@ -20,7 +22,7 @@ from surgical_marl.runs.settings import load_config, read_config
 from surgical_marl.scenes.check import check
 from surgical_marl.scenes.load import load_scene
 from surgical_marl.scenes.objects import load_object
-from surgical_marl.untrusted.values import shown
+from surgical_marl.untrusted.values import as_number, shown
 from tests.robots.test_urdf import URDF, YAML
 
 LONG = "1" + "0" * 399
@@ -252,6 +254,18 @@ def test_values_in_errors_are_short() -> None:
     for value in ("a", 1, -1.5, None, [1, "b"], {"b": 1, "a": [None]}, (1,), 10**30, True):
         assert shown(value) == repr(value)
     assert shown(-(10**400)) == "-10000... (a whole number of 401 digits)"
+
+
+@given(
+    st.recursive(
+        st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=20),
+        lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=8), inner, max_size=4),
+        max_leaves=8,
+    )
+)
+def test_any_value_is_shown_shortly_and_read_as_a_number(value: Any) -> None:
+    assert len(shown(value)) <= 200
+    assert isinstance(as_number(value, words=True), float)
 
 
 def test_a_setting_may_be_written_as_before(tmp_path: Path) -> None:
