@@ -39,7 +39,7 @@ def play(
         held: number of the object, [E].
         look: what to return, from the data and the name of the object.
     """
-    scene, bodies = grasps.scene, begin.objects.bodies
+    scene, bodies = grasps.scene, begin.rigid_bodies.bodies
     model, nq = mujoco.MjModel.from_xml_string(mjcf(scene, timestep=scene.model.opt.timestep / FINE)), scene.model.nq
     model.opt.impratio, model.opt.tolerance = IMPRATIO, TOLERANCE
     found: list[Any] = []

@@ -22,8 +22,8 @@ from surgical_marl.bench.physics import bare_state
 from surgical_marl.engines.choose import Engine, make_engine
 from surgical_marl.envs.env import Env
 from surgical_marl.envs.state import Carry, State
-from surgical_marl.physics.systems.dynamics import Physics
-from surgical_marl.physics.systems.rigid_bodies import rotation
+from surgical_marl.physics.state import Physics
+from surgical_marl.physics.systems.rigid_motion import rotation
 from surgical_marl.robots.rotation import quaternion
 from surgical_marl.scenes.grasps import Jaw
 
@@ -97,7 +97,7 @@ class Watched(Env):
 
         def substep(state: tuple[Physics, Array, Array], _: None) -> tuple[tuple[Physics, Array, Array], None]:
             physics, overlap, struck = state
-            physics, _touch = simulator._step(physics, simulator.untouched)
+            physics, _touch = simulator.step(physics, simulator.untouched)
             deep, near = self._depths(physics)
             return (physics, jnp.maximum(overlap, deep), struck | (near > -CLOSE)), None
 
@@ -109,33 +109,34 @@ class Watched(Env):
     @property
     def fingers(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the numbers of the two fingers of each arm, [a, 2], and those of their bodies in the scene's model."""
-        assert self.simulator._objects
-        tables = self.simulator._objects.tables
+        assert self.simulator.step.bodies
+        tables = self.simulator.step.bodies.tables
         fingers = np.array([tables.jaws[arm] for arm in range(tables.arms)])
         return fingers, tables.bodies["pads"][fingers]
 
     def _depths(self, physics: Physics) -> tuple[Array, Array]:
         """Return how deep objects overlap with fingers, and how deep with other parts of arms, m."""
-        together = self.simulator._objects
-        assert together
-        tables, depth = together.tables, together.depths(physics)
+        step = self.simulator.step
+        assert step.bodies
+        tables, depth = step.bodies.tables, step.depths(physics)
         grips, on_arm = tables.finger < len(tables.fingers), tables.owner < tables.arms
         return jnp.max(jnp.where(grips, depth, -1.0)), jnp.max(jnp.where(on_arm & ~grips, depth, -1.0))
 
     def _look(self, carry: Carry) -> Seen:
-        together, physics, held = self.simulator._objects, carry.physics, carry.goal
-        assert together
-        bodies = physics.objects.bodies
-        data, axes, place = self.simulator._together.pose(physics.qpos), rotation(bodies.quaternion), bodies.position
+        step, physics, held = self.simulator.step, carry.physics, carry.goal
+        bodies = physics.rigid_bodies.bodies
+        data, axes = step.arms.dynamics.pose(physics.qpos), rotation(bodies.quaternion)
+        place = bodies.position
         fingers, links = self.fingers
         frames, offset = in_jaws(jnp, data.xpos[links], data.xmat[links], place[held])
         holds = [
-            jnp.stack([h.holding for h in together.handles(physics.objects, a).values()]) for a in range(len(links))
+            jnp.stack([h.holding for h in step.grips.view(physics.rigid_bodies.grips, a).values()])
+            for a in range(len(links))
         ]
         return Seen(
             position=offset,
             rotation=frames @ axes[held],
-            force=physics.objects.grips.force[held][fingers],
+            force=physics.rigid_bodies.grips.force[held][fingers],
             holding=jnp.stack(holds)[:, held],
             overlap=jnp.float32(0.0),
             struck=jnp.bool_(False),
@@ -193,12 +194,12 @@ class Grasps:
         drawn = zip(*(self._draw(rng, self.names[o]) for o in held), strict=True)
         qpos, position, turn = (jnp.asarray(np.array(part), jnp.float32) for part in drawn)
         physics, each = jax.vmap(self.simulator.at)(qpos), np.arange(len(held))
-        bodies = physics.objects.bodies
+        bodies = physics.rigid_bodies.bodies
         placed = bodies._replace(
             position=bodies.position.at[each, held].set(position),
             quaternion=bodies.quaternion.at[each, held].set(turn),
         )
-        return physics._replace(objects=physics.objects._replace(bodies=placed))
+        return physics.with_systems(rigid_bodies=physics.rigid_bodies._replace(bodies=placed))
 
     def play(self, physics: Physics, actions: np.ndarray, held: np.ndarray) -> tuple[Physics, Seen]:
         """Return states [E] after actions [E, steps, a, n], and what was seen of the held objects, [E, steps]."""

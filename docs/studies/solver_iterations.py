@@ -14,12 +14,11 @@ import numpy as np
 from docs.studies.command import make_parser
 from surgical_marl import load_scene
 from surgical_marl.control.controller import Controller
-from surgical_marl.physics import joined
 from surgical_marl.physics.outputs import Touch
 from surgical_marl.physics.simulator import Simulator
-from surgical_marl.physics.solver import constraint_rows
-from surgical_marl.physics.systems import dynamics
-from surgical_marl.physics.systems.dynamics import Physics
+from surgical_marl.physics.solver import arm_newton, constraint_rows
+from surgical_marl.physics.state import ArmState, Physics
+from surgical_marl.physics.systems import arms
 from surgical_marl.scenes.scene import Scene
 from surgical_marl.scenes.timing import DECIMATION
 
@@ -42,7 +41,7 @@ def states_in_contact(scene: Scene) -> tuple[Physics, np.ndarray, np.ndarray]:
     for step in range(STEPS):
         if step % 40 == 0:
             actions = {agent: np.float32(rng.choice([-1, 1], len(m.arm.actuated))) for agent, m in scene.mounts.items()}
-        now = command(now._replace(qpos=data.qpos), actions)
+        now = command(now.with_arms(qpos=data.qpos), actions)
         data.ctrl[:] = now.ctrl
         for _ in range(DECIMATION):
             state = snapshot(data)
@@ -83,7 +82,7 @@ def random_states(scene: Scene) -> tuple[Physics, np.ndarray]:
 
 def snapshot(data: mujoco.MjData) -> Physics:
     parts: Any = (np.float32(part) for part in (data.qpos, data.qvel, data.qacc_warmstart, data.ctrl))
-    return Physics(*parts)
+    return Physics({"arms": ArmState(*parts)})
 
 
 def batch(states: list[Physics]) -> Physics:
@@ -101,8 +100,8 @@ def step(scene: Scene, states: Physics, touching: bool) -> tuple[np.ndarray, np.
 
     def advance(state: Physics) -> tuple[Physics, Touch]:
         if not touching:
-            return simulated._apart(state, simulated.untouched)
-        return simulated._joined.step(state, simulated.untouched, {})
+            return simulated.step._arms_apart(state, simulated.untouched)
+        return simulated.step._arms_together(state, simulated.untouched)
 
     after, touch = jax.jit(jax.vmap(advance))(states)
     return np.asarray(after.qvel), np.asarray(touch.force)
@@ -118,7 +117,7 @@ def touching() -> None:
     print("| iterations | line search | velocity off: 99 % | worst | largest force off: 99 % | worst |")
     print("|---|---|---|---|---|---|")
     for iterations, line_search in TOUCHING:
-        joined.ITERATIONS = iterations, line_search
+        arm_newton.ITERATIONS_WITH_ROWS = iterations, line_search
         velocity, force = step(scene, states, touching=True)
         off = (np.abs(velocity - velocities) / speeds(scene)).max(1)
         force_off = np.abs(force - forces).max(1) / np.maximum(forces.max(1), 1.0)
@@ -132,7 +131,7 @@ def apart() -> None:
         scene = load_scene(name)
         states, velocities = random_states(scene)
         for sweeps, (iterations, line_search) in APART:
-            constraint_rows.SWEEPS, dynamics.ITERATIONS = sweeps, (iterations, line_search)
+            constraint_rows.SWEEPS, arms.ITERATIONS = sweeps, (iterations, line_search)
             velocity, _ = step(scene, states, touching=False)
             off = (np.abs(velocity - velocities) / speeds(scene)).max(1)
             print(f"| {name} | {sweeps} | {iterations} | {line_search} | {shares(off)} |")

@@ -130,14 +130,14 @@ def _along(physics: Engine, commands: list[Any], hold: int = HOLD) -> Callable[[
     def step() -> None:
         now = next(turn)
         if now % hold == 0:
-            physics.write(".physics.ctrl", commands[now // hold % LAPS])
+            physics.write(".physics.arms.ctrl", commands[now // hold % LAPS])
         physics.step({})
 
     return step
 
 
 def _wait(engine: Engine) -> None:
-    engine.read(".physics.qpos", "numpy")
+    engine.read(".physics.arms.qpos", "numpy")
 
 
 def _torch(values: np.ndarray) -> Any:

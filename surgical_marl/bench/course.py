@@ -18,6 +18,7 @@ from surgical_marl.control.controller import Controller, actuators_of
 from surgical_marl.engines.choose import make_engine
 from surgical_marl.envs.env import Env
 from surgical_marl.physics.simulator import Simulator
+from surgical_marl.physics.state import ARMS, RIGID_BODIES
 from surgical_marl.robots.rotation import matrix_of
 from surgical_marl.scenes.grasps import graspers
 from surgical_marl.scenes.load import load_scene
@@ -50,12 +51,13 @@ class Course(NamedTuple):
     touching: float
     """Share of the environments in which something touches at the start, from 0 to 1."""
     objects: Any = ()
-    """The state of the objects, a tree like `Physics.objects`; [n, ...]."""
+    """The state of the free objects, a tree like `Physics.rigid_bodies`; [n, ...]."""
 
     @property
     def parts(self) -> dict[str, np.ndarray]:
-        """The arrays of the start by their path in an environment's carry, as in ".physics.qpos"."""
-        start = {name: getattr(self, name) for name in ("qpos", "qvel", "ctrl", "objects")}
+        """The arrays of the start by their path in an environment's carry, as in ".physics.arms.qpos"."""
+        start = {f"{ARMS}.{name}": getattr(self, name) for name in ("qpos", "qvel", "ctrl")}
+        start[RIGID_BODIES] = self.objects
         return {f".physics.{name}{path}": v for name, tree in start.items() for path, v in _leaves(tree).items()}
 
 
@@ -99,9 +101,10 @@ def make_course(workload: Workload) -> Course:
         now = command(now, action)
         commands.append(np.asarray(now.ctrl))
         now = roll(now)
-    held = start.objects.grips.force > 0 if scene.objects else None
+    held = start.rigid_bodies.grips.force > 0 if scene.objects else None
     touching = float(held.any((1, 2)).mean()) if held is not None else _touching(scene.model, start.qpos)
-    return Course(start.qpos, start.qvel, start.ctrl, np.array(commands), actions, touching, start.objects)
+    objects = start.systems.get(RIGID_BODIES, ())
+    return Course(start.qpos, start.qvel, start.ctrl, np.array(commands), actions, touching, objects)
 
 
 def _drawn(
@@ -145,8 +148,8 @@ def _back(drawn: dict[str, np.ndarray], closed: list[str]) -> dict[str, np.ndarr
 def _grasping(now: Any, starts: Starts, at: Any) -> Any:
     """Return the state [n, ...] in which jaws are about to close on objects."""
     qpos, position, turned = (x.astype(np.float32) for x in starts[:3])
-    objects = now.objects._replace(bodies=now.objects.bodies._replace(position=position, quaternion=turned))
-    return at(qpos)._replace(objects=objects)
+    objects = now.rigid_bodies._replace(bodies=now.rigid_bodies.bodies._replace(position=position, quaternion=turned))
+    return at(qpos).with_systems(rigid_bodies=objects)
 
 
 def tile(values: np.ndarray, num_envs: int) -> np.ndarray:
@@ -201,7 +204,7 @@ def _by_mujoco(model: Any, now: Any) -> Any:
     data = mujoco.MjData(model)
     found, _ = rollout.rollout(model, data, state, np.asarray(now.ctrl, float)[:, None], nstep=HOLD)
     end = np.asarray(found[:, -1], np.float32)
-    return now._replace(qpos=end[:, 1 : 1 + model.nq], qvel=end[:, 1 + model.nq :])
+    return now.with_arms(qpos=end[:, 1 : 1 + model.nq], qvel=end[:, 1 + model.nq :])
 
 
 def _touching(model: Any, qpos: np.ndarray) -> float:

@@ -11,14 +11,14 @@ from jax import Array
 from surgical_marl.envs.env import Env
 from surgical_marl.envs.state import Carry, State
 from surgical_marl.physics.outputs import Contacts
-from surgical_marl.physics.systems.dynamics import Physics
+from surgical_marl.physics.state import Physics
 
 
 class PhysicsAlone(Env):
     """An environment whose step is some physics steps alone.
 
     The step takes a state and gives the next one, and the distances of all pairs that can touch where it began. There
-    is no agent, no reward and no reset. Commands are set by `engine.write(".physics.ctrl", ...)`.
+    is no agent, no reward and no reset. Commands are set by `engine.write(".physics.arms.ctrl", ...)`.
 
     Args:
         env: whose physics it is.
@@ -43,7 +43,7 @@ class PhysicsAlone(Env):
         known = distance if self.decimation == 1 else None
 
         def substep(physics: Physics, _: None) -> tuple[Physics, None]:
-            return simulator._step(physics, self.simulator.untouched, known)[0], None
+            return simulator.step(physics, self.simulator.untouched, known)[0], None
 
         physics, _ = jax.lax.scan(substep, carry.physics, None, length=self.decimation)
         return bare_state(carry._replace(physics=physics), distance)

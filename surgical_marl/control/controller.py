@@ -98,7 +98,7 @@ class Controller:
 
     def apply(self, physics: Any, actions: Mapping[str, Array]) -> Any:
         """Return a state of `Simulator` with the next commands of all actuators."""
-        return physics._replace(ctrl=self.command(physics.ctrl, physics.qpos, actions)[0])
+        return physics.with_arms(ctrl=self.command(physics.ctrl, physics.qpos, actions)[0])
 
     def _with_followers(self, agent: str, commands: Array) -> Array:
         """Return the commands of all moving joints of an arm from those of its actuated joints, [n].

@@ -23,7 +23,7 @@ class Engine(Protocol):
     device: str
     """"cpu" or "cuda"."""
     carry_shapes: dict[str, tuple[int, ...]]
-    """The parts of an environment's `Carry` by path, as in ".physics.qpos", and their shapes."""
+    """The parts of an environment's `Carry` by path, as in ".physics.arms.qpos", and their shapes."""
 
     def reset(self, seed: int, first: int = 0) -> None: ...
 

@@ -263,7 +263,7 @@ def find_device(device: str) -> Any:
 
 
 def _paths(tree: Any) -> dict[str, Any]:
-    """Return the leaves of a tree by their path, as in ".physics.qpos"."""
+    """Return the leaves of a tree by their path, as in ".physics.arms.qpos"."""
     return {jax.tree_util.keystr(path): leaf for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]}
 
 

@@ -277,7 +277,7 @@ class BatchedEnv:
     @property
     def qpos(self) -> np.ndarray:
         """Joint positions of the whole scene, [N, nq], numpy."""
-        return np.asarray(self._part(".physics.qpos", "numpy"))
+        return np.asarray(self._part(".physics.arms.qpos", "numpy"))
 
     @property
     def object_poses(self) -> Poses:

@@ -17,7 +17,7 @@ class FaultPlace(NamedTuple):
     agent: str
     """Of an arm; "" if it belongs to none, as an object's position."""
     term: str
-    """Such as "observation tool_tip[2]", "reward distance" or "state physics.qpos[3] (joint psm_0/insertion)"."""
+    """Such as "observation tool_tip[2]", "reward distance" or "state physics.arms.qpos[3] (joint psm_0/insertion)"."""
 
     def __str__(self) -> str:
         return f"{self.term} of {self.agent}" if self.agent else self.term
@@ -43,7 +43,7 @@ def fault_place(env: Env, name: str) -> FaultPlace:
 def _of_state(env: Env, path: str, index: int, name: str) -> FaultPlace:
     """Return the place of a number of the carry: of joints with their names."""
     what = f"state {name}"
-    if path in ("physics.qpos", "physics.qvel"):
+    if path in ("physics.arms.qpos", "physics.arms.qvel"):
         joint = mujoco.mj_id2name(env.scene.model, mujoco.mjtObj.mjOBJ_JOINT, index)
         return FaultPlace(joint.partition("/")[0], f"{what} (joint {joint})")
     if path == "tips":

@@ -12,13 +12,13 @@ if TYPE_CHECKING:
     from surgical_marl.engines.choose import Engine
     from surgical_marl.scenes.scene import Scene
 
-STATE = ".physics.objects.bodies"
+STATE = ".physics.rigid_bodies.bodies"
 """Where an engine has the centres of mass and the orientations of objects."""
 SIZE = ".hidden.objects.size"
 """Where it has by what their lengths are multiplied, if the scene randomises objects."""
-HELD = ".physics.objects.grips.held"
+HELD = ".physics.rigid_bodies.grips.held"
 """Where it has for how long arms have held them."""
-FORCE = ".physics.objects.grips.force"
+FORCE = ".physics.rigid_bodies.grips.force"
 """Where it has the normal forces of fingers on them."""
 
 
@@ -34,7 +34,7 @@ class FreeObjects:
         """Return which arms hold which objects, [N, k, arms] bool."""
         if not self.count:
             return np.zeros((num_envs, 0, self._arms), bool)
-        from surgical_marl.physics.contact.contact_model import DWELL
+        from surgical_marl.physics.contact.grips import DWELL
 
         return np.asarray(engine.read(HELD, "numpy") >= np.float32(DWELL))
 

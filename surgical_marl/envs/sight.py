@@ -97,7 +97,7 @@ class Sight:
         objects = None
         if self._free_objects.count:
             objects = self._free_objects.read(self._engine, self._num_envs, self._library, place)
-        return self._pictures.draw(self._read(f"{place}.physics.qpos"), self._rows(place), objects)
+        return self._pictures.draw(self._read(f"{place}.physics.arms.qpos"), self._rows(place), objects)
 
     def _rows(self, place: str) -> Any:
         if not self._matched:

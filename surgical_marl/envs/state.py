@@ -9,7 +9,7 @@ if TYPE_CHECKING:
 
     from surgical_marl.physics.outputs import ArmView, Contacts
     from surgical_marl.physics.plant import Hidden
-    from surgical_marl.physics.systems.dynamics import Physics
+    from surgical_marl.physics.state import Physics
 
 
 class Carry(NamedTuple):

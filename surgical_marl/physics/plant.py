@@ -24,8 +24,9 @@ from jax import Array
 from surgical_marl.control.controller import Controller
 from surgical_marl.physics.outputs import ArmView, Contacts, ObjectView
 from surgical_marl.physics.randomisation import Factors
-from surgical_marl.physics.simulator import Physics, Simulator
-from surgical_marl.physics.systems.rigid_bodies import product
+from surgical_marl.physics.simulator import Simulator
+from surgical_marl.physics.state import Physics
+from surgical_marl.physics.systems.rigid_motion import product
 from surgical_marl.scenes.poses import Pose
 
 Views = dict[str, ArmView]
@@ -139,7 +140,7 @@ class Plant:
         """
         simulator = self.actual(hidden)
         physics = simulator.at(jnp.asarray(simulator.scene.home, jnp.float32) if qpos is None else qpos, poses)
-        return physics if hidden is None else physics._replace(ctrl=hidden.motor)
+        return physics if hidden is None else physics.with_arms(ctrl=hidden.motor)
 
     def command(
         self, physics: Physics, hidden: Hidden | None, actions: dict[str, Array]
@@ -151,17 +152,17 @@ class Plant:
         simulator = self._simulator
         if hidden is None:
             ctrl, infos = self._controller.command(physics.ctrl, physics.qpos, actions)
-            return physics._replace(ctrl=ctrl), None, infos
+            return physics.with_arms(ctrl=ctrl), None, infos
         actions, pending = self._delay(actions, hidden)
         read = physics.qpos + hidden.offset + self._play(physics, hidden)
         motor, infos = self._controller.command(hidden.motor, read, actions)
         hidden = hidden._replace(motor=motor, pending=pending)
         if not self._backlash.any():
-            return physics._replace(ctrl=motor), hidden, infos
+            return physics.with_arms(ctrl=motor), hidden, infos
         # a joint's target moves once the motor has crossed the play
         half, target = hidden.backlash[simulator.address] / 2, motor[simulator.drives]
         target = jnp.clip(physics.ctrl[simulator.drives], target - half, target + half)
-        return physics._replace(ctrl=jnp.matmul(simulator.moment, target)), hidden, infos
+        return physics.with_arms(ctrl=jnp.matmul(simulator.moment, target)), hidden, infos
 
     def advance(self, physics: Physics, hidden: Hidden | None) -> tuple[Physics, Contacts, Views]:
         """Advance physics by one control step, as `Simulator.advance` does, with the drawn values in place."""
@@ -188,7 +189,7 @@ class Plant:
             return views
         noise = jax.random.normal(key, self._noise.shape) * self._noise
         read = physics.qpos + hidden.offset + self._play(physics, hidden) + noise
-        return self._simulator.view(physics._replace(qpos=read, ctrl=hidden.motor), contacts)
+        return self._simulator.view(physics.with_arms(qpos=read, ctrl=hidden.motor), contacts)
 
     def _delay(self, actions: dict[str, Array], hidden: Hidden) -> tuple[dict[str, Array], Array]:
         """Return the actions that act now, and those that are stored for later steps."""

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from surgical_marl.physics.contact.contact_pairs import Tables
-from surgical_marl.physics.systems.rigid_bodies import Masses
+from surgical_marl.physics.contact.contact_pairs import ContactPairs
+from surgical_marl.physics.systems.rigid_motion import Masses
 
 LENGTHS = "start", "end", "middle", "radius", "around", "bound", "centers"
 """Tables of lengths of objects, [k, ...]."""
@@ -26,7 +26,7 @@ class Factors(NamedTuple):
     """The coefficient of friction."""
 
 
-def varied(tables: Tables, factors: Factors) -> Tables:
+def varied(tables: ContactPairs, factors: Factors) -> ContactPairs:
     """Return the tables of objects that differ from their files."""
     own: Any = copy.copy(tables)
     size, mass = factors.size, factors.mass
@@ -37,11 +37,11 @@ def varied(tables: Tables, factors: Factors) -> Tables:
     # of two surfaces the geometric mean counts
     rough = jnp.sqrt(jnp.append(factors.friction, 1.0))
     own.sliding = rough[tables.first_object] * rough[tables.second_object] * tables.sliding
-    found: Tables = own
+    found: ContactPairs = own
     return found
 
 
-def grown(tables: Tables, factors: Factors, frames: Array) -> Array:
+def grown(tables: ContactPairs, factors: Factors, frames: Array) -> Array:
     """Return by how much centres of mass move if objects with axes [k, 3, 3] get their size where they lie, m, [k, 3].
 
     They grow from their lowest points, and to the sides from the origins of their frames: so what lies on something

@@ -1,7 +1,7 @@
 """The physics of a scene in pure JAX, for one environment: commands in, newest state and contacts out.
 
     simulator = Simulator(load_scene("bimanual_psm"))
-    physics = simulator.home._replace(ctrl=commands)         # [nu], those of `surgical_marl.control`
+    physics = simulator.home.with_arms(ctrl=commands)         # [nu], those of `surgical_marl.control`
     physics, contacts, views = simulator.advance(physics)
 
 docs/physics.md says how a step is computed and compares it with C MuJoCo.
@@ -20,15 +20,12 @@ import numpy as np
 from jax import Array
 
 from surgical_marl.content import unknown
-from surgical_marl.physics.contact.arm_contacts import Pairs
-from surgical_marl.physics.joined import Joined
 from surgical_marl.physics.outputs import ArmView, Contacts, ObjectView, Touch
 from surgical_marl.physics.randomisation import Factors
-from surgical_marl.physics.systems.arms import Kind
-from surgical_marl.physics.systems.dynamics import Dynamics, Physics
-from surgical_marl.physics.together import Together
+from surgical_marl.physics.state import ARMS, RIGID_BODIES, ArmState, Physics
+from surgical_marl.physics.step import Step
 from surgical_marl.scenes.poses import Pose
-from surgical_marl.scenes.scene import Scene, payload_body
+from surgical_marl.scenes.scene import Scene
 from surgical_marl.scenes.timing import DECIMATION
 
 
@@ -41,11 +38,7 @@ class Simulator:
 
     def __init__(self, scene: Scene, decimation: int = DECIMATION) -> None:
         self.scene = scene
-        self._fields: dict[str, Array] = {}
-        self._pairs, self._together = Pairs(scene.model), Dynamics(scene.model)
-        self._kinds = [Kind(scene, agents) for agents in scene.types.values()]
-        self._joined = Joined(self._together, self._pairs, self._kinds)
-        self._objects = Together(scene, self._together, self._pairs, self._kinds) if scene.objects else None
+        self.step = Step(scene)
         self.decimation, self.control_dt = decimation, decimation * scene.model.opt.timestep
         self._index_joints()
         self._index_pairs()
@@ -66,12 +59,13 @@ class Simulator:
         Raises:
             ValueError: a name that is not that of a free object.
         """
-        still = jnp.zeros(self.scene.model.nv, jnp.float32)
         for name in poses or {}:
             if name not in self.scene.free_objects:
                 raise unknown(f"free object of scene {self.scene.name!r}", name, list(self.scene.free_objects))
-        objects = self._objects.start(self.scene, poses or {}) if self._objects else ()
-        return Physics(qpos, still, still, self._holding(qpos), objects)
+        states: dict[str, Any] = {ARMS: self.step.arms.start(qpos, self._holding(qpos))}
+        if self.step.bodies:
+            states[RIGID_BODIES] = self.step.bodies.start(poses or {})
+        return Physics(states)
 
     def _holding(self, qpos: Any) -> Any:
         """Return the commands [nu] that keep the arms where they are."""
@@ -87,7 +81,7 @@ class Simulator:
         """
         # A reverse derivative computes each physics step again, instead of keeping all that is in it: that takes less
         # time, to compile and to run, and far less memory. Without a derivative it changes nothing.
-        step = jax.checkpoint(self._step)
+        step = jax.checkpoint(self.step)
 
         def substep(state: tuple[Physics, Touch], _: None) -> tuple[tuple[Physics, Touch], None]:
             return step(*state), None
@@ -95,19 +89,20 @@ class Simulator:
         (physics, touch), _ = jax.lax.scan(substep, (physics, self.untouched), None, length=self.decimation)
         tools, distance = self._look(physics.qpos)
         contacts = Contacts(distance, jnp.maximum(touch.penetration, -distance), touch.force, touch.overflow)
-        handled = touch.handled if self._objects else None
+        handled = touch.handled if self.step.bodies else None
         return physics, contacts, self._view(jnp, physics, tools, contacts, handled)
 
     @property
     def untouched(self) -> Touch:
         """Return the touch of a control step so far, at its beginning."""
-        none = jnp.zeros(self._pairs.count, jnp.float32)
-        arms = len(self.scene.agents) if self._objects else 0
+        none = jnp.zeros(self.step.pairs.count, jnp.float32)
+        arms = len(self.scene.agents) if self.step.bodies else 0
         return Touch(none, none, jnp.zeros((2, arms), jnp.float32), jnp.int32(0))
 
     def objects(self, physics: Physics) -> dict[str, ObjectView]:
         """Return the view of every free object of the scene, by name."""
-        return self._objects.views(physics.objects) if self._objects else {}
+        bodies = self.step.bodies
+        return bodies.view(physics.rigid_bodies.bodies) if bodies else {}
 
     def varied(
         self, stiffness: Array, damping: Array, friction: Array, payload: Array, offset: Array,
@@ -123,24 +118,12 @@ class Simulator:
             offset: by how much the controllers of joints misread their positions, [nq], rad or m.
             objects: factors of the free objects; None if they are as in their files.
         """
-        model, varied, nominal = self._together.model, copy.copy(self), self.scene.model
-        by_position = nominal.actuator_biasprm[:, 1] != 0
-        by_velocity = ~by_position & (nominal.actuator_biasprm[:, 2] != 0)
-        gain = jnp.where(by_position, stiffness, jnp.where(by_velocity, damping, 1.0))
-        pull = model.actuator_biasprm[:, 1] * stiffness
-        misread = pull * (self.moment @ offset[self.address])
-        bias = jnp.stack([misread, pull, model.actuator_biasprm[:, 2] * damping], -1)
-        loaded = self.scene.mounts if self.scene.randomisation.payload else {}
-        bodies = [nominal.body(payload_body(agent, mount.arm)).id for agent, mount in loaded.items()]
-        varied._fields = {
-            "actuator_gainprm": model.actuator_gainprm.at[:, 0].set(model.actuator_gainprm[:, 0] * gain),
-            "actuator_biasprm": model.actuator_biasprm.at[:, :3].set(bias),
-            "dof_frictionloss": model.dof_frictionloss * friction,
-            "dof_damping": model.dof_damping * friction,
-            "body_mass": model.body_mass.at[np.array(bodies, int)].set(payload[: len(bodies)]),
-        }
-        if objects is not None and self._objects:
-            varied._objects = self._objects.varied(objects)
+        varied, bodies = copy.copy(self), self.step.bodies
+        misread = self.moment @ offset[self.address]
+        arms = self.step.arms.randomise(stiffness, damping, friction, payload, misread)
+        if objects is not None and bodies:
+            bodies = bodies.randomise(objects)
+        varied.step = self.step.varied(arms, bodies)
         return varied
 
     def look(self, physics: Physics) -> tuple[Contacts, dict[str, ArmView]]:
@@ -159,29 +142,9 @@ class Simulator:
 
     def _look(self, qpos: Array) -> tuple[tuple[Array, Array], Array]:
         """Return tool tips [arms, 3] and their axes [arms, 3, 3] in the world, and the distance of every pair."""
-        data = self._together.pose(qpos)
+        data = self.step.arms.dynamics.pose(qpos)
         sites = np.array(list(self._sites.values()))
-        return (data.site_xpos[sites], data.site_xmat[sites]), self._pairs.distance(data.geom_xpos, data.geom_xmat)
-
-    def _step(self, physics: Physics, touch: Touch, distance: Array | None = None) -> tuple[Physics, Touch]:
-        """Return the state after one physics step, and the hardest touch up to the start of that step.
-
-        Arms that touch nothing do not affect each other, so each is stepped on its own. `distance` is that of every
-        pair at the start, if it is known.
-        """
-        if not (self._pairs.count or self._objects):
-            return self._apart(physics, touch)
-        data = self._together.pose(physics.qpos)
-        overlap = self._pairs.overlap(data.geom_xpos, data.geom_xmat) if distance is None else (distance < 0).any()
-        if self._objects:
-            return self._objects.step(physics, touch, data, overlap, self._fields)
-        joined = lambda physics, touch: self._joined.step(physics, touch, self._fields)  # noqa: E731
-        return jax.lax.cond(overlap, joined, self._apart, physics, touch)
-
-    def _apart(self, physics: Physics, touch: Touch) -> tuple[Physics, Touch]:
-        for kind in self._kinds:
-            physics = kind.step(physics, self._fields)
-        return physics, touch
+        return (data.site_xpos[sites], data.site_xmat[sites]), self.step.pairs.distance(data.geom_xpos, data.geom_xmat)
 
     def _view(
         self, xp: Any, physics: Physics, tools: tuple[Any, Any], contacts: Contacts, handled: Any = None
@@ -217,7 +180,7 @@ class Simulator:
                 contact_force=contacts.force[touching].max(initial=most[0, i]),
                 bump_force=contacts.force[touching].max(initial=most[1, i]),
                 contact_overflow=contacts.overflow,
-                handles=self._objects.handles(physics.objects, i) if self._objects else {},
+                handles=self.step.grips.view(physics.rigid_bodies.grips, i) if self.step.bodies else {},
             )
         return views
 
@@ -261,8 +224,9 @@ class Simulator:
         distance = np.array([mujoco.mj_geomDistance(model, data, a, b, 100.0, None) for a, b in ids])
         still = np.zeros(model.nv)
         contacts: Any = Contacts(distance, np.maximum(-distance, 0.0), 0.0 * distance, np.int32(0))  # type: ignore[arg-type]
-        objects = self._objects.start(self.scene, {}) if self._objects else ()
-        physics: Any = Physics(self.scene.home, still, still, self._holding(self.scene.home), objects)  # type: ignore[arg-type]
+        physics: Any = Physics({ARMS: ArmState(self.scene.home, still, still, self._holding(self.scene.home))})  # type: ignore[arg-type]
+        if self.step.bodies:
+            physics = physics.with_systems(rigid_bodies=self.step.bodies.start({}))
         sites = list(self._sites.values())
         views = self._view(np, physics, (data.site_xpos[sites], data.site_xmat[sites].reshape(-1, 3, 3)), contacts)
         kinds = {"b": jnp.bool_, "i": jnp.int32}

@@ -73,7 +73,7 @@ class _StillJaw:
 
         It is the present command in the environments where the policy `begins`, [N] bool.
         """
-        command = to_numpy(self._env.engine.read(".physics.ctrl", "numpy"))[:, self._actuator]
+        command = to_numpy(self._env.engine.read(".physics.arms.ctrl", "numpy"))[:, self._actuator]
         self._kept = np.where(begins, command, self._kept)
         opened, closed = np.abs(command + np.clip(self._ends - command, -self._reach, self._reach) - self._kept)
         return np.where(opened < closed, 1.0, 0.0)

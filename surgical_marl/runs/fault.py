@@ -4,7 +4,7 @@ The file is an npz file without pickles:
 
     about               JSON text: layout, kind "fault", environment (its options), engine, device, seed, index (of the
                         environment), iteration (of a training, or null), place, versions
-    start<path>         all that the first step depends on, as in "start.physics.qpos", [1, ...]
+    start<path>         all that the first step depends on, as in "start.physics.arms.qpos", [1, ...]
     actions/<agent>     what each arm was commanded, [T, 1, a] float32; after the last of these steps the fault is there
 """
 

@@ -3,7 +3,7 @@
 `surgical-marl view --record DIR` writes takes, and `surgical-marl replay FILE` steps one again. A take is an npz file:
 
     about               JSON text: layout, environment (its options), engine, device, num_envs, seed, movers, versions
-    start<path>         all that the first step depends on, as in "start.physics.qpos", [N, ...]
+    start<path>         all that the first step depends on, as in "start.physics.arms.qpos", [N, ...]
     actions/<agent>     what each arm was commanded, [T, N, a] float32
     rewards/<agent>     [T, N] float32
     qpos                joint positions after each step, [T, N, nq] float32

@@ -29,15 +29,17 @@ def test_what_is_timed_is_what_c_mujoco_steps() -> None:
     rows, steps = 8, HOLD * LAPS // 2
     engine = make_engine(PhysicsAlone(Env("reach", "ecm")), rows, "fused", "cpu")
     engine.reset(0)
-    engine.write(".physics.qpos", course.qpos[:rows])
-    engine.write(".physics.qvel", course.qvel[:rows])
+    engine.write(".physics.arms.qpos", course.qpos[:rows])
+    engine.write(".physics.arms.qvel", course.qvel[:rows])
     step = contenders._along(engine, [command[:rows] for command in course.commands])
     for _ in range(steps):
         step()
     control = course.commands[:, :rows].astype(float).repeat(HOLD, 0).swapaxes(0, 1)[:, :steps]
     state = full_state(course.qpos[:rows], course.qvel[:rows])
     found, _ = rollout.rollout(scene.model, mujoco.MjData(scene.model), state, control)
-    np.testing.assert_allclose(engine.read(".physics.qpos", "numpy"), found[:, -1, 1 : 1 + scene.model.nq], atol=1e-5)
+    np.testing.assert_allclose(
+        engine.read(".physics.arms.qpos", "numpy"), found[:, -1, 1 : 1 + scene.model.nq], atol=1e-5
+    )
     assert np.abs(found[:, -1, 1 : 1 + scene.model.nq] - course.qpos[:rows]).max() > 1e-2, "nothing moved"
 
 
@@ -47,12 +49,12 @@ def test_steps_made_at_once_are_those_made_one_by_one() -> None:
     for steps in (1, HOLD):
         engine = make_engine(PhysicsAlone(Env("reach", "ecm"), steps), rows, "fused", "cpu")
         engine.reset(0)
-        engine.write(".physics.qpos", course.qpos[:rows])
-        engine.write(".physics.qvel", course.qvel[:rows])
+        engine.write(".physics.arms.qpos", course.qpos[:rows])
+        engine.write(".physics.arms.qvel", course.qvel[:rows])
         step = contenders._along(engine, [command[:rows] for command in course.commands], HOLD // steps)
         for _ in range(2 * HOLD // steps):
             step()
-        found.append(engine.read(".physics.qpos", "numpy"))
+        found.append(engine.read(".physics.arms.qpos", "numpy"))
     np.testing.assert_allclose(*found, atol=1e-6)
     assert np.abs(found[0] - course.qpos[:rows]).max() > 1e-3, "nothing moved"
 
@@ -74,7 +76,7 @@ def test_as_many_environments_differ_as_are_asked_for() -> None:
 def test_where_a_policy_plays_environments_are_anywhere_in_their_episodes() -> None:
     """The later in its episode, the nearer is a tip to its goal; and the policy goes on from there."""
     workload, count = Workload(scene="ecm", motion="policy", device="cpu"), 64
-    paths = [".steps", ".physics.qpos", ".goal.targets"]
+    paths = [".steps", ".physics.arms.qpos", ".goal.targets"]
     (steps, qpos, goals), actions = played("reach-ecm", workload, count, LAPS, paths, np.random.default_rng(0))
     most = BatchedEnv("reach", "ecm", num_envs=1, device="cpu").max_steps
     assert steps.min() < 0.1 * most and steps.max() > 0.8 * most and len(np.unique(steps)) > 20
@@ -96,11 +98,11 @@ def test_arms_that_grasp_are_not_in_the_wall() -> None:
     """A peg board has a wall between two arms that may stand anywhere. Of 48 such starts two used to be in it."""
     simulator = Env("peg_transfer", "bimanual_psm_pegs").simulator
     starts = grasps(simulator.scene, 48, np.random.default_rng(7))
-    assert simulator._objects and (starts.arms > 1).any()
-    tables, begin = simulator._objects.tables, jax.vmap(simulator.at)(jnp.float32(starts.qpos))
+    assert simulator.step.bodies and (starts.arms > 1).any()
+    tables, begin = simulator.step.bodies.tables, jax.vmap(simulator.at)(jnp.float32(starts.qpos))
     placed = {"position": jnp.float32(starts.position), "quaternion": jnp.float32(starts.quaternion)}
-    objects = begin.objects._replace(bodies=begin.objects.bodies._replace(**placed))
-    depths = np.asarray(jax.jit(jax.vmap(simulator._objects.depths))(begin._replace(objects=objects)))
+    objects = begin.rigid_bodies._replace(bodies=begin.rigid_bodies.bodies._replace(**placed))
+    depths = np.asarray(jax.jit(jax.vmap(simulator.step.depths))(begin.with_systems(rigid_bodies=objects)))
     assert depths[:, tables.owner < tables.arms].max() < 0
 
 
@@ -112,7 +114,7 @@ def test_objects_are_carried_along_a_course() -> None:
     )
     course = make_course(workload)
     assert len(np.unique(course.qpos, axis=0)) == len(course.qpos) == 280
-    assert set(course.parts) >= {".physics.qpos", ".physics.ctrl", ".physics.objects.bodies.position"}
+    assert set(course.parts) >= {".physics.arms.qpos", ".physics.arms.ctrl", ".physics.rigid_bodies.bodies.position"}
     start, above = load_scene("psm_needle").objects["needle"].position, course.objects.bodies.position[..., 2]
     assert 0.4 < (np.abs(above - start[2]) > 2e-3).mean() < 0.9, "a quarter lies where the scene puts it"
     assert 0.4 < course.touching < 0.95

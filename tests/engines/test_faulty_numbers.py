@@ -41,7 +41,7 @@ def test_a_state_at_fault_ends_its_episode_and_the_next_step_begins_another(engi
     bad = {index: value for index, value in BAD.items() if index < count} or {0: np.nan}
     env.reset(seed=0)
     assert (env.step(still(env)).faults == -1).all()
-    poisoned(env, ".physics.qvel", bad)
+    poisoned(env, ".physics.arms.qvel", bad)
     first = env.step(still(env))
     assert sorted(np.flatnonzero(first.faults >= 0)) == sorted(bad)
     for index in bad:
@@ -58,7 +58,7 @@ def test_a_state_at_fault_ends_its_episode_and_the_next_step_begins_another(engi
 def test_other_environments_go_on_bit_for_bit() -> None:
     env, whole = (BatchedEnv("reach", "psm", num_envs=N, engine="fused", device="cpu") for _ in range(2))
     env.reset(seed=0), whole.reset(seed=0)
-    poisoned(env, ".physics.qpos", BAD)
+    poisoned(env, ".physics.arms.qpos", BAD)
     others = np.delete(np.arange(N), list(BAD))
     for _ in range(4):
         found, wanted = env.step(still(env)), whole.step(still(env))
@@ -79,7 +79,7 @@ def test_a_reward_at_fault_names_its_term_and_the_state_goes_on() -> None:
 def test_an_end_that_was_ordered_before_a_checkpoint_is_no_new_fault_after_it() -> None:
     env = BatchedEnv("reach", "psm", num_envs=4, engine="fused", device="cpu")
     env.reset(seed=0)
-    poisoned(env, ".physics.qpos", {2: np.nan})
+    poisoned(env, ".physics.arms.qpos", {2: np.nan})
     env.step(still(env))
     carry = env.carry()
     env.reset(seed=1)
@@ -87,7 +87,7 @@ def test_an_end_that_was_ordered_before_a_checkpoint_is_no_new_fault_after_it() 
     assert (env.step(still(env)).faults == -1).all() and np.isfinite(env.qpos).all()
 
 
-@pytest.mark.parametrize("part", [".physics.qpos", ".actions"])
+@pytest.mark.parametrize("part", [".physics.arms.qpos", ".actions"])
 def test_the_kernel_of_a_gpu_does_what_numpy_does(part: str) -> None:
     """Here it runs on the CPU, on the same arrays."""
     found: list[Any] = []

@@ -13,7 +13,7 @@ import pytest
 from surgical_marl import list_scenes
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.physics.contact.arm_contacts import SLOTS
-from surgical_marl.physics.simulator import Physics
+from surgical_marl.physics.state import ArmState, Physics
 from surgical_marl.scenes.timing import DECIMATION, TIMESTEP
 from tests.helpers.actions import random_actions
 from tests.helpers.commands import commander
@@ -190,7 +190,8 @@ def settle(env: Any, data: mujoco.MjData, start: dict[str, np.ndarray]) -> Any:
     pressed = env.scene.full_qpos({**start, "psm_0": start["psm_0"] - [0, 0.04, 0, 0, 0, 0, 0]})
     data.ctrl[:] = env.scene.moment @ pressed
     mujoco.mj_step(env.scene.model, data, 10 * DECIMATION)
-    return Physics(*(np.float32(a) for a in (data.qpos, data.qvel, data.qacc_warmstart, data.ctrl)))
+    arrays = (np.float32(a) for a in (data.qpos, data.qvel, data.qacc_warmstart, data.ctrl))
+    return Physics({"arms": ArmState(*arrays)})  # type: ignore[arg-type]
 
 
 @cache
@@ -291,7 +292,7 @@ def test_contacts_that_are_left_out_are_counted() -> None:
     ids = zip(model.pair_geom1, model.pair_geom2, strict=True)
     overlapping = sum(mujoco.mj_geomDistance(model, data, a, b, 1.0, None) < 0 for a, b in ids)
     assert overlapping > SLOTS
-    env.engine.write(".physics.qpos", qpos.astype(np.float32))
+    env.engine.write(".physics.arms.qpos", qpos.astype(np.float32))
     infos = env.step(random_actions(env, np.random.default_rng(0))).infos
     for agent in env.agents:
         left_out = infos[agent]["contact_overflow"]

@@ -95,7 +95,7 @@ def test_at_own_nothing_depends_on_other_arms(task: str, scene: str) -> None:
     start = env.task.start(jax.random.PRNGKey(0))
     physics = env.plant.at_rest(None, start.qpos, start.poses)
     objects = env.plant.objects(physics, None)
-    moved = physics._replace(qpos=physics.qpos + np.float32(0.01))
+    moved = physics.with_arms(qpos=physics.qpos + np.float32(0.01))
     here, there = (env.simulator.look(now)[1] for now in (physics, moved))
     for agent, observed in env.observed.items():
         near = {part: getattr(there[agent], part) for part in ("nearest_tip", "min_distance")}

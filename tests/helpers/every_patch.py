@@ -1,4 +1,4 @@
-"""Contacts without any search: every capsule of every pair of bodies, for comparison with what `Finder` finds."""
+"""Contacts without any search: every capsule of every pair of bodies, for comparison with what `Detection` finds."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from surgical_marl.physics.contact.contact_patch import TILT, TILT_IN_JAW, Patch
 from surgical_marl.physics.contact.detection import AHEAD
 from surgical_marl.physics.contact.shapes import between_segments, on_plate
 from surgical_marl.physics.simulator import Physics
-from surgical_marl.physics.together import Together
+from surgical_marl.physics.step import Step
 from surgical_marl.scenes.scene import Scene
 
 UNEVEN = 0.03
@@ -33,13 +33,13 @@ class Upright(NamedTuple):
     radius: np.ndarray
 
 
-def lying(together: Together, states: Physics, seed: int) -> Physics:
+def lying(step: Step, states: Physics, seed: int) -> Physics:
     """Return states [n] in which each object lies about flat on a finger or on something fixed.
 
     Arms move in all of them, objects in half.
     """
-    rng, tables, count = np.random.default_rng(seed), together.tables, len(states.qpos)
-    poses = jax.jit(jax.vmap(together._dynamics.pose))(states.qpos)
+    rng, tables, count = np.random.default_rng(seed), step.bodies.tables, len(states.qpos)
+    poses = jax.jit(jax.vmap(step.arms.dynamics.pose))(states.qpos)
     centres, frames = (np.asarray(x)[:, tables.pad_geoms] for x in (poses.geom_xpos, poses.geom_xmat))
     position, turned = np.zeros((count, tables.count, 3)), np.zeros((count, tables.count, 4))
     for e in range(count):
@@ -47,19 +47,19 @@ def lying(together: Together, states: Physics, seed: int) -> Physics:
                     strict=True)  # fmt: skip
         plates = Upright(*(np.concatenate(part) for part in parts))
         for o in range(tables.count):
-            position[e, o], turned[e, o] = _laid(together, o, plates, rng)
+            position[e, o], turned[e, o] = _laid(step, o, plates, rng)
     single = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
     flies = rng.normal(size=(count, tables.count, 6)) * [*[0.1] * 3, *[10.0] * 3] * (rng.random((count, 1, 1)) < 0.5)
-    bodies = states.objects.bodies._replace(
+    bodies = states.rigid_bodies.bodies._replace(
         position=single(position), quaternion=single(turned), velocity=single(flies)
     )
     qvel = single(0.3 * rng.normal(size=states.qvel.shape))
-    return states._replace(qvel=qvel, objects=states.objects._replace(bodies=bodies))
+    return states.with_arms(qvel=qvel).with_systems(rigid_bodies=states.rigid_bodies._replace(bodies=bodies))
 
 
-def _laid(together: Together, o: int, plates: Upright, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def _laid(step: Step, o: int, plates: Upright, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Return where an object is, and how it is turned, that lies somewhere on one of some plates."""
-    tables, p = together.tables, rng.integers(len(plates.radius))
+    tables, p = step.bodies.tables, rng.integers(len(plates.radius))
     frame, up = plates.frame[p], plates.frame[p][:, 2]
     side = Rotation.from_euler("zx", [rng.uniform(0, 2 * np.pi), rng.integers(4) * np.pi / 2])
     right_handed = Rotation.from_matrix(np.column_stack([frame[:, 0], np.cross(up, frame[:, 0]), up]))
@@ -70,22 +70,22 @@ def _laid(together: Together, o: int, plates: Upright, rng: np.random.Generator)
     return plates.centre[p] + frame[:, :2] @ beside + height * up, turn.as_quat(scalar_first=True)
 
 
-def every_patch(together: Together, scene: Scene, states: Physics, dt: float) -> Patch:
+def every_patch(step: Step, scene: Scene, states: Physics, dt: float) -> Patch:
     """Return the patches of all pairs in states [n], by numbers of pairs, [n, g]."""
-    tables, places = together.tables, Places(together.tables)
+    tables, places = step.bodies.tables, Places(step.bodies.tables)
 
     @jax.jit
     @jax.vmap
     def patches(state: Physics, ways: dict[str, Way]) -> Patch:
-        data = together._dynamics.pose(state.qpos)
-        placed, found = places.place(data, places.joints(data), state.qvel, state.objects.bodies, dt), []
+        data = step.arms.dynamics.pose(state.qpos)
+        placed, found = places.place(data, places.joints(data), state.qvel, state.rigid_bodies.bodies, dt), []
         torsion = np.split(tables.torsion, np.cumsum([len(meeting.one) for meeting in tables.meetings])[:-1])
         for meeting, own in zip(tables.meetings, torsion, strict=True):
             one = lambda row, meeting=meeting: _patch(places, placed, ways, meeting, *row)  # noqa: E731
             found.append(jax.lax.map(one, (meeting.one, meeting.other, own)))
         return jax.tree.map(lambda *parts: jnp.concatenate(parts), *found)
 
-    return jax.tree.map(np.asarray, patches(states, _ways(together, scene.model, states, dt)))
+    return jax.tree.map(np.asarray, patches(states, _ways(step, scene.model, states, dt)))
 
 
 def _patch(
@@ -112,9 +112,9 @@ def _patch(
     return find_patch(lambda _: seen, 1, 1, middle, axes, tilt, torsion, middle if lies else None)
 
 
-def _ways(together: Together, model: mujoco.MjModel, states: Physics, dt: float) -> dict[str, Way]:
+def _ways(step: Step, model: mujoco.MjModel, states: Physics, dt: float) -> dict[str, Way]:
     """Return how bodies move in a step: fingers and links as C MuJoCo says, objects as they fly and spin."""
-    tables, data, bodies = together.tables, mujoco.MjData(model), states.objects.bodies
+    tables, data, bodies = step.bodies.tables, mujoco.MjData(model), states.rigid_bodies.bodies
     geoms = {"pads": tables.pad_geoms, "links": tables.near}
     moves = {kind: np.zeros((len(states.qpos), len(of), 2, 3), np.float32) for kind, of in geoms.items()}
     for e, (qpos, qvel) in enumerate(zip(np.asarray(states.qpos), np.asarray(states.qvel), strict=True)):

@@ -12,13 +12,11 @@ import numpy as np
 import yaml
 
 import surgical_marl as sm
-from surgical_marl.physics import together
-from surgical_marl.physics.contact.arm_contacts import Pairs
 from surgical_marl.physics.simulator import Simulator
-from surgical_marl.physics.systems import sleeping
-from surgical_marl.physics.systems.dynamics import Dynamics
-from surgical_marl.physics.systems.rigid_bodies import Bodies, rotation
-from surgical_marl.physics.together import Objects, Together
+from surgical_marl.physics.step import Step
+from surgical_marl.physics.systems import rigid_bodies, sleeping
+from surgical_marl.physics.systems.rigid_bodies import RigidBodyState
+from surgical_marl.physics.systems.rigid_motion import Bodies, rotation
 
 DT = 0.0025
 DOWN = np.array([0.0, 0.0, -9.81], np.float32)
@@ -43,40 +41,44 @@ class Falling:
         arms = {"psm_0": {"arm": "psm", "position": [0.0, 0.0, 5.0]}}
         path.write_text(yaml.safe_dump({"arms": arms, "objects": objects}, sort_keys=False))
         self.scene = sm.load_scene(path)
-        self.together = Together(self.scene, Dynamics(self.scene.model), Pairs(self.scene.model), ())
-        self.masses, self.names = self.together.tables.masses, self.together.names
+        self.step = Step(self.scene)
+        self.masses, self.names = self.bodies.tables.masses, self.bodies.names
         self._arms = Simulator(self.scene).home
         self._play = jax.jit(jax.vmap(self._advance, in_axes=(0, 0, None, None)), static_argnums=3)
         self.depths = jax.jit(jax.vmap(self.depth))
         """`depth` in many environments [E]. Without `jit` each call would compile each of its loops once more, and some
         hundred calls take all the memory maps that Linux gives to a process."""
 
-    def begin(self, count: int) -> Objects:
+    @property
+    def bodies(self) -> Any:
+        return self.step.bodies
+
+    def begin(self, count: int) -> RigidBodyState:
         """Return the objects where the scene has them, [count]."""
-        start = self.together.start(self.scene, {})
+        start = self.bodies.start({})
         return jax.tree.map(lambda x: jnp.repeat(x[None], count, 0), start)
 
     def play(
-        self, objects: Objects, seconds: float, gravity: np.ndarray = DOWN, slow: float = sleeping.SLOW
-    ) -> tuple[Objects, Trace]:
+        self, objects: RigidBodyState, seconds: float, gravity: np.ndarray = DOWN, slow: float = sleeping.SLOW
+    ) -> tuple[RigidBodyState, Trace]:
         """Return the objects after a time, and what they did. With `slow` 0 m/s nothing counts as at rest."""
         each = jnp.broadcast_to(jnp.asarray(gravity, jnp.float32), (len(objects.bodies.position), 3))
         objects, path = self._play(objects, each, slow, round(seconds / DT))
         return objects, Trace(*(np.asarray(part, float) for part in path))
 
-    def _advance(self, objects: Objects, gravity: Any, slow: Any, steps: int) -> tuple[Objects, Trace]:
-        def step(objects: Objects, _: None) -> tuple[Objects, Trace]:
-            slots = self.together.find(self._arms._replace(objects=objects))
-            objects = self.together._step_objects(objects, slots)
+    def _advance(self, objects: RigidBodyState, gravity: Any, slow: Any, steps: int) -> tuple[RigidBodyState, Trace]:
+        def step(objects: RigidBodyState, _: None) -> tuple[RigidBodyState, Trace]:
+            slots = self.step.slots(self._arms.with_systems(rigid_bodies=objects))
+            objects = self.step.step_bodies(objects, slots)
             bodies, depth = objects.bodies, self.depth(objects)
             return objects, Trace(bodies.position, bodies.quaternion, bodies.velocity, depth)
 
-        with patch.object(together, "GRAVITY", gravity), patch.object(sleeping, "SLOW", slow):
+        with patch.object(rigid_bodies, "GRAVITY", gravity), patch.object(sleeping, "SLOW", slow):
             return jax.lax.scan(step, objects, None, length=steps)
 
-    def depth(self, objects: Objects) -> Any:
+    def depth(self, objects: RigidBodyState) -> Any:
         """Return the deepest overlap of anything, m."""
-        return self.together.depths(self._arms._replace(objects=objects)).max(initial=-1.0)
+        return self.step.depths(self._arms.with_systems(rigid_bodies=objects)).max(initial=-1.0)
 
     def energy(self, path: Trace) -> np.ndarray:
         """Return kinetic and potential energy, J, [E, T, k]."""
@@ -102,7 +104,7 @@ def wide_pad(folder: Path) -> dict[str, str]:
     return {"object": str(path)}
 
 
-def thrown(objects: Objects, **changes: Any) -> Objects:
+def thrown(objects: RigidBodyState, **changes: Any) -> RigidBodyState:
     """Return objects with other fields of their bodies."""
     values = {name: jnp.asarray(value, jnp.float32) for name, value in changes.items()}
     bodies: Bodies = objects.bodies._replace(**values)

@@ -345,7 +345,7 @@ def _make_fault(folder: Path) -> Loader:
     env, settings, path = _env(), Settings(task="reach", scene="psm", engine="fused", device="cpu"), folder / "f.npz"
     env.reset(seed=0)
     start = {name: np.array(value) for name, value in env.carry().items()}
-    start[".physics.qvel"][:] = np.nan
+    start[".physics.arms.qvel"][:] = np.nan
     actions = {agent: np.zeros((3, 1, *space.shape), np.float32) for agent, space in env.action_spaces.items()}
     fault.write_fault(path, env, settings, start, actions, seed=0, index=0, place="state")
 

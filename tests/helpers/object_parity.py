@@ -11,8 +11,11 @@ from surgical_marl.bench.physics import PhysicsAlone
 from surgical_marl.engines.choose import make_engine
 from surgical_marl.envs.env import Env
 
-PARTS = (".qpos", ".qvel", ".objects.bodies.position", ".objects.bodies.quaternion", ".objects.bodies.velocity",
-         ".objects.grips.force", ".objects.grips.position")  # fmt: skip
+PARTS = (
+    *(f".arms.{name}" for name in ("qpos", "qvel")),
+    *(f".rigid_bodies.bodies.{name}" for name in ("position", "quaternion", "velocity")),
+    *(f".rigid_bodies.grips.{name}" for name in ("force", "position")),
+)
 DRAWS = 4
 """Random ways to change last digits. One way is too few: a light needle in a stiff grip answers some far more."""
 
@@ -27,7 +30,7 @@ class Beside:
         self._engine.reset(0)
         plant = self.env.plant
         drawn = jax.vmap(plant.start)(self._engine.read(".key", "numpy"))
-        step = jax.vmap(lambda physics, hidden: plant.actual(hidden)._step(physics, simulator.untouched)[0])
+        step = jax.vmap(lambda physics, hidden: plant.actual(hidden).step(physics, simulator.untouched)[0])
         self._step = jax.jit(lambda physics: step(physics, drawn))
 
     def step(self, now: Any, compared: bool = True) -> Any:
@@ -62,9 +65,11 @@ def _nudged(physics: Any, way: float | np.random.Generator) -> Any:
         towards = way if isinstance(way, float) else way.choice((-99.0, 99.0), values.shape)
         return np.nextafter(values, np.asarray(towards, np.float32))
 
-    bodies = physics.objects.bodies
+    bodies = physics.rigid_bodies.bodies
     moved = bodies._replace(**{part: change(getattr(bodies, part)) for part in ("position", "quaternion", "velocity")})
-    return physics._replace(qpos=change(physics.qpos), objects=physics.objects._replace(bodies=moved))
+    return physics.with_arms(qpos=change(physics.qpos)).with_systems(
+        rigid_bodies=physics.rigid_bodies._replace(bodies=moved)
+    )
 
 
 def _leaves(tree: Any) -> dict[str, np.ndarray]:

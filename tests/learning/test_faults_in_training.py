@@ -38,7 +38,7 @@ def hurt(monkeypatch: pytest.MonkeyPatch, chosen: slice, iteration: int) -> None
     def iterate(self: trainer.Trainer) -> Report:
         if self.iteration == iteration - 1:
             carry = self.env.env.carry()
-            carry[".physics.qvel"][chosen] = FAST
+            carry[".physics.arms.qvel"][chosen] = FAST
             self.env.env.set_carry(carry)
         return original(self)
 
@@ -131,7 +131,7 @@ def test_the_study_finds_a_fault_and_keeps_it(tmp_path: Path, monkeypatch: pytes
     def reset(self: BatchedEnv, *given: Any, **named: Any) -> Any:
         found = original(self, *given, **named)
         carry = self.carry()
-        carry[".physics.qvel"][3] = FAST
+        carry[".physics.arms.qvel"][3] = FAST
         self.set_carry(carry)
         return found
 

@@ -7,7 +7,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from surgical_marl.physics.systems.rigid_bodies import carried, turn
+from surgical_marl.physics.systems.rigid_motion import carried, turn
 from surgical_marl.robots.rotation import matrix_of
 
 NUMBERS = st.floats(-1.0, 1.0, width=32)

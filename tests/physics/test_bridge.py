@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from surgical_marl.physics.solver.arm_newton import Arms, Left
+from surgical_marl.physics.solver.arm_newton import Arms, Condensed
 from surgical_marl.physics.solver.constraint_rows import JointRows, Rows, rows_of
 
 JOINTS = 5
@@ -58,7 +58,7 @@ class _Drawn(NamedTuple):
 
     problem: SimpleNamespace
     here: jax.Array
-    left: Left
+    left: Condensed
     whole: np.ndarray
     """The matrix of all joints, then all objects."""
     force: np.ndarray
@@ -92,7 +92,7 @@ def _drawn(rng: np.random.Generator, arms: int, objects: int, bridge: int) -> _D
         whole[dofs[i][:, None], dofs[i]] = mass[i] + stiff[i]
     none = Rows(single(np.zeros((0, *shape))), *[single([])] * 4)
     felt = -np.einsum("ijk,ik->ij", stiff, here)
-    left = Left(halves(stiff), jnp.ones(arms, bool), *map(single, (felt, half, wide)), jnp.asarray(touched))
+    left = Condensed(halves(stiff), jnp.ones(arms, bool), *map(single, (felt, half, wide)), jnp.asarray(touched))
     problem = SimpleNamespace(mass=halves(mass), smooth=single(smooth), joints=_joints(rng, arms), between=none)
     return _Drawn(problem, single(here), left, whole, np.concatenate([smooth.ravel(), push.ravel()]))
 

@@ -59,5 +59,5 @@ def test_six_arms_step_as_in_c_mujoco(tmp_path: Path) -> None:
     for name, values in (("qpos", qpos), ("qvel", qvel), ("ctrl", ctrl), ("qacc_warmstart", 0 * qvel)):
         engine.write(f".physics.{name}", values)
     engine.step({})
-    off = np.abs(engine.read(".physics.qvel", "numpy") - expected) / limits
+    off = np.abs(engine.read(".physics.arms.qvel", "numpy") - expected) / limits
     assert off.max() < 1e-3

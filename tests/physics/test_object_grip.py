@@ -14,8 +14,8 @@ import pytest
 
 import surgical_marl as sm
 from docs.studies.shaking import CLOSING, Grasps
-from surgical_marl.physics import together
 from surgical_marl.physics.simulator import Simulator
+from surgical_marl.physics.systems import rigid_bodies
 from tests.helpers.commands import commander
 
 STEPS = 240
@@ -43,27 +43,27 @@ def test_a_held_object_breaks_away_at_the_force_that_coulomb_says(tmp_path: Path
     (tmp_path / "ball.yaml").write_text(BALL)
     jaw, each = Grasps([str(tmp_path / "ball.yaml")]), 3
     held, mu = np.zeros(3 * each, int), np.repeat(FRICTIONS, each)
-    assert jaw.simulator._objects
-    tables = jaw.simulator._objects.tables
+    assert jaw.simulator.step.bodies
+    tables = jaw.simulator.step.bodies.tables
     mass, fingers, pads = float(tables.masses.mass[0]), tables.bodies["pads"], tables.pad_geoms
     physics, _ = jaw.play(jaw.begin(held, seed=3), jaw.still(len(held), CLOSING), held)
 
     def frame(physics: Any) -> tuple[Any, Any, Any]:
         """Return the way out of the jaw, how far out the object is, and how far the pads' normals point that way."""
-        data = jaw.simulator._together.pose(physics.qpos)
+        data = jaw.simulator.step.arms.dynamics.pose(physics.qpos)
         out = -data.xmat[fingers][:, :, 2].sum(0)
         out /= jnp.linalg.norm(out)
         lean = jnp.abs(data.geom_xmat[pads][:, :, 0] @ out)  # they are thinnest in x
-        return out, out @ (physics.objects.bodies.position[0] - data.xpos[fingers].mean(0)), lean
+        return out, out @ (physics.rigid_bodies.bodies.position[0] - data.xpos[fingers].mean(0)), lean
 
     def pull(physics: Any, mu: Any) -> Any:
         out, _, _ = frame(physics)
 
         def step(physics: Any, force: Any) -> Any:
             sliding = jnp.full(len(tables.sliding), mu)
-            with patch.object(together, "GRAVITY", out * force / mass), patch.object(tables, "sliding", sliding):
-                physics, _ = jaw.simulator._step(physics, jaw.simulator.untouched)
-            return physics, (*frame(physics)[1:], physics.objects.grips.force[0])
+            with patch.object(rigid_bodies, "GRAVITY", out * force / mass), patch.object(tables, "sliding", sliding):
+                physics, _ = jaw.simulator.step(physics, jaw.simulator.untouched)
+            return physics, (*frame(physics)[1:], physics.rigid_bodies.grips.force[0])
 
         return jax.lax.scan(step, physics, 60 * mu * jnp.arange(STEPS) / STEPS)[1]
 
@@ -89,7 +89,7 @@ def test_a_finger_pressed_on_something_stops_there(
     text = f"arms:\n  psm_0: {{arm: psm, position: [0.0, 0.0, 0.15]}}\nobjects:\n  thing: {thing}\n  needle: {needle}\n"
     (tmp_path / "pressing.yaml").write_text(text)
     simulator = Simulator(sm.load_scene(tmp_path / "pressing.yaml"))
-    objects, scene = simulator._objects, simulator.scene
+    objects, scene = simulator.step.bodies, simulator.scene
     assert objects
     on_arm = np.flatnonzero(objects.tables.owner < objects.tables.arms)
     joints = [joint.name for joint in scene.mounts["psm_0"].arm.actuated]
@@ -100,7 +100,7 @@ def test_a_finger_pressed_on_something_stops_there(
     def step(physics: Any, _: None) -> Any:
         physics, _, views = simulator.advance(command(physics, {"psm_0": down}))
         return physics, (
-            objects.depths(physics)[on_arm].max(),
+            simulator.step.depths(physics)[on_arm].max(),
             views["psm_0"].bump_force,
             jnp.abs(physics.qvel).max(),
         )
@@ -111,12 +111,13 @@ def test_a_finger_pressed_on_something_stops_there(
 
 def test_a_grip_is_no_bump() -> None:
     """The force of a finger on a needle counts in `contact_force` alone, that of another part of the arm in both."""
-    together = Simulator(sm.load_scene("psm_needle"))._objects
-    assert together
-    tables, ours = together.tables, together.tables.owner < together.tables.arms
+    step = Simulator(sm.load_scene("psm_needle")).step
+    assert step.bodies
+    tables = step.bodies.tables
+    ours = tables.owner < tables.arms
     bump = int(np.flatnonzero(ours & (tables.finger == len(tables.fingers)))[0])
     number = jnp.array([tables.grip[0, 0], tables.grip[0, 1], bump])
     for total, expected in ((2, [[20.0], [0.0]]), (3, [[20.0], [3.0]])):
         slots: Any = SimpleNamespace(number=number, total=total)
         pressed: Any = SimpleNamespace(normal=jnp.array([20.0, 19.0, 3.0]))
-        np.testing.assert_array_equal(together._hardest(slots, pressed), expected)
+        np.testing.assert_array_equal(step._hardest(slots, pressed), expected)

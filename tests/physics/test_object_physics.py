@@ -17,10 +17,10 @@ from docs.studies.grasping import Held, judge
 from docs.studies.plain_mujoco import IMPRATIO, TOLERANCE
 from docs.studies.shaking import CHUNK, OBJECTS, Grasps
 from surgical_marl.envs.batch import BatchedEnv
-from surgical_marl.physics import together
 from surgical_marl.physics.contact.contact_model import FASTEST
 from surgical_marl.physics.simulator import Simulator
-from surgical_marl.physics.together import Objects
+from surgical_marl.physics.systems import rigid_bodies
+from surgical_marl.physics.systems.rigid_bodies import RigidBodyState
 from surgical_marl.policies.oracle import oracle
 from surgical_marl.robots.rotation import quaternion, turned
 from surgical_marl.scenes.load import load_scene
@@ -136,7 +136,7 @@ def test_what_is_put_down_on_a_blunt_edge_or_flat_comes_to_rest_there(falling: F
     assert np.abs(path.position[:, -1, :, 2] - place[..., 2]).max() < 3e-4, "something rolled over"
 
 
-def comes_to_rest(falling: Falling, start: Objects) -> Trace:
+def comes_to_rest(falling: Falling, start: RigidBodyState) -> Trace:
     """Return what objects do in 2 s; after that they lie still, and go on to do so."""
     objects, path = falling.play(start, SECONDS)
     assert path.depth[:, -1].max() < 1e-5 and np.abs(path.velocity[:, -1, :, :3]).max() < 1e-3
@@ -228,17 +228,17 @@ def test_what_an_arm_slides_along_a_floor_stays_on_it(tmp_path: Path) -> None:
     arms = {"psm_0": {"arm": "psm", "position": [0.0, 0.0, 0.25]}}
     (tmp_path / "slide.yaml").write_text(yaml.safe_dump({"arms": arms, "objects": objects}))
     simulator, push = Simulator(load_scene(tmp_path / "slide.yaml")), np.float32([0.8 * 9.81, 0.0, -9.81])
-    begin = thrown(simulator.home.objects, velocity=simulator.home.objects.bodies.velocity.at[0, 0].set(0.05))
+    begin = thrown(simulator.home.rigid_bodies, velocity=simulator.home.rigid_bodies.bodies.velocity.at[0, 0].set(0.05))
 
     def slide(held: Any) -> Any:
         def step(physics: Any, _: None) -> Any:
-            grips = physics.objects.grips
-            objects = physics.objects._replace(grips=grips._replace(held=0 * grips.held + held))
-            physics, _touch = simulator._step(physics._replace(objects=objects), simulator.untouched)
-            return physics, physics.objects.bodies.position[0]
+            grips = physics.rigid_bodies.grips
+            objects = physics.rigid_bodies._replace(grips=grips._replace(held=0 * grips.held + held))
+            physics, _touch = simulator.step(physics.with_systems(rigid_bodies=objects), simulator.untouched)
+            return physics, physics.rigid_bodies.bodies.position[0]
 
-        with patch.object(together, "GRAVITY", push):
-            return jax.lax.scan(step, simulator.home._replace(objects=begin), None, length=200)[1]
+        with patch.object(rigid_bodies, "GRAVITY", push):
+            return jax.lax.scan(step, simulator.home.with_systems(rigid_bodies=begin), None, length=200)[1]
 
     loose, held = np.asarray(jax.jit(jax.vmap(slide))(jnp.float32([0, 1])), float)
     for way in (loose, held):

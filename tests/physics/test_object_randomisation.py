@@ -15,7 +15,7 @@ from surgical_marl.bench.starts import grasps
 from surgical_marl.content import find
 from surgical_marl.control.controller import Controller
 from surgical_marl.envs.batch import BatchedEnv
-from surgical_marl.physics.contact.contact_pairs import Tables
+from surgical_marl.physics.contact.contact_pairs import ContactPairs
 from surgical_marl.physics.plant import Hidden, Plant
 from surgical_marl.physics.randomisation import Factors, varied
 from surgical_marl.physics.simulator import Simulator
@@ -78,7 +78,7 @@ def test_a_varied_object_is_one_whose_file_says_so(tmp_path: Path) -> None:
         places = ((name, 0.1), ("block", 0.2))
         objects = {f"thing_{i}": {"object": what, "position": [0, y, 0]} for i, (what, y) in enumerate(places)}
         path.write_text(yaml.safe_dump({"arms": {"psm_0": {"arm": "psm"}}, "objects": objects}, sort_keys=False))
-        found[name] = Tables(load_scene(path))
+        found[name] = ContactPairs(load_scene(path))
     other = lambda value: jnp.array([value, 1.0])  # noqa: E731
     ours, truth = varied(found["ring"], Factors(other(size), other(size**3), other(friction))), found["larger.yaml"]
     for field, expected in vars(truth).items():
@@ -94,9 +94,7 @@ def test_what_lies_on_something_lies_there_whatever_its_size(tmp_path: Path) -> 
 
     def look(hidden: Hidden) -> Any:
         physics = plant.at_rest(hidden)
-        together = plant.actual(hidden)._objects
-        assert together
-        return together.depths(physics).max(), plant.objects(physics, hidden)["needle"]
+        return plant.actual(hidden).step.depths(physics).max(), plant.objects(physics, hidden)["needle"]
 
     depth, needle = jax.jit(jax.vmap(look))(hidden)
     assert np.abs(depth).max() < 1e-7
@@ -125,7 +123,7 @@ def test_a_varied_object_slides_where_coulomb_says(tmp_path: Path) -> None:
     places = {f"sled_{i}": {"object": "sled.yaml", "position": [0, 0.1 * i, 0.001]} for i in range(4)}
     scene, factors = Falling(tmp_path, {"floor": {"object": "floor.yaml"}, **places}), np.array([0.5, 0.9, 1.1, 1.5])
     drawn = Factors(*(jnp.asarray(x, jnp.float32) for x in ([1.0, 1.2, 0.8, 1.0], [1.0, 3.0, 0.5, 1.0], factors)))
-    scene.together = scene.together.varied(drawn)
+    scene.step = scene.step.varied(scene.step.arms, scene.bodies.randomise(drawn))
     tilt = np.arctan(0.5)
     _, path = scene.play(scene.begin(1), 0.5, 9.81 * np.array([np.sin(tilt), 0, -np.cos(tilt)]))
     way = path.position[0, -1, :, 0] - path.position[0, 0, :, 0]
@@ -141,11 +139,12 @@ def test_both_engines_step_varied_objects_alike(tmp_path: Path) -> None:
     simulator, starts = both.simulator, grasps(both.env.scene, COUNT, np.random.default_rng(0))
     qpos, position, quaternion = (x.astype(np.float32) for x in starts[:3])
     now = jax.vmap(simulator.at)(qpos)
-    bodies = now.objects.bodies._replace(position=position, quaternion=quaternion)
-    now = now._replace(objects=now.objects._replace(bodies=bodies), ctrl=np.array(now.ctrl) - 0.03)
+    bodies = now.rigid_bodies.bodies._replace(position=position, quaternion=quaternion)
+    now = now.with_systems(rigid_bodies=now.rigid_bodies._replace(bodies=bodies))
+    now = now.with_arms(ctrl=np.array(now.ctrl) - 0.03)
     for k in range(16):
         now = both.step(now, compared=k % 5 == 0)
-    assert (now.objects.grips.force.max((1, 2)) > 1.0).mean() > 0.25
+    assert (now.rigid_bodies.grips.force.max((1, 2)) > 1.0).mean() > 0.25
 
 
 @pytest.mark.parametrize(

@@ -49,7 +49,7 @@ def play(scene: Scene, episodes: int, steps: int, seed: int = 0) -> Iterator[tup
         agent: np.float32([[sides() for _ in range(count)] for _ in range(episodes)]) for agent, count in joints.items()
     }
     of_one = commander(simulator)
-    command = jax.jit(jax.vmap(lambda physics, qpos, action: of_one(physics._replace(qpos=qpos), action)))
+    command = jax.jit(jax.vmap(lambda physics, qpos, action: of_one(physics.with_arms(qpos=qpos), action)))
     physics = jax.tree.map(lambda part: jnp.tile(part, (episodes, 1)), simulator.home)
     qpos = np.tile(scene.home, (episodes, 1, 1))
     for step in range(steps):
@@ -194,7 +194,7 @@ def test_a_urdf_may_list_its_joints_in_any_order(tmp_path: Path) -> None:
         for _ in range(20):
             order = np.concatenate([term.joints for term in Controller(scene, dt=0.02).terms[agent].values()])
             values = np.array([action.get(arm.actuated[joint].name, 0.0) for joint in order], np.float32)
-            physics = commander(simulator)(physics._replace(qpos=jnp.asarray(data.qpos, jnp.float32)), {agent: values})
+            physics = commander(simulator)(physics.with_arms(qpos=jnp.asarray(data.qpos, jnp.float32)), {agent: values})
             data.ctrl[:] = physics.ctrl
             mujoco.mj_step(scene.model, data, DECIMATION)
         mujoco.mj_kinematics(scene.model, data)

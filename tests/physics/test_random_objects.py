@@ -131,14 +131,14 @@ def test_the_fused_engine_steps_random_scenes_as_the_reference_does(seed: int, t
     )
     k = len(scene.free_objects)
     near = np.array([0.0, 0.0, 0.04]) + rng.uniform(-0.02, 0.02, (COUNT, k, 3))
-    bodies = now.objects.bodies._replace(
+    bodies = now.rigid_bodies.bodies._replace(
         position=near.astype(np.float32),
         quaternion=random_turns(rng, COUNT, k).astype(np.float32),
         velocity=(rng.uniform(-1, 1, (COUNT, k, 6)) * ([0.3] * 3 + [12.0] * 3)).astype(np.float32),
     )
-    now, falls = now._replace(objects=now.objects._replace(bodies=bodies)), bodies.velocity[..., :3]
+    now, falls = now.with_systems(rigid_bodies=now.rigid_bodies._replace(bodies=bodies)), bodies.velocity[..., :3]
     for step in range(10):
         now = both.step(now, compared=step in (0, 9))
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(now))
-    pushed = now.objects.bodies.velocity[..., :3] - falls - 10 * DT * DOWN
+    pushed = now.rigid_bodies.bodies.velocity[..., :3] - falls - 10 * DT * DOWN
     assert (np.abs(pushed).max((1, 2)) > 0.01).sum() >= 2, "hardly anything touched"

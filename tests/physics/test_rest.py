@@ -51,8 +51,8 @@ def test_a_struck_object_moves_and_so_does_what_lies_behind_it(blocks: Falling) 
     rested, _ = second(blocks, blocks.begin(8))
     assert at_rest(rested).all()
     velocity, place = np.zeros((8, 3, 6)), np.array(rested.bodies.position)
-    place[:, 1, 0] = place[:, 2, 0] - 2 * blocks.together.tables.bound[0]
-    place[:, 0, 0] = place[:, 1, 0] - 2 * blocks.together.tables.bound[0] - 0.001
+    place[:, 1, 0] = place[:, 2, 0] - 2 * blocks.bodies.tables.bound[0]
+    place[:, 0, 0] = place[:, 1, 0] - 2 * blocks.bodies.tables.bound[0] - 0.001
     velocity[:, 0, 0] = np.linspace(0.6, 1.3, 8)
     struck = thrown(rested, velocity=velocity, position=place)
     (_, path), (_, moved) = second(blocks, struck), second(blocks, struck, slow=0.0)

@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 from surgical_marl import load_scene
 from surgical_marl.physics.solver import constraint_rows
 from surgical_marl.physics.solver.constraint_rows import JointRows, Rows, relax, solve
-from surgical_marl.physics.systems.dynamics import ITERATIONS
+from surgical_marl.physics.systems.arms import ITERATIONS
 
 SEEDS = st.integers(0, 2**32 - 1)
 JOINTS, CONTACTS = 5, 2

@@ -12,13 +12,12 @@ import numpy as np
 import pytest
 import yaml
 
-from surgical_marl.physics.contact.arm_contacts import Pairs
 from surgical_marl.physics.contact.broadphase import Places
 from surgical_marl.physics.contact.detection import AHEAD, MARGIN, NEAR, NEAREST, Slots
 from surgical_marl.physics.contact.shapes import on_plate
 from surgical_marl.physics.simulator import Physics, Simulator
+from surgical_marl.physics.step import Step
 from surgical_marl.physics.systems.dynamics import Dynamics
-from surgical_marl.physics.together import Together
 from surgical_marl.robots.rotation import matrix_of
 from surgical_marl.scenes.load import load_scene
 from surgical_marl.scenes.mjcf import mjcf
@@ -34,7 +33,7 @@ class Thrown(NamedTuple):
     """Two arms at postures over a board, and blocks among their tips, the pegs and the wall."""
 
     scene: Scene
-    together: Together
+    step: Step
     find: Any
     """The search, compiled for states [STATES]."""
     depths: Any
@@ -50,7 +49,7 @@ class Thrown(NamedTuple):
     @property
     def kinds(self) -> np.ndarray:
         """Number of the meeting that each pair is of, [g]."""
-        meetings = self.together.tables.meetings
+        meetings = self.step.bodies.tables.meetings
         return np.repeat(np.arange(len(meetings)), [len(meeting.one) for meeting in meetings])
 
 
@@ -58,30 +57,32 @@ class Thrown(NamedTuple):
 def thrown() -> Thrown:
     scene, rng = load_scene("bimanual_psm_pegs"), np.random.default_rng(0)
     dynamics, home = Dynamics(scene.model), Simulator(scene).home
-    together = Together(scene, dynamics, Pairs(scene.model), ())
+    step = Step(scene)
     qpos = np.asarray(home.qpos) + rng.uniform(-0.5, 0.5, (STATES, len(home.qpos)))
-    depth = np.flatnonzero(together.tables.slides.any(0))[0] + np.array([0, len(home.qpos) // 2])
+    depth = np.flatnonzero(step.bodies.tables.slides.any(0))[0] + np.array([0, len(home.qpos) // 2])
     qpos[:, depth] = np.asarray(home.qpos)[depth] + rng.uniform(-0.02, 0.1, (STATES, 2))
     board = scene.objects["board"].position
     places = board + rng.uniform([-0.1, -0.05, 0.0], [0.1, 0.05, 0.1], (STATES, 2, 3))
     pegs = board + [[x, y, 0.01] for x in (-0.08, -0.06, 0.04, 0.06) for y in (-0.03, 0.0, 0.03)]
     near = rng.random((STATES, 2)) < 0.7
     places[near] = rng.choice(pegs, near.sum()) + rng.normal(size=(near.sum(), 3)) * 0.005
-    fingers = jax.vmap(dynamics.pose)(jnp.asarray(qpos, jnp.float32)).geom_xpos[:, together.tables.pad_geoms[::2]]
+    fingers = jax.vmap(dynamics.pose)(jnp.asarray(qpos, jnp.float32)).geom_xpos[:, step.bodies.tables.pad_geoms[::2]]
     held = rng.random((STATES, 2)) < 0.3
     places[held] = np.asarray(fingers)[held] + rng.normal(size=(held.sum(), 3)) * 0.005
     one = jax.tree.map(lambda x: jnp.repeat(x[None], STATES, 0), home)
-    bodies = one.objects.bodies._replace(
+    bodies = one.rigid_bodies.bodies._replace(
         position=jnp.asarray(places, jnp.float32),
         quaternion=jnp.asarray(random_turns(rng, STATES, 2), jnp.float32),
     )
-    states = one._replace(qpos=jnp.asarray(qpos, jnp.float32), objects=one.objects._replace(bodies=bodies))
-    return searched(scene, together, states, float(dynamics.dt))
+    states = one.with_arms(qpos=jnp.asarray(qpos, jnp.float32)).with_systems(
+        rigid_bodies=one.rigid_bodies._replace(bodies=bodies)
+    )
+    return searched(scene, step, states, float(dynamics.dt))
 
 
-def searched(scene: Scene, together: Together, states: Physics, dt: float) -> Thrown:
-    find, depths = (jax.jit(jax.vmap(what)) for what in (together.find, together.depths))
-    return Thrown(scene, together, find, depths, states, dt)
+def searched(scene: Scene, step: Step, states: Physics, dt: float) -> Thrown:
+    find, depths = (jax.jit(jax.vmap(what)) for what in (step.slots, step.depths))
+    return Thrown(scene, step, find, depths, states, dt)
 
 
 def rod(start: list[float], end: list[float]) -> dict[str, Any]:
@@ -114,7 +115,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Thrown:
         (folder / f"{name}.yaml").write_text(yaml.safe_dump({**weight, **felt, "shapes": shapes}))
     space = Falling(folder, {name: {"object": f"{name}.yaml", "position": at} for name, (_, at) in things.items()})
     states = jax.tree.map(lambda x: jnp.repeat(jnp.asarray(x)[None], STATES, 0), space._arms)
-    return searched(space.scene, space.together, states._replace(objects=space.begin(STATES)), DT)
+    return searched(space.scene, space.step, states.with_systems(rigid_bodies=space.begin(STATES)), DT)
 
 
 def test_every_pair_that_overlaps_is_found_and_none_that_is_far(thrown: Thrown) -> None:
@@ -127,22 +128,22 @@ def test_every_pair_that_overlaps_is_found_and_none_that_is_far(thrown: Thrown) 
             within = set(np.flatnonzero(own > -MARGIN).tolist())  # from there on points are stiff
             assert within <= found
             met |= set(thrown.kinds[list(within)].tolist())
-    assert met >= {k for k, meeting in enumerate(thrown.together.tables.meetings) if meeting.second != "objects"}
+    assert met >= {k for k, meeting in enumerate(thrown.step.bodies.tables.meetings) if meeting.second != "objects"}
 
 
 def flying(states: Physics, speed: float) -> Physics:
     """Return states in which objects fly straight."""
     flies = np.zeros((STATES, 2, 6), np.float32)
     flies[..., :3] = np.random.default_rng(1).normal(size=(STATES, 2, 3)) * speed
-    return states._replace(objects=moved(states.objects, velocity=flies))
+    return states.with_systems(rigid_bodies=moved(states.rigid_bodies, velocity=flies))
 
 
 def test_what_will_overlap_after_a_step_is_found_before_it(thrown: Thrown) -> None:
     """Convex shapes that fly straight are at no time nearer than where they were says, with how fast they come."""
     states = flying(thrown.states, 0.8)  # 2 mm in a step, 9 at most: within AHEAD
-    bodies, slots, come = states.objects.bodies, thrown.search(states), 0
-    after = moved(states.objects, position=bodies.position + thrown.dt * bodies.velocity[..., :3])
-    before, then = (np.asarray(thrown.depths(each)) for each in (states, states._replace(objects=after)))
+    bodies, slots, come = states.rigid_bodies.bodies, thrown.search(states), 0
+    after = moved(states.rigid_bodies, position=bodies.position + thrown.dt * bodies.velocity[..., :3])
+    before, then = (np.asarray(thrown.depths(each)) for each in (states, states.with_systems(rigid_bodies=after)))
     for own, were, numbers, total in zip(then, before, slots.number, slots.total, strict=True):
         if total <= len(numbers):
             overlaps = set(np.flatnonzero(own > 1e-5).tolist())
@@ -163,8 +164,8 @@ def test_what_flies_fast_is_looked_for_ahead_but_not_everywhere(thrown: Thrown) 
 def test_patches_are_those_of_all_capsules_of_all_pairs(world: str, request: pytest.FixtureRequest) -> None:
     """What the search leaves out has no part in a patch, for objects that lie about flat, move and spin."""
     there: Thrown = request.getfixturevalue(world)
-    states, meetings = lying(there.together, there.states, seed=2), there.together.tables.meetings
-    slots, every = there.search(states), every_patch(there.together, there.scene, states, there.dt)
+    states, meetings = lying(there.step, there.states, seed=2), there.step.bodies.tables.meetings
+    slots, every = there.search(states), every_patch(there.step, there.scene, states, there.dt)
     assert (slots.total <= slots.number.shape[1]).all()
     for own, numbers, total in zip(every.reach, slots.number, slots.total, strict=True):
         found = set(numbers[:total].tolist())
@@ -187,11 +188,11 @@ def test_patches_are_those_of_all_capsules_of_all_pairs(world: str, request: pyt
 
 def test_no_capsule_is_nearer_to_a_plate_than_it_seems(thrown: Thrown) -> None:
     """And few seem to be near: balls around the capsules let nearly twice as many seem to be."""
-    tables, model = thrown.together.tables, Dynamics(thrown.scene.model)
+    tables, model = thrown.step.bodies.tables, Dynamics(thrown.scene.model)
     places, capsules = Places(tables), np.arange(tables.radius.shape[1], dtype=np.int32)
 
     def gaps(state: Physics) -> Any:
-        data, bodies = model.pose(state.qpos), state.objects.bodies
+        data, bodies = model.pose(state.qpos), state.rigid_bodies.bodies
         placed = places.place(data, places.joints(data), state.qvel, bodies, 0.0)
 
         def of_pair(pair: Any) -> Any:
@@ -214,8 +215,8 @@ def test_no_capsule_is_nearer_to_a_plate_than_it_seems(thrown: Thrown) -> None:
 
 def test_overlaps_of_capsules_are_those_of_mujoco(thrown: Thrown) -> None:
     """Of all pairs of capsules that are within 5 cm, as `mj_geomDistance` measures them."""
-    tables, scene, seen, far = thrown.together.tables, thrown.scene, 0, 0.05
-    depths, bodies = np.asarray(thrown.depths(thrown.states)), thrown.states.objects.bodies
+    tables, scene, seen, far = thrown.step.bodies.tables, thrown.scene, 0, 0.05
+    depths, bodies = np.asarray(thrown.depths(thrown.states)), thrown.states.rigid_bodies.bodies
     model = mujoco.MjModel.from_xml_string(mjcf(scene))
     data, shapes = mujoco.MjData(model), {name: len(place.object.shapes) for name, place in scene.objects.items()}
     geoms = {"links": [[model.geom(scene.model.geom(int(geom)).name).id] for geom in tables.near],

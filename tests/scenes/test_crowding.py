@@ -69,6 +69,6 @@ def test_contacts_are_counted_where_objects_come_to_rest(tmp_path: Path) -> None
 def test_contacts_without_a_slot_are_counted(tmp_path: Path) -> None:
     falling = Falling(tmp_path, balls(tmp_path, SLOTS + 3))
     objects = jax.tree.map(lambda x: x[0], falling.begin(1))
-    slots = jax.jit(falling.together.find)(falling._arms._replace(objects=objects))
+    slots = jax.jit(falling.step.slots)(falling._arms.with_systems(rigid_bodies=objects))
     assert slots.total == SLOTS + 3 and slots.found == SLOTS
     assert len(np.unique(slots.number)) == SLOTS

@@ -116,7 +116,7 @@ def test_an_episode_begins_where_its_key_says(scene: str) -> None:
     np.testing.assert_allclose(views["ball"].position[:, ::2], np.tile([0.0, 0.004], (4, 1)), atol=1e-7)
     np.testing.assert_allclose(views["other"].position, np.tile([0.03, 0.0, 0.004], (4, 1)), atol=1e-7)
     centre = turn @ [0.001, 0, 0] + np.array(views["ball"].position)
-    np.testing.assert_allclose(carry.physics.objects.bodies.position[:, 0], centre, atol=1e-7)
+    np.testing.assert_allclose(carry.physics.rigid_bodies.bodies.position[:, 0], centre, atol=1e-7)
 
 
 @pytest.mark.slow

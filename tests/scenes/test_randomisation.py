@@ -92,7 +92,7 @@ def test_a_varied_simulator_is_a_varied_model(tmp_path: Path) -> None:
     for _ in range(50):
         posture = scene.home + rng.uniform(-0.02, 0.02, model.nq) * [1, 1, 0.2, 1, 1, 1, 0, 0]
         ctrl = scene.moment @ posture
-        physics, straight = (p._replace(ctrl=jnp.asarray(ctrl, jnp.float32)) for p in (physics, straight))
+        physics, straight = (p.with_arms(ctrl=jnp.asarray(ctrl, jnp.float32)) for p in (physics, straight))
         physics, straight = advance(physics)[0], nominal(straight)[0]
         commands += [ctrl - scene.moment @ np.asarray(hidden.offset)] * DECIMATION  # by joints that are misread
     _, qpos, _ = roll_out(model, data, read_state(model, data)[None], np.array([commands]))
@@ -152,7 +152,7 @@ def test_a_joint_follows_its_motor_across_the_play(tmp_path: Path) -> None:
             action[:, 0] = 0.4 * direction
             step = env.step({"psm_0": action})
         carry = env.carry()
-        ahead = carry[".hidden.motor"][:, 0] - carry[".physics.ctrl"][:, 0]
+        ahead = carry[".hidden.motor"][:, 0] - carry[".physics.arms.ctrl"][:, 0]
         np.testing.assert_allclose(ahead, direction * gap[:, 0] / 2, atol=1e-6)
         np.testing.assert_allclose(step.observations["psm_0"][:, 0], env.qpos[:, 0] + ahead, atol=1e-6)
 

@@ -84,9 +84,9 @@ def test_errors_are_of_the_camera_and_zero_at_the_hidden_posture(scene: str) -> 
         angle = np.arccos((np.trace(turn.T @ wanted) - 1) / 2)
         assert outcome.infos["ecm_0"]["tip_error"][i] == pytest.approx(np.linalg.norm(here - there), abs=1e-5)
         assert outcome.infos["ecm_0"]["angle_error"][i] == pytest.approx(angle, abs=1e-4)
-    env.engine.write(".physics.qpos", hidden(env).astype(np.float32))
-    env.engine.write(".physics.qvel", np.zeros((COUNT, model.nv), np.float32))
-    env.engine.write(".physics.ctrl", (hidden(env) @ env.scene.moment.T).astype(np.float32))
+    env.engine.write(".physics.arms.qpos", hidden(env).astype(np.float32))
+    env.engine.write(".physics.arms.qvel", np.zeros((COUNT, model.nv), np.float32))
+    env.engine.write(".physics.arms.ctrl", (hidden(env) @ env.scene.moment.T).astype(np.float32))
     still = {a: np.zeros_like(action) for a, action in random_actions(env, np.random.default_rng(0)).items()}
     there = env.step(still).infos["ecm_0"]
     assert there["tip_error"].max() < 1e-4 and there["angle_error"].max() < 2e-3 and there["success"].all()

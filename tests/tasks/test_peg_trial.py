@@ -30,7 +30,10 @@ FIRST, SECOND, BOTH, NONE = {"psm_0"}, {"psm_1"}, {"psm_0", "psm_1"}, set[str]()
 HIGH = np.array([0.0, 0.0, 0.05])
 """From a block that stands on the plate to one that is clear of the pegs, m."""
 
-DIGITS = (".physics.qpos", *(f".physics.objects.bodies.{part}" for part in ("position", "quaternion", "velocity")))
+DIGITS = (
+    ".physics.arms.qpos",
+    *(f".physics.rigid_bodies.bodies.{part}" for part in ("position", "quaternion", "velocity")),
+)
 
 FORCE = 0.1
 """What 0.1 um, some units in the last place of a coordinate, are worth in a contact of 1e6 N/m, N."""

@@ -74,16 +74,16 @@ def test_poses_are_of_the_frames_of_falling_objects(env: BatchedEnv) -> None:
         assert env.scene.model.body(name).mocapid[0] == list(env.scene.free_objects).index(name)
     np.testing.assert_allclose(env.object_poses.origin[1], [place.position for place in places], atol=1e-7)
     carry = env.carry()
-    carry[".physics.objects.bodies.velocity"][0, 0, 3:] = [30, 20, 10]  # rad/s
+    carry[".physics.rigid_bodies.bodies.velocity"][0, 0, 3:] = [30, 20, 10]  # rad/s
     env.set_carry(carry)
     env.step(STILL)
     env.step(STILL)
     found, bodies = env.object_poses, env.carry()
     for i, place in enumerate(places):
         turn = matrix_of(found.quaternion[0, i].astype(float))
-        center = bodies[".physics.objects.bodies.position"][0, i]
+        center = bodies[".physics.rigid_bodies.bodies.position"][0, i]
         np.testing.assert_allclose(found.origin[0, i] + turn @ place.object.center, center, atol=1e-7)
-    parts = [bodies[f".physics.objects.bodies.{part}"] for part in ("position", "quaternion")]
+    parts = [bodies[f".physics.rigid_bodies.bodies.{part}"] for part in ("position", "quaternion")]
     centers = np.array([place.object.center for place in places], np.float32)
     tensors = frames(*map(torch.from_numpy, [*parts, centers]))
     np.testing.assert_allclose(tensors.origin.numpy(), found.origin, atol=1e-8)

@@ -192,7 +192,7 @@ class FusedEngine:
 
 
 def flatten(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Leaves of a dict of dicts by their path, as in ".physics.qpos"."""
+    """Leaves of a dict of dicts by their path, as in ".physics.arms.qpos"."""
     found: dict[str, Any] = {}
     for name, value in tree.items():
         path = f"{prefix}.{name}"

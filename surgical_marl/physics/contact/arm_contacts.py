@@ -17,6 +17,7 @@ import mujoco
 import numpy as np
 from jax import Array
 
+from surgical_marl.physics import skip
 from surgical_marl.physics.contact.arm_pairs import Tiles
 from surgical_marl.scenes.geometry import Capsule, axis_gap
 
@@ -103,7 +104,7 @@ class Pairs:
                 found |= exact(*ends)
                 continue
             sides = (self._capsules(geoms[self._trees[geoms] == arm], geom_xpos, geom_xmat) for arm in arms)
-            found |= jax.lax.cond(_apart(*sides), lambda *_: jnp.bool_(False), exact, *ends)
+            found |= skip.cond("arm_planes", ~_apart(*sides), exact, lambda *_: jnp.bool_(False), *ends)
         return found
 
     def distance(self, geom_xpos: Array, geom_xmat: Array) -> Array:

@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from surgical_marl.physics.contact.contact_pairs import Tables
+from surgical_marl.physics.contact.contact_pairs import ContactPairs
 from surgical_marl.physics.contact.shapes import Plate, Points, Segments, between_segments, in_frame
-from surgical_marl.physics.systems.rigid_bodies import Bodies, rotation
+from surgical_marl.physics.systems.rigid_motion import Bodies, rotation
 from surgical_marl.physics.tree_utils import row_of
 
 
@@ -71,9 +71,9 @@ class Placed(NamedTuple):
 
 
 class Places:
-    """Finds where the bodies of a scene are. Kinds of bodies are those of `Tables.meetings`."""
+    """Finds where the bodies of a scene are. Kinds of bodies are those of `ContactPairs.meetings`."""
 
-    def __init__(self, tables: Tables) -> None:
+    def __init__(self, tables: ContactPairs) -> None:
         self._tables = tables
 
     def joints(self, data: Any) -> Joints:

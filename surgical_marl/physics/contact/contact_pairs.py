@@ -1,6 +1,6 @@
 """The constants of contact with objects: which bodies of a scene can touch, their shapes and surfaces.
 
-Patches are in the order of `Tables.meetings`, and within one in that of its bodies.
+Patches are in the order of `ContactPairs.meetings`, and within one in that of its bodies.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from surgical_marl.physics.contact.arm_contacts import moved_bodies
 from surgical_marl.physics.contact.contact_patch import AWAY
 from surgical_marl.physics.contact.shapes import Plate, Segments, plate_of_box
-from surgical_marl.physics.systems.rigid_bodies import Masses
+from surgical_marl.physics.systems.rigid_motion import Masses
 from surgical_marl.robots.spec import COLLISION_GROUP, PAD_GROUP
 from surgical_marl.scenes.objects import JAW, LINK, Placement, Surface
 
@@ -54,7 +54,7 @@ class Meeting(NamedTuple):
     """So many pairs in a row have the same first body."""
 
 
-class Tables:
+class ContactPairs:
     """Constants of a scene with objects, or of its objects alone.
 
     A number that stands for no body is the number of bodies of that kind, so that what is written there is dropped.

@@ -14,11 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from surgical_marl.physics import skip
 from surgical_marl.physics.contact.broadphase import Ball, Joints, Placed, Places, Way, between_balls
-from surgical_marl.physics.contact.contact_pairs import Meeting, Tables
+from surgical_marl.physics.contact.contact_pairs import ContactPairs, Meeting
 from surgical_marl.physics.contact.contact_patch import BLEND, TILT, TILT_IN_JAW, Patch, find_patch, no_patch
 from surgical_marl.physics.contact.shapes import Points, Segments, between_segments, on_plate
-from surgical_marl.physics.systems.rigid_bodies import Bodies
+from surgical_marl.physics.systems.rigid_motion import Bodies
 from surgical_marl.physics.systems.sleeping import Company, company, moving
 from surgical_marl.physics.tree_utils import Listed, put, room, row_of
 from surgical_marl.scenes.object_contacts import SLOTS
@@ -39,7 +40,7 @@ class Slots(NamedTuple):
 
     patch: Patch
     number: Array
-    """Of each patch in `Tables`, [s]."""
+    """Of each patch in `ContactPairs`, [s]."""
     total: Array
     """How many there are, []; more than there are slots if some found no room."""
     company: Company
@@ -53,10 +54,10 @@ class Slots(NamedTuple):
         return jnp.minimum(self.total, len(self.number))
 
 
-class Finder:
+class Detection:
     """Finds the patches of a scene."""
 
-    def __init__(self, tables: Tables) -> None:
+    def __init__(self, tables: ContactPairs) -> None:
         self._tables, self._places = tables, Places(tables)
         self.slots = min(SLOTS, len(tables.stiffness))
 
@@ -76,7 +77,7 @@ class Finder:
         """
         placed = self._places.place(data, joints, qvel, bodies, dt)
         near = company(placed, self._tables.slender, _reach)
-        awake, none = near.spread(moving(bodies)), jnp.int32(0)
+        awake, none = near.spread(moving(bodies)) | (not skip.enabled("sleeping")), jnp.int32(0)
         number, rows = 0, self.slots + 1  # what finds no room goes to the last one
         slots = Slots(room(jax.eval_shape(no_patch), rows), jnp.zeros(rows, jnp.int32), none, near, awake)
         for meeting in self._tables.meetings:
@@ -233,7 +234,7 @@ def _tilt(meeting: Meeting) -> float:
 
 def _if_any(near: Array, change: Callable[[Any], Any], found: Any) -> Any:
     """Return what was found, changed if anything is near."""
-    return jax.lax.cond(near.any(), change, lambda found: found, found)
+    return skip.cond("far_pairs", near.any(), change, lambda found: found, found)
 
 
 def _numbers(meeting: Meeting, pair: Array) -> tuple[Array, Array]:

@@ -11,7 +11,7 @@ from surgical_marl.physics.contact.friction_cone import Cone
 from surgical_marl.physics.solver.problem import Contact
 
 
-class Twists:
+class RelativeMotion:
     """Finds the twists of contacts in one scene with k objects. `dofs` [a, m] is as for `Newton`."""
 
     def __init__(self, dofs: np.ndarray, objects: int) -> None:

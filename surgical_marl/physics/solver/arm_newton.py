@@ -17,13 +17,19 @@ from jax import Array
 from surgical_marl.physics.solver.cholesky import packed
 from surgical_marl.physics.solver.constraint_rows import JointRows, Rows, row_forces, rows_of, solve
 from surgical_marl.physics.solver.problem import Problem
-from surgical_marl.physics.solver.woodbury import Bridge, Own
+from surgical_marl.physics.solver.woodbury import Own, Woodbury
 
 ITERATIONS = (6, 4)
 """Newton steps for arms alone at most, and line search steps in each, while contacts are linear functions."""
 
 
-class Left(NamedTuple):
+ITERATIONS_WITH_ROWS = (6, 6)
+"""Newton steps, and line search steps in each, at most, of arms with their contacts as rows: see docs/physics.md."""
+MOST_DENSE = 32
+"""Joints up to which all arms are one dense problem with rows: the code of a dense one grows with the cube of them."""
+
+
+class Condensed(NamedTuple):
     """What k objects and all contacts leave of the equations of arms."""
 
     stiff: Array
@@ -41,7 +47,7 @@ class Left(NamedTuple):
 
 
 class _Row(NamedTuple):
-    """What is known of an arm, or of each [a, ...]: see `Problem`, `Left` and `Arms`."""
+    """What is known of an arm, or of each [a, ...]: see `Problem`, `Condensed` and `Arms`."""
 
     number: Array
     mass: Array
@@ -60,10 +66,41 @@ class Arms:
     """
 
     def __init__(self, dofs: np.ndarray, joints: int) -> None:
-        self._there = dofs < joints
+        self._there, self._dofs, self._joints = dofs < joints, dofs, joints
         self._places, self._all = packed(dofs.shape[1]), packed((dofs < joints).sum())
 
-    def together(self, problem: Problem, here: Array, begin: Array, left: Left) -> Array:
+    def with_rows(
+        self, mass: Array, smooth: Array, joints: JointRows, start: Array, between: Rows
+    ) -> tuple[Array, Array]:
+        """Return the accelerations [a, m] of arms with contacts among themselves alone, and the contacts' forces [r].
+
+        Args:
+            mass: lower halves of the arms' mass matrices, [a, m (m + 1) / 2].
+            smooth: sums of all other forces, [a, m].
+            joints: friction and limits of joints, [a, m].
+            start: accelerations where Newton's method begins, [a, m].
+            between: contacts of arms with arms; their Jacobian is [r, a, m].
+        """
+        n, dofs = self._joints, self._dofs
+
+        def by_joint(rows: Array) -> Array:
+            return jnp.zeros(n + 1).at[dofs].set(rows)[:n]
+
+        whole = jnp.zeros((n + 1, n + 1)).at[dofs[:, :, None], dofs[:, None]].set(mass[:, self._places])[:n, :n]
+        jacobian = jax.vmap(by_joint)(between.jacobian)
+        own, contacts = rows_of(JointRows(*map(by_joint, joints))), between._replace(jacobian=jacobian)
+        rows = Rows(*(jnp.concatenate(parts) for parts in zip(own, contacts, strict=True)))
+        arms = self._by_size if n > MOST_DENSE else []
+        qacc, force = solve(whole, by_joint(smooth), rows, by_joint(start), *ITERATIONS_WITH_ROWS, arms)
+        return jnp.append(qacc, 0.0)[dofs], force[2 * n :]
+
+    @property
+    def _by_size(self) -> list[np.ndarray]:
+        """The joints of arms with the same number of joints, [a, m] for each number."""
+        sizes = self._there.sum(1)
+        return [self._dofs[sizes == size][:, :size] for size in np.unique(sizes)]
+
+    def together(self, problem: Problem, here: Array, begin: Array, left: Condensed) -> Array:
         """Return the ways [a, m] from an acceleration [a, m] of arms that objects, or contacts of arms, join."""
         there, (first, second) = self._there, np.tril_indices(len(self._all))
 
@@ -103,7 +140,7 @@ class Arms:
         ]
         return jnp.stack(ways)
 
-    def each(self, problem: Problem, here: Array, begin: Array, moving: Array, left: Left) -> Array:
+    def each(self, problem: Problem, here: Array, begin: Array, moving: Array, left: Condensed) -> Array:
         """Return the ways [a, m] of arms of which no two are joined: one problem after the other.
 
         Those that are not `moving` [a] have none.
@@ -122,7 +159,7 @@ class Arms:
         found: Array = jax.lax.map(one, (self._rows(problem, here, left), begin, moving))
         return found
 
-    def bridged(self, problem: Problem, here: Array, begin: Array, left: Left) -> Array:
+    def bridged(self, problem: Problem, here: Array, begin: Array, left: Condensed) -> Array:
         """Return the ways [a, m] of arms that one object joins and nothing else."""
         a, k = len(self._there), len(left.half)
         bridge = jnp.argmax(left.touched.sum(1) > 1)
@@ -135,14 +172,14 @@ class Arms:
 
         own = Own(rows.number, stiff, force, problem.joints, here)
         resisted = partial(self._resisted, problem, np.ones(a, bool))
-        return Bridge(own, wide, resisted, self._places).solve(begin - here, ITERATIONS[0])
+        return Woodbury(own, wide, resisted, self._places).solve(begin - here, ITERATIONS[0])
 
-    def _rows(self, problem: Problem, here: Array, left: Left) -> _Row:
+    def _rows(self, problem: Problem, here: Array, left: Condensed) -> _Row:
         arms = jnp.arange(len(self._there))
         contacts = left.on_arm, left.stiff, left.force
         return _Row(arms, problem.mass, problem.smooth, problem.joints, here, *contacts)
 
-    def _alone(self, left: Left, takes: Any, row: _Row) -> tuple[Array, Array]:
+    def _alone(self, left: Condensed, takes: Any, row: _Row) -> tuple[Array, Array]:
         """Return what is left of an arm's matrix, its lower half, and of the forces on it.
 
         `takes` [k] are those objects that take something from the matrix.

@@ -19,7 +19,7 @@ from surgical_marl.physics.tree_utils import absent, add, put, row_of
 _WHOLE = packed(6)
 
 
-class Sums(NamedTuple):
+class Hessian(NamedTuple):
     """Sums over contacts of a arms with m joints each at most and of k objects, and of one that stands for none."""
 
     arm_force: Array
@@ -42,18 +42,18 @@ class Sums(NamedTuple):
     """Whether objects press on each other, [] bool."""
 
     @classmethod
-    def of(cls, problem: Problem, base: Base, objects: Array) -> Sums:
+    def of(cls, problem: Problem, base: Base, objects: Array) -> Hessian:
         """Return sums over what contacts feel at a base, where objects have these accelerations [k, 6]."""
 
-        def one(i: Array, sums: Sums) -> Sums:
+        def one(i: Array, sums: Hessian) -> Hessian:
             n = base.pressing.numbers[i]
             return sums._and(problem.contacts.at(n), row_of(base.felt, n))
 
-        found: Sums = jax.lax.fori_loop(0, base.pressing.length, one, cls._none(problem, objects))
+        found: Hessian = jax.lax.fori_loop(0, base.pressing.length, one, cls._none(problem, objects))
         return found
 
     @classmethod
-    def _none(cls, problem: Problem, objects: Array) -> Sums:
+    def _none(cls, problem: Problem, objects: Array) -> Hessian:
         """Return sums over no contacts."""
         (a, m), k = problem.smooth.shape, len(objects)
         inertia = (problem.masses @ (problem.free - objects)[..., None])[..., 0]
@@ -71,13 +71,13 @@ class Sums(NamedTuple):
             jnp.bool_(False),
         )
 
-    def _and(self, contact: Contact, felt: Forces) -> Sums:
+    def _and(self, contact: Contact, felt: Forces) -> Hessian:
         """Return sums with one more contact."""
         a, k = len(self.arm_force), len(self.force) - 1
         first, second, cone = contact.first, contact.second, contact.cone
         pull, stiff = wrench(cone, felt), curvature(cone, felt)
 
-        def on_other(sums: Sums) -> Sums:
+        def on_other(sums: Hessian) -> Hessian:
             moved, at = moved_cone(contact), (36 * (k * first + second),)
             block = jax.lax.dynamic_slice(sums.cross, at, (36,)) + between(cone, moved, felt).ravel()
             return sums._replace(
@@ -87,7 +87,7 @@ class Sums(NamedTuple):
                 linked=jnp.bool_(True),
             )
 
-        def on_arm(sums: Sums) -> Sums:
+        def on_arm(sums: Hessian) -> Hessian:
             arm, jacobian = contact.arm, contact.jacobian
             half = stiff[_WHOLE] @ jacobian
             first_joint, second_joint = np.tril_indices(jacobian.shape[1])

@@ -16,10 +16,11 @@ import numpy as np
 from jax import Array
 
 from surgical_marl.physics.contact.friction_cone import Parting, parting
-from surgical_marl.physics.contact.relative_motion import Twists
+from surgical_marl.physics.contact.relative_motion import RelativeMotion
 from surgical_marl.physics.solver import schur
-from surgical_marl.physics.solver.arm_newton import Arms, Left
-from surgical_marl.physics.solver.hessian import Sums
+from surgical_marl.physics.solver.arm_newton import Arms, Condensed
+from surgical_marl.physics.solver.constraint_rows import JointRows, Rows
+from surgical_marl.physics.solver.hessian import Hessian
 from surgical_marl.physics.solver.line_search import ENOUGH, search
 from surgical_marl.physics.solver.newton_line import Base, look_ahead, set_out
 from surgical_marl.physics.solver.problem import Point, Problem, Solution
@@ -44,8 +45,14 @@ class Newton:
 
     def __init__(self, dofs: np.ndarray, joints: int, objects: int) -> None:
         self._dofs, self._objects, self._arms = dofs, objects, Arms(dofs, joints)
-        self.twists = Twists(dofs, objects)
+        self.twists = RelativeMotion(dofs, objects)
         self._passes = PASSES if len(dofs) else ALONE
+
+    def solve_arms(
+        self, mass: Array, smooth: Array, joints: JointRows, start: Array, between: Rows
+    ) -> tuple[Array, Array]:
+        """Return accelerations [a, m] and forces of contacts [r] of arms alone: see `Arms.with_rows`."""
+        return self._arms.with_rows(mass, smooth, joints, start, between)
 
     def solve(self, problem: Problem) -> Solution:
         """Return the accelerations and forces."""
@@ -56,7 +63,7 @@ class Newton:
 
         def iterate(state: Any) -> Any:
             here, base, _, count = state
-            sums = Sums.of(problem, base, here.objects)
+            sums = Hessian.of(problem, base, here.objects)
             way, touching = self._direction(problem, here, sums, count == 0), _touching(problem)
             # Arms that touch nothing go all of their way at once, as if nothing else were there, and are done.
             free = jnp.where(touching[:, None], 0.0, way.arms)
@@ -101,7 +108,7 @@ class Newton:
 
     # -- the way from there
 
-    def _direction(self, problem: Problem, here: Point, sums: Sums, first: Array) -> Point:
+    def _direction(self, problem: Problem, here: Point, sums: Hessian, first: Array) -> Point:
         """Return the way to the least cost if contacts are linear functions; friction and limits of joints are not.
 
         Objects are eliminated, arms solved, and objects found from them. Unless it is the `first` Newton step, arms
@@ -114,11 +121,11 @@ class Newton:
         found = here.arms
         if len(self._dofs):
             on = touched | (linked & touched.any(0))  # what an object touches moves those that it touches
-            left = Left(sums.arm, sums.on_arm, sums.arm_force, gone.half, gone.wide, on)
+            left = Condensed(sums.arm, sums.on_arm, sums.arm_force, gone.half, gone.wide, on)
             found = self._ways(problem, here.arms, left, first)
         return Point(found, schur.ways(gone, found, touched, linked))
 
-    def _ways(self, problem: Problem, here: Array, left: Left, first: Array) -> Array:
+    def _ways(self, problem: Problem, here: Array, left: Condensed, first: Array) -> Array:
         """Return the ways [a, m] of arms: of each alone, of those that one object joins, or of all at once."""
         begin = jnp.where(first, problem.eased, here)
         together = partial(self._arms.together, problem, here, begin)

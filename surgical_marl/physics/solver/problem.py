@@ -90,6 +90,12 @@ class Problem(NamedTuple):
     """How many contacts there are, []; no more than there is room for."""
 
 
+def no_arms() -> tuple[Array, Array, JointRows, Array, Rows, Array]:
+    """Return the first fields of a `Problem` without arms."""
+    none, rows = jnp.zeros((0, 0)), Rows(jnp.zeros((0, 0, 0)), *[jnp.zeros(0)] * 4)
+    return none, none, JointRows(*[none] * len(JointRows._fields)), none, rows, jnp.bool_(False)
+
+
 class Pressed(NamedTuple):
     """The forces of contacts, [s]."""
 

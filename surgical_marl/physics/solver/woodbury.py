@@ -45,7 +45,7 @@ class _State(NamedTuple):
     steps: Array
 
 
-class Bridge:
+class Woodbury:
     """Solves for the ways of arms that one object joins.
 
     Args:

@@ -1,7 +1,7 @@
 """The dynamics of a model without contacts, and the terms that contacts are solved with: pure JAX, by MJX.
 
     dynamics = Dynamics(model)
-    physics = dynamics.step(physics)
+    forces = dynamics.forces(arm_state)
 
 This is the only module that calls MJX. docs/physics.md says how a step is computed and compares it with C MuJoCo.
 """
@@ -18,24 +18,10 @@ import mujoco
 import numpy as np
 from jax import Array
 
-from surgical_marl.physics.solver.constraint_rows import JointRows, Rows, relax, solve, solve_positive
+from surgical_marl.physics.solver.constraint_rows import JointRows, Rows
 from surgical_marl.physics.solver.solref import response
+from surgical_marl.physics.state import ArmState
 from surgical_marl.runtime import prepare_mjx
-
-ITERATIONS = (1, 1)
-"""Newton steps, and line search steps in each, after joints were relaxed: see docs/physics.md."""
-
-
-class Physics(NamedTuple):
-    """The physics state: all that is kept between two steps. Everything else follows from it."""
-
-    qpos: Array
-    qvel: Array
-    qacc_warmstart: Array
-    ctrl: Array
-    """Command of every actuator: position target, velocity or torque."""
-    objects: Any = ()
-    """The free objects (`surgical_marl/physics/together.py`), in a scene that has any."""
 
 
 class Forces(NamedTuple):
@@ -77,26 +63,14 @@ class Dynamics:
         """Return MJX's data with the axes of all joints, beside the poses."""
         return _stage("com_pos")(self.model, self.pose(qpos))
 
-    def forces(self, physics: Physics) -> Forces:
+    def forces(self, state: ArmState) -> Forces:
         """Compute all of `mjx.forward` except collision and solver."""
-        qpos, qvel, warmstart, ctrl, _ = physics
+        qpos, qvel, warmstart, ctrl = state
         data = self._data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart, ctrl=ctrl)
         for stage in ("fwd_position", "fwd_velocity", "fwd_actuation"):
             data = _stage(stage)(self.model, data)
         smooth = data.qfrc_passive - data.qfrc_bias + data.qfrc_actuator
         return Forces(_internal(data).M, smooth, self._damping(data), self._rows(data))
-
-    def step(self, physics: Physics) -> Physics:
-        """Return the state after one physics step without contacts.
-
-        The integration is implicit in the forces that depend on velocity.
-        """
-        forces = self.forces(physics)
-        start = relax(forces.mass, forces.smooth, self.joint_rows(forces.rows), physics.qacc_warmstart)
-        qacc, _ = solve(forces.mass, forces.smooth, forces.rows, start, *ITERATIONS)
-        change = solve_positive(forces.mass + self.dt * forces.damping, forces.mass @ qacc)
-        qvel = physics.qvel + self.dt * change
-        return physics._replace(qpos=physics.qpos + self.dt * qvel, qvel=qvel, qacc_warmstart=qacc)
 
     def _rows(self, data: Any) -> Rows:
         rows = _internal(data)

@@ -1,130 +1,103 @@
-"""Free rigid bodies: the state of objects, the forces on them without contacts, and how they move."""
+"""The free rigid bodies of a scene: where they start, how they move without contacts, and when they come to rest."""
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
-REPETITIONS = 3
-"""In which the velocity after a step without contacts is found. A needle of 25 rad/s then keeps its angular momentum to
-0.1 % for a second, one of 150 rad/s to 3 %."""
+from surgical_marl.physics.contact.contact_pairs import ContactPairs
+from surgical_marl.physics.contact.grips import Grips, no_grips
+from surgical_marl.physics.outputs import ObjectView
+from surgical_marl.physics.randomisation import Factors, grown, varied
+from surgical_marl.physics.systems.rigid_motion import Bodies, Masses, free_acceleration, inertias, moved, rotation
+from surgical_marl.physics.systems.sleeping import Company, settled
+from surgical_marl.robots.rotation import quaternion
+from surgical_marl.scenes.poses import Pose
+from surgical_marl.scenes.scene import Scene
+
+GRAVITY = np.array([0.0, 0.0, -9.81], np.float32)
+"""m/s2, on rigid bodies alone: arms are balanced."""
 
 
-MOST_TURN = 1.0
-"""Most that a body turns in a step, rad. A faster one is slowed: contacts are those of the start of the step, and mean
-nothing after half a turn."""
+class RigidBodyState(NamedTuple):
+    """The state of all free rigid bodies of a scene, and of the fingers that hold them."""
+
+    bodies: Bodies
+    grips: Grips
 
 
-class Bodies(NamedTuple):
-    """The state of k free objects, in the world."""
+class RigidBodies:
+    """All free rigid bodies of a scene, k of them."""
 
-    position: Array
-    """Centres of mass, m, [k, 3]."""
-    quaternion: Array
-    """Orientation of the objects' frames, w, x, y, z, [k, 4]."""
-    velocity: Array
-    """Of the centres of mass, m/s, then angular, rad/s, both by the world's axes, [k, 6]."""
-    acceleration: Array
-    """Found by the last step, where the solver begins, [k, 6]."""
+    def __init__(self, scene: Scene, dt: Any, arms: bool = True) -> None:
+        self.dt, self._arms = dt, len(scene.agents)
+        self.tables = self._nominal = ContactPairs(scene, arms)
+        self.names = self.tables.names
+        self._places = [scene.objects[name] for name in self.names]
+        self._factors: Factors | None = None
 
+    def start(self, poses: Mapping[str, Pose]) -> RigidBodyState:
+        """Return the bodies at rest, at these poses or where the scene places them."""
+        tables, places = self._nominal, self._places
+        k = tables.count
+        centres = np.array([place.position + place.rotation @ place.object.center for place in places], np.float32)
+        turns = np.array([quaternion(place.rotation) for place in places], np.float32)
+        still = jnp.zeros((k, 6), jnp.float32)
+        falls = still + jnp.append(GRAVITY, jnp.zeros(3, jnp.float32))  # until a step has found what bears them
+        position, turned = jnp.asarray(centres).reshape(k, 3), jnp.asarray(turns).reshape(k, 4)
+        for name, pose in poses.items():
+            o = self.names.index(name)
+            centre = pose.position + rotation(pose.quaternion) @ jnp.asarray(tables.centers[o])
+            position, turned = position.at[o].set(centre), turned.at[o].set(pose.quaternion)
+        if self._factors is not None:
+            position += grown(self.tables, self._factors, rotation(turned))
+        return RigidBodyState(Bodies(position, turned, still, falls), no_grips(k, len(tables.fingers), self._arms))
 
-class Masses(NamedTuple):
-    """Mass and inertia of k objects."""
+    def free_motion(self, bodies: Bodies, awake: Array) -> tuple[Array, Array]:
+        """Return mass matrices [k, 6, 6], and accelerations without contacts [k, 6]; none of a body at rest."""
 
-    mass: Array
-    """kg, [k]."""
-    inertia: Array
-    """About the centre of mass, by the axes of the object's frame, kg m2, [k, 3, 3]."""
+        def one(row: tuple[Bodies, Masses, Array]) -> tuple[Array, Array]:
+            body, masses, awake = row
+            frame = rotation(body.quaternion)
 
+            def falls() -> Array:
+                return free_acceleration(body, masses, frame, jnp.asarray(GRAVITY), self.dt)
 
-def rotation(quaternion: Array) -> Array:
-    """Return the rotation matrices [..., 3, 3] of unit quaternions [..., 4]."""
-    w, x, y, z = (quaternion[..., i] for i in range(4))
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    return jnp.stack([jnp.stack(row, -1) for row in rows], -2)
+            return inertias(masses, frame), jax.lax.cond(awake, falls, lambda: jnp.zeros(6))
 
+        found: tuple[Array, Array] = jax.lax.map(one, (bodies, self.tables.masses, awake))
+        return found
 
-def product(one: Array, other: Array) -> Array:
-    """Return the product of quaternions [..., 4]: first `other`, then `one`."""
-    a, u, b, v = one[..., :1], one[..., 1:], other[..., :1], other[..., 1:]
-    real = a * b - jnp.sum(u * v, -1, keepdims=True)
-    return jnp.concatenate([real, a * v + b * u + jnp.cross(u, v)], -1)
+    def apply(self, bodies: Bodies, acceleration: Array, awake: Array, company: Company) -> Bodies:
+        """Return the bodies after a step with accelerations [k, 6].
 
+        Those that are not `awake` [k] stay where they are; those that have come to rest are still from now on.
+        """
 
-def conjugate(quaternion: Array) -> Array:
-    """Return the inverse of unit quaternions [..., 4]."""
-    return quaternion * jnp.array([1.0, -1.0, -1.0, -1.0], jnp.float32)
+        def one(row: tuple[Bodies, Array, Array]) -> Bodies:
+            body, acceleration, awake = row
+            return jax.lax.cond(awake, lambda: moved(body, acceleration, self.dt), lambda: body)
 
+        after: Bodies = jax.lax.map(one, (bodies, acceleration, awake))
+        return settled(after, self.tables.bound, company)
 
-def turn(angle: Array) -> Array:
-    """Return the quaternion [..., 4] of a rotation vector [..., 3], rad."""
-    square = jnp.sum(angle * angle, -1, keepdims=True) / 4
-    half = jnp.sqrt(square)
-    small = square < 1e-4
-    share = jnp.where(small, 0.5 - square / 12, 0.5 * jnp.sin(half) / jnp.where(small, 1.0, half))
-    return jnp.concatenate([jnp.cos(half), share * angle], -1)
+    def view(self, bodies: Bodies) -> dict[str, ObjectView]:
+        """Return the view of every free body, by name."""
+        frames, centers = rotation(bodies.quaternion), jnp.asarray(self.tables.centers)
+        origins = bodies.position - (frames @ centers[..., None])[..., 0]
+        sizes = [1.0] * len(self.names) if self._factors is None else self._factors.size
+        return {
+            name: ObjectView(origins[o], frames[o], bodies.velocity[o], sizes[o]) for o, name in enumerate(self.names)
+        }
 
-
-def turned(angle: Array, quaternion: Array) -> Array:
-    """Return orientations [..., 4] after rotation vectors [..., 3] by the world's axes, as unit quaternions."""
-    moved = product(turn(angle), quaternion)
-    return moved / jnp.sqrt(jnp.sum(moved * moved, -1, keepdims=True))
-
-
-def carried(quaternion: Array, place: Array) -> Array:
-    """Return by how much a turn by unit quaternions [..., 4] about the origin moved what is at places [..., 3] now.
-
-    It keeps its precision where the turn is small.
-    """
-    real, axis = quaternion[..., :1], quaternion[..., 1:]
-    return 2 * jnp.cross(axis, real * place - jnp.cross(axis, place))
-
-
-def inertias(masses: Masses, frame: Array) -> Array:
-    """Return the mass matrix [6, 6] of one object by the world's axes, from its frame [3, 3]."""
-    none = jnp.zeros((3, 3))
-    return jnp.block([[masses.mass * jnp.eye(3), none], [none, frame @ masses.inertia @ frame.T]])
-
-
-def free_acceleration(body: Bodies, masses: Masses, frame: Array, gravity: Array, dt: Any) -> Array:
-    """Return the acceleration [6] of one object that touches nothing, from its frame [3, 3].
-
-    Objects keep their angular momentum: the velocity at the end of the step is that with which the momentum is the same
-    in the orientation to which it turns. It is found by repetition, and gains no energy. Torques from the start of the
-    step alone would gain energy in every step.
-    """
-    spin = body.velocity[3:]
-    momentum = frame @ (masses.inertia @ (frame.T @ spin))
-
-    def again(_: Any, after: Array) -> Array:
-        turns = rotation(turn(dt * after)) @ frame
-        return turns @ _solve3(masses.inertia, turns.T @ momentum)
-
-    after = jax.lax.fori_loop(0, REPETITIONS, again, spin)
-    local = (rotation(turn(dt * after)) @ frame).T @ after
-    energy, before = jnp.sum(local * (masses.inertia @ local)), jnp.sum(spin * momentum)
-    after *= jnp.sqrt(jnp.minimum(before / jnp.maximum(energy, 1e-30), 1.0))
-    return jnp.concatenate([gravity, (after - spin) / dt])
-
-
-def moved(body: Bodies, acceleration: Array, dt: Any) -> Bodies:
-    """Return one body after a step with an acceleration [6]."""
-    velocity = body.velocity + dt * acceleration
-    spin = jnp.sqrt(jnp.sum(velocity[3:] ** 2))
-    slowed = velocity[3:] * jnp.minimum(1.0, MOST_TURN / (dt * jnp.maximum(spin, 1e-9)))
-    velocity = jnp.concatenate([velocity[:3], slowed])
-    return Bodies(body.position + dt * velocity[:3], turned(dt * velocity[3:], body.quaternion), velocity, acceleration)
-
-
-def _solve3(matrix: Array, right: Array) -> Array:
-    """Return x with matrix @ x = right, [3], by Cramer's rule."""
-    a, b, c = matrix.T
-    rows = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)])
-    return rows @ right / (a @ rows[0])
+    def randomise(self, factors: Factors) -> RigidBodies:
+        """Return bodies whose size, mass and friction differ from their files by these factors."""
+        own = copy.copy(self)
+        own.tables, own._factors = varied(self._nominal, factors), factors
+        return own

@@ -15,7 +15,7 @@ import numpy as np
 from jax import Array
 
 from surgical_marl.physics.contact.broadphase import Ball, Placed, between_balls, nearest, size
-from surgical_marl.physics.systems.rigid_bodies import Bodies
+from surgical_marl.physics.systems.rigid_motion import Bodies
 
 SLOW = 1e-4
 """Speed below which each point of an object has to be to come to rest, m/s. What lies still has less than a hundredth

@@ -56,10 +56,10 @@ def random_state(env: Env, seed: int = 0) -> tuple[dict[str, np.ndarray], dict[s
     slack = 0.05 * (high - low)
     fastest = np.concatenate([[joint.velocity for joint in m.arm.joints] for m in env.scene.mounts.values()])
     carry = {
-        ".physics.qpos": rng.uniform(low - slack, high + slack, (STATES, model.nq)),
-        ".physics.qvel": rng.uniform(-fastest, fastest, (STATES, model.nv)),
-        ".physics.qacc_warmstart": rng.normal(0, 10, (STATES, model.nv)),
-        ".physics.ctrl": rng.uniform(*model.actuator_ctrlrange.T, (STATES, model.nu)),
+        ".physics.arms.qpos": rng.uniform(low - slack, high + slack, (STATES, model.nq)),
+        ".physics.arms.qvel": rng.uniform(-fastest, fastest, (STATES, model.nv)),
+        ".physics.arms.qacc_warmstart": rng.normal(0, 10, (STATES, model.nv)),
+        ".physics.arms.ctrl": rng.uniform(*model.actuator_ctrlrange.T, (STATES, model.nu)),
         ".episode": rng.integers(0, 1000, STATES),
         ".steps": rng.integers(0, env.max_steps, STATES),
     }
@@ -98,8 +98,8 @@ def test_a_step_is_the_mjx_engines(task: str, scene: str, control: str) -> None:
     carry, actions = random_state(env)
     mjx = MjxEngine(env, STATES, "cpu")
     expected, found = play(mjx, carry, actions), play(FusedEngine(env, STATES, "cpu"), carry, actions)
-    qpos = carry[".physics.qpos"]
-    moved = [play(mjx, carry | {".physics.qpos": np.nextafter(qpos, np.float32(way))}, actions) for way in (-9, 9)]
+    qpos = carry[".physics.arms.qpos"]
+    moved = [play(mjx, carry | {".physics.arms.qpos": np.nextafter(qpos, np.float32(way))}, actions) for way in (-9, 9)]
     assert expected.keys() == found.keys()
     touching = expected[".contacts.penetration"].max(1, initial=0) > 0
     if len(env.agents) > 1:
@@ -129,13 +129,13 @@ def test_episodes_stay_as_near_as_a_changed_last_digit(scene: str) -> None:
         rng = np.random.default_rng(0)
         engine.reset(0)
         for _ in range(ulps):
-            engine.write(".physics.qpos", np.nextafter(engine.read(".physics.qpos", "numpy"), np.float32(9)))
+            engine.write(".physics.arms.qpos", np.nextafter(engine.read(".physics.arms.qpos", "numpy"), np.float32(9)))
         path = []
         for step in range(200):
             if step % 10 == 0:
                 hold = {a: rng.uniform(-1, 1, (count, env.num_actions(a))).astype(np.float32) for a in env.agents}
             engine.step(hold)
-            path.append(engine.read(".physics.qpos", "numpy"))
+            path.append(engine.read(".physics.arms.qpos", "numpy"))
         return np.array(path)
 
     mjx = MjxEngine(env, count, "cpu")
@@ -165,7 +165,7 @@ def test_an_environment_does_not_depend_on_the_others() -> None:
         engine.reset(0)
         for action in actions:
             engine.step({"psm_0": action[:count]})
-        found.append(engine.read(".physics.qpos", "numpy")[:3])
+        found.append(engine.read(".physics.arms.qpos", "numpy")[:3])
     np.testing.assert_array_equal(*found)
 
 

@@ -31,14 +31,15 @@ def follow_grasps(both: Beside) -> None:
     simulator, starts = both.simulator, grasps(both.env.scene, COUNT, np.random.default_rng(0))
     qpos, position, quaternion = (x.astype(np.float32) for x in starts[:3])
     now = jax.vmap(simulator.at)(qpos)
-    bodies = now.objects.bodies._replace(position=position, quaternion=quaternion)
+    bodies = now.rigid_bodies.bodies._replace(position=position, quaternion=quaternion)
     closed = np.array(simulator.home.ctrl)
-    now = now._replace(objects=now.objects._replace(bodies=bodies), ctrl=np.where(closed > 0, closed, now.ctrl))
-    now = now._replace(ctrl=np.array(now.ctrl) - 0.03)  # jaws close, and wrists move
+    now = now.with_systems(rigid_bodies=now.rigid_bodies._replace(bodies=bodies))
+    now = now.with_arms(ctrl=np.where(closed > 0, closed, now.ctrl))
+    now = now.with_arms(ctrl=np.array(now.ctrl) - 0.03)  # jaws close, and wrists move
     held = 0.0
     for k in range(STEPS):
         # Nothing is known of accelerations in the first step: one state of 16 takes all Newton steps that there may be,
         # and how near that comes depends on rounding.
         now = both.step(now, compared=k % EVERY == EVERY - 1)
-        held = max(held, float(now.objects.grips.force.max()))
+        held = max(held, float(now.rigid_bodies.grips.force.max()))
     assert held > 1.0

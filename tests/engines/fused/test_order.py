@@ -81,7 +81,7 @@ def test_a_fault_is_told_of_the_environment_that_it_is_in(both: list[BatchedEnv]
     same(still, moving, 3)
     for env in both:
         carry = env.carry()
-        carry[".physics.qvel"][BAD, 0] = np.nan
+        carry[".physics.arms.qvel"][BAD, 0] = np.nan
         env.set_carry(carry)
     found, wanted = (env.step(random_actions(env, np.random.default_rng(0))).faults for env in both)
     assert np.flatnonzero(found >= 0).tolist() == BAD and np.array_equal(found, wanted)

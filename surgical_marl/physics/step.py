@@ -1,0 +1,283 @@
+"""One physics step of a scene, in the order in which it is computed.
+
+    free motion   forces on each system, and how it would move without contacts
+    contacts      where arms and rigid bodies touch, or will within the step
+    solve         the accelerations at which all forces balance
+    move          positions and velocities at the end of the step
+    outputs       the hardest touch so far
+
+Arms and bodies that touch nothing do not affect each other. `skip` leaves out what would only say so.
+"""
+
+from __future__ import annotations
+
+import copy
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from surgical_marl.physics import skip
+from surgical_marl.physics.contact.arm_contacts import Pairs
+from surgical_marl.physics.contact.broadphase import Joints
+from surgical_marl.physics.contact.contact_model import ContactModel
+from surgical_marl.physics.contact.detection import Detection, Slots
+from surgical_marl.physics.contact.grips import Fingers, GripMemory, released
+from surgical_marl.physics.outputs import Touch
+from surgical_marl.physics.solver.constraint_rows import Rows
+from surgical_marl.physics.solver.newton import Newton
+from surgical_marl.physics.solver.problem import Contacts, Pressed, Problem, no_arms
+from surgical_marl.physics.state import Physics
+from surgical_marl.physics.systems.arms import ArmForces, Arms, accelerations_apart, implicit_change, relaxed
+from surgical_marl.physics.systems.rigid_bodies import RigidBodies, RigidBodyState
+from surgical_marl.physics.tree_utils import absent
+from surgical_marl.scenes.scene import Scene
+
+
+class ArmContacts(NamedTuple):
+    """Contacts of arms with arms."""
+
+    rows: Rows
+    """Frictionless, along normals; their Jacobian is [r, a, m]."""
+    pair: Array
+    """Pair of each row, [r]."""
+    penetration: Array
+    """Overlap of all pairs, m, [P]."""
+    overflow: Array
+    """Number of overlapping pairs beyond the rows, []."""
+
+
+class Found(NamedTuple):
+    """What a step finds out about contacts with rigid bodies before it moves anything."""
+
+    slots: Slots
+    joints: Joints
+    fingers: Fingers
+
+
+class Step:
+    """The physics step of a scene with arms and, if it has any objects, rigid bodies."""
+
+    def __init__(self, scene: Scene) -> None:
+        self.arms, self.pairs, self._agents = Arms(scene), Pairs(scene.model), len(scene.agents)
+        self.bodies = RigidBodies(scene, self.arms.dt) if scene.objects else None
+        joints, count = scene.model.nv, len(scene.free_objects)
+        none = np.zeros((0, 0), int)
+        self._newton, self._newton_of_bodies, self._newton_of_one = (
+            Newton(self.arms.dofs, joints, count),
+            Newton(none, 0, count),
+            Newton(none, 0, 1),
+        )
+        self._index()
+
+    def varied(self, arms: Arms, bodies: RigidBodies | None) -> Step:
+        """Return the step of a scene whose arms and bodies differ from their files."""
+        own = copy.copy(self)
+        own.arms, own.bodies = arms, bodies
+        own._index()
+        return own
+
+    def _index(self) -> None:
+        if self.bodies:
+            self.detection = Detection(self.bodies.tables)
+            self.grips = GripMemory(self.bodies.tables, self._newton.twists)
+
+    def __call__(self, physics: Physics, touch: Touch, distance: Array | None = None) -> tuple[Physics, Touch]:
+        """Return the state after one physics step, and the hardest touch up to the start of that step.
+
+        Args:
+            physics: the state.
+            touch: the hardest touch so far.
+            distance: of every pair of arms' shapes at the start, m, [P], if it is known.
+        """
+        if not (self.pairs.count or self.bodies):
+            return self._arms_apart(physics, touch)
+        poses = self.arms.dynamics.pose(physics.qpos)
+        places = poses.geom_xpos, poses.geom_xmat
+        overlap = self.pairs.overlap(*places) if distance is None else (distance < 0).any()
+        if not self.bodies:
+            return skip.cond("arms_apart", overlap, self._arms_together, self._arms_apart, physics, touch)
+        return self._with_bodies(physics, touch, self.find(physics, poses), overlap)
+
+    @property
+    def _rigid(self) -> RigidBodies:
+        assert self.bodies, "a scene without objects has no rigid bodies"
+        return self.bodies
+
+    def slots(self, physics: Physics) -> Slots:
+        """Return the patches at which bodies, arms and fixed things touch, or nearly do."""
+        return self.find(physics, self.arms.dynamics.pose(physics.qpos)).slots
+
+    def depths(self, physics: Physics) -> Array:
+        """Return the overlap of each pair of bodies, m, in the order of `ContactPairs`; negative for a distance."""
+        poses = self.arms.dynamics.pose(physics.qpos)
+        return self.detection.depths(poses, self.detection.joints(poses), physics.rigid_bodies.bodies)
+
+    # -- arms alone
+
+    def _arms_apart(self, physics: Physics, touch: Touch) -> tuple[Physics, Touch]:
+        return physics.with_systems(arms=self.arms.step_apart(physics.arms)), touch
+
+    def _arms_together(self, physics: Physics, touch: Touch) -> tuple[Physics, Touch]:
+        """Step arms that touch each other, in a scene without objects.
+
+        Damping is taken implicitly after the solve, as MuJoCo does, so forces of contacts are MuJoCo's.
+        """
+        between, forces = self._contacts_of_arms(physics), self.arms.free_motion(physics.arms)
+        found, pressed = self._newton.solve_arms(
+            forces.mass, forces.smooth, forces.joints, relaxed(forces), between.rows
+        )
+        arms = self.arms.apply(physics.arms, found, implicit_change(forces, found))
+        return physics.with_systems(arms=arms), self._touched(touch, between, pressed)
+
+    # -- arms and rigid bodies
+
+    def _with_bodies(self, physics: Physics, touch: Touch, found: Found, overlap: Array) -> tuple[Physics, Touch]:
+        """Step arms and bodies: together if an arm touches anything, else each on its own."""
+        forces = self.arms.free_motion(physics.arms)
+        near = overlap | (self._arm_of(found.slots) < self._agents).any()
+
+        def together(physics: Physics, touch: Touch) -> tuple[Physics, Touch]:
+            return self._together(physics, touch, forces, found, overlap)
+
+        def apart(physics: Physics, touch: Touch) -> tuple[Physics, Touch]:
+            bodies = self.step_bodies(physics.rigid_bodies, found.slots)
+            arms = self.arms.apply(physics.arms, *accelerations_apart(forces))
+            overflow = jnp.maximum(touch.overflow, found.slots.total - len(found.slots.number))
+            return Physics({"arms": arms, "rigid_bodies": bodies}), touch._replace(overflow=overflow)
+
+        return skip.cond("arms_apart", near, together, apart, physics, touch)
+
+    def find(self, physics: Physics, poses: Any) -> Found:
+        """Return the contact patches at the start of a step, from MJX's data with the poses of the arms."""
+        joints, bodies = self.detection.joints(poses), physics.rigid_bodies.bodies
+        slots = self.detection.find(poses, joints, physics.qvel, bodies, self.arms.dt)
+        pads = self._rigid.tables.bodies["pads"]
+        return Found(slots, joints, Fingers(poses.xpos[pads], poses.xquat[pads]))
+
+    def _together(
+        self, physics: Physics, touch: Touch, forces: ArmForces, found: Found, overlap: Array
+    ) -> tuple[Physics, Touch]:  # fmt: skip
+        """Step all arms and bodies together.
+
+        Damping is a part of the arms' mass matrix here, so the solver sees the velocities at the end of the step.
+        """
+        dt, slots, (bodies, grips) = self.arms.dt, found.slots, physics.rigid_bodies
+        model = ContactModel(self._rigid.tables, self._newton.twists)
+        felt = model.feel(slots, found.joints, found.fingers, physics.qvel, bodies, grips, dt)
+        masses, free = self._rigid.free_motion(bodies, slots.awake)
+        between = self._contacts_of_arms_if(physics, overlap)
+        problem = Problem(
+            forces.implicit, forces.smooth, forces.joints, self.arms.friction_start(forces), between.rows, overlap,
+            masses, free, felt.contacts, slots.found,
+        )  # fmt: skip
+        solution = self._newton.solve(problem)
+        arms = self.arms.apply(physics.arms, solution.arms)
+        after = self._rigid.apply(bodies, solution.objects, slots.awake, slots.company)
+        moves = dt * arms.qvel, dt * after.velocity
+        grips = self.grips.remember(
+            felt.contacts, felt.slip, slots, solution.pressed, found.fingers, bodies, moves, grips, dt
+        )
+        touch = touch._replace(
+            handled=jnp.maximum(touch.handled, self._hardest(slots, solution.pressed)),
+            overflow=jnp.maximum(touch.overflow, slots.total - len(slots.number)),
+        )
+        touch = self._touched_if(touch, between, solution.between, overlap)
+        return Physics({"arms": arms, "rigid_bodies": RigidBodyState(after, grips)}), touch
+
+    def step_bodies(self, state: RigidBodyState, slots: Slots) -> RigidBodyState:
+        """Return the bodies after a step in which no arm is near."""
+        if not self._rigid.names:
+            return state
+        bodies, grips = state
+        masses, free = self._rigid.free_motion(bodies, slots.awake)
+        model = ContactModel(self._rigid.tables, self._newton_of_bodies.twists)
+        felt = model.feel(slots, None, None, jnp.zeros(0), bodies, grips, self.arms.dt)
+        found = self._solve_bodies(masses, free, felt.contacts, slots)
+        return RigidBodyState(self._rigid.apply(bodies, found, slots.awake, slots.company), released(grips))
+
+    def _solve_bodies(self, masses: Array, free: Array, contacts: Contacts, slots: Slots) -> Array:
+        """Return the accelerations [k, 6] of bodies that touch no arm: one by one, if none touches another."""
+        k, total = len(free), slots.found
+
+        def whole() -> Array:
+            return self._newton_of_bodies.solve(Problem(*no_arms(), masses, free, contacts, total)).objects
+
+        def single(row: tuple[Array, ...]) -> Array:
+            number, mass, free = row
+
+            def own(n: Array) -> Any:
+                contact = contacts.at(n)
+                return contact._replace(first=jnp.where(contact.first == number, 0, 1))
+
+            problem = Problem(*no_arms(), mass[None], free[None], contacts._replace(at=own), total)
+            solve = lambda: self._newton_of_one.solve(problem).objects[0]  # noqa: E731
+            return skip.cond("sleeping", slots.awake[number], solve, lambda: jnp.zeros(6))
+
+        def each() -> Array:
+            return jax.lax.map(single, (jnp.arange(k), masses, free))
+
+        if k < 2:
+            return whole()
+        joined = (contacts.second < k) & (np.arange(len(contacts.second)) < total)
+        return skip.cond("bodies_apart", joined.any(), whole, each)
+
+    # -- contacts of arms with arms
+
+    def _contacts_of_arms(self, physics: Physics) -> ArmContacts:
+        poses = self.arms.dynamics.axes(physics.qpos)  # again: quicker than to keep poses until here
+        distance = self.pairs.distance_by_arms(poses.geom_xpos, poses.geom_xmat)
+        deepest = self.pairs.deepest(poses, distance)
+        rows = self.arms.dynamics.contact_rows(deepest.jacobian, deepest.distance, deepest.weight, physics.qvel)
+        by_arm = jnp.pad(rows.jacobian, ((0, 0), (0, 1)))[:, self.arms.dofs]
+        return ArmContacts(rows._replace(jacobian=by_arm), deepest.pair, -distance, deepest.left_out)
+
+    def _contacts_of_arms_if(self, physics: Physics, overlap: Array) -> ArmContacts:
+        """Return the contacts of arms with arms. There is nothing in them unless any overlap."""
+        if not self.pairs.count:
+            empty = jnp.zeros(0)
+            rows = Rows(jnp.zeros((0, *self.arms.dofs.shape)), empty, empty, empty, empty)
+            return ArmContacts(rows, empty, empty, jnp.int32(0))
+
+        def found(_: None) -> ArmContacts:
+            return self._contacts_of_arms(physics)
+
+        def nothing(_: None) -> ArmContacts:
+            none: ArmContacts = absent(jax.eval_shape(lambda: found(None)))
+            return none
+
+        between: ArmContacts = skip.cond("arm_contacts", overlap, found, nothing, None)
+        return between
+
+    # -- outputs
+
+    def _touched(self, touch: Touch, between: ArmContacts, forces: Array) -> Touch:
+        """Return the hardest touch with these contacts of arms, and the forces [r] of their rows."""
+        return touch._replace(
+            penetration=jnp.maximum(touch.penetration, between.penetration),
+            force=jnp.maximum(touch.force, self.pairs.spread(between.pair, forces)),
+            overflow=jnp.maximum(touch.overflow, between.overflow),
+        )
+
+    def _touched_if(self, touch: Touch, between: ArmContacts, forces: Array, overlap: Array) -> Touch:
+        if not self.pairs.count:
+            return touch
+        touched: Touch = jax.lax.cond(
+            overlap, lambda touch: self._touched(touch, between, forces), lambda touch: touch, touch
+        )
+        return touched
+
+    def _arm_of(self, slots: Slots) -> Array:
+        """Return the arm that the patch in each slot is on, [s]; the number of arms for none."""
+        arm = jnp.asarray(self._rigid.tables.owner.astype(np.int32))[slots.number]
+        return jnp.where(np.arange(len(slots.number)) < slots.total, arm, self._agents)
+
+    def _hardest(self, slots: Slots, pressed: Pressed) -> Array:
+        """Return the largest normal force of a patch on each arm, N, and of one that is not a finger's, [2, a]."""
+        tables = self._rigid.tables
+        mine = self._arm_of(slots)[:, None] == np.arange(self._agents)
+        bumps = jnp.asarray(tables.finger == len(tables.fingers))[slots.number]
+        force = jnp.stack([pressed.normal, jnp.where(bumps, pressed.normal, 0.0)])
+        return jnp.max(jnp.where(mine, force[..., None], 0.0), 1, initial=0.0)
