@@ -46,7 +46,7 @@ def test_a_state_at_fault_ends_its_episode_and_the_next_step_begins_another(engi
     assert sorted(np.flatnonzero(first.faults >= 0)) == sorted(bad)
     for index in bad:
         place = env.fault_place(first.faults[index])
-        assert place == ("psm_0", "state physics.qpos[0] (joint psm_0/yaw)")
+        assert place == ("psm_0", "state physics.arms.qpos[0] (joint psm_0/yaw)")
         assert first.terminated[index] and not first.truncated[index] and first.rewards["psm_0"][index] == 0
     second, third = env.step(still(env)), env.step(still(env))
     assert clean(first) and clean(second) and clean(third)
