@@ -36,6 +36,7 @@ from surgical_marl.content import list_arms, list_objects, list_policies, list_s
 from surgical_marl.interfaces.registration import register_ids, register_task
 from surgical_marl.plugins.algorithms import list_algorithms, register_algorithm
 from surgical_marl.plugins.controls import list_controls, register_control
+from surgical_marl.plugins.systems import list_systems, register_system
 from surgical_marl.plugins.tasks import list_tasks, module_name
 from surgical_marl.runtime import note_forks
 
@@ -77,6 +78,7 @@ __all__ = [
     "list_objects",
     "list_policies",
     "list_scenes",
+    "list_systems",
     "list_tasks",
     "load_arm",
     "load_object",
@@ -84,6 +86,7 @@ __all__ = [
     "parallel_env",
     "register_algorithm",
     "register_control",
+    "register_system",
     "register_task",
 ]
 

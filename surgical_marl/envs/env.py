@@ -135,7 +135,8 @@ class Env:
     @property
     def classes(self) -> tuple[type, ...]:
         """Classes whose code a step runs."""
-        return type(self), type(self.task), *self.controller.classes
+        systems = (type(system) for system in self.scene.systems.values())
+        return type(self), type(self.task), *self.controller.classes, *systems
 
     @cached_property
     def parameters(self) -> dict[str, Any]:

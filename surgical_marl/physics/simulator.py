@@ -65,6 +65,7 @@ class Simulator:
         states: dict[str, Any] = {ARMS: self.step.arms.start(qpos, self._holding(qpos))}
         if self.step.bodies:
             states[RIGID_BODIES] = self.step.bodies.start(poses or {})
+        states |= {name: system.start() for name, system in self.step.systems.items()}
         return Physics(states)
 
     def _holding(self, qpos: Any) -> Any:
@@ -227,6 +228,7 @@ class Simulator:
         physics: Any = Physics({ARMS: ArmState(self.scene.home, still, still, self._holding(self.scene.home))})  # type: ignore[arg-type]
         if self.step.bodies:
             physics = physics.with_systems(rigid_bodies=self.step.bodies.start({}))
+        physics = physics.with_systems(**{name: system.start() for name, system in self.step.systems.items()})
         sites = list(self._sites.values())
         views = self._view(np, physics, (data.site_xpos[sites], data.site_xmat[sites].reshape(-1, 3, 3)), contacts)
         kinds = {"b": jnp.bool_, "i": jnp.int32}

@@ -31,7 +31,10 @@ from surgical_marl.physics.solver.newton import Newton
 from surgical_marl.physics.solver.problem import Contacts, Pressed, Problem, no_arms
 from surgical_marl.physics.state import Physics
 from surgical_marl.physics.systems.arms import ArmForces, Arms, accelerations_apart, implicit_change, relaxed
+from surgical_marl.physics.systems.coupling import Coupling
 from surgical_marl.physics.systems.rigid_bodies import RigidBodies, RigidBodyState
+from surgical_marl.physics.systems.rigid_motion import Bodies
+from surgical_marl.physics.systems.system import Ends, Loads, System
 from surgical_marl.physics.tree_utils import absent
 from surgical_marl.scenes.scene import Scene
 
@@ -57,12 +60,22 @@ class Found(NamedTuple):
     fingers: Fingers
 
 
+class Meeting(NamedTuple):
+    """What a system of plug-ins does before arms and rigid bodies are solved."""
+
+    motion: Any
+    """Its forces without contacts."""
+    ends: Ends
+    loads: Loads
+
+
 class Step:
-    """The physics step of a scene with arms and, if it has any objects, rigid bodies."""
+    """The physics step of a scene with arms and, if it has any objects or other systems, rigid bodies."""
 
     def __init__(self, scene: Scene) -> None:
         self.arms, self.pairs, self._agents = Arms(scene), Pairs(scene.model), len(scene.agents)
-        self.bodies = RigidBodies(scene, self.arms.dt) if scene.objects else None
+        self.bodies = RigidBodies(scene, self.arms.dt) if scene.objects or scene.systems else None
+        self.systems: dict[str, System] = dict(scene.systems)
         joints, count = scene.model.nv, len(scene.free_objects)
         none = np.zeros((0, 0), int)
         self._newton, self._newton_of_bodies, self._newton_of_one = (
@@ -72,10 +85,12 @@ class Step:
         )
         self._index()
 
-    def varied(self, arms: Arms, bodies: RigidBodies | None) -> Step:
-        """Return the step of a scene whose arms and bodies differ from their files."""
+    def varied(
+        self, arms: Arms, bodies: RigidBodies | None, systems: dict[str, System] | None = None
+    ) -> Step:  # fmt: skip
+        """Return the step of a scene whose arms, bodies and other systems differ from their files."""
         own = copy.copy(self)
-        own.arms, own.bodies = arms, bodies
+        own.arms, own.bodies, own.systems = arms, bodies, systems or self.systems
         own._index()
         return own
 
@@ -83,6 +98,9 @@ class Step:
         if self.bodies:
             self.detection = Detection(self.bodies.tables)
             self.grips = GripMemory(self.bodies.tables, self._newton.twists)
+            self._couplings = {
+                name: Coupling(self.bodies.tables, system.surface) for name, system in self.systems.items()
+            }
 
     def __call__(self, physics: Physics, touch: Touch, distance: Array | None = None) -> tuple[Physics, Touch]:
         """Return the state after one physics step, and the hardest touch up to the start of that step.
@@ -99,7 +117,7 @@ class Step:
         overlap = self.pairs.overlap(*places) if distance is None else (distance < 0).any()
         if not self.bodies:
             return skip.cond("arms_apart", overlap, self._arms_together, self._arms_apart, physics, touch)
-        return self._with_bodies(physics, touch, self.find(physics, poses), overlap)
+        return self._with_bodies(physics, touch, poses, self.find(physics, poses), overlap)
 
     @property
     def _rigid(self) -> RigidBodies:
@@ -120,12 +138,15 @@ class Step:
     def _arms_apart(self, physics: Physics, touch: Touch) -> tuple[Physics, Touch]:
         return physics.with_systems(arms=self.arms.step_apart(physics.arms)), touch
 
-    def _arms_together(self, physics: Physics, touch: Touch) -> tuple[Physics, Touch]:
-        """Step arms that touch each other, in a scene without objects.
+    def _arms_together(
+        self, physics: Physics, touch: Touch, forces: ArmForces | None = None
+    ) -> tuple[Physics, Touch]:  # fmt: skip
+        """Step arms that touch each other alone, from the forces on them, if these are known.
 
         Damping is taken implicitly after the solve, as MuJoCo does, so forces of contacts are MuJoCo's.
         """
-        between, forces = self._contacts_of_arms(physics), self.arms.free_motion(physics.arms)
+        between = self._contacts_of_arms(physics)
+        forces = self.arms.free_motion(physics.arms) if forces is None else forces
         found, pressed = self._newton.solve_arms(
             forces.mass, forces.smooth, forces.joints, relaxed(forces), between.rows
         )
@@ -134,21 +155,64 @@ class Step:
 
     # -- arms and rigid bodies
 
-    def _with_bodies(self, physics: Physics, touch: Touch, found: Found, overlap: Array) -> tuple[Physics, Touch]:
+    def _with_bodies(
+        self, physics: Physics, touch: Touch, poses: Any, found: Found, overlap: Array
+    ) -> tuple[Physics, Touch]:  # fmt: skip
         """Step arms and bodies: together if an arm touches anything, else each on its own."""
         forces = self.arms.free_motion(physics.arms)
-        near = overlap | (self._arm_of(found.slots) < self._agents).any()
+        meetings = {name: self._meet(name, physics, found, poses) for name in self.systems}
+        for name, met in meetings.items():
+            forces = self._couplings[name].on_arms(forces, met.loads, met.ends, found.joints)
+        near = overlap | (self._arm_of(found.slots) < self._agents).any() if self.detection.slots else overlap
 
         def together(physics: Physics, touch: Touch) -> tuple[Physics, Touch]:
-            return self._together(physics, touch, forces, found, overlap)
+            if not self.detection.slots:
+                return self._arms_together(physics, touch, forces)
+            return self._together(physics, touch, forces, found, overlap, meetings)
 
         def apart(physics: Physics, touch: Touch) -> tuple[Physics, Touch]:
-            bodies = self.step_bodies(physics.rigid_bodies, found.slots)
+            bodies = self.step_bodies(physics.rigid_bodies, found.slots, meetings)
             arms = self.arms.apply(physics.arms, *accelerations_apart(forces))
             overflow = jnp.maximum(touch.overflow, found.slots.total - len(found.slots.number))
-            return Physics({"arms": arms, "rigid_bodies": bodies}), touch._replace(overflow=overflow)
+            return physics.with_systems(arms=arms, rigid_bodies=bodies), touch._replace(overflow=overflow)
 
-        return skip.cond("arms_apart", near, together, apart, physics, touch)
+        if self.pairs.count or self.detection.slots:
+            after, touch = skip.cond("arms_apart", near, together, apart, physics, touch)
+        else:  # one arm, and systems whose loads are in the forces on it
+            after, touch = apart(physics, touch)
+        return self._systems_moved(physics, after, found, meetings), self._loaded(touch, meetings)
+
+    # -- other systems
+
+    def _meet(self, name: str, physics: Physics, found: Found, poses: Any) -> Meeting:
+        """Return the forces on a system, and its loads on what it touches."""
+        system, state, dt = self.systems[name], physics.systems[name], self.arms.dt
+        bodies = physics.rigid_bodies.bodies
+        motion = system.free_motion(state, dt)
+        ends = self._couplings[name].ends(system.shapes(state), poses, found.joints, physics.qvel, bodies, dt)
+        return Meeting(motion, ends, system.respond(state, motion, ends, dt))
+
+    def _systems_moved(
+        self, before: Physics, after: Physics, found: Found, meetings: dict[str, Meeting]
+    ) -> Physics:  # fmt: skip
+        """Move all other systems by the accelerations that arms and bodies have had in the step."""
+        dt, bodies, moved = self.arms.dt, before.rigid_bodies.bodies, {}
+        for name, met in meetings.items():
+            by_arm = self._newton.twists.by_arm((after.qvel - before.qvel) / dt)
+            by_body = (after.rigid_bodies.bodies.velocity - bodies.velocity) / dt
+            ends = self._couplings[name].accelerations(met.ends, found.joints, bodies, by_arm, by_body)
+            moved[name] = self.systems[name].apply(before.systems[name], met.motion, met.ends, ends, dt)
+        return after.with_systems(**moved)
+
+    def _loaded(self, touch: Touch, meetings: dict[str, Meeting]) -> Touch:
+        """Return the hardest touch with the loads of other systems on arms; those on fingers are no bumps."""
+        for name, met in meetings.items():
+            coupling, force = self._couplings[name], jnp.max(jnp.abs(jnp.sum(met.loads.force * met.ends.normal, -1)), 0)
+            on_arm = coupling.arm[:, None] == np.arange(self._agents)
+            kinds = np.stack([on_arm, on_arm & ~coupling.fingers[:, None]])
+            most = jnp.max(jnp.where(kinds, force[:, None], 0.0), 1, initial=0.0)
+            touch = touch._replace(handled=jnp.maximum(touch.handled, most))
+        return touch
 
     def find(self, physics: Physics, poses: Any) -> Found:
         """Return the contact patches at the start of a step, from MJX's data with the poses of the arms."""
@@ -158,7 +222,8 @@ class Step:
         return Found(slots, joints, Fingers(poses.xpos[pads], poses.xquat[pads]))
 
     def _together(
-        self, physics: Physics, touch: Touch, forces: ArmForces, found: Found, overlap: Array
+        self, physics: Physics, touch: Touch, forces: ArmForces, found: Found, overlap: Array,
+        meetings: dict[str, Meeting],
     ) -> tuple[Physics, Touch]:  # fmt: skip
         """Step all arms and bodies together.
 
@@ -167,7 +232,7 @@ class Step:
         dt, slots, (bodies, grips) = self.arms.dt, found.slots, physics.rigid_bodies
         model = ContactModel(self._rigid.tables, self._newton.twists)
         felt = model.feel(slots, found.joints, found.fingers, physics.qvel, bodies, grips, dt)
-        masses, free = self._rigid.free_motion(bodies, slots.awake)
+        masses, free, awake = self._free_bodies(bodies, slots, meetings)
         between = self._contacts_of_arms_if(physics, overlap)
         problem = Problem(
             forces.implicit, forces.smooth, forces.joints, self.arms.friction_start(forces), between.rows, overlap,
@@ -175,7 +240,7 @@ class Step:
         )  # fmt: skip
         solution = self._newton.solve(problem)
         arms = self.arms.apply(physics.arms, solution.arms)
-        after = self._rigid.apply(bodies, solution.objects, slots.awake, slots.company)
+        after = self._rigid.apply(bodies, solution.objects, awake, slots.company)
         moves = dt * arms.qvel, dt * after.velocity
         grips = self.grips.remember(
             felt.contacts, felt.slip, slots, solution.pressed, found.fingers, bodies, moves, grips, dt
@@ -185,20 +250,33 @@ class Step:
             overflow=jnp.maximum(touch.overflow, slots.total - len(slots.number)),
         )
         touch = self._touched_if(touch, between, solution.between, overlap)
-        return Physics({"arms": arms, "rigid_bodies": RigidBodyState(after, grips)}), touch
+        return physics.with_systems(arms=arms, rigid_bodies=RigidBodyState(after, grips)), touch
 
-    def step_bodies(self, state: RigidBodyState, slots: Slots) -> RigidBodyState:
+    def _free_bodies(
+        self, bodies: Bodies, slots: Slots, meetings: dict[str, Meeting]
+    ) -> tuple[Array, Array, Array]:  # fmt: skip
+        """Return mass matrices and accelerations of bodies without contacts, with loads, and which are awake."""
+        awake = slots.awake
+        masses, free = self._rigid.free_motion(bodies, awake)
+        for name, met in meetings.items():
+            masses, free, touched = self._couplings[name].on_bodies(masses, free, met.loads, met.ends, bodies)
+            awake |= touched
+        return masses, free, awake
+
+    def step_bodies(
+        self, state: RigidBodyState, slots: Slots, meetings: dict[str, Meeting] | None = None
+    ) -> RigidBodyState:  # fmt: skip
         """Return the bodies after a step in which no arm is near."""
         if not self._rigid.names:
             return state
         bodies, grips = state
-        masses, free = self._rigid.free_motion(bodies, slots.awake)
+        masses, free, awake = self._free_bodies(bodies, slots, meetings or {})
         model = ContactModel(self._rigid.tables, self._newton_of_bodies.twists)
         felt = model.feel(slots, None, None, jnp.zeros(0), bodies, grips, self.arms.dt)
-        found = self._solve_bodies(masses, free, felt.contacts, slots)
-        return RigidBodyState(self._rigid.apply(bodies, found, slots.awake, slots.company), released(grips))
+        found = self._solve_bodies(masses, free, felt.contacts, slots, awake)
+        return RigidBodyState(self._rigid.apply(bodies, found, awake, slots.company), released(grips))
 
-    def _solve_bodies(self, masses: Array, free: Array, contacts: Contacts, slots: Slots) -> Array:
+    def _solve_bodies(self, masses: Array, free: Array, contacts: Contacts, slots: Slots, awake: Array) -> Array:
         """Return the accelerations [k, 6] of bodies that touch no arm: one by one, if none touches another."""
         k, total = len(free), slots.found
 
@@ -214,7 +292,7 @@ class Step:
 
             problem = Problem(*no_arms(), mass[None], free[None], contacts._replace(at=own), total)
             solve = lambda: self._newton_of_one.solve(problem).objects[0]  # noqa: E731
-            return skip.cond("sleeping", slots.awake[number], solve, lambda: jnp.zeros(6))
+            return skip.cond("sleeping", awake[number], solve, lambda: jnp.zeros(6))
 
         def each() -> Array:
             return jax.lax.map(single, (jnp.arange(k), masses, free))

@@ -31,7 +31,7 @@ class Registry:
         base: "module:Class", which all of them are subclasses of.
     """
 
-    def __init__(self, noun: str, package: str, group: str, base: str) -> None:
+    def __init__(self, noun: str, package: str | None, group: str, base: str) -> None:
         self.noun, self.package, self.group, self.base = noun, package, group, base
         self._registered: dict[str, type] = {}
 

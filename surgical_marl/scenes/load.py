@@ -13,11 +13,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
 
 from surgical_marl.content import find
+from surgical_marl.plugins.systems import read_systems
 from surgical_marl.robots.arm import Arm, load_arm
 from surgical_marl.robots.rotation import turned
 from surgical_marl.robots.spec import SOLREF
@@ -32,8 +34,8 @@ from surgical_marl.untrusted.schema import Place, Vector, angles, check, lengths
 from surgical_marl.untrusted.values import LONGEST
 from surgical_marl.yaml_file import read_yaml
 
-MAX_ARMS, MAX_TISSUE = 32, 200
-"""Arms and pieces of tissue of a scene."""
+MAX_ARMS, MAX_TISSUE, MAX_SYSTEMS = 32, 200, 20
+"""Arms, pieces of tissue and systems of a scene."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,8 @@ class SceneFile:
     view: View = field(default_factory=View)
     tissue: dict[str, TissueEntry] = several("pieces of tissue", MAX_TISSUE)
     objects: dict[str, PlacementEntry] = several("objects", MAX_OBJECTS)
+    systems: dict[str, Any] = several("systems", MAX_SYSTEMS)
+    """Systems of plug-ins, by name: a `type`, and its settings."""
     randomisation: Randomisation = field(default_factory=Randomisation)
     observe: dict[str, tuple[str, ...]] = several("lists of observation terms", MAX_ARMS)
 
@@ -82,12 +86,13 @@ def load_scene(name: str | Path, control: str = "position") -> Scene:
               about.arms.items()}  # fmt: skip
     where = place.part("objects", settings)
     objects = read_placements(about.objects, where, settings.get("objects"), mounts)
+    systems = read_systems(about.systems, place.part("systems", settings), {**mounts, **objects})
     observe = {agent: list(names) for agent, names in about.observe.items()}
     scene = partial(Scene, path.stem, about.description, control, mounts, randomisation=about.randomisation,
-                    observe=observe, objects=objects)  # fmt: skip
+                    observe=observe, objects=objects, systems=systems)  # fmt: skip
 
     def compute() -> mujoco.MjModel:
-        spec = build_scene(path.stem, mounts, control, about.randomisation, pads=bool(objects))
+        spec = build_scene(path.stem, mounts, control, about.randomisation, pads=bool(objects or systems))
         add_surroundings(spec, mounts, about.view)
         for piece, entry in about.tissue.items():
             add_tissue(spec, f"tissue/{piece}", entry)

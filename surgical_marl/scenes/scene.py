@@ -99,6 +99,8 @@ class Scene:
     """Agent -> names of the observation terms that it observes, instead of the task's own choice."""
     objects: dict[str, Placement] = field(default_factory=dict)
     """Name -> object and where it is. In `model` free objects are mocap bodies of this name, which have no joints."""
+    systems: dict[str, Any] = field(default_factory=dict)
+    """Name -> a system of a plug-in (`surgical_marl.physics.systems.system.System`)."""
 
     @property
     def agents(self) -> tuple[str, ...]:

@@ -161,6 +161,8 @@ class ContactPairs:
     def _number(self, free: dict[str, Placement]) -> None:
         """Set the number of each patch, the bodies that it is between, and how their surfaces feel."""
         own = [place.object.surface for place in free.values()]
+        self.surfaces = {"objects": own, **self._fixed_surfaces}
+        """Surfaces of free bodies and of fixed ones, by kind."""
         felt = {"pads": [JAW] * len(self.fingers), "links": [LINK] * len(self.near), "objects": own,
                 **self._fixed_surfaces}  # fmt: skip
         objects, fingers, links = range(self.count), range(len(self.fingers)), range(len(self.near))
