@@ -21,7 +21,8 @@ from surgical_marl.cli.flags import one_of
 from surgical_marl.content import BASELINES, list_scenes
 from surgical_marl.evaluation.command import play_all
 from surgical_marl.evaluation.evaluate import summarise
-from surgical_marl.plugins.tasks import TASKS, list_tasks, scenes_for
+from surgical_marl.plugins.tasks import TASKS, list_tasks
+from surgical_marl.scenes.placing import scenes_for
 from surgical_marl.yaml_file import dump_yaml, parse_yaml
 
 HASHES = Path(surgical_marl.evaluation.goal_set.__file__).with_name("goal_sets.yaml")

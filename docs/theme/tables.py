@@ -22,11 +22,12 @@ import yaml
 from surgical_marl import list_arms, list_objects, list_policies, list_scenes, list_tasks
 from surgical_marl.content import find
 from surgical_marl.evaluation.card import worst_over_seeds
-from surgical_marl.plugins.tasks import TASKS, scenes_for
+from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.robots.arm import load_arm
 from surgical_marl.runs.folder import read_metrics, read_origin, read_settings
 from surgical_marl.scenes.load import load_scene
 from surgical_marl.scenes.objects import load_object
+from surgical_marl.scenes.placing import scenes_for
 
 DOCS = Path(__file__).resolve().parents[1]
 MARKED = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end of table -->)", re.DOTALL)

@@ -27,6 +27,7 @@ class Registry:
     Args:
         noun: word for one of the classes, for messages.
         package: the package of the shipped classes: for each name a module or folder with one subclass of `base`.
+            None if no class ships.
         group: the entry-point group in which an installed package declares its classes as `name = "module:Class"`.
         base: "module:Class", which all of them are subclasses of.
     """
@@ -105,6 +106,8 @@ class Registry:
     @cached_property
     def shipped(self) -> list[str]:
         """Names of the classes of this package."""
+        if self.package is None:
+            return []
         modules = pkgutil.iter_modules(import_module(self.package).__path__)
         return [module.name for module in modules if not self.base.startswith(f"{self.package}.{module.name}.")]
 

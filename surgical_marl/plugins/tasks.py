@@ -70,11 +70,3 @@ def find_task(task: str | os.PathLike[str]) -> str:
 def scene_of(task: str) -> str:
     """Return the scene that a task is played in where none is named: its own, or "psm" if it has none."""
     return TASKS.load(find_task(task)).default_scene or "psm"
-
-
-def scenes_for(task: str) -> list[str]:
-    """Return the names of the shipped scenes that a task is meant for."""
-    from surgical_marl.scenes.placing import scenes_without_objects  # it imports MuJoCo
-
-    scenes = TASKS.load(task).scenes
-    return scenes_without_objects() if scenes is None else list(scenes)

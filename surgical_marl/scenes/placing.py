@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 
 from surgical_marl.content import find, list_scenes
+from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.robots.rotation import quaternion, turned
 from surgical_marl.scenes.objects import Placement, add_shape, load_object
 from surgical_marl.scenes.surroundings import STILL
@@ -37,6 +38,12 @@ class PlacementEntry:
 def scenes_without_objects() -> list[str]:
     """Return the names of the scenes in which arms have nothing to touch but each other."""
     return [name for name in list_scenes() if not read_yaml(find("scenes", name)).get("objects")]
+
+
+def scenes_for(task: str) -> list[str]:
+    """Return the names of the shipped scenes that a task is meant for."""
+    scenes = TASKS.load(task).scenes
+    return scenes_without_objects() if scenes is None else list(scenes)
 
 
 def read_placements(

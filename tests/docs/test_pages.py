@@ -31,10 +31,11 @@ from surgical_marl.content import content_dir, list_scenes
 from surgical_marl.envs.env import Env
 from surgical_marl.learning.trainer import OWN
 from surgical_marl.plugins.algorithms import ALGORITHMS
-from surgical_marl.plugins.tasks import TASKS, scenes_for
+from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.runs.checkpoint import write_checkpoint
 from surgical_marl.runs.folder import has_begun
 from surgical_marl.scenes.load import load_scene
+from surgical_marl.scenes.placing import scenes_for
 from surgical_marl.tasks.base.options import Options, make_options
 from surgical_marl.view.browser import gate
 from tests.helpers.pages import PAGES, ROOT, commands, free_names, is_name_only, pieces, stand_in

@@ -28,9 +28,10 @@ from surgical_marl.evaluation.goal_set import (
     standard_hashes,
 )
 from surgical_marl.learning import train
-from surgical_marl.plugins.tasks import TASKS, list_tasks, scenes_for
+from surgical_marl.plugins.tasks import TASKS, list_tasks
 from surgical_marl.runs.folder import write_config
 from surgical_marl.runs.settings import NetworkSettings, Settings, own_sections
+from surgical_marl.scenes.placing import scenes_for
 from tests.helpers.fake_env import FakeEnv
 
 SMALL = Settings(num_envs=8, iterations=1, steps_per_iteration=8, network=NetworkSettings(hidden=(8,)))

@@ -11,7 +11,8 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from surgical_marl.cli import main as cli
-from surgical_marl.plugins.tasks import TASKS, scenes_for
+from surgical_marl.plugins.tasks import TASKS
+from surgical_marl.scenes.placing import scenes_for
 from tests.helpers import ROOT
 
 PATTERNS = ("README.md", "CONTRIBUTING.md", "docs/**/*.md", "arms/*/README.md", "policies/**/README.md")

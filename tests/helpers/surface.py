@@ -28,8 +28,9 @@ import numpy as np
 
 import surgical_marl as sm
 from surgical_marl.cli import main as cli
-from surgical_marl.plugins.tasks import TASKS, scenes_for
+from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.runs.settings import Settings
+from surgical_marl.scenes.placing import scenes_for
 from tests.helpers import ROOT
 
 FILE = ROOT / "tests/public_surface.json"

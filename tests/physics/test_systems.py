@@ -82,9 +82,8 @@ def test_a_finger_pushes_it_as_hard_as_its_springs_pull_back(pushed: tuple[Simul
     mujoco.mj_fwdPosition(model, data)
     expected = np.zeros(model.nv)
     geoms = [*step.bodies.tables.pad_geoms, *step.bodies.tables.near]
-    for (bead, shape), place in zip(
-        np.ndindex(force.shape[:2]), np.asarray(met.ends.place).reshape(-1, 3), strict=True
-    ):
+    places = np.asarray(met.ends.place)
+    for bead, shape in np.ndindex(force.shape[:2]):
         jacobian = np.zeros((3, model.nv))
         mujoco.mj_jac(model, data, jacobian, None, places[bead, shape], int(model.geom_bodyid[geoms[shape]]))
         expected += force[bead, shape] @ jacobian

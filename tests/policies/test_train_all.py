@@ -14,9 +14,10 @@ from typing import Any
 
 import pytest
 
-from surgical_marl.plugins.tasks import list_tasks, scenes_for
+from surgical_marl.plugins.tasks import list_tasks
 from surgical_marl.runs.checkpoint import read_checkpoint
 from surgical_marl.runs.folder import CHECKPOINT, CONFIG, read_metrics
+from surgical_marl.scenes.placing import scenes_for
 from tests.helpers import ROOT
 
 
