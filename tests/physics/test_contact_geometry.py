@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
@@ -47,7 +49,7 @@ from surgical_marl.physics.contact.shapes import (
     plate_of_box,
 )
 from surgical_marl.physics.solver.cholesky import packed
-from surgical_marl.physics.tree_utils import row_of
+from surgical_marl.physics.tree_utils import picked, row_of
 from tests.physics.test_search import drawn
 
 COUNT = 200
@@ -331,3 +333,14 @@ def test_few_pairs_are_never_too_many() -> None:
         found = known.deepest(SimpleNamespace(**poses), distance)
         assert (np.asarray(distance) < 0).all() and int(found.left_out) == left
         np.testing.assert_allclose(known.closest(places, frames, np.arange(known.count)).distance, distance)
+
+
+shapes = st.lists(st.lists(st.integers(1, 3), max_size=2).map(tuple), min_size=1, max_size=3)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(1, 4), shapes, st.data())
+def test_a_row_out_of_one_flat_array_is_the_row(rows: int, shapes: list[tuple[int, ...]], data: st.DataObject) -> None:
+    rng, i = np.random.default_rng(0), data.draw(st.integers(0, rows - 1))
+    tree = {str(n): jnp.asarray(rng.normal(size=(rows, *shape)), jnp.float32) for n, shape in enumerate(shapes)}
+    jax.tree.map(np.testing.assert_array_equal, picked(tree, jnp.int32(i)), row_of(tree, i))

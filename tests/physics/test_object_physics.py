@@ -12,6 +12,8 @@ import mujoco
 import numpy as np
 import pytest
 import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from docs.studies.grasping import Held, judge
 from docs.studies.plain_mujoco import IMPRATIO, TOLERANCE
@@ -21,8 +23,9 @@ from surgical_marl.physics.contact.contact_model import FASTEST
 from surgical_marl.physics.simulator import Simulator
 from surgical_marl.physics.systems import rigid_bodies
 from surgical_marl.physics.systems.rigid_bodies import RigidBodyState
+from surgical_marl.physics.systems.rigid_motion import carried, turn
 from surgical_marl.policies.oracle import oracle
-from surgical_marl.robots.rotation import quaternion, turned
+from surgical_marl.robots.rotation import matrix_of, quaternion, turned
 from surgical_marl.scenes.load import load_scene
 from surgical_marl.scenes.mjcf import mjcf
 from tests.helpers.falling import DT, Falling, Trace, random_turns, thrown, wide_pad
@@ -167,8 +170,8 @@ def sleds(folder: Path, feet: list[tuple[float, float]], frictions: list[tuple[f
     own = {"stiffness": 1e6, "free": True, "mass": 0.001, "shapes": shapes}
     files = {f"sled_{i}": own | {"friction": {"sliding": sliding**2, "torsion": torsion**2}}
              for i, (sliding, torsion) in enumerate(frictions)} | {"floor": floor}  # fmt: skip
-    for name, settings in files.items():
-        (folder / f"{name}.yaml").write_text(yaml.safe_dump(settings))
+    for name, content in files.items():
+        (folder / f"{name}.yaml").write_text(yaml.safe_dump(content))
     places = {f"sled_{i}": {"object": f"sled_{i}.yaml", "position": [0, 0.1 * i, 0.001]} for i in range(len(frictions))}
     return Falling(folder, {"floor": {"object": "floor.yaml"}, **places})
 
@@ -222,8 +225,8 @@ def test_what_an_arm_slides_along_a_floor_stays_on_it(tmp_path: Path) -> None:
     own = {"free": False, "stiffness": 1e6, "friction": {"sliding": 0.8, "torsion": 0.0}}
     feet = [{"sphere": {"radius": 0.001, "position": [x, y, 0]}} for x, y in ((0.01, 0), (-0.01, 0.01), (-0.01, -0.01))]
     sled = own | {"free": True, "mass": 0.001, "shapes": feet}
-    for name, settings in {"sled": sled, "floor": own | {"shapes": [{"plane": {}}]}}.items():
-        (tmp_path / f"{name}.yaml").write_text(yaml.safe_dump(settings))
+    for name, content in {"sled": sled, "floor": own | {"shapes": [{"plane": {}}]}}.items():
+        (tmp_path / f"{name}.yaml").write_text(yaml.safe_dump(content))
     objects = {"floor": {"object": "floor.yaml"}, "sled": {"object": "sled.yaml", "position": [0.3, 0, 0.001]}}
     arms = {"psm_0": {"arm": "psm", "position": [0.0, 0.0, 0.25]}}
     (tmp_path / "slide.yaml").write_text(yaml.safe_dump({"arms": arms, "objects": objects}))
@@ -268,3 +271,21 @@ def test_what_falls_on_a_board_and_on_pegs_comes_to_rest_there(tmp_path: Path) -
     energy = falling.energy(path).sum(-1)
     gained, pushed_out = np.diff(energy, axis=1), falling.masses.mass.sum() * FASTEST**2 / 2
     assert gained.max() <= pushed_out, np.unravel_index(gained.argmax(), gained.shape)
+
+
+NUMBERS = st.floats(-1.0, 1.0, width=32)
+VECTORS = st.tuples(NUMBERS, NUMBERS, NUMBERS)
+
+
+@settings(deadline=None)
+@given(VECTORS, VECTORS, st.sampled_from([3.0, 0.1, 1e-4]), st.sampled_from([1.0, -1.0]))
+def test_a_turn_has_moved_what_is_at_a_place_from_where_it_was(
+    axis: tuple[float, ...], place: tuple[float, ...], size: float, sign: float
+) -> None:
+    """To float32's precision of the way itself, also where that is ten thousand times shorter than the place is far."""
+    angle, there = size * np.array(axis), np.array(place)
+    quaternion = sign * turn(jnp.asarray(angle, jnp.float32))
+    exact = matrix_of(np.asarray(quaternion, float) / np.linalg.norm(np.asarray(quaternion, float)))
+    way = there - exact.T @ there
+    found = np.asarray(carried(quaternion, jnp.asarray(there, jnp.float32)))
+    np.testing.assert_allclose(found, way, atol=1e-6 * np.linalg.norm(angle) * np.linalg.norm(there) + 1e-12)
