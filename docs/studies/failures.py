@@ -16,7 +16,7 @@ import numpy as np
 
 from docs.studies.command import make_parser, run
 from surgical_marl.cli.flags import whole
-from surgical_marl.evaluation.asked import common_settings, find_policy
+from surgical_marl.evaluation.environment import common_settings, find_policy
 from surgical_marl.evaluation.evaluate import MAX_BATCH
 from surgical_marl.evaluation.goal_set import episode_seed
 from surgical_marl.policies.policy import load_policy

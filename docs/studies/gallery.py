@@ -92,7 +92,7 @@ def object_picture(name: str) -> Picture:
 
 def clip(task: str, path: Path) -> str:
     """Film a task, and return a sentence that says what is seen."""
-    from surgical_marl.evaluation.asked import common_settings
+    from surgical_marl.evaluation.environment import common_settings
     from surgical_marl.runs.settings import make_env
     from surgical_marl.view.film import Look, pictures
     from surgical_marl.view.movers import Movers

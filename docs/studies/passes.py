@@ -14,8 +14,8 @@ import numpy as np
 
 from docs.studies.command import make_parser
 from surgical_marl.bench.clock import race
-from surgical_marl.bench.contenders import clock_of
 from surgical_marl.bench.course import Course, make_course, tile
+from surgical_marl.bench.engines import clock_of
 from surgical_marl.bench.workload import Workload
 from surgical_marl.engines.fused.options import PASSES
 from surgical_marl.engines.fused.pipeline import CSE

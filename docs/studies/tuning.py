@@ -38,7 +38,7 @@ from surgical_marl.bench.solve import Goal, Solution, solve
 from surgical_marl.bench.workload import Workload
 from surgical_marl.cli.flags import whole
 from surgical_marl.files import write_atomic, write_text
-from surgical_marl.learning.room import in_memory
+from surgical_marl.learning.memory import in_memory
 from surgical_marl.runs.settings import Settings, load_config, make_env
 
 FRESH = 1000

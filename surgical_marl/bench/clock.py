@@ -65,7 +65,7 @@ def cuda_clock(step: Callable[[], object], cycle: int) -> Clock:
     """
     import torch
 
-    from surgical_marl.learning.graphs import Replayed
+    from surgical_marl.learning.cuda_graph import Replayed
 
     def lap() -> None:
         for _ in range(cycle):

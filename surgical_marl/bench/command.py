@@ -50,7 +50,7 @@ def _sim(arguments: Namespace) -> int:
     if engines == ("mujoco",) and arguments.device == "cuda":
         raise ValueError("engine 'mujoco' has no device 'cuda': it runs on a CPU")
 
-    from surgical_marl.bench.contenders import ENGINES
+    from surgical_marl.bench.engines import ENGINES
     from surgical_marl.bench.report import run
 
     workload = Workload(task=arguments.task, scene=arguments.scene, **arguments.given)
@@ -92,7 +92,7 @@ def _face(arguments: Namespace) -> int:
 
 def _view(arguments: Namespace) -> int:
     from surgical_marl.bench.page import run
-    from surgical_marl.view.browser.gate import check_viser
+    from surgical_marl.view.browser.server import check_viser
 
     check_viser()
     print(run(arguments.task, arguments.scene, arguments.seconds, arguments.json))

@@ -18,12 +18,12 @@ from dataclasses import asdict, dataclass
 import torch
 
 from surgical_marl.bench import clock, sim
-from surgical_marl.bench.contenders import clock_of
 from surgical_marl.bench.course import LAPS
+from surgical_marl.bench.engines import clock_of
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.evaluation.report import aligned
+from surgical_marl.learning.memory import in_memory
 from surgical_marl.learning.reporter import Mark, mark, seconds_between
-from surgical_marl.learning.room import in_memory
 from surgical_marl.learning.train import make_training
 from surgical_marl.learning.trainer import Trainer
 from surgical_marl.machine import describe_machine

@@ -15,9 +15,9 @@ from typing import NamedTuple
 
 from surgical_marl import machine
 from surgical_marl.bench import clock
-from surgical_marl.bench.contenders import ENGINES, prepare
 from surgical_marl.bench.course import Course, make_course
-from surgical_marl.bench.rivals import MOST_ROLLED, Contender
+from surgical_marl.bench.engines import ENGINES, prepare
+from surgical_marl.bench.other_simulators import MOST_ROLLED, Contender
 from surgical_marl.bench.workload import Workload
 from surgical_marl.engines.choose import DeviceName
 from surgical_marl.scenes.timing import TIMESTEP

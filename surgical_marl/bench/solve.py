@@ -25,7 +25,7 @@ from surgical_marl.evaluation.evaluate import Played, play
 from surgical_marl.evaluation.goal_set import is_standard
 from surgical_marl.evaluation.metrics import SUCCESS_MM, metrics
 from surgical_marl.evaluation.report import aligned
-from surgical_marl.learning.room import in_memory
+from surgical_marl.learning.memory import in_memory
 from surgical_marl.learning.train import make_training
 from surgical_marl.learning.trainer import Trainer
 from surgical_marl.machine import describe_machine

@@ -82,8 +82,8 @@ def _check_eval(arguments: argparse.Namespace) -> None:
 def _eval(arguments: argparse.Namespace) -> None:
     policies = arguments.policies
     with preparing(f"the episodes of {', '.join(policies)}"):
-        from surgical_marl.evaluation.asked import CHOSEN, OWN
         from surgical_marl.evaluation.command import play_all, read_result, report
+        from surgical_marl.evaluation.environment import CHOSEN, OWN
 
         older = None if arguments.against is None else (str(arguments.against), read_result(arguments.against))
         asked = {key: getattr(arguments, key) for key in (*OWN, *CHOSEN)}
@@ -98,8 +98,8 @@ def _check_crossplay(arguments: argparse.Namespace) -> None:
 
 def _crossplay(arguments: argparse.Namespace) -> None:
     with preparing(f"the episodes of {', '.join(arguments.teams)}"):
-        from surgical_marl.evaluation.asked import CHOSEN, OWN
         from surgical_marl.evaluation.crossplay import crossplay, report
+        from surgical_marl.evaluation.environment import CHOSEN, OWN
 
         asked = {key: getattr(arguments, key) for key in (*OWN, *CHOSEN)}
         result = crossplay(arguments.teams, asked, arguments.episodes, arguments.seed)

@@ -90,7 +90,7 @@ def _view(arguments: argparse.Namespace) -> None:
 def _open(arguments: argparse.Namespace) -> Any:
     """Return the viewer that is asked for."""
     settings, who = _settings(arguments)
-    from surgical_marl.view.browser.gate import check_port, check_viser
+    from surgical_marl.view.browser.server import check_port, check_viser
 
     check_viser()  # this and the port are looked at before anything is compiled
     check_port(arguments.port)
@@ -217,7 +217,7 @@ def _settings(arguments: argparse.Namespace) -> tuple[Any, str | None]:
     """Return the settings of what is shown, and who moves the arms; ValueError if they don't fit together."""
     # for policies that need torch: with few environments its threads wait for each other longer than they compute
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    from surgical_marl.evaluation.asked import common_settings
+    from surgical_marl.evaluation.environment import common_settings
 
     asked = {key: getattr(arguments, key) for key in ("task", "scene", *_OWN)}
     settings = common_settings([arguments.policy or "zero"], {**asked, "goals": asked["goals"] or "training"})

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from surgical_marl.evaluation.asked import common_settings, find_policy
+from surgical_marl.evaluation.environment import common_settings, find_policy
 from surgical_marl.evaluation.evaluate import EPISODES, MAX_BATCH, Played, difference, play, summarise, write_played
 from surgical_marl.evaluation.report import ABOUT, format_table, write_csv
 from surgical_marl.files import write_text
@@ -38,9 +38,9 @@ def play_all(
 
     Args:
         policies: runs or shipped policies of one task and scene, or one of `BASELINES` alone.
-        asked: options of `OWN` and `CHOSEN` (`evaluation/asked.py`); None leaves an option out. Goals are held-out
-            ones by default; all other defaults are those of the trained policy, which also refuses other values of
-            `OWN`.
+        asked: options of `OWN` and `CHOSEN` (`evaluation/environment.py`); None leaves an option out. Goals are
+            held-out ones by default; all other defaults are those of the trained policy, which also refuses other
+            values of `OWN`.
         partners: agent -> who moves it instead, see `surgical_marl.policies.team.Team`.
 
     Raises:

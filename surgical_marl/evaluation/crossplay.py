@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from surgical_marl.content import PARTNERS
-from surgical_marl.evaluation.asked import common_settings, find_policy
+from surgical_marl.evaluation.environment import common_settings, find_policy
 from surgical_marl.evaluation.evaluate import MAX_BATCH, Played, play
 from surgical_marl.evaluation.interval import interval
 from surgical_marl.evaluation.metrics import Metric

@@ -10,8 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from surgical_marl.learning.cuda_graph import Replayed
 from surgical_marl.learning.demonstrations import Demonstrations
-from surgical_marl.learning.graphs import Replayed
 from surgical_marl.policies.networks import MultiAgentActor
 from surgical_marl.runs.progress import progress
 from surgical_marl.untrusted.values import LARGEST, as_number, shown

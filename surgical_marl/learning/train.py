@@ -26,7 +26,7 @@ from surgical_marl.learning import distributed
 from surgical_marl.learning.demonstrations import check_demonstrations
 from surgical_marl.learning.faults import Diverged, Fault
 from surgical_marl.learning.log import Log, Reports
-from surgical_marl.learning.room import check_room, in_memory
+from surgical_marl.learning.memory import check_room, in_memory
 from surgical_marl.learning.trainer import OWN, Trainer
 from surgical_marl.plugins.task_file import label
 from surgical_marl.plugins.tasks import TASKS

@@ -12,10 +12,10 @@ import torch
 from surgical_marl.interfaces.rsl_rl import RslRlVecEnv
 from surgical_marl.learning import distributed
 from surgical_marl.learning.algorithm import Algorithm
+from surgical_marl.learning.cuda_graph import Replayed
 from surgical_marl.learning.demonstrations import Demonstrations
 from surgical_marl.learning.episodes import Episodes
 from surgical_marl.learning.faults import Fault
-from surgical_marl.learning.graphs import Replayed
 from surgical_marl.learning.imitation import RATE, Imitation, ImitationLoss
 from surgical_marl.learning.reporter import Report, Reporter, mark
 from surgical_marl.plugins.algorithms import ALGORITHMS

@@ -13,7 +13,7 @@ from markupsafe import Markup
 
 from surgical_marl.plugins.task_file import label
 from surgical_marl.plugins.tasks import TASKS
-from surgical_marl.report import judged, tables, training
+from surgical_marl.report import evaluation, tables, training
 from surgical_marl.report.charts import COLORS, Chart, Drawing
 from surgical_marl.report.groups import Group, group
 from surgical_marl.report.run import Run, flatten
@@ -132,7 +132,7 @@ def _evaluation(drawing: Drawing, groups: Sequence[Group]) -> list[Section]:
     found = [tables.results(groups), tables.stages(groups)]
     own = tables.rewards(every[0]) if len(every) == 1 else None
     sections = [Section("evaluation", "How well it does", notes, tables=[table for table in found if table])]
-    if charts := judged.charts(drawing, groups):
+    if charts := evaluation.charts(drawing, groups):
         notes = ["Bands are 95 % intervals over episodes, and over seeds where a group has several."]
         sections.append(Section("episodes", "Errors, distances and forces", notes, charts))
     if own:

@@ -22,8 +22,8 @@ from surgical_marl.robots.arm_findings import number_findings
 from surgical_marl.robots.inverse_kinematics import inverse_kinematics
 from surgical_marl.robots.spec import COLLISION_GROUP, build_spec
 from surgical_marl.scenes.build import set_physics
+from surgical_marl.scenes.contact_count import crowding
 from surgical_marl.scenes.contacts import collision_geoms, neighbours
-from surgical_marl.scenes.crowding import crowding
 from surgical_marl.scenes.load import load_scene
 from surgical_marl.scenes.objects import load_object
 from surgical_marl.scenes.scene import Scene

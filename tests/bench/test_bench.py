@@ -14,13 +14,13 @@ import pytest
 from mujoco import rollout
 
 from surgical_marl import machine
-from surgical_marl.bench import render, report, rivals, sim
+from surgical_marl.bench import other_simulators, render, report, sim
 from surgical_marl.bench.clock import race
 from surgical_marl.bench.course import make_course
 from surgical_marl.bench.face import measure_face
+from surgical_marl.bench.other_simulators import Contender
 from surgical_marl.bench.render import measure_rendering
 from surgical_marl.bench.report import QUOTED, draw, ratios, sweep_table
-from surgical_marl.bench.rivals import Contender
 from surgical_marl.bench.sim import Point, Speed, measure, sweep
 from surgical_marl.bench.workload import Workload
 from surgical_marl.cli.main import main
@@ -133,15 +133,15 @@ def test_mujoco_warp_steps_as_c_mujoco_does(scene: str, motion: Any, count: int,
     workload = Workload(scene=scene, motion=motion, num_envs=count, device="cpu")
     course = make_course(workload)
     prepare_mjx()
-    model, states = rivals._exported(workload, course)
-    controls = rivals._controls(course)[:count]
-    contacts, rows = rivals._most(model, states[:count], controls)
-    _, _, data, short = rivals._warp_lap(prepare_warp(), workload, course, model, states, contacts, rows)
+    model, states = other_simulators._exported(workload, course)
+    controls = other_simulators._controls(course)[:count]
+    contacts, rows = other_simulators._most(model, states[:count], controls)
+    _, _, data, short = other_simulators._warp_lap(prepare_warp(), workload, course, model, states, contacts, rows)
     found, _ = rollout.rollout(model, mujoco.MjData(model), states[:count], controls)
     assert not short
     apart = np.abs(data.qpos.numpy() - found[:, -1, 1 : 1 + model.nq]).max(1)
     assert apart.max() < 2 * near and np.quantile(apart, share) < near and np.quantile(apart, 0.75) < near / 2
-    *_, short = rivals._warp_lap(prepare_warp(), workload, course, model, states, 0, -6)
+    *_, short = other_simulators._warp_lap(prepare_warp(), workload, course, model, states, 0, -6)
     assert short, "one row is not enough, and it did not say so"
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from mujoco import rollout
 
-from surgical_marl.bench import contenders
+from surgical_marl.bench import engines
 from surgical_marl.bench.course import HOLD, LAPS, full_state, make_course
 from surgical_marl.bench.physics import PhysicsAlone
 from surgical_marl.bench.starts import NOISE, grasps, played
@@ -31,7 +31,7 @@ def test_what_is_timed_is_what_c_mujoco_steps() -> None:
     engine.reset(0)
     engine.write(".physics.arms.qpos", course.qpos[:rows])
     engine.write(".physics.arms.qvel", course.qvel[:rows])
-    step = contenders._along(engine, [command[:rows] for command in course.commands])
+    step = engines._along(engine, [command[:rows] for command in course.commands])
     for _ in range(steps):
         step()
     control = course.commands[:, :rows].astype(float).repeat(HOLD, 0).swapaxes(0, 1)[:, :steps]
@@ -51,7 +51,7 @@ def test_steps_made_at_once_are_those_made_one_by_one() -> None:
         engine.reset(0)
         engine.write(".physics.arms.qpos", course.qpos[:rows])
         engine.write(".physics.arms.qvel", course.qvel[:rows])
-        step = contenders._along(engine, [command[:rows] for command in course.commands], HOLD // steps)
+        step = engines._along(engine, [command[:rows] for command in course.commands], HOLD // steps)
         for _ in range(2 * HOLD // steps):
             step()
         found.append(engine.read(".physics.arms.qpos", "numpy"))

@@ -37,7 +37,7 @@ from surgical_marl.runs.folder import has_begun
 from surgical_marl.scenes.load import load_scene
 from surgical_marl.scenes.placing import scenes_for
 from surgical_marl.tasks.base.options import Options, make_options
-from surgical_marl.view.browser import gate
+from surgical_marl.view.browser import server
 from tests.helpers.pages import PAGES, ROOT, commands, free_names, is_name_only, pieces, stand_in
 
 QUICK = {("reach", "psm"), ("reach", "bimanual_psm")}
@@ -181,7 +181,7 @@ BENCHES = (f"bench.{kind}.run" for kind in ("report", "learning", "solve", "face
 WORK = ("cli.doctor.report", "evaluation.export.export_policy", "report.command.report",
         "view.take.replay", *BENCHES)  # fmt: skip
 """Where the work of commands begins."""
-BIND = gate._bind
+BIND = server._bind
 """Takes a port for a page of the viewer; `view` serves before it makes an environment."""
 
 
@@ -193,7 +193,7 @@ def check_surgical_marl(argv: list[str]) -> None:
             patch.setattr(f"surgical_marl.{work}", no_work)
         for module in ("envs.batch", "learning.demonstrations"):
             patch.setattr(f"surgical_marl.{module}.Env", no_env)
-        patch.setattr("surgical_marl.view.browser.gate._bind", lambda _: BIND(0))  # another test may serve on it now
+        patch.setattr("surgical_marl.view.browser.server._bind", lambda _: BIND(0))  # another test may serve on it now
         patch.setattr("surgical_marl.bench.command._no_caches", nullcontext)  # it would outlast the command
         assert cli.main(argv) == 0, argv
     shutil.rmtree("runs", ignore_errors=True)

@@ -18,7 +18,7 @@ from surgical_marl.cli.main import main
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.envs.env import Env
 from surgical_marl.evaluation import command
-from surgical_marl.evaluation.asked import common_settings
+from surgical_marl.evaluation.environment import common_settings
 from surgical_marl.evaluation.goal_set import (
     describe_goals,
     episode_seed,

@@ -60,9 +60,13 @@ def test_mjx_still_carries_mujoco_warp() -> None:
     try:
         warp = importlib.import_module("mujoco.mjx.third_party.mujoco_warp")
     except ImportError:
-        pytest.fail("mujoco-mjx moved third_party.mujoco_warp: vision.endoscope and bench.rivals need its new place")
+        pytest.fail(
+            "mujoco-mjx moved third_party.mujoco_warp: vision.endoscope and bench.other_simulators need its new place"
+        )
     for name in ("put_model", "make_data", "kinematics", "camlight", "step", "OverflowType"):
-        assert hasattr(warp, name), f"mujoco_warp moved {name}: vision.endoscope or bench.rivals needs its new place"
+        assert hasattr(warp, name), (
+            f"mujoco_warp moved {name}: vision.endoscope or bench.other_simulators needs its new place"
+        )
 
 
 def test_rsl_rl_still_asks_its_models_how_wide_they_are_before_the_mlp() -> None:

@@ -18,7 +18,7 @@ import surgical_marl as sm
 from surgical_marl.evaluation.command import FILM, RESULT
 from surgical_marl.evaluation.evaluate import EPISODES, read_played, write_played
 from surgical_marl.evaluation.report import Evaluation
-from surgical_marl.report import judged, page, training
+from surgical_marl.report import evaluation, page, training
 from surgical_marl.report.charts import SHARE, Drawing, Text
 from surgical_marl.report.groups import curve, differences, group
 from surgical_marl.report.page import render
@@ -133,7 +133,7 @@ def test_the_parts_of_an_iteration_have_curves_where_they_are_known(tmp_path: Pa
 def test_numbers_beside_charts_are_those_of_the_episodes(tmp_path: Path) -> None:
     episodes = played(("left", "right"), stages=("grasped",))
     run = read_run(evaluate(make_run(tmp_path / "run"), episodes))
-    found = {chart.title: chart for chart in judged.charts(Drawing(), group([run]))}
+    found = {chart.title: chart for chart in evaluation.charts(Drawing(), group([run]))}
     within = 1000 * episodes.measures["held"] < 2
     assert f"left: {np.mean(1000 * episodes.measures['held'][:, 0] < 1):.1%} within 1 mm" in (
         described := found["Success against threshold"].description
@@ -149,7 +149,7 @@ def test_numbers_beside_charts_are_those_of_the_episodes(tmp_path: Path) -> None
 def test_a_histogram_is_not_ruled_by_one_outlier(tmp_path: Path) -> None:
     episodes = played(tuple(f"arm_{i}" for i in range(10)))
     episodes.measures["contact_force"][0, 0] = 1000.0
-    found = judged.charts(Drawing(), group([read_run(evaluate(make_run(tmp_path / "run"), episodes))]))
+    found = evaluation.charts(Drawing(), group([read_run(evaluate(make_run(tmp_path / "run"), episodes))]))
     (chart,) = [chart for chart in found if chart.title == "Peak contact force (N)"]
     assert "arm_0: " in chart.description and "1e+03" in chart.description
     assert chart.rows[-1][0].endswith(" or more") and chart.rows[-1][1] != "0.0%" and chart.rows[0][1] != "0.0%"

@@ -18,7 +18,7 @@ import yaml
 
 from surgical_marl.cli.main import main
 from surgical_marl.content import content_dir, find
-from surgical_marl.evaluation.asked import common_settings
+from surgical_marl.evaluation.environment import common_settings
 from surgical_marl.interfaces.gymnasium import SurgicalEnv
 from surgical_marl.learning import train
 from surgical_marl.policies.policy import load_policy

@@ -19,9 +19,9 @@ from surgical_marl.cli.main import _parser, main
 from surgical_marl.content import find
 from surgical_marl.robots.rotation import turned
 from surgical_marl.runs.settings import Settings
-from surgical_marl.view.browser.gate import open_server
 from surgical_marl.view.browser.nodes import Paths
 from surgical_marl.view.browser.panel import status
+from surgical_marl.view.browser.server import open_server
 from surgical_marl.view.hand import Hand
 from surgical_marl.view.history import History, summary
 from surgical_marl.view.moment import Near, Observer

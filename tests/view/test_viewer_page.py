@@ -32,11 +32,11 @@ from surgical_marl.content import find
 from surgical_marl.engines.stages import compiling
 from surgical_marl.runs.settings import Settings
 from surgical_marl.scenes.load import load_scene
-from surgical_marl.view.browser.gate import close_server, open_server, unlocked
 from surgical_marl.view.browser.nodes import distance_colour, offsets, segments
 from surgical_marl.view.browser.panel import Choice
 from surgical_marl.view.browser.pictures import observed
 from surgical_marl.view.browser.plots import Plots, curves
+from surgical_marl.view.browser.server import close_server, open_server, unlocked
 from surgical_marl.view.browser.shapes import body_glb, geom_mesh
 from surgical_marl.view.browser.viewer import Viewer
 from surgical_marl.view.history import History

@@ -20,11 +20,11 @@ from surgical_marl.plugins.task_file import label
 from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.runs.settings import Settings
 from surgical_marl.view.browser.arms import Arms
-from surgical_marl.view.browser.gate import close_server, open_server
 from surgical_marl.view.browser.nodes import Nodes
 from surgical_marl.view.browser.panel import Choice, Panel
 from surgical_marl.view.browser.pictures import Pictures
 from surgical_marl.view.browser.plots import Plots
+from surgical_marl.view.browser.server import close_server, open_server
 from surgical_marl.view.session import Pace, Session
 
 FPS = 30.0

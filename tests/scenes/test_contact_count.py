@@ -15,7 +15,7 @@ import surgical_marl as sm
 from surgical_marl.cli.main import main
 from surgical_marl.physics.contact.detection import SLOTS
 from surgical_marl.scenes.check import check
-from surgical_marl.scenes.crowding import crowd
+from surgical_marl.scenes.contact_count import crowd
 from tests.helpers.falling import Falling
 
 BALL = {

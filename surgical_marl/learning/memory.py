@@ -1,4 +1,4 @@
-"""Checks whether a batch fits into memory, and turns a lack of memory into an error of one sentence."""
+"""Check whether a batch fits into memory, and turn a lack of memory into an error of one sentence."""
 
 from __future__ import annotations
 

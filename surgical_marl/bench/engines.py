@@ -13,8 +13,8 @@ import numpy as np
 
 from surgical_marl.bench.clock import Clock, cpu_clock, cuda_clock
 from surgical_marl.bench.course import HOLD, LAPS, Course, tile
+from surgical_marl.bench.other_simulators import RIVALS, Contender
 from surgical_marl.bench.physics import PhysicsAlone
-from surgical_marl.bench.rivals import RIVALS, Contender
 from surgical_marl.bench.workload import Workload
 from surgical_marl.content import unknown
 from surgical_marl.engines.choose import Engine, make_engine

@@ -1,4 +1,4 @@
-"""The environment that is asked for: by policies, which were trained in one, and by options that can be chosen."""
+"""The environment of an evaluation: that in which its policies were trained, with the options that can be chosen."""
 
 from __future__ import annotations
 

@@ -11,9 +11,8 @@ import pytest
 import torch
 
 from surgical_marl.cli.main import main
-from surgical_marl.learning import room as memory
-from surgical_marl.learning import train
-from surgical_marl.learning.room import check_room, in_memory, rollout_bytes
+from surgical_marl.learning import memory, train
+from surgical_marl.learning.memory import check_room, in_memory, rollout_bytes
 from surgical_marl.learning.trainer import Trainer
 from surgical_marl.runs.settings import ConstraintSettings, Settings
 from tests.helpers.fake_env import FakeEnv

@@ -1,4 +1,4 @@
-"""Other simulators, ready to be timed: C MuJoCo and MuJoCo Warp, on the scene as `export scene` writes it.
+"""Prepare other simulators for timing: C MuJoCo and MuJoCo Warp, on the scene as `export scene` writes it.
 
 Without objects that is `Scene.model` itself.
 """

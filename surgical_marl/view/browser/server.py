@@ -1,4 +1,4 @@
-"""A web server that only who knows the address can use: on this machine alone, with a secret in the path.
+"""Start the viewer's web server: on this machine alone, with a secret token in the path of its address.
 
 viser serves its page and a websocket on one port, by the public package websockets, to everybody who can reach it.
 Here it gets a socket that is bound to 127.0.0.1, and websockets asks `_guarded` before it answers any request, be it
