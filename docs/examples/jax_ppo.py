@@ -77,7 +77,10 @@ def adam(learner, gradient, rate):
     mean = jax.tree.map(lambda m, g: 0.9 * m + 0.1 * g, learner.mean, gradient)
     square = jax.tree.map(lambda s, g: 0.999 * s + 0.001 * g**2, learner.square, gradient)
     n = learner.count + 1
-    step = lambda w, m, s: w - rate * m / (1 - 0.9**n) / (jnp.sqrt(s / (1 - 0.999**n)) + 1e-5)  # noqa: E731
+
+    def step(w, m, s):
+        return w - rate * m / (1 - 0.9**n) / (jnp.sqrt(s / (1 - 0.999**n)) + 1e-5)
+
     return Learner(jax.tree.map(step, learner.weights, mean, square), mean, square, n, learner.scale)
 
 
