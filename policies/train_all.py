@@ -26,9 +26,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 from surgical_marl.content import content_dir, unknown
-from surgical_marl.plugins.tasks import list_tasks, scenes_for
+from surgical_marl.plugins.tasks import list_tasks
 from surgical_marl.runs.settings import own_sections
 from surgical_marl.runtime import defer_compiler
+from surgical_marl.scenes.placing import scenes_for
 
 PLACES = {
     f"{task}-{scene}{end}": (task, scene, level)
