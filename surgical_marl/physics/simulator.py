@@ -22,7 +22,7 @@ from jax import Array
 from surgical_marl.content import unknown
 from surgical_marl.physics.outputs import ArmView, Contacts, ObjectView, Touch
 from surgical_marl.physics.randomisation import Factors
-from surgical_marl.physics.state import ARMS, RIGID_BODIES, ArmState, Physics
+from surgical_marl.physics.state import ARMS, ATTACHMENTS, RIGID_BODIES, ArmState, Physics
 from surgical_marl.physics.step import Step
 from surgical_marl.scenes.poses import Pose
 from surgical_marl.scenes.scene import Scene
@@ -65,6 +65,9 @@ class Simulator:
         states: dict[str, Any] = {ARMS: self.step.arms.start(qpos, self._holding(qpos))}
         if self.step.bodies:
             states[RIGID_BODIES] = self.step.bodies.start(poses or {})
+            if self.step.attachments:
+                poses = self.step.arms.dynamics.pose(qpos)
+                states[ATTACHMENTS] = self.step.attachments.start(poses, states[RIGID_BODIES].bodies)
         states |= {name: system.start() for name, system in self.step.systems.items()}
         return Physics(states)
 

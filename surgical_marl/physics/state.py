@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import jax
 from jax import Array
 
-ARMS, RIGID_BODIES = "arms", "rigid_bodies"
-"""Names of the two systems that the solver knows; all others meet them in contacts."""
+ARMS, RIGID_BODIES, ATTACHMENTS = "arms", "rigid_bodies", "attachments"
+"""Names of what the solver knows: two systems, and what holds bodies at arms. All others meet them in contacts."""
 
 
 class ArmState(NamedTuple):

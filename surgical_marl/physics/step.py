@@ -21,6 +21,7 @@ from jax import Array
 
 from surgical_marl.physics import skip
 from surgical_marl.physics.contact.arm_contacts import Pairs
+from surgical_marl.physics.contact.attachment import Attachments
 from surgical_marl.physics.contact.broadphase import Joints
 from surgical_marl.physics.contact.contact_model import ContactModel
 from surgical_marl.physics.contact.detection import Detection, Slots
@@ -29,7 +30,7 @@ from surgical_marl.physics.outputs import Touch
 from surgical_marl.physics.solver.constraint_rows import Rows
 from surgical_marl.physics.solver.newton import Newton
 from surgical_marl.physics.solver.problem import Contacts, Pressed, Problem, no_arms
-from surgical_marl.physics.state import Physics
+from surgical_marl.physics.state import ATTACHMENTS, Physics
 from surgical_marl.physics.systems.arms import ArmForces, Arms, accelerations_apart, implicit_change, relaxed
 from surgical_marl.physics.systems.coupling import Coupling
 from surgical_marl.physics.systems.rigid_bodies import RigidBodies, RigidBodyState
@@ -55,6 +56,8 @@ class ArmContacts(NamedTuple):
 class Found(NamedTuple):
     """What a step finds out about contacts with rigid bodies before it moves anything."""
 
+    poses: Any
+    """MJX's data with the poses of the arms."""
     slots: Slots
     joints: Joints
     fingers: Fingers
@@ -75,6 +78,7 @@ class Step:
     def __init__(self, scene: Scene) -> None:
         self.arms, self.pairs, self._agents = Arms(scene), Pairs(scene.model), len(scene.agents)
         self.bodies = RigidBodies(scene, self.arms.dt) if scene.objects or scene.systems else None
+        self.attachments = Attachments(scene, self.bodies.tables) if self.bodies and scene.attachments else None
         self.systems: dict[str, System] = dict(scene.systems)
         joints, count = scene.model.nv, len(scene.free_objects)
         none = np.zeros((0, 0), int)
@@ -117,7 +121,7 @@ class Step:
         overlap = self.pairs.overlap(*places) if distance is None else (distance < 0).any()
         if not self.bodies:
             return skip.cond("arms_apart", overlap, self._arms_together, self._arms_apart, physics, touch)
-        return self._with_bodies(physics, touch, poses, self.find(physics, poses), overlap)
+        return self._with_bodies(physics, touch, self.find(physics, poses), overlap)
 
     @property
     def _rigid(self) -> RigidBodies:
@@ -156,17 +160,17 @@ class Step:
     # -- arms and rigid bodies
 
     def _with_bodies(
-        self, physics: Physics, touch: Touch, poses: Any, found: Found, overlap: Array
+        self, physics: Physics, touch: Touch, found: Found, overlap: Array
     ) -> tuple[Physics, Touch]:  # fmt: skip
         """Step arms and bodies: together if an arm touches anything, else each on its own."""
         forces = self.arms.free_motion(physics.arms)
-        meetings = {name: self._meet(name, physics, found, poses) for name in self.systems}
+        meetings = {name: self._meet(name, physics, found) for name in self.systems}
         for name, met in meetings.items():
             forces = self._couplings[name].on_arms(forces, met.loads, met.ends, found.joints)
         near = overlap | (self._arm_of(found.slots) < self._agents).any() if self.detection.slots else overlap
 
         def together(physics: Physics, touch: Touch) -> tuple[Physics, Touch]:
-            if not self.detection.slots:
+            if not self.detection.slots:  # nothing but arms, and systems whose loads are in the forces on them
                 return self._arms_together(physics, touch, forces)
             return self._together(physics, touch, forces, found, overlap, meetings)
 
@@ -176,6 +180,8 @@ class Step:
             overflow = jnp.maximum(touch.overflow, found.slots.total - len(found.slots.number))
             return physics.with_systems(arms=arms, rigid_bodies=bodies), touch._replace(overflow=overflow)
 
+        if self.attachments:
+            near |= physics.systems[ATTACHMENTS].active.any()
         if self.pairs.count or self.detection.slots:
             after, touch = skip.cond("arms_apart", near, together, apart, physics, touch)
         else:  # one arm, and systems whose loads are in the forces on it
@@ -184,12 +190,12 @@ class Step:
 
     # -- other systems
 
-    def _meet(self, name: str, physics: Physics, found: Found, poses: Any) -> Meeting:
+    def _meet(self, name: str, physics: Physics, found: Found) -> Meeting:
         """Return the forces on a system, and its loads on what it touches."""
         system, state, dt = self.systems[name], physics.systems[name], self.arms.dt
         bodies = physics.rigid_bodies.bodies
         motion = system.free_motion(state, dt)
-        ends = self._couplings[name].ends(system.shapes(state), poses, found.joints, physics.qvel, bodies, dt)
+        ends = self._couplings[name].ends(system.shapes(state), found.poses, found.joints, physics.qvel, bodies, dt)
         return Meeting(motion, ends, system.respond(state, motion, ends, dt))
 
     def _systems_moved(
@@ -219,7 +225,7 @@ class Step:
         joints, bodies = self.detection.joints(poses), physics.rigid_bodies.bodies
         slots = self.detection.find(poses, joints, physics.qvel, bodies, self.arms.dt)
         pads = self._rigid.tables.bodies["pads"]
-        return Found(slots, joints, Fingers(poses.xpos[pads], poses.xquat[pads]))
+        return Found(poses, slots, joints, Fingers(poses.xpos[pads], poses.xquat[pads]))
 
     def _together(
         self, physics: Physics, touch: Touch, forces: ArmForces, found: Found, overlap: Array,
@@ -232,18 +238,25 @@ class Step:
         dt, slots, (bodies, grips) = self.arms.dt, found.slots, physics.rigid_bodies
         model = ContactModel(self._rigid.tables, self._newton.twists)
         felt = model.feel(slots, found.joints, found.fingers, physics.qvel, bodies, grips, dt)
-        masses, free, awake = self._free_bodies(bodies, slots, meetings)
+        masses, free, awake = self._free_bodies(bodies, slots, meetings, self._attached(physics))
+        contacts, rows = felt.contacts, None
+        if self.attachments:
+            rows = self.attachments.rows(
+                physics.systems[ATTACHMENTS], found.poses, found.joints, physics.qvel, bodies, dt
+            )
+            held = (rows.active[:, None] & (rows.arm[:, None] == np.arange(self._agents))).any(0)
+            contacts = contacts._replace(on_arm=contacts.on_arm | held)
         between = self._contacts_of_arms_if(physics, overlap)
         problem = Problem(
             forces.implicit, forces.smooth, forces.joints, self.arms.friction_start(forces), between.rows, overlap,
-            masses, free, felt.contacts, slots.found,
+            masses, free, contacts, slots.found, rows,
         )  # fmt: skip
         solution = self._newton.solve(problem)
         arms = self.arms.apply(physics.arms, solution.arms)
         after = self._rigid.apply(bodies, solution.objects, awake, slots.company)
         moves = dt * arms.qvel, dt * after.velocity
         grips = self.grips.remember(
-            felt.contacts, felt.slip, slots, solution.pressed, found.fingers, bodies, moves, grips, dt
+            contacts, felt.slip, slots, solution.pressed, found.fingers, bodies, moves, grips, dt
         )
         touch = touch._replace(
             handled=jnp.maximum(touch.handled, self._hardest(slots, solution.pressed)),
@@ -253,15 +266,22 @@ class Step:
         return physics.with_systems(arms=arms, rigid_bodies=RigidBodyState(after, grips)), touch
 
     def _free_bodies(
-        self, bodies: Bodies, slots: Slots, meetings: dict[str, Meeting]
+        self, bodies: Bodies, slots: Slots, meetings: dict[str, Meeting], attached: Array | bool = False
     ) -> tuple[Array, Array, Array]:  # fmt: skip
         """Return mass matrices and accelerations of bodies without contacts, with loads, and which are awake."""
-        awake = slots.awake
+        awake = slots.awake if attached is False else slots.awake | attached
         masses, free = self._rigid.free_motion(bodies, awake)
         for name, met in meetings.items():
             masses, free, touched = self._couplings[name].on_bodies(masses, free, met.loads, met.ends, bodies)
             awake |= touched
         return masses, free, awake
+
+    def _attached(self, physics: Physics) -> Array | bool:
+        """Return which bodies an attachment holds, [k] bool; False in a scene without attachments."""
+        if not self.attachments:
+            return False
+        active = physics.systems[ATTACHMENTS].active
+        return (active[:, None] & (self.attachments.bodies[:, None] == np.arange(len(self._rigid.names)))).any(0)
 
     def step_bodies(
         self, state: RigidBodyState, slots: Slots, meetings: dict[str, Meeting] | None = None

@@ -45,7 +45,7 @@ def read_systems(entries: Mapping[str, Any], place: Place, taken: Mapping[str, A
         where = place.part(name, entries)
         given = dict(as_mapping(where, entry, "a type and its settings"))
         kind = given.pop("type", None)
-        if name in ("arms", "rigid_bodies", *taken):
+        if name in ("arms", "rigid_bodies", "attachments", *taken):
             raise ValueError(f"{where}: the scene has something else of this name already; take another one")
         if not isinstance(kind, str):
             raise ValueError(

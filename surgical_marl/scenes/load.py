@@ -27,7 +27,7 @@ from surgical_marl.scenes.build import build_scene, cached_model, compile_scene,
 from surgical_marl.scenes.contacts import contact_pairs
 from surgical_marl.scenes.object_contacts import check_apart
 from surgical_marl.scenes.placing import MAX_OBJECTS, PlacementEntry, add_objects, read_placements
-from surgical_marl.scenes.scene import Mount, Randomisation, Scene
+from surgical_marl.scenes.scene import AttachmentEntry, Mount, Randomisation, Scene
 from surgical_marl.scenes.surroundings import TissueEntry, View, add_surroundings, add_tissue
 from surgical_marl.untrusted.markup import check_name
 from surgical_marl.untrusted.schema import Place, Vector, angles, check, lengths, number, several
@@ -35,7 +35,7 @@ from surgical_marl.untrusted.values import LONGEST
 from surgical_marl.yaml_file import read_yaml
 
 MAX_ARMS, MAX_TISSUE, MAX_SYSTEMS = 32, 200, 20
-"""Arms, pieces of tissue and systems of a scene."""
+"""Arms, pieces of tissue, and systems or attachments of a scene."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +61,7 @@ class SceneFile:
     view: View = field(default_factory=View)
     tissue: dict[str, TissueEntry] = several("pieces of tissue", MAX_TISSUE)
     objects: dict[str, PlacementEntry] = several("objects", MAX_OBJECTS)
+    attachments: dict[str, AttachmentEntry] = several("attachments", MAX_SYSTEMS)
     systems: dict[str, Any] = several("systems", MAX_SYSTEMS)
     """Systems of plug-ins, by name: a `type`, and its settings."""
     randomisation: Randomisation = field(default_factory=Randomisation)
@@ -89,7 +90,7 @@ def load_scene(name: str | Path, control: str = "position") -> Scene:
     systems = read_systems(about.systems, place.part("systems", settings), {**mounts, **objects})
     observe = {agent: list(names) for agent, names in about.observe.items()}
     scene = partial(Scene, path.stem, about.description, control, mounts, randomisation=about.randomisation,
-                    observe=observe, objects=objects, systems=systems)  # fmt: skip
+                    observe=observe, objects=objects, attachments=about.attachments, systems=systems)  # fmt: skip
 
     def compute() -> mujoco.MjModel:
         spec = build_scene(path.stem, mounts, control, about.randomisation, pads=bool(objects or systems))

@@ -85,6 +85,18 @@ class Mount:
 
 
 @dataclass(frozen=True)
+class AttachmentEntry:
+    """A free object that a link of an arm holds, until it is released."""
+
+    body: str
+    """Name of the object."""
+    link: str
+    """Name of the link in the scene's model, as in "psm_0/jaw_left_link"."""
+    active: bool = True
+    """Whether it holds at the beginning of an episode."""
+
+
+@dataclass(frozen=True)
 class Scene:
     """Arms in a world. `model` holds all of them; `control` is the control mode of their actuators."""
 
@@ -99,6 +111,8 @@ class Scene:
     """Agent -> names of the observation terms that it observes, instead of the task's own choice."""
     objects: dict[str, Placement] = field(default_factory=dict)
     """Name -> object and where it is. In `model` free objects are mocap bodies of this name, which have no joints."""
+    attachments: dict[str, AttachmentEntry] = field(default_factory=dict)
+    """Name -> a free object and the link that it can be attached to."""
     systems: dict[str, Any] = field(default_factory=dict)
     """Name -> a system of a plug-in (`surgical_marl.physics.systems.system.System`)."""
 

@@ -150,13 +150,19 @@ class ContactPairs:
         for arm, own in enumerate(joints):
             self.dofs[arm, : len(own)] = own
         self.slides = np.append(model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE, False)[self.dofs]
-        moved = np.pad(moved_bodies(model), ((0, 0), (0, 1)))
         self.arm_of, self.moves = {}, {}
         """Of each kind of body: the arm that it is on, and which of that arm's joints move it, [m]."""
         for kind, bodies in self.bodies.items():
-            self.arm_of[kind] = np.array([agents.index(name) for name in _owners(model, bodies)], int)
-            own = self.dofs[self.arm_of[kind]] if len(bodies) else np.zeros((0, self.most), int)
-            self.moves[kind] = np.take_along_axis(moved[bodies], own, 1).astype(np.float32)
+            self.arm_of[kind], self.moves[kind] = self.joints_of(model, agents, bodies)
+
+    def joints_of(
+        self, model: mujoco.MjModel, agents: tuple[str, ...], bodies: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+        """Return the arm that each of some bodies of arms is on, [n], and which of its joints move it, [n, m]."""
+        moved = np.pad(moved_bodies(model), ((0, 0), (0, 1)))
+        arms = np.array([agents.index(name) for name in _owners(model, bodies)], int)
+        own = self.dofs[arms] if len(bodies) else np.zeros((0, self.most), int)
+        return arms, np.take_along_axis(moved[bodies], own, 1).astype(np.float32)
 
     def _number(self, free: dict[str, Placement]) -> None:
         """Set the number of each patch, the bodies that it is between, and how their surfaces feel."""

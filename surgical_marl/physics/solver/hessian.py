@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ from surgical_marl.physics.contact.friction_cone import Forces, between, curvatu
 from surgical_marl.physics.contact.relative_motion import moved_cone
 from surgical_marl.physics.solver.cholesky import packed
 from surgical_marl.physics.solver.newton_line import Base
-from surgical_marl.physics.solver.problem import Contact, Problem
+from surgical_marl.physics.solver.problem import AttachmentRows, Contact, Point, Problem
 from surgical_marl.physics.tree_utils import absent, add, put, row_of
 
 _WHOLE = packed(6)
@@ -42,15 +42,15 @@ class Hessian(NamedTuple):
     """Whether objects press on each other, [] bool."""
 
     @classmethod
-    def of(cls, problem: Problem, base: Base, objects: Array) -> Hessian:
-        """Return sums over what contacts feel at a base, where objects have these accelerations [k, 6]."""
+    def of(cls, problem: Problem, base: Base, here: Point) -> Hessian:
+        """Return sums over contacts and attachments at accelerations `here`, where contacts feel what `base` says."""
 
         def one(i: Array, sums: Hessian) -> Hessian:
             n = base.pressing.numbers[i]
             return sums._and(problem.contacts.at(n), row_of(base.felt, n))
 
-        found: Hessian = jax.lax.fori_loop(0, base.pressing.length, one, cls._none(problem, objects))
-        return found
+        found: Hessian = jax.lax.fori_loop(0, base.pressing.length, one, cls._none(problem, here.objects))
+        return found if problem.attachments is None else found._and_attachments(problem.attachments, here)
 
     @classmethod
     def _none(cls, problem: Problem, objects: Array) -> Hessian:
@@ -88,21 +88,45 @@ class Hessian(NamedTuple):
             )
 
         def on_arm(sums: Hessian) -> Hessian:
-            arm, jacobian = contact.arm, contact.jacobian
-            half = stiff[_WHOLE] @ jacobian
-            first_joint, second_joint = np.tril_indices(jacobian.shape[1])
-            own, pair = jnp.sum(jacobian[:, first_joint] * half[:, second_joint], 0), a * first + arm
-            return sums._replace(
-                arm_force=add(sums.arm_force, arm, jacobian.T @ pull),
-                arm=_begun(sums.arm, arm, own, sums.on_arm),
-                coupling=_begun(sums.coupling, pair, half, sums.met),
-                met=put(sums.met, pair, True),
-                on_arm=put(sums.on_arm, arm, True),
-            )
+            return sums._on_arm(first, contact.arm, contact.jacobian, pull, stiff[_WHOLE])
 
         sums = jax.lax.cond(second < k, on_other, lambda sums: sums, self) if k > 1 else self
         sums = sums._replace(force=add(sums.force, first, pull), object=add(sums.object, first, stiff))
         return jax.lax.cond(contact.arm < a, on_arm, lambda sums: sums, sums) if a else sums
+
+    def _on_arm(self, body: Any, arm: Any, jacobian: Array, pull: Array, stiff: Array) -> Hessian:
+        """Return sums with the end on an arm of a contact or an attachment.
+
+        Args:
+            body: number of the body at the other end.
+            arm: number of the arm.
+            jacobian: relative twist by velocity of the arm's joints, [6, m].
+            pull: force and torque on the body, [6].
+            stiff: by how much they fall, [6, 6].
+        """
+        half = stiff @ jacobian
+        first_joint, second_joint = np.tril_indices(jacobian.shape[1])
+        own, pair = jnp.sum(jacobian[:, first_joint] * half[:, second_joint], 0), len(self.arm_force) * body + arm
+        return self._replace(
+            arm_force=add(self.arm_force, arm, jacobian.T @ pull),
+            arm=_begun(self.arm, arm, own, self.on_arm),
+            coupling=_begun(self.coupling, pair, half, self.met),
+            met=put(self.met, pair, True),
+            on_arm=put(self.on_arm, arm, True),
+        )
+
+    def _and_attachments(self, rows: AttachmentRows, here: Point) -> Hessian:
+        """Return sums with all active attachments."""
+        sums, lower = self, rows.stiffness[np.tril_indices(6)]
+        for n, (body, arm) in enumerate(zip(rows.body.tolist(), rows.arm.tolist(), strict=True)):
+            felt = rows.wrench[n] - rows.stiffness @ rows.relative(n, here)
+
+            def hold(sums: Hessian, n: int = n, body: int = body, arm: int = arm, felt: Array = felt) -> Hessian:
+                sums = sums._replace(force=add(sums.force, body, felt), object=add(sums.object, body, lower))
+                return sums._on_arm(body, arm, rows.jacobian[n], felt, rows.stiffness)
+
+            sums = jax.lax.cond(rows.active[n], hold, lambda sums: sums, sums)
+        return sums
 
 
 def _with_room(each: Array) -> Array:

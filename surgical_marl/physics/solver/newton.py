@@ -63,13 +63,13 @@ class Newton:
 
         def iterate(state: Any) -> Any:
             here, base, _, count = state
-            sums = Hessian.of(problem, base, here.objects)
+            sums = Hessian.of(problem, base, here)
             way, touching = self._direction(problem, here, sums, count == 0), _touching(problem)
             # Arms that touch nothing go all of their way at once, as if nothing else were there, and are done.
             free = jnp.where(touching[:, None], 0.0, way.arms)
             way = way._replace(arms=jnp.where(touching[:, None], way.arms, 0.0))
             by, whole = self._partings(problem, way), here.ahead(way, jnp.float32(1.0))
-            end = look_ahead(problem, base, by)
+            end = look_ahead(problem, base, by, way)
             base, settled = base._replace(pressed=end.pressed), end.foreseen
             good = jnp.abs(end.slope) <= jnp.where(count == 0, FIRST, ENOUGH) * end.growth
             good &= end.growth > LEAST

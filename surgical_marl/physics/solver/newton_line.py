@@ -79,13 +79,14 @@ class End(NamedTuple):
         return (self.missed <= (TOLERANCE * self.largest) ** 2).all()
 
 
-def look_ahead(problem: Problem, base: Base, by: Parting) -> End:
+def look_ahead(problem: Problem, base: Base, by: Parting, way: Point) -> End:
     """Return what is found at the whole length of a way.
 
     Args:
         problem: whose contacts [s] they are.
         base: what these feel where the way begins.
         by: how much more the bodies of each contact accelerate per length, [s].
+        way: of arms and bodies.
     """
 
     def look(n: Array, end: End) -> End:
@@ -107,6 +108,8 @@ def look_ahead(problem: Problem, base: Base, by: Parting) -> End:
 
     none, each, objects = jnp.float32(0.0), jnp.zeros(len(problem.free) + 1), len(problem.free)
     found: End = jax.lax.fori_loop(0, problem.total, look, End(base.pressed, each, each, none, none))
+    if problem.attachments is not None:
+        found = found._replace(growth=found.growth + problem.attachments.growth(way))
     return found
 
 
@@ -166,7 +169,10 @@ def set_out(
     begin -= jnp.sum(forces.objects * way.objects)
     inertia = problem.masses @ jnp.stack([here.objects - problem.free, way.objects], -1)
     of_objects = jnp.sum(way.objects[..., None] * inertia, (0, 1))
-    return begin, Along(here, way, moves, by, slope + of_objects[0], growth + of_objects[1])
+    slope, growth = slope + of_objects[0], growth + of_objects[1]
+    if problem.attachments is not None:
+        slope, growth = slope + problem.attachments.slope(here, way), growth + problem.attachments.growth(way)
+    return begin, Along(here, way, moves, by, slope, growth)
 
 
 def _times(length: Array, by: Parting) -> Parting:

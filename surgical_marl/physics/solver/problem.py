@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from surgical_marl.physics.contact.friction_cone import Cone, Forces, Springs, Stuck
@@ -66,6 +67,44 @@ class Contacts(NamedTuple):
     """Makes one of them by its number, wherever it is needed: that takes less time than to load it from memory."""
 
 
+class AttachmentRows(NamedTuple):
+    """Bilateral constraints between a body and a link of an arm each: w linear springs in six directions."""
+
+    body: np.ndarray
+    """Number of the body, [w]."""
+    arm: np.ndarray
+    """Number of the arm, [w]."""
+    active: Array
+    """[w] bool"""
+    jacobian: Array
+    """Twist of the body relative to the link, at the body's centre of mass, by velocity of the arm's joints,
+    [w, 6, m]."""
+    wrench: Array
+    """Force and torque on the body without any acceleration, N and N m, [w, 6]."""
+    stiffness: Array
+    """How much they fall per relative acceleration, kg and kg m2, [6, 6]."""
+
+    def relative(self, n: int, point: Point) -> Array:
+        """Return the acceleration [6] of a body relative to the link that it is attached to."""
+        return point.objects[self.body[n]] + self.jacobian[n] @ point.arms[self.arm[n]]
+
+    def growth(self, way: Point) -> Array:
+        """Return how much the slope of the cost of all active attachments grows per length of a way, []."""
+        total = jnp.float32(0.0)
+        for n in range(len(self.body)):
+            by = self.relative(n, way)
+            total += jnp.where(self.active[n], by @ self.stiffness @ by, 0.0)
+        return total
+
+    def slope(self, here: Point, way: Point) -> Array:
+        """Return the slope of their cost along a way at a point, []."""
+        total = jnp.float32(0.0)
+        for n in range(len(self.body)):
+            felt = self.wrench[n] - self.stiffness @ self.relative(n, here)
+            total -= jnp.where(self.active[n], felt @ self.relative(n, way), 0.0)
+        return total
+
+
 class Problem(NamedTuple):
     """What is to be solved: a arms with m joints each at most, k objects, s contacts."""
 
@@ -88,6 +127,8 @@ class Problem(NamedTuple):
     contacts: Contacts
     total: Array
     """How many contacts there are, []; no more than there is room for."""
+    attachments: AttachmentRows | None = None
+    """None in a scene without any."""
 
 
 def no_arms() -> tuple[Array, Array, JointRows, Array, Rows, Array]:
