@@ -33,9 +33,9 @@ def on_device(values: np.ndarray, workload: Workload) -> Any:
     return torch.from_numpy(tiled).cuda()
 
 
-def batch_without(name: str, workload: Workload, course: Course) -> BatchedEnv:
-    """Return environments at the start of a course, compiled without a pass; "" is for none."""
-    os.environ[PASSES] = f"-{name}" if name else ""
+def batch_without(variable: str, name: str, workload: Workload, course: Course) -> BatchedEnv:
+    """Return environments at the start of a course, compiled without what a variable names; "" is for none."""
+    os.environ[variable] = f"-{name}" if name else ""
     arrays: Any = "torch" if workload.where == "cuda" else "numpy"
     given = workload.of_environment()
     batch = BatchedEnv(**given, num_envs=workload.count, engine="fused", device=workload.where, arrays=arrays)
@@ -52,33 +52,47 @@ def passes_on(target: str) -> list[str]:
     return [CSE, *(one.name for one in ALL if not one.required and one.target in ("", target))]
 
 
-def measure(workload: Workload, names: Sequence[str], repeats: int) -> dict[str, float]:
-    """Return how much longer an environment step takes without each pass, as a share of the step with all."""
+def measure(workload: Workload, names: Sequence[str], repeats: int, variable: str = PASSES) -> dict[str, float]:
+    """Return how much longer an environment step takes without each pass, as a share of the step with all.
+
+    An environment `variable` switches off what `names` are of: passes, or skips of the physics.
+    """
     course = make_course(workload)
     actions = [{agent: on_device(rows, workload) for agent, rows in lap.items()} for lap in course.actions]
     batches = {}
     for name in ("", *names):
         print(f"compiling without {name or 'none'}", file=sys.stderr, flush=True)
-        batches[name] = batch_without(name, workload, course)
+        batches[name] = batch_without(variable, name, workload, course)
     took = race({name: clock_of(batch, actions) for name, batch in batches.items()}, repeats=repeats)
     return {name: took[name] / took[""] - 1 for name in names}
 
 
 def main(argv: list[str] | None = None) -> None:
     """Print a row for each pass."""
-    parser = make_parser(__doc__)
+    a, workload = parsed(__doc__, argv)
+    report("pass", measure(workload, a.only or passes_on(workload.where), a.repeats), workload)
+
+
+def report(noun: str, found: dict[str, float], workload: Workload) -> None:
+    """Print a table of what was measured."""
+    print(f"| {noun} | more time without it, `{workload.scene}` on {workload.where} |\n|---|---|")
+    for name, more in found.items():
+        print(f"| `{name}` | {more:+.1%} |")
+
+
+def parsed(about: str | None, argv: list[str] | None) -> tuple[Any, Workload]:
+    """Return the options of the command line, and the workload that they name."""
+    parser = make_parser(about)
     parser.add_argument("--scene", default="psm")
     parser.add_argument("--task", default="reach")
     parser.add_argument("--motion", default="random")
     parser.add_argument("--num-envs", type=int)
     parser.add_argument("--device", default="auto")
     parser.add_argument("--repeats", type=int, default=10)
-    parser.add_argument("--only", nargs="*", help="passes (default: all of the device)")
+    parser.add_argument("--only", nargs="*", help="names (default: all)")
     a = parser.parse_args(argv)
     workload = Workload(task=a.task, scene=a.scene, motion=a.motion, num_envs=a.num_envs, device=a.device, decimation=8)
-    print(f"| pass | more time without it, `{a.scene}` on {workload.where} |\n|---|---|")
-    for name, more in measure(workload, a.only or passes_on(workload.where), a.repeats).items():
-        print(f"| `{name}` | {more:+.1%} |")
+    return a, workload
 
 
 if __name__ == "__main__":

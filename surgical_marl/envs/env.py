@@ -26,6 +26,7 @@ from surgical_marl.envs.knowledge import Knowledge
 from surgical_marl.envs.observations import Scale
 from surgical_marl.envs.observed import Observed
 from surgical_marl.envs.state import Carry, Moved, State
+from surgical_marl.physics.skip import switched_off
 from surgical_marl.plugins.task_file import label
 from surgical_marl.plugins.tasks import TASKS, find_task, scene_of
 from surgical_marl.runtime import jax, jax_scope, jnp, prepare_jax
@@ -129,7 +130,8 @@ class Env:
         mujoco.mj_saveModel(self.scene.model, None, model)
         observed = {agent: (seen.names, seen.stated) for agent, seen in self.observed.items()}
         how = (self.options.control, self.decimation, self.scene.randomisation, self.options.start, self.scaled)
-        about = f"{self.task_name} {self.task.constants} {how} {observed} {self.messages}"
+        physics = sorted(switched_off()), self.scene.attachments, self.scene.systems
+        about = f"{self.task_name} {self.task.constants} {how} {physics} {observed} {self.messages}"
         return self.scene.fingerprint + about.encode() + model.tobytes()
 
     @property

@@ -10,12 +10,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from typing import Any
-
-import jax
-from jax import Array
+from typing import TYPE_CHECKING, Any
 
 from surgical_marl.content import unknown
+
+if TYPE_CHECKING:
+    from jax import Array
 
 SKIPS = {
     "arms_apart": "arms in contact with nothing are solved one by one, not together with all others",
@@ -56,4 +56,6 @@ def cond(name: str, needed: Array, full: Callable[..., Any], without: Callable[.
     """
     if not enabled(name):
         return full(*operands)
+    import jax
+
     return jax.lax.cond(needed, full, without, *operands)

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from surgical_marl.physics import skip
 from surgical_marl.physics.contact.friction_cone import Parting, parting
 from surgical_marl.physics.contact.relative_motion import RelativeMotion
 from surgical_marl.physics.solver import schur
@@ -84,7 +85,9 @@ class Newton:
                 return found.length, found.looks == 0
 
             def gone_on() -> tuple[Point, Base, Array]:
-                length, settled = jax.lax.cond(good, lambda: (jnp.float32(1.0), jnp.bool_(False)), searched)
+                length, settled = skip.cond(
+                    "line_search", ~good, searched, lambda: (jnp.float32(1.0), jnp.bool_(False))
+                )
                 return here.ahead(way, length), base.ahead(problem, by, length), settled
 
             there, base, settled = jax.lax.cond(settled, lambda: (whole, base, jnp.bool_(True)), gone_on)
