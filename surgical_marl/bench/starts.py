@@ -12,11 +12,12 @@ from surgical_marl.bench.workload import Workload
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.policies.acting import forget
 from surgical_marl.policies.policy import load_policy
-from surgical_marl.policies.team import SAME, check_same
+from surgical_marl.policies.team import check_same
 from surgical_marl.robots.rotation import quaternion
 from surgical_marl.scenes.grasps import Jaw, graspers
 from surgical_marl.scenes.scene import Scene
 from surgical_marl.scenes.timing import DECIMATION
+from surgical_marl.tasks.base.options import SAME
 
 NOISE = 0.13
 """Standard deviation of the noise on actions: that of `needle_handover` at the end of a training."""

@@ -12,7 +12,7 @@ from surgical_marl.cli.flags import add_flags, task_help, whole
 from surgical_marl.content import BASELINES, PARTNERS, list_policies, list_scenes, unknown
 from surgical_marl.plugins.tasks import list_tasks
 from surgical_marl.runs.progress import preparing
-from surgical_marl.tasks.base.options import Options
+from surgical_marl.tasks.base.options import SAME, Options
 from surgical_marl.untrusted.files import is_file, is_folder, user_path
 
 
@@ -60,7 +60,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     """Add the flags that say which episodes are played."""
     parser.add_argument("--task", help=f"of a policy that is not trained, {task_help()}")
     parser.add_argument("--scene", help="likewise: a name (see `list scenes`) or a .yaml file")
-    add_flags(parser, Options, ("control", "knowledge", "messages", "difficulty", "start"), default="the policy's own")
+    add_flags(parser, Options, (*SAME[2:], "difficulty", "start"), default="the policy's own")
     add_flags(parser, Options, ("goals",), default="held_out")
     parser.add_argument("--episodes", type=whole(1, 1_000_000), default=200, metavar="N")
     parser.add_argument("--seed", type=whole(0), default=0, metavar="S")
@@ -83,10 +83,10 @@ def _eval(arguments: argparse.Namespace) -> None:
     policies = arguments.policies
     with preparing(f"the episodes of {', '.join(policies)}"):
         from surgical_marl.evaluation.command import play_all, read_result, report
-        from surgical_marl.evaluation.environment import CHOSEN, OWN
+        from surgical_marl.evaluation.environment import CHOSEN
 
         older = None if arguments.against is None else (str(arguments.against), read_result(arguments.against))
-        asked = {key: getattr(arguments, key) for key in (*OWN, *CHOSEN)}
+        asked = {key: getattr(arguments, key) for key in (*SAME, *CHOSEN)}
         played = play_all(policies, asked, arguments.episodes, arguments.seed, arguments.partners)
     print(report(played, older, arguments.json, arguments.csv, arguments.figure))
 
@@ -99,9 +99,9 @@ def _check_crossplay(arguments: argparse.Namespace) -> None:
 def _crossplay(arguments: argparse.Namespace) -> None:
     with preparing(f"the episodes of {', '.join(arguments.teams)}"):
         from surgical_marl.evaluation.crossplay import crossplay, report
-        from surgical_marl.evaluation.environment import CHOSEN, OWN
+        from surgical_marl.evaluation.environment import CHOSEN
 
-        asked = {key: getattr(arguments, key) for key in (*OWN, *CHOSEN)}
+        asked = {key: getattr(arguments, key) for key in (*SAME, *CHOSEN)}
         result = crossplay(arguments.teams, asked, arguments.episodes, arguments.seed)
     print(report(result, arguments.json, arguments.figure))
 

@@ -16,11 +16,11 @@ from surgical_marl.content import BASELINES, find, list_scenes
 from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.runs.process import ending_signals
 from surgical_marl.runs.progress import preparing
-from surgical_marl.tasks.base.options import Options
+from surgical_marl.tasks.base.options import SAME, Options
 from surgical_marl.untrusted.files import is_file, user_path
 from surgical_marl.untrusted.values import plural
 
-_OWN = ("control", "knowledge", "messages", "difficulty", "start", "goals")
+_OWN = (*SAME[2:], "difficulty", "start", "goals")
 
 
 def add_view(commands: Any) -> None:

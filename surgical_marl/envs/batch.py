@@ -49,9 +49,9 @@ class BatchedEnv:
         device: "cpu", "cuda" or "auto".
         arrays: library of the arrays that come back, "numpy", "torch" or "jax". Don't write into what you get: it may
             share memory with the engine.
-        options: further fields of `surgical_marl.tasks.base.options.Options`: control, difficulty, start, max_steps,
-            decimation, reward, observe, knowledge, messages, and observations, which are "si" by default: policies of
-            runs and controllers read them. For a learner without a normaliser choose "scaled".
+        options: further fields of `surgical_marl.tasks.base.options.Options`: control, control_frame, difficulty,
+            start, max_steps, decimation, reward, observe, knowledge, messages, and observations, which are "si" by
+            default: policies of runs and controllers read them. For a learner without a normaliser choose "scaled".
 
     Raises:
         ValueError: naming what is unknown or out of range.
@@ -91,7 +91,7 @@ class BatchedEnv:
         self.scene = self.env.scene
         self.types = alike(self.env)
         self.task, self.task_name = self.env.task, self.env.task_name
-        self.control = self.scene.control
+        self.control = self.env.options.control
         self.max_steps, self.control_dt = self.env.max_steps, self.env.control_dt
         self.device = self.engine.device
         self.action_spaces = {agent: self.env.action_space(agent) for agent in self.agents}
@@ -168,6 +168,15 @@ class BatchedEnv:
         Pictures stand beside the vector, under their own names.
         """
         return dict(self.env.observed[agent].slices)
+
+    def action_terms(self, agent: str) -> dict[str, slice]:
+        """Return the names of the terms of an agent's action, and where each stands in it.
+
+        The numbers of a message follow as "message", if there are `messages`.
+        """
+        if agent not in self.agents:
+            raise unknown("agent", agent, self.agents)
+        return self.env.action_terms(agent)
 
     def restated(self, observations: Mapping[str, Any], how: str) -> dict[str, Any]:
         """Return observations of this environment as another one, with `observations=how`, would have them.

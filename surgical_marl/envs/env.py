@@ -72,7 +72,9 @@ class Env:
         self.agents = self.scene.agents
         self.decimation = self.options.decimation
         self.control_dt = self.decimation * self.scene.model.opt.timestep
-        self.controller = Controller(self.scene, self.options.control, dt=self.control_dt)
+        self.controller = Controller(
+            self.scene, self.options.control, dt=self.control_dt, frame=self.options.control_frame
+        )
         chosen = {**self.scene.observe, **self.options.observe}
         for agent in chosen:
             if agent not in self.agents:
@@ -129,7 +131,8 @@ class Env:
         model = np.empty(mujoco.mj_sizeModel(self.scene.model), np.uint8)
         mujoco.mj_saveModel(self.scene.model, None, model)
         observed = {agent: (seen.names, seen.stated) for agent, seen in self.observed.items()}
-        how = (self.options.control, self.decimation, self.scene.randomisation, self.options.start, self.scaled)
+        control = self.options.control, self.options.control_frame
+        how = (control, self.decimation, self.scene.randomisation, self.options.start, self.scaled)
         physics = sorted(switched_off()), self.scene.attachments, self.scene.systems
         about = f"{self.task_name} {self.task.constants} {how} {physics} {observed} {self.messages}"
         return self.scene.fingerprint + about.encode() + model.tobytes()
@@ -178,6 +181,11 @@ class Env:
         """
         return self.controller.num_actions(agent) + self.messages
 
+    def action_terms(self, agent: str) -> dict[str, slice]:
+        """Return the names of the terms of an agent's action, a message's as "message", and where each stands in it."""
+        found, end = self.controller.slices(agent), self.controller.num_actions(agent)
+        return {**found, "message": slice(end, end + self.messages)} if self.messages else found
+
     def action_space(self, agent: str) -> spaces.Box:
         """[-1, 1] for every number of the terms, and of a message."""
         return spaces.Box(-1.0, 1.0, (self.num_actions(agent),), np.float32)
@@ -221,7 +229,9 @@ class Env:
             truncated=jnp.bool_(False),
             final_observations=observations,
             final_state=state,
-            infos=infos(self.scene, task, world, jnp.zeros_like(carry.tips), self.control_dt, nothing),
+            infos=infos(
+                self.scene, task, world, jnp.zeros_like(carry.tips), self.control_dt, nothing, self._untold(carry)
+            ),
             contacts=contacts,
         )
 
@@ -285,7 +295,7 @@ class Env:
             truncated=truncated,
             final_observations=final_observations,
             final_state=final_state,
-            infos=infos(self.scene, task, world, carry.tips - moved.tips, self.control_dt, terms),
+            infos=infos(self.scene, task, world, carry.tips - moved.tips, self.control_dt, terms, moved.told),
             contacts=contacts,
         )
 
@@ -299,6 +309,12 @@ class Env:
 
     def _unsensed(self) -> dict[str, Array]:
         return {name: jnp.float32(0.0) for name in self.senses}
+
+    def _untold(self, carry: Carry) -> dict[str, dict[str, Array]]:
+        """Return zeros for the infos of action terms, which tell nothing of a reset."""
+        still = {agent: jnp.zeros(self.controller.num_actions(agent)) for agent in self.agents}
+        told = jax.eval_shape(self.controller.command, carry.physics.ctrl, carry.physics.qpos, still)[1]
+        return {agent: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), told[agent]) for agent in self.agents}
 
     def _start(self, task: Task, key: Array, episode: Array) -> tuple[Carry, Contacts, dict[str, ArmView]]:
         """Return how an episode starts, and the views of the arms there."""

@@ -19,7 +19,13 @@ if TYPE_CHECKING:
 
 
 def infos(
-    scene: Scene, task: Task, world: World, moved: Array, dt: float, terms: dict[str, dict[str, Array]]
+    scene: Scene,
+    task: Task,
+    world: World,
+    moved: Array,
+    dt: float,
+    terms: dict[str, dict[str, Array]],
+    told: dict[str, dict[str, Array]],
 ) -> dict[str, dict[str, Array]]:
     """Return agent -> name -> value, as `State.infos` says.
 
@@ -30,6 +36,7 @@ def infos(
         moved: how far the tool tips moved in the step, [arms, 3], m.
         dt: time of the step, s.
         terms: agent -> reward term -> its weighted value.
+        told: what action terms tell of the step, by agent and name.
     """
     success, stages, metrics = task.success(world), task.reached(world), task.metrics(world)
     speeds, found = jnp.linalg.norm(moved, axis=-1) / np.float32(dt), {}
@@ -46,6 +53,7 @@ def infos(
             **_handling(view),
             "cost": sum((cost.astype(jnp.float32) for cost in broken.values()), start=jnp.float32(0.0)),
             **{f"cost_{name}": cost for name, cost in broken.items()},
+            **told[agent],
             **metrics[agent],
         }
     return found

@@ -38,9 +38,9 @@ def play_all(
 
     Args:
         policies: runs or shipped policies of one task and scene, or one of `BASELINES` alone.
-        asked: options of `OWN` and `CHOSEN` (`evaluation/environment.py`); None leaves an option out. Goals are
+        asked: options of `SAME` and `CHOSEN` (`evaluation/environment.py`); None leaves an option out. Goals are
             held-out ones by default; all other defaults are those of the trained policy, which also refuses other
-            values of `OWN`.
+            values of `SAME`.
         partners: agent -> who moves it instead, see `surgical_marl.policies.team.Team`.
 
     Raises:

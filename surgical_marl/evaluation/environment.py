@@ -13,10 +13,10 @@ from surgical_marl.runs.content import scene_label
 from surgical_marl.runs.folder import check_trained, read_settings
 from surgical_marl.runs.identity import setting
 from surgical_marl.runs.settings import Settings
+from surgical_marl.tasks.base.options import SAME
 
-OWN = ("task", "scene", "control", "knowledge", "messages")
 CHOSEN = ("difficulty", "start", "goals")
-"""Options that a trained policy determines, and options that can be chosen for any policy."""
+"""Options that can be chosen for any policy. A trained policy determines those of `SAME`."""
 
 
 def common_settings(policies: Sequence[str], asked: Mapping[str, str | None]) -> Settings:
@@ -31,7 +31,7 @@ def common_settings(policies: Sequence[str], asked: Mapping[str, str | None]) ->
     settings = {policy: _settings(policy, given) for policy in trained or policies}
     name, first = next(iter(settings.items()))
     for policy, other in settings.items():
-        for key in (*OWN, *CHOSEN, "max_steps"):
+        for key in (*SAME, *CHOSEN, "max_steps"):
             if (theirs := setting(other, key)) != (ours := setting(first, key)):
                 advice = f"choose one for all with --{key}" if key in CHOSEN else "they can't be compared"
                 raise ValueError(f"{policy} has {key} {theirs!r} and {name} has {ours!r}: {advice}")
@@ -51,7 +51,7 @@ def _settings(policy: str, asked: Mapping[str, str]) -> Settings:
     if policy in BASELINES:
         return Settings(**asked)  # type: ignore[arg-type]
     settings = read_settings(find("policies", policy))
-    for key in OWN:
+    for key in SAME:
         if key not in asked:
             continue
         wanted = scene_label(asked[key]) if key == "scene" else asked[key]

@@ -39,7 +39,7 @@ def describe_goals(env: BatchedEnv, episodes: int) -> dict[str, Any]:
     return {
         "task": env.task_name,
         "scene": env.scene.name,
-        "control": env.control,
+        "control": env.env.options.control_label,
         "difficulty": env.env.options.difficulty,
         "goals": env.env.options.goals,
         "start": env.env.options.start,

@@ -22,13 +22,12 @@ from surgical_marl.runs.content import scene_label
 from surgical_marl.runs.folder import find_run, read_settings
 from surgical_marl.runs.identity import setting
 from surgical_marl.scenes.load import load_scene
+from surgical_marl.tasks.base.options import SAME
 
 if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv
     from surgical_marl.runs.settings import Settings
 
-SAME = ("task", "scene", "control", "knowledge", "messages")
-"""Settings that a partner has in common with the environment that it acts in."""
 DELAY = 0.5
 """Time for which a "delayed" partner keeps still at the start of an episode, s."""
 
@@ -82,11 +81,10 @@ def check_partners(partners: Mapping[str, str], settings: Settings) -> None:
 def check_fits(who: str, env: BatchedEnv) -> None:
     """Raise ValueError if a policy was trained for another environment than this one.
 
-    Task, scene, control, knowledge and the length of messages must be the same.
+    The options `SAME` must be the same.
     """
     asked = env.env.options
-    own = env.task_name, asked.scene, env.control, asked.knowledge, asked.messages
-    check_same(who, dict(zip(SAME, own, strict=True)))
+    check_same(who, {key: getattr(asked, key) for key in SAME})
 
 
 def _check_roles(partners: Mapping[str, str], agents: Sequence[str]) -> None:

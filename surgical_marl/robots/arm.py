@@ -17,7 +17,7 @@ import numpy as np
 
 from surgical_marl.content import find
 from surgical_marl.robots.description import MOVING, Robot, RobotJoint, Vector
-from surgical_marl.robots.drives import Cable, Drive
+from surgical_marl.robots.drives import Cable, Drive, TipSpeed
 from surgical_marl.robots.jaw import Jaw, JawEntry
 from surgical_marl.robots.mesh import MAX_MESH, mesh_files, resolve_meshes
 from surgical_marl.robots.reach import Box, box_of
@@ -81,6 +81,8 @@ class Arm:
     joints: tuple[Joint, ...]
     """All moving joints in the order of the chain, those that mimic another included."""
     cables: tuple[Cable, ...]
+    tip_speed: TipSpeed
+    """How fast Cartesian control moves the tool tip."""
     urdf: Robot = field(repr=False)
     """Links, joints and shapes; meshes by their files in `folder`."""
 
@@ -240,6 +242,7 @@ class ArmFile:
     camera: Camera | None = None
     joints: dict[str, Drive] = several("drives", MAX_JOINTS)
     cables: tuple[Cable, ...] | None = several("cables", MAX_JOINTS, empty=tuple)
+    tip_speed: TipSpeed = field(default_factory=TipSpeed)
     jaw: JawEntry | None = None
 
 
@@ -278,6 +281,7 @@ def load_arm(name: str | Path) -> Arm:
         camera=about.camera and replace(about.camera, link=link_name(about.camera.link)),
         joints=tuple(_joint(joint, about.joints, drives) for joint in robot.joints if joint.type in MOVING),
         cables=about.cables or (),
+        tip_speed=about.tip_speed,
         urdf=robot,
     )
 

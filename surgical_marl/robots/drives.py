@@ -25,6 +25,14 @@ class Drive:
 
 
 @dataclass(frozen=True)
+class TipSpeed:
+    """How fast a full action of Cartesian control moves and turns the tool tip, along and about each axis."""
+
+    translation: float = number(0.1, LEAST, LARGEST, unit="m/s")
+    rotation: float = number(1.5, LEAST, LARGEST, unit="rad/s")
+
+
+@dataclass(frozen=True)
 class Cable:
     """A cable that couples several joints.
 

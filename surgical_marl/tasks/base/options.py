@@ -23,6 +23,9 @@ from surgical_marl.untrusted.schema import Checked, choice, number
 MOST_WEIGHT = 1e6
 """The largest weight of a reward term, either sign."""
 
+SAME = ("task", "scene", "control", "control_frame", "knowledge", "messages")
+"""Options that a policy is made for: it acts only in environments where they are the same."""
+
 
 @dataclass(frozen=True)
 class Options(Checked):
@@ -32,6 +35,8 @@ class Options(Checked):
         task: a name of `list_tasks()`, or a task file, `my_task.py` or `my_task.py:Escort`.
         scene: a name of `list_scenes()` or the path of a scene file, which becomes absolute.
         control: a name of `list_controls()`: what an action commands (docs/control.md).
+        control_frame: the frame of Cartesian actions: "base", that of each arm, or "camera", that of its own endoscope
+            or of the scene's first (x right, y down, z along the view).
         difficulty: a level of the task; the docstring of the task says what each level is.
         goals: "training", or "held_out" for goals of evaluations, which training never draws.
         start: "home", or "random" for a collision-free posture that is drawn anew in each episode, if the task has such
@@ -55,6 +60,9 @@ class Options(Checked):
     task: str = "reach"
     scene: str = "bimanual_psm"
     control: str = choice("position", "what an action commands")
+    control_frame: Literal["base", "camera"] = choice(
+        "base", "frame of Cartesian actions: the arm's, or an endoscope's"
+    )
     difficulty: str = choice("default", "how far, how fast, how crowded: a level of the task")
     goals: Literal["training", "held_out"] = choice("training", "which goals episodes are drawn from")
     start: Literal["home", "random"] = choice("home", "postures that episodes begin with")
@@ -72,6 +80,11 @@ class Options(Checked):
         if not is_task_file(self.task):  # a task file may register a control of its own
             CONTROLS.check(self.control)
         object.__setattr__(self, "scene", absolute("scenes", self.scene))
+
+    @property
+    def control_label(self) -> str:
+        """The control for people, with its frame unless that is the base: "cartesian (camera)"."""
+        return self.control if self.control_frame == "base" else f"{self.control} ({self.control_frame})"
 
     def of_environment(self) -> dict[str, Any]:
         """Return the environment's options by name, without what a subclass adds to them."""
