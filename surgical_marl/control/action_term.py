@@ -16,7 +16,7 @@ A subclass is found by its name as tasks and algorithms are (docs/control.md).
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, ClassVar, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 
@@ -31,11 +31,14 @@ if TYPE_CHECKING:
 
 
 class Joints(NamedTuple):
-    """The actuated joints of an arm at the start of a control step, [n] each, in rad (m for prismatic joints)."""
+    """The actuated joints of an arm at the start of a control step, [n] each, in rad (m for prismatic joints).
 
-    position: Array
+    Arrays of JAX; on the host [N, n] of numpy.
+    """
+
+    position: Any
     """As the encoders read them."""
-    command: Array
+    command: Any
     """Their last commands: position targets, or velocities or torques."""
 
 
@@ -60,7 +63,7 @@ class ActionTerm:
     """The frames that its numbers can refer to: "base", that of the arm, or "camera", that of an endoscope."""
 
     def __init__(self, scene: Scene, agent: str, dt: float, frame: str = "base") -> None:
-        self.scene, self.agent, self.dt, self.frame = scene, agent, np.float32(dt), frame
+        self.scene, self.agent, self.dt, self.frame = scene, agent, dt, frame
         self.arm = scene.mounts[agent].arm
         self.joints = np.flatnonzero(~self.arm.moves_jaw)
 
@@ -87,6 +90,27 @@ class ActionTerm:
         """Return entries of the agent's `infos` after the step, [] each; `commands` [k] are those of `to_commands`."""
         return {}
 
+    # -- on the host, for N environments at once: scripts and people move position targets by these two
+
+    def steps_of(self, command: np.ndarray, change: np.ndarray) -> np.ndarray:
+        """Return how many control steps a change of position targets takes at full speed, [N].
+
+        Args:
+            command: the targets of all actuated joints now, [N, n].
+            change: [N, n]; only that of `joints` counts.
+        """
+        step = self.dt * self.arm.speed[self.joints]
+        return np.asarray(np.abs(change[:, self.joints] / step).max(-1, initial=0.0))
+
+    def action_of(self, change: np.ndarray, arms: Mapping[str, Joints]) -> np.ndarray:
+        """Return the numbers [N, size] that change position targets by `change` [N, n] in a step, beyond 1 if need be.
+
+        Args:
+            change: only that of `joints` counts.
+            arms: as in `to_commands`, [N, n] each.
+        """
+        raise NotImplementedError
+
 
 class Jaw(ActionTerm):
     """The jaw of an arm: a positive number opens it, any other one closes it, at the speed of its joint."""
@@ -103,7 +127,7 @@ class Jaw(ActionTerm):
 
     def to_commands(self, action: Array, arms: Mapping[str, Joints]) -> Array:
         """Return the next position target of the jaw's joint, [1]."""
-        last, step = arms[self.agent].command[self.joints], self.speed * self.dt
+        last, step = arms[self.agent].command[self.joints], self.speed * np.float32(self.dt)
         closed, opened = (end.astype(np.float32) for end in self.bounds)
         return last + jnp.clip(jnp.where(action > 0, opened, closed) - last, -step, step)
 

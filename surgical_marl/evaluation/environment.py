@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from surgical_marl.content import BASELINES, find
-from surgical_marl.policies.oracle import check_control
+from surgical_marl.policies.target_mover import check_control
 from surgical_marl.runs.content import scene_label
 from surgical_marl.runs.folder import check_trained, read_settings
 from surgical_marl.runs.identity import setting

@@ -30,6 +30,7 @@ from surgical_marl.plugins.task_file import label
 from surgical_marl.policies.actor import acting_policy
 from surgical_marl.policies.layout import Layout
 from surgical_marl.policies.oracle import oracle
+from surgical_marl.policies.target_mover import moves_targets
 from surgical_marl.runs.progress import progress
 from surgical_marl.runs.settings import Settings, make_env
 
@@ -55,11 +56,11 @@ def check_demonstrations(settings: Settings) -> None:
     """Refuse a run whose task the oracle can't demonstrate, before anything is compiled for it.
 
     Raises:
-        ValueError: the control is not "position", or an agent observes pictures; or there are rounds of imitation, and
-            the oracle follows a script of several steps.
+        ValueError: the control has no position targets, or an agent observes pictures; or there are rounds of
+            imitation, and the oracle follows a script of several steps.
     """
-    if settings.control != "position":
-        raise ValueError(f"{_NEITHER} with control {settings.control!r}: the oracle needs position")
+    if not moves_targets(settings.control):
+        raise ValueError(f"{_NEITHER} with control {settings.control!r}: the oracle moves position targets")
     env = Env(**settings.of_environment())
     if any(seen.pictures for seen in env.observed.values()):
         raise ValueError(f"{_NEITHER} where agents observe pictures")
@@ -208,8 +209,10 @@ class _Disturbance:
 
     def __init__(self, env: BatchedEnv, rng: np.random.Generator) -> None:
         self._rng = rng
-        joints = {agent: ~env.scene.mounts[agent].arm.moves_jaw for agent in env.agents}
-        self._free = {agent: np.pad(free, (0, env.env.messages)) for agent, free in joints.items()}
+        self._free = {agent: np.ones(env.action_space(agent).shape or (), bool) for agent in env.agents}
+        for agent, free in self._free.items():
+            for name in {"jaw", "message"} & env.action_terms(agent).keys():
+                free[env.action_terms(agent)[name]] = False
         self._now = {agent: np.zeros((env.num_envs, free.size)) for agent, free in self._free.items()}
 
     def added(self, actions: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -241,11 +244,11 @@ def _jaws_rest(
     rest = np.ones(env.num_envs, bool)
     for agent, action in actions.items():
         arm = env.scene.mounts[agent].arm
-        if arm.jaw is None:
+        if arm.jaw is None or (jaw := env.action_terms(agent).get("jaw")) is None:
             continue
-        jaw = np.flatnonzero(arm.moves_jaw)
         own = env.restated({agent: observations[agent]}, "si")[agent]
-        command, opens = own[:, env.observation_terms(agent)["command"]][:, jaw], action[:, jaw] > 0
+        command = own[:, env.observation_terms(agent)["command"]][:, arm.moves_jaw]
+        opens = action[:, jaw] > 0
         ends = np.where(opens, arm.jaw.open, arm.jaw.closed)
         rest &= ((np.abs(ends - command) < 1e-3) | (opens != (before[agent][:, jaw] > 0))).all(-1)
     return rest

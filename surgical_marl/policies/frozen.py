@@ -16,6 +16,7 @@ import numpy as np
 
 from surgical_marl.envs.observations import proprioception
 from surgical_marl.policies.acting import like, to_numpy
+from surgical_marl.policies.target_mover import jaw_column
 
 if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv
@@ -25,8 +26,8 @@ if TYPE_CHECKING:
 class Frozen:
     """Keep arms as they are when the policy begins to act: in a new episode, or in place of another one.
 
-    An arm under position control holds its targets, one under velocity or torque control is commanded 0. A jaw that is
-    neither open nor closed stays within a control step's way of where it is commanded to be.
+    An arm whose actions move position targets holds these, one under velocity or torque control is commanded 0. A jaw
+    that is neither open nor closed stays within a control step's way of where it is commanded to be.
 
     Args:
         env: the environments.
@@ -36,7 +37,11 @@ class Frozen:
     def __init__(self, env: BatchedEnv, agents: Sequence[str]) -> None:
         jaws = {agent: env.scene.mounts[agent].arm.jaw for agent in agents}
         self._env = env
-        self._jaws = {agent: None if jaw is None else _StillJaw(env, agent, jaw) for agent, jaw in jaws.items()}
+        columns = {agent: jaw_column(env, agent) for agent in agents}
+        self._jaws = {
+            agent: None if jaw is None or (column := columns[agent]) is None else _StillJaw(env, agent, jaw, column)
+            for agent, jaw in jaws.items()
+        }
         self._next = np.full(env.num_envs, -1.0)
         """The number of the step in which the policy acts again, if no other one does before."""
 
@@ -60,11 +65,11 @@ class Frozen:
 class _StillJaw:
     """The jaw of an arm that keeps still."""
 
-    def __init__(self, env: BatchedEnv, agent: str, jaw: Jaw) -> None:
+    def __init__(self, env: BatchedEnv, agent: str, jaw: Jaw, column: int) -> None:
         arm = env.scene.mounts[agent].arm
         self._env, self._ends = env, np.array([[jaw.open], [jaw.closed]])
-        self.column = int(np.flatnonzero(arm.moves_jaw)[0])
-        self._reach = env.control_dt * arm.speed[self.column]
+        self.column = column
+        self._reach = env.control_dt * arm.speed[arm.moves_jaw][0]
         self._actuator = env.scene.model.actuator(f"{agent}/{jaw.joint}").id
         self._kept = np.zeros(env.num_envs)
 

@@ -17,7 +17,8 @@ import numpy as np
 from surgical_marl.envs.observations import proprioception
 from surgical_marl.plugins.task_file import label
 from surgical_marl.policies.acting import like, to_numpy
-from surgical_marl.policies.scripted import Scripted, without_words
+from surgical_marl.policies.scripted import Scripted
+from surgical_marl.policies.target_mover import TargetMover, check_control
 from surgical_marl.robots.inverse_kinematics import inverse_kinematics
 
 if TYPE_CHECKING:
@@ -46,7 +47,7 @@ class Oracle(Protocol):
 
 
 def oracle(env: BatchedEnv, agents: Sequence[str] | None = None) -> Oracle:
-    """Make the oracle of an environment with control "position", for all of its tasks.
+    """Make the oracle of an environment with position targets, for all of its tasks.
 
     If the task has a script, the arms follow it. Otherwise joints follow straight lines in joint space, all arms at the
     same pace; `tasks/base/workspace.py` has checked these paths. For moving targets, commands lead by the joints' lag:
@@ -61,7 +62,7 @@ def oracle(env: BatchedEnv, agents: Sequence[str] | None = None) -> Oracle:
         the agents that it moves. It says nothing: its messages are zeros.
 
     Raises:
-        ValueError: the environment has another control mode.
+        ValueError: the environment's control has no position targets.
     """
     check_control(env.control)
     steps = env.task.script()
@@ -69,12 +70,6 @@ def oracle(env: BatchedEnv, agents: Sequence[str] | None = None) -> Oracle:
         raise ValueError(f"the task {label(env.task_name)!r} has no target for tool tips that an oracle could move to")
     agents = env.agents if agents is None else agents
     return Scripted(env, steps, agents) if steps else _Oracle(env, agents)
-
-
-def check_control(control: str) -> None:
-    """Raise ValueError if the oracle can't move arms with such a control mode."""
-    if control != "position":
-        raise ValueError(f"the oracle moves position targets: control must be 'position', not {control!r}")
 
 
 class _Oracle:
@@ -90,12 +85,14 @@ class _Oracle:
         targets, began = np.asarray(env.task.targets(env.goal), float), to_numpy(env.steps) == 0
         own = env.restated({agent: observations[agent] for agent in arms}, "si")
         seen = {agent: proprioception(observation) for agent, observation in own.items()}
-        moves = {agent: arm.move(targets, began, to_numpy(seen[agent])) for agent, arm in arms.items()}
-        furthest = np.max([np.abs(move).max(-1) for move in moves.values()], axis=0)
+        changes = {agent: arm.change(targets, began, to_numpy(seen[agent])) for agent, arm in arms.items()}
+        furthest = np.max([arms[agent].mover.steps(*change) for agent, change in changes.items()], axis=0)
         pace = 1 / np.maximum(furthest, 1)[:, None]
         # 0 closes a jaw as -1 does, but an actor that imitates it would open the jaw as often as not.
-        moves = {agent: np.where(arms[agent].moves, pace * move, -1.0) for agent, move in moves.items()}
-        return {agent: like(seen[agent], without_words(env, move)) for agent, move in moves.items()}
+        return {
+            agent: like(seen[agent], arms[agent].mover.action(command, pace * change, jaw=-1.0))
+            for agent, (command, change) in changes.items()
+        }
 
 
 class _Guide:
@@ -104,9 +101,8 @@ class _Guide:
     def __init__(self, env: BatchedEnv, agent: str, index: int) -> None:
         self.index, self.arm, joints = index, env.scene.mounts[agent].arm, env.scene.mounts[agent].arm.actuated
         self.dt = env.control_dt
-        self.reach = self.dt * self.arm.speed
         self.lag = np.array([joint.drive.damping / joint.drive.stiffness for joint in joints])
-        self.moves = ~self.arm.moves_jaw
+        self.mover = TargetMover(env, agent)
         self.q = np.tile(self.arm.home, (env.num_envs, 1))
         self.targets = np.full((env.num_envs, 3), np.nan)  # of the last step; unknown at first
         self.wanted = self._on_target if env.task.follows else self._at_target
@@ -114,11 +110,11 @@ class _Guide:
         if missing := {"qpos", "command"} - self.terms.keys():
             raise ValueError(f"the oracle needs to observe {' and '.join(sorted(missing))} of {agent!r}")
 
-    def move(self, targets: np.ndarray, began: np.ndarray, observation: np.ndarray) -> np.ndarray:
-        """Return how far the commands have to move to targets [N, arms, 3], in units of an action of 1, [N, n]."""
+    def change(self, targets: np.ndarray, began: np.ndarray, observation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the commands [N, n], and by how much they have to change for targets [N, arms, 3], [N, n]."""
         wanted = self.wanted(targets[:, self.index], observation[:, self.terms["qpos"]], began)
         command = observation[:, self.terms["command"]]
-        return np.asarray((np.clip(wanted, self.arm.lower, self.arm.upper) - command) / self.reach * self.moves)
+        return command, np.clip(wanted, self.arm.lower, self.arm.upper) - command
 
     def _at_target(self, targets: np.ndarray, qpos: np.ndarray, began: np.ndarray) -> np.ndarray:
         """Return the commands [N, n] that hold tips at targets [N, 3], near to where joints `qpos` began."""

@@ -10,6 +10,7 @@ import numpy as np
 
 from surgical_marl.envs.observations import proprioception
 from surgical_marl.policies.acting import like, to_numpy
+from surgical_marl.policies.target_mover import TargetMover
 from surgical_marl.tasks.base.grasp_poses import frames, joints_at, tool_of
 from surgical_marl.tasks.base.oracle_script import Snapshot, Step, Wish
 
@@ -26,7 +27,7 @@ class Scripted:
     (`Task.attends`) follow no step, and nobody waits for them.
 
     Args:
-        env: the environments, with control "position".
+        env: the environments, with position targets.
         steps: the script.
         agents: those that the policy moves, if others have another one.
 
@@ -63,23 +64,22 @@ class Scripted:
         self._left -= 1
         self.waits = self._left <= self._pauses[self._now]
         share = np.minimum(1.0, self._paces[self._now] / np.maximum(self._furthest(), 1e-9))[:, None]
-        ways = {agent: share * self._tools[agent].way() for agent in self._led} | self._attend()
-        moves = {agent: self._tools[agent].action(ways[agent]) for agent in self._moved}
-        return {agent: like(seen[agent], without_words(env, move)) for agent, move in moves.items()}
+        moves = {agent: self._tools[agent].action(share) for agent in self._led} | self._attend()
+        return {agent: like(seen[agent], moves[agent]) for agent in self._moved}
 
     def _attend(self) -> dict[str, np.ndarray]:
-        """Return how far the commands of agents that attend to others move, in units of an action of 1, [N, n]."""
+        """Return the actions of agents that attend to others, [N, a]."""
         if not self._attending:
             return {}
         every = np.arange(self._env.num_envs)
         wishes = self._env.task.attend(self._look(every))
         for agent in self._attending:
             self._tools[agent].send([(every, wishes[agent])])
-        return {agent: np.clip(self._tools[agent].way(), -1.0, 1.0) for agent in self._attending}
+        return {agent: np.clip(self._tools[agent].action(), -1.0, 1.0) for agent in self._attending}
 
     def _furthest(self, rows: Any = slice(None)) -> np.ndarray:
-        """Return the longest way of a joint in some environments, in units of an action of 1, [n]."""
-        return np.max([np.abs(self._tools[agent].way()[rows]).max(-1) for agent in self._led], axis=0, initial=0.0)
+        """Return in how many control steps at full speed all tools are there, in some environments, [n]."""
+        return np.max([self._tools[agent].steps(rows) for agent in self._led], axis=0, initial=0.0)
 
     def _plan(self, due: np.ndarray, began: np.ndarray) -> None:
         """Plan the next step of the environments `due`; those that `began` an episode start with the first step."""
@@ -116,19 +116,14 @@ class Scripted:
         return Snapshot(tools, objects, held, goal, joints)
 
 
-def without_words(env: BatchedEnv, moves: np.ndarray) -> np.ndarray:
-    """Return the actions [N, n + K] that move joints by `moves` [N, n] and say nothing: messages of zeros."""
-    return np.pad(moves, ((0, 0), (0, env.env.messages)))
-
-
 class _Tool:
     """Path of an agent's tool."""
 
     def __init__(self, env: BatchedEnv, agent: str) -> None:
         self.mount = env.scene.mounts[agent]
         arm = self.mount.arm
-        self.reach = env.control_dt * arm.speed
-        self.jaw = arm.moves_jaw
+        self._mover = TargetMover(env, agent)
+        self._jaw = arm.moves_jaw
         self.q = np.tile(arm.home, (env.num_envs, 1))
         self.command = self.q.copy()
         self.opens = np.zeros(env.num_envs)
@@ -161,18 +156,22 @@ class _Tool:
         if places:
             self.q[np.concatenate(places)], _ = joints_at(self.mount, np.concatenate(poses), np.concatenate(starts))
 
-    def way(self) -> np.ndarray:
-        """Return how far the commands have to move, in units of an action of 1, [N, n]."""
-        return np.asarray((self.q - self.command) / self.reach * ~self.jaw)
+    def steps(self, rows: Any = slice(None)) -> np.ndarray:
+        """Return in how many control steps at full speed the tool is there, in some environments, [n]."""
+        return self._mover.steps(self.command[rows], (self.q - self.command)[rows])
 
-    def action(self, way: np.ndarray) -> np.ndarray:
-        """Return the action that moves the commands by `way` [N, n] and opens or closes the jaw."""
+    def action(self, share: Any = 1.0) -> np.ndarray:
+        """Return the action that moves the commands by a share of their way, and opens or closes the jaw."""
+        return self._mover.action(self.command, share * (self.q - self.command), self._jaw_number())
+
+    def _jaw_number(self) -> Any:
+        """Return the number of the jaw in an action, [N], if the arm has a jaw."""
         jaw = self.mount.arm.jaw
         if jaw is None:
-            return way
+            return 0.0
         aim = jaw.closed + self.opens * (jaw.open - jaw.closed)
-        wider = (self.opens >= 1.0)[:, None] | (self.command < aim[:, None] - 1e-6)
-        return np.where(self.jaw, np.where(wider, 1.0, -1.0), way)
+        wider = (self.opens >= 1.0) | (self.command[:, self._jaw][:, 0] < aim - 1e-6)
+        return np.where(wider, 1.0, -1.0)
 
 
 def _rows(snapshot: Snapshot, rows: np.ndarray) -> Snapshot:

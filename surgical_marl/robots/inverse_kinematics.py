@@ -150,11 +150,11 @@ def _residual(arm: Arm, q: Any, targets: Any, length: float) -> tuple[Any, Any]:
     if targets.shape[-1] == 3:
         return targets - pose[..., :3, 3], jacobian[..., :3, :]
     turn = targets[..., :3, :3] @ xp.matrix_transpose(pose[..., :3, :3])
-    error = xp.concatenate([targets[..., :3, 3] - pose[..., :3, 3], length * _rotation_vector(turn)], -1)
+    error = xp.concatenate([targets[..., :3, 3] - pose[..., :3, 3], length * rotation_vector(turn)], -1)
     return error, xp.concatenate([jacobian[..., :3, :], length * jacobian[..., 3:, :]], -2)
 
 
-def _rotation_vector(turn: Any) -> Any:
+def rotation_vector(turn: Any) -> Any:
     """Return axis times angle in rad, [..., 3], of rotation matrices [..., 3, 3].
 
     At half a turn the axis may be wrong.

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from surgical_marl.envs.observations import proprioception
+from surgical_marl.policies.target_mover import TargetMover
 from surgical_marl.robots.inverse_kinematics import inverse_kinematics
 
 if TYPE_CHECKING:
@@ -29,23 +30,21 @@ class Hand:
     Commands go straight to the wanted joint positions, at the joints' speeds.
 
     Args:
-        env: the environments, with control "position".
+        env: the environments, with position targets.
         agent: the arm.
 
     Raises:
-        ValueError: another control mode, or the agent does not observe its command.
+        ValueError: the control has no position targets, or the agent does not observe its command.
     """
 
     def __init__(self, env: BatchedEnv, agent: str) -> None:
-        if env.control != "position":
-            raise ValueError(f"a person moves position targets: control must be 'position', not {env.control!r}")
+        self._mover = TargetMover(env, agent)
         terms = env.observation_terms(agent)
         if "command" not in terms:
             raise ValueError(f"a person's arm must observe its command, and {agent!r} does not")
         self._env, self._agent, self._command = env, agent, terms["command"]
         self.mount = env.scene.mounts[agent]
         self._arm = self.mount.arm
-        self._pace = env.control_dt * self._arm.speed
         self.jaw = self._arm.moves_jaw
         """True for joints that open the jaw, [n] bool."""
         self.jaw_open = False
@@ -106,9 +105,9 @@ class Hand:
 
     def __call__(self, observation: Any) -> np.ndarray:
         """Return the action [N, n] that moves commands towards what is wanted."""
-        way = (self.q - self._commands(observation)) / self._pace
-        moves = np.where(self.jaw, 1.0 if self.jaw_open else -1.0, np.clip(way, -1.0, 1.0))
-        return np.pad(moves, ((0, 0), (0, self._env.env.messages))).astype(np.float32)
+        command = self._commands(observation)
+        found = self._mover.action(command, self.q - command, 1.0 if self.jaw_open else -1.0)
+        return np.clip(found, -1.0, 1.0).astype(np.float32)
 
     def _commands(self, observation: Any) -> np.ndarray:
         """Return where the arm is sent to, [N, n]."""

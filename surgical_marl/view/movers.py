@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from surgical_marl.content import find, list_policies, unknown
+from surgical_marl.policies.target_mover import moves_targets
 from surgical_marl.policies.team import check_fits
 from surgical_marl.policies.teammates import FROZEN, Teammates
 from surgical_marl.untrusted.markup import check_name
@@ -106,7 +107,7 @@ def choices(env: BatchedEnv, further: Iterable[str] = ()) -> list[str]:
         env: the environment.
         further: runs, by their folders.
     """
-    found = [YOU] if env.control == "position" else []
+    found = [YOU] if moves_targets(env.control) else []
     for name in (*further, *list_policies(), *SIMPLE):
         if name not in found and _fits(name, env):
             found.append(name)
@@ -121,7 +122,7 @@ def first(env: BatchedEnv) -> str:
 
 def _fits(name: str, env: BatchedEnv) -> bool:
     if name == "oracle":
-        return env.control == "position" and (env.task.has_targets or bool(env.task.script()))
+        return moves_targets(env.control) and (env.task.has_targets or bool(env.task.script()))
     try:
         check_fits(str(_place(name, env)), env)
     except ValueError:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
@@ -27,22 +29,23 @@ def term_of(arm: Arm) -> Cartesian:
     return Cartesian(scene, "arm", DT)
 
 
-def commanded(term: Cartesian, q: np.ndarray, actions: np.ndarray, measured: np.ndarray | None = None) -> Any:
-    """The next commands and the infos, of rows of last commands and actions."""
-
-    @jax.jit
-    @jax.vmap
+@cache
+def compiled(term: Cartesian) -> Callable[..., Any]:
     def command(now: Any, last: Any, action: Any) -> Any:
         arms = {"arm": Joints(now, last)}
         found = term.to_commands(action, arms)
-        return found, term.infos(action, arms, found)
+        return found, term.infos(action, arms, found)["cartesian_error"]
 
-    last = jnp.asarray(q, jnp.float32)
-    now = last if measured is None else jnp.asarray(measured, jnp.float32)
-    found, infos = command(now, last, jnp.asarray(actions, jnp.float32))
+    return jax.jit(jax.vmap(command))
+
+
+def commanded(term: Cartesian, q: np.ndarray, actions: np.ndarray, measured: np.ndarray | None = None) -> Any:
+    """The next commands and the errors told, of rows of last commands and actions."""
+    rows = (q if measured is None else measured, q, actions)
+    found, told = compiled(term)(*(jnp.asarray(part, jnp.float32) for part in rows))
     every = np.asarray(q, np.float32).astype(float)
     every[:, term.joints] = found
-    return every, np.asarray(infos["cartesian_error"])
+    return every, np.asarray(told)
 
 
 def between(one: np.ndarray, other: np.ndarray) -> np.ndarray:

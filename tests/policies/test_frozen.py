@@ -27,7 +27,8 @@ def simulator(control: str) -> Simulator:
 def commanded(physics: Any, simulator: Simulator) -> SimpleNamespace:
     """An environment in which nothing moves but commands."""
     env = SimpleNamespace(scene=simulator.scene, num_envs=1, control_dt=simulator.control_dt, steps=np.ones(1, int),
-                          physics=physics, action_space=lambda _: np.zeros(9))  # fmt: skip
+                          physics=physics, action_space=lambda _: np.zeros(9),
+                          action_terms=lambda _: {"jaw": slice(6, 7)})  # fmt: skip
     env.engine = SimpleNamespace(read=lambda *_: np.asarray(env.physics.ctrl)[None])
     return env
 

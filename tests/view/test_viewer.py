@@ -168,7 +168,7 @@ def test_the_menu_has_what_fits(session: Session) -> None:
 
 def test_nobody_moves_velocities_by_hand() -> None:
     env: Any = SimpleNamespace(control="velocity")
-    with pytest.raises(ValueError, match="control must be 'position', not 'velocity'"):
+    with pytest.raises(ValueError, match="control must be cartesian or position, not 'velocity'"):
         Hand(env, "psm_0")
 
 

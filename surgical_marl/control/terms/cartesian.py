@@ -14,6 +14,7 @@ import numpy as np
 from surgical_marl.content import find, list_scenes
 from surgical_marl.control.action_term import ActionTerm, Joints, lead_limit, symmetric
 from surgical_marl.robots.arm import load_arm
+from surgical_marl.robots.inverse_kinematics import rotation_vector
 from surgical_marl.robots.reach import Box
 from surgical_marl.runtime import jax, jnp
 from surgical_marl.scenes.scene import Mount, Scene
@@ -70,6 +71,27 @@ class Cartesian(ActionTerm):
         missed = self._pose(commands)[0][:3, 3] - target.position
         return {"cartesian_error": jnp.sqrt(jnp.sum(missed**2))}
 
+    def steps_of(self, command: np.ndarray, change: np.ndarray) -> np.ndarray:
+        """Return how many control steps a change of targets takes at the speeds of the joints and of the tip, [N]."""
+        own = np.zeros(change.shape)
+        own[:, self.joints] = change[:, self.joints]
+        twist = (self.arm.jacobian(command) @ own[..., None])[..., 0].reshape(-1, 2, 3)
+        speed = self.arm.tip_speed
+        ways = np.linalg.norm(twist, axis=-1) / (self.dt * np.array([speed.translation, speed.rotation]))
+        return np.maximum(ways.max(-1), super().steps_of(command, change))
+
+    def action_of(self, change: np.ndarray, arms: Mapping[str, Joints]) -> np.ndarray:
+        """Return the twist [N, 6] from the tip's pose at the targets to that at the changed ones."""
+        command = arms[self.agent].command
+        wanted = command.copy()
+        wanted[:, self.joints] += change[:, self.joints]
+        now, then = (self.arm.forward_kinematics(q) for q in (command, wanted))
+        turn = rotation_vector(then[:, :3, :3] @ np.swapaxes(now[:, :3, :3], 1, 2))
+        twist = np.stack([then[:, :3, 3] - now[:, :3, 3], turn], 1)
+        if self._camera:
+            twist = twist @ self._camera_axes(arms)
+        return np.asarray(twist.reshape(-1, 6) / (self.dt * self.bounds.high))
+
     def _reach(self, joints: Joints) -> _Reach:
         """Return where the joints may be commanded to in this step, and the command that the step starts from."""
         own, most = self.joints, lead_limit(self.arm)[self.joints]
@@ -77,7 +99,7 @@ class Cartesian(ActionTerm):
         lower, upper = (end[own].astype(np.float32) for end in (self.arm.lower, self.arm.upper))
         now, last = joints.position[own], joints.command[own]
         low, high = jnp.clip(now - most, lower, upper), jnp.clip(now + most, lower, upper)
-        start, step = jnp.clip(last, low, high), speed * self.dt
+        start, step = jnp.clip(last, low, high), speed * np.float32(self.dt)
         return _Reach(start, jnp.maximum(low, start - step), jnp.minimum(high, start + step))
 
     def _target(self, action: Array, arms: Mapping[str, Joints], reach: _Reach) -> _Target:
@@ -89,11 +111,12 @@ class Cartesian(ActionTerm):
         return _Target(pose[:3, 3] + twist[0], _rotation(twist[1]) @ pose[:3, :3])
 
     def _camera_axes(self, arms: Mapping[str, Joints]) -> Any:
-        """Return the axes of the endoscope's picture in the base frame of this arm, columns, [3, 3]."""
+        """Return the axes of the endoscope's picture in the base frame of this arm, columns, [..., 3, 3]."""
         mounts, camera = self.scene.mounts, self._camera
+        assert camera is not None
         arm = mounts[camera].arm
         assert arm.camera is not None
-        axes = arm.link_poses(arms[camera].position, (arm.camera.link,))[arm.camera.link][:3, :3]
+        axes = arm.link_poses(arms[camera].position, (arm.camera.link,))[arm.camera.link][..., :3, :3]
         between = mounts[self.agent].rotation.T @ mounts[camera].rotation
         return between.astype(np.float32) @ axes @ CAMERA.astype(np.float32)
 
@@ -110,7 +133,7 @@ class Cartesian(ActionTerm):
         turn = 0.5 * jnp.sum(jnp.cross(axes, target.axes, axis=0), 1)  # of a small angle
         error = jnp.concatenate([target.position - pose[:3, 3], LENGTH * turn])
         # in m that each joint moves the tip at its speed in a step
-        speed = self.arm.speed[self.joints].astype(np.float32) * self.dt
+        speed = (self.arm.speed[self.joints] * self.dt).astype(np.float32)
         slope = jacobian * np.repeat([1.0, LENGTH], 3).astype(np.float32)[:, None] * speed
         downhill = error @ slope
         held = ((q <= reach.low) & (downhill < 0)) | ((q >= reach.high) & (downhill > 0))
@@ -135,7 +158,7 @@ class _Target(NamedTuple):
     """Columns, [3, 3]."""
 
 
-def _damped_least_squares(slope: Array, error: Array) -> Array:
+def _damped_least_squares(slope: Array, error: Array) -> Any:
     """Return the change [k] for which `slope @ change` [d, k] [k] is nearest to an error [d], damped.
 
     The system that is solved has the lesser of the two sizes.
@@ -150,7 +173,7 @@ def _damped_least_squares(slope: Array, error: Array) -> Array:
     return jax.scipy.linalg.cho_solve(factor, error @ slope)
 
 
-def _rotation(vector: Array) -> Array:
+def _rotation(vector: Array) -> Any:
     """Return the rotation matrix [3, 3] of axis times angle [3], rad (Rodrigues' formula)."""
     x, y, z = vector
     angle = jnp.sqrt(jnp.sum(vector**2) + np.float32(1e-12))

@@ -30,6 +30,10 @@ class JointPosition(ActionTerm):
         """Return the next position targets, [size]."""
         arm, most = self.arm, lead_limit(self.arm)[self.joints]
         now, last = (part[self.joints] for part in arms[self.agent])
-        step = arm.speed[self.joints].astype(np.float32) * self.dt
+        step = arm.speed[self.joints].astype(np.float32) * np.float32(self.dt)
         low, high = (end[self.joints].astype(np.float32) for end in (arm.lower, arm.upper))
         return jnp.clip(now + jnp.clip(last + action * step - now, -most, most), low, high)
+
+    def action_of(self, change: np.ndarray, arms: Mapping[str, Joints]) -> np.ndarray:
+        """Return the numbers that move the targets by `change` in a step, [N, size]."""
+        return np.asarray(change[:, self.joints] / (self.dt * self.arm.speed[self.joints]))
