@@ -159,6 +159,7 @@ def test_the_example_algorithm_is_listed_trained_and_loaded(
 ) -> None:
     done = example(USED + ALGORITHM)
     listed = dict(line.split(maxsplit=1) for line in done.stdout.splitlines()[:6])
+    assert listed["controls"].split(", ") == ["cartesian", "depth", "position", "torque", "velocity"]
     assert listed["algorithms"].split(", ") == ["happo", "ippo", "joint", "mappo", "spo"]
     assert {"salute", "reach"} <= set(listed["tasks"].split(", "))
     assert {"psm_watched", "psm"} <= set(listed["scenes"].split(", "))
