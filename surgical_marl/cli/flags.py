@@ -35,6 +35,8 @@ def add_flags(
         if item.name not in (flagged(of) if only is None else only):
             continue
         check, metavar = _reader(hints[item.name], item.metadata.get("range"))
+        if names := item.metadata.get("names"):
+            check, metavar = one_of(names()), "|".join(names())
         text = item.metadata["help"] + (f" (default: {default})" if default else "")
         parser.add_argument(f"--{item.name.replace('_', '-')}", type=check, metavar=metavar, help=text)
 

@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 import numbers
 import types
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass, replace
 from functools import cache
@@ -72,9 +72,9 @@ def rgb(default: Any = None) -> Any:
     return number(default, 0.0, 1.0)
 
 
-def choice(default: Any, text: str) -> Any:
-    """Return a dataclass field with a text for `--help`; its type says which values are good."""
-    return field(default=default, metadata={"help": text})
+def choice(default: Any, text: str, names: Callable[[], Sequence[str]] | None = None) -> Any:
+    """Return a dataclass field with a text for `--help`; its type, or `names`, says which values are good."""
+    return field(default=default, metadata={"help": text, "names": names})
 
 
 def several(noun: str, most: int, least: int = 0, empty: Any = dict) -> Any:

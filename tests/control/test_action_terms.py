@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +16,7 @@ from surgical_marl.control.action_term import ActionTerm, symmetric
 from surgical_marl.control.controller import Controller, actuators_of
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.envs.env import Env
+from surgical_marl.plugins.controls import CONTROLS
 from surgical_marl.robots.reach import Box
 
 DT = 0.02
@@ -51,8 +54,12 @@ class Grip(ActionTerm):
         return low + (action + 1) / 2 * (high - low)
 
 
-sm.register_control("push", Push)
-sm.register_control("grip", Grip)
+@pytest.fixture(autouse=True, scope="module")
+def registered() -> Iterator[None]:
+    with mock.patch.dict(CONTROLS._registered):
+        sm.register_control("push", Push)
+        sm.register_control("grip", Grip)
+        yield
 
 
 def command(scene: str, control: str, actions: dict[str, np.ndarray]) -> tuple[np.ndarray, Any, Any]:

@@ -208,7 +208,7 @@ def test_pictures_are_terms_of_any_task(start: str) -> None:
             r"unknown start of task 'match_image' 'random'.*choose from home",
         ),
         ({"goals": "new"}, "goals must be one of training, held_out, not 'new'"),
-        ({"control": "psition"}, "control must be one of position, velocity, torque, not 'psition'"),
+        ({"control": "psition"}, "unknown control 'psition', did you mean 'position'"),
         ({"difficulty": "hrad"}, "unknown difficulty 'hrad', did you mean 'hard'"),
         ({"reward": {"colision": 1}}, "unknown reward term 'colision', did you mean 'collision'"),
         ({"reward": {"collision": float("nan")}}, "reward.collision must be a number"),

@@ -325,7 +325,7 @@ PLAY = ["play", "reach", "--scene", "psm", "--out", "f.gif"]
         ([*PLAY, "--grid", "4"], ["4x4", "'4'"]),
         ([*PLAY, "--grid", "9x1"], ["1 to 8", "9x1"]),
         ([*PLAY, "--grid", "4x8", "--size", "4096x4096"], ["32768x16384", "8192 pixels"]),
-        ([*PLAY, "--policy", "oracle", "--control", "torque"], ["oracle", "'position', not 'torque'"]),
+        ([*PLAY, "--policy", "oracle", "--control", "torque"], ["oracle", "position, not 'torque'"]),
         ([*PLAY, "--camera", "0,0,-1"], ["distance", "'0,0,-1'"]),
         ([*PLAY, "--slow", "0"], ["0.1 to 100", "not 0"]),
         ([*PLAY, "--slow", "much"], ["'much'"]),

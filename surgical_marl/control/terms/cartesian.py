@@ -31,6 +31,8 @@ do both, the tip keeps its path, and its orientation gives way."""
 DAMPING = 1e-6
 """Damping as a share of the trace of the squared Jacobian: the least that keeps the matrix regular in float32. Speeds
 of joints near a singularity are bounded by their limits."""
+PLACES = 5
+"""Places of a straight path of the joints at which the speed of the tip is looked at."""
 CAMERA = np.diag([1.0, -1.0, -1.0])
 """From the frame of a picture, x right, y down and z along the view, to that of a MuJoCo camera."""
 
@@ -75,10 +77,12 @@ class Cartesian(ActionTerm):
         """Return how many control steps a change of targets takes at the speeds of the joints and of the tip, [N]."""
         own = np.zeros(change.shape)
         own[:, self.joints] = change[:, self.joints]
-        twist = (self.arm.jacobian(command) @ own[..., None])[..., 0].reshape(-1, 2, 3)
-        speed = self.arm.tip_speed
-        ways = np.linalg.norm(twist, axis=-1) / (self.dt * np.array([speed.translation, speed.rotation]))
-        return np.maximum(ways.max(-1), super().steps_of(command, change))
+        # the tip's path bends: it is as slow everywhere as it must be where it is longest
+        path = command + np.linspace(0.0, 1.0, PLACES)[:, None, None] * own
+        twist = (self.arm.jacobian(path) @ own[..., None])[..., 0].reshape(*path.shape[:2], 2, 3)
+        speed = self.dt * np.array([self.arm.tip_speed.translation, self.arm.tip_speed.rotation])
+        ways = (np.linalg.norm(twist, axis=-1) / speed).max((0, -1))
+        return np.maximum(ways, super().steps_of(command, change))
 
     def action_of(self, change: np.ndarray, arms: Mapping[str, Joints]) -> np.ndarray:
         """Return the twist [N, 6] from the tip's pose at the targets to that at the changed ones."""

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_type_hints
 
 from surgical_marl.content import absolute, as_name
-from surgical_marl.plugins.controls import CONTROLS
+from surgical_marl.plugins.controls import CONTROLS, list_controls
 from surgical_marl.plugins.task_file import absolute as absolute_task
 from surgical_marl.plugins.task_file import is_task_file
 from surgical_marl.scenes.timing import DECIMATION
@@ -59,7 +59,7 @@ class Options(Checked):
 
     task: str = "reach"
     scene: str = "bimanual_psm"
-    control: str = choice("position", "what an action commands")
+    control: str = choice("position", "what an action commands", list_controls)
     control_frame: Literal["base", "camera"] = choice(
         "base", "frame of Cartesian actions: the arm's, or an endoscope's"
     )
