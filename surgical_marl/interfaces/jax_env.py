@@ -100,6 +100,11 @@ class JaxEnv:
         """Return the space [-1, 1] of what an agent does. ValueError for an unknown agent."""
         return self._of(agent, self.action_spaces)
 
+    def action_terms(self, agent: str) -> dict[str, slice]:
+        """Return the names of the terms of an agent's action, and where each stands in it."""
+        self._of(agent, self.action_spaces)
+        return self.env.action_terms(agent)
+
     @jax_scope()
     def reset(self, key: Array, *, number: Array | int = 0) -> tuple[dict[str, Array], EnvState]:
         """Return the observations, [d] by agent, and the state at the start of an episode.

@@ -78,6 +78,14 @@ class _Face:
         """Return an agent's Box [-1, 1], of one environment; the same object each time."""
         return self.batch.action_space(agent)
 
+    def observation_terms(self, agent: str) -> dict[str, slice]:
+        """Return the names of what an agent observes, and where each stands in its vector."""
+        return self.batch.observation_terms(agent)
+
+    def action_terms(self, agent: str) -> dict[str, slice]:
+        """Return the names of the terms of an agent's action, and where each stands in it."""
+        return self.batch.action_terms(agent)
+
     def state(self) -> Any:
         """Return the whole state that a centralised critic sees: [S], with `num_envs` [N, S]."""
         self.batch.check_open()
@@ -224,13 +232,13 @@ def parallel_env(
         arrays: with `num_envs`, the library of the arrays: "numpy", "torch" or "jax".
         render_mode: of one environment: None, "rgb_array" for pictures, or "human" for a window that follows.
         render_size: width and height of a picture, pixels; None for 480 and 360.
-        options: `control` ("position", "velocity" or "torque"), `difficulty` (a level of the task), `start` ("home" or
-            "random"), `observations` ("scaled" for numbers from -1 to 1 between their bounds, the default, or "si" for
-            metres, radians and newtons), `max_steps` (control steps until truncation), `decimation` (physics steps a
-            control step), `reward` (weights of reward terms, as in {"collision": -5}), `knowledge` ("task", "all",
-            "own" or "one": who knows what), `messages` (numbers that an agent says to its teammates in a step) and
-            `observe` (terms that agents see, as in {"ecm_0": ["qpos", "image"]}): see
-            `surgical_marl.tasks.base.options.Options`.
+        options: `control` ("position", "velocity", "torque", "cartesian" or a term of your own), `control_frame`
+            ("base" or "camera"), `difficulty` (a level of the task), `start` ("home" or "random"), `observations`
+            ("scaled" for numbers from -1 to 1 between their bounds, the default, or "si" for metres, radians and
+            newtons), `max_steps` (control steps until truncation), `decimation` (physics steps a control step),
+            `reward` (weights of reward terms, as in {"collision": -5}), `knowledge` ("task", "all", "own" or "one": who
+            knows what), `messages` (numbers that an agent says to its teammates in a step) and `observe` (terms that
+            agents see, as in {"ecm_0": ["qpos", "image"]}): see `surgical_marl.tasks.base.options.Options`.
 
     Raises:
         ValueError: naming the unknown value and the good ones.

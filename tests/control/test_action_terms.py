@@ -90,6 +90,14 @@ def test_an_action_is_the_numbers_of_its_terms(control: str, first: int) -> None
         assert env.action_space(agent).shape == (max(part.stop for part in env.action_terms(agent).values()),)
 
 
+def test_faces_name_the_terms_of_actions_and_observations() -> None:
+    env = sm.parallel_env("reach", scene="psm", engine="mjx", device="cpu")
+    assert env.action_terms("psm_0") == {"position": slice(0, 6), "jaw": slice(6, 7)}
+    assert env.observation_terms("psm_0") == env.batch.observation_terms("psm_0")
+    with pytest.raises(ValueError, match="unknown agent 'psm_1'"):
+        env.action_terms("psm_1")
+
+
 def test_bounds_say_what_a_full_action_is() -> None:
     scene = sm.load_scene("psm")
     arm = scene.mounts["psm_0"].arm
