@@ -33,7 +33,7 @@ train: $(READY)
 
 # Neighbours in a file share what they compile: a worker takes half of the tests, in order, and from the other when done.
 test: $(READY)
-	$(BIN)/pytest -n 2 --dist worksteal $(ARGS)
+	$(BIN)/pytest -n 2 --dist worksteal --durations 20 $(ARGS)
 
 # Not --quiet: it would also hide the warnings that --strict counts.
 docs: $(SITE_READY)
