@@ -24,7 +24,7 @@ from surgical_marl import list_scenes, list_tasks, load_scene
 from surgical_marl.content import find
 from surgical_marl.engines.fused.kernel import compile_kernels
 from surgical_marl.envs.batch import BatchedEnv
-from surgical_marl.envs.batch_step import BatchStep
+from surgical_marl.envs.state import BatchStep
 from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.robots.rotation import matrix_of
 from surgical_marl.runs.fault import write_fault

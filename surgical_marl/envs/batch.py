@@ -9,6 +9,7 @@ An environment that ends starts its next episode within the same step, unless `a
 
 from __future__ import annotations
 
+import numbers
 import secrets
 from collections.abc import Mapping, Sequence
 from types import SimpleNamespace
@@ -19,21 +20,21 @@ from gymnasium import spaces
 
 from surgical_marl.content import unknown
 from surgical_marl.engines.choose import ENGINES, make_engine
+from surgical_marl.engines.fused.threefry import episode_keys
 from surgical_marl.envs.actions import check_actions
-from surgical_marl.envs.agent_types import alike
-from surgical_marl.envs.batch_step import BatchStep
+from surgical_marl.envs.agent_observation import alike
 from surgical_marl.envs.env import Env
 from surgical_marl.envs.fault_place import FaultPlace, fault_place
 from surgical_marl.envs.free_objects import FreeObjects
-from surgical_marl.envs.meant_for import meant_for
 from surgical_marl.envs.observations import each, with_vector
-from surgical_marl.envs.seeds import check_seed, is_whole, keys_of
+from surgical_marl.envs.state import BatchStep
 from surgical_marl.physics.outputs import Contacts
+from surgical_marl.plugins.tasks import meant_for
 from surgical_marl.scenes.poses import Poses
 
 if TYPE_CHECKING:
     from surgical_marl.engines.choose import Engine
-    from surgical_marl.envs.sight import Sight
+    from surgical_marl.envs.picture_terms import PictureTerms
 
 ARRAYS = ("numpy", "torch", "jax")
 
@@ -68,7 +69,7 @@ class BatchedEnv:
         arrays: str = "numpy",
         **options: Any,
     ) -> None:
-        if not is_whole(num_envs) or num_envs < 1:
+        if not _is_whole(num_envs) or num_envs < 1:
             raise ValueError(f"num_envs must be a whole number of at least 1, not {num_envs!r}")
         num_envs = int(num_envs)
         if engine not in ENGINES:
@@ -99,11 +100,11 @@ class BatchedEnv:
         self._action_shapes = {agent: (num_envs, *space.shape) for agent, space in self.action_spaces.items()}
         self.state_space = self.env.state_space
         self._free_objects = FreeObjects(self.scene)
-        self._sight: Sight | None = None
+        self._sight: PictureTerms | None = None
         if self.env.pauses:
-            from surgical_marl.envs.sight import Sight
+            from surgical_marl.envs.picture_terms import PictureTerms
 
-            self._sight = Sight(self.env, self.engine, num_envs, arrays)
+            self._sight = PictureTerms(self.env, self.engine, num_envs, arrays)
             self.observation_spaces |= self._sight.spaces(self.observation_spaces)
         self._started = False
 
@@ -222,7 +223,7 @@ class BatchedEnv:
         """
         engine = self.engine
         if mask is None and not isinstance(seed, Sequence | np.ndarray):
-            whole = check_seed(seed)
+            whole = _check_seed(seed)
             if whole is None and self._started:
                 engine.begin(engine.read(".key", "numpy"), engine.read(".episode", "numpy") + np.int32(1))
             else:
@@ -237,15 +238,18 @@ class BatchedEnv:
             self._sight.begin(found)
         if mask is not None and not mask.all():
             rows = np.flatnonzero(mask)
-            of_agents = lambda tree: {agent: each(own, lambda part: part[rows]) for agent, own in tree.items()}  # noqa: E731
-            return of_agents(found["observations"]), found["state"][rows], of_agents(found["infos"])
+            observations, infos = (
+                {agent: each(own, lambda part: part[rows]) for agent, own in found[kind].items()}
+                for kind in ("observations", "infos")
+            )
+            return observations, found["state"][rows], infos
         return found["observations"], found["state"], found["infos"]
 
     def _begin(self, seed: Any, first: int, mask: np.ndarray) -> None:
         """Begin the first episode of the environments of a mask that have a seed, and the next one of the others."""
         if mask.shape != (self.num_envs,) or mask.dtype != bool:
             raise ValueError(f"mask of shape {mask.shape} and type {mask.dtype} must be [{self.num_envs}] bool")
-        seeded, keys = keys_of(seed, self.num_envs, first)
+        seeded, keys = _keys_of(seed, self.num_envs, first)
         if not self._started:
             if not mask.all():
                 raise ValueError("mask before the first reset: call reset() for all environments first")
@@ -371,3 +375,33 @@ class BatchedEnv:
         if not self._started:
             raise ValueError("no episode yet: call reset() first")
         return engine.read(name, library)
+
+
+def _check_seed(seed: Any) -> int | None:
+    """Return a seed as an int, or None for none; ValueError if it is no whole number in range."""
+    if seed is not None and not (_is_whole(seed) and 0 <= seed < 2**63):
+        raise ValueError(f"seed must be a whole number from 0 to 2**63 - 1, not {seed!r}")
+    return None if seed is None else int(seed)
+
+
+def _is_whole(value: Any) -> bool:
+    """Whether a value is a whole number, of Python or of numpy."""
+    return isinstance(value, numbers.Integral) and not isinstance(value, bool)
+
+
+def _keys_of(seed: Any, num_envs: int, first: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return which environments get a seed, [N] bool, and the keys that the seeds lead to, [N, 2].
+
+    Args:
+        seed: one for all, or a list with one for each environment; None leaves an environment without.
+        num_envs: how many environments.
+        first: the number of the first one.
+    """
+    if not isinstance(seed, Sequence | np.ndarray):
+        one = _check_seed(seed)
+        return np.full(num_envs, one is not None), episode_keys(one or 0, num_envs, first)
+    if len(seed) != num_envs:
+        raise ValueError(f"a list of {len(seed)} seeds does not fit {num_envs} environments: give one for each")
+    seeds = [_check_seed(own) for own in seed]
+    keys = np.concatenate([episode_keys(own or 0, 1) for own in seeds])
+    return np.array([own is not None for own in seeds]), keys

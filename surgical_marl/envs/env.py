@@ -21,10 +21,10 @@ from gymnasium import spaces
 from surgical_marl.cache import cached
 from surgical_marl.control.controller import Controller, actuators_of
 from surgical_marl.engines.stepper import describe
+from surgical_marl.envs.agent_observation import AgentObservation
+from surgical_marl.envs.information_level import InformationLevel
 from surgical_marl.envs.infos import infos
-from surgical_marl.envs.knowledge import Knowledge
 from surgical_marl.envs.observations import Scale
-from surgical_marl.envs.observed import Observed
 from surgical_marl.envs.state import Carry, Moved, State
 from surgical_marl.physics.skip import switched_off
 from surgical_marl.plugins.task_file import label
@@ -84,8 +84,8 @@ class Env:
         self.scaled, self.messages = self.options.observations == "scaled", self.options.messages
         if self.messages and len(self.agents) < 2:
             raise ValueError(f"messages must be 0 in a scene of one arm such as {scene!r}, not {self.messages}")
-        known = {a: Knowledge(self.task, a, self.options.knowledge, self.messages) for a in self.agents}
-        self.observed = {a: Observed(self.task, own, chosen.get(a), self.scaled) for a, own in known.items()}
+        known = {a: InformationLevel(self.task, a, self.options.knowledge, self.messages) for a in self.agents}
+        self.observed = {a: AgentObservation(self.task, own, chosen.get(a), self.scaled) for a, own in known.items()}
 
     @property
     def _sizes(self) -> list[int]:
@@ -109,9 +109,11 @@ class Env:
     def begins_at_home(self) -> bool:
         """Whether all episodes begin with all arms at home. It is kept on disk: JAX finds it out by tracing."""
 
+        def start(key: Array, parameters: Any) -> Any:
+            return self._bound(parameters)[0].start(key)
+
         @jax_scope()
         def trace() -> np.ndarray:
-            start = lambda key, p: self.task.bound(p["weights"], p["tables"]).start(key)  # noqa: E731
             found = jax.eval_shape(start, jax.ShapeDtypeStruct((2,), np.uint32), self.parameters)
             return np.array(found.qpos is None)
 

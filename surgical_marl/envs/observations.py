@@ -1,4 +1,4 @@
-"""Observations: one array each, or a dict of arrays where `surgical_marl/envs/sight.py` adds pictures.
+"""Observations: one array each, or a dict of arrays where `surgical_marl/envs/picture_terms.py` adds pictures.
 
 The numbers of an array are in SI units, or scaled: each from -1 to 1 between its bounds.
 """

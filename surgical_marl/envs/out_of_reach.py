@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 
@@ -46,7 +47,10 @@ def out_of_reach(env: Env) -> str | None:
 def _draw(env: Env) -> np.ndarray:
     """Return the targets at the start of `DRAWS` episodes, [DRAWS, arms, 3], m, each in its arm's base frame."""
     keys = np.random.default_rng(0).integers(0, 2**32, (DRAWS, 2), np.uint32)
-    start = lambda key, p: env.task.bound(p["weights"], p["tables"]).start(key).goal  # noqa: E731
+
+    def start(key: Any, parameters: Any) -> Any:
+        return env.task.bound(parameters["weights"], parameters["tables"]).start(key).goal
+
     with jax.default_device(jax.devices("cpu")[0]):
         goal = jax.jit(jax.vmap(start, (0, None)))(keys, env.parameters)
     fields = {name: np.asarray(value) for name, value in goal._asdict().items()}

@@ -52,7 +52,7 @@ class State(NamedTuple):
     of each `<object>_force` (N), `<object>_holding` and `<object>_slip` (m); `stage_<name>` and the task's own metrics,
     such as tip_error (m); what action terms tell, as Cartesian control tells `cartesian_error` (m);
     `reward_<term>`, the weighted terms that the reward is the sum of; `cost_<name>`, the limits broken
-    (`surgical_marl/envs/costs.py`), and their number `cost`. Of this step's episode, even if it ended."""
+    (`surgical_marl/envs/infos.py`), and their number `cost`. Of this step's episode, even if it ended."""
     contacts: Contacts
     """Every pair of geoms that can touch, likewise."""
 
@@ -70,3 +70,33 @@ class Moved(NamedTuple):
     """How the actions of all arms differ from the last ones."""
     told: dict[str, dict[str, Array]]
     """What action terms tell of the step, by agent and name of an entry of `infos`."""
+
+
+class BatchStep(NamedTuple):
+    """What a step returns. Shapes start with N, the number of environments; dicts are keyed by agent."""
+
+    observations: dict[str, Any]
+    """[N, d]; of the next episode where one ended. For an agent that sees pictures a dict of it, as "proprioception",
+    and of the pictures, [N, H, W, C] each."""
+    state: Any
+    """[N, S], for a centralised critic, likewise of the next episode, the same whoever knows what: all observations
+    but pictures, what agents were not shown of them, `Task.privileged` and messages."""
+    rewards: dict[str, Any]
+    terminated: Any
+    """[N] bool"""
+    truncated: Any
+    """[N] bool: the time limit."""
+    final_observations: dict[str, Any]
+    """[N, d], of this step's episode even where it ended."""
+    final_state: Any
+    infos: dict[str, dict[str, Any]]
+    """agent -> success, collision (bool), min_distance (m), contact_force (N), contact_overflow (a count), stage_<name>
+    (bool), reward_<term> (weighted), cost, cost_<name> (bool), [N] each, and a task's own metrics such as tip_error
+    (m); of this step's episode."""
+    contacts: Contacts
+    """Distance and penetration (m) and force (N) of every pair in `scene.pairs`, [N, P] each; likewise."""
+    faults: Any
+    """[N] int32: where a number was NaN or infinite, the code of the first one, which `fault_place` names; else -1.
+
+    Such an episode is terminated, its reward is 0, and observations that were not finite are 0 too. If its state was at
+    fault, the next step begins a new episode, whatever the action."""

@@ -26,7 +26,7 @@ from surgical_marl.tasks.base.options import scaled_by_default
 
 if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv
-    from surgical_marl.envs.batch_step import BatchStep
+    from surgical_marl.envs.state import BatchStep
 
 
 class _Face:

@@ -20,7 +20,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from surgical_marl.envs.batch import BatchedEnv
-from surgical_marl.envs.batch_step import BatchStep
+from surgical_marl.envs.state import BatchStep
 
 try:
     from torchrl.data import Binary, Bounded, Composite, Unbounded

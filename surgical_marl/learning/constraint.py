@@ -24,7 +24,7 @@ class Constraint(nn.Module):
     Args:
         layout: of the environment, which stacks costs as it does rewards.
         num_envs: N.
-        cost: "collision", or the name of a limit in `surgical_marl/envs/costs.py`.
+        cost: "collision", or the name of a limit in `surgical_marl/envs/infos.py`.
         limit: the share of episodes that may have it, 0 to 1.
         kp, ki, kd: gains of the controller: for the excess over the limit, for its sum over iterations, and for its
             growth since the last iteration.

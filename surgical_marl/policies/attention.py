@@ -15,7 +15,7 @@ from rsl_rl.models import MLPModel
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from surgical_marl.envs.knowledge import MESSAGES
+from surgical_marl.envs.information_level import MESSAGES
 from surgical_marl.policies.layout import Layout
 from surgical_marl.tasks.base.object_terms import AT_HAND, PARTS
 

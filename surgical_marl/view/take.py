@@ -32,7 +32,7 @@ from surgical_marl.untrusted.values import check_count, shown
 
 if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv
-    from surgical_marl.envs.batch_step import BatchStep
+    from surgical_marl.envs.state import BatchStep
 
 LAYOUT = 1
 MOST_STEPS = 10_000

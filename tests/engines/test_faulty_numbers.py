@@ -9,7 +9,7 @@ import pytest
 
 from surgical_marl.engines.fused.finite_check import FiniteCheck
 from surgical_marl.envs.batch import BatchedEnv
-from surgical_marl.envs.batch_step import BatchStep
+from surgical_marl.envs.state import BatchStep
 
 N = 70  # more than one sum takes together
 BAD = {3: np.nan, 41: np.inf, 69: -np.inf}

@@ -47,7 +47,8 @@ STRONGEST = 100.0
 EYES, CHANNELS = ("left", "right"), ("rgb", "depth")
 About = Literal["arm", "others", "object", "goal", "team_goal", "messages"]
 """Subject of a term: the arm itself, of other arms, of objects and what cameras show; where this arm itself should
-be, or what all arms are after together; what other arms said. Levels of knowledge go by it (`envs/knowledge.py`)."""
+be, or what all arms are after together; what other arms said. Levels of knowledge go by it:
+`envs/information_level.py`."""
 
 
 class Term(NamedTuple):

@@ -18,7 +18,7 @@ Seen = dict[str, dict[str, Any]]
 """agent -> term -> picture [N, H, W, C], of numpy on a CPU and of torch on a GPU."""
 
 
-class Sight:
+class PictureTerms:
     """The pictures of N environments that an engine runs.
 
     Args:

@@ -197,13 +197,13 @@ class Vague(TipTask):
 
 
 def test_a_term_that_says_nothing_of_itself_is_hidden_from_nobody_by_mistake() -> None:
-    from surgical_marl.envs.knowledge import Knowledge
+    from surgical_marl.envs.information_level import InformationLevel
 
     scene = made("reach", "trimanual_psm_ecm").scene
     vague = Vague(scene, Options("reach", "trimanual_psm_ecm"))
-    assert "wish" in Knowledge(vague, "psm_0", "task", 0).terms(vague)
+    assert "wish" in InformationLevel(vague, "psm_0", "task", 0).terms(vague)
     with pytest.raises(ValueError, match="knowledge 'one' needs terms that say what they are about, and 'wish'"):
-        Knowledge(vague, "psm_0", "one", 0)
+        InformationLevel(vague, "psm_0", "one", 0)
 
 
 def test_shipped_policies_play_what_the_task_shows() -> None:

@@ -6,13 +6,18 @@ Terms say what they are about, and a level is a rule for that. So every task who
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from surgical_marl.runtime import jnp
 from surgical_marl.tasks.base.task import Task
 from surgical_marl.tasks.base.terms import About, Picture, Term
+
+if TYPE_CHECKING:
+    from jax import Array
+
+    from surgical_marl.tasks.base.world import World
 
 MESSAGES = "messages"
 """Name of the term of what teammates said."""
@@ -27,7 +32,7 @@ class Rule(NamedTuple):
     """It observes, besides, what the task shows its teammates about these."""
 
 
-class Knowledge:
+class InformationLevel:
     """What an agent may observe, and what it does.
 
     Args:
@@ -69,7 +74,10 @@ class Knowledge:
         if self._messages:
             numbers = [number for number, agent in enumerate(task.scene.agents) if agent != self.agent]
             ends = np.ones(len(numbers) * self._messages)
-            heard = lambda world: jnp.concatenate([world.messages[number] for number in numbers])  # noqa: E731
+
+            def heard(world: World) -> Array:
+                return jnp.concatenate([world.messages[number] for number in numbers])
+
             found[MESSAGES] = Term(heard, -ends, ends, "messages")
         return found
 
