@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from surgical_marl.envs import costs as safety
+from surgical_marl.envs import infos as safety
 from surgical_marl.physics.outputs import ObjectView
 from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.robots.arm import load_arm

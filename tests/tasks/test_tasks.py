@@ -14,7 +14,7 @@ import yaml
 
 import surgical_marl as sm
 from surgical_marl.content import content_dir
-from surgical_marl.envs import costs as safety
+from surgical_marl.envs import infos as safety
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.envs.env import Env
 from surgical_marl.plugins.tasks import TASKS as KNOWN
