@@ -12,6 +12,7 @@ from __future__ import annotations
 import numbers
 import secrets
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
@@ -22,14 +23,15 @@ from surgical_marl.content import unknown
 from surgical_marl.engines.choose import ENGINES, make_engine
 from surgical_marl.engines.fused.threefry import episode_keys
 from surgical_marl.envs.actions import check_actions
-from surgical_marl.envs.agent_observation import alike
-from surgical_marl.envs.env import Env
+from surgical_marl.envs.env import Env, alike
 from surgical_marl.envs.fault_place import FaultPlace, fault_place
 from surgical_marl.envs.free_objects import FreeObjects
 from surgical_marl.envs.observations import each, with_vector
 from surgical_marl.envs.state import BatchStep
 from surgical_marl.physics.outputs import Contacts
-from surgical_marl.plugins.tasks import meant_for
+from surgical_marl.plugins.task_file import is_task_file, label
+from surgical_marl.plugins.tasks import TASKS, list_tasks
+from surgical_marl.scenes.load import load_scene
 from surgical_marl.scenes.poses import Poses
 
 if TYPE_CHECKING:
@@ -81,7 +83,7 @@ class BatchedEnv:
         try:
             self.env = Env(task, scene, **options)
         except ValueError as error:
-            if more := meant_for(task, scene, error):
+            if more := _meant_for(task, scene, error):
                 raise ValueError(f"{error}{more}") from None
             raise
         # a copy may be made in another working folder
@@ -405,3 +407,16 @@ def _keys_of(seed: Any, num_envs: int, first: int) -> tuple[np.ndarray, np.ndarr
     seeds = [_check_seed(own) for own in seed]
     keys = np.concatenate([episode_keys(own or 0, 1) for own in seeds])
     return np.array([own is not None for own in seeds]), keys
+
+
+def _meant_for(task: str, scene: str | None, error: ValueError) -> str:
+    """Return the scenes that a task is meant for, as the end of an error about a scene that is none of them.
+
+    "" for other errors, and where the error says it itself.
+    """
+    if type(error) is not ValueError or not (is_task_file(task) or task in list_tasks()) or "choose from" in str(error):
+        return ""
+    with suppress(ValueError):  # of a scene that fits no task
+        if scene and (meant := TASKS.load(task).scenes) and load_scene(scene).name not in meant:
+            return f"; {label(task)} is meant for the scenes {', '.join(meant)}"
+    return ""

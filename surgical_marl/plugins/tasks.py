@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from contextlib import suppress
 from typing import Any
 
 from surgical_marl.plugins.registry import Registry
@@ -71,18 +70,3 @@ def find_task(task: str | os.PathLike[str]) -> str:
 def scene_of(task: str) -> str:
     """Return the scene that a task is played in where none is named: its own, or "psm" if it has none."""
     return TASKS.load(find_task(task)).default_scene or "psm"
-
-
-def meant_for(task: str, scene: str | None, error: ValueError) -> str:
-    """Return the scenes that a task is meant for, as the end of an error about a scene that is none of them.
-
-    "" for other errors, and where the error says it itself.
-    """
-    if type(error) is not ValueError or not (is_task_file(task) or task in list_tasks()) or "choose from" in str(error):
-        return ""
-    from surgical_marl.scenes.load import load_scene  # it imports MuJoCo
-
-    with suppress(ValueError):  # of a scene that fits no task
-        if scene and (meant := TASKS.load(task).scenes) and load_scene(scene).name not in meant:
-            return f"; {label(task)} is meant for the scenes {', '.join(meant)}"
-    return ""
