@@ -280,7 +280,8 @@ def check_make(argv: list[str]) -> None:
 
 
 def check_pytest(argv: list[str]) -> None:
-    files = [ROOT / word for word in argv if word.startswith("tests/")]
+    named = [ROOT / word for word in argv if word.startswith("tests/")]
+    files = [file for path in named for file in (path.rglob("*.py") if path.is_dir() else [path])]
     text = "".join(path.read_text(encoding="utf-8") for path in files)
     if "-k" in argv:
         wanted = set(re.findall(r"\w+", argv[argv.index("-k") + 1])) - {"or", "and", "not"}
