@@ -18,7 +18,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from surgical_marl.content import find
+from surgical_marl.content import find, unknown
 from surgical_marl.plugins.systems import read_systems
 from surgical_marl.robots.arm import Arm, load_arm
 from surgical_marl.robots.rotation import turned
@@ -107,7 +107,23 @@ def load_scene(name: str | Path, control: str = "position") -> Scene:
 
     contents = (part for mount in mounts.values() for part in mount.arm.content)
     held = (item.object.content for item in objects.values())
-    return scene(model=cached_model(compute, repr((path.stem, control, _without_sources(about))), *contents, *held))
+    model = cached_model(compute, repr((path.stem, control, _without_sources(about))), *contents, *held)
+    loaded = scene(model=model)
+    _check_attachments(loaded, place.part("attachments", settings), settings.get("attachments"))
+    return loaded
+
+
+def _check_attachments(scene: Scene, place: Place, entries: Any) -> None:
+    """Raise ValueError unless each attachment of a scene file is between a free object and a link of an arm."""
+    bodies = (scene.model.body(i).name for i in range(scene.model.nbody))
+    links = [name for name in bodies if name.partition("/")[0] in scene.mounts]
+    for name, entry in scene.attachments.items():
+        for noun, value, good in (
+            (f"free object of scene {scene.name!r}", entry.body, list(scene.free_objects)),
+            (f"link of scene {scene.name!r}", entry.link, links),
+        ):
+            if value not in good:
+                raise ValueError(f"{place.part(name, entries)}: {unknown(noun, value, good)}")
 
 
 def _without_sources(about: SceneFile) -> SceneFile:

@@ -74,4 +74,11 @@ def test_a_welded_needle_goes_with_the_jaw_until_it_is_released(tmp_path: Path) 
 )
 def test_a_bad_attachment_is_one_sentence(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        Simulator(sm.load_scene(welded(tmp_path, **changes)))
+        sm.load_scene(welded(tmp_path, **changes))
+
+
+def test_an_attachment_without_an_object_is_refused(tmp_path: Path) -> None:
+    path = Path(welded(tmp_path))
+    path.write_text(yaml.safe_dump({k: v for k, v in yaml.safe_load(path.read_text()).items() if k != "objects"}))
+    with pytest.raises(ValueError, match=r"attachments.weld: unknown free object .* 'needle' \(choose from none\)"):
+        sm.load_scene(path)

@@ -14,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from surgical_marl.content import unknown
 from surgical_marl.physics.contact.broadphase import Joints
 from surgical_marl.physics.contact.contact_pairs import ContactPairs
 from surgical_marl.physics.solver.problem import AttachmentRows
@@ -45,16 +44,9 @@ class Attachments:
         self._tables, model = tables, scene.model
         self.names = tuple(scene.attachments)
         entries = list(scene.attachments.values())
-        for entry in entries:
-            if entry.body not in tables.names:
-                raise unknown(f"free object of scene {scene.name!r}", entry.body, tables.names)
-        links = {model.body(i).name: i for i in range(model.nbody) if "/" in model.body(i).name}
-        for entry in entries:
-            if entry.link not in links:
-                raise unknown(f"link of scene {scene.name!r}", entry.link, list(links))
         self.bodies = np.array([tables.names.index(entry.body) for entry in entries], int)
         """Number of the body of each attachment, [w]."""
-        self.links = np.array([links[entry.link] for entry in entries], int)
+        self.links = np.array([model.body(entry.link).id for entry in entries], int)
         self.arms, self._moves = tables.joints_of(model, scene.agents, self.links)
         """The arm that each attachment is on, [w]."""
         self._active = np.array([entry.active for entry in entries], bool)
