@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array
 from scipy.spatial.transform import Rotation
 
-from surgical_marl.physics.contact.broadphase import Placed, Places, Way
+from surgical_marl.physics.contact.broadphase import Displacement, Placed, Places
 from surgical_marl.physics.contact.contact_pairs import Meeting
 from surgical_marl.physics.contact.contact_patch import TILT, TILT_IN_JAW, Patch, find_patch
 from surgical_marl.physics.contact.detection import AHEAD
@@ -76,7 +76,7 @@ def every_patch(step: Step, scene: Scene, states: Physics, dt: float) -> Patch:
 
     @jax.jit
     @jax.vmap
-    def patches(state: Physics, ways: dict[str, Way]) -> Patch:
+    def patches(state: Physics, ways: dict[str, Displacement]) -> Patch:
         data = step.arms.dynamics.pose(state.qpos)
         placed, found = places.place(data, places.joints(data), state.qvel, state.rigid_bodies.bodies, dt), []
         torsion = np.split(tables.torsion, np.cumsum([len(meeting.one) for meeting in tables.meetings])[:-1])
@@ -89,7 +89,7 @@ def every_patch(step: Step, scene: Scene, states: Physics, dt: float) -> Patch:
 
 
 def _patch(
-    places: Places, placed: Placed, ways: dict[str, Way], meeting: Meeting, i: Array, j: Array, torsion: Array
+    places: Places, placed: Placed, ways: dict[str, Displacement], meeting: Meeting, i: Array, j: Array, torsion: Array
 ) -> Patch:
     """Return the patch of two bodies, as of one shape that has all places at which any of theirs may touch."""
     capsules, axes = places.capsules(placed, meeting.first, i), jnp.eye(3)[:2]
@@ -101,7 +101,7 @@ def _patch(
         points = jax.vmap(lambda capsule: between_segments(capsule, others))(capsules)
     points = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), points)
     nearer = sum(
-        sign * Way(ways[kind].shift[n], ways[kind].turn[n]).of(points)
+        sign * Displacement(ways[kind].shift[n], ways[kind].turn[n]).approach(points)
         for kind, n, sign in ((meeting.first, i, 1), (meeting.second, j, -1))
         if kind in ways
     )
@@ -112,7 +112,7 @@ def _patch(
     return find_patch(lambda _: seen, 1, 1, middle, axes, tilt, torsion, middle if lies else None)
 
 
-def _ways(step: Step, model: mujoco.MjModel, states: Physics, dt: float) -> dict[str, Way]:
+def _ways(step: Step, model: mujoco.MjModel, states: Physics, dt: float) -> dict[str, Displacement]:
     """Return how bodies move in a step: fingers and links as C MuJoCo says, objects as they fly and spin."""
     tables, data, bodies = step.bodies.tables, mujoco.MjData(model), states.rigid_bodies.bodies
     geoms = {"pads": tables.pad_geoms, "links": tables.near}
@@ -127,5 +127,8 @@ def _ways(step: Step, model: mujoco.MjModel, states: Physics, dt: float) -> dict
                 mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_GEOM, geom, twist, 0)
                 moves[kind][e, k] = twist[3:] - np.cross(twist[:3], data.geom_xpos[geom]), twist[:3]
     turn = bodies.velocity[..., 3:]
-    ways = {kind: Way(dt * of[:, :, 0], dt * of[:, :, 1]) for kind, of in moves.items()}
-    return {**ways, "objects": Way(dt * (bodies.velocity[..., :3] - jnp.cross(turn, bodies.position)), dt * turn)}
+    ways = {kind: Displacement(dt * of[:, :, 0], dt * of[:, :, 1]) for kind, of in moves.items()}
+    return {
+        **ways,
+        "objects": Displacement(dt * (bodies.velocity[..., :3] - jnp.cross(turn, bodies.position)), dt * turn),
+    }

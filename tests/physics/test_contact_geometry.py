@@ -271,7 +271,7 @@ def test_forces_are_the_nearest_ones_in_the_friction_cone() -> None:
         assert np.linalg.norm(found[4:]) <= mu * found[:4].sum() + 1e-4 and (found[:4] >= 0).all()
         assert cost(found) <= cost(best.x) + 1e-3 * (1 + cost(best.x))
         np.testing.assert_allclose(found, best.x, atol=2e-2)
-        np.testing.assert_allclose(felt.way, pull / np.linalg.norm(pull), atol=1e-5)
+        np.testing.assert_allclose(felt.direction, pull / np.linalg.norm(pull), atol=1e-5)
         assert float(felt.left) == pytest.approx(np.linalg.norm(found[4:]) / np.linalg.norm(pull), abs=1e-4)
         sticks = np.linalg.norm(pull) <= mu * np.maximum(push, 0).sum()
         assert bool(felt.slips) == (not sticks)

@@ -87,18 +87,20 @@ class Pairs:
         return Tiles(self._model, *self._geoms)
 
     def overlap(self, geom_xpos: Array, geom_xmat: Array) -> Array:
-        """Return whether any pair overlaps, []: for less than what `distance` costs."""
+        """Return whether any pair overlaps, []; cheaper than `distance`."""
 
         def least(one: Capsule, other: Capsule, is_pair: Any) -> Array:
             gap, reach = axis_gap(one, other)[1], one.radius + other.radius
             return jnp.min(jnp.where(is_pair, jnp.sum(gap * gap, -1) - reach * reach, np.inf), initial=np.inf)
+
+        def exact(one: Capsule, other: Capsule) -> Array:
+            return least(one, other, np.bool_(True)) < 0
 
         if not self._at_once:
             return jnp.min(self._by_arms(least, geom_xpos, geom_xmat)) < 0
         found = jnp.bool_(False)  # also if there are no pairs
         for arms, pairs in self._groups.items():
             ends = [self._capsules(of[pairs], geom_xpos, geom_xmat) for of in self._geoms]
-            exact = lambda one, other: least(one, other, np.bool_(True)) < 0  # noqa: E731
             geoms = np.unique([of[pairs] for of in self._geoms])
             if arms[0] == arms[1] or len(pairs) < len(geoms):
                 found |= exact(*ends)
@@ -126,7 +128,7 @@ class Pairs:
         return _closest(*self._tiles.ends_of(pair, self._capsules(self._tiles.geoms, geom_xpos, geom_xmat)))
 
     def _by_arms(self, of: Callable[[Capsule, Capsule, Any], Any], geom_xpos: Array, geom_xmat: Array) -> Any:
-        """Return what a function makes of the capsules of all pairs of arms, as `Tiles.each` does."""
+        """Return a function's results for the capsules of all pairs of arms, as `Tiles.each` does."""
         return self._tiles.each(of, self._capsules(self._tiles.geoms, geom_xpos, geom_xmat))
 
     def _capsules(self, geoms: np.ndarray, geom_xpos: Array, geom_xmat: Array) -> Capsule:
@@ -170,19 +172,19 @@ class Pairs:
         return depth, pair, jnp.maximum(more, 0.0).astype(jnp.int32)
 
     def spread(self, pair: Array, values: Array) -> Array:
-        """Return the sum of values [K] of each pair, [P], which they are of by its number [K]; 0 for all others."""
+        """Return the sum [P] of the values [K] that belong to each pair, by the pairs' numbers [K]; 0 without any."""
         if self._at_once:  # in registers of a GPU
             return jnp.where(pair == np.arange(self.count)[:, None], values, 0.0).sum(-1)
         return jnp.zeros(self.count, values.dtype).at[pair].add(values)
 
 
 def _apart(one: Capsule, other: Capsule) -> Array:
-    """Return whether a plane is between two groups of capsules, across the way from the first to the first, []."""
-    way = other.centre[0] - one.centre[0]
-    length = jnp.sqrt(jnp.sum(way * way))
+    """Return whether a plane separates two groups of capsules, normal to the line between the first of each, []."""
+    axis = other.centre[0] - one.centre[0]
+    length = jnp.sqrt(jnp.sum(axis * axis))
 
     def reach(capsules: Capsule) -> tuple[Array, Array]:
-        middle, half = capsules.centre @ way, jnp.abs(capsules.axis @ way) * capsules.half + capsules.radius * length
+        middle, half = capsules.centre @ axis, jnp.abs(capsules.axis @ axis) * capsules.half + capsules.radius * length
         return jnp.min(middle - half), jnp.max(middle + half)
 
     return reach(other)[0] - reach(one)[1] > APART * length

@@ -40,7 +40,10 @@ class Tiles:
         filled = [np.array([t[k] + t[k][-1:] * (width[k] - len(t[k])) for t in sides.values()]) for k in (0, 1)]
         self.geoms = np.unique([first, second])
         """Geoms that are in pairs, [c]; below they are numbered in this order."""
-        number = lambda geoms: np.searchsorted(self.geoms, geoms).astype(np.int32)  # noqa: E731
+
+        def number(geoms: np.ndarray) -> np.ndarray:
+            return np.searchsorted(self.geoms, geoms).astype(np.int32)
+
         self._sides = number(filled[0]), number(filled[1])  # [T, A] and [T, B]
         self._ends = number(first), number(second)  # [P] each
         tile = {arms: t for t, arms in enumerate(sides)}
@@ -55,7 +58,7 @@ class Tiles:
         self._is_pair = np.isin(np.arange(np.prod(shape)), self.place).reshape(shape)
 
     def each(self, of: Callable[[Capsule, Capsule, Any], Any], capsules: Capsule) -> Any:
-        """Return what a function makes of each tile, [T, ...].
+        """Return a function's result for each tile, [T, ...].
 
         Args:
             of: takes the capsules of both sides, [A, 1] and [1, B], and which of their cells are pairs, [A, B].

@@ -1,4 +1,4 @@
-"""Where the bodies of a scene are and how they move: all that is asked of them before two are looked at closely."""
+"""Broadphase: where the bodies of a scene are, how far they move in a step, and lower bounds of their distances."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from surgical_marl.physics.systems.rigid_motion import Bodies, rotation
 from surgical_marl.physics.tree_utils import row_of
 
 
-class Way(NamedTuple):
-    """How bodies move in a step with the velocities of now: a point p of one by shift + turn x p. World, [n]."""
+class Displacement(NamedTuple):
+    """How far bodies move in a step at their present velocities: a point p by shift + turn x p. World, [n]."""
 
     shift: Array
     """m, [n, 3]"""
     turn: Array
     """rad, [n, 3]"""
 
-    def of(self, points: Points) -> Array:
-        """Return by how much points come nearer along their normals in the step, if one body [] moves, m, [...]."""
+    def approach(self, points: Points) -> Array:
+        """Return how much nearer along their normals points come in the step if the first body moves, m, [...]."""
         return -jnp.sum((self.shift + jnp.cross(self.turn, points.place)) * points.normal, -1)
 
 
@@ -37,49 +37,57 @@ class Joints(NamedTuple):
     """A point on the axis, [a, m, 3]."""
 
     def columns(self, slides: Any, place: Array) -> tuple[Array, Array]:
-        """Return the velocity of places [..., 3] and the angular velocity by joint velocity, [..., 3] both."""
+        """Return columns of the Jacobian at places [..., 3]: velocity and angular velocity per joint velocity.
+
+        Args:
+            slides: which joints are prismatic, [a, m].
+            place: in the world, m; the last axis but one is for the joints.
+        """
         moving = jnp.where(slides[..., None], self.axis, jnp.cross(self.axis, place - self.anchor))
         return moving, jnp.where(slides[..., None], 0.0, self.axis)
 
 
 class Ball(NamedTuple):
-    """Balls that hold bodies, [n]. World."""
+    """Bounding balls of bodies, [n]. World."""
 
     centre: Array
     """m, [n, 3]"""
     radius: Array
     """m, [n]"""
     moves: Array
-    """How far a point of the body goes in a step at most, m, [n]."""
+    """Largest displacement of any point of the body in a step, m, [n]."""
 
 
 class Placed(NamedTuple):
-    """Where all bodies are and how they move."""
+    """Poses, displacements and bounding balls of all bodies."""
 
     position: Array
     """Centres of mass of the objects, [k, 3]."""
     frames: Array
     """Axes of their frames, [k, 3, 3]."""
     pads: Plate
-    """[f]"""
+    """Pads of fingers, [f]."""
     links: Segments
-    """[l]"""
-    ways: dict[str, Way]
-    """Of what moves, by kind of body."""
+    """Capsules of the arms' links, [l]."""
+    displacements: dict[str, Displacement]
+    """By kind of body; fixed kinds have none."""
     balls: dict[str, Ball]
-    """Around all bodies, by their kind."""
+    """By kind of body."""
 
 
 class Places:
-    """Finds where the bodies of a scene are. Kinds of bodies are those of `ContactPairs.meetings`."""
+    """Computes where the bodies of a scene are. Kinds of bodies are those of `ContactPairs.meetings`."""
 
     def __init__(self, tables: ContactPairs) -> None:
         self._tables = tables
 
     def joints(self, data: Any) -> Joints:
         """Return the axes of the arms' joints from MJX's data with poses."""
-        pad = lambda x: jnp.concatenate([x, jnp.zeros((1, 3))])[self._tables.dofs]  # noqa: E731
-        return Joints(pad(data.xaxis), pad(data.xanchor))
+
+        def by_arm(x: Array) -> Array:
+            return jnp.concatenate([x, jnp.zeros((1, 3))])[self._tables.dofs]
+
+        return Joints(by_arm(data.xaxis), by_arm(data.xanchor))
 
     def place(self, data: Any, joints: Joints, qvel: Array, bodies: Bodies, dt: Any) -> Placed:
         """Return where all bodies are, and how they move in a step of `dt`, s.
@@ -97,18 +105,20 @@ class Places:
         centre = data.geom_xpos[t.near]
         half = jnp.asarray(t.link_half)[:, None] * data.geom_xmat[t.near][:, :, 2]
         links = Segments(centre - half, centre + half, jnp.asarray(t.link_radius))
-        ways = {"objects": Way(dt * bodies.velocity[:, :3] - jnp.cross(turn, bodies.position), turn)}
+        displacements = {"objects": Displacement(dt * bodies.velocity[:, :3] - jnp.cross(turn, bodies.position), turn)}
         moves, columns = dt * jnp.append(qvel, 0.0)[t.dofs], joints.columns(jnp.asarray(t.slides), jnp.zeros(3))
         by_joint = tuple(column * moves[..., None] for column in columns)
         for kind in t.bodies:  # not in a loop: links of an arm are moved by what moves those before them, and more
-            ways[kind] = Way(*(jnp.einsum("nm,nmd->nd", t.moves[kind], of[t.arm_of[kind]]) for of in by_joint))
+            displacements[kind] = Displacement(
+                *(jnp.einsum("nm,nmd->nd", t.moves[kind], of[t.arm_of[kind]]) for of in by_joint)
+            )
         around = {"objects": (bodies.position, jnp.asarray(t.bound)), "pads": _around(pads), "links": _around(links)}
         around |= {"plates": _around(t.plates), "rods": _around(t.rods)}
-        balls = {kind: _ball(*ball, ways.get(kind)) for kind, ball in around.items()}
-        return Placed(bodies.position, frames, pads, links, ways, balls)
+        balls = {kind: _ball(*ball, displacements.get(kind)) for kind, ball in around.items()}
+        return Placed(bodies.position, frames, pads, links, displacements, balls)
 
     def capsules(self, placed: Placed, kind: str, i: Array) -> Segments:
-        """Return all capsules of one body, [c]; there is one but for objects."""
+        """Return all capsules of one body, [c]; one for a link or a rod."""
         if kind == "objects":
             return jax.vmap(lambda c: self.capsule(placed, kind, i, c))(jnp.arange(self._tables.radius.shape[1]))
         return jax.tree.map(lambda x: x[None], self.capsule(placed, kind, i, jnp.int32(0)))
@@ -147,24 +157,29 @@ class Places:
         return jnp.max(_beyond(start, end, *t.boxes[fixed]), -1) - radius
 
     def capsule_gap(self, placed: Placed, i: Array, kind: str, j: Array) -> Callable[[Array], Array]:
-        """Return what finds a lower bound of the distance of object i's capsules, by their numbers, from a body, m.
+        """Return a function from a capsule of object i to a lower bound of its distance from a body, m.
 
-        Of long capsules and a plate it is the distance of a box around the capsule's axis, along the plate's sides: few
-        bars of a block are near a finger on one of them, but balls around most are.
+        The bound is that of the capsule's bounding ball. Between long capsules and a plate it is that of a box around
+        the capsule's axis, along the plate's sides: balls around the bars of a block are too large to tell which bar a
+        finger is near.
         """
         t, frame, at = self._tables, placed.frames[i], placed.position[i]
         if kind not in ("pads", "plates") or not t.has_bars:
-            middle = lambda c: at + frame @ jnp.asarray(t.middle)[i, c]  # noqa: E731
-            return lambda c: self.distance(placed, kind, j, middle(c)) - jnp.asarray(t.around)[i, c]
+
+            def ball_gap(c: Array) -> Array:
+                middle = at + frame @ jnp.asarray(t.middle)[i, c]
+                return self.distance(placed, kind, j, middle) - jnp.asarray(t.around)[i, c]
+
+            return ball_gap
         plate = self.plate(placed, kind, j)
         turn, place, half = plate.frame.T @ frame, in_frame(at, plate), jnp.append(plate.half, 0.0)
 
-        def gap(c: Array) -> Array:
+        def box_gap(c: Array) -> Array:
             start, end = (place + turn @ jnp.asarray(of)[i, c] for of in (t.start, t.end))
             beyond = jnp.maximum(_beyond(start, end, -half, half), 0.0)
             return size(beyond) - plate.radius - jnp.asarray(t.radius)[i, c]
 
-        return gap
+        return box_gap
 
     def link_distance(self, placed: Placed, kind: str, j: Array, link: Segments) -> Array:
         """Return a lower bound of the distance of a link from what is fixed, m; exact for rods."""
@@ -181,19 +196,20 @@ def _beside(link: Segments, plate: Plate) -> Array:
 
 
 def _beyond(start: Array, end: Array, low: Any, high: Any) -> Array:
-    """Return by how far the box around a segment is beyond another box on each axis, [3]; negative where it is not."""
+    """Return the gap between the box around a segment and another box on each axis, [3]; negative if they overlap."""
     return jnp.maximum(jnp.minimum(start, end) - high, low - jnp.maximum(start, end))
 
 
 def size(vector: Array) -> Array:
+    """Return the length of vectors [..., 3]."""
     return jnp.sqrt(jnp.sum(vector * vector, -1))
 
 
 def nearest(segment: Segments, points: Array) -> Array:
-    """Return where a segment is nearest to points, [..., 3]."""
-    way = segment.end - segment.start
-    share = jnp.clip((points - segment.start) @ way / jnp.maximum(way @ way, 1e-12), 0.0, 1.0)
-    return segment.start + share[..., None] * way
+    """Return the points [..., 3] of a segment that are nearest to points [..., 3]."""
+    axis = segment.end - segment.start
+    share = jnp.clip((points - segment.start) @ axis / jnp.maximum(axis @ axis, 1e-12), 0.0, 1.0)
+    return segment.start + share[..., None] * axis
 
 
 def between_balls(one: Ball, other: Ball) -> Array:
@@ -202,14 +218,15 @@ def between_balls(one: Ball, other: Ball) -> Array:
 
 
 def _around(shapes: Plate | Segments) -> tuple[Array, Array]:
-    """Return centres [n, 3] and radii [n] of balls that hold shapes."""
+    """Return centres [n, 3] and radii [n] of the bounding balls of shapes."""
     if isinstance(shapes, Plate):
         return jnp.asarray(shapes.centre), size(jnp.asarray(shapes.half)) + shapes.radius
     return (shapes.start + shapes.end) / 2, size(shapes.end - shapes.start) / 2 + shapes.radius
 
 
-def _ball(centre: Any, radius: Any, way: Way | None) -> Ball:
+def _ball(centre: Any, radius: Any, displacement: Displacement | None) -> Ball:
     moves = jnp.zeros(len(centre))
-    if way is not None:
-        moves = size(way.shift + jnp.cross(way.turn, centre)) + size(way.turn) * radius
+    if displacement is not None:
+        shift, turn = displacement
+        moves = size(shift + jnp.cross(turn, centre)) + size(turn) * radius
     return Ball(jnp.asarray(centre), jnp.asarray(radius), moves)

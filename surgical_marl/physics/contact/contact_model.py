@@ -1,4 +1,4 @@
-"""How patches resist: springs and dampers along the normal, friction that remembers how fingers hold objects."""
+"""The contact model: springs and dampers of each patch along its normal and along the surface."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ CREEP = 0.025
 
 
 class Felt(NamedTuple):
-    """Contacts, and how far friction's springs are stretched, m, [s, 3]."""
+    """The contacts of a step, and how far their friction springs are stretched, m, [s, 3]."""
 
     contacts: Contacts
     slip: Array
 
 
 class _Kept(NamedTuple):
-    """What is kept of a contact: all that its patch and the poses of arms and objects do not say."""
+    """The part of a contact that is stored; the rest is computed again from the patch and the poses where needed."""
 
     second: Array
     """As in `Contact`."""
@@ -57,7 +57,7 @@ class _Kept(NamedTuple):
 
 
 class _Speeds(NamedTuple):
-    """Velocities."""
+    """Velocities of arms and objects."""
 
     joints: Array
     """Of arms, [a, m]."""
@@ -66,21 +66,20 @@ class _Speeds(NamedTuple):
 
 
 class _Motion(NamedTuple):
-    """How two bodies move relative to each other."""
+    """Relative velocity and convective acceleration of two bodies."""
 
     twist: Array
     """[6]"""
     bends: Array
-    """Relative acceleration at all points and at the centre, [s + 1, 3], with which both go on at the velocities of
-    now.
+    """Relative acceleration at all points and at the centre if no joint and no object accelerates, [s + 1, 3].
 
-    In a step joints move bodies on arcs, and an object turns about its centre of mass, which goes straight on. Half of
-    this acceleration times the step's duration makes velocities at its start those of its chords.
+    In a step joints move bodies on arcs, and an object turns about its centre of mass, which moves straight. Half of
+    this acceleration times dt turns the velocity at the start of the step into the mean velocity over it (the chord).
     """
 
 
 class ContactModel:
-    """What friction and contact do in a scene."""
+    """The contact model of one scene."""
 
     def __init__(self, tables: ContactPairs, twists: RelativeMotion) -> None:
         self.tables, self._twists, self._memory = tables, twists, GripMemory(tables, twists)
@@ -89,7 +88,17 @@ class ContactModel:
         self, slots: Slots, joints: Joints | None, fingers: Fingers | None, qvel: Array, bodies: Bodies, grips: Grips,
         dt: Any,
     ) -> Felt:  # fmt: skip
-        """Return how the patches that were found resist. There are neither joints nor fingers without arms."""
+        """Return the contacts of all patches, with the forces at zero acceleration.
+
+        Args:
+            slots: the patches.
+            joints: axes of the arms' joints; None without arms, as `fingers`.
+            fingers: frames of the fingers.
+            qvel: velocities of the arms' joints, [nv].
+            bodies: the free objects.
+            grips: memory of friction.
+            dt: duration of a step, s.
+        """
         speeds = _Speeds(self._twists.by_arm(qvel), self._twists.by_object(bodies.velocity))
         at = self._twists.by_object(bodies.position), self._twists.by_object(bodies.quaternion)
         columns = None if joints is None else joints.columns(jnp.asarray(self.tables.slides), jnp.zeros(3))
@@ -124,7 +133,7 @@ class ContactModel:
         return Felt(Contacts(*found), kept.slip)
 
     def _contact(self, patch: Patch, number: Array, columns: tuple[Array, Array] | None, position: Array) -> Contact:
-        """Return a contact that does not resist yet: what it is between, and its directions.
+        """Return the geometry of a contact: its bodies and the rows of its Jacobian; its springs are still zero.
 
         `columns` are those of all joints of arms [a, m, 3], about the world's origin.
         """
@@ -142,7 +151,7 @@ class ContactModel:
         points, (ahead, *across) = patch.points, patch.frame
         normal = jnp.concatenate([points.normal, jnp.cross(points.place - origin, points.normal)], -1)
         lever = patch.centre - origin
-        along = [jnp.concatenate([way, jnp.cross(lever, way)]) for way in across]
+        along = [jnp.concatenate([axis, jnp.cross(lever, axis)]) for axis in across]
         about = jnp.concatenate([jnp.zeros(3), patch.radius * ahead])
         cone = Cone(normal, jnp.stack([*along, about]), Springs(jnp.zeros(len(normal)), none, none))
         return Contact(cone, first, second, offset, arm, origin, pulls, moving, turning)
@@ -150,9 +159,9 @@ class ContactModel:
     def _resisting(
         self, cone: Cone, patch: Patch, number: Array, slip: Array, motion: _Motion, goes_on: Array, dt: Any
     ) -> tuple[Springs, Stuck]:
-        """Return the springs, and the forces of springs and dampers at a motion of now, without acceleration.
+        """Return the springs, and the trial forces of springs and dampers at zero acceleration.
 
-        What `goes_on` is not stopped by friction, as an arm moves it along something fixed.
+        `goes_on` [] is true if an arm moves the first body along something fixed: friction will not stop it then.
         """
         t, points = self.tables, patch.points
         speed = cone.normal @ motion.twist + dt / 2 * jnp.sum(points.normal * motion.bends[:-1], -1)

@@ -49,9 +49,9 @@ class Meeting(NamedTuple):
     other: np.ndarray
     """Numbers of the second bodies, [m]."""
     surfaces: tuple[Surface, ...]
-    """How each pair feels."""
+    """Surface properties of each pair."""
     partners: int
-    """So many pairs in a row have the same first body."""
+    """Pairs of each first body: it stays the same over so many pairs in a row."""
 
 
 class ContactPairs:
@@ -110,7 +110,10 @@ class ContactPairs:
 
     def _read_links(self, model: mujoco.MjModel) -> None:
         plates = [plate_of_box(model.geom_size[finger.geom]) for finger in self.fingers]
-        single = lambda values, shape: np.array(values, np.float32).reshape(shape)  # noqa: E731
+
+        def single(values: Any, shape: tuple[int, ...]) -> np.ndarray:
+            return np.array(values, np.float32).reshape(shape)
+
         self.pad_geoms = np.array([finger.geom for finger in self.fingers], int)
         self.pad_axes = single([axes for axes, _, _ in plates], (-1, 3, 3))
         self.pad_half = single([half for _, half, _ in plates], (-1, 2))
@@ -187,12 +190,16 @@ class ContactPairs:
             for first, second, which, partners in pairs if which
         )  # fmt: skip
         surfaces = [surface for meeting in self.meetings for surface in meeting.surfaces]
-        each = lambda of: np.array([getattr(surface, of) for surface in surfaces], np.float32)  # noqa: E731
-        self.sliding, self.torsion, self.stiffness = each("sliding"), each("torsion"), each("stiffness")
-        ends = [[(m.first, m.one) for m in self.meetings], [(m.second, m.other) for m in self.meetings]]
-        numbers = lambda end, kind, none: np.concatenate(  # noqa: E731
-            [np.zeros(0, int), *(n if of == kind else np.full(len(n), none) for of, n in end)]
+        self.sliding, self.torsion, self.stiffness = (
+            np.array([getattr(surface, of) for surface in surfaces], np.float32)
+            for of in ("sliding", "torsion", "stiffness")
         )
+        ends = [[(m.first, m.one) for m in self.meetings], [(m.second, m.other) for m in self.meetings]]
+
+        def numbers(end: list[tuple[str, np.ndarray]], kind: str, none: int) -> np.ndarray:
+            own = (n if of == kind else np.full(len(n), none) for of, n in end)
+            return np.concatenate([np.zeros(0, int), *own])
+
         self.first_object, self.second_object = (numbers(end, "objects", self.count) for end in ends)
         self.finger = numbers(ends[1], "pads", len(self.fingers))
         self.grip = {

@@ -77,13 +77,13 @@ def find_patch(
     """Return the patch of a pair of bodies.
 
     Args:
-        look: from the number of a shape to all points at which it may touch, [d], and their depths after a step with
-            the velocities of now, [d]. A point counts by the larger one of both depths, so that no part of a fast
+        look: takes the number of a shape; returns all points at which it may touch, [d], and their depths after a step
+            at the present velocities, [d]. A point counts by the larger of both depths, so that no part of a fast
             object comes in unseen.
         count: how many shapes there are, []; without any, the patch is nothing.
         rows: how many there may be.
         middle: a place near the points, from which they are measured, [3].
-        axes: two directions, [2, 3]: bodies are tilted about those across them.
+        axes: two directions along the surface, [2, 3]; a tilt adds depth along a mix of them.
         tilt: by how much, rad.
         torsion: radius of the contact at a point, m, [].
         centre: where the weight of one of the bodies acts, [3]. The deepest point is then looked for under a slight
@@ -98,19 +98,22 @@ def find_patch(
     rim = _supports(points, count, rims, most)
     lean = LEAN * _beyond(axes @ centre, rim.place @ axes.T) @ axes
     leant = _Tilts(lean[None], np.full(1, -AWAY, np.float32), middle)
-    find = lambda n, most: jnp.maximum(most, leant.deepest(*row_of(points, n)))  # noqa: E731
-    deepest = _supports(points, count, leant, jax.lax.fori_loop(0, count, find, jnp.full(1, 2 * AWAY)))
+
+    def deeper(n: Array, most: Array) -> Array:
+        return jnp.maximum(most, leant.deepest(*row_of(points, n)))
+
+    deepest = _supports(points, count, leant, jax.lax.fori_loop(0, count, deeper, jnp.full(1, 2 * AWAY)))
     chosen = Points(*(jnp.concatenate(parts) for parts in zip(deepest, rim, strict=True)))
     return _patch(chosen, torsion, reach)
 
 
 class _Tilts(NamedTuple):
-    """Ways to tilt one of two bodies, p of them."""
+    """Tilts of one of two bodies, p of them, under which the deepest point is looked for."""
 
     by: Array
-    """How fast a place comes nearer, by how far it is from the middle, [p, 3]."""
+    """Gradient of the added depth by place: a place gains `by @ (place - middle)`, [p, 3]."""
     limits: Any
-    """Depths beyond these count as these, m, [p]."""
+    """Largest depths that are told apart: deeper points count as these, m, [p]."""
     middle: Array
     """[3]"""
 
@@ -146,9 +149,9 @@ def _seen(
 
 
 def _beyond(point: Array, corners: Array) -> Array:
-    """Return the way on which a point [2] leaves a triangle, [2]: 0 well within, of length 1 beyond an edge.
+    """Return the outward direction in which a point [2] lies beyond a triangle, [2]: 0 well within, length 1 outside.
 
-    The corners [3, 2] go around to the left.
+    The corners [3, 2] go around counterclockwise.
     """
     along = jnp.roll(corners, -1, 0) - corners
     out = jnp.stack([along[:, 1], -along[:, 0]], 1)

@@ -1,7 +1,7 @@
-"""Finds what touches objects and what is fixed in the world: at most `SLOTS` patches at a time; more are counted.
+"""Collision detection of objects, and of links with fixed bodies: at most `SLOTS` patches; more are only counted.
 
-Pairs of bodies that are far from each other cost a distance of a ball. What is found is kept in slots, so that all that
-follows is in proportion to what touches, not to what could.
+A pair of bodies that are far apart costs the distance of two balls. Patches are kept in slots, so the cost of all later
+work grows with the bodies that touch, not with those that could.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from jax import Array
 
 from surgical_marl.physics import skip
-from surgical_marl.physics.contact.broadphase import Ball, Joints, Placed, Places, Way, between_balls
+from surgical_marl.physics.contact.broadphase import Ball, Displacement, Joints, Placed, Places, between_balls
 from surgical_marl.physics.contact.contact_pairs import ContactPairs, Meeting
 from surgical_marl.physics.contact.contact_patch import BLEND, TILT, TILT_IN_JAW, Patch, find_patch, no_patch
 from surgical_marl.physics.contact.shapes import Points, Segments, between_segments, on_plate
@@ -50,7 +50,7 @@ class Slots(NamedTuple):
 
     @property
     def found(self) -> Array:
-        """How many found room, []: what is in slots beyond is nothing."""
+        """Number of slots in use, []; the slots after them hold nothing."""
         return jnp.minimum(self.total, len(self.number))
 
 
@@ -89,8 +89,8 @@ class Detection:
     def _meet(self, placed: Placed, meeting: Meeting, start: int, slots: Slots) -> Slots:
         """Return the slots with the patches of a meeting, whose numbers begin at `start`.
 
-        Pairs that are near are listed first. Environments that run side by side then look closely at as many pairs as
-        the one of them with most, and not at all that are near in any of them.
+        Pairs that are near are listed first. Environments run in lockstep: with a list the narrow phase takes as many
+        rounds as the longest list of any environment; without one it would visit each pair that is near in any.
         """
         most = min(NEAREST, len(meeting.one))
         pairs, count = self._near_pairs(placed, meeting, slots.awake, most)
@@ -110,9 +110,9 @@ class Detection:
     def _near_pairs(self, placed: Placed, meeting: Meeting, awake: Array, most: int) -> Listed:
         """Return the numbers of pairs that may touch in the next step, at most so many.
 
-        What the first bodies may meet is gone through for each of them, but not for one that is far from all of it, and
-        not for an object at rest. All of them are asked that at once: loops that ask one at a time take ten times as
-        long on a GPU, which waits for the memory in each round.
+        The partners of a first body are visited in a loop, unless all are far from it or it is an object at rest. That
+        test is made for all first bodies at once: a loop that tests one at a time takes ten times as long on a GPU,
+        which waits for the memory in each round.
         """
         one, other = (of.astype(np.int32).reshape(-1, meeting.partners) for of in (meeting.one, meeting.other))
         near = self._perhaps_near(placed, meeting, one[:, 0], other)
@@ -136,7 +136,7 @@ class Detection:
     def _perhaps_near(self, placed: Placed, meeting: Meeting, one: np.ndarray, other: np.ndarray) -> Array:
         """Return which of bodies `one` [n] may touch each of its partners `other` [n, p] in the next step, [n, p].
 
-        Balls around both tell it. One that may be near any fixed body of a kind counts as near all of them.
+        The bounding balls decide. A body that may be near any fixed body of a kind counts as near all of them.
         """
         balls, partners = row_of(placed.balls[meeting.first], one), row_of(placed.balls[meeting.second], other)
         if meeting.second in self._tables.boxes:
@@ -160,19 +160,23 @@ class Detection:
             return looked_at(None)
         return jax.lax.cond(between_balls(one, other) < reach, looked_at, lambda _: jnp.bool_(False), None)
 
-    def _ways(self, placed: Placed, meeting: Meeting, i: Array, j: Array) -> tuple[Way, Way | None]:
-        its = placed.ways.get(meeting.second)
-        return row_of(placed.ways[meeting.first], i), None if its is None else row_of(its, j)
+    def _displacements(
+        self, placed: Placed, meeting: Meeting, i: Array, j: Array
+    ) -> tuple[Displacement, Displacement | None]:  # fmt: skip
+        """Return the displacements of two bodies in the step; None for a second one that is fixed."""
+        second = placed.displacements.get(meeting.second)
+        return row_of(placed.displacements[meeting.first], i), None if second is None else row_of(second, j)
 
     def _patch(self, placed: Placed, meeting: Meeting, start: int, pair: Array) -> tuple[Patch, Array]:
         """Return the patch of two bodies, and whether they touch."""
         i, j = _numbers(meeting, pair)
         touch, axes = self._touch(placed, meeting.second, j)
-        ways, (capsules, count) = self._ways(placed, meeting, i, j), self._near_capsules(placed, meeting, i, j)
+        first, second = self._displacements(placed, meeting, i, j)
+        capsules, count = self._near_capsules(placed, meeting, i, j)
 
         def look(n: Array) -> tuple[Points, Array]:
             points = touch(self._places.capsule(placed, meeting.first, i, capsules[n]))
-            nearer = ways[0].of(points) - (0.0 if ways[1] is None else ways[1].of(points))
+            nearer = first.approach(points) - (0.0 if second is None else second.approach(points))
             return points, points.depth + jnp.minimum(nearer, AHEAD)
 
         torsion, middle = jnp.asarray(self._tables.torsion)[start + pair], placed.balls[meeting.first].centre[i]
@@ -183,8 +187,8 @@ class Detection:
     def _near_capsules(self, placed: Placed, meeting: Meeting, i: Array, j: Array) -> Listed:
         """Return the numbers of a body's capsules that may have a part in a patch.
 
-        A capsule has none that is farther away than the one that touches by more than tilting can make up for: by the
-        angle, times the way from a place of the one to a place of the other.
+        A capsule is left out if it is farther away than a capsule that touches by more than a tilt can make up for: its
+        angle, times the distance between places of the two.
         """
         c = self._tables.radius.shape[1]
         if meeting.first != "objects" or c == 1:
@@ -201,7 +205,7 @@ class Detection:
         return jax.lax.scan(look, Listed.none(c), jnp.arange(c, dtype=jnp.int32))[0]
 
     def _touch(self, placed: Placed, kind: str, j: Array) -> tuple[Callable[[Segments], Points], Array]:
-        """Return what finds where a capsule may touch a body, [d], and two axes [2, 3] along which they spread."""
+        """Return a function from a capsule to the points [d] where it may touch a body, and axes of tilts, [2, 3]."""
         if kind in ("pads", "plates"):
             plate = self._places.plate(placed, kind, j)
             return lambda capsule: on_plate(capsule, plate), plate.frame[:, :2].T
@@ -233,7 +237,7 @@ def _tilt(meeting: Meeting) -> float:
 
 
 def _if_any(near: Array, change: Callable[[Any], Any], found: Any) -> Any:
-    """Return what was found, changed if anything is near."""
+    """Return `change(found)` if anything is near, else `found`."""
     return skip.cond("far_pairs", near.any(), change, lambda found: found, found)
 
 

@@ -19,12 +19,12 @@ _FIRST, _SECOND = np.tril_indices(6)
 
 
 class Springs(NamedTuple):
-    """What a patch resists with, at s points."""
+    """Resistance of a patch of s points to relative acceleration, at the end of the step."""
 
     stiff: Array
-    """Normal force per acceleration, [s]."""
+    """By how much the normal force of each point falls per acceleration apart, kg, [s]."""
     rub: Array
-    """Friction per acceleration, []."""
+    """By how much friction that sticks falls per acceleration along the surface, kg, []."""
     coefficient: Array
     """Friction coefficient, []."""
 
@@ -38,7 +38,8 @@ class Cone(NamedTuple):
     normal: Array
     """Speed along the normal of each point by twist, [s, 6]."""
     along: Array
-    """Speed in two directions along the surface, and about the normal times the patch's radius, by twist, [3, 6]."""
+    """Rows of friction, by twist, [3, 6]: two speeds along the surface, and the spin about the normal times the
+    patch's radius."""
     springs: Springs
 
 
@@ -52,10 +53,10 @@ class Parting(NamedTuple):
 
 
 class Stuck(NamedTuple):
-    """The forces of a patch that can neither part nor slip."""
+    """The forces that a patch would have without its bounds: the trial forces, before projection on the cone."""
 
     push: Array
-    """Along the normal of each point, N, [s]; it pulls where this is below 0."""
+    """Along the normal of each point, N, [s]; negative where the spring would pull."""
     pull: Array
     """Friction, N, [3]."""
 
@@ -69,10 +70,10 @@ class Forces(NamedTuple):
     """N, [3]."""
     slips: Array
     """Whether friction is at its bound, [] bool."""
-    way: Array
+    direction: Array
     """Unit vector of friction, [3]."""
     left: Array
-    """Share of the friction that would stick, []."""
+    """Friction as a share of the trial friction, []."""
 
 
 def parting(cone: Cone, twist: Array) -> Parting:
@@ -81,15 +82,16 @@ def parting(cone: Cone, twist: Array) -> Parting:
 
 
 def stretched(springs: Springs, stuck: Stuck, by: Parting) -> Stuck:
-    """Return the forces that stick once the bodies accelerate by so much more."""
+    """Return the trial forces once the bodies accelerate by so much more."""
     return Stuck(stuck.push - springs.stiff * by.normal, stuck.pull - springs.rub * by.along)
 
 
 def nearest(springs: Springs, stuck: Stuck) -> Forces:
-    """Return the forces in the friction cone that are nearest to those that stick.
+    """Return the forces in the friction cone that are nearest to trial forces, in the metric of the springs.
 
-    Where friction slips it gives way by an unknown amount, and the normal forces grow with it. It is the root of a
-    concave function, piecewise linear with a corner at each point: Newton's method from the far end never overshoots.
+    Where friction slips, its trial is reduced by `rub` times an unknown `amount`, and the normal forces grow by `mu
+    stiff amount`. The amount is the root of a concave function, piecewise linear with a corner at each point: Newton's
+    method from the far end never overshoots.
     """
     (stiff, rub, mu), (push, pull) = springs, stuck
     size = jnp.sqrt(jnp.sum(pull * pull))
@@ -105,8 +107,8 @@ def nearest(springs: Springs, stuck: Stuck) -> Forces:
     raised = push + mu * stiff * amount
     left = jnp.where((raised > 0).any(), jnp.maximum(size - rub * amount, 0.0), 0.0)
     size = jnp.maximum(size, 1e-20)
-    way = pull / size
-    return Forces(jnp.maximum(raised, 0.0), left * way, amount > 0, way, left / size)
+    direction = pull / size
+    return Forces(jnp.maximum(raised, 0.0), left * direction, amount > 0, direction, left / size)
 
 
 def presses(felt: Forces) -> Array:
@@ -120,13 +122,13 @@ def wrench(cone: Cone, felt: Forces) -> Array:
 
 
 def curvature(cone: Cone, felt: Forces) -> Array:
-    """Return by how much the wrench falls per acceleration: the lower half of a matrix [6, 6], row by row, [21]."""
+    """Return the Hessian of a contact's cost, by which the wrench falls per twist: lower half, row by row, [21]."""
     pressed, rub, soft, ahead, across = _gives(cone.springs, felt)
     lower = jnp.sum((pressed[:, None] * cone.normal)[:, _FIRST] * cone.normal[:, _SECOND], 0)
     lower += rub * across * jnp.sum(cone.along[:, _FIRST] * cone.along[:, _SECOND], 0)
 
     def slipping(lower: Array) -> Array:
-        rubs, raised = felt.way @ cone.along, cone.springs.coefficient * (pressed @ cone.normal)
+        rubs, raised = felt.direction @ cone.along, cone.springs.coefficient * (pressed @ cone.normal)
         mixed = rub * rubs - raised / 2
         lower += rub * (ahead - across) * rubs[_FIRST] * rubs[_SECOND]
         return lower + soft * (raised[_FIRST] * mixed[_SECOND] + raised[_SECOND] * mixed[_FIRST])
@@ -142,7 +144,7 @@ def between(cone: Cone, other: Cone, felt: Forces) -> Array:
     """
     pressed, rub, soft, ahead, across = _gives(cone.springs, felt)
     (rubs, raised), (its, its_raised) = (
-        (felt.way @ own.along, cone.springs.coefficient * (pressed @ own.normal)) for own in (cone, other)
+        (felt.direction @ own.along, cone.springs.coefficient * (pressed @ own.normal)) for own in (cone, other)
     )
     mixed, its_mixed = rub * rubs - raised / 2, rub * its - its_raised / 2
     whole = (pressed[:, None] * cone.normal).T @ other.normal
@@ -151,24 +153,25 @@ def between(cone: Cone, other: Cone, felt: Forces) -> Array:
 
 
 def falls(springs: Springs, felt: Forces, by: Parting) -> tuple[Array, Array]:
-    """Return by how much normal forces [s] and friction [3] fall per length of a way, at its beginning.
+    """Return the directional derivative of forces, negated: by how much normal forces [s] and friction [3] fall.
 
     Args:
         springs: of the contact.
-        felt: its forces at the beginning.
-        by: how much more the bodies accelerate per length.
+        felt: its forces.
+        by: the direction, as relative acceleration.
     """
     pressed, rub, soft, ahead, across = _gives(springs, felt)
-    rubs, raised = rub * (felt.way @ by.along), springs.coefficient * (pressed @ by.normal)
+    rubs, raised = rub * (felt.direction @ by.along), springs.coefficient * (pressed @ by.normal)
     normal = pressed * (by.normal + springs.coefficient * soft * (rubs - raised))
-    return normal, rub * across * by.along + ((ahead - across) * rubs + soft * rub * raised) * felt.way
+    return normal, rub * across * by.along + ((ahead - across) * rubs + soft * rub * raised) * felt.direction
 
 
 def _gives(springs: Springs, felt: Forces) -> tuple[Array, Array, Array, Array, Array]:
-    """Return by how much forces fall per acceleration.
+    """Return the elements of the forces' derivative by acceleration.
 
-    Those along the normals of points that press, [s]; friction that sticks, []; the amount by which friction that slips
-    gives way per force, []; and the shares of friction that are left along its own direction and across it, [].
+    In order: stiffness of points that press, [s]; `rub` of a patch that presses, []; the change of `amount` (see
+    `nearest`) per force, 0 if nothing slips, []; and the shares of `rub` that are left along the friction's direction
+    and across it, [] each.
     """
     presses = felt.normal > 0
     pressed = jnp.where(presses, springs.stiff, 0.0)

@@ -1,4 +1,4 @@
-"""Grips: what friction remembers of the fingers that hold a body, and whether an arm holds it."""
+"""Grips: the memory of friction between fingers and bodies, and whether an arm holds a body."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ DWELL = 1.0 / 30.0
 
 
 class Grips(NamedTuple):
-    """How k objects are held by f fingers of a arms, and what friction remembers of it."""
+    """The state of friction between k objects and f fingers, and for how long each of a arms has held each object."""
 
     position: Array
     """Centre of mass in the finger's frame when the spring of friction was relaxed, m, [k, f, 3]."""
@@ -152,7 +152,7 @@ class GripMemory:
     def _slid(self, number: Array, forces: Pressed, slip: Array, after: Array, dt: Any) -> Array:
         """Return how far friction slides in a step that would stretch its spring from `slip` to `after`, m, [3].
 
-        What slides is in series with the spring and the damper beside it, which bear its force together.
+        A slider is in series with a spring and a damper, which are parallel and bear the friction together.
         """
         pulled = -forces.friction / (SHEAR * jnp.asarray(self.tables.stiffness)[number])
         return jnp.where(forces.slips, after - (dt * pulled + DAMPING * slip) / (dt + DAMPING), 0.0)
@@ -172,21 +172,21 @@ class GripMemory:
             at: place and orientation of the object.
             grip: what was kept.
 
-        Where it slides, friction's spring is relaxed in the pose of now, less what it stays stretched by along the
-        surface and about the normal. In all other directions that pose is taken as it is: if an object that rolls as it
-        slides kept its old one, the spring would feel it roll back.
+        Where friction slides, the pose in which its spring is relaxed becomes the present pose, moved back by what the
+        spring stays stretched along the surface and about the normal. In all other directions the present pose is
+        taken: otherwise an object that rolls as it slides would be pulled as if it had to roll back.
         """
         (place, faces), (position, quaternion, force, before), axes = finger, grip, rotation(finger.quaternion)
         new, left = force <= 0, slip - slid
         # Kept as it is while nothing slips: rounding errors of a pose made anew in each step would add up.
-        moves, way = new | forces.slips, jnp.sqrt(jnp.sum(slid[:2] ** 2))
+        moves, distance = new | forces.slips, jnp.sqrt(jnp.sum(slid[:2] ** 2))
         spin = left[2] / patch.radius * patch.normal
         was = at[0] + carried(turn(spin), patch.centre - at[0]) - left[:2] @ patch.frame[1:]
         return (
             jnp.where(moves, axes.T @ (was - place), position),
             jnp.where(moves, product(conjugate(faces), turned(-spin, at[1])), quaternion),
             forces.normal,
-            jnp.where(new, 0.0, before + jnp.where(forces.slips, way, 0.0)),
+            jnp.where(new, 0.0, before + jnp.where(forces.slips, distance, 0.0)),
         )
 
     def _held(self, normal: Array, force: Array, held: Array, dt: Any) -> Array:

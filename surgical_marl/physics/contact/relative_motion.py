@@ -24,16 +24,17 @@ class RelativeMotion:
             found -= _moved_to(objects[contact.second], contact.offset)
         if not len(self._dofs):
             return found
-        with_arm = lambda: found + contact.by_joints(arms[contact.arm])  # noqa: E731
-        whole: Array = jax.lax.cond(contact.arm < len(self._dofs), with_arm, lambda: found)
+        whole: Array = jax.lax.cond(
+            contact.arm < len(self._dofs), lambda: found + contact.by_joints(arms[contact.arm]), lambda: found
+        )
         return whole
 
     def by_arm(self, joints: Array) -> Array:
-        """Return what belongs to the joints [n] of all arms by arm, [a, m]; 0 for joints that are not."""
+        """Return values of all joints [n] as rows of arms, [a, m]; 0 where an arm has fewer joints."""
         return jnp.append(joints, 0.0)[np.minimum(self._dofs, len(joints))]
 
     def by_object(self, each: Array) -> Array:
-        """Return what belongs to objects [k, ...], and 0 for the one that stands for none, [k + 1, ...]."""
+        """Return values of objects [k, ...] with a row of zeros for "no object", [k + 1, ...]."""
         return jnp.concatenate([each, jnp.zeros((1, *each.shape[1:]))])
 
 
@@ -54,10 +55,10 @@ def bends(columns: Array, places: Array) -> Array:
 
 
 def moved_cone(contact: Contact) -> Cone:
-    """Return the cone with its twists at the centre of mass of the other object, and as that one feels it.
+    """Return the cone for the second object: rows negated, and moved to that object's centre of mass.
 
-    Its rows are moved before anything is made of them: in float32 a curvature about one body's centre, moved to that of
-    a small one, would be wrong by more than that one's inertia.
+    Rows are moved before they are squared: in float32 a curvature about one body's centre, moved to that of a small
+    one, would be wrong by more than the small one's inertia.
     """
     shift, cone = _shift(contact.offset), contact.cone
     return cone._replace(normal=-cone.normal @ shift, along=-cone.along @ shift)

@@ -21,7 +21,7 @@ EVEN = 0.2
 """Angle likewise up to which a capsule has a point near its farther end: more than it turns within a step, so that a
 step knows on what it will rest."""
 _POINTS = ((0.5, NEAR), (0.0, EVEN), (1.0, EVEN))
-"""From where each of a capsule's three points is drawn away, as a share of its length, and by which angle."""
+"""Of each of a capsule's three points: its anchor, as a share of the length, and the angle of its penalty."""
 
 
 class Segments(NamedTuple):
@@ -83,21 +83,21 @@ def between_segments(one: Segments, other: Segments) -> Points:
 def on_plate(one: Segments, plate: Plate) -> Points:
     """Return three points [..., 3] where each capsule is near a plate: its nearest point, and one for each end.
 
-    All three are where the distance to the plate is least, plus a small price for the way from a place on the capsule:
-    from its middle, or from one of its ends. The price is half of an angle, times the capsule's length, times the
-    square of the way as a share of that length. So a capsule that lies flat has its points in the middle and at both
-    ends, or at the edges of the plate where it juts out. As it turns by that angle they move to its lower end. These
-    are proximal points (J. J. Moreau, "Proximité et dualité dans un espace hilbertien", 1965): they move no faster than
-    the capsule's length over the angle, however the shapes lie. Depth and normal are those of the points themselves,
-    and change no faster than these move.
+    Each point minimises the distance to the plate plus a small penalty on its distance along the capsule from an
+    anchor: the middle, or one of the ends. The penalty is half of an angle, times the capsule's length, times the
+    square of the distance from the anchor as a share of that length. So a capsule that lies flat has its points in the
+    middle and at both ends, or at the edges of the plate where it juts out. As it turns by that angle they move to its
+    lower end. These are proximal points (J. J. Moreau, "Proximité et dualité dans un espace hilbertien", 1965): they
+    move no faster than the capsule's length over the angle, however the shapes lie. Depth and normal are those of the
+    points themselves, and change no faster than these move.
 
     The ends of the part above the plate, for example, would not do: they jump when the capsule leaves over an edge.
     """
     start, end = (in_frame(point, plate) for point in (one.start, one.end))
-    way = end - start
+    extent = end - start
     half, radius = jnp.asarray(plate.half), one.radius + plate.radius
-    share = _nearest(start, way, half, radius * jnp.sqrt(jnp.maximum(_dot(way, way), 1e-18)))
-    point = start[..., None, :] + share[..., None] * way[..., None, :]
+    share = _nearest(start, extent, half, radius * jnp.sqrt(jnp.maximum(_dot(extent, extent), 1e-18)))
+    point = start[..., None, :] + share[..., None] * extent[..., None, :]
     off = _off(point, half)
     length = jnp.sqrt(jnp.maximum(_dot(off, off), 1e-18))
     depth, normal = radius[..., None] - length, off / length[..., None]
@@ -107,22 +107,23 @@ def on_plate(one: Segments, plate: Plate) -> Points:
     return Points(depth, world - (radius - depth / 2)[..., None] * normal, normal)
 
 
-def _nearest(start: Array, way: Array, half: Array, price: Array) -> Array:
+def _nearest(start: Array, extent: Array, half: Array, scale: Array) -> Array:
     """Return where on segments, 0 to 1, their three points near a rectangle are, [..., 3].
 
     Half the squared distance has a slope along the segment that grows piecewise linearly, with corners where the
-    segment passes a side of the rectangle. So has the price, a length times the angle. The root of their sum lies
-    between the last corner where it is negative and the first one where it is positive.
+    segment passes a side of the rectangle. The slope of the penalty is linear: the angle, times `scale` [...] (the sum
+    of the radii times the capsule's length), times the distance from the anchor. The root of their sum lies between the
+    last corner where it is negative and the first one where it is positive.
     """
-    slope = jnp.where(jnp.abs(way[..., :2]) < 1e-9, 1e-9, way[..., :2])
+    slope = jnp.where(jnp.abs(extent[..., :2]) < 1e-9, 1e-9, extent[..., :2])
     ends = (-half - start[..., :2]) / slope, (half - start[..., :2]) / slope
     first, last = (jnp.clip(order(*ends), 0.0, 1.0) for order in (jnp.minimum, jnp.maximum))
     corners = jnp.stack(_sorted(*(first[..., 0], last[..., 0], first[..., 1], last[..., 1])), -1)
     none = jnp.zeros((*corners.shape[:-1], 1))
     corners = jnp.concatenate([none, corners, none + 1.0], -1)
-    point = start[..., None, :] + corners[..., None] * way[..., None, :]
-    rise = jnp.sum(_off(point, half) * way[..., None, :], -1)
-    found = [_root(corners, rise + even * price[..., None] * (corners - anchor)) for anchor, even in _POINTS]
+    point = start[..., None, :] + corners[..., None] * extent[..., None, :]
+    rise = jnp.sum(_off(point, half) * extent[..., None, :], -1)
+    found = [_root(corners, rise + even * scale[..., None] * (corners - anchor)) for anchor, even in _POINTS]
     return jnp.stack(found, -1)
 
 
@@ -147,7 +148,7 @@ def _where(condition: Array, one: tuple[Array, Array], other: tuple[Array, Array
 
 
 def _off(point: Array, half: Array) -> Array:
-    """Return the way to points [..., q, 3] from the nearest points of rectangles with half sides [..., 2]."""
+    """Return the offset of points [..., q, 3] from the nearest points of rectangles with half sides [..., 2]."""
     held = jnp.clip(point[..., :2], -half[..., None, :], half[..., None, :])
     return jnp.concatenate([point[..., :2] - held, point[..., 2:]], -1)
 

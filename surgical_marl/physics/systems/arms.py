@@ -30,7 +30,7 @@ from surgical_marl.scenes.build import alone
 from surgical_marl.scenes.scene import Scene, payload_body
 
 ITERATIONS = (1, 1)
-"""Newton steps, and line search steps in each, of an arm that touches nothing, after its joints were relaxed."""
+"""Newton steps, and line search steps in each, of an arm that touches nothing, after `relax`."""
 
 
 class ArmForces(NamedTuple):
@@ -253,7 +253,7 @@ def _dofs(scene: Scene) -> np.ndarray:
 
 
 def _friction_decay(model: mujoco.MjModel) -> np.ndarray:
-    """Return the share of each joint's last acceleration at which its friction is as before, [nv + 1]; last a 1."""
+    """Return by what to multiply last accelerations, so that friction is as in the last step, [nv + 1]; last a 1."""
     dt, still = np.float32(model.opt.timestep), jnp.zeros(model.nv)
     _, damping, _ = response(model.dof_solref.T, model.dof_solimp.T, still, dt)
     return np.append(1 - dt * np.asarray(damping), 1.0).astype(np.float32)

@@ -1,4 +1,4 @@
-"""How systems meet arms and rigid bodies: the ends of their contacts, loads on them, and how the ends accelerate."""
+"""Contacts of systems of plug-ins with arms and rigid bodies: their ends, the loads on these, their accelerations."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from surgical_marl.physics.contact.broadphase import Joints, Placed, Places, Way
+from surgical_marl.physics.contact.broadphase import Displacement, Joints, Placed, Places
 from surgical_marl.physics.contact.contact_pairs import ContactPairs
 from surgical_marl.physics.contact.shapes import Points, Segments, between_segments, on_plate
 from surgical_marl.physics.solver.cholesky import back, cholesky, forward
@@ -55,17 +55,19 @@ class Coupling:
         placed = self._places.place(poses, joints, qvel, bodies, dt)
         points, velocities = [], []
         for kind in (kind for kind, size in self._counts.items() if size):
-            way = placed.ways.get(kind)
+            displacement = placed.displacements.get(kind)
 
-            def of_sphere(row: Any, kind: str = kind, way: Way | None = way) -> tuple[Points, Array]:
+            def of_sphere(
+                row: Any, kind: str = kind, displacement: Displacement | None = displacement
+            ) -> tuple[Points, Array]:  # fmt: skip
                 centre, radius = row
                 sphere = Segments(centre, centre, radius)
 
                 def meet(number: Array) -> tuple[Points, Array]:
                     point = self._point(placed, kind, number, sphere)
-                    if way is None:
+                    if displacement is None:
                         return point, jnp.zeros(3)
-                    own = row_of(way, number)
+                    own = row_of(displacement, number)
                     return point, (own.shift + jnp.cross(own.turn, point.place)) / dt
 
                 return jax.lax.map(meet, jnp.arange(self._counts[kind]))
@@ -152,8 +154,11 @@ class Coupling:
             arm, moves, body, place = row
             found = jnp.zeros(3)
             if a:
-                of_arm = lambda: self._jacobian(joints, arm, moves, place) @ by_arm.at[arm].get(mode="clip")  # noqa: E731
-                found = jax.lax.cond(arm < a, of_arm, lambda: jnp.zeros(3))
+                found = jax.lax.cond(
+                    arm < a,
+                    lambda: self._jacobian(joints, arm, moves, place) @ by_arm.at[arm].get(mode="clip"),
+                    lambda: jnp.zeros(3),
+                )
             if k:
                 motion = _motion_of(place - bodies.position.at[body].get(mode="clip"))
                 found += jnp.where(body < k, motion @ by_body.at[body].get(mode="clip"), 0.0)
@@ -169,7 +174,7 @@ class Coupling:
         return (moving.at[arm].get(mode="clip") * moves[:, None]).T
 
     def _rows(self, loads: Loads | None, ends: Ends) -> dict[str, Array]:
-        """Return all contacts in one row after the other, [n r]."""
+        """Return the contacts of all spheres as rows, [n r], by column."""
         n = len(ends.depth)
         rows = {"arm": np.tile(self.arm, n), "moves": np.tile(self.moves, (n, 1)), "body": np.tile(self.body, n)}
         found = {name: jnp.asarray(values) for name, values in rows.items()}

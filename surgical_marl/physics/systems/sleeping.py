@@ -1,4 +1,4 @@
-"""Objects at rest: what lies still, and has nothing that moves near it, stays as it is until something comes.
+"""Sleeping: an object that lies still with nothing moving near it keeps its pose until something comes near.
 
 An object whose velocity and acceleration are zero, all six numbers of both, is at rest. Objects begin with the
 acceleration of gravity, so none is at rest before a step has found what bears it. MuJoCo calls this sleeping.
@@ -25,7 +25,7 @@ UNFORCED = 0.01
 
 
 class Company(NamedTuple):
-    """What keeps objects from being at rest."""
+    """Neighbours that keep objects awake."""
 
     arms: Array
     """Which objects an arm is near, [k] bool."""
@@ -33,7 +33,7 @@ class Company(NamedTuple):
     """Which objects are near each other, [k, k] bool."""
 
     def spread(self, awake: Array) -> Array:
-        """Return which objects are not at rest, [k] bool, if these are not: those too that lie against one of them."""
+        """Return which objects are awake, [k] bool: those of `awake`, those near an arm, and all their neighbours."""
         awake |= self.arms
         for _ in range(len(awake) - 1):
             awake |= (self.objects & awake).any(1)
@@ -41,13 +41,13 @@ class Company(NamedTuple):
 
 
 def company(placed: Placed, slender: np.ndarray, reach: Callable[..., Array]) -> Company:
-    """Return what is near objects.
+    """Return which arms and objects are near each object.
 
     Args:
         placed: where all bodies are.
-        slender: numbers of links that are long and thin, as shafts of instruments. A ball around one would keep awake
-            all that lies under it.
-        reach: of two balls or rows of balls, the distance below which their bodies may touch in the next step, m.
+        slender: numbers of long, thin links, such as shafts of instruments. They are compared by their axes: a ball
+            around a shaft would keep all objects under it awake.
+        reach: takes two balls or rows of balls; returns the distance below which bodies may touch in the next step, m.
     """
     objects, links = placed.balls["objects"], placed.balls["links"]
     own = Ball(*(x[:, None] for x in objects))
@@ -55,23 +55,23 @@ def company(placed: Placed, slender: np.ndarray, reach: Callable[..., Array]) ->
         between_balls(own, ball) < reach(own, ball) for ball in (placed.balls["pads"], links, objects)
     )
     shafts, around = (jax.tree.map(lambda x: x[slender], of) for of in (placed.links, links))
-    way = own.centre - jax.vmap(nearest, (0, None), 1)(shafts, objects.centre)
-    by_link = by_link.at[:, slender].set(size(way) - shafts.radius - own.radius < reach(own, around))
+    offset = own.centre - jax.vmap(nearest, (0, None), 1)(shafts, objects.centre)
+    by_link = by_link.at[:, slender].set(size(offset) - shafts.radius - own.radius < reach(own, around))
     return Company(by_pad.any(1) | by_link.any(1), by_object)
 
 
 def moving(bodies: Bodies) -> Array:
-    """Return which objects are not at rest by themselves, [k] bool."""
+    """Return which objects have a velocity or an acceleration, [k] bool."""
     return (jnp.concatenate([bodies.velocity, bodies.acceleration], -1) != 0).any(-1)
 
 
 def settled(bodies: Bodies, bound: Any, near: Company) -> Bodies:
-    """Return the objects after a step, with those at rest that have come to it.
+    """Return the objects after a step: those slow enough, and with no neighbour awake, get zero velocity and rest.
 
     Args:
         bodies: after the step.
         bound: radius of a ball about the centre of mass that holds the object, m, [k].
-        near: what is near the objects.
+        near: their neighbours.
     """
     fast = jnp.zeros(len(bodies.position), bool)
     for rate, most in ((bodies.velocity, SLOW), (bodies.acceleration, UNFORCED)):

@@ -20,7 +20,7 @@ from surgical_marl.scenes.objects import Surface
 
 
 class Spheres(NamedTuple):
-    """The places of a system at which others touch it, n of them. World."""
+    """The collision shapes of a system: n spheres. World."""
 
     centre: Array
     """m, [n, 3]"""
@@ -53,7 +53,7 @@ class Loads(NamedTuple):
     force: Array
     """At the start of the step's solve, while ends do not accelerate, N, [n, r, 3]."""
     stiffness: Array
-    """How much the force falls per acceleration of its end, kg, [n, r, 3, 3]."""
+    """By how much the force falls per acceleration of its end, kg, [n, r, 3, 3]; symmetric, positive semidefinite."""
 
 
 class System(ABC):
@@ -87,10 +87,10 @@ class System(ABC):
         """Return the state after a step in which the ends have these accelerations, m/s2, [n, r, 3]."""
 
     def view(self, state: Any) -> Any:
-        """Return the part of the state that tasks see; all of it unless a system says otherwise."""
+        """Return the part of the state that tasks see: all of it by default. Nothing in this package calls it."""
         return state
 
     def randomise(self, key: Array) -> System:
-        """Return the system with values drawn for an episode by a key; itself unless a system says otherwise."""
+        """Return the system with values drawn by a key: itself by default. Nothing in this package calls it."""
         del key
         return self
