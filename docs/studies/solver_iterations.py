@@ -16,7 +16,7 @@ from surgical_marl import load_scene
 from surgical_marl.control.controller import Controller
 from surgical_marl.physics.outputs import Touch
 from surgical_marl.physics.simulator import Simulator
-from surgical_marl.physics.solver import arm_newton, constraint_rows
+from surgical_marl.physics.solver import arm_solver, constraint_rows
 from surgical_marl.physics.state import ArmState, Physics
 from surgical_marl.physics.systems import arms
 from surgical_marl.scenes.scene import Scene
@@ -117,7 +117,7 @@ def touching() -> None:
     print("| iterations | line search | velocity off: 99 % | worst | largest force off: 99 % | worst |")
     print("|---|---|---|---|---|---|")
     for iterations, line_search in TOUCHING:
-        arm_newton.ITERATIONS_WITH_ROWS = iterations, line_search
+        arm_solver.ITERATIONS_WITH_ROWS = iterations, line_search
         velocity, force = step(scene, states, touching=True)
         off = (np.abs(velocity - velocities) / speeds(scene)).max(1)
         force_off = np.abs(force - forces).max(1) / np.maximum(forces.max(1), 1.0)

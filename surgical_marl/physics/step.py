@@ -28,7 +28,7 @@ from surgical_marl.physics.contact.detection import Detection, Slots
 from surgical_marl.physics.contact.grips import Fingers, GripMemory, released
 from surgical_marl.physics.outputs import Touch
 from surgical_marl.physics.solver.constraint_rows import Rows
-from surgical_marl.physics.solver.newton import Newton
+from surgical_marl.physics.solver.contact_solver import ContactSolver
 from surgical_marl.physics.solver.problem import Contacts, Pressed, Problem, no_arms
 from surgical_marl.physics.state import ATTACHMENTS, Physics
 from surgical_marl.physics.systems.arms import ArmForces, Arms, accelerations_apart, implicit_change, relaxed
@@ -83,9 +83,9 @@ class Step:
         joints, count = scene.model.nv, len(scene.free_objects)
         none = np.zeros((0, 0), int)
         self._newton, self._newton_of_bodies, self._newton_of_one = (
-            Newton(self.arms.dofs, joints, count),
-            Newton(none, 0, count),
-            Newton(none, 0, 1),
+            ContactSolver(self.arms.dofs, joints, count),
+            ContactSolver(none, 0, count),
+            ContactSolver(none, 0, 1),
         )
         self._index()
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from surgical_marl.physics.solver.arm_newton import Arms, Condensed
+from surgical_marl.physics.solver.arm_solver import Arms, Condensed
 from surgical_marl.physics.solver.constraint_rows import JointRows, Rows, rows_of
 
 JOINTS = 5
@@ -102,7 +102,7 @@ def _drawn(rng: np.random.Generator, arms: int, objects: int, bridge: int) -> _D
 def test_arms_that_an_object_joins_are_solved_as_all_at_once_in_float64(
     arms: int, objects: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("surgical_marl.physics.solver.arm_newton.ITERATIONS", (60, 4))  # six do not solve all of these
+    monkeypatch.setattr("surgical_marl.physics.solver.arm_solver.ITERATIONS", (60, 4))  # six do not solve all of these
     rng, errors = np.random.default_rng(10 * arms + objects), []
     solver = Arms(np.arange(arms * JOINTS).reshape(arms, JOINTS), arms * JOINTS)
     bridged = jax.jit(lambda fields, *given: given[0] + solver.bridged(SimpleNamespace(**fields), *given))  # type: ignore[arg-type]

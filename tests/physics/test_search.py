@@ -21,7 +21,7 @@ from surgical_marl.physics.contact.friction_cone import (
     wrench,
 )
 from surgical_marl.physics.solver.cholesky import packed
-from surgical_marl.physics.solver.line_search import ENOUGH, search
+from surgical_marl.physics.solver.newton import ENOUGH, line_search
 
 POINTS = 4
 
@@ -80,14 +80,14 @@ def test_a_length_is_found_where_the_slope_is_small(
             grows += jnp.where(length > place, begin * more, 0.0)
         return slope, grows
 
-    length = search(jnp.float32(-begin), 0.0, measure).length
+    length = line_search(jnp.float32(-begin), 0.0, measure).length
     slope, _ = measure(length)
     assert 0 < float(length) <= 1 / growth * (1 + ENOUGH) + 1e-6
     assert abs(float(slope)) <= ENOUGH * begin
 
 
 def test_a_slope_that_is_next_to_none_takes_the_whole_way_without_a_look() -> None:
-    found = search(jnp.float32(-1e-3), 1e-3, lambda length: (length, length))
+    found = line_search(jnp.float32(-1e-3), 1e-3, lambda length: (length, length))
     assert (float(found.length), int(found.looks)) == (1.0, 0)
 
 
@@ -100,7 +100,7 @@ def test_a_slope_that_is_steep_between_flat_ends_does_not_send_the_search_to_and
         places = jnp.linspace(0.0, 1.0, len(slopes))
         return jnp.interp(length, places, jnp.array(slopes)), jnp.interp(length, places, jnp.array(growths))
 
-    found = search(jnp.float32(slopes[0]), 0.0, measure)
+    found = line_search(jnp.float32(slopes[0]), 0.0, measure)
     slope, _ = measure(found.length)
     assert abs(float(slope)) <= -ENOUGH * slopes[0]
     assert int(found.looks) <= 4

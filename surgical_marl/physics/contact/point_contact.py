@@ -26,13 +26,13 @@ from surgical_marl.physics.contact.friction_cone import (
 )
 from surgical_marl.physics.contact.grips import DAMPING
 from surgical_marl.physics.solver.cholesky import back, cholesky, forward, packed
-from surgical_marl.physics.solver.line_search import search
+from surgical_marl.physics.solver.newton import line_search, newton
 from surgical_marl.physics.systems.system import Ends, Loads
 
 ITERATIONS = 6
-"""Newton steps for one point mass: each contact is linear but for a change between free, stuck and sliding."""
+"""Newton steps for one point mass at most: each contact is linear but for a change between free, stuck and sliding."""
 LEAST = 1e-9
-"""Fall of the cost in a Newton step, N m/s2, after which a step is taken whole."""
+"""Fall of the cost in a Newton step, N m/s2, after which none follows."""
 _BLOCK = packed(6)[:3, :3]
 
 
@@ -131,7 +131,7 @@ def _solve(mass: Array, force: Array, laws: _Law, moves: Array) -> Array:
         found: tuple[Array, Array] = jax.lax.scan(add, (force - mass @ acceleration, mass), (laws, moves))[0]
         return found
 
-    def newton(_: Array, acceleration: Array) -> Array:
+    def step_from(acceleration: Array, _: Array) -> tuple[Array, Array]:
         excess, matrix = left(acceleration)
         factor = cholesky(matrix)
         step = back(factor, forward(factor, excess))
@@ -140,7 +140,7 @@ def _solve(mass: Array, force: Array, laws: _Law, moves: Array) -> Array:
             excess, matrix = left(acceleration + length * step)
             return -(step @ excess), step @ (matrix @ step)
 
-        return acceleration + search(-(step @ excess), LEAST, measure).length * step
+        return acceleration + line_search(-(step @ excess), LEAST, measure).length * step, step @ excess <= LEAST
 
-    found: Array = jax.lax.fori_loop(0, ITERATIONS, newton, jnp.zeros(3))
+    found: Array = newton(step_from, jnp.zeros(3), ITERATIONS)
     return found

@@ -12,7 +12,7 @@ from surgical_marl.physics.solver.problem import Contact
 
 
 class RelativeMotion:
-    """Finds the twists of contacts in one scene with k objects. `dofs` [a, m] is as for `Newton`."""
+    """Finds the twists of contacts in one scene with k objects. `dofs` [a, m] is as for `ContactSolver`."""
 
     def __init__(self, dofs: np.ndarray, objects: int) -> None:
         self._dofs, self._objects = dofs, objects

@@ -23,6 +23,8 @@ import numpy as np
 from jax import Array
 from jax.scipy.linalg import cho_solve
 
+from surgical_marl.physics.solver.newton import line_search, newton
+
 RELAXATION = 1.15
 """Relaxation factor: a little more than 1 makes coupled joints converge soonest (successive over-relaxation, Young,
 1950)."""
@@ -127,14 +129,14 @@ def solve(
     rows: Rows,
     start: Array,
     iterations: int,
-    line_search: int,
+    looks: int,
     arms: Sequence[np.ndarray] = (),
     steady: int = 2,
 ) -> tuple[Array, Array]:
     """Return the acceleration [n] and the force of each row [r].
 
     They are found for a mass matrix [n, n] and the sum `smooth` [n] of all other forces, by Newton steps from `start`.
-    Each Newton step has `line_search` steps of line search. If there are many arms, `arms` has the numbers of their
+    Each Newton step has `looks` steps of line search. If there are many arms, `arms` has the numbers of their
     joints, [a, m] for each type, and the first 2 n rows are those of `rows_of`: then no matrix larger than that of an
     arm is factorised (`_newton_step`), in loops over arms.
 
@@ -144,14 +146,14 @@ def solve(
     Its derivative is that of the solution (`_differentiate`), whatever the way there.
     """
 
-    def newton(qacc: Array) -> tuple[Array, Array]:
+    def step(qacc: Array, _: Array) -> tuple[Array, Array]:
         unbounded = unbounded_forces(rows, qacc)
         force = jnp.clip(unbounded, rows.low, rows.high)
         above, below = unbounded > rows.low, unbounded < rows.high
         rest = mass @ qacc - smooth
         gives = jnp.where(above & below, rows.impedance, 0.0)
         search = _newton_step(mass, rows.jacobian, gives, rows.jacobian.T @ force - rest, arms)
-        part = partial(_line_search, mass, rows, unbounded, rest, search, line_search, not arms)
+        part = partial(_length, mass, rows, unbounded, rest, search, looks)
         if iterations == 1:
             return qacc + part() * search, jnp.bool_(True)
         # The whole step is the best one if no row changes sides over it. A part of a step ends where one does, on
@@ -160,19 +162,7 @@ def solve(
         whole = (((end > rows.low) == above) & ((end < rows.high) == below)).all()
         return qacc + jax.lax.cond(whole, lambda: jnp.float32(1.0), part) * search, whole
 
-    def unsettled(state: tuple[Array, Array, Array]) -> Array:
-        _, settled, count = state
-        return (settled < steady) & (count < iterations)
-
-    def iterate(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        qacc, settled, count = state
-        qacc, kept = newton(qacc)
-        return qacc, jnp.where(kept, settled + 1, 0), count + 1
-
-    if iterations == 1:
-        qacc = newton(start)[0]
-    else:
-        qacc, _, _ = jax.lax.while_loop(unsettled, iterate, (start, jnp.int32(0), jnp.int32(0)))
+    qacc = newton(step, start, iterations, steady)
     return qacc, row_forces(rows, qacc)
 
 
@@ -201,7 +191,7 @@ def _newton_step(
 @solve.defjvp
 def _differentiate(
     iterations: int,
-    line_search: int,
+    looks: int,
     arms: Sequence[np.ndarray],
     steady: int,
     primals: tuple[Any, ...],
@@ -213,7 +203,7 @@ def _differentiate(
     system, which is never degenerate. The way to the solution is no use: at rest it divides zero by zero.
     """
     mass, smooth, rows, _ = primals
-    qacc, force = solve(*primals, iterations, line_search, arms, steady)
+    qacc, force = solve(*primals, iterations, looks, arms, steady)
 
     def excess(mass: Array, smooth: Array, rows: Rows) -> Array:
         return smooth + rows.jacobian.T @ row_forces(rows, qacc) - mass @ qacc
@@ -240,32 +230,21 @@ def giving(rows: Rows, unbounded: Array) -> Array:
     return jnp.where((unbounded > rows.low) & (unbounded < rows.high), rows.impedance, 0.0)
 
 
-def _line_search(
-    mass: Array, rows: Rows, unbounded: Array, rest: Array, search: Array, iterations: int, unroll: bool
-) -> Array:
-    """Return how far to go along `search`.
-
-    The best length is the root of the slope of the cost, which grows piecewise linearly. It is found by Newton's method
-    within a bracket.
-    """
+def _length(
+    mass: Array, rows: Rows, unbounded: Array, rest: Array, search: Array, looks: int
+) -> Array:  # fmt: skip
+    """Return how far to go along `search`: the root of the slope of the cost, which grows piecewise linearly."""
     along = rows.jacobian @ search
     fall = rows.impedance * along
     slope_0, slope_1 = search @ rest, search @ (mass @ search)
 
-    def iterate(state: tuple[Array, Array, Array], _: None) -> tuple[tuple[Array, Array, Array], None]:
-        step, low, high = state
-        at = unbounded - step * fall
-        slope = slope_0 + step * slope_1 - along @ jnp.clip(at, rows.low, rows.high)
-        growth = slope_1 + along @ jnp.where((at > rows.low) & (at < rows.high), fall, 0.0)
-        low, high = jnp.where(slope < 0, step, low), jnp.where(slope < 0, high, step)
-        step = step - slope / jnp.maximum(growth, 1e-20)
-        inside = jnp.where(slope < 0, step < high, step > low)  # to the other end and back, it would go on forever
-        return (jnp.where(inside, step, jnp.where(high < jnp.inf, (low + high) / 2, 2 * low)), low, high), None
+    def measure(length: Array) -> tuple[Array, Array]:
+        at = unbounded - length * fall
+        slope = slope_0 + length * slope_1 - along @ jnp.clip(at, rows.low, rows.high)
+        return slope, slope_1 + along @ jnp.where((at > rows.low) & (at < rows.high), fall, 0.0)
 
-    whole, none = jnp.float32(1.0), jnp.float32(0.0)
-    start = (whole, none, jnp.float32(jnp.inf))
-    (step, _, _), _ = jax.lax.scan(iterate, start, None, length=iterations, unroll=unroll)
-    return step
+    begin = slope_0 - along @ jnp.clip(unbounded, rows.low, rows.high)
+    return line_search(begin, 0.0, measure, looks, 0.0).length
 
 
 def solve_positive(matrix: Array, right: Array) -> Array:

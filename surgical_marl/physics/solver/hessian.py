@@ -12,7 +12,7 @@ from jax import Array
 from surgical_marl.physics.contact.friction_cone import Forces, between, curvature, wrench
 from surgical_marl.physics.contact.relative_motion import moved_cone
 from surgical_marl.physics.solver.cholesky import packed
-from surgical_marl.physics.solver.newton_line import Base
+from surgical_marl.physics.solver.contact_line import Base
 from surgical_marl.physics.solver.problem import AttachmentRows, Contact, Point, Problem
 from surgical_marl.physics.tree_utils import absent, add, put, row_of
 

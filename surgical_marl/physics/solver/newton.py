@@ -1,150 +1,101 @@
-"""The acceleration of arms and objects at which all forces balance, by Newton's method on what touches.
+"""Newton's method on convex functions: the loop over steps, and the line search within a step.
 
-All forces are gradients of convex functions of the acceleration (`solver.py`, `cone.py`), and so is their sum. A Newton
-step is a linear system in which each object is six numbers that only meet arms, so objects are eliminated first: what
-is left is as large as the arms, whatever the number of objects. Objects that touch each other are eliminated together.
+All problems of this folder are of that kind: an arm alone and arms with contacts as rows (`constraint_rows.py`), arms
+that one body joins (`woodbury.py`), arms and bodies with friction cones (`contact_solver.py`), and point masses.
 """
 
 from __future__ import annotations
 
-from functools import partial
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
-from surgical_marl.physics import skip
-from surgical_marl.physics.contact.friction_cone import Parting, parting
-from surgical_marl.physics.contact.relative_motion import RelativeMotion
-from surgical_marl.physics.solver import schur
-from surgical_marl.physics.solver.arm_newton import Arms, Condensed
-from surgical_marl.physics.solver.constraint_rows import JointRows, Rows
-from surgical_marl.physics.solver.hessian import Hessian
-from surgical_marl.physics.solver.line_search import ENOUGH, search
-from surgical_marl.physics.solver.newton_line import Base, look_ahead, set_out
-from surgical_marl.physics.solver.problem import Point, Problem, Solution
-from surgical_marl.physics.tree_utils import filled
-
-PASSES, ALONE = 12, 24
-"""Newton steps at most, with arms and of objects alone, whose steps are short. A GPU waits for the last one of its
-environments (docs/physics.md)."""
-LEAST = 1e-7
-"""Fall of the cost in a Newton step, N m/s2, after which none follows: that of a needle of 0.03 g whose acceleration
-changes by 0.06 m/s2."""
-FIRST = 10.0
-"""Slope at the end of the first Newton step, as a share of what contacts resist along it, up to which it is gone whole.
-A search might find a better place to go on from, but seldom saves a step."""
+ENOUGH = 0.3
+"""A length is good if the slope there is at most this share of that at the beginning: the next Newton step needs no
+better one."""
+LOOKS = 10
+"""Lengths that are tried at most."""
 
 
-class Newton:
-    """Solves problems of one scene with k objects.
+def newton(step: Callable[[Any, Array], tuple[Any, Array]], start: Any, most: int, steady: int = 1) -> Any:
+    """Return the state after at most `most` Newton steps, fewer if `steady` of them in a row are the last ones needed.
 
-    `dofs` [a, m] are the numbers of each arm's joints; where it has fewer than others, that of no joint.
+    Args:
+        step: from a state and the number of steps before to the next state, and whether no other step is needed, [].
+        start: the first state, a tree of arrays.
+        most: steps at most. One step is taken without a loop.
+        steady: steps in a row that need no other one, after which the search stops.
+    """
+    if most == 1:
+        return step(start, jnp.int32(0))[0]
+
+    def going(loop: Any) -> Array:
+        _, settled, count = loop
+        return (settled < steady) & (count < most)
+
+    def iterate(loop: Any) -> Any:
+        state, settled, count = loop
+        state, last = step(state, count)
+        return state, jnp.where(last, settled + 1, 0), count + 1
+
+    return jax.lax.while_loop(going, iterate, (start, jnp.int32(0), jnp.int32(0)))[0]
+
+
+class Tried(NamedTuple):
+    """The lengths that a line search has tried."""
+
+    length: Array
+    """The one to try next, or the one that was found."""
+    low: Array
+    """The longest that was too short."""
+    high: Array
+    """The shortest that was too long."""
+    step: Array
+    """How far the next one is from the last one."""
+    looks: Array
+    """How many there were."""
+    done: Array
+
+
+def line_search(
+    begin: Array,
+    least: float,
+    measure: Callable[[Array], tuple[Array, Array]],
+    looks: int = LOOKS,
+    enough: float = ENOUGH,
+) -> Tried:
+    """Return a length at which the slope of a convex function is small.
+
+    Newton's method on the slope, within a bracket, which is halved instead where a step further is more than half as
+    long as the one before: from one flat end of a slope that is steep in the middle Newton's steps would lead to the
+    other one, and back (W. H. Press et al., "Numerical Recipes", 3rd edition, section 9.4). The first length is 1. If
+    the slope at the beginning is no more than `least`, that is taken without a look.
+
+    Args:
+        begin: slope at length 0, below 0, [].
+        least: size of a slope that counts as none.
+        measure: from a length to the slope there, and by how much it grows per length.
+        looks: lengths that are tried at most. One is tried without a loop.
+        enough: share of the slope at the beginning at which a length is good.
     """
 
-    def __init__(self, dofs: np.ndarray, joints: int, objects: int) -> None:
-        self._dofs, self._objects, self._arms = dofs, objects, Arms(dofs, joints)
-        self.twists = RelativeMotion(dofs, objects)
-        self._passes = PASSES if len(dofs) else ALONE
+    def look(tried: Tried) -> Tried:
+        slope, growth = measure(tried.length)
+        good, short = jnp.abs(slope) <= -enough * begin, slope < 0
+        low, high = jnp.where(short, tried.length, tried.low), jnp.where(short, tried.high, tried.length)
+        length = tried.length - slope / jnp.maximum(growth, 1e-20)
+        nearer = (jnp.abs(length - tried.length) <= tried.step / 2) | ~short | (high == jnp.inf)
+        halved = jnp.where(high < jnp.inf, (low + high) / 2, 2 * low)
+        length = jnp.where((length > low) & (length < high) & nearer, length, halved)
+        step, count = jnp.abs(length - tried.length), tried.looks + 1
+        return Tried(jnp.where(good, tried.length, length), low, high, step, count, good | (count >= looks))
 
-    def solve_arms(
-        self, mass: Array, smooth: Array, joints: JointRows, start: Array, between: Rows
-    ) -> tuple[Array, Array]:
-        """Return accelerations [a, m] and forces of contacts [r] of arms alone: see `Arms.with_rows`."""
-        return self._arms.with_rows(mass, smooth, joints, start, between)
-
-    def solve(self, problem: Problem) -> Solution:
-        """Return the accelerations and forces."""
-
-        def going(state: Any) -> Array:
-            *_, settled, count = state
-            return ~settled & (count < self._passes)
-
-        def iterate(state: Any) -> Any:
-            here, base, _, count = state
-            sums = Hessian.of(problem, base, here)
-            way, touching = self._direction(problem, here, sums, count == 0), _touching(problem)
-            # Arms that touch nothing go all of their way at once, as if nothing else were there, and are done.
-            free = jnp.where(touching[:, None], 0.0, way.arms)
-            way = way._replace(arms=jnp.where(touching[:, None], way.arms, 0.0))
-            by, whole = self._partings(problem, way), here.ahead(way, jnp.float32(1.0))
-            end = look_ahead(problem, base, by, way)
-            base, settled = base._replace(pressed=end.pressed), end.foreseen
-            good = jnp.abs(end.slope) <= jnp.where(count == 0, FIRST, ENOUGH) * end.growth
-            good &= end.growth > LEAST
-            if len(problem.between.low):
-                same = (self._sides(problem, here.arms) == self._sides(problem, whole.arms)).all()
-                settled, good = settled & same, good & same
-
-            def searched() -> tuple[Array, Array]:
-                forces = Point(sums.arm_force, sums.force[: self._objects])
-                begin, along = set_out(self._arms, problem, forces, here, way, touching, by)
-                found = search(begin, LEAST, along.measure(self._arms, problem, base.stuck))
-                return found.length, found.looks == 0
-
-            def gone_on() -> tuple[Point, Base, Array]:
-                length, settled = skip.cond(
-                    "line_search", ~good, searched, lambda: (jnp.float32(1.0), jnp.bool_(False))
-                )
-                return here.ahead(way, length), base.ahead(problem, by, length), settled
-
-            there, base, settled = jax.lax.cond(settled, lambda: (whole, base, jnp.bool_(True)), gone_on)
-            return there._replace(arms=there.arms + free), base, settled, count + 1
-
-        here = Point(jnp.zeros(self._dofs.shape), jnp.zeros((self._objects, 6)))
-        state = here, Base.of(problem.contacts), jnp.bool_(False), jnp.int32(0)
-        here, base, *_ = jax.lax.while_loop(going, iterate, state)
-        return Solution(here.arms, here.objects, base.pressed, self._arms.between(problem, here.arms))
-
-    def _partings(self, problem: Problem, way: Point) -> Parting:
-        """Return how the bodies of all contacts accelerate relative to each other per length of a way, [s]."""
-        motion = way.arms, self.twists.by_object(way.objects)
-
-        def one(n: Array) -> Parting:
-            contact = problem.contacts.at(n)
-            return parting(contact.cone, self.twists.of(contact, *motion))
-
-        found: Parting = filled(one, problem.total, len(problem.contacts.second))
-        return found
-
-    # -- the way from there
-
-    def _direction(self, problem: Problem, here: Point, sums: Hessian, first: Array) -> Point:
-        """Return the way to the least cost if contacts are linear functions; friction and limits of joints are not.
-
-        Objects are eliminated, arms solved, and objects found from them. Unless it is the `first` Newton step, arms
-        that touch nothing are where their forces balance.
-        """
-        k, linked = self._objects, sums.linked
-        touched = sums.met.reshape(k + 1, len(self._dofs))[:k]
-        blocks = schur.Blocks(sums.object[:k], sums.cross)
-        gone = schur.eliminate(blocks, sums.force[:k], sums.coupling, touched, linked)
-        found = here.arms
-        if len(self._dofs):
-            on = touched | (linked & touched.any(0))  # what an object touches moves those that it touches
-            left = Condensed(sums.arm, sums.on_arm, sums.arm_force, gone.half, gone.wide, on)
-            found = self._ways(problem, here.arms, left, first)
-        return Point(found, schur.ways(gone, found, touched, linked))
-
-    def _ways(self, problem: Problem, here: Array, left: Condensed, first: Array) -> Array:
-        """Return the ways [a, m] of arms: of each alone, of those that one object joins, or of all at once."""
-        begin = jnp.where(first, problem.eased, here)
-        together = partial(self._arms.together, problem, here, begin)
-        bridged = partial(self._arms.bridged, problem, here, begin)
-        each = partial(self._arms.each, problem, here, begin, _touching(problem) | first)
-        if len(self._dofs) < 2:
-            return each(left)
-        bridges, pressed = left.touched.sum(1) > 1, self._sides(problem, here).any()
-        joined = lambda left: jax.lax.cond(pressed | (bridges.sum() > 1), together, bridged, left)  # noqa: E731
-        return jax.lax.cond(pressed | bridges.any(), joined, each, left)
-
-    def _sides(self, problem: Problem, arms: Array) -> Array:
-        """Return which contacts of arms with arms press, [r] bool."""
-        return self._arms.between(problem, arms) > 0
-
-
-def _touching(problem: Problem) -> Array:
-    """Return which arms touch anything, [a] bool."""
-    return problem.contacts.on_arm | problem.overlap
+    one, none, far = (jnp.float32(x) for x in (1.0, 0.0, jnp.inf))
+    start = Tried(one, none, far, far, jnp.int32(0), -begin <= least)
+    if looks == 1:
+        return look(start)
+    found: Tried = jax.lax.while_loop(lambda tried: ~tried.done, look, start)
+    return found

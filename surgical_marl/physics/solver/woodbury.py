@@ -18,7 +18,7 @@ from jax import Array
 
 from surgical_marl.physics.solver.cholesky import back, cholesky, forward
 from surgical_marl.physics.solver.constraint_rows import JointRows, Rows, giving, rows_of, unbounded_forces
-from surgical_marl.physics.solver.line_search import search
+from surgical_marl.physics.solver.newton import line_search, newton
 
 
 class Own(NamedTuple):
@@ -41,8 +41,6 @@ class _State(NamedTuple):
     """[a, m]"""
     moved: Array
     """W times the ways, [6]."""
-    settled: Array
-    steps: Array
 
 
 class Woodbury:
@@ -71,19 +69,16 @@ class Woodbury:
         The first of them begins at the ways `begin` [a, m].
         """
 
-        def unsettled(state: _State) -> Array:
-            return ~state.settled & (state.steps < iterations)
-
         def add(moved: Array, row: tuple[Array, Array]) -> tuple[Array, None]:
             number, way = row
             return moved + self._wide(number) @ way, None
 
         moved, _ = jax.lax.scan(add, jnp.zeros(6), (self._own.number, begin))
-        start = _State(begin, moved, jnp.bool_(False), jnp.int32(0))
-        return jax.lax.while_loop(unsettled, self._newton, start).ways
+        found: _State = newton(self._step, _State(begin, moved), iterations)
+        return found.ways
 
-    def _newton(self, state: _State) -> _State:
-        """Return the state after a step."""
+    def _step(self, state: _State, _: Array) -> tuple[_State, Array]:
+        """Return the state after a Newton step, and whether it was whole and changed no side."""
         excess, factors, joined = self._factorise(state)
 
         def step_of(sums: tuple[Array, Array, Array], row: Any) -> tuple[tuple[Array, Array, Array], Array]:
@@ -99,7 +94,7 @@ class Woodbury:
         (moved, begin, whole), steps = jax.lax.scan(step_of, start, (self._own, state.ways, excess, factors))
         part = lambda: self._length(state, steps, moved, begin)  # noqa: E731
         length = jax.lax.cond(whole, lambda: jnp.float32(1.0), part)
-        return _State(state.ways + length * steps, state.moved + length * moved, whole, state.steps + 1)
+        return _State(state.ways + length * steps, state.moved + length * moved), whole
 
     def _factorise(self, state: _State) -> tuple[Array, Array, Array]:
         """Return the forces left over [a, m], the factors of the arms' matrices [a, m, m], and what joins them [6]."""
@@ -136,7 +131,7 @@ class Woodbury:
             resists, gives = self._resisted(here, steps, length)
             return slope + length * growth + resists, growth + gives
 
-        return search(begin, 0.0, measure).length
+        return line_search(begin, 0.0, measure).length
 
 
 def _rows(own: Own, way: Array) -> tuple[Rows, Array]:

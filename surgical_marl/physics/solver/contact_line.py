@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from surgical_marl.physics.contact.friction_cone import Forces, Parting, Stuck, falls, nearest, presses, stretched
-from surgical_marl.physics.solver.arm_newton import Arms
+from surgical_marl.physics.solver.arm_solver import Arms
 from surgical_marl.physics.solver.problem import Contacts, Point, Pressed, Problem
 from surgical_marl.physics.tree_utils import Listed, put, room, row_of
 

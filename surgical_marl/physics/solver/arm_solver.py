@@ -60,7 +60,7 @@ class _Row(NamedTuple):
 
 
 class Arms:
-    """Solves for the ways of arms. `dofs` [a, m] are the numbers of their joints, as for `Newton`.
+    """Solves for the ways of arms. `dofs` [a, m] are the numbers of their joints, as for `ContactSolver`.
 
     Ways lead from an acceleration `here`, and are looked for from an acceleration `begin` on, [a, m] each.
     """

@@ -1,0 +1,144 @@
+"""The acceleration of arms and objects at which all forces balance, by Newton's method on what touches.
+
+All forces are gradients of convex functions of the acceleration (`solver.py`, `cone.py`), and so is their sum. A Newton
+step is a linear system in which each object is six numbers that only meet arms, so objects are eliminated first: what
+is left is as large as the arms, whatever the number of objects. Objects that touch each other are eliminated together.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from surgical_marl.physics import skip
+from surgical_marl.physics.contact.friction_cone import Parting, parting
+from surgical_marl.physics.contact.relative_motion import RelativeMotion
+from surgical_marl.physics.solver import schur
+from surgical_marl.physics.solver.arm_solver import Arms, Condensed
+from surgical_marl.physics.solver.constraint_rows import JointRows, Rows
+from surgical_marl.physics.solver.contact_line import Base, look_ahead, set_out
+from surgical_marl.physics.solver.hessian import Hessian
+from surgical_marl.physics.solver.newton import ENOUGH, line_search, newton
+from surgical_marl.physics.solver.problem import Point, Problem, Solution
+from surgical_marl.physics.tree_utils import filled
+
+PASSES, ALONE = 12, 24
+"""Newton steps at most, with arms and of objects alone, whose steps are short. A GPU waits for the last one of its
+environments (docs/physics.md)."""
+LEAST = 1e-7
+"""Fall of the cost in a Newton step, N m/s2, after which none follows: that of a needle of 0.03 g whose acceleration
+changes by 0.06 m/s2."""
+FIRST = 10.0
+"""Slope at the end of the first Newton step, as a share of what contacts resist along it, up to which it is gone whole.
+A search might find a better place to go on from, but seldom saves a step."""
+
+
+class ContactSolver:
+    """Solves problems of one scene with k objects.
+
+    `dofs` [a, m] are the numbers of each arm's joints; where it has fewer than others, that of no joint.
+    """
+
+    def __init__(self, dofs: np.ndarray, joints: int, objects: int) -> None:
+        self._dofs, self._objects, self._arms = dofs, objects, Arms(dofs, joints)
+        self.twists = RelativeMotion(dofs, objects)
+        self._passes = PASSES if len(dofs) else ALONE
+
+    def solve_arms(
+        self, mass: Array, smooth: Array, joints: JointRows, start: Array, between: Rows
+    ) -> tuple[Array, Array]:
+        """Return accelerations [a, m] and forces of contacts [r] of arms alone: see `Arms.with_rows`."""
+        return self._arms.with_rows(mass, smooth, joints, start, between)
+
+    def solve(self, problem: Problem) -> Solution:
+        """Return the accelerations and forces."""
+
+        def step(state: tuple[Point, Base], count: Array) -> tuple[tuple[Point, Base], Array]:
+            here, base = state
+            sums = Hessian.of(problem, base, here)
+            way, touching = self._direction(problem, here, sums, count == 0), _touching(problem)
+            # Arms that touch nothing go all of their way at once, as if nothing else were there, and are done.
+            free = jnp.where(touching[:, None], 0.0, way.arms)
+            way = way._replace(arms=jnp.where(touching[:, None], way.arms, 0.0))
+            by, whole = self._partings(problem, way), here.ahead(way, jnp.float32(1.0))
+            end = look_ahead(problem, base, by, way)
+            base, settled = base._replace(pressed=end.pressed), end.foreseen
+            good = jnp.abs(end.slope) <= jnp.where(count == 0, FIRST, ENOUGH) * end.growth
+            good &= end.growth > LEAST
+            if len(problem.between.low):
+                same = (self._sides(problem, here.arms) == self._sides(problem, whole.arms)).all()
+                settled, good = settled & same, good & same
+
+            def searched() -> tuple[Array, Array]:
+                forces = Point(sums.arm_force, sums.force[: self._objects])
+                begin, along = set_out(self._arms, problem, forces, here, way, touching, by)
+                found = line_search(begin, LEAST, along.measure(self._arms, problem, base.stuck))
+                return found.length, found.looks == 0
+
+            def gone_on() -> tuple[Point, Base, Array]:
+                length, settled = skip.cond(
+                    "line_search", ~good, searched, lambda: (jnp.float32(1.0), jnp.bool_(False))
+                )
+                return here.ahead(way, length), base.ahead(problem, by, length), settled
+
+            there, base, settled = jax.lax.cond(settled, lambda: (whole, base, jnp.bool_(True)), gone_on)
+            return (there._replace(arms=there.arms + free), base), settled
+
+        here = Point(jnp.zeros(self._dofs.shape), jnp.zeros((self._objects, 6)))
+        here, base = newton(step, (here, Base.of(problem.contacts)), self._passes)
+        return Solution(here.arms, here.objects, base.pressed, self._arms.between(problem, here.arms))
+
+    def _partings(self, problem: Problem, way: Point) -> Parting:
+        """Return how the bodies of all contacts accelerate relative to each other per length of a way, [s]."""
+        motion = way.arms, self.twists.by_object(way.objects)
+
+        def one(n: Array) -> Parting:
+            contact = problem.contacts.at(n)
+            return parting(contact.cone, self.twists.of(contact, *motion))
+
+        found: Parting = filled(one, problem.total, len(problem.contacts.second))
+        return found
+
+    # -- the way from there
+
+    def _direction(self, problem: Problem, here: Point, sums: Hessian, first: Array) -> Point:
+        """Return the way to the least cost if contacts are linear functions; friction and limits of joints are not.
+
+        Objects are eliminated, arms solved, and objects found from them. Unless it is the `first` Newton step, arms
+        that touch nothing are where their forces balance.
+        """
+        k, linked = self._objects, sums.linked
+        touched = sums.met.reshape(k + 1, len(self._dofs))[:k]
+        blocks = schur.Blocks(sums.object[:k], sums.cross)
+        gone = schur.eliminate(blocks, sums.force[:k], sums.coupling, touched, linked)
+        found = here.arms
+        if len(self._dofs):
+            on = touched | (linked & touched.any(0))  # what an object touches moves those that it touches
+            left = Condensed(sums.arm, sums.on_arm, sums.arm_force, gone.half, gone.wide, on)
+            found = self._ways(problem, here.arms, left, first)
+        return Point(found, schur.ways(gone, found, touched, linked))
+
+    def _ways(self, problem: Problem, here: Array, left: Condensed, first: Array) -> Array:
+        """Return the ways [a, m] of arms: of each alone, of those that one object joins, or of all at once."""
+        begin = jnp.where(first, problem.eased, here)
+        together = partial(self._arms.together, problem, here, begin)
+        bridged = partial(self._arms.bridged, problem, here, begin)
+        each = partial(self._arms.each, problem, here, begin, _touching(problem) | first)
+        if len(self._dofs) < 2:
+            return each(left)
+        bridges, pressed = left.touched.sum(1) > 1, self._sides(problem, here).any()
+        joined = lambda left: jax.lax.cond(pressed | (bridges.sum() > 1), together, bridged, left)  # noqa: E731
+        return jax.lax.cond(pressed | bridges.any(), joined, each, left)
+
+    def _sides(self, problem: Problem, arms: Array) -> Array:
+        """Return which contacts of arms with arms press, [r] bool."""
+        return self._arms.between(problem, arms) > 0
+
+
+def _touching(problem: Problem) -> Array:
+    """Return which arms touch anything, [a] bool."""
+    return problem.contacts.on_arm | problem.overlap
