@@ -220,7 +220,7 @@ class Env:
         task, *_ = self._bound(parameters)
         carry, contacts, arms = self._start(task, key, jnp.int32(episode))
         observations, state = self._observe(task, carry, contacts, arms)
-        world = World(arms, carry.goal, self._unsensed(), self.plant.objects(carry.physics, carry.hidden))
+        world = World(arms, carry.goal, self._unsensed(), *self.plant.things(carry.physics, carry.hidden))
         nothing = jax.tree.map(jnp.zeros_like, task.reward_terms(world))
         return State(
             carry=carry,
@@ -272,9 +272,9 @@ class Env:
         task, max_steps, autoreset = self._bound(parameters)
         carry, contacts = moved.carry, moved.contacts
         arms = {agent: moved.arms[agent] for agent in self.agents}  # JAX sorts them by name
-        objects, ends = self.plant.objects(carry.physics, carry.hidden), np.cumsum(self._sizes)[:-1]
+        things, ends = self.plant.things(carry.physics, carry.hidden), np.cumsum(self._sizes)[:-1]
         changes = dict(zip(self.agents, jnp.split(moved.changes, ends), strict=True))
-        world = World(arms, carry.goal, sensed, objects, changes=changes)
+        world = World(arms, carry.goal, sensed, *things, changes=changes)
         terms = task.rewards(world)
         carry = carry._replace(goal=task.remember(world))
         terminated = task.terminated(world)
@@ -329,7 +329,7 @@ class Env:
         if start.qpos is not None:
             contacts, arms = self.simulator.look(physics)
         tips = jnp.stack([view.tool_tip for view in arms.values()])
-        goal = task.remember(World(arms, start.goal, self._unsensed(), self.plant.objects(physics, hidden)))
+        goal = task.remember(World(arms, start.goal, self._unsensed(), *self.plant.things(physics, hidden)))
         silence = jnp.zeros((len(self.agents), self.messages)) if self.messages else ()
         rest = jnp.zeros(sum(self._sizes))
         return Carry(physics, goal, key, episode, jnp.int32(0), tips, hidden, silence, rest), contacts, arms
@@ -340,8 +340,8 @@ class Env:
         """Return what policies observe, and what critics observe, of arms that are as in `arms`."""
         noise = jax.random.fold_in(jax.random.fold_in(jax.random.fold_in(carry.key, carry.episode), NOISE), carry.steps)
         measured = self.plant.measure(carry.physics, carry.hidden, contacts, arms, noise)
-        objects = self.plant.objects(carry.physics, carry.hidden)
-        world = World(measured, carry.goal, objects=objects, messages=carry.messages)
+        objects, systems = self.plant.things(carry.physics, carry.hidden)
+        world = World(measured, carry.goal, objects=objects, systems=systems, messages=carry.messages)
         observations = {agent: seen.read(task, world) for agent, seen in self.observed.items()}
         every = [
             observations[agent] if seen.stated == seen.names else seen.read(task, world, stated=True)

@@ -13,7 +13,7 @@ ones.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -30,6 +30,9 @@ from surgical_marl.physics.systems.rigid_motion import product
 from surgical_marl.scenes.poses import Pose
 
 Views = dict[str, ArmView]
+
+FACTORS, SYSTEMS = 10, 11
+"""Numbers by which the keys of free objects and of systems follow from an episode's key."""
 
 
 class Hidden(NamedTuple):
@@ -54,6 +57,8 @@ class Hidden(NamedTuple):
     """The last actions of all agents, newest first, [greatest latency, n]."""
     objects: Factors | None = None
     """Factors of the free objects; None if the scene randomises none of them."""
+    systems: Array | None = None
+    """The key by which systems of plug-ins draw their values; None in a scene without any."""
 
 
 class Plant:
@@ -96,7 +101,8 @@ class Plant:
             motor=(simulator.home if qpos is None else simulator.at(qpos)).ctrl
             + believed,  # so that the arms stay where they are
             pending=jnp.zeros((r.latency, sum(map(self._controller.num_actions, scene.agents)))),
-            objects=self._factors(jax.random.fold_in(key, len(Hidden._fields))),
+            objects=self._factors(jax.random.fold_in(key, FACTORS)),
+            systems=jax.random.fold_in(key, SYSTEMS) if scene.systems else None,
         )
 
     def _factors(self, key: Array) -> Factors | None:
@@ -172,13 +178,19 @@ class Plant:
         """Return the true view of every free object, by name."""
         return self.actual(hidden).objects(physics)
 
+    def things(self, physics: Physics, hidden: Hidden | None) -> tuple[dict[str, ObjectView], dict[str, Any]]:
+        """Return the true views of every free object, and of every system of a plug-in, by name."""
+        simulator = self.actual(hidden)
+        return simulator.objects(physics), simulator.systems(physics)
+
     def actual(self, hidden: Hidden | None) -> Simulator:
         """Return the simulator with the drawn values in place."""
         if hidden is None:
             return self._simulator
         return self._simulator.varied(
-            hidden.stiffness, hidden.damping, hidden.friction, hidden.payload, hidden.offset, hidden.objects
-        )
+            hidden.stiffness, hidden.damping, hidden.friction, hidden.payload, hidden.offset, hidden.objects,
+            hidden.systems,
+        )  # fmt: skip
 
     def measure(self, physics: Physics, hidden: Hidden | None, contacts: Contacts, views: Views, key: Array) -> Views:
         """Return the views as the encoders report them, for arms whose true views are `views`.

@@ -108,9 +108,13 @@ class Simulator:
         bodies = self.step.bodies
         return bodies.view(physics.rigid_bodies.bodies) if bodies else {}
 
+    def systems(self, physics: Physics) -> dict[str, Any]:
+        """Return the view of every system of a plug-in in the scene, by name."""
+        return {name: system.view(physics.systems[name]) for name, system in self.step.systems.items()}
+
     def varied(
         self, stiffness: Array, damping: Array, friction: Array, payload: Array, offset: Array,
-        objects: Factors | None = None,
+        objects: Factors | None = None, systems: Array | None = None,
     ) -> Simulator:  # fmt: skip
         """Return a copy of this simulator whose arms and objects differ from their models.
 
@@ -121,13 +125,17 @@ class Simulator:
             payload: masses at the tool tips, [arms], kg; used only if the scene has room for them.
             offset: by how much the controllers of joints misread their positions, [nq], rad or m.
             objects: factors of the free objects; None if they are as in their files.
+            systems: a key by which systems of plug-ins draw their values; None if they are as in the scene file.
         """
         varied, bodies = copy.copy(self), self.step.bodies
         misread = self.moment @ offset[self.address]
         arms = self.step.arms.randomise(stiffness, damping, friction, payload, misread)
         if objects is not None and bodies:
             bodies = bodies.randomise(objects)
-        varied.step = self.step.varied(arms, bodies)
+        drawn = self.step.systems
+        if systems is not None:
+            drawn = {n: own.randomise(jax.random.fold_in(systems, i)) for i, (n, own) in enumerate(drawn.items())}
+        varied.step = self.step.varied(arms, bodies, drawn)
         return varied
 
     def look(self, physics: Physics) -> tuple[Contacts, dict[str, ArmView]]:

@@ -90,11 +90,11 @@ class Step:
         self._index()
 
     def varied(
-        self, arms: Arms, bodies: RigidBodies | None, systems: dict[str, System] | None = None
+        self, arms: Arms, bodies: RigidBodies | None, systems: dict[str, System]
     ) -> Step:  # fmt: skip
         """Return the step of a scene whose arms, bodies and other systems differ from their files."""
         own = copy.copy(self)
-        own.arms, own.bodies, own.systems = arms, bodies, systems or self.systems
+        own.arms, own.bodies, own.systems = arms, bodies, systems
         own._index()
         return own
 

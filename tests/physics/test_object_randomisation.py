@@ -123,7 +123,7 @@ def test_a_varied_object_slides_where_coulomb_says(tmp_path: Path) -> None:
     places = {f"sled_{i}": {"object": "sled.yaml", "position": [0, 0.1 * i, 0.001]} for i in range(4)}
     scene, factors = Falling(tmp_path, {"floor": {"object": "floor.yaml"}, **places}), np.array([0.5, 0.9, 1.1, 1.5])
     drawn = Factors(*(jnp.asarray(x, jnp.float32) for x in ([1.0, 1.2, 0.8, 1.0], [1.0, 3.0, 0.5, 1.0], factors)))
-    scene.step = scene.step.varied(scene.step.arms, scene.bodies.randomise(drawn))
+    scene.step = scene.step.varied(scene.step.arms, scene.bodies.randomise(drawn), {})
     tilt = np.arctan(0.5)
     _, path = scene.play(scene.begin(1), 0.5, 9.81 * np.array([np.sin(tilt), 0, -np.cos(tilt)]))
     way = path.position[0, -1, :, 0] - path.position[0, 0, :, 0]

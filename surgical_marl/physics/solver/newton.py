@@ -89,7 +89,8 @@ def line_search(
         length = tried.length - slope / jnp.maximum(growth, 1e-20)
         nearer = (jnp.abs(length - tried.length) <= tried.step / 2) | ~short | (high == jnp.inf)
         halved = jnp.where(high < jnp.inf, (low + high) / 2, 2 * low)
-        length = jnp.where((length > low) & (length < high) & nearer, length, halved)
+        inside = jnp.where(short, length < high, length > low)  # from a bound, it can only lead inwards
+        length = jnp.where(inside & nearer, length, halved)
         step, count = jnp.abs(length - tried.length), tried.looks + 1
         return Tried(jnp.where(good, tried.length, length), low, high, step, count, good | (count >= looks))
 

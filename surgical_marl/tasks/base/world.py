@@ -21,6 +21,8 @@ class World(NamedTuple):
     """The numbers that `Task.sense` computed from the pictures, by the names in `Task.senses`."""
     objects: Mapping[str, ObjectView] = {}
     """The view of each free object of the scene."""
+    systems: Mapping[str, Any] = {}
+    """The view of each system of a plug-in in the scene."""
     messages: Array | tuple[()] = ()
     """Message of each arm in the last step, [arms, K]; () without messages, and where rewards are computed."""
     changes: Mapping[str, Array] = {}
