@@ -41,7 +41,9 @@ class Functions:
 
 @lru_cache(MOST_KEPT)
 def _functions(env: Stepper, num_envs: int) -> Functions:
-    every = lambda function, axes: jax.jit(jax.vmap(function, (*axes, None)))  # noqa: E731
+    def every(function: Any, axes: Any) -> Any:
+        return jax.jit(jax.vmap(function, (*axes, None)))
+
     key, number = jax.ShapeDtypeStruct((2,), jnp.uint32), jax.ShapeDtypeStruct((), jnp.int32)
     return Functions(
         reset=every(env.reset, (0, 0)),
@@ -67,7 +69,10 @@ def _join(*parts: Any) -> Any:
 def _end_faulty(state: Any, leaving: Array, limit: int) -> tuple[Any, Array, Array]:
     """Return the state with faulty episodes ended, where the next step ends one, [N] bool, and the codes of faults."""
     count, results = len(leaving), {name: value for name, value in state._asdict().items() if name != "carry"}
-    bad_in = lambda leaf: ~jnp.isfinite(leaf).reshape(count, -1)  # noqa: E731
+
+    def bad_in(leaf: Any) -> Any:
+        return ~jnp.isfinite(leaf).reshape(count, -1)
+
     carry = [bad_in(leaf) for leaf in _floats(state.carry).values()]
     found = {name: bad_in(leaf) for name, leaf in checked(results)}
     bad = jnp.concatenate([*carry, *found.values()], 1)

@@ -70,7 +70,10 @@ class Plant:
         exact = np.zeros(model.nq, bool)
         exact[simulator.address[simulator.jaws]] = True
         slides = model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE
-        each = lambda angle, slide: np.where(exact, 0.0, np.where(slides, slide, angle)).astype(np.float32)  # noqa: E731
+
+        def each(angle: Any, slide: Any) -> Any:
+            return np.where(exact, 0.0, np.where(slides, slide, angle)).astype(np.float32)
+
         r = self._ranges
         self._offset, self._noise = each(r.offset_angle, r.offset_slide), each(r.noise_angle, r.noise_slide)
         self._positions = simulator.scene.control == "position"
@@ -86,7 +89,10 @@ class Plant:
         if not r:
             return None
         keys = iter(jax.random.split(key, 7))
-        even = lambda n, low, high: jax.random.uniform(next(keys), (n,), jnp.float32, low, high)  # noqa: E731
+
+        def even(n: Any, low: Any, high: Any) -> Any:
+            return jax.random.uniform(next(keys), (n,), jnp.float32, low, high)
+
         nq, nu, nv, arms = scene.model.nq, scene.model.nu, scene.model.nv, len(scene.agents)
         offset = even(nq, -1.0, 1.0) * self._offset
         believed = jnp.matmul(simulator.moment, offset[simulator.address]) if self._positions else 0.0
@@ -128,7 +134,10 @@ class Plant:
         reach = np.array([shift, shift, 0.0, angle], np.float32)
         draws = jax.random.uniform(key, (len(free), 4), jnp.float32, -1.0, 1.0) * reach
         placed = {name: Pose(*(np.float32(part) for part in place.pose)) for name, place in free.items()} | dict(poses)
-        upright = lambda angle: jnp.stack([jnp.cos(angle / 2), 0.0, 0.0, jnp.sin(angle / 2)])  # noqa: E731
+
+        def upright(angle: Any) -> Any:
+            return jnp.stack([jnp.cos(angle / 2), 0.0, 0.0, jnp.sin(angle / 2)])
+
         return {
             name: Pose(pose.position + own[:3], product(upright(own[3]), pose.quaternion))
             for (name, pose), own in zip(placed.items(), draws, strict=True)

@@ -30,7 +30,10 @@ def varied(tables: ContactPairs, factors: Factors) -> ContactPairs:
     """Return the tables of objects that differ from their files."""
     own: Any = copy.copy(tables)
     size, mass = factors.size, factors.mass
-    long = lambda values: size.reshape(-1, *[1] * (values.ndim - 1)) * values  # noqa: E731
+
+    def long(values: Any) -> Any:
+        return size.reshape(-1, *[1] * (values.ndim - 1)) * values
+
     vars(own).update({name: long(getattr(tables, name)) for name in LENGTHS})
     inertia = (mass * size * size)[:, None, None] * tables.masses.inertia
     own.masses = Masses(mass * tables.masses.mass, inertia)

@@ -243,6 +243,9 @@ class Simulator:
         sites = list(self._sites.values())
         views = self._view(np, physics, (data.site_xpos[sites], data.site_xmat[sites].reshape(-1, 3, 3)), contacts)
         kinds = {"b": jnp.bool_, "i": jnp.int32}
-        single = lambda x: jnp.asarray(x, kinds.get(x.dtype.kind, jnp.float32))  # noqa: E731
+
+        def single(x: Any) -> Any:
+            return jnp.asarray(x, kinds.get(x.dtype.kind, jnp.float32))
+
         # one by one: JAX would sort the agents by name
         return jax.tree.map(single, contacts), {agent: jax.tree.map(single, view) for agent, view in views.items()}

@@ -311,7 +311,10 @@ class Step:
                 return contact._replace(first=jnp.where(contact.first == number, 0, 1))
 
             problem = Problem(*no_arms(), mass[None], free[None], contacts._replace(at=own), total)
-            solve = lambda: self._newton_of_one.solve(problem).objects[0]  # noqa: E731
+
+            def solve() -> Any:
+                return self._newton_of_one.solve(problem).objects[0]
+
             return skip.cond("sleeping", awake[number], solve, lambda: jnp.zeros(6))
 
         def each() -> Array:
@@ -362,9 +365,11 @@ class Step:
     def _touched_if(self, touch: Touch, between: ArmContacts, forces: Array, overlap: Array) -> Touch:
         if not self.pairs.count:
             return touch
-        touched: Touch = jax.lax.cond(
-            overlap, lambda touch: self._touched(touch, between, forces), lambda touch: touch, touch
-        )
+
+        def found(touch: Touch) -> Touch:
+            return self._touched(touch, between, forces)
+
+        touched: Touch = skip.cond("arm_contacts", overlap, found, lambda touch: touch, touch)
         return touched
 
     def _arm_of(self, slots: Slots) -> Array:

@@ -77,7 +77,7 @@ def test_objects_are_eliminated_as_from_a_dense_matrix(linked: list[tuple[int, i
     given = schur.Blocks(own, single(cross.ravel())), single(force), single(met), jnp.asarray(touched)
     for joined in {True, bool(linked)}:
         found = schur.eliminate(*given, jnp.bool_(joined))
-        compared(found, schur.ways(found, single(arms), given[3], jnp.bool_(joined)), joined)
+        compared(found, schur.back_substitute(found, single(arms), given[3], jnp.bool_(joined)), joined)
 
 
 def test_the_curvature_between_two_bodies_is_how_the_force_on_one_falls_with_the_other_s_acceleration() -> None:

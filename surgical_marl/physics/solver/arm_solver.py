@@ -24,7 +24,8 @@ ITERATIONS = (6, 4)
 
 
 ITERATIONS_WITH_ROWS = (6, 6)
-"""Newton steps, and line search steps in each, at most, of arms with their contacts as rows: see docs/physics.md."""
+"""Newton steps, and line search steps in each, at most, of arms with their contacts as rows
+(`python -m docs.studies.solver_iterations`)."""
 MOST_DENSE = 32
 """Joints up to which all arms are one dense problem with rows: the code of a dense one grows with the cube of them."""
 
@@ -60,7 +61,7 @@ class _Row(NamedTuple):
 
 
 class Arms:
-    """Solves for the ways of arms. `dofs` [a, m] are the numbers of their joints, as for `ContactSolver`.
+    """Solves for the directions of arms. `dofs` [a, m] are the numbers of their joints, as for `ContactSolver`.
 
     Ways lead from an acceleration `here`, and are looked for from an acceleration `begin` on, [a, m] each.
     """
@@ -101,7 +102,7 @@ class Arms:
         return [self._dofs[sizes == size][:, :size] for size in np.unique(sizes)]
 
     def together(self, problem: Problem, here: Array, begin: Array, left: Condensed) -> Array:
-        """Return the ways [a, m] from an acceleration [a, m] of arms that objects, or contacts of arms, join."""
+        """Return the directions [a, m] from an acceleration [a, m] of arms that objects, or contacts of arms, join."""
         there, (first, second) = self._there, np.tril_indices(len(self._all))
 
         def flat(each: Array) -> Array:
@@ -130,18 +131,22 @@ class Arms:
 
         total = stiff, force - mass @ start
         if len(problem.between.low):
-            with_rows = lambda total: jax.lax.scan(press, total, problem.between)[0]  # noqa: E731
+
+            def with_rows(total: Any) -> Any:
+                return jax.lax.scan(press, total, problem.between)[0]
+
             total = jax.lax.cond(problem.overlap, with_rows, lambda total: total, total)
         (stiff, force), _ = jax.lax.scan(subtract, total, (jnp.arange(len(left.half)), left.half, left.touched))
         joints = rows_of(JointRows(*map(flat, problem.joints)))
-        found, rows = _way(stiff[self._all], force, joints, start, flat(begin)), np.cumsum(there.sum(1))
-        ways = [
-            jnp.zeros(len(own)).at[own].set(way) for own, way in zip(there, jnp.split(found, rows[:-1]), strict=True)
+        found, rows = _direction_of(stiff[self._all], force, joints, start, flat(begin)), np.cumsum(there.sum(1))
+        directions = [
+            jnp.zeros(len(own)).at[own].set(direction)
+            for own, direction in zip(there, jnp.split(found, rows[:-1]), strict=True)
         ]
-        return jnp.stack(ways)
+        return jnp.stack(directions)
 
     def each(self, problem: Problem, here: Array, begin: Array, moving: Array, left: Condensed) -> Array:
-        """Return the ways [a, m] of arms of which no two are joined: one problem after the other.
+        """Return the directions [a, m] of arms of which no two are joined: one problem after the other.
 
         Those that are not `moving` [a] have none.
         """
@@ -150,17 +155,17 @@ class Arms:
         def one(each: tuple[_Row, Array, Array]) -> Array:
             row, begin, moves = each
 
-            def way() -> Array:
+            def direction() -> Array:
                 stiff, force = self._alone(left, takes, row)
-                return _way(stiff[self._places], force, rows_of(row.joints), row.here, begin)
+                return _direction_of(stiff[self._places], force, rows_of(row.joints), row.here, begin)
 
-            return jax.lax.cond(moves, way, lambda: jnp.zeros_like(row.here))
+            return jax.lax.cond(moves, direction, lambda: jnp.zeros_like(row.here))
 
         found: Array = jax.lax.map(one, (self._rows(problem, here, left), begin, moving))
         return found
 
     def bridged(self, problem: Problem, here: Array, begin: Array, left: Condensed) -> Array:
-        """Return the ways [a, m] of arms that one object joins and nothing else."""
+        """Return the directions [a, m] of arms that one object joins and nothing else."""
         a, k = len(self._there), len(left.half)
         bridge = jnp.argmax(left.touched.sum(1) > 1)
         rows = self._rows(problem, here, left)
@@ -191,7 +196,10 @@ class Arms:
 
             def less(total: tuple[Array, Array]) -> tuple[Array, Array]:
                 wide = left.wide[len(self._there) * i + row.number]
-                lower = lambda whole: whole - jnp.sum(wide[:, first] * wide[:, second], 0)  # noqa: E731
+
+                def lower(whole: Any) -> Any:
+                    return whole - jnp.sum(wide[:, first] * wide[:, second], 0)
+
                 return jax.lax.cond(takes, lower, lambda whole: whole, total[0]), total[1] - wide.T @ half
 
             return jax.lax.cond(touched[row.number], less, lambda total: total, total), None
@@ -203,48 +211,52 @@ class Arms:
         return found
 
     def slopes(
-        self, problem: Problem, moves: Array, here: Array, way: Array, force: Array
+        self, problem: Problem, moves: Array, here: Array, direction: Array, force: Array
     ) -> tuple[Array, Array, Array]:
-        """Return slopes of the cost along ways [a, m] of arms, of which some move [a], from an acceleration, [] each.
+        """Return slopes of the cost along directions [a, m] of arms, of which some move [a], [] each.
 
         The first is that of the whole cost, with forces of contacts [a, m]. The second is the slope, there, of what
         does not depend on contacts, nor on friction and limits; the third is by how much that grows per length.
         """
 
         def add(sums: tuple[Array, Array, Array], row: Any) -> tuple[tuple[Array, Array, Array], None]:
-            moves, lower, smooth, joints, here, way, force = row
+            moves, lower, smooth, joints, here, direction, force = row
 
             def more(sums: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
                 mass, rows = lower[self._places], rows_of(joints)
                 rest = mass @ here - smooth
                 whole = rest - force - rows.jacobian.T @ row_forces(rows, here)
-                return sums[0] + way @ whole, sums[1] + way @ rest, sums[2] + way @ (mass @ way)
+                return sums[0] + direction @ whole, sums[1] + direction @ rest, sums[2] + direction @ (mass @ direction)
 
             return jax.lax.cond(moves, more, lambda sums: sums, sums), None
 
         zero = jnp.float32(0.0)
-        rows = moves, problem.mass, problem.smooth, problem.joints, here, way, force
+        rows = moves, problem.mass, problem.smooth, problem.joints, here, direction, force
         whole, slope, growth = jax.lax.scan(add, (zero, zero, zero), rows)[0]
         if len(problem.between.low):
-            whole = jax.lax.cond(problem.overlap, lambda: whole - self._power(problem, here, way), lambda: whole)
+            whole = jax.lax.cond(problem.overlap, lambda: whole - self._power(problem, here, direction), lambda: whole)
         return whole, slope, growth
 
-    def resisted(self, problem: Problem, moves: Array, here: Array, way: Array, length: Array) -> tuple[Array, Array]:
-        """Return the slope of friction and limits of joints at a length of ways, and how much it grows per length.
+    def resisted(
+        self, problem: Problem, moves: Array, here: Array, direction: Array, length: Array
+    ) -> tuple[Array, Array]:
+        """Return the slope of friction and limits of joints at a length along directions, and its growth per length.
 
         Arms that do not move [a] are left out.
         """
-        found = self._resisted(problem, moves, here, way, length)
+        found = self._resisted(problem, moves, here, direction, length)
         if not len(problem.between.low):
             return found
 
-        flat = here.ravel(), way.ravel()
+        flat = here.ravel(), direction.ravel()
 
         def press(sums: tuple[Array, Array], row: Rows) -> tuple[tuple[Array, Array], None]:
             own = Rows(row.jacobian.reshape(1, -1), *(x[None] for x in row[1:]))
             return _added(sums, own, *flat, length), None
 
-        with_rows = lambda sums: jax.lax.scan(press, sums, problem.between)[0]  # noqa: E731
+        def with_rows(sums: Any) -> Any:
+            return jax.lax.scan(press, sums, problem.between)[0]
+
         return jax.lax.cond(problem.overlap, with_rows, lambda sums: sums, found)
 
     def between(self, problem: Problem, arms: Array) -> Array:
@@ -252,25 +264,33 @@ class Arms:
         none = jnp.zeros(len(problem.between.low))
         if not len(none):
             return none
-        pressed = lambda arms: row_forces(_flat(problem.between), arms.ravel())  # noqa: E731
+
+        def pressed(arms: Any) -> Any:
+            return row_forces(_flat(problem.between), arms.ravel())
+
         return jax.lax.cond(problem.overlap, pressed, lambda _: none, arms)
 
-    def _resisted(self, problem: Problem, moves: Any, here: Array, way: Array, length: Array) -> tuple[Array, Array]:
+    def _resisted(
+        self, problem: Problem, moves: Any, here: Array, direction: Array, length: Array
+    ) -> tuple[Array, Array]:
         """Return what `resisted` does, but for contacts of arms with arms."""
 
         def add(sums: tuple[Array, Array], row: Any) -> tuple[tuple[Array, Array], None]:
-            moves, joints, here, way = row
-            added = lambda sums: _added(sums, rows_of(joints), here, way, length)  # noqa: E731
+            moves, joints, here, direction = row
+
+            def added(sums: Any) -> Any:
+                return _added(sums, rows_of(joints), here, direction, length)
+
             return jax.lax.cond(moves, added, lambda sums: sums, sums), None
 
-        rows = moves, problem.joints, here, way
+        rows = moves, problem.joints, here, direction
         found: tuple[Array, Array] = jax.lax.scan(add, (jnp.float32(0.0),) * 2, rows)[0]
         return found
 
-    def _power(self, problem: Problem, here: Array, way: Array) -> Array:
-        """Return the power along ways of contacts of arms with arms, []."""
+    def _power(self, problem: Problem, here: Array, direction: Array) -> Array:
+        """Return the power along directions of contacts of arms with arms, []."""
         rows = _flat(problem.between)
-        return row_forces(rows, here.ravel()) @ (rows.jacobian @ way.ravel())
+        return row_forces(rows, here.ravel()) @ (rows.jacobian @ direction.ravel())
 
     def _lower(self, halves: Array) -> Array:
         """Return the lower half of one matrix for all joints that are there, of the lower halves of each arm's."""
@@ -287,14 +307,14 @@ def _flat(rows: Rows) -> Rows:
     return rows._replace(jacobian=rows.jacobian.reshape(len(rows.low), -1))
 
 
-def _added(sums: tuple[Array, Array], rows: Rows, here: Array, way: Array, length: Array) -> tuple[Array, Array]:
-    """Return slope and growth of the cost along a way with those of rows, at a length of it."""
-    along = rows.jacobian @ way
+def _added(sums: tuple[Array, Array], rows: Rows, here: Array, direction: Array, length: Array) -> tuple[Array, Array]:
+    """Return slope and growth of the cost along a direction with those of rows, at a length of it."""
+    along = rows.jacobian @ direction
     force, by = rows.impedance * (rows.reference - rows.jacobian @ here - length * along), rows.impedance * along
     gives = jnp.where((force > rows.low) & (force < rows.high), by, 0.0)
     return sums[0] - along @ jnp.clip(force, rows.low, rows.high), sums[1] + along @ gives
 
 
-def _way(stiff: Array, force: Array, rows: Rows, here: Array, begin: Array) -> Array:
-    """Return the way to the acceleration at which these forces balance with those of joints."""
+def _direction_of(stiff: Array, force: Array, rows: Rows, here: Array, begin: Array) -> Array:
+    """Return the direction to the acceleration at which these forces balance with those of joints."""
     return solve(stiff, stiff @ here + force, rows, begin, *ITERATIONS, steady=1)[0] - here

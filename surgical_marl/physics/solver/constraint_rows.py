@@ -64,7 +64,10 @@ class JointRows(NamedTuple):
 def rows_of(joints: JointRows) -> Rows:
     """Return friction and limits of n joints as rows, [2 n]: all frictions, then all limits."""
     one = np.eye(len(joints.side), dtype=np.float32)
-    both = lambda first, second: jnp.concatenate([first, second])  # noqa: E731
+
+    def both(first: Any, second: Any) -> Any:
+        return jnp.concatenate([first, second])
+
     return Rows(
         both(one, joints.side[:, None] * one),
         both(joints.friction_impedance, joints.limit_impedance),
@@ -143,7 +146,7 @@ def solve(
     There are at most `iterations` Newton steps. A whole step over which no row changes sides ends at the solution, and
     a second such step removes its rounding error. After `steady` of them the search stops.
 
-    Its derivative is that of the solution (`_differentiate`), whatever the way there.
+    Its derivative is that of the solution (`_differentiate`), whatever led there.
     """
 
     def step(qacc: Array, _: Array) -> tuple[Array, Array]:
@@ -200,7 +203,7 @@ def _differentiate(
     """Return the solution and its derivative, by the implicit function theorem.
 
     At the solution all forces balance the inertia, and each row stays on its side. So the derivative takes one linear
-    system, which is never degenerate. The way to the solution is no use: at rest it divides zero by zero.
+    system, which is never degenerate. The direction to the solution is no use: at rest it divides zero by zero.
     """
     mass, smooth, rows, _ = primals
     qacc, force = solve(*primals, iterations, looks, arms, steady)

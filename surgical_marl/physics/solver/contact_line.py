@@ -1,7 +1,7 @@
-"""What happens along the way of a Newton step: what contacts feel, and how the cost changes.
+"""Contacts along the direction of a Newton step: their forces, and the slope of the cost.
 
-At the whole length of a way all forces balance, if contacts feel there what was foreseen. The slope of the cost at its
-end is therefore the force that was not foreseen, times the way.
+After a whole step all forces balance, if contacts feel there what their linear prediction says. The slope of the cost
+there is therefore the part of the forces that was not predicted, times the direction.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ not balance."""
 
 
 class Base(NamedTuple):
-    """What contacts feel where a way begins, [s]."""
+    """The forces of contacts where a direction begins, [s]."""
 
     stuck: Stuck
     felt: Forces
     pressing: Listed
     """Which of them press."""
     pressed: Pressed
-    """What is kept of `felt`, or of what they feel at the end of the way."""
+    """What is kept of `felt`, or of what they feel after a whole step."""
 
     @classmethod
     def of(cls, contacts: Contacts) -> Base:
@@ -41,7 +41,7 @@ class Base(NamedTuple):
         return cls(contacts.stuck, contacts.felt, contacts.pressing, pressed)
 
     def ahead(self, problem: Problem, by: Parting, length: Array) -> Base:
-        """Return what they feel at a length of a way, along which they part by so much more."""
+        """Return what they feel at a length of a direction, along which they part by so much more."""
 
         def one(n: Array, base: Base) -> Base:
             springs, here, more = row_of((problem.contacts.springs, base.stuck, by), n)
@@ -56,21 +56,21 @@ class Base(NamedTuple):
 
 
 class End(NamedTuple):
-    """What is found at the whole length of a way."""
+    """The forces of contacts after a whole Newton step, and the slope of the cost there."""
 
     pressed: Pressed
     """What contacts feel, [s]."""
     missed: Array
     """Square of the largest force that a contact of each object feels and would not if contacts were linear from the
-    beginning of the way on, N2; at the end of contacts without an object, [k + 1]."""
+    beginning of the direction on, N2; at the end of contacts without an object, [k + 1]."""
     largest: Array
     """Largest normal force likewise, N, [k + 1]."""
     slope: Array
     """Of the cost, []."""
     growth: Array
-    """By how much the slope of the cost of contacts grew on the way, had they been linear, [].
+    """Growth of the slope of the cost of contacts along the direction, had they been linear, [].
 
-    Without contacts it grows, too. So the slope where the way begins is less than minus this.
+    Without contacts it grows, too. So the slope where the direction begins is less than minus this.
     """
 
     @property
@@ -79,14 +79,14 @@ class End(NamedTuple):
         return (self.missed <= (TOLERANCE * self.largest) ** 2).all()
 
 
-def look_ahead(problem: Problem, base: Base, by: Parting, way: Point) -> End:
-    """Return what is found at the whole length of a way.
+def look_ahead(problem: Problem, base: Base, by: Parting, direction: Point) -> End:
+    """Return forces and slope after a whole Newton step.
 
     Args:
         problem: whose contacts [s] they are.
-        base: what these feel where the way begins.
+        base: what these feel where the direction begins.
         by: how much more the bodies of each contact accelerate per length, [s].
-        way: of arms and bodies.
+        direction: of arms and bodies.
     """
 
     def look(n: Array, end: End) -> End:
@@ -109,15 +109,15 @@ def look_ahead(problem: Problem, base: Base, by: Parting, way: Point) -> End:
     none, each, objects = jnp.float32(0.0), jnp.zeros(len(problem.free) + 1), len(problem.free)
     found: End = jax.lax.fori_loop(0, problem.total, look, End(base.pressed, each, each, none, none))
     if problem.attachments is not None:
-        found = found._replace(growth=found.growth + problem.attachments.growth(way))
+        found = found._replace(growth=found.growth + problem.attachments.growth(direction))
     return found
 
 
 class Along(NamedTuple):
-    """A way, from an acceleration `here`."""
+    """A direction, from an acceleration `here`."""
 
     here: Point
-    way: Point
+    direction: Point
     moves: Array
     """Which arms move, [a]."""
     by: Parting
@@ -128,11 +128,11 @@ class Along(NamedTuple):
     """By how much this slope grows per length, []."""
 
     def measure(self, arms: Arms, problem: Problem, stuck: Stuck) -> Callable[[Array], tuple[Array, Array]]:
-        """Return what measures the slope of the cost at a length of the way, and by how much it grows per length.
+        """Return a function from a length along the direction to the slope of the cost there and its growth per length.
 
-        `stuck` are the forces of contacts that would stick where the way begins, [s].
+        `stuck` are the forces of contacts that would stick where the direction begins, [s].
         """
-        here, way, moves, by, slope, growth = self
+        here, direction, moves, by, slope, growth = self
 
         def measure(length: Array) -> tuple[Array, Array]:
             def look(n: Array, sums: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -143,7 +143,7 @@ class Along(NamedTuple):
                 slope -= felt.normal @ own.normal + felt.friction @ own.along
                 return slope, growth + normal @ own.normal + friction @ own.along
 
-            resists, gives = arms.resisted(problem, moves, here.arms, way.arms, length)
+            resists, gives = arms.resisted(problem, moves, here.arms, direction.arms, length)
             start = slope + length * growth + resists, growth + gives
             found: tuple[Array, Array] = jax.lax.fori_loop(0, problem.total, look, start)
             return found
@@ -152,27 +152,30 @@ class Along(NamedTuple):
 
 
 def set_out(
-    arms: Arms, problem: Problem, forces: Point, here: Point, way: Point, moves: Array, by: Parting
+    arms: Arms, problem: Problem, forces: Point, here: Point, direction: Point, moves: Array, by: Parting
 ) -> tuple[Array, Along]:
-    """Return the slope of the whole cost where a way begins, and what is known of the way.
+    """Return the slope of the whole cost where a direction begins, and the direction with its constants.
 
     Args:
         arms: which find what is due to arms.
         problem: what is solved.
         forces: of contacts on arms, and all on objects, at `here`.
         here: an acceleration.
-        way: from there.
+        direction: from there.
         moves: which arms move, [a].
         by: how much more the bodies of each contact accelerate per length, [s].
     """
-    begin, slope, growth = arms.slopes(problem, moves, here.arms, way.arms, forces.arms)
-    begin -= jnp.sum(forces.objects * way.objects)
-    inertia = problem.masses @ jnp.stack([here.objects - problem.free, way.objects], -1)
-    of_objects = jnp.sum(way.objects[..., None] * inertia, (0, 1))
+    begin, slope, growth = arms.slopes(problem, moves, here.arms, direction.arms, forces.arms)
+    begin -= jnp.sum(forces.objects * direction.objects)
+    inertia = problem.masses @ jnp.stack([here.objects - problem.free, direction.objects], -1)
+    of_objects = jnp.sum(direction.objects[..., None] * inertia, (0, 1))
     slope, growth = slope + of_objects[0], growth + of_objects[1]
     if problem.attachments is not None:
-        slope, growth = slope + problem.attachments.slope(here, way), growth + problem.attachments.growth(way)
-    return begin, Along(here, way, moves, by, slope, growth)
+        slope, growth = (
+            slope + problem.attachments.slope(here, direction),
+            growth + problem.attachments.growth(direction),
+        )
+    return begin, Along(here, direction, moves, by, slope, growth)
 
 
 def _times(length: Array, by: Parting) -> Parting:

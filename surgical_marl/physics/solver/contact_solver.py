@@ -1,13 +1,15 @@
 """The acceleration of arms and objects at which all forces balance, by Newton's method on what touches.
 
-All forces are gradients of convex functions of the acceleration (`solver.py`, `cone.py`), and so is their sum. A Newton
-step is a linear system in which each object is six numbers that only meet arms, so objects are eliminated first: what
-is left is as large as the arms, whatever the number of objects. Objects that touch each other are eliminated together.
+All forces are gradients of convex functions of the acceleration (`constraint_rows.py`, `friction_cone.py`), and so is
+their sum. A Newton step is a linear system in which each object is six numbers that only meet arms, so objects are
+eliminated first: what is left is as large as the arms, whatever the number of objects. Objects that touch each other
+are eliminated together.
 """
 
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -60,12 +62,12 @@ class ContactSolver:
         def step(state: tuple[Point, Base], count: Array) -> tuple[tuple[Point, Base], Array]:
             here, base = state
             sums = Hessian.of(problem, base, here)
-            way, touching = self._direction(problem, here, sums, count == 0), _touching(problem)
-            # Arms that touch nothing go all of their way at once, as if nothing else were there, and are done.
-            free = jnp.where(touching[:, None], 0.0, way.arms)
-            way = way._replace(arms=jnp.where(touching[:, None], way.arms, 0.0))
-            by, whole = self._partings(problem, way), here.ahead(way, jnp.float32(1.0))
-            end = look_ahead(problem, base, by, way)
+            direction, touching = self._direction(problem, here, sums, count == 0), _touching(problem)
+            # Arms that touch nothing take their whole step at once, as if nothing else were there, and are done.
+            free = jnp.where(touching[:, None], 0.0, direction.arms)
+            direction = direction._replace(arms=jnp.where(touching[:, None], direction.arms, 0.0))
+            by, whole = self._partings(problem, direction), here.ahead(direction, jnp.float32(1.0))
+            end = look_ahead(problem, base, by, direction)
             base, settled = base._replace(pressed=end.pressed), end.foreseen
             good = jnp.abs(end.slope) <= jnp.where(count == 0, FIRST, ENOUGH) * end.growth
             good &= end.growth > LEAST
@@ -75,7 +77,7 @@ class ContactSolver:
 
             def searched() -> tuple[Array, Array]:
                 forces = Point(sums.arm_force, sums.force[: self._objects])
-                begin, along = set_out(self._arms, problem, forces, here, way, touching, by)
+                begin, along = set_out(self._arms, problem, forces, here, direction, touching, by)
                 found = line_search(begin, LEAST, along.measure(self._arms, problem, base.stuck))
                 return found.length, found.looks == 0
 
@@ -83,7 +85,7 @@ class ContactSolver:
                 length, settled = skip.cond(
                     "line_search", ~good, searched, lambda: (jnp.float32(1.0), jnp.bool_(False))
                 )
-                return here.ahead(way, length), base.ahead(problem, by, length), settled
+                return here.ahead(direction, length), base.ahead(problem, by, length), settled
 
             there, base, settled = jax.lax.cond(settled, lambda: (whole, base, jnp.bool_(True)), gone_on)
             return (there._replace(arms=there.arms + free), base), settled
@@ -92,9 +94,9 @@ class ContactSolver:
         here, base = newton(step, (here, Base.of(problem.contacts)), self._passes)
         return Solution(here.arms, here.objects, base.pressed, self._arms.between(problem, here.arms))
 
-    def _partings(self, problem: Problem, way: Point) -> Parting:
-        """Return how the bodies of all contacts accelerate relative to each other per length of a way, [s]."""
-        motion = way.arms, self.twists.by_object(way.objects)
+    def _partings(self, problem: Problem, direction: Point) -> Parting:
+        """Return how the bodies of all contacts accelerate relative to each other per length of a direction, [s]."""
+        motion = direction.arms, self.twists.by_object(direction.objects)
 
         def one(n: Array) -> Parting:
             contact = problem.contacts.at(n)
@@ -103,10 +105,10 @@ class ContactSolver:
         found: Parting = filled(one, problem.total, len(problem.contacts.second))
         return found
 
-    # -- the way from there
+    # -- the search direction
 
     def _direction(self, problem: Problem, here: Point, sums: Hessian, first: Array) -> Point:
-        """Return the way to the least cost if contacts are linear functions; friction and limits of joints are not.
+        """Return the direction to the least cost with contacts as linear functions; joints keep friction and limits.
 
         Objects are eliminated, arms solved, and objects found from them. Unless it is the `first` Newton step, arms
         that touch nothing are where their forces balance.
@@ -119,11 +121,11 @@ class ContactSolver:
         if len(self._dofs):
             on = touched | (linked & touched.any(0))  # what an object touches moves those that it touches
             left = Condensed(sums.arm, sums.on_arm, sums.arm_force, gone.half, gone.wide, on)
-            found = self._ways(problem, here.arms, left, first)
-        return Point(found, schur.ways(gone, found, touched, linked))
+            found = self._directions(problem, here.arms, left, first)
+        return Point(found, schur.back_substitute(gone, found, touched, linked))
 
-    def _ways(self, problem: Problem, here: Array, left: Condensed, first: Array) -> Array:
-        """Return the ways [a, m] of arms: of each alone, of those that one object joins, or of all at once."""
+    def _directions(self, problem: Problem, here: Array, left: Condensed, first: Array) -> Array:
+        """Return the directions [a, m] of arms: of each alone, of those that one object joins, or of all at once."""
         begin = jnp.where(first, problem.eased, here)
         together = partial(self._arms.together, problem, here, begin)
         bridged = partial(self._arms.bridged, problem, here, begin)
@@ -131,7 +133,10 @@ class ContactSolver:
         if len(self._dofs) < 2:
             return each(left)
         bridges, pressed = left.touched.sum(1) > 1, self._sides(problem, here).any()
-        joined = lambda left: jax.lax.cond(pressed | (bridges.sum() > 1), together, bridged, left)  # noqa: E731
+
+        def joined(left: Any) -> Any:
+            return jax.lax.cond(pressed | (bridges.sum() > 1), together, bridged, left)
+
         return jax.lax.cond(pressed | bridges.any(), joined, each, left)
 
     def _sides(self, problem: Problem, arms: Array) -> Array:

@@ -88,20 +88,20 @@ class AttachmentRows(NamedTuple):
         """Return the acceleration [6] of a body relative to the link that it is attached to."""
         return point.objects[self.body[n]] + self.jacobian[n] @ point.arms[self.arm[n]]
 
-    def growth(self, way: Point) -> Array:
-        """Return how much the slope of the cost of all active attachments grows per length of a way, []."""
+    def growth(self, direction: Point) -> Array:
+        """Return how much the slope of the cost of all active attachments grows per length of a direction, []."""
         total = jnp.float32(0.0)
         for n in range(len(self.body)):
-            by = self.relative(n, way)
+            by = self.relative(n, direction)
             total += jnp.where(self.active[n], by @ self.stiffness @ by, 0.0)
         return total
 
-    def slope(self, here: Point, way: Point) -> Array:
-        """Return the slope of their cost along a way at a point, []."""
+    def slope(self, here: Point, direction: Point) -> Array:
+        """Return the slope of their cost along a direction at a point, []."""
         total = jnp.float32(0.0)
         for n in range(len(self.body)):
             felt = self.wrench[n] - self.stiffness @ self.relative(n, here)
-            total -= jnp.where(self.active[n], felt @ self.relative(n, way), 0.0)
+            total -= jnp.where(self.active[n], felt @ self.relative(n, direction), 0.0)
         return total
 
 
@@ -163,11 +163,11 @@ class Solution(NamedTuple):
 
 
 class Point(NamedTuple):
-    """Accelerations of arms [a, m] and objects [k, 6], or ways between two such points."""
+    """Accelerations of arms [a, m] and objects [k, 6], or directions between two such points."""
 
     arms: Array
     objects: Array
 
-    def ahead(self, way: Point, length: Array) -> Point:
-        """Return the point at a length of a way from here."""
-        return Point(self.arms + length * way.arms, self.objects + length * way.objects)
+    def ahead(self, direction: Point, length: Array) -> Point:
+        """Return the point at a length of a direction from here."""
+        return Point(self.arms + length * direction.arms, self.objects + length * direction.objects)

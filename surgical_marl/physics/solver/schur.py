@@ -47,18 +47,24 @@ def eliminate(blocks: Blocks, force: Array, coupling: Array, touched: Array, lin
         touched: which objects touch which arms, [k, a].
         linked: whether any objects touch each other, [].
     """
-    alone = lambda coupling: apart(blocks.own, force, coupling, touched)  # noqa: E731
+
+    def alone(coupling: Any) -> Any:
+        return apart(blocks.own, force, coupling, touched)
+
     if len(force) < 2:
         return alone(coupling)
     return jax.lax.cond(linked, lambda coupling: touching(blocks, force, coupling, touched), alone, coupling)
 
 
-def ways(found: Eliminated, arms: Array, touched: Array, linked: Array) -> Array:
-    """Return the ways [k, 6] of objects, by those of the arms' joints [a, m]; the rest as for `eliminate`."""
-    alone = lambda: ways_apart(found, arms, touched)  # noqa: E731
+def back_substitute(found: Eliminated, arms: Array, touched: Array, linked: Array) -> Array:
+    """Return the directions [k, 6] of objects, by those of the arms' joints [a, m]; the rest as for `eliminate`."""
+
+    def alone() -> Any:
+        return substituted_apart(found, arms, touched)
+
     if len(touched) < 2:
         return alone()
-    return jax.lax.cond(linked, lambda: ways_touching(found, arms), alone)
+    return jax.lax.cond(linked, lambda: substituted_touching(found, arms), alone)
 
 
 def apart(own: Array, force: Array, coupling: Array, touched: Array) -> Eliminated:
@@ -73,7 +79,9 @@ def apart(own: Array, force: Array, coupling: Array, touched: Array) -> Eliminat
         factor = cholesky(own[packed(6)])
 
         def of_arm(wide: Array, arm: Array) -> tuple[Array, None]:
-            divided = lambda wide: put(wide, a * i + arm, forward(factor, wide[a * i + arm]))  # noqa: E731
+            def divided(wide: Any) -> Any:
+                return put(wide, a * i + arm, forward(factor, wide[a * i + arm]))
+
             return jax.lax.cond(touched[arm], divided, lambda wide: wide, wide), None
 
         if coupling.size:
@@ -85,21 +93,23 @@ def apart(own: Array, force: Array, coupling: Array, touched: Array) -> Eliminat
     return Eliminated(half, wide, factor, rows)
 
 
-def ways_apart(found: Eliminated, arms: Array, touched: Array) -> Array:
-    """Return the ways [k, 6] of objects of which no two touch, by those of the arms' joints [a, m]."""
+def substituted_apart(found: Eliminated, arms: Array, touched: Array) -> Array:
+    """Return the directions [k, 6] of objects of which no two touch, by those of the arms' joints [a, m]."""
 
     def one(row: Any) -> Array:
         i, half, factor, touched = row
 
         def of_arm(left: Array, arm: Array) -> tuple[Array, None]:
-            less = lambda left: left - found.wide[len(arms) * i + arm] @ arms[arm]  # noqa: E731
+            def less(left: Any) -> Any:
+                return left - found.wide[len(arms) * i + arm] @ arms[arm]
+
             return jax.lax.cond(touched[arm], less, lambda left: left, left), None
 
         left = jax.lax.scan(of_arm, half, jnp.arange(len(arms)))[0] if len(arms) else half
         return back(factor, left)
 
-    found_ways: Array = jax.lax.map(one, (jnp.arange(len(touched)), found.half, found.factor, touched))
-    return found_ways
+    found_steps: Array = jax.lax.map(one, (jnp.arange(len(touched)), found.half, found.factor, touched))
+    return found_steps
 
 
 def touching(blocks: Blocks, force: Array, coupling: Array, touched: Array) -> Eliminated:
@@ -136,7 +146,10 @@ def touching(blocks: Blocks, force: Array, coupling: Array, touched: Array) -> E
 
         def divide(rows: Array, at: Array) -> tuple[Array, None]:
             column = _columns(rows, at, 1)[0]
-            divided = lambda rows: _put(rows, at, forward(factor, column))  # noqa: E731
+
+            def divided(rows: Any) -> Any:
+                return _put(rows, at, forward(factor, column))
+
             return jax.lax.cond((column != 0).any(), divided, lambda rows: rows, rows), None
 
         def subtract(rows: Array, i: Array) -> tuple[Array, None]:
@@ -147,7 +160,9 @@ def touching(blocks: Blocks, force: Array, coupling: Array, touched: Array) -> E
                 less = _columns(rows, at, 1)[0] - block @ _columns(rows, j * width + c, 1)[0]
                 return _put(rows, at, less), None
 
-            all_ = lambda rows: jax.lax.scan(column, rows, jnp.arange(width))[0]  # noqa: E731
+            def all_(rows: Any) -> Any:
+                return jax.lax.scan(column, rows, jnp.arange(width))[0]
+
             return jax.lax.cond((i > j) & (block != 0).any(), all_, lambda rows: rows, rows), None
 
         rows = jax.lax.scan(divide, rows, j * width + jnp.arange(width))[0]
@@ -166,18 +181,18 @@ def touching(blocks: Blocks, force: Array, coupling: Array, touched: Array) -> E
     return Eliminated(half, wide, absent(jax.ShapeDtypeStruct((k, 6, 6), force.dtype)), rows)
 
 
-def ways_touching(found: Eliminated, arms: Array) -> Array:
-    """Return the ways [k, 6] of objects of which some touch each other, by those of the arms' joints [a, m]."""
+def substituted_touching(found: Eliminated, arms: Array) -> Array:
+    """Return the directions [k, 6] of objects of which some touch, by those of the arms' joints [a, m]."""
     k, rows = len(found.half), found.rows
     width = rows.size // (6 * k)
 
-    def one(ways: Array, j: Array) -> tuple[Array, None]:
+    def one(directions: Array, j: Array) -> tuple[Array, None]:
         def add(total: Array, c: Array) -> tuple[Array, None]:
-            return total - ways[c] * _columns(rows, j * width + c, 1)[0], None
+            return total - directions[c] * _columns(rows, j * width + c, 1)[0], None
 
         left = jax.lax.scan(add, jnp.zeros(6), jnp.arange(width))[0]  # those up to j are still 0
         factor = _columns(rows, j * (width + 6), 6)
-        return jax.lax.dynamic_update_slice(ways, back(factor, left), (6 * j,)), None
+        return jax.lax.dynamic_update_slice(directions, back(factor, left), (6 * j,)), None
 
     all_ = jnp.concatenate([jnp.zeros(6 * k), -jnp.ones(1), arms.ravel()])
     return jax.lax.scan(one, all_, jnp.arange(k), reverse=True)[0][: 6 * k].reshape(k, 6)

@@ -1,4 +1,4 @@
-"""The way of arms that one object joins: each arm is factorised alone, and six numbers of the object join them.
+"""The search direction of arms that one body joins: each arm is factorised alone, six numbers of the body join them.
 
 Without the object, the matrix B of all arms has one block for each arm. The object takes W.T @ W from it, where W is
 six rows. By Woodbury's identity (W. Hager, "Updating the inverse of a matrix", SIAM Review 31, 1989) the solution x of
@@ -33,24 +33,24 @@ class Own(NamedTuple):
     joints: JointRows
     """Friction and limits of joints, [a, m]."""
     here: Array
-    """The acceleration that ways lead from, [a, m]."""
+    """The acceleration that directions lead from, [a, m]."""
 
 
 class _State(NamedTuple):
-    ways: Array
+    directions: Array
     """[a, m]"""
     moved: Array
-    """W times the ways, [6]."""
+    """W times the directions, [6]."""
 
 
 class Woodbury:
-    """Solves for the ways of arms that one object joins.
+    """Solves for the directions of arms that one object joins.
 
     Args:
         own: what belongs to each arm.
         wide: from the number of an arm to its columns of W, [6, m].
-        resisted: from accelerations [a, m], ways [a, m] and a length to the slope of friction and limits of joints
-            there, and by how much it grows per length.
+        resisted: from accelerations [a, m], directions [a, m] and a length to the slope of friction and limits of
+            joints there, and by how much it grows per length.
         places: where each element of an arm's matrix is in its lower half, [m, m].
     """
 
@@ -64,26 +64,26 @@ class Woodbury:
         self._own, self._wide, self._resisted, self._places = own, wide, resisted, places
 
     def solve(self, begin: Array, iterations: int) -> Array:
-        """Return the ways [a, m], by at most `iterations` Newton steps: the last one is whole and changes no side.
+        """Return the directions [a, m] after at most `iterations` Newton steps; the last is whole and changes no side.
 
-        The first of them begins at the ways `begin` [a, m].
+        The first of them begins at the directions `begin` [a, m].
         """
 
         def add(moved: Array, row: tuple[Array, Array]) -> tuple[Array, None]:
-            number, way = row
-            return moved + self._wide(number) @ way, None
+            number, direction = row
+            return moved + self._wide(number) @ direction, None
 
         moved, _ = jax.lax.scan(add, jnp.zeros(6), (self._own.number, begin))
         found: _State = newton(self._step, _State(begin, moved), iterations)
-        return found.ways
+        return found.directions
 
     def _step(self, state: _State, _: Array) -> tuple[_State, Array]:
         """Return the state after a Newton step, and whether it was whole and changed no side."""
         excess, factors, joined = self._factorise(state)
 
         def step_of(sums: tuple[Array, Array, Array], row: Any) -> tuple[tuple[Array, Array, Array], Array]:
-            own, way, excess, factor = row
-            across, (rows, force) = self._wide(own.number), _rows(own, way)  # again: quicker than to keep them
+            own, direction, excess, factor = row
+            across, (rows, force) = self._wide(own.number), _rows(own, direction)  # again: quicker than to keep them
             step = _solved(factor, excess + across.T @ joined)
             end = force - rows.impedance * (rows.jacobian @ step)
             kept = ((force > rows.low) == (end > rows.low)) & ((force < rows.high) == (end < rows.high))
@@ -91,19 +91,22 @@ class Woodbury:
             return (moved + across @ step, begin - excess @ step, whole & kept.all()), step
 
         start = jnp.zeros(6), jnp.float32(0.0), jnp.bool_(True)
-        (moved, begin, whole), steps = jax.lax.scan(step_of, start, (self._own, state.ways, excess, factors))
-        part = lambda: self._length(state, steps, moved, begin)  # noqa: E731
+        (moved, begin, whole), steps = jax.lax.scan(step_of, start, (self._own, state.directions, excess, factors))
+
+        def part() -> Any:
+            return self._length(state, steps, moved, begin)
+
         length = jax.lax.cond(whole, lambda: jnp.float32(1.0), part)
-        return _State(state.ways + length * steps, state.moved + length * moved), whole
+        return _State(state.directions + length * steps, state.moved + length * moved), whole
 
     def _factorise(self, state: _State) -> tuple[Array, Array, Array]:
         """Return the forces left over [a, m], the factors of the arms' matrices [a, m, m], and what joins them [6]."""
 
         def factorise(sums: tuple[Array, Array], row: Any) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-            own, way = row
-            matrix, across, (rows, force) = own.stiff[self._places], self._wide(own.number), _rows(own, way)
+            own, direction = row
+            matrix, across, (rows, force) = own.stiff[self._places], self._wide(own.number), _rows(own, direction)
             excess = own.force + rows.jacobian.T @ jnp.clip(force, rows.low, rows.high)
-            excess += across.T @ state.moved - matrix @ way
+            excess += across.T @ state.moved - matrix @ direction
             gives = giving(rows, force)
             factor = cholesky(matrix + rows.jacobian.T @ (gives[:, None] * rows.jacobian))
             eased = forward(factor, jnp.concatenate([excess[:, None], across.T], 1))
@@ -111,21 +114,21 @@ class Woodbury:
             return joined, (excess, factor)
 
         none = jnp.eye(6), jnp.zeros(6)
-        (matrix, right), (excess, factors) = jax.lax.scan(factorise, none, (self._own, state.ways))
+        (matrix, right), (excess, factors) = jax.lax.scan(factorise, none, (self._own, state.directions))
         return excess, factors, _solved(cholesky(matrix), right)
 
     def _length(self, state: _State, steps: Array, moved: Array, begin: Array) -> Array:
         """Return how far to go along steps [a, m], by which W moves `moved` [6]; `begin` is the slope before them."""
 
         def add(sums: tuple[Array, Array], row: Any) -> tuple[tuple[Array, Array], None]:
-            own, way, step = row
+            own, direction, step = row
             spread = own.stiff[self._places] @ step
-            return (sums[0] + way @ spread - own.force @ step, sums[1] + step @ spread), None
+            return (sums[0] + direction @ spread - own.force @ step, sums[1] + step @ spread), None
 
         none = jnp.float32(0.0)
-        (slope, growth), _ = jax.lax.scan(add, (none, none), (self._own, state.ways, steps))
+        (slope, growth), _ = jax.lax.scan(add, (none, none), (self._own, state.directions, steps))
         slope, growth = slope - state.moved @ moved, growth - moved @ moved
-        here = self._own.here + state.ways
+        here = self._own.here + state.directions
 
         def measure(length: Array) -> tuple[Array, Array]:
             resists, gives = self._resisted(here, steps, length)
@@ -134,10 +137,10 @@ class Woodbury:
         return line_search(begin, 0.0, measure).length
 
 
-def _rows(own: Own, way: Array) -> tuple[Rows, Array]:
-    """Return friction and limits of an arm's joints as rows, and their forces at a way if they had no bounds."""
+def _rows(own: Own, direction: Array) -> tuple[Rows, Array]:
+    """Return friction and limits of an arm's joints as rows, and their forces without bounds after a step."""
     rows = rows_of(own.joints)
-    return rows, unbounded_forces(rows, own.here + way)
+    return rows, unbounded_forces(rows, own.here + direction)
 
 
 def _solved(factor: Array, right: Array) -> Array:

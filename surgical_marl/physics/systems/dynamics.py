@@ -43,7 +43,7 @@ class Dynamics:
     def __init__(self, model: mujoco.MjModel) -> None:
         mjx = prepare_mjx()
         smooth = copy.copy(model)
-        smooth.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT  # `collision.py` detects collisions
+        smooth.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT  # `arm_contacts.py` detects collisions
         self.model, self._data = mjx.put_model(smooth), mjx.make_data(smooth)
         self.dt = np.float32(model.opt.timestep)
         self._stop = [jnp.asarray(of[0], jnp.float32) for of in (model.pair_solref, model.pair_solimp) if model.npair]
