@@ -321,7 +321,7 @@ def test_no_limit_is_passed_and_nothing_breaks_at_full_effort(scene: str) -> Non
     [
         ({"task": "reech"}, "unknown task 'reech', did you mean 'reach'"),
         ({"scene": "bimanual"}, "unknown scene 'bimanual'"),
-        ({"control": "force"}, "control must be one of position, velocity, torque, not 'force'"),
+        ({"control": "force"}, r"unknown control 'force' \(choose from cartesian, position, torque, velocity\)"),
         ({"engine": "warp"}, "unknown engine 'warp'"),
         ({"device": "tpu"}, "unknown device 'tpu'"),
         ({"num_envs": 0}, "num_envs must be a whole number of at least 1, not 0"),
