@@ -60,4 +60,6 @@ def test_without_a_skip_the_same_comes_out(monkeypatch: pytest.MonkeyPatch, name
     usual = play(monkeypatch, "")
     other = play(monkeypatch, ",".join(f"-{each}" for each in SKIPS) if name == "all" else f"-{name}")
     for part, values in usual.items():
-        np.testing.assert_allclose(other[part], values, atol=1e-4, err_msg=part)
+        # arms in contact take their damping in the solve, arms apart after it: see docs/physics.md
+        most = 2e-3 if name in ("all", "arms_apart") and part.endswith("qpos") else 1e-4
+        np.testing.assert_allclose(other[part], values, atol=most, err_msg=part)
