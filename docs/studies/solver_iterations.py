@@ -101,7 +101,7 @@ def step(scene: Scene, states: Physics, touching: bool) -> tuple[np.ndarray, np.
     def advance(state: Physics) -> tuple[Physics, Touch]:
         if not touching:
             return simulated.step._arms_apart(state, simulated.untouched)
-        return simulated.step._arms_together(state, simulated.untouched)
+        return simulated.step._arms_coupled(state, simulated.untouched)
 
     after, touch = jax.jit(jax.vmap(advance))(states)
     return np.asarray(after.qvel), np.asarray(touch.force)

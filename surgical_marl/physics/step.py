@@ -82,7 +82,7 @@ class Step:
         self.systems: dict[str, System] = dict(scene.systems)
         joints, count = scene.model.nv, len(scene.free_objects)
         none = np.zeros((0, 0), int)
-        self._newton, self._newton_of_bodies, self._newton_of_one = (
+        self._solver, self._solver_of_bodies, self._solver_of_one = (
             ContactSolver(self.arms.dofs, joints, count),
             ContactSolver(none, 0, count),
             ContactSolver(none, 0, 1),
@@ -101,7 +101,7 @@ class Step:
     def _index(self) -> None:
         if self.bodies:
             self.detection = Detection(self.bodies.tables)
-            self.grips = GripMemory(self.bodies.tables, self._newton.twists)
+            self.grips = GripMemory(self.bodies.tables, self._solver.twists)
             self._couplings = {
                 name: Coupling(self.bodies.tables, system.surface) for name, system in self.systems.items()
             }
@@ -120,7 +120,7 @@ class Step:
         places = poses.geom_xpos, poses.geom_xmat
         overlap = self.pairs.overlap(*places) if distance is None else (distance < 0).any()
         if not self.bodies:
-            return skip.cond("arms_apart", overlap, self._arms_together, self._arms_apart, physics, touch)
+            return skip.cond("arms_apart", overlap, self._arms_coupled, self._arms_apart, physics, touch)
         return self._with_bodies(physics, touch, self.find(physics, poses), overlap)
 
     @property
@@ -142,7 +142,7 @@ class Step:
     def _arms_apart(self, physics: Physics, touch: Touch) -> tuple[Physics, Touch]:
         return physics.with_systems(arms=self.arms.step_apart(physics.arms)), touch
 
-    def _arms_together(
+    def _arms_coupled(
         self, physics: Physics, touch: Touch, forces: ArmForces | None = None
     ) -> tuple[Physics, Touch]:  # fmt: skip
         """Step arms that touch each other alone, from the forces on them, if these are known.
@@ -151,7 +151,7 @@ class Step:
         """
         between = self._contacts_of_arms(physics)
         forces = self.arms.free_motion(physics.arms) if forces is None else forces
-        found, pressed = self._newton.solve_arms(
+        found, pressed = self._solver.solve_arms(
             forces.mass, forces.smooth, forces.joints, relaxed(forces), between.rows
         )
         arms = self.arms.apply(physics.arms, found, implicit_change(forces, found))
@@ -169,10 +169,10 @@ class Step:
             forces = self._couplings[name].on_arms(forces, met.loads, met.ends, found.joints)
         near = overlap | (self._arm_of(found.slots) < self._agents).any() if self.detection.slots else overlap
 
-        def together(physics: Physics, touch: Touch) -> tuple[Physics, Touch]:
+        def coupled(physics: Physics, touch: Touch) -> tuple[Physics, Touch]:
             if not self.detection.slots:  # nothing but arms, and systems whose loads are in the forces on them
-                return self._arms_together(physics, touch, forces)
-            return self._together(physics, touch, forces, found, overlap, meetings)
+                return self._arms_coupled(physics, touch, forces)
+            return self._all_coupled(physics, touch, forces, found, overlap, meetings)
 
         def apart(physics: Physics, touch: Touch) -> tuple[Physics, Touch]:
             bodies = self.step_bodies(physics.rigid_bodies, found.slots, meetings)
@@ -183,7 +183,7 @@ class Step:
         if self.attachments:
             near |= physics.systems[ATTACHMENTS].active.any()
         if self.pairs.count or self.detection.slots:
-            after, touch = skip.cond("arms_apart", near, together, apart, physics, touch)
+            after, touch = skip.cond("arms_apart", near, coupled, apart, physics, touch)
         else:  # one arm, and systems whose loads are in the forces on it
             after, touch = apart(physics, touch)
         return self._systems_moved(physics, after, found, meetings), self._loaded(touch, meetings)
@@ -204,7 +204,7 @@ class Step:
         """Move all other systems by the accelerations that arms and bodies have had in the step."""
         dt, bodies, moved = self.arms.dt, before.rigid_bodies.bodies, {}
         for name, met in meetings.items():
-            by_arm = self._newton.twists.by_arm((after.qvel - before.qvel) / dt)
+            by_arm = self._solver.twists.by_arm((after.qvel - before.qvel) / dt)
             by_body = (after.rigid_bodies.bodies.velocity - bodies.velocity) / dt
             ends = self._couplings[name].accelerations(met.ends, found.joints, bodies, by_arm, by_body)
             moved[name] = self.systems[name].apply(before.systems[name], met.motion, met.ends, ends, dt)
@@ -227,7 +227,7 @@ class Step:
         pads = self._rigid.tables.bodies["pads"]
         return Found(poses, slots, joints, Fingers(poses.xpos[pads], poses.xquat[pads]))
 
-    def _together(
+    def _all_coupled(
         self, physics: Physics, touch: Touch, forces: ArmForces, found: Found, overlap: Array,
         meetings: dict[str, Meeting],
     ) -> tuple[Physics, Touch]:  # fmt: skip
@@ -236,7 +236,7 @@ class Step:
         Damping is a part of the arms' mass matrix here, so the solver sees the velocities at the end of the step.
         """
         dt, slots, (bodies, grips) = self.arms.dt, found.slots, physics.rigid_bodies
-        model = ContactModel(self._rigid.tables, self._newton.twists)
+        model = ContactModel(self._rigid.tables, self._solver.twists)
         felt = model.feel(slots, found.joints, found.fingers, physics.qvel, bodies, grips, dt)
         masses, free, awake = self._free_bodies(bodies, slots, meetings, self._attached(physics))
         contacts, rows = felt.contacts, None
@@ -251,7 +251,7 @@ class Step:
             forces.implicit, forces.smooth, forces.joints, self.arms.friction_start(forces), between.rows, overlap,
             masses, free, contacts, slots.found, rows,
         )  # fmt: skip
-        solution = self._newton.solve(problem)
+        solution = self._solver.solve(problem)
         arms = self.arms.apply(physics.arms, solution.arms)
         after = self._rigid.apply(bodies, solution.objects, awake, slots.company)
         moves = dt * arms.qvel, dt * after.velocity
@@ -291,7 +291,7 @@ class Step:
             return state
         bodies, grips = state
         masses, free, awake = self._free_bodies(bodies, slots, meetings or {})
-        model = ContactModel(self._rigid.tables, self._newton_of_bodies.twists)
+        model = ContactModel(self._rigid.tables, self._solver_of_bodies.twists)
         felt = model.feel(slots, None, None, jnp.zeros(0), bodies, grips, self.arms.dt)
         found = self._solve_bodies(masses, free, felt.contacts, slots, awake)
         return RigidBodyState(self._rigid.apply(bodies, found, awake, slots.company), released(grips))
@@ -301,7 +301,7 @@ class Step:
         k, total = len(free), slots.found
 
         def whole() -> Array:
-            return self._newton_of_bodies.solve(Problem(*no_arms(), masses, free, contacts, total)).objects
+            return self._solver_of_bodies.solve(Problem(*no_arms(), masses, free, contacts, total)).objects
 
         def single(row: tuple[Array, ...]) -> Array:
             number, mass, free = row
@@ -313,7 +313,7 @@ class Step:
             problem = Problem(*no_arms(), mass[None], free[None], contacts._replace(at=own), total)
 
             def solve() -> Any:
-                return self._newton_of_one.solve(problem).objects[0]
+                return self._solver_of_one.solve(problem).objects[0]
 
             return skip.cond("sleeping", awake[number], solve, lambda: jnp.zeros(6))
 
