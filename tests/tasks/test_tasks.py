@@ -129,9 +129,9 @@ def test_the_oracle_takes_tensors_on_a_gpu() -> None:
     assert float((step.infos["psm_0"]["tip_error"] < 0.002).float().mean()) >= 0.98
 
 
-def test_the_oracle_needs_position_control() -> None:
+def test_the_oracle_needs_position_targets() -> None:
     env = SimpleNamespace(control="torque", task=SimpleNamespace(has_targets=True))
-    with pytest.raises(ValueError, match="control must be 'position', not 'torque'"):
+    with pytest.raises(ValueError, match="control must be cartesian or position, not 'torque'"):
         load_policy("oracle", env)  # type: ignore[arg-type]
 
 
