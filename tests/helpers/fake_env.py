@@ -62,6 +62,9 @@ class FakeEnv:
     def action_space(self, agent: str) -> Box:
         return self._box(self.sizes[agent], 1.0)
 
+    def action_terms(self, agent: str) -> dict[str, slice]:
+        return {"velocity": slice(0, self.sizes[agent])}
+
     def _draw(self) -> dict[str, Tensor]:
         shapes = {agent: (self.num_envs, 2 * size) for agent, size in self.sizes.items()}
         return {a: torch.rand(s, generator=self.generator) * 2 - 1 for a, s in shapes.items()}
