@@ -35,6 +35,7 @@ joints:
   yaw: {stiffness: 1, damping: 1, speed: 1, armature: 0, home: 0, margin: 0}
 cables:
   - {joints: {yaw: 1, pitch: -1}, stiffness: 1, damping: 1, effort: 1, armature: 0}
+tip_speed: {translation: 1, rotation: 1}
 jaw:
   joint: grip
   open: 1
@@ -50,6 +51,10 @@ tissue:
   liver: {shape: box, size: [1, 1, 1], colour: [1, 0, 0], position: [0, 0, 0], tilt: [0, 0, 0]}
 objects:
   pad: {object: pad, position: [0, 0, 0], tilt: [0, 0, 0], colour: [1, 0, 0]}
+attachments:
+  weld: {body: pad, link: psm_0/tip, active: true}
+systems:
+  beads: {type: bead_string}
 randomisation:
   {offset_angle: 0, offset_slide: 0, backlash_angle: 0, backlash_slide: 0, noise_angle: 0, noise_slide: 0, stiffness: 0,
    damping: 0, friction: 0, payload: 0, latency: 0, object_shift: 0, object_turn: 0, object_size: 0, object_mass: 0,
@@ -79,6 +84,8 @@ sites:
 
 def good_types(kind: Any) -> set[str]:
     """Names of `OTHERS` whose type a field takes."""
+    if kind is Any:
+        return set(OTHERS)
     if get_origin(kind) in (Union, types.UnionType):
         return {"null", *good_types(get_args(kind)[0])}
     if is_dataclass(kind):
@@ -102,7 +109,7 @@ def places(kind: Any, value: Any, *keys: str | int) -> Iterator[tuple[tuple[str 
             if key in value:  # each shape has one of its kinds
                 yield (*keys, key), hint
                 yield from places(hint, value[key], *keys, key)
-    elif isinstance(value, (dict, list)):
+    elif isinstance(value, (dict, list)) and kind is not Any:
         inner = get_args(kind)[1] if isinstance(value, dict) else get_args(kind)[0]
         for key, part in value.items() if isinstance(value, dict) else enumerate(value):
             if inner is not float or isinstance(value, dict):  # a vector is one value
