@@ -56,7 +56,7 @@ def test_training_goes_on_and_the_fault_can_be_replayed(
     assert "became NaN or infinite in iteration 2, environment 5, seed 0" in said and "fault-2.npz" in said
     found = read_fault(run / "fault-2.npz")
     assert found is not None and found[0]["place"].startswith("state physics.arms.qpos[")
-    assert (found[1]["start.physics.qvel"] == FAST).all(), "it begins where all was finite"
+    assert (found[1]["start.physics.arms.qvel"] == FAST).all(), "it begins where all was finite"
     assert main(["replay", str(run / "fault-2.npz")]) == 0
     told = capsys.readouterr().out
     assert "seed 0, environment 5" in told and "not finite after step 1 of 1, on cpu" in told
