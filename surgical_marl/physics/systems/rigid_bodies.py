@@ -56,7 +56,7 @@ class RigidBodies:
             centre = pose.position + rotation(pose.quaternion) @ jnp.asarray(tables.centers[o])
             position, turned = position.at[o].set(centre), turned.at[o].set(pose.quaternion)
         if self._factors is not None:
-            position += grown(self.tables, self._factors, rotation(turned))
+            position += grown(tables, self._factors, rotation(turned))
         return RigidBodyState(Bodies(position, turned, still, falls), no_grips(k, len(tables.fingers), self._arms))
 
     def free_motion(self, bodies: Bodies, awake: Array) -> tuple[Array, Array]:
