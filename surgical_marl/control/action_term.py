@@ -58,7 +58,7 @@ class ActionTerm:
     """
 
     actuators: ClassVar[Literal["position", "velocity", "torque"]] = "position"
-    """How the actuators of the joints are driven. A jaw is always under position control."""
+    """Control of the joints' actuators. A jaw is always under position control."""
     frames: ClassVar[tuple[str, ...]] = ("base",)
     """The frames that its numbers can refer to: "base", that of the arm, or "camera", that of an endoscope."""
 

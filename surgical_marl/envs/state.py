@@ -69,11 +69,11 @@ class Moved(NamedTuple):
     changes: Array
     """How the actions of all arms differ from the last ones."""
     told: dict[str, dict[str, Array]]
-    """What action terms tell of the step, by agent and name of an entry of `infos`."""
+    """Entries of `infos` that action terms give, by agent and name."""
 
 
 class BatchStep(NamedTuple):
-    """What a step returns. Shapes start with N, the number of environments; dicts are keyed by agent."""
+    """The result of a step. Shapes start with N, the number of environments; dicts are keyed by agent."""
 
     observations: dict[str, Any]
     """[N, d]; of the next episode where one ended. For an agent that sees pictures a dict of it, as "proprioception",

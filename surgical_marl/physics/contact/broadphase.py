@@ -16,7 +16,7 @@ from surgical_marl.physics.tree_utils import row_of
 
 
 class Displacement(NamedTuple):
-    """How far bodies move in a step at their present velocities: a point p by shift + turn x p. World, [n]."""
+    """The motion of bodies in a step at their present velocities: a point p moves by shift + turn x p. World, [n]."""
 
     shift: Array
     """m, [n, 3]"""

@@ -44,7 +44,7 @@ class Grips(NamedTuple):
     force: Array
     """Normal force of the finger at the end of the last step, N, [k, f]; 0 where it does not touch."""
     slid: Array
-    """How far the object has slid along the finger since it was touched, m, [k, f]."""
+    """Distance that the object has slid along the finger since it was touched, m, [k, f]."""
     held: Array
     """For how long the arm has held the object, s, [k, a]: both fingers press, from opposite sides."""
 
