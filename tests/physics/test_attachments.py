@@ -63,6 +63,12 @@ def test_a_welded_needle_goes_with_the_jaw_until_it_is_released(tmp_path: Path) 
     fallen = np.asarray(held.rigid_bodies.bodies.position - free.rigid_bodies.bodies.position)[0]
     assert fallen[2] > 1.0, "it falls freely for half a second"
 
+    data, bodies = step.arms.dynamics.pose(free.qpos), free.rigid_bodies.bodies
+    again = step.attachments.fasten(free.systems["attachments"], 0, data, bodies)  # type: ignore[union-attr]
+    assert bool(again.active[0])
+    where = data.xpos[link] + rotation(data.xquat[link]) @ again.position[0]
+    np.testing.assert_allclose(where, bodies.position[0], atol=1e-6)
+
 
 @pytest.mark.parametrize(
     ("changes", "message"),

@@ -50,7 +50,7 @@ class Grips(NamedTuple):
 
 
 OF_FINGERS = Grips._fields[:4]
-"""What is kept for each finger."""
+"""The fields that are kept for each finger."""
 
 
 class Fingers(NamedTuple):

@@ -25,7 +25,7 @@ from surgical_marl.physics.contact.friction_cone import (
     wrench,
 )
 from surgical_marl.physics.contact.grips import DAMPING
-from surgical_marl.physics.solver.cholesky import back, cholesky, forward, packed
+from surgical_marl.physics.solver.cholesky import cholesky, forward, packed, solve_factored
 from surgical_marl.physics.solver.newton import line_search, newton
 from surgical_marl.physics.systems.system import Ends, Loads
 
@@ -134,7 +134,7 @@ def _solve(mass: Array, force: Array, laws: _Law, moves: Array) -> Array:
     def step_from(acceleration: Array, _: Array) -> tuple[Array, Array]:
         excess, matrix = left(acceleration)
         factor = cholesky(matrix)
-        step = back(factor, forward(factor, excess))
+        step = solve_factored(factor, excess)
 
         def measure(length: Array) -> tuple[Array, Array]:
             excess, matrix = left(acceleration + length * step)

@@ -45,3 +45,8 @@ def back(factor: Array, right: Array) -> Array:
     """Return x [n] or [n, k] with factor.T @ x = right, for a lower factor [n, n]."""
     columns = right.reshape(len(right), -1)
     return triangular_solve(factor, columns, left_side=True, lower=True, transpose_a=True).reshape(right.shape)
+
+
+def solve_factored(factor: Array, right: Array) -> Array:
+    """Return x [n] or [n, k] with factor @ factor.T @ x = right, for a lower factor [n, n]."""
+    return back(factor, forward(factor, right))

@@ -32,7 +32,7 @@ class Base(NamedTuple):
     pressing: Listed
     """Which of them press."""
     pressed: Pressed
-    """What is kept of `felt`, or of what they feel after a whole step."""
+    """The part of `felt` that is kept, or of the forces after a whole step."""
 
     @classmethod
     def of(cls, contacts: Contacts) -> Base:

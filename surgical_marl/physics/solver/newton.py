@@ -54,9 +54,9 @@ class Tried(NamedTuple):
     high: Array
     """The shortest that was too long."""
     step: Array
-    """How far the next one is from the last one."""
+    """Distance of the next one from the last one."""
     looks: Array
-    """How many there were."""
+    """Number of lengths tried."""
     done: Array
 
 

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from surgical_marl.physics.solver.cholesky import back, cholesky, forward
+from surgical_marl.physics.solver.cholesky import cholesky, forward, solve_factored
 from surgical_marl.physics.solver.constraint_rows import JointRows, Rows, giving, rows_of, unbounded_forces
 from surgical_marl.physics.solver.newton import line_search, newton
 
@@ -84,7 +84,7 @@ class Woodbury:
         def step_of(sums: tuple[Array, Array, Array], row: Any) -> tuple[tuple[Array, Array, Array], Array]:
             own, direction, excess, factor = row
             across, (rows, force) = self._wide(own.number), _rows(own, direction)  # again: quicker than to keep them
-            step = _solved(factor, excess + across.T @ joined)
+            step = solve_factored(factor, excess + across.T @ joined)
             end = force - rows.impedance * (rows.jacobian @ step)
             kept = ((force > rows.low) == (end > rows.low)) & ((force < rows.high) == (end < rows.high))
             moved, begin, whole = sums
@@ -115,7 +115,7 @@ class Woodbury:
 
         none = jnp.eye(6), jnp.zeros(6)
         (matrix, right), (excess, factors) = jax.lax.scan(factorise, none, (self._own, state.directions))
-        return excess, factors, _solved(cholesky(matrix), right)
+        return excess, factors, solve_factored(cholesky(matrix), right)
 
     def _length(self, state: _State, steps: Array, moved: Array, begin: Array) -> Array:
         """Return how far to go along steps [a, m], by which W moves `moved` [6]; `begin` is the slope before them."""
@@ -141,8 +141,3 @@ def _rows(own: Own, direction: Array) -> tuple[Rows, Array]:
     """Return friction and limits of an arm's joints as rows, and their forces without bounds after a step."""
     rows = rows_of(own.joints)
     return rows, unbounded_forces(rows, own.here + direction)
-
-
-def _solved(factor: Array, right: Array) -> Array:
-    """Return x [n] with factor @ factor.T @ x = right."""
-    return back(factor, forward(factor, right))

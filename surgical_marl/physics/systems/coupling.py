@@ -12,7 +12,7 @@ from jax import Array
 from surgical_marl.physics.contact.broadphase import Displacement, Joints, Placed, Places
 from surgical_marl.physics.contact.contact_pairs import ContactPairs
 from surgical_marl.physics.contact.shapes import Points, Segments, between_segments, on_plate
-from surgical_marl.physics.solver.cholesky import back, cholesky, forward
+from surgical_marl.physics.solver.cholesky import cholesky, solve_factored
 from surgical_marl.physics.systems.arms import ArmForces
 from surgical_marl.physics.systems.rigid_motion import Bodies
 from surgical_marl.physics.systems.system import Ends, Loads, Spheres
@@ -142,7 +142,7 @@ class Coupling:
         (masses, force, touched), _ = jax.lax.scan(
             add, start, (rows["body"], rows["force"], rows["stiffness"], rows["place"])
         )
-        return masses, jax.vmap(_solved)(masses, force), touched
+        return masses, jax.vmap(lambda mass, own: solve_factored(cholesky(mass), own))(masses, force), touched
 
     def accelerations(
         self, ends: Ends, joints: Joints, bodies: Bodies, by_arm: Array, by_body: Array
@@ -190,8 +190,3 @@ def _motion_of(offset: Array) -> Array:
     zero = jnp.zeros_like(x)
     cross = jnp.stack([jnp.stack([zero, z, -y]), jnp.stack([-z, zero, x]), jnp.stack([y, -x, zero])])
     return jnp.concatenate([jnp.eye(3), cross], 1)
-
-
-def _solved(matrix: Array, right: Array) -> Array:
-    factor = cholesky(matrix)
-    return back(factor, forward(factor, right))
