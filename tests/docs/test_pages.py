@@ -31,6 +31,8 @@ from surgical_marl.content import content_dir, list_scenes
 from surgical_marl.envs.env import Env
 from surgical_marl.learning.trainer import OWN
 from surgical_marl.plugins.algorithms import ALGORITHMS
+from surgical_marl.plugins.controls import CONTROLS
+from surgical_marl.plugins.systems import SYSTEMS
 from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.runs.checkpoint import write_checkpoint
 from surgical_marl.runs.folder import has_begun
@@ -86,7 +88,7 @@ def no_work(*arguments: Any, **_: Any) -> None:
 def page_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty working folder. What a page registers ends with its test."""
     monkeypatch.chdir(tmp_path)
-    for registry in (TASKS, ALGORITHMS):
+    for registry in (TASKS, ALGORITHMS, CONTROLS, SYSTEMS):
         monkeypatch.setattr(registry, "_registered", dict(registry._registered))
     return tmp_path
 
@@ -149,7 +151,7 @@ def test_view_serves_a_page_until_it_is_interrupted(page_folder: Path) -> None:
 
 def install(settings: dict[str, Any], names: dict[str, Any]) -> None:
     """Register the page's classes as a package with this pyproject.toml would."""
-    for registry in (TASKS, ALGORITHMS):
+    for registry in (TASKS, ALGORITHMS, CONTROLS, SYSTEMS):
         for name, where in settings["project"]["entry-points"].get(registry.group, {}).items():
             registry._registered[name] = names[where.partition(":")[2]]
 
