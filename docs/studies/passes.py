@@ -5,16 +5,19 @@ Run: python -m docs.studies.passes --scene bimanual_psm_needle --task needle_han
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import sys
 from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from docs.studies.command import make_parser
 from surgical_marl.bench.clock import race
-from surgical_marl.bench.course import Course, make_course, tile
+from surgical_marl.bench.course import make_course, tile
 from surgical_marl.bench.engines import clock_of
 from surgical_marl.bench.workload import Workload
 from surgical_marl.engines.fused.options import PASSES
@@ -33,18 +36,31 @@ def on_device(values: np.ndarray, workload: Workload) -> Any:
     return torch.from_numpy(tiled).cuda()
 
 
-def batch_without(variable: str, name: str, workload: Workload, course: Course) -> BatchedEnv:
-    """Return environments at the start of a course, compiled without what a variable names; "" is for none."""
+def batch_without(name: str, variable: str, workload: Workload) -> BatchedEnv:
+    """Return environments that are compiled without what a variable names; "" is for none."""
     os.environ[variable] = f"-{name}" if name else ""
+    print(f"compiling {workload.scene} without {name or 'none'}", file=sys.stderr, flush=True)
     arrays: Any = "torch" if workload.where == "cuda" else "numpy"
     given = workload.of_environment()
-    batch = BatchedEnv(**given, num_envs=workload.count, engine="fused", device=workload.where, arrays=arrays)
-    batch.reset(seed=0)
-    for part, values in course.parts.items():
-        batch.engine.write(part, on_device(values, workload))
-    steps = np.random.default_rng(0).integers(0, batch.max_steps, workload.distinct, dtype=np.int32)
-    batch.steps = on_device(steps, workload)  # otherwise all episodes would end in the same step
-    return batch
+    return BatchedEnv(**given, num_envs=workload.count, engine="fused", device=workload.where, arrays=arrays)
+
+
+def compile_all(names: Sequence[str], variable: str, workload: Workload, processes: int) -> None:
+    """Compile kernels without each of the names in turn into the caches, by several processes side by side."""
+    if processes > 1:
+        os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # otherwise one takes most of a GPU's memory
+        with ProcessPoolExecutor(processes, multiprocessing.get_context("spawn")) as pool:
+            list(pool.map(partial(_compile, variable=variable, workload=workload), names))
+
+
+def _compile(name: str, variable: str, workload: Workload) -> None:
+    batch_without(name, variable, workload).close()
+
+
+def begin(batch: BatchedEnv, start: dict[str, Any]) -> None:
+    """Put environments to the start of a course: parts of the state by their paths."""
+    for path, values in start.items():
+        batch.engine.write(path, values)
 
 
 def passes_on(target: str) -> list[str]:
@@ -52,25 +68,36 @@ def passes_on(target: str) -> list[str]:
     return [CSE, *(one.name for one in ALL if not one.required and one.target in ("", target))]
 
 
-def measure(workload: Workload, names: Sequence[str], repeats: int, variable: str = PASSES) -> dict[str, float]:
+def measure(
+    workload: Workload, names: Sequence[str], repeats: int, variable: str = PASSES, processes: int = 1
+) -> dict[str, float]:
     """Return how much longer an environment step takes without each pass, as a share of the step with all.
 
-    An environment `variable` switches off what `names` are of: passes, or skips of the physics.
+    An environment `variable` switches off what `names` are of: passes, or skips of the physics. So many `processes`
+    compile, and one times.
     """
+    compile_all(("", *names), variable, workload, processes)
+    os.environ[variable] = ""
     course = make_course(workload)
     actions = [{agent: on_device(rows, workload) for agent, rows in lap.items()} for lap in course.actions]
-    batches = {}
+    start = {path: on_device(values, workload) for path, values in course.parts.items()}
+    clocks = {}
     for name in ("", *names):
-        print(f"compiling without {name or 'none'}", file=sys.stderr, flush=True)
-        batches[name] = batch_without(variable, name, workload, course)
-    took = race({name: clock_of(batch, actions) for name, batch in batches.items()}, repeats=repeats)
+        batch = batch_without(name, variable, workload)
+        batch.reset(seed=0)
+        begin(batch, start)
+        steps = np.random.default_rng(0).integers(0, batch.max_steps, workload.distinct, dtype=np.int32)
+        batch.steps = on_device(steps, workload)  # otherwise all episodes would end in the same step
+        clocks[name] = clock_of(batch, actions, partial(begin, batch, start) if workload.motion == "grasp" else None)
+    took = race(clocks, repeats=repeats)
     return {name: took[name] / took[""] - 1 for name in names}
 
 
 def main(argv: list[str] | None = None) -> None:
     """Print a row for each pass."""
     a, workload = parsed(__doc__, argv)
-    report("pass", measure(workload, a.only or passes_on(workload.where), a.repeats), workload)
+    names = a.only or passes_on(workload.where)
+    report("pass", measure(workload, names, a.repeats, processes=a.processes), workload)
 
 
 def report(noun: str, found: dict[str, float], workload: Workload) -> None:
@@ -89,6 +116,7 @@ def parsed(about: str | None, argv: list[str] | None) -> tuple[Any, Workload]:
     parser.add_argument("--num-envs", type=int)
     parser.add_argument("--device", default="auto")
     parser.add_argument("--repeats", type=int, default=10)
+    parser.add_argument("--processes", type=int, default=1, help="compile so many kernels side by side (%(default)s)")
     parser.add_argument("--only", nargs="*", help="names (default: all)")
     a = parser.parse_args(argv)
     workload = Workload(task=a.task, scene=a.scene, motion=a.motion, num_envs=a.num_envs, device=a.device, decimation=8)

@@ -12,7 +12,8 @@ from surgical_marl.physics.skip import SKIPS, VARIABLE
 def main(argv: list[str] | None = None) -> None:
     """Print a row for each skip."""
     a, workload = parsed(__doc__, argv)
-    report("skip", measure(workload, a.only or list(SKIPS), a.repeats, VARIABLE), workload)
+    names = a.only or list(SKIPS)
+    report("skip", measure(workload, names, a.repeats, VARIABLE, a.processes), workload)
 
 
 if __name__ == "__main__":

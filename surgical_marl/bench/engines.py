@@ -84,9 +84,14 @@ def _batched(name: str, workload: Workload, course: Course) -> Contender:
     return Contender(count, workload.where, compile_s, *clocks, stride, _bytes_per_env(batch.engine))
 
 
-def clock_of(batch: BatchedEnv, actions: list[Any]) -> Clock:
-    """Return the clock of a batch that is stepped by some actions in turn."""
-    return _clock(_through(batch, actions), batch.engine, _cycle(len(actions), batch.env.decimation))
+def clock_of(batch: BatchedEnv, actions: list[Any], begin: Callable[[], None] | None = None) -> Clock:
+    """Return the clock of a batch that is stepped by some actions in turn.
+
+    `begin` puts its environments back to their starts before every cycle. Where jaws hold objects it is needed: new
+    episodes have nothing in them.
+    """
+    step, cycle = _through(batch, actions), _cycle(len(actions), batch.env.decimation)
+    return _clock(_beginning(step, begin, cycle) if begin else step, batch.engine, cycle)
 
 
 def _beginning(step: Callable[[], None], begin: Callable[[], None], every: int) -> Callable[[], None]:
