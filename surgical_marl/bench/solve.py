@@ -116,6 +116,8 @@ class Solution:
     evaluations: int
     exam: Exam
     """The last evaluation."""
+    best_success: float
+    """The highest success of all evaluations."""
     num_envs: int
     engine: str
     device: str
@@ -174,6 +176,7 @@ def solve(
         env_steps=training.iteration * settings.num_envs * settings.steps_per_iteration,
         evaluations=len(exams),
         exam=exams[-1],
+        best_success=max(exam.success for exam in exams),
         num_envs=settings.num_envs,
         engine=env.engine.name,
         device=str(env.device),
@@ -272,7 +275,8 @@ def run(settings: Settings, goal: Goal, limit: float, as_json: bool = False) -> 
 def summary(settings: Settings, goal: Goal, found: Solution) -> str:
     """Return a solution as JSON, with the settings that it was found with."""
     values = {**asdict(found), **asdict(found.times), **asdict(found.exam)}
-    about = {name: getattr(settings, name) for name in ("task", "scene", "algo", "seed", "control", "difficulty")}
+    named = ("task", "scene", "algo", "seed", "control", "control_frame", "difficulty")
+    about = {name: getattr(settings, name) for name in named}
     del values["times"], values["exam"]
     return json.dumps({**about, "goal": asdict(goal), **values, **machine.machine()})
 

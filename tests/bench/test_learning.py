@@ -97,6 +97,7 @@ def test_solved_as_json(fakes: None, monkeypatch: pytest.MonkeyPatch, capsys: py
     assert sum(found[part] for part in parts) == pytest.approx(found["seconds"])
     assert found["env_steps"] == 32 * 4 * found["iterations"]
     assert found["evaluations"] == 1 and "within 2 mm" in err
+    assert found["best_success"] == found["success_2mm"] and found["control_frame"] == "base"
 
 
 def test_given_up(fakes: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
