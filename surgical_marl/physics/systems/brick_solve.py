@@ -1,0 +1,234 @@
+"""One implicit step of soft tissue: the balance of all forces on its nodes, by conjugate gradients.
+
+A step linearises once, about the state at its start, and solves for the displacements u of the nodes
+
+    (mass / dt^2 + (1 + damping / dt) K + springs) u = mass (v / dt + gravity) + forces at the start
+
+from u = dt v, with the inverse of each node's own block [3, 3] as preconditioner. Nothing is assembled: a product with
+K is a loop over bricks. Loops over bricks and nodes are scans, since the fused engine keeps these as loops.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from surgical_marl.physics.systems.brick import FULL, LOWER, Brick, Cell, inverse_symmetric
+from surgical_marl.physics.systems.brick_grid import BrickGrid
+
+
+class Nodes(NamedTuple):
+    """The motion of n nodes."""
+
+    position: Array
+    """m, [n, 3]"""
+    velocity: Array
+    """m/s, [n, 3]"""
+
+
+class Support(NamedTuple):
+    """What holds the nodes: constants, [n]."""
+
+    fixed: np.ndarray
+    """Which do not move, bool."""
+    stiffness: np.ndarray
+    """Of a spring to the place at rest, N/m; 0 for none."""
+
+
+class Springs(NamedTuple):
+    """Linear springs at c points of the tissue, of which the first `used` are there."""
+
+    nodes: Array
+    """On which each point hangs, [c, 4]."""
+    weights: Array
+    """Shares of these nodes, [c, 4]."""
+    force: Array
+    """On the point without displacement, N, [c, 3]."""
+    stiffness: Array
+    """By how much it falls as the point moves, N/m, lower half, [c, 6]."""
+    used: Array
+    """[]"""
+
+
+class Linear(NamedTuple):
+    """A step's linear equations without springs: matrix times displacement is the force."""
+
+    cells: Cell
+    """Of every brick, [e, ...]."""
+    force: Array
+    """Right side: all forces at the start, and mass times v / dt, N, [n, 3]."""
+    block: Array
+    """Each node's own block of the matrix, N/m, lower half, [n, 6]."""
+    inertia: Array
+    """The part of it that is not elastic, N/m, [n]."""
+    guess: Array
+    """Displacement that the velocity at the start would give, m, [n, 3]."""
+
+
+class BrickSolver:
+    """The constants of a mesh of bricks, and its implicit step."""
+
+    gravity = np.array([0.0, 0.0, -9.81], np.float32)
+    """m/s2"""
+
+    def __init__(
+        self,
+        grid: BrickGrid,
+        brick: Brick,
+        support: Support,
+        damping: float = 0.0,
+        drag: float = 0.0,
+        iterations: int = 8,
+    ) -> None:
+        """Collect the constants.
+
+        Args:
+            grid: mesh.
+            brick: element.
+            support: of the borders.
+            damping: s; the force of damping is this times K times the velocity.
+            drag: force of what is around per mass and velocity, 1/s.
+            iterations: of conjugate gradients.
+        """
+        self.grid, self.brick, self.support, self.iterations = grid, brick, support, iterations
+        self.damping, self.drag = damping, drag
+        self.free = (~support.fixed & (grid.mass > 0)).astype(np.float32)
+
+    def linearise(self, state: Nodes, dt: Any) -> Linear:
+        """Return the forces on nodes and their derivatives."""
+        grid, blend = self.grid, 1 + self.damping / dt
+
+        def begin(row: Any) -> tuple[Array, Array, Array, Array]:
+            mass, support, free, x, rest, v = row
+            inertia = mass * (1 / dt**2 + self.drag / dt) + support
+            block = inertia * jnp.array([1.0, 0.0, 1.0, 0.0, 0.0, 1.0])
+            return mass * (v / dt + self.gravity) - support * (x - rest), block, inertia, free * dt * v
+
+        def add(sums: tuple[Array, Array], first: Array) -> tuple[tuple[Array, Array], Cell]:
+            nodes = first + jnp.asarray(grid.offsets)
+            cell, forces = self.brick.deformed(state.position[nodes])
+            own = blend * (cell.turn @ jnp.asarray(self.brick.diagonal) @ cell.turn.T)
+            force, block = sums
+            force = force.at[nodes].add(forces, mode="promise_in_bounds")
+            block = block.at[nodes].add(own[:, *LOWER], mode="promise_in_bounds")
+            return (force, block), cell
+
+        rows = (*self._constants, state.position, jnp.asarray(grid.rest), state.velocity)
+        force, block, inertia, guess = jax.lax.map(begin, rows)
+        (force, block), cells = jax.lax.scan(add, (force, block), jnp.asarray(grid.first))
+        return Linear(cells, force, block, inertia, guess)
+
+    @property
+    def _constants(self) -> tuple[Array, Array, Array]:
+        """Mass, stiffness of the support and freedom (0 or 1) of each node, [n]."""
+        return jnp.asarray(self.grid.mass), jnp.asarray(self.support.stiffness), jnp.asarray(self.free)
+
+    def displacements(self, linear: Linear, springs: Springs | None, dt: Any) -> Array:
+        """Return the displacements of the nodes in a step, m, [n, 3]."""
+        free, right, block = jnp.asarray(self.free), linear.force, linear.block
+        if springs is not None:
+            right, block = _with_springs(springs, right, block)
+        inverse = jax.lax.map(lambda lower: inverse_symmetric(lower[FULL])[LOWER], block)
+
+        def matrix(p: Array, sums: Array) -> Array:
+            """Return the matrix times p, [n, 3], in the rows of `sums`, which hold inertia times p."""
+            sums = self._elastic(linear.cells, p, sums, dt)
+            return sums if springs is None else _springs_times(springs, p, sums)
+
+        def begin(sum_: Array, row: Any) -> tuple[Array, Any]:
+            right, moved, free, inverse, inertia = row
+            residual = free * (right - moved)
+            p = inverse[FULL] @ residual
+            return sum_ + residual @ p, (residual, p, inertia * p)
+
+        start = jax.lax.map(lambda row: row[0] * row[1], (linear.inertia, linear.guess))
+        rows = right, matrix(linear.guess, start), free, inverse, linear.inertia
+        rz, (residual, p, ap) = jax.lax.scan(begin, jnp.float32(0.0), rows)
+
+        def iterate(_: Any, found: tuple[Array, ...]) -> tuple[Array, ...]:
+            u, residual, p, ap, rz = found
+
+            def project(sum_: Array, row: Any) -> tuple[Array, Array]:
+                own, p, free = row
+                own *= free
+                return sum_ + own @ p, own
+
+            pap, ap = jax.lax.scan(project, jnp.float32(0.0), (matrix(p, ap), p, free))
+            length = rz / jnp.maximum(pap, 1e-30)
+
+            def advance(sum_: Array, row: Any) -> tuple[Array, Any]:
+                u, residual, p, ap, inverse = row
+                residual -= length * ap
+                return sum_ + residual @ (inverse[FULL] @ residual), (u + length * p, residual)
+
+            after, (u, residual) = jax.lax.scan(advance, jnp.float32(0.0), (u, residual, p, ap, inverse))
+            share = after / jnp.maximum(rz, 1e-30)
+
+            def turn(row: Any) -> tuple[Array, Array]:
+                residual, p, inverse, inertia = row
+                p = inverse[FULL] @ residual + share * p
+                return p, inertia * p
+
+            p, ap = jax.lax.map(turn, (residual, p, inverse, linear.inertia))
+            return u, residual, p, ap, after
+
+        found: Array = jax.lax.fori_loop(0, self.iterations, iterate, (linear.guess, residual, p, ap, rz))[0]
+        return found
+
+    def _elastic(self, cells: Cell, p: Array, sums: Array, dt: Any) -> Array:
+        """Return sums [n, 3] with the elastic part of the matrix times p, [n, 3]."""
+        blend = 1 + self.damping / dt
+
+        def add(sums: Array, row: Any) -> tuple[Array, None]:
+            first, cell = row
+            nodes = first + jnp.asarray(self.grid.offsets)
+            fall = blend * self.brick.product(cell, p[nodes])
+            return sums.at[nodes].add(fall, mode="promise_in_bounds"), None
+
+        found: Array = jax.lax.scan(add, sums, (jnp.asarray(self.grid.first), cells))[0]
+        return found
+
+    def moved(self, state: Nodes, u: Array, dt: Any) -> Nodes:
+        """Return the nodes after displacements u, m, [n, 3]."""
+        found: Nodes = jax.lax.map(lambda row: Nodes(row[0] + row[1], row[1] / dt), (state.position, u))
+        return found
+
+    def step(self, state: Nodes, dt: Any, springs: Springs | None = None) -> Nodes:
+        """Return the state after a step in which nothing but its supports, its weight and springs act."""
+        return self.moved(state, self.displacements(self.linearise(state, dt), springs, dt), dt)
+
+
+def _each(springs: Springs, of: Callable[[Any, Any], Any], start: Any) -> Any:
+    def add(row: Array, sums: Any) -> Any:
+        return of(jax.tree.map(lambda x: x[row], springs._replace(used=springs.force)), sums)
+
+    return jax.lax.fori_loop(0, springs.used, add, start)
+
+
+def _with_springs(springs: Springs, right: Array, block: Array) -> tuple[Array, Array]:
+    def add(own: Any, sums: tuple[Array, Array]) -> tuple[Array, Array]:
+        right, block = sums
+        for node, weight in zip(own.nodes, own.weights, strict=True):
+            right = right.at[node].add(weight * own.force, mode="promise_in_bounds")
+            block = block.at[node].add(weight * weight * own.stiffness, mode="promise_in_bounds")
+        return right, block
+
+    found: tuple[Array, Array] = _each(springs, add, (right, block))
+    return found
+
+
+def _springs_times(springs: Springs, p: Array, out: Array) -> Array:
+    def add(own: Any, out: Array) -> Array:
+        moved = own.weights @ p[own.nodes]
+        force = own.stiffness[FULL] @ moved
+        for node, weight in zip(own.nodes, own.weights, strict=True):
+            out = out.at[node].add(weight * force, mode="promise_in_bounds")
+        return out
+
+    found: Array = _each(springs, add, out)
+    return found
