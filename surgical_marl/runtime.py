@@ -193,7 +193,9 @@ class _Lazy(types.ModuleType):
 # To import JAX takes most of a second, and an environment whose kernel is in the cache never calls it.
 if TYPE_CHECKING:
     import jax as jax
-    import jax.numpy as jnp
+    import jax.numpy
+
+    jnp = jax.numpy
 else:
     jax, jnp = _Lazy("jax"), _Lazy("jax.numpy")
 

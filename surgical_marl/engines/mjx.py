@@ -249,7 +249,7 @@ class MjxEngine:
         if library == "torch":
             import torch
 
-            return jax.tree.map(torch.from_dlpack, tree)
+            return jax.tree.map(torch.utils.dlpack.from_dlpack, tree)
         return jax.tree.map(np.asarray, tree)
 
 

@@ -23,10 +23,10 @@ from surgical_marl.robots.inverse_kinematics import inverse_kinematics
 from surgical_marl.robots.spec import COLLISION_GROUP, build_spec
 from surgical_marl.scenes.build import set_physics
 from surgical_marl.scenes.contact_count import crowding
-from surgical_marl.scenes.contacts import collision_geoms, neighbours
+from surgical_marl.scenes.contacts import neighbours
 from surgical_marl.scenes.load import load_scene
 from surgical_marl.scenes.objects import load_object
-from surgical_marl.scenes.scene import Scene
+from surgical_marl.scenes.scene import Scene, collision_geoms
 from surgical_marl.scenes.timing import TIMESTEP
 from surgical_marl.untrusted.files import is_file, is_folder, user_path
 from surgical_marl.untrusted.schema import Faults

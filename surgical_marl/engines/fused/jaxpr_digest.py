@@ -99,4 +99,4 @@ class _Digest:
 
 
 def _is_key(value: Any) -> bool:
-    return bool(jax.dtypes.issubdtype(value.dtype, jax.dtypes.prng_key))
+    return bool(jax.numpy.issubdtype(value.dtype, jax.dtypes.prng_key))

@@ -317,7 +317,7 @@ def _of_key(function: Callable[..., Any], *more: Any) -> Any:
 
 
 def _is_key(aval: Any) -> bool:
-    return bool(jax.dtypes.issubdtype(aval.dtype, jax.dtypes.prng_key))
+    return bool(jax.numpy.issubdtype(aval.dtype, jax.dtypes.prng_key))
 
 
 def _row(g: Graph, x: AnyArray | Table, i: int) -> AnyArray:

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from surgical_marl.physics.contact.contact_model import CREEP, FASTEST, FIRM, SHEAR
+from surgical_marl.physics.contact.contact_model import CREEP, FASTEST, FIRM
 from surgical_marl.physics.contact.contact_patch import AWAY, tangents
 from surgical_marl.physics.contact.friction_cone import (
     Cone,
@@ -24,7 +24,7 @@ from surgical_marl.physics.contact.friction_cone import (
     stretched,
     wrench,
 )
-from surgical_marl.physics.contact.grips import DAMPING
+from surgical_marl.physics.contact.grips import DAMPING, SHEAR
 from surgical_marl.physics.solver.cholesky import cholesky, forward, packed, solve_factored
 from surgical_marl.physics.solver.newton import line_search, newton
 from surgical_marl.physics.systems.system import Ends, Loads

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,6 +13,18 @@ from surgical_marl.robots.rotation import matrix_of, quaternion
 from surgical_marl.view.hand import Hand
 from surgical_marl.view.movers import YOU
 from surgical_marl.view.session import Session
+
+if TYPE_CHECKING:
+    from viser import (
+        CommandEvent,
+        GuiButtonGroupHandle,
+        GuiEvent,
+        GuiFolderHandle,
+        GuiInputHandle,
+        GuiTabHandle,
+        TransformControlsEvent,
+        ViserServer,
+    )
 
 Ask = Callable[[Callable[[], None]], None]
 """Lets the thread that steps do something."""
@@ -35,10 +47,12 @@ _QUIET = 0.5
 class Arms:
     """The part of the page that says who moves each arm."""
 
-    def __init__(self, server: Any, folder: Any, session: Session, ask: Ask, offset: np.ndarray) -> None:
+    def __init__(
+        self, server: ViserServer, folder: GuiTabHandle, session: Session, ask: Ask, offset: np.ndarray
+    ) -> None:
         self._server, self._session, self._ask, self._offset = server, session, ask, offset
         self._menus: dict[str, Any] = {}
-        self._folders: dict[str, Any] = {}
+        self._folders: dict[str, GuiFolderHandle] = {}
         self._controls: dict[str, Controls] = {}
         self._told = dict(session.movers.who)
         """Movers of the arms as the menus show them."""
@@ -83,7 +97,7 @@ class Arms:
         arms = gui.add_button_group("moves", agents if len(agents) == 1 else (*agents, ALL))
 
         @arms.on_click
-        async def _(event: Any) -> None:
+        async def _(event: GuiEvent[GuiButtonGroupHandle]) -> None:
             if event.client is not None:
                 run, chosen = str(name.value).strip(), str(arms.value)
                 self._ask(lambda: self._let_run(run, agents if chosen == ALL else [chosen]))
@@ -99,9 +113,9 @@ class Arms:
         """Let keys move the first arm that a person moves."""
         gui = self._server.gui
 
-        def bind(key: str, label: str, act: Callable[[Hand], None]) -> None:
+        def bind(key: Any, label: str, act: Callable[[Hand], None]) -> None:
             @gui.add_command(label, hotkey=key).on_trigger
-            async def _(_: Any) -> None:
+            async def _(_: CommandEvent) -> None:
                 self._ask(lambda: self._with_first(act))
 
         def nudge(step: tuple[float, float, float]) -> Callable[[Hand], None]:
@@ -121,7 +135,9 @@ class Arms:
 class Controls:
     """Controls by which a person moves one arm."""
 
-    def __init__(self, server: Any, folder: Any, hand: Hand, ask: Ask, number: int, offset: np.ndarray) -> None:
+    def __init__(
+        self, server: ViserServer, folder: GuiFolderHandle, hand: Hand, ask: Ask, number: int, offset: np.ndarray
+    ) -> None:
         self._hand, self._ask, self._offset = hand, ask, offset
         self._used = 0.0
         lower, upper = hand.limits
@@ -135,7 +151,7 @@ class Controls:
         self._handle = server.scene.add_transform_controls(f"/handle/{number}", scale=0.06, depth_test=False)
 
         @self._handle.on_update
-        async def _(event: Any) -> None:
+        async def _(event: TransformControlsEvent) -> None:
             position, turn = np.array(event.target.position), matrix_of(np.array(event.target.wxyz))
             self._use(lambda: self._hand.reach(position - self._offset, turn))
 
@@ -163,24 +179,24 @@ class Controls:
         self._used = time.monotonic()
         self._ask(act)
 
-    def _slider(self, server: Any, index: int, name: str, lower: float, upper: float) -> Any:
+    def _slider(self, server: ViserServer, index: int, name: str, lower: float, upper: float) -> Any:
         value = round(float(np.clip(self._hand.q[index], lower, upper)), _DIGITS)
         step = 10.0**-_DIGITS
         slider = server.gui.add_slider(name, min=lower, max=upper, step=step, initial_value=value)
         _let(slider, self._use, lambda wanted: self._hand.set_joint(index, float(wanted)))
         return slider
 
-    def _jaw_box(self, server: Any) -> Any:
+    def _jaw_box(self, server: ViserServer) -> Any:
         box = server.gui.add_checkbox("jaw open", initial_value=self._hand.jaw_open, hint=f"key {JAW_KEY}")
         _let(box, self._ask, lambda wanted: setattr(self._hand, "jaw_open", bool(wanted)))
         return box
 
 
-def _let(control: Any, ask: Ask, act: Callable[[Any], None]) -> None:
+def _let(control: GuiInputHandle[Any], ask: Ask, act: Callable[[Any], None]) -> None:
     """Let a control, whenever a person uses it, ask to act on the value that it then has."""
 
     @control.on_update
-    async def _(event: Any) -> None:
+    async def _(event: GuiEvent[Any]) -> None:
         if event.client is not None:
             value = control.value
             ask(lambda: act(value))

@@ -20,6 +20,8 @@ from surgical_marl.view.shading import AGENTS, GOAL_RADIUS, materials
 from surgical_marl.view.stage import paint
 
 if TYPE_CHECKING:
+    from viser import ViserServer
+
     from surgical_marl.envs.batch import BatchedEnv
 
 
@@ -66,7 +68,7 @@ def segments(points: np.ndarray) -> np.ndarray:
 class Nodes:
     """The nodes of a session in viser's scene. Their names are numbers: names of agents might hold anything."""
 
-    def __init__(self, server: Any, session: Session) -> None:
+    def __init__(self, server: ViserServer, session: Session) -> None:
         self._scene, self._session = server.scene, session
         env = session.env
         first = session.moment()
@@ -159,7 +161,7 @@ class Nodes:
             own = each if marks == arms and env.task.has_targets else np.tile(GOLD, (marks, 1))
             self._marks = self._balls("/targets", moment.marks, np.tile(own, (count, 1)), GOAL_RADIUS, 0.75)
         ring = trimesh.creation.torus(0.009, 0.0014, major_sections=32, minor_sections=10)
-        self._trocars = []
+        self._trocars: list[Any] = []
         for arm, (agent, mount) in enumerate(env.scene.mounts.items()):
             if mount.arm.remote_center:
                 self._trocars.append(
@@ -198,7 +200,7 @@ class Nodes:
         self._trails, self._lines, self._ways = line("/trails", 3.0), line("/distance", 2.5), line("/paths", 1.5)
 
         def arrows(name: str, shaft: float) -> Any:
-            size = {"shaft_radius": shaft, "head_radius": 2.5 * shaft, "head_length": 5 * shaft}
+            size: Any = {"shaft_radius": shaft, "head_radius": 2.5 * shaft, "head_length": 5 * shaft}
             return self._scene.add_arrows(name, _NONE, np.zeros((0, 3), np.uint8), **size)
 
         self._arrows, self._presses = arrows("/contacts", 0.0012), arrows("/grips", 0.0008)

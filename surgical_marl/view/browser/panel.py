@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Coroutine, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,6 +17,9 @@ from surgical_marl.view.browser.nodes import PARTS, Nodes
 from surgical_marl.view.history import summary
 from surgical_marl.view.session import Pace, Session
 from surgical_marl.view.take import MOST_ENVS
+
+if TYPE_CHECKING:
+    from viser import CommandEvent, GuiEvent, GuiInputHandle, GuiTabHandle, ViserServer
 
 _WHOLE = "font-size:0.8em;padding:0 1em 0.8em;overflow-wrap:anywhere"
 _CELL = "padding:1px 8px 1px 0;vertical-align:top"
@@ -37,7 +40,7 @@ class Choice:
     difficulty: str
     num_envs: int
     max_steps: int
-    """Of an episode."""
+    """Control steps of an episode."""
 
 
 class Panel:
@@ -50,7 +53,9 @@ class Panel:
         ask: lets the thread that steps do something.
     """
 
-    def __init__(self, server: Any, session: Session, pace: Pace, ask: Callable[[Callable[[], None]], None]) -> None:
+    def __init__(
+        self, server: ViserServer, session: Session, pace: Pace, ask: Callable[[Callable[[], None]], None]
+    ) -> None:
         self._gui, self._session, self._pace, self._ask = server.gui, session, pace, ask
         self._told = session.seed
         """The seed that the page was last told."""
@@ -64,7 +69,7 @@ class Panel:
             self._told = self._session.seed
             self._seed.value = self._told
 
-    def add_parts(self, folder: Any, nodes: Nodes) -> None:
+    def add_parts(self, folder: GuiTabHandle, nodes: Nodes) -> None:
         """Add a box for each part of the scene that can be hidden."""
 
         def box(part: str) -> None:
@@ -79,7 +84,7 @@ class Panel:
         gui, pace = self._gui, self._pace
         buttons = gui.add_button_group("time", (GO, STEP, RESET), hint="keys: space, N, R")
         speed = gui.add_dropdown("speed", SPEEDS, initial_value=f"{pace.speed:g}")
-        self._seed = gui.add_number("seed", self._told, min=0, max=2**31 - 1, step=1)
+        self._seed: Any = gui.add_number("seed", self._told, min=0, max=2**31 - 1, step=1)
 
         def turn() -> None:
             pace.paused = not pace.paused
@@ -92,20 +97,21 @@ class Panel:
             self._session.reset(int(self._seed.value))
 
         acts = {GO: turn, STEP: single, RESET: begin}
-        for (name, act), key in zip(acts.items(), ("space", "N", "R"), strict=True):
+        keys: Any = ("space", "N", "R")
+        for (name, act), key in zip(acts.items(), keys, strict=True):
             gui.add_command(name, hotkey=key).on_trigger(self._then(act))
         buttons.on_click(self._then(lambda: acts[buttons.value]()))
         speed.on_update(self._then(lambda: setattr(pace, "speed", float(speed.value))))
         self._seed.on_update(self._then(begin))
 
-    def add_menus(self, folder: Any, choose: Callable[[Choice], None]) -> None:
+    def add_menus(self, folder: GuiTabHandle, choose: Callable[[Choice], None]) -> None:
         """Add the menus of what is looked at; `choose` looks at something else."""
         with folder:
             chosen, menus = self._make_menus()
         for menu in menus:
             menu.on_update(self._then(lambda: choose(chosen())))
 
-    def _make_menus(self) -> tuple[Callable[[], Choice], list[Any]]:
+    def _make_menus(self) -> tuple[Callable[[], Choice], list[GuiInputHandle[Any]]]:
         """Return what says what the menus say, and the menus."""
         env, gui = self._session.env, self._gui
         scene = self._session.settings.scene
@@ -128,10 +134,10 @@ class Panel:
 
         return chosen, [task, place, level, count, length]
 
-    def _then(self, act: Callable[[], None]) -> Callable[[Any], Any]:
+    def _then(self, act: Callable[[], None]) -> Callable[[Any], Coroutine[Any, Any, None]]:
         """Return a callback of viser that lets the stepping thread act, when it was a person who caused it."""
 
-        async def callback(event: Any) -> None:
+        async def callback(event: GuiEvent[Any] | CommandEvent) -> None:
             if event.client is not None:
                 self._ask(act)
 

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from surgical_marl.scenes.poses import Poses
 from surgical_marl.view.session import Session
+
+if TYPE_CHECKING:
+    from viser import GuiImageHandle, GuiTabHandle, ViserServer
+
+    from surgical_marl.vision.endoscope import Endoscope
 
 SIZE = 192
 """Pixels along each side of the endoscope's picture."""
@@ -19,10 +24,10 @@ _FAR = 0.25
 class Pictures:
     """The pictures of the first environment of a session; none in a scene without an endoscope."""
 
-    def __init__(self, server: Any, folder: Any, session: Session) -> None:
+    def __init__(self, server: ViserServer, folder: GuiTabHandle, session: Session) -> None:
         self._gui, self._folder, self._session = server.gui, folder, session
-        self._handles: dict[str, Any] = {}
-        self._endoscope: Any = None
+        self._handles: dict[str, GuiImageHandle] = {}
+        self._endoscope: Endoscope | None = None
         scene = session.env.scene
         if any(mount.arm.camera is not None for mount in scene.mounts.values()):
             from surgical_marl.vision.endoscope import Endoscope

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from surgical_marl.view.browser.nodes import colour
 from surgical_marl.view.history import REWARD, History
+
+if TYPE_CHECKING:
+    from viser import GuiTabHandle, GuiUplotHandle, ViserServer
 
 _TERMS = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#8c564b", "#e377c2", "#17becf", "#bcbd22", "#7f7f7f", "#ff7f0e")
 _HEIGHT = 150
@@ -68,9 +71,9 @@ def _grips(history: History, colours: Sequence[str]) -> dict[str, list[Curve]]:
 class Plots:
     """The plots of a session on the page. They appear with the first numbers."""
 
-    def __init__(self, server: Any, folder: Any) -> None:
+    def __init__(self, server: ViserServer, folder: GuiTabHandle) -> None:
         self._gui, self._folder = server.gui, folder
-        self._handles: dict[str, Any] = {}
+        self._handles: dict[str, GuiUplotHandle] = {}
 
     def draw(self, history: History) -> None:
         """Show the last steps."""
@@ -84,15 +87,15 @@ class Plots:
             else:
                 self._handles[title] = self._make(title, data, lines)
 
-    def _make(self, title: str, data: tuple[np.ndarray, ...], lines: Sequence[Curve]) -> Any:
-        series = ({"label": "s"}, *map(_series, lines))
+    def _make(self, title: str, data: tuple[np.ndarray, ...], lines: Sequence[Curve]) -> GuiUplotHandle:
+        series: Any = ({"label": "s"}, *map(_series, lines))
         with self._folder:
             return self._gui.add_uplot(
                 data, series, title=title, scales={"x": {"time": False}}, height=_HEIGHT, legend={"show": True}
             )
 
 
-def _series(line: Curve) -> dict[str, Any]:
+def _series(line: Curve) -> Any:
     """Return how uPlot draws a line."""
     if line.shaded:
         return {"label": line.label, "stroke": line.colour, "fill": f"{line.colour}40", "width": 0}

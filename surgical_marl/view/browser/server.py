@@ -20,7 +20,10 @@ import io
 import secrets
 import socket
 from collections.abc import Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from viser import ViserServer
 
 HOST = "127.0.0.1"
 
@@ -31,7 +34,7 @@ def check_viser() -> None:
         raise ValueError("the viewer needs the package viser: pip install 'surgical-marl[view]'")
 
 
-def open_server(port: int) -> tuple[Any, str]:
+def open_server(port: int) -> tuple[ViserServer, str]:
     """Start viser on a port, 0 for any that is free, and return its server and the address of the page.
 
     Raises:
@@ -62,7 +65,7 @@ def check_port(port: int) -> None:
     _bind(port).close()
 
 
-def close_server(server: Any) -> None:
+def close_server(server: ViserServer) -> None:
     """Stop a server of viser, without a word."""
     with contextlib.redirect_stdout(io.StringIO()):
         server.stop()

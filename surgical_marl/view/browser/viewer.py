@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from threading import Event
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -26,6 +26,9 @@ from surgical_marl.view.browser.pictures import Pictures
 from surgical_marl.view.browser.plots import Plots
 from surgical_marl.view.browser.server import close_server, open_server
 from surgical_marl.view.session import Pace, Session
+
+if TYPE_CHECKING:
+    from viser import InitialCameraConfig, ViserServer
 
 FPS = 30.0
 """Times a second that the scene is drawn."""
@@ -166,7 +169,7 @@ def _choice(session: Session) -> Choice:
     return Choice(settings.task, settings.scene, settings.difficulty, env.num_envs, env.max_steps)
 
 
-def _settings(choice: Choice, old: Session) -> tuple[Settings, Any]:
+def _settings(choice: Choice, old: Session) -> tuple[Settings, dict[str, str] | None]:
     """Return the settings of what is chosen, and who moves its arms.
 
     A task that was just chosen brings a scene of its own if it is not meant for the old one.
@@ -181,7 +184,7 @@ def _settings(choice: Choice, old: Session) -> tuple[Settings, Any]:
     return Settings(choice.task, scene, difficulty=difficulty, seed=old.seed), None
 
 
-def _aim(camera: Any, session: Session) -> None:
+def _aim(camera: InitialCameraConfig, session: Session) -> None:
     """Let a camera look at all tool tips from where no arm stands: from across the bases of the arms."""
     tips = session.moment().tips.mean((0, 1))
     stat, count = session.env.scene.model.stat, session.env.num_envs
@@ -194,7 +197,7 @@ def _aim(camera: Any, session: Session) -> None:
     camera.fov = float(np.deg2rad(50))
 
 
-def _light(server: Any) -> None:
+def _light(server: ViserServer) -> None:
     """Light the scene like a room, without files from elsewhere."""
     server.scene.set_up_direction("+z")
     server.scene.configure_environment_map(None)
