@@ -22,7 +22,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from surgical_marl.files import writable, write_atomic
+from surgical_marl.files import writable, write_npz
 from surgical_marl.runtime import cache_dir
 
 PACKAGE = __name__.partition(".")[0]
@@ -73,7 +73,7 @@ def cached_arrays(
         arrays = compute()
         with contextlib.suppress(OSError):
             path.parent.mkdir(parents=True, exist_ok=True)
-            write_atomic(path, lambda part: _save(part, arrays))
+            write_npz(path, arrays, compressed=False)
     return arrays
 
 
@@ -90,11 +90,6 @@ def locked(path: Path) -> Iterator[None]:
             path.parent.mkdir(parents=True, exist_ok=True)
             held.enter_context(FileLock(path.with_name(f".{path.name}.lock")))
         yield
-
-
-def _save(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    with path.open("wb") as file:  # a name without .npz would get one
-        np.savez(file, **arrays)  # type: ignore[arg-type]  # the one option is no array's name
 
 
 def _load(path: Path) -> dict[str, np.ndarray] | None:

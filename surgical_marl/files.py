@@ -10,8 +10,12 @@ import re
 import shutil
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import numpy as np
 
 _ROOM = 64_000_000
 """Bytes that a folder for a cache must have room for, which is more than any file in it."""
@@ -41,6 +45,17 @@ def write_atomic(path: Path, write: Callable[[Path], object]) -> None:
 def write_text(path: Path, text: str) -> None:
     """Write a text in UTF-8, as `write_atomic` writes a file."""
     write_atomic(path, lambda part: part.write_text(text, encoding="utf-8"))
+
+
+def write_npz(path: Path, arrays: Mapping[str, np.ndarray], compressed: bool = True) -> None:
+    """Write arrays by name as an npz file, as `write_atomic` writes a file."""
+    import numpy as np
+
+    def write(part: Path) -> None:
+        with part.open("wb") as file:  # a name without .npz would get one
+            (np.savez_compressed if compressed else np.savez)(file, **arrays)  # type: ignore[arg-type]
+
+    write_atomic(path, write)
 
 
 def remove_temporaries(folder: Path) -> None:

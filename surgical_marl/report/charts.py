@@ -19,7 +19,6 @@ import numpy as np
 from markupsafe import Markup
 from matplotlib import rc_context
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, FuncFormatter, LogLocator, MaxNLocator, MultipleLocator, NullFormatter
 
@@ -167,7 +166,6 @@ class Drawing:
 def _axes(x_label: str, height: int, left: float) -> tuple[Figure, Axes]:
     with rc_context(_STYLE):
         figure = Figure(figsize=(WIDTH / 72, height / 72))
-        FigureCanvasSVG(figure)
         figure.patch.set_visible(False)
         below, above = (40 if x_label else 26), 10
         axis = figure.add_axes((left, below / height, 0.97 - left, 1 - (below + above) / height))

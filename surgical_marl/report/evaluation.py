@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from surgical_marl.evaluation.interval import interval
-from surgical_marl.evaluation.metrics import HOLD, STAGE, THRESHOLDS_MM, Metric, success
+from surgical_marl.evaluation.metrics import HOLD, STAGE, THRESHOLDS_MM, Metric, mean_of_known, success
 from surgical_marl.report.charts import SHARE, Chart, Drawing, Line, Scale, Text, percent, plain
 from surgical_marl.report.groups import Group, stacked
 
@@ -80,7 +80,7 @@ def _threshold(drawing: Drawing, series: Sequence[Series], following: bool) -> C
     grid = np.unique([*np.geomspace(low, high, THRESHOLDS), *THRESHOLDS_MM])
     lines, columns, sentences = [], [], []
     for one in series:
-        metrics = [success(held[one.label], threshold)._replace(reduce=_known_mean) for threshold in grid]
+        metrics = [success(held[one.label], threshold)._replace(reduce=mean_of_known) for threshold in grid]
         value = np.array([_mean(metric) for metric in metrics])
         bounds = np.array([interval(metric) or (np.nan, np.nan) for metric in metrics])
         lines.append(Line(one.number, grid, value, (bounds[:, 0], bounds[:, 1])))
@@ -155,7 +155,7 @@ def _stages(drawing: Drawing, series: Sequence[Series], stages: Sequence[str]) -
     stages = [stage for stage in stages if all(f"{STAGE}{stage}" in one.measures for one in series)]
     if not stages:
         return None
-    metrics = [[Metric(one.measures[f"{STAGE}{s}"], _known_mean, share=True) for one in series] for s in stages]
+    metrics = [[Metric(one.measures[f"{STAGE}{s}"], mean_of_known, share=True) for one in series] for s in stages]
     values = np.array([[_mean(metric) for metric in row] for row in metrics])
     missing = np.full(2, np.nan)
     bounds = np.array([
@@ -180,9 +180,3 @@ def _cell(value: float, bounds: np.ndarray) -> str:
 
 def _mean(metric: Metric) -> float:
     return float(metric.reduce(metric.values.ravel()))
-
-
-def _known_mean(values: np.ndarray) -> np.ndarray:
-    known = np.isfinite(values)
-    with np.errstate(invalid="ignore"):
-        return np.where(known, values, 0.0).sum(-1) / known.sum(-1)

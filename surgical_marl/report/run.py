@@ -31,9 +31,9 @@ class Run:
     """A run or a shipped policy."""
 
     name: str
-    """Its folder's name."""
+    """Name of the folder."""
     given: str
-    """Its name on the command line."""
+    """Name of the run on the command line."""
     folder: Path
     config: Mapping[str, Any]
     """Dotted name -> setting."""

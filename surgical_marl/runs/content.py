@@ -36,7 +36,7 @@ class _Part(NamedTuple):
     user: str
     """The agent, or the object's name in the scene."""
     path: Path
-    """Its path."""
+    """Path of the arm's folder, or of the object's file."""
 
 
 def copy_content(scene: str, folder: Path) -> str:

@@ -22,7 +22,7 @@ PANELS = (
 )
 
 COLOURS = 128
-"""In the picture: nobody sees the difference, and the file is a third as large as with all."""
+"""Number of colours of the picture: nobody sees the difference, and the file is a third as large as with all."""
 
 
 def draw_curve(run: Path, title: str) -> None:

@@ -21,7 +21,7 @@ import numpy as np
 from surgical_marl.engines.choose import DeviceName
 from surgical_marl.engines.faults import checked
 from surgical_marl.envs.fault_place import fault_place
-from surgical_marl.files import write_atomic
+from surgical_marl.files import write_npz
 from surgical_marl.runs.content import found_scene, stored_scene
 from surgical_marl.runs.settings import Settings, make_env
 from surgical_marl.runtime import has_cuda
@@ -47,7 +47,7 @@ class Reproduced(NamedTuple):
     at: int | None
     """The first step, from 0, after which a number is not finite; None if all stay finite."""
     places: list[str]
-    """Their places then, in the order in which faults spread."""
+    """Places of the numbers that are not finite then, in the order in which faults spread."""
     told: str
     """Facts in the file: seed, environment and place."""
     device: str
@@ -86,12 +86,7 @@ def write_fault(
     content = {"about": np.array(json.dumps(about))}
     content |= {f"{_START}{name}": value for name, value in start.items()}
     content |= {f"actions/{agent}": np.asarray(own, np.float32) for agent, own in actions.items()}
-
-    def save(part: Path) -> None:
-        with part.open("wb") as file:
-            np.savez_compressed(file, **content)  # type: ignore[arg-type]
-
-    write_atomic(path, save)
+    write_npz(path, content)
 
 
 def read_fault(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]] | None:

@@ -32,7 +32,7 @@ SHORT = 20
 _NUMBERS = "{n_fmt}/{total_fmt} [{elapsed}<{remaining}{postfix}]"
 """Without tqdm's rate, for which a terminal of 80 columns has no room beside the figures."""
 _LAYOUTS = "{l_bar}{bar}| " + _NUMBERS, "{desc}" + _NUMBERS, _NUMBERS
-"""From the widest to the narrowest."""
+"""Layouts of a bar, from the widest to the narrowest."""
 _LINE = "{desc}{n_fmt} of {total_fmt} {unit}, {elapsed} done, {remaining} left{postfix}"
 
 
@@ -77,7 +77,7 @@ def preparing(what: str) -> Iterator[None]:
 
     Bad input is found sooner than that in most cases, and then there is only its error.
     """
-    timer = threading.Timer(PATIENCE, _say, (what,))
+    timer = threading.Timer(PATIENCE, say, (f"preparing {what}",))
     timer.daemon = True
     _waiting.append(timer)
     timer.start()
@@ -161,8 +161,9 @@ def _hush() -> None:
         timer.cancel()
 
 
-def _say(what: str) -> None:
-    print(f"surgical-marl: preparing {what}", file=sys.stderr, flush=True)
+def say(text: str) -> None:
+    """Write a line on stderr."""
+    print(f"surgical-marl: {text}", file=sys.stderr, flush=True)
 
 
 def _has_widgets() -> bool:

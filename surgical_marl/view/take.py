@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from surgical_marl.files import write_atomic
+from surgical_marl.files import write_npz
 from surgical_marl.runs.content import stored_scene
 from surgical_marl.runs.fault import PACKAGES, changed_versions, made_in
 from surgical_marl.runs.settings import Settings, make_env
@@ -81,12 +81,8 @@ class Take:
         content |= {f"{_START}{name}": value for name, value in self._start.items()}
         content |= {name: np.stack([step[name] for step in self._steps]) for name in self._steps[0]}
 
-        def save(part: Path) -> None:
-            with part.open("wb") as file:
-                np.savez_compressed(file, **content)  # type: ignore[arg-type]
-
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomic(path, save)
+        write_npz(path, content)
         return path
 
 
