@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from surgical_marl.tasks.base.world import World
 
 
+ERRORS = ("tip_error", "goal_error")
+"""Infos of how far a tool tip, or an object, is from its goal, m: readers take the first that there is."""
 NEAR = 0.005
 """Least distance between arms, m: half the clearance of targets (`workspace.CLEARANCE`), and the way that a tool at
 0.25 m/s moves in a control step."""

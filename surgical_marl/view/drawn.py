@@ -34,12 +34,12 @@ class Extra(NamedTuple):
     """A shape that is drawn but is no part of the model, and stands still."""
 
     kind: int
-    """Of `vision/rays.py`, or `PLANE`."""
+    """A kind of `vision/rays.py`, or `PLANE`."""
     size: tuple[float, float, float]
-    """As a geom of MuJoCo has it, m."""
+    """Size of a geom of MuJoCo, m."""
     place: Array
     axes: Array
-    """Its axes as columns, [3, 3]."""
+    """Axes of the shape as columns, [3, 3]."""
     material: Material
     casts: bool = True
     """True if it throws a shadow."""

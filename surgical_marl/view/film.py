@@ -8,25 +8,30 @@ The environments of a grid play at the same time, and each frame holds all of th
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from surgical_marl.content import unknown
-from surgical_marl.machine import cores
-from surgical_marl.runs.progress import progress
 from surgical_marl.view.history import summary
 from surgical_marl.view.moment import Observer
-from surgical_marl.view.record import FPS, HEIGHT, WIDTH, Pose, ScenePicture, played
+from surgical_marl.view.record import (
+    FPS,
+    HEIGHT,
+    WIDTH,
+    Picture,
+    Pose,
+    ScenePicture,
+    draw_in_threads,
+    played,
+    steps_per_frame,
+    write_film,
+)
 from surgical_marl.view.render import View
-from surgical_marl.view.video import write_video
 
 if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv
@@ -42,8 +47,6 @@ CLOSEST, FARTHEST = 0.001, 100.0
 """Distances of a camera, m."""
 MOST = 8
 """Rows and columns of a grid at most."""
-
-Picture = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
@@ -105,18 +108,9 @@ class Shot(NamedTuple):
 
 def film(env: BatchedEnv, movers: Movers, path: Path, look: Look, episodes: int = 1, seed: int = 0) -> Path:
     """Film the environments of `env`, as many as `look.grid` holds, and return the path of the film."""
-    every = _every(env, look)
-    bar = progress(-(-episodes * env.max_steps // every), "frame", "filming")
-
-    def shown() -> Iterator[Picture]:
-        for frame in pictures(env, movers, look, episodes, seed):
-            bar.update()
-            yield frame
-
-    try:
-        return write_video(path, shown(), 1 / (every * env.control_dt * look.slow))
-    finally:
-        bar.close()
+    every = steps_per_frame(env, look.fps * look.slow)
+    count, fps = -(-episodes * env.max_steps // every), 1 / (every * env.control_dt * look.slow)
+    return write_film(path, pictures(env, movers, look, episodes, seed), count, fps)
 
 
 def pictures(env: BatchedEnv, movers: Movers, look: Look, episodes: int = 1, seed: int = 0) -> Iterator[Picture]:
@@ -127,15 +121,10 @@ def pictures(env: BatchedEnv, movers: Movers, look: Look, episodes: int = 1, see
         seen = written(picture.draw(shot.pose, look.camera), shot.words)
         return seen if scope is None else np.concatenate([seen, scope(shot.pose)], 1)
 
-    most = cores()
-    drawn: deque[list[Future[Picture]]] = deque()
-    with ThreadPoolExecutor(most) as threads:  # a picture takes a tenth of a second of a core, without Python's lock
-        for shots in _shots(env, movers, look, picture, episodes, seed):
-            drawn.append([threads.submit(draw, shot) for shot in shots])
-            if len(drawn) > most:
-                yield _joined(drawn.popleft(), look)
-        while drawn:
-            yield _joined(drawn.popleft(), look)
+    def draw_all(shots: list[Shot]) -> Picture:
+        return wall(map(draw, shots), look.grid[1])
+
+    return draw_in_threads(draw_all, _shots(env, movers, look, picture, episodes, seed))
 
 
 def camera_of(text: str | None, env: BatchedEnv) -> str | View | None:
@@ -194,24 +183,15 @@ def _wrapped(line: str, font: Any, width: float) -> list[str]:
     return found
 
 
-def _joined(tiles: list[Future[Picture]], look: Look) -> Picture:
-    return wall((tile.result() for tile in tiles), look.grid[1])
-
-
 def _shots(
     env: BatchedEnv, movers: Movers, look: Look, picture: ScenePicture, episodes: int, seed: int
 ) -> Iterator[list[Shot]]:
     """Yield what each frame shows, while the environments play."""
-    every, steps = _every(env, look), episodes * env.max_steps
+    every, steps = steps_per_frame(env, look.fps * look.slow), episodes * env.max_steps
     for step, (infos, ended) in enumerate(played(env, movers.actions, movers.begin, steps, seed), 1):
         if step % every == 0 or ended.any():
             words = [_words(env, infos, index) if look.words else [] for index in range(env.num_envs)]
             yield [Shot(picture.pose(index), words[index]) for index in range(env.num_envs)]
-
-
-def _every(env: BatchedEnv, look: Look) -> int:
-    """Return how many control steps there are from one picture to the next."""
-    return max(1, round(1 / (look.fps * look.slow * env.control_dt)))
 
 
 def _words(env: BatchedEnv, infos: Any, index: int) -> list[str]:

@@ -16,6 +16,7 @@ import numpy as np
 from surgical_marl.envs.observations import proprioception
 from surgical_marl.policies.target_mover import TargetMover
 from surgical_marl.robots.inverse_kinematics import inverse_kinematics
+from surgical_marl.tasks.base.grasp_poses import tool_of
 
 if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv
@@ -98,10 +99,7 @@ class Hand:
 
     def tip(self) -> np.ndarray:
         """Return the wanted pose of the tool tip in the world, [4, 4]."""
-        pose = np.array(self._arm.forward_kinematics(self.q))
-        pose[:3, 3] = self.mount.rotation @ pose[:3, 3] + self.mount.position
-        pose[:3, :3] = self.mount.rotation @ pose[:3, :3]
-        return pose
+        return tool_of(self.mount, self.q)
 
     def __call__(self, observation: Any) -> np.ndarray:
         """Return the action [N, n] that moves commands towards what is wanted."""

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-ERRORS = ("tip_error", "goal_error")
-"""Infos of how far a tool tip, or an object, is from its goal, m: the first that there is counts."""
+from surgical_marl.envs.infos import ERRORS
+
 REWARD = "reward_"
 """Beginning of the names of infos of reward terms."""
 GRIP = ("force", "holding", "slip")

@@ -19,7 +19,7 @@ OPTIONS = {
     # Sums and quotients in another order: a sixth less time. Not -ffast-math, which knows no infinity.
     "cpu_compiler_flags": "-march=native -funsafe-math-optimizations -ffp-contract=fast",
 }
-"""Of all modules with kernels that draw pictures for people."""
+"""Options of all Warp modules with kernels that draw pictures for people."""
 wp.set_module_options(OPTIONS)
 
 PLAIN, TISSUE, DRAPE, FLOOR, GLOW = map(wp.constant, range(5))

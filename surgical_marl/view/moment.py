@@ -29,14 +29,14 @@ class Near(NamedTuple):
     distance: float
     """m; below 0 where they overlap."""
     ends: np.ndarray
-    """Its ends in the world, [2, 3], m."""
+    """Ends of the line in the world, [2, 3], m."""
 
 
 class Push(NamedTuple):
     """A contact of two shapes."""
 
     place: np.ndarray
-    """In the world, [3], m."""
+    """Place of the contact in the world, [3], m."""
     direction: np.ndarray
     """Unit vector from the first shape into the second one, [3]: this way the first one pushes."""
     force: float
@@ -49,16 +49,16 @@ class Grip(NamedTuple):
     arm: int
     """Number of the arm."""
     push: Push
-    """Of the finger on the object."""
+    """Force of the finger on the object."""
 
 
 class Moment(NamedTuple):
     """N environments at one moment, each in its own world; lengths in m, quaternions w, x, y, z."""
 
     positions: np.ndarray
-    """Of all bodies of the scene's model, [N, bodies, 3]."""
+    """Origins of all bodies of the scene's model, [N, bodies, 3]."""
     quaternions: np.ndarray
-    """[N, bodies, 4]"""
+    """Orientations of all bodies, [N, bodies, 4]."""
     tips: np.ndarray
     """Tool tips, [N, arms, 3]."""
     objects: np.ndarray
@@ -68,7 +68,7 @@ class Moment(NamedTuple):
     marks: np.ndarray
     """Places that the task marks as goals, [N, marks, 3]."""
     nearest: list[Near | None]
-    """For each environment; None in a scene of one arm."""
+    """Shortest line between two arms, for each environment; None in a scene of one arm."""
     pushes: list[list[Push]]
     """Contacts of arms in the last step, for each environment."""
     grips: list[list[Grip]]

@@ -47,7 +47,7 @@ class Movers:
     def __init__(self, env: BatchedEnv, who: str | Mapping[str, str]) -> None:
         self._env = env
         self.hands: dict[str, Hand] = {}
-        """Of the arms that a person moves."""
+        """Hands of the arms that a person moves, by agent."""
         self.who: dict[str, str] = {}
         self._groups: dict[str, Teammates] = {}
         self._assign(dict.fromkeys(env.agents, who) if isinstance(who, str) else dict(who))

@@ -24,26 +24,19 @@ class Pixels:
     """Hits of rays through the middles of pixels."""
 
     depths: wp.array2d[float]
-    """Their lengths, m, [height, width], as all but the light."""
+    """Lengths of the rays, m, [height, width]."""
     normals: wp.array2d[wp.vec3]
-    """Of what they meet."""
+    """Normals of the surfaces that rays meet, [height, width]."""
     sides: wp.array2d[int]
-    """The side of which shape that is; 0 for nothing."""
+    """Number of the side of the shape that each ray meets, [height, width]; 0 for nothing."""
     orbs: wp.array2d[int]
-    """The code of a ball that they show (`ball_at`)."""
+    """Code of the ball that each ray shows (`ball_at`), [height, width]."""
     lights: wp.array2d[wp.vec2]
     """Shares of the lamp and of the sky at every `COARSE`th pixel of every `COARSE`th row."""
 
 
 @wp.func
-def look(
-    world: World,
-    shape: int,
-    point: wp.vec3,
-    normal: wp.vec3,
-    ray: wp.vec3,
-    light: wp.vec2,
-):
+def look(world: World, shape: int, point: wp.vec3, normal: wp.vec3, ray: wp.vec3, light: wp.vec2):
     """Return what a ray sees of a point of a shape; `light` are shares of the lamp and of the sky."""
     pattern, local = world.shapes[shape].pattern, world.shapes[shape].back @ (point - world.shapes[shape].place)
     base, slope = patterned(world.grain, world.shapes[shape].colour, local, pattern)
@@ -64,15 +57,7 @@ def ball_at(world: World, ray: wp.vec3, best: float):
 
 
 @wp.func
-def colour_of(
-    world: World,
-    pixels: Pixels,
-    column: float,
-    row: float,
-    best: float,
-    normal: wp.vec3,
-    side: int,
-):
+def colour_of(world: World, pixels: Pixels, column: float, row: float, best: float, normal: wp.vec3, side: int):
     """Return the colour of a ray that meets a side of a shape, as a screen shows it."""
     eye = world.eyes[0]
     ray = ray_of(eye, column, row)

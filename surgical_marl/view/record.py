@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import mujoco
 import numpy as np
@@ -26,6 +26,11 @@ from surgical_marl.view.video import write_video
 
 if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv
+
+Picture = NDArray[np.uint8]
+_Shot = TypeVar("_Shot")
+Act = Callable[[Mapping[str, Any]], Mapping[str, Any]]
+"""Maps the observations of all agents to their actions."""
 
 FPS = 25
 LONGEST = 40.0
@@ -50,15 +55,21 @@ def record(
 
     `small`: as for `write_video`.
     """
-    every = _every(env)
-    with _one_thread(), progress(-(-_steps(env, episodes) // every), "frame", "filming") as bar:
+    count = -(-_steps(env, episodes) // steps_per_frame(env, FPS))
+    with _one_thread():
+        return write_film(path, frames(env, policy, episodes, seed), count, FPS, small)
 
-        def shown() -> Iterator[NDArray[np.uint8]]:
-            for frame in frames(env, policy, episodes, seed):
+
+def write_film(path: Path, pictures: Iterable[Picture], count: int, fps: float, small: bool = False) -> Path:
+    """Write pictures, about `count` of them, as `write_video` does, and show a progress bar; return the path."""
+    with progress(count, "frame", "filming") as bar:
+
+        def shown() -> Iterator[Picture]:
+            for picture in pictures:
                 bar.update()
-                yield frame
+                yield picture
 
-        return write_video(path, shown(), FPS, small)
+        return write_video(path, shown(), fps, small)
 
 
 @contextmanager
@@ -74,46 +85,35 @@ def _one_thread() -> Iterator[None]:
         torch.set_num_threads(usual)
 
 
-def frames(
-    env: BatchedEnv,
-    policy: Callable[[Mapping[str, Any]], Mapping[str, Any]],
-    episodes: int,
-    seed: int,
-) -> Iterator[NDArray[np.uint8]]:
+def frames(env: BatchedEnv, policy: Act, episodes: int, seed: int) -> Iterator[Picture]:
     """Yield pictures of the first environment, `FPS` of them for a second of simulated time."""
-    picture, most = ScenePicture(env), cores()
-    drawn: deque[Future[NDArray[np.uint8]]] = deque()
-    with ThreadPoolExecutor(
-        most
-    ) as threads:  # a picture takes a tenth of a second of a core, without holding Python's lock
-        for pose in _poses(env, policy, picture, episodes, seed):
-            drawn.append(threads.submit(picture.draw, pose))
+    picture = ScenePicture(env)
+    return draw_in_threads(picture.draw, _poses(env, policy, picture, episodes, seed))
+
+
+def draw_in_threads(draw: Callable[[_Shot], Picture], shots: Iterable[_Shot]) -> Iterator[Picture]:
+    """Yield the picture of each shot, in order."""
+    most = cores()  # a picture takes a tenth of a second of a core, without Python's lock
+    drawn: deque[Future[Picture]] = deque()
+    with ThreadPoolExecutor(most) as threads:
+        for shot in shots:
+            drawn.append(threads.submit(draw, shot))
             if len(drawn) > most:
                 yield drawn.popleft().result()
         while drawn:
             yield drawn.popleft().result()
 
 
-def _poses(
-    env: BatchedEnv,
-    policy: Callable[[Mapping[str, Any]], Mapping[str, Any]],
-    picture: ScenePicture,
-    episodes: int,
-    seed: int,
-) -> Iterator[Pose]:
+def _poses(env: BatchedEnv, policy: Act, picture: ScenePicture, episodes: int, seed: int) -> Iterator[Pose]:
     """Yield the poses that the pictures of `frames` show."""
-    every, steps = _every(env), _steps(env, episodes)
+    every, steps = steps_per_frame(env, FPS), _steps(env, episodes)
     for step, (_, ended) in enumerate(played(env, policy, lambda _, ended: forget(policy, ended), steps, seed), 1):
         if step % every == 0 or ended[0]:
             yield picture.pose()
 
 
 def played(
-    env: BatchedEnv,
-    act: Callable[[Mapping[str, Any]], Mapping[str, Any]],
-    begin: Callable[[Any, Any], None],
-    steps: int,
-    seed: int,
+    env: BatchedEnv, act: Act, begin: Callable[[Any, Any], None], steps: int, seed: int
 ) -> Iterator[tuple[dict[str, dict[str, Any]], NDArray[np.bool_]]]:
     """Play episodes, and yield after each step while the environments are as that step left them, ended or not.
 
@@ -143,9 +143,9 @@ def played(
         env.autoreset = before
 
 
-def _every(env: BatchedEnv) -> int:
-    """Return after how many steps there is a picture."""
-    return max(1, round(1 / (FPS * env.control_dt)))
+def steps_per_frame(env: BatchedEnv, fps: float) -> int:
+    """Return how many control steps there are from one picture to the next, for about `fps` a simulated second."""
+    return max(1, round(1 / (fps * env.control_dt)))
 
 
 def _steps(env: BatchedEnv, episodes: int) -> int:
@@ -158,9 +158,9 @@ class Pose(NamedTuple):
 
     qpos: NDArray[np.float64]
     origins: NDArray[np.float64]
-    """Of free objects, m, [k, 3]."""
+    """Origins of free objects, m, [k, 3]."""
     quaternions: NDArray[np.float64]
-    """Of free objects, w, x, y, z, [k, 4]."""
+    """Orientations of free objects, w, x, y, z, [k, 4]."""
     balls: list[Sphere]
     """A ball at each arm's goal."""
 
@@ -176,7 +176,7 @@ class ScenePicture:
         self._renderer = Renderer(scene.model, width, height, stage(scene), paint(scene))
         self._view = best_view(scene, task_places(env.task), width / height)
 
-    def draw(self, pose: Pose | None = None, camera: str | View | None = None) -> NDArray[np.uint8]:
+    def draw(self, pose: Pose | None = None, camera: str | View | None = None) -> Picture:
         """Return a picture [height, width, 3] of the environment.
 
         It shows the environment as it was at `pose`, or as it is now if there is no `pose`. The `camera` is one of
@@ -201,5 +201,8 @@ class ScenePicture:
         marks = env.task.marks(env.goal)
         for number, place in enumerate(marks[index] if marks.size else []):
             balls.append((tuple(place), GOAL_RADIUS, (*goal_colour(number, marks.shape[1], len(env.agents)), 1.0)))
-        objects, own = env.object_poses, lambda values: np.array(values[index], float)
-        return Pose(own(env.qpos), own(objects.origin), own(objects.quaternion), balls)
+        objects = env.object_poses
+        qpos, origins, quaternions = (
+            np.array(part[index], float) for part in (env.qpos, objects.origin, objects.quaternion)
+        )
+        return Pose(qpos, origins, quaternions, balls)

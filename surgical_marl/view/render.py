@@ -28,7 +28,7 @@ from surgical_marl.view.shading import Material
 Array = NDArray[np.float64]
 
 _LAMP = np.array([-0.7, 0.6, 1.6])
-"""From the middle of a model to the lamp, in its extents: to the viewer's right, towards the viewer, and up."""
+"""Way from the middle of a model to the lamp, in extents: to the viewer's right, towards the viewer, and up."""
 _LAMP_SIZE, _SKY_SIZE = 0.045, 0.55
 """Radii over distance of the lamp, and of the part of the sky that things near by hide."""
 _FAR, _SKY_FAR = 1e6, 0.2

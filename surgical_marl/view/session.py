@@ -69,9 +69,9 @@ class Session:
         self.choices += [name for name in dict.fromkeys(self.movers.who.values()) if name not in self.choices]
         self.history = History(self.env.agents, self.env.control_dt, objects=list(self.env.scene.free_objects))
         self.infos: dict[str, dict[str, Any]] = {}
-        """Of the last step; empty after a reset."""
+        """Infos of the last step, by agent; empty after a reset."""
         self.steps = 0
-        """Since the last reset."""
+        """Steps since the last reset."""
         self._observer = Observer(self.env.scene)
         self._forces: np.ndarray | None = None
         self._trail: deque[Moment] = deque(maxlen=TRAIL)

@@ -77,7 +77,7 @@ class Material(NamedTuple):
     """Linear light, [3]."""
     gloss: tuple[float, float, float]
     pattern: int
-    """Of `view/lighting.py`."""
+    """A pattern of `view/lighting.py`."""
 
 
 def material(rgb: Array, fleshy: bool = False, broad: bool = False) -> Material:

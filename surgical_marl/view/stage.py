@@ -23,9 +23,9 @@ TABLE = -0.045
 _HALF = np.array([0.60, 0.42])
 """Half sides of the table at least, m."""
 _HEIGHT = 0.9
-"""Of the table above the floor, m."""
+"""Height of the table's top above the floor, m."""
 _EDGE = 0.12
-"""From the middle of an arm's foot to the edge of the table, m."""
+"""Distance from the middle of an arm's foot to the edge of the table, m."""
 _BED = 0.075
 """Reach of the mound under tissue beyond the middles of the pieces, m."""
 _BOOM, _BOOM_RADIUS = 1.5, 0.045

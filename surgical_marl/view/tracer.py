@@ -59,18 +59,18 @@ class Shape:
     """One of `vision/rays.py`, or `PLANE`."""
     size: wp.vec3
     radius: wp.float32
-    """Of a ball about the shape's origin that holds it."""
+    """Radius of a ball about the shape's origin that holds the shape, m."""
     place: wp.vec3
     viewer: wp.vec3
     """The viewpoint, in the shape's frame."""
     near: wp.float32
-    """From there to the ball about the shape, m; below 0 inside it."""
+    """Distance from the viewpoint to the ball about the shape, m; below 0 inside it."""
     bottom: wp.float32
     """Height of its lowest point, or less, m."""
     top: wp.float32
     """Height of its highest point, or more, m."""
     back: wp.mat33
-    """From the world's frame to the shape's."""
+    """Rotation from the world's frame to the shape's."""
     shadow_kind: wp.int32
     """Number of the shape that throws its shadow; -1 if it throws none."""
     shadow_size: wp.vec3
@@ -104,7 +104,7 @@ class World:
     listed: wp.array2d[wp.uint16]
     """Shapes that rays through a tile may meet [tiles, shapes], of all eyes."""
     counts: wp.array[int]
-    """Their number, [tiles]."""
+    """Number of the shapes that are listed for each tile, [tiles]."""
 
 
 @wp.func
@@ -118,11 +118,7 @@ def meets(world: World, eye: Eye, shape: int, n: wp.vec3):
 
 
 @wp.kernel
-def list_shapes(
-    world: World,
-    order: wp.array[int],
-    number: int,
-):
+def list_shapes(world: World, order: wp.array[int], number: int):
     """List shapes for every tile of an eye; one thread does all, so that all lists are in the same order.
 
     Args:
@@ -161,13 +157,7 @@ def list_shapes(
 
 
 @wp.func
-def lit(
-    world: World,
-    lamp: Eye,
-    point: wp.vec3,
-    own: int,
-    joint: float,
-):
+def lit(world: World, lamp: Eye, point: wp.vec3, own: int, joint: float):
     """Return the share of a lamp that a point of a shape sees.
 
     Args:
@@ -222,12 +212,7 @@ def lit(
 
 
 @wp.func
-def lamps(
-    world: World,
-    shape: int,
-    point: wp.vec3,
-    normal: wp.vec3,
-):
+def lamps(world: World, shape: int, point: wp.vec3, normal: wp.vec3):
     """Return the shares of the lamp and of the sky that a point of a shape sees."""
     raised = point + 2e-5 * normal
     light, open = float(0.0), float(HALF_OPEN)
@@ -247,11 +232,7 @@ def ray_of(eye: Eye, column: float, row: float):
 
 
 @wp.func
-def meet(
-    world: World,
-    column: float,
-    row: float,
-):
+def meet(world: World, column: float, row: float):
     """Return how far a ray goes, the normal of what it meets, and the side of which shape that is; 0 for nothing."""
     eye = world.eyes[0]
     ray = ray_of(eye, column, row)

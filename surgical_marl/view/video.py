@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 QUALITY = 55
-"""Of a webp, from 0 to 100."""
+"""Quality of a webp, from 0 to 100."""
 
 Frames = Iterable[NDArray[np.uint8]]
 
