@@ -68,8 +68,8 @@ class Algorithm(PPO):
 
     def __init__(
         self,
-        actor: Any,
-        critic: Any,
+        actor: MultiAgentActor,
+        critic: nn.Module,
         storage: MultiAgentStorage,
         *,
         team_reward: bool = False,
@@ -311,12 +311,7 @@ class Algorithm(PPO):
         """Return all that `load` needs to go on, as tensors and plain values."""
         return {**super().save(), "options_state_dict": self.options.state_dict()}
 
-    def load(
-        self,
-        loaded_dict: dict[str, Any],
-        load_cfg: dict[str, Any] | None = None,
-        strict: bool = True,
-    ) -> bool:
+    def load(self, loaded_dict: dict[str, Any], load_cfg: dict[str, Any] | None = None, strict: bool = True) -> bool:
         """Load what `save` returned.
 
         The optimizer then holds its own copy of the learning rate: share it again.

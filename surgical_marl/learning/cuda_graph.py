@@ -1,4 +1,4 @@
-"""Work that a CUDA graph repeats: the host starts some thousand kernels by one call."""
+"""Functions as CUDA graphs: the host starts some thousand kernels by one call."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from surgical_marl.runtime import no_collection
 
 
-class Replayed:
+class GraphedFunction:
     """A function without arguments that works in place, as a CUDA graph from its second call on.
 
     All that it reads from and writes to between calls must stay where it is in memory, nothing in it may wait for the

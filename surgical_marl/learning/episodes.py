@@ -45,14 +45,7 @@ class Episodes:
         self.collided |= collision.any(0)
         # where, not a product: the error of an episode that runs on must not matter, whatever it
         # is.
-        ended = torch.stack(
-            [
-                torch.ones_like(rewards),
-                error.mean(0),
-                success.float().mean(0),
-                self.collided.float(),
-            ]
-        )
+        ended = torch.stack([torch.ones_like(rewards), error.mean(0), success.float().mean(0), self.collided.float()])
         sums = torch.where(dones & ~self.moved & ~faulty, ended, 0.0).sum(-1)
         self._totals += torch.cat([sums, rewards.mean()[None], self._mean_terms(infos, rewards)])
         self.collided &= ~dones

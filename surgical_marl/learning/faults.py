@@ -25,17 +25,17 @@ class Fault(NamedTuple):
 
     iteration: int
     total: int
-    """Of faults in this iteration, in this process."""
+    """Number of faults in this iteration, in this process."""
     step: int
-    """In the rollout, from 0."""
+    """Number of the step in the rollout, from 0."""
     number: int
-    """Of the environment, among those of this process."""
+    """Number of the environment among those of this process."""
     code: int
-    """See `BatchedEnv.fault_place`."""
+    """Code of the place of the fault, see `BatchedEnv.fault_place`."""
     start: dict[str, np.ndarray]
-    """Its carry when the rollout began, [1, ...]."""
+    """Carry of the environment when the rollout began, [1, ...]."""
     actions: np.ndarray
-    """Its actions up to that step, [T, sum]."""
+    """Actions of the environment up to that step, [T, sum]."""
 
 
 def too_many(count: float, steps: int) -> bool:

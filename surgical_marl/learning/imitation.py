@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from surgical_marl.learning.cuda_graph import Replayed
+from surgical_marl.learning.cuda_graph import GraphedFunction
 from surgical_marl.learning.demonstrations import Demonstrations
 from surgical_marl.policies.networks import MultiAgentActor
 from surgical_marl.runs.progress import progress
@@ -65,7 +65,7 @@ class Imitation:
             for weight in weights
         ]
         self._optimizer.state.update(zip(weights, self._moments, strict=True))
-        self._graph = Replayed(self._descend, enabled=self._cuda)
+        self._graph = GraphedFunction(self._descend, enabled=self._cuda)
 
     def run(self, stopped: Callable[[], bool] = lambda: False, show: bool = False) -> bool:
         """Do the steps that are left, until something has `stopped` it; return whether none is left.
@@ -126,7 +126,7 @@ class Imitation:
             parts = [self._actor(part) - wanted for part, wanted in pairs]
         off = torch.cat([part.square().mean(-1).sqrt() for part in parts])
         self._off = off.clamp(max=1.0).double().cumsum(0)  # far off no action is more wrong than another
-        self._graph = Replayed(self._descend, enabled=self._cuda)
+        self._graph = GraphedFunction(self._descend, enabled=self._cuda)
 
     def _draw(self) -> Tensor:
         """Return the numbers of a batch's pairs."""

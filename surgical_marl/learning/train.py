@@ -58,6 +58,7 @@ from surgical_marl.runs.folder import (
 )
 from surgical_marl.runs.identity import identity
 from surgical_marl.runs.process import ending_signals, lasting_streams
+from surgical_marl.runs.progress import say
 from surgical_marl.runs.settings import Settings, make_env
 from surgical_marl.untrusted.values import plural
 
@@ -311,7 +312,7 @@ def _own(state: dict[str, Any], run: Path) -> dict[str, Any]:
 
 def _say(what: str, by: int = 0) -> None:
     if distributed.rank() == by:
-        print(f"surgical-marl: {what}", file=sys.stderr, flush=True)
+        say(what)
 
 
 @contextmanager

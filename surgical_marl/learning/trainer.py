@@ -12,14 +12,14 @@ import torch
 from surgical_marl.interfaces.rsl_rl import RslRlVecEnv
 from surgical_marl.learning import distributed
 from surgical_marl.learning.algorithm import Algorithm
-from surgical_marl.learning.cuda_graph import Replayed
+from surgical_marl.learning.cuda_graph import GraphedFunction
 from surgical_marl.learning.demonstrations import Demonstrations
 from surgical_marl.learning.episodes import Episodes
 from surgical_marl.learning.faults import Fault
 from surgical_marl.learning.imitation import RATE, Imitation, ImitationLoss
 from surgical_marl.learning.reporter import Report, Reporter, mark
 from surgical_marl.plugins.algorithms import ALGORITHMS
-from surgical_marl.policies.networks import actor_config, network_config
+from surgical_marl.policies.networks import MultiAgentActor, actor_config, network_config
 from surgical_marl.runs.identity import identity
 from surgical_marl.runs.settings import Settings
 
@@ -85,9 +85,9 @@ class Trainer:
             if imitation.weight > 0:
                 self.algorithm.imitation = ImitationLoss(*pairs, imitation.batch_size, imitation.weight)
         self._samples = steps * env.num_envs * distributed.size()
-        self.rollout = Replayed(self._rollout, enabled=self._cuda and self.env.capturable)
-        self._parts = [Replayed(part, enabled=self._cuda) for part in self.algorithm.parts()]
-        self._gather = Replayed(self._reporter.gather, enabled=self._cuda)
+        self.rollout = GraphedFunction(self._rollout, enabled=self._cuda and self.env.capturable)
+        self._parts = [GraphedFunction(part, enabled=self._cuda) for part in self.algorithm.parts()]
+        self._gather = GraphedFunction(self._reporter.gather, enabled=self._cuda)
 
     def update(self) -> None:
         """Learn from the rollout, part by part in the order that the algorithm draws; and gather what `row` reads."""
@@ -263,7 +263,7 @@ class Trainer:
             torch.cuda.set_rng_state(state["random_cuda"])
 
 
-def _widths(actor: Any, group: str) -> list[int]:
+def _widths(actor: MultiAgentActor, group: str) -> list[int]:
     """Return the number of agents of a group, and the widths of their observation and of their action."""
     return [actor.counts[group], actor.models[group].obs_dim, actor.outputs[group]]
 

@@ -1,4 +1,4 @@
-"""Networks of torch that act: of a run, of a policy that ships, or untrained."""
+"""Networks of torch that act: those of a run or of a policy that ships, or untrained ones."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from surgical_marl.envs.observations import each, proprioception
 from surgical_marl.policies.acting import Policy
-from surgical_marl.policies.layout import Grouping, Layout, fitting_layout, zeros
+from surgical_marl.policies.layout import Layout, fitting_layout, zeros
 from surgical_marl.policies.networks import MultiAgentActor, actor_config, make_actor
 from surgical_marl.policies.recurrent import cleared
 from surgical_marl.policies.weights import NOT_OF_THIS_NETWORK, read_weights
@@ -33,7 +33,7 @@ def load_actor(run: str | Path, env: BatchedEnv) -> tuple[MultiAgentActor, Layou
     settings = read_settings(folder)
     trained, state = _read(folder)
     layout = fitting_layout(env, trained, run, settings.scene)
-    actor = _actor(settings, env, layout)
+    actor = untrained_actor(settings, env, layout)
     try:
         actor.load_state_dict(state)
     except RuntimeError:
@@ -41,19 +41,11 @@ def load_actor(run: str | Path, env: BatchedEnv) -> tuple[MultiAgentActor, Layou
     return actor, layout
 
 
-def untrained_policy(env: BatchedEnv, settings: Settings | None = None, grouping: Grouping = "type") -> Policy:
-    """Make the policy that a run with these settings starts from: fresh weights, for comparison.
-
-    Args:
-        env: the environment that the policy will act in.
-        settings: of the run; they decide the networks.
-        grouping: of the run's algorithm (see `Layout`).
-    """
-    settings = settings or Settings()
-    layout = Layout(env, grouping)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(settings.seed)
-        return acting_policy(_actor(settings, env, layout), layout, str(env.device))
+def untrained_actor(settings: Settings, env: BatchedEnv, layout: Layout) -> MultiAgentActor:
+    """Make the networks that a run with these settings starts from, on the CPU, by torch's random numbers."""
+    seen = {agent: each(zeros(env.observation_space(agent)), torch.from_numpy) for agent in layout.agents}
+    samples = TensorDict({**layout.stack(seen)}, batch_size=[1])
+    return make_actor(samples, env, layout, actor_config(settings.network)).eval()
 
 
 def acting_policy(actor: MultiAgentActor, layout: Layout, device: str) -> Policy:
@@ -82,12 +74,6 @@ def _read(folder: Path) -> tuple[dict[str, list[int]], dict[str, Tensor]]:
             f"{folder / CHECKPOINT} is damaged, or not a checkpoint of this program: restore it from a copy"
         )
     return groups, state
-
-
-def _actor(settings: Settings, env: BatchedEnv, layout: Layout) -> MultiAgentActor:
-    seen = {agent: each(zeros(env.observation_space(agent)), torch.from_numpy) for agent in layout.agents}
-    samples = TensorDict({**layout.stack(seen)}, batch_size=[1])
-    return make_actor(samples, env, layout, actor_config(settings.network)).eval()
 
 
 class _Acting:

@@ -51,7 +51,7 @@ class AttentionModel(MLPModel):
         self.ask = nn.Linear(len(own), self._width)
         self.answer = nn.Linear(self._width, 2 * self._width)
 
-    def get_latent(self, obs: TensorDict, masks: Tensor | None = None, hidden_state: Any = None) -> Tensor:
+    def get_latent(self, obs: TensorDict, masks: Tensor | None = None, hidden_state: Tensor | None = None) -> Tensor:
         """Return the agent's own normalised observation, [..., d], followed by what it attends to, [..., 16 heads]."""
         seen = super().get_latent(obs).index_select(-1, self._columns)
         parts = [

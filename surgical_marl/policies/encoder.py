@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from rsl_rl.models import CNNModel, MLPModel
@@ -13,8 +12,8 @@ from torch import Tensor
 PICTURES = "_pictures"
 """Suffix of the name of the group of an agent type's pictures."""
 ENCODER = {"output_channels": [32, 64, 64], "kernel_size": [4, 4, 3], "stride": [4, 2, 1], "activation": "elu"}
-"""Of 64 x 64 pixels it makes 1600 features. Its first layer sees patches that don't overlap: on an H200 learning
-then takes a third less time than with the 8 x 8 pixels that are usual."""
+"""The encoder makes 1600 features of 64 x 64 pixels. Its first layer sees patches that don't overlap: on an H200
+learning then takes a third less time than with the usual 8 x 8 pixels."""
 
 FURTHEST = 0.3
 """Depth is clipped to this for networks, m; endoscopes are nearer to what they look at."""
@@ -23,7 +22,7 @@ FURTHEST = 0.3
 class PictureModel(CNNModel):
     """rsl_rl's CNN model, for uint8 pictures [..., C, H, W] beside vectors [..., d], with any leading axes."""
 
-    def get_latent(self, obs: TensorDict, masks: Tensor | None = None, hidden_state: Any = None) -> Tensor:
+    def get_latent(self, obs: TensorDict, masks: Tensor | None = None, hidden_state: Tensor | None = None) -> Tensor:
         """Return the normalised vector, followed by the features of the pictures."""
         vector = MLPModel.get_latent(self, obs)
         (group,) = self.obs_groups_2d

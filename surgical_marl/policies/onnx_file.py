@@ -31,7 +31,7 @@ from torch import Tensor, nn
 
 from surgical_marl.files import write_atomic
 from surgical_marl.policies.encoder import stack_pictures
-from surgical_marl.policies.weights import WEIGHTS
+from surgical_marl.runs.folder import WEIGHTS
 from surgical_marl.untrusted.arrays import MAX_WEIGHTS, read_header
 from surgical_marl.untrusted.files import read_bytes
 

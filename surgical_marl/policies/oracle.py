@@ -27,12 +27,12 @@ if TYPE_CHECKING:
 ITERATIONS = 8
 """Steps of inverse kinematics from the last joint positions."""
 NEAR, AHEAD = 4, 2
-"""Its steps to a moving target, which is never far, and to where that will be a control step later."""
+"""Steps of inverse kinematics to a moving target, which is never far, and to its place a control step later."""
 CATCH_UP = 0.025
 """Time in which a tip that is off a moving target comes three times as near to it, s: hardly more than a control step.
 With a position command alone it would take damping over stiffness of the drives, four times as long for a STAR."""
 FIRST, STARTS = 20, 8
-"""Its steps in the first of an episode, and from how many postures: from a random one alone it may end at a limit."""
+"""Steps at the start of an episode, and postures that they start from: from one alone they may end at a limit."""
 
 
 class Oracle(Protocol):

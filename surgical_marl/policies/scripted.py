@@ -77,7 +77,7 @@ class Scripted:
             self._tools[agent].send([(every, wishes[agent])])
         return {agent: np.clip(self._tools[agent].action(), -1.0, 1.0) for agent in self._attending}
 
-    def _furthest(self, rows: Any = slice(None)) -> np.ndarray:
+    def _furthest(self, rows: np.ndarray | slice = slice(None)) -> np.ndarray:
         """Return in how many control steps at full speed all tools are there, in some environments, [n]."""
         return np.max([self._tools[agent].steps(rows) for agent in self._led], axis=0, initial=0.0)
 
@@ -156,15 +156,15 @@ class _Tool:
         if places:
             self.q[np.concatenate(places)], _ = joints_at(self.mount, np.concatenate(poses), np.concatenate(starts))
 
-    def steps(self, rows: Any = slice(None)) -> np.ndarray:
+    def steps(self, rows: np.ndarray | slice = slice(None)) -> np.ndarray:
         """Return in how many control steps at full speed the tool is there, in some environments, [n]."""
         return self._mover.steps(self.command[rows], (self.q - self.command)[rows])
 
-    def action(self, share: Any = 1.0) -> np.ndarray:
+    def action(self, share: float | np.ndarray = 1.0) -> np.ndarray:
         """Return the action that moves the commands by a share of their way, and opens or closes the jaw."""
         return self._mover.action(self.command, share * (self.q - self.command), self._jaw_number())
 
-    def _jaw_number(self) -> Any:
+    def _jaw_number(self) -> float | np.ndarray:
         """Return the number of the jaw in an action, [N], if the arm has a jaw."""
         jaw = self.mount.arm.jaw
         if jaw is None:

@@ -8,7 +8,7 @@ Scripts, people and demonstrations say where joints should be; the control's ter
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -49,7 +49,7 @@ class TargetMover:
         """
         return self._term.steps_of(command, change)
 
-    def action(self, command: np.ndarray, change: np.ndarray, jaw: Any = 0.0) -> np.ndarray:
+    def action(self, command: np.ndarray, change: np.ndarray, jaw: float | np.ndarray = 0.0) -> np.ndarray:
         """Return the action [N, a] that moves targets by `change` in a step; its message is zeros.
 
         Numbers are beyond -1 and 1 where that takes more than a step.

@@ -47,7 +47,7 @@ from surgical_marl.tasks.base.grasp_poses import (
     tool_of,
     tool_poses,
 )
-from surgical_marl.tasks.base.object_task import FAR, NEAR, Best, Now, ObjectTask, known
+from surgical_marl.tasks.base.object_task import FAR, NEAR, Best, Now, ObjectTask, as_float, known
 from surgical_marl.tasks.base.oracle_script import EARLY, Snapshot, Step, Wish
 from surgical_marl.tasks.base.resting_poses import resting_poses
 from surgical_marl.tasks.base.task import Start
@@ -69,9 +69,9 @@ END = 0.155
 OUT = 0.02
 """Least distance of starts and goals from the other arm's reach, m: more than a needle is wide."""
 HEIGHT = 0.06
-"""Of the exchange above the pad, m."""
+"""Height of the exchange above the pad, m."""
 BACK, DEEP, AWAY = 0.015, 0.003, 0.025
-"""The second tool comes from so far, its tip goes so far past the wire, and the first one leaves so far, m."""
+"""Distances from which the second tool comes, by which its tip passes the wire, and by which the first leaves, m."""
 THERE = 0.01
 """The second tool comes once the needle is nearer than this to where it is handed over, m."""
 
@@ -82,9 +82,9 @@ class Team(NamedTuple):
     meet: Array
     """Least distance of the second tool from the needle's middle half while the needle was held, m."""
     receive: Array
-    """1 once both held it, the second one in its middle half."""
+    """1 once both arms held the needle, the second one in its middle half; before that 0."""
     passed: Array
-    """1 once the second arm held it alone, there."""
+    """1 once the second arm alone held the needle, in its middle half; before that 0."""
 
 
 class HandoverGoal(NamedTuple):
@@ -118,7 +118,7 @@ class Task(ObjectTask):
         count = len(bars(self._item)[0])
         self._useful = np.arange(count // 4, -(-3 * count // 4))
         self.grips = count - count // 4, count // 4
-        """Of the oracle: the bars that the first and the second arm grip, near the point and a third from the tail."""
+        """Bars that the first and the second arm of the oracle grip, near the point and a third from the tail."""
         about = repr((self.object, self.level, self.seed))
         table = cached("needle_handover", lambda: self._draw(scene), about, scene.fingerprint, self._item.content)
         self._set_tables(table[:, :7], frames(table[:, 7:10], table[:, 10:14]))
@@ -138,13 +138,10 @@ class Task(ObjectTask):
         away, there = self._to_useful(world, self.presenter), self._usefully(now) & (now.lift >= 1.0)
         way = known(jnp.sqrt(jnp.sum(away * away)))
 
-        def single(x: Array) -> Array:
-            return x.astype(jnp.float32)
-
         return Team(
             jnp.where(team.meet < 0, way, jnp.where(first | second, jnp.minimum(team.meet, way), team.meet)),
-            jnp.maximum(team.receive, single(first & second & there)),
-            jnp.maximum(team.passed, single(self.presents(now) & there)),
+            jnp.maximum(team.receive, as_float(first & second & there)),
+            jnp.maximum(team.passed, as_float(self.presents(now) & there)),
         )
 
     def remember(self, world: World) -> Any:

@@ -98,7 +98,7 @@ class Task(ObjectTask):
         table = cached("needle_pick", lambda: self._draw(scene), about, scene.fingerprint, self._item.content)
         self._set_tables(table[:, :7], frames(table[:, 7:10], table[:, 10:14]))
         self.grips = table[:, 14].astype(int)
-        """Of the oracle: the number of the bar that it grips."""
+        """Number of the bar that the oracle grips, [rows]."""
 
     def start(self, key: Array) -> Start:
         """Return where the needle lies, and the goal."""

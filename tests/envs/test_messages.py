@@ -19,7 +19,7 @@ import surgical_marl as sm
 from surgical_marl import BatchedEnv
 from surgical_marl.learning import train
 from surgical_marl.learning.demonstrations import Demonstrations
-from surgical_marl.policies.actor import load_actor, untrained_policy
+from surgical_marl.policies.actor import load_actor
 from surgical_marl.policies.layout import Layout
 from surgical_marl.policies.onnx_file import write_onnx
 from surgical_marl.policies.oracle import oracle
@@ -28,6 +28,7 @@ from surgical_marl.policies.team import check_fits
 from surgical_marl.policies.weights import write_weights
 from surgical_marl.runs.folder import read_settings
 from surgical_marl.runs.settings import ImitationSettings, NetworkSettings, PPOSettings, Settings
+from tests.helpers.runs import untrained_policy
 from tests.helpers.scenes import PAIR
 
 SCENE, K, JOINTS = PAIR, 2, 4

@@ -12,6 +12,9 @@ from typing import Any
 import torch
 
 from surgical_marl.learning import train
+from surgical_marl.policies.acting import Policy
+from surgical_marl.policies.actor import acting_policy, untrained_actor
+from surgical_marl.policies.layout import Layout
 from surgical_marl.runs.checkpoint import read_checkpoint
 from surgical_marl.runs.folder import read_metrics
 from surgical_marl.runs.settings import ConstraintSettings, NetworkSettings, PPOSettings, Settings
@@ -45,6 +48,14 @@ ALL: dict[str, Any] = {
 
 def fake_env(settings: Settings, num_envs: int | None = None) -> Any:
     return FakeEnv(COUNTS, SIZES, settings.num_envs, max_steps=10)
+
+
+def untrained_policy(env: Any, settings: Settings, grouping: Any = "type") -> Policy:
+    """Make the policy that a run with these settings starts from: fresh weights, for comparison."""
+    layout = Layout(env, grouping)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(settings.seed)
+        return acting_policy(untrained_actor(settings, env, layout), layout, str(env.device))
 
 
 def run(settings: Settings, out: Path, resume: bool = False) -> None:

@@ -20,13 +20,12 @@ from surgical_marl.learning.algorithm import Algorithm
 from surgical_marl.learning.episodes import Episodes
 from surgical_marl.learning.reporter import Report
 from surgical_marl.plugins.algorithms import ALGORITHMS, list_algorithms
-from surgical_marl.policies.actor import untrained_policy
 from surgical_marl.policies.policy import load_policy, random_policy, zero_policy
 from surgical_marl.runs.checkpoint import read_checkpoint
 from surgical_marl.runs.folder import CONFIG, read_metrics, read_settings, write_metrics
 from surgical_marl.runs.settings import NetworkSettings, PPOSettings, Settings
 from tests.helpers.fake_env import FakeEnv
-from tests.helpers.runs import ALL, COUNTS, OPTIONS, SIZES, SMALL
+from tests.helpers.runs import ALL, COUNTS, OPTIONS, SIZES, SMALL, untrained_policy
 
 
 @pytest.fixture

@@ -14,10 +14,9 @@ from typing import NamedTuple
 import numpy as np
 
 from surgical_marl.cache import cached
-from surgical_marl.robots.inverse_kinematics import inverse_kinematics
 from surgical_marl.scenes.geometry import Capsule, axis_gap
 from surgical_marl.scenes.scene import Mount, Scene
-from surgical_marl.tasks.base.workspace import CLEARANCE, PATH_POINTS, TOLERANCE, choose
+from surgical_marl.tasks.base.workspace import CLEARANCE, PATH_POINTS, choose, reach
 
 ROWS = 2048
 NEAREST, FARTHEST = 0.025, 0.05
@@ -101,14 +100,14 @@ def _draw(scene: Scene, pair: list[str], spread: float, seed: int) -> np.ndarray
             begin[agent] = np.tile(mount.arm.home, (ROWS, 1))
             targets[agent] = mount.workspace + rng.normal(0.0, OTHERS, (ROWS, 3))
             if agent in pair:
-                begin[agent], reached = _reach(mount, mount.workspace + rng.normal(0.0, spread, (ROWS, 3)))
+                begin[agent], reached = reach(mount.arm, mount.workspace + rng.normal(0.0, spread, (ROWS, 3)))
                 good &= reached
         for agent, other in (pair, pair[::-1]):
             axis, along = shaft(scene.mounts[other], begin[other])
             point = scene.mounts[other].position + (along - rng.uniform(NEAREST, FARTHEST, ROWS))[:, None] * axis
             targets[agent] = (point - scene.mounts[agent].position) @ scene.mounts[agent].rotation
         for agent, mount in scene.mounts.items():
-            end[agent], reached = _reach(mount, targets[agent])
+            end[agent], reached = reach(mount.arm, targets[agent])
             good &= reached
         good &= (scene.clearance(begin) > CLEARANCE) & (scene.clearance(end) > APART)
         targets, begin, end = ({agent: q[good] for agent, q in part.items()} for part in (targets, begin, end))
@@ -136,12 +135,6 @@ def _crosses(scene: Scene, pair: list[str], q: dict[str, np.ndarray]) -> np.ndar
         lines.append(Capsule(mount.position + way / 2, way / lengths[-1][:, None], lengths[-1] / 2, 0.0))
     shares = axis_gap(*lines)[0], axis_gap(*lines[::-1])[0]
     return np.all([(1 - share) * length > BEYOND for share, length in zip(shares, lengths, strict=True)], 0)
-
-
-def _reach(mount: Mount, targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the joint positions at targets [n, 3] in the base frame, and whether the arm gets there, [n] bool."""
-    q = inverse_kinematics(mount.arm, targets, starts=1)
-    return q, np.linalg.norm(mount.arm.forward_kinematics(q)[:, :3, 3] - targets, axis=-1) < TOLERANCE
 
 
 def _ways(

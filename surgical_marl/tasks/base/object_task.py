@@ -40,13 +40,13 @@ class Best(NamedTuple):
     reach: Array
     """Least distance of a tool from the object, m."""
     grasp: Array
-    """1 once it was held."""
+    """1 once the object was held, before that 0."""
     lift: Array
     """Greatest height to which it was lifted, from 0 to 1 at `LIFT`."""
     carry: Array
-    """Least distance of the object from its goal while it was held, m."""
+    """Least distance of the object from its goal while it was held, m; below 0 before the start."""
     turn: Array
-    """Least angle between the object and its goal likewise, rad."""
+    """Least angle between the object and its goal while it was held, rad; below 0 before the start."""
 
 
 class ObjectGoal(NamedTuple):
@@ -63,19 +63,19 @@ class Now(NamedTuple):
     reach: dict[str, Array]
     """Distance of each tool tip from the object's nearest bar, m."""
     part: dict[str, Array]
-    """Number of that bar."""
+    """Number of the bar that is nearest to each tool tip."""
     held: dict[str, Array]
     """True if each arm holds the object."""
     touched: dict[str, Array]
     """True if fingers of each arm touch it."""
     lift: Array
-    """Its height, from 0 to 1 at `LIFT`."""
+    """Height of the object, from 0 to 1 at `LIFT`."""
     error: Array
-    """Distance of its point from the goal, m."""
+    """Distance of the object's point from the goal, m."""
     angle: Array
-    """Angle by which it is turned away from the goal, rad."""
+    """Angle by which the object is turned away from the goal, rad."""
     dropped: Array
-    """True if it was lifted before, and no finger touches it now, or it is lost."""
+    """True if the object was lifted before and no finger touches it now, or if it is lost."""
 
 
 class ObjectTask(Task):
@@ -93,7 +93,7 @@ class ObjectTask(Task):
     tolerance: ClassVar[float] = 0.002
     """Greatest distance of the point from its goal that is a success, m."""
     angle: ClassVar[float] = np.radians(10.0)
-    """Greatest angle likewise, where the goal has an orientation, rad."""
+    """Greatest angle between object and goal that is a success, where the goal has an orientation, rad."""
     hands: ClassVar[int] = 1
     """Arms with jaws that can hold something, in a scene of the task."""
     point: ClassVar[str] = "tip"
@@ -185,7 +185,7 @@ class ObjectTask(Task):
 
         return Best(
             jnp.minimum(best.reach, now.reach[self.picker]),
-            jnp.maximum(best.grasp, now.held[self.picker].astype(jnp.float32)),
+            jnp.maximum(best.grasp, as_float(now.held[self.picker])),
             jnp.where(_any(now.held), jnp.maximum(best.lift, now.lift), best.lift),
             jnp.where(best.carry < 0, now.error, least(now.error, best.carry)),
             jnp.where(best.turn < 0, now.angle, least(now.angle, best.turn)),
@@ -215,16 +215,15 @@ class ObjectTask(Task):
         """
         now, best, safety = self.now(world), world.goal.best, super().reward_terms(world)
         new, presents = self.better(best, now), self.presents(now)
-        oriented, single = jnp.float32(self.oriented), lambda x: x.astype(jnp.float32)
         team = {
             "reach": best.reach - new.reach,
             "grasp": new.grasp - best.grasp,
             "lift": new.lift - best.lift,
             "carry": best.carry - new.carry,
-            "turn": oriented * (best.turn - new.turn),
+            "turn": jnp.float32(self.oriented) * (best.turn - new.turn),
             "precision": jnp.where(presents, jnp.exp(-now.error / PRECISION), 0.0),
-            "success": single(self.at_goal(now)),
-            "drop": single(now.dropped),
+            "success": as_float(self.at_goal(now)),
+            "drop": as_float(now.dropped),
         }
         return {agent: {**team, **safety[agent]} for agent in world.arms}
 
@@ -275,7 +274,7 @@ class ObjectTask(Task):
         def others_hold(world: World) -> Array:
             arms = self.at_hand(world).arms
             held = [view.handles[name].holding for other, view in arms.items() if other != agent]
-            return jnp.stack(held).any().astype(jnp.float32)[None]
+            return as_float(jnp.stack(held).any())[None]
 
         far, reach, one, every = np.full(3, FAR), mount.arm.reach, np.ones(1), np.arange(len(self._middles))
         others = {"others_hold": Term(others_hold, 0 * one, one, "others")} if len(self.scene.agents) > 1 else {}
@@ -345,6 +344,11 @@ def _such_as(scenes: Sequence[str]) -> str:
 
 def _any(of: dict[str, Array]) -> Array:
     return jnp.stack(list(of.values())).any()
+
+
+def as_float(flag: Array) -> Array:
+    """Return a flag as 0 or 1, float32."""
+    return flag.astype(jnp.float32)
 
 
 def known(value: Array) -> Array:

@@ -212,6 +212,12 @@ def _away(rng: np.random.Generator, arm: Arm, q: np.ndarray) -> np.ndarray:
     return rng.uniform(np.maximum(q - furthest, arm.lower), np.minimum(q + furthest, arm.upper))
 
 
+def reach(arm: Arm, targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the joint positions at targets [n, 3] in the base frame, m, and whether the arm gets there, [n] bool."""
+    q = inverse_kinematics(arm, targets, starts=1)
+    return q, np.linalg.norm(arm.forward_kinematics(q)[:, :3, 3] - targets, axis=-1) < TOLERANCE
+
+
 def _reach(scene: Scene, targets: np.ndarray, time: float = TIME) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Return the joint positions at targets, and whether all agents get there from home in time.
 
@@ -226,10 +232,8 @@ def _reach(scene: Scene, targets: np.ndarray, time: float = TIME) -> tuple[dict[
     good, goals = np.ones(len(targets), dtype=bool), {}
     for i, agent in enumerate(scene.agents):
         arm = scene.mounts[agent].arm
-        goals[agent] = inverse_kinematics(arm, targets[:, i], starts=1)
-        tips = arm.forward_kinematics(goals[agent])[:, :3, 3]
-        good &= np.linalg.norm(tips - targets[:, i], axis=-1) < TOLERANCE
-        good &= (np.abs(goals[agent] - arm.home) <= time * arm.speed).all(-1)
+        goals[agent], reached = reach(arm, targets[:, i])
+        good &= reached & (np.abs(goals[agent] - arm.home) <= time * arm.speed).all(-1)
     return goals, good
 
 

@@ -7,19 +7,17 @@ does not count: tools are thin.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from surgical_marl.scenes.scene import Mount
 
-if TYPE_CHECKING:
-    pass
-
 NEAREST = 0.02
 """Least distance along the view at which a point is in view, m: `match_image` keeps as far away from what it sees."""
 FARTHEST = 0.3
-"""Greatest one, m: there a pixel of a picture of 64 x 64 is 5.4 mm wide, more than half a tool's shaft of 8 mm."""
+"""Greatest distance along the view at which a point is in view, m: a pixel of a 64 x 64 picture there is 5.4 mm wide,
+more than half a tool's shaft of 8 mm."""
 CLOSE = 0.1
 """Least distance of the nearest point in a good view, m: there a square picture of 60 degrees is 115 mm wide.
 Tools part faster than an endoscope draws back."""
@@ -32,7 +30,7 @@ STEPS = 20
 SMALL = 1e-4
 """Change of a joint, as a share of its range, for derivatives."""
 DAMPING = 0.5
-"""Of the steps of `look_at`: errors have kinks where another point becomes the outermost one."""
+"""Damping of the steps of `look_at`: errors have kinks where another point becomes the outermost one."""
 MIRROR = np.diag([-1.0, 1.0, -1.0])
 """Axes of the endoscope's frame in MuJoCo's camera frame."""
 

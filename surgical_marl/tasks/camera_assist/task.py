@@ -40,7 +40,7 @@ from surgical_marl.robots.inverse_kinematics import inverse_kinematics
 from surgical_marl.runtime import jax, jnp
 from surgical_marl.tasks import reach
 from surgical_marl.tasks.base.grasp_poses import bars
-from surgical_marl.tasks.base.object_task import FAR, ObjectTask
+from surgical_marl.tasks.base.object_task import FAR, ObjectTask, as_float
 from surgical_marl.tasks.base.options import Options
 from surgical_marl.tasks.base.oracle_script import Snapshot, Step, Wish
 from surgical_marl.tasks.base.task import Start
@@ -48,13 +48,7 @@ from surgical_marl.tasks.base.task import Task as BaseTask
 from surgical_marl.tasks.base.terms import Picture, Term
 from surgical_marl.tasks.base.workspace import TIME
 from surgical_marl.tasks.camera_assist.eye import Eye
-from surgical_marl.tasks.camera_assist.starts import (
-    ROWS,
-    draw_postures,
-    find_roles,
-    visible_targets,
-    work_in,
-)
+from surgical_marl.tasks.camera_assist.starts import ROWS, draw_postures, find_roles, visible_targets, work_in
 from surgical_marl.tasks.camera_assist.terms import GOAL, Shown, Sights
 
 if TYPE_CHECKING:
@@ -75,7 +69,7 @@ FURTHEST_OFF, WORST_DEPTH = 3.0, 1.0
 VIEW = {"in_view": 1.0, "centring": -0.5, "depth": -0.5, "travel": -10.0}
 """Weights of the terms of the view beside those of `reach`, which like them count in each step."""
 BESIDE_OBJECTS = 0.1
-"""Their share beside the work with objects, whose progress counts once."""
+"""Factor of the weights `VIEW` beside the work with objects, whose progress counts once."""
 SELF = ("clearance", "collision", "action_change")
 """Terms of each arm for itself."""
 
@@ -97,9 +91,9 @@ class ViewGoal(NamedTuple):
     row: Array
     """Row of the table of postures."""
     time: Array
-    """Since the start, s, []."""
+    """Time since the start, s, []."""
     found: Array
-    """1 once all was in view at once, []."""
+    """1 once everything was in view at the same time, before that 0, []."""
     origin: Array
     """Place of the endoscope's tip after the last step, world, m, [3]."""
 
@@ -209,7 +203,7 @@ class Task(BaseTask):
     def remember(self, world: World) -> Any:
         """Return the goal with what the work keeps, whether all has been in view, and where the endoscope's tip is."""
         _, visible, origin = self.sights(world)
-        found = jnp.maximum(world.goal.found, self._all(visible).astype(jnp.float32))
+        found = jnp.maximum(world.goal.found, as_float(self._all(visible)))
         return world.goal._replace(work=self.work.remember(self._inside(world)), found=found, origin=origin)
 
     def _all(self, visible: Mapping[str, Array]) -> Array:
@@ -264,18 +258,18 @@ class Task(BaseTask):
             worst = jnp.stack([work[agent]["tip_error"] for agent in self.tools]).max()
             work = {**work, self.camera: {"tip_error": worst}}
         seen, visible, origin = self.sights(world)
-        names, single = self.wanted_in_view, lambda x: x.astype(jnp.float32)
+        names = self.wanted_in_view
         off, _ = self._eye.aim(jnp.stack([seen[name] for name in names]))
-        things = [single(visible[name]) for name in names if name not in self.tools]
+        things = [as_float(visible[name]) for name in names if name not in self.tools]
         found = (world.goal.found > 0) | self._all(visible)
-        view = {agent: {"in_view": single(visible[agent])} for agent in self.tools}
+        view = {agent: {"in_view": as_float(visible[agent])} for agent in self.tools}
         view[self.camera] = {
-            "in_view": jnp.stack([single(visible[agent]) for agent in self.tools]).mean(),
+            "in_view": jnp.stack([as_float(visible[agent]) for agent in self.tools]).mean(),
             "object_in_view": jnp.stack(things).mean(),
             "centre_error": jnp.sqrt(jnp.sum(off * off) + 1e-12),
             "camera_travel": self._travel(world, origin),
         }
-        searching = single(~found & (world.goal.time < SEARCH))
+        searching = as_float(~found & (world.goal.time < SEARCH))
         return {agent: {**work[agent], **view[agent], "searching": searching} for agent in world.arms}
 
     def terminated(self, world: World) -> Array:

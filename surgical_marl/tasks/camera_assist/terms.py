@@ -28,13 +28,13 @@ class Shown(NamedTuple):
 
     scene: Scene
     camera: str
-    """Its agent."""
+    """The agent with the endoscope."""
     tools: tuple[str, ...]
     object: str | None
     """Name of the object that the tools move; None if each has a target for its tip."""
     eye: Eye
     sights: Callable[[World], Sights]
-    """Of tips by agent, objects by name, and of `GOAL`, or the target of a tool as `<agent>/target`."""
+    """View of tips by agent, objects by name, and `GOAL` or the target of a tool as `<agent>/target`."""
 
     def to_tool(self, agent: str, work: Mapping[str, Term | Picture]) -> dict[str, Term | Picture]:
         """Return all that a tool may observe: the terms of its work, 0 out of view, and what it sees."""
@@ -89,11 +89,11 @@ class Sights(NamedTuple):
     """View of an endoscope: places by name, and which of them are visible."""
 
     place: dict[str, Array]
-    """In its frame, m, [3] each."""
+    """Places in the endoscope's frame, m, [3] each."""
     visible: dict[str, Array]
-    """True if each is in view, [] bool."""
+    """True for places that are in view, [] bool each."""
     origin: Array
-    """Of its frame in the world, m, [3]."""
+    """Origin of the endoscope's frame in the world, m, [3]."""
 
 
 def hidden(term: Term, sights: Callable[[World], Sights], needs: tuple[str, ...]) -> Term:

@@ -39,7 +39,7 @@ from surgical_marl.cache import cached
 from surgical_marl.runtime import jax, jnp
 from surgical_marl.scenes.poses import Pose
 from surgical_marl.tasks.base.grasp_poses import frames
-from surgical_marl.tasks.base.object_task import NEAR, Best, Now, ObjectTask
+from surgical_marl.tasks.base.object_task import NEAR, Best, Now, ObjectTask, as_float
 from surgical_marl.tasks.base.object_terms import AT_HAND, PARTS, object_terms
 from surgical_marl.tasks.base.oracle_script import Snapshot, Step
 from surgical_marl.tasks.base.task import Start
@@ -69,7 +69,7 @@ STANDS = 0.002
 SHIFT = 0.0015
 """Greatest distance of a block from its peg's axis at the start, m."""
 LOOSE = 0.0026
-"""The same in training at `hard`, m: as far as a block may stand where an arm has let it go."""
+"""Greatest distance of a block from its peg's axis at the start in training at `hard`, m: as arms put it."""
 CLEAR = 0.024
 """Height of a block's underside above the plate from which on it is clear of the pegs, m: these are 20 mm high."""
 
@@ -91,11 +91,11 @@ class Team(NamedTuple):
     """The best that the arms did so far, [] float32 each."""
 
     receive: Array
-    """1 once both held it, lifted."""
+    """1 once both arms held the lifted block, before that 0."""
     passed: Array
-    """1 once the second arm held it alone."""
+    """1 once the second arm alone held the block, before that 0."""
     over: Array
-    """1 once it was held over its goal."""
+    """1 once the block was held over its goal, before that 0."""
 
 
 class PegGoal(NamedTuple):
@@ -214,7 +214,7 @@ class Task(ObjectTask):
         away = (self._base(world) - self.tables["points"][world.goal.row])[:2]
         over = self.presents(now) & (jnp.sum(away * away) < AROUND**2) & (self._height(world) > CLEAR - STANDS)
         found = (both & lifted, alone, over)
-        return Team(*(jnp.maximum(best, new.astype(jnp.float32)) for best, new in zip(team, found, strict=True)))
+        return Team(*(jnp.maximum(best, as_float(new)) for best, new in zip(team, found, strict=True)))
 
     def stands(self, world: World) -> Array:
         """Return whether the block stands on its goal peg and no finger touches it, [] bool."""
@@ -236,7 +236,7 @@ class Task(ObjectTask):
             return goal
         placed, trial = self.placed(world), goal.trial
         lifted = jnp.stack(list(now.held.values())).any() & (now.lift >= 1.0)
-        fallen = jnp.where(lifted | placed, 0.0, jnp.maximum(trial.fallen, now.dropped.astype(jnp.float32)))
+        fallen = jnp.where(lifted | placed, 0.0, jnp.maximum(trial.fallen, as_float(now.dropped)))
         score, scored = self._score(world)
         following = PegGoal(self.turns.following(goal.row), self.nothing, Team(*[jnp.float32(0.0)] * 3), trial)
         goal = jax.tree.map(lambda new, old: jnp.where(placed, new, old), following, goal)
@@ -246,7 +246,7 @@ class Task(ObjectTask):
     def _score(self, world: World) -> tuple[Array, Array]:
         """Return the points of a trial, and the time of the last one, s, with what is placed now."""
         placed, trial = self.placed(world), world.goal.trial
-        return trial.score + placed.astype(jnp.float32), jnp.where(placed, trial.time, trial.scored)
+        return trial.score + as_float(placed), jnp.where(placed, trial.time, trial.scored)
 
     def terminated(self, world: World) -> Array:
         """Return whether the block has been dropped or lost; at `hard` whether any block is below the plate's top."""
@@ -267,8 +267,8 @@ class Task(ObjectTask):
         """Return the terms of every task that brings an object to a goal, `receive`, `passed`, `over` and `placed`."""
         new = self.further(world, self.now(world))
         more = {name: value - best for name, value, best in zip(Team._fields, new, world.goal.team, strict=True)}
-        more["success"] = self.stands(world).astype(jnp.float32)
-        more["placed"] = jnp.float32(0.0) if self.turns is None else self.placed(world).astype(jnp.float32)
+        more["success"] = as_float(self.stands(world))
+        more["placed"] = jnp.float32(0.0) if self.turns is None else as_float(self.placed(world))
         return {agent: {**terms, **more} for agent, terms in super().reward_terms(world).items()}
 
     def success(self, world: World) -> dict[str, Array]:

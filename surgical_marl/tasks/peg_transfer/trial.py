@@ -24,15 +24,15 @@ class Trial(NamedTuple):
     score: Array
     """Points, float32."""
     scored: Array
-    """Time of the last one, s; 0 without any."""
+    """Time of the last point, s; 0 without any."""
     time: Array
-    """Since the start, s."""
+    """Time since the start, s."""
     fallen: Array
-    """1 while the block whose turn it is lies where it was dropped, float32."""
+    """1 while the block in turn lies where it was dropped, else 0, float32."""
 
 
 class Turns:
-    """Whose turn it is. A row of the tables is a turn of a trial: rows r n, ..., r n + n - 1 are those of trial r.
+    """The turns of a trial. A row of the tables is a turn of a trial: rows r n, ..., r n + n - 1 are those of trial r.
 
     Args:
         scene: the arms and the blocks.
