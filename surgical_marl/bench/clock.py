@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-import sys
 import time
 from collections.abc import Callable
+
+from surgical_marl.runs.progress import say
 
 Clock = Callable[[int], float]
 """Function from a number of steps to the seconds that they take."""
@@ -31,14 +32,12 @@ def race(clocks: dict[str, Clock], seconds: float = SECONDS, repeats: int = REPE
     for repeat in range(repeats):
         for key, clock in clocks.items():
             best[key] = min(best[key], clock(counts[key]) / counts[key])
-        print(f"surgical-marl: timed {repeat + 1} of {repeats}", file=sys.stderr, flush=True)
+        say(f"timed {repeat + 1} of {repeats}")
     return best
 
 
 def cpu_clock(
-    step: Callable[[], object],
-    wait: Callable[[], object] = lambda: None,
-    now: Callable[[], float] = time.perf_counter,
+    step: Callable[[], object], wait: Callable[[], object] = lambda: None, now: Callable[[], float] = time.perf_counter
 ) -> Clock:
     """Return a clock that times `step`.
 
@@ -65,22 +64,22 @@ def cuda_clock(step: Callable[[], object], cycle: int) -> Clock:
     """
     import torch
 
-    from surgical_marl.learning.cuda_graph import Replayed
+    from surgical_marl.learning.cuda_graph import GraphedFunction
 
     def lap() -> None:
         for _ in range(cycle):
             step()
 
-    replayed = Replayed(lap, enabled=True)
+    graphed = GraphedFunction(lap, enabled=True)
     for _ in range(2):  # an ordinary call, and the one that captures
-        replayed()
+        graphed()
 
     def seconds(count: int) -> float:
         replays = math.ceil(count / cycle)
         start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
         start.record()
         for _ in range(replays):
-            replayed()
+            graphed()
         end.record()
         end.synchronize()
         return float(start.elapsed_time(end)) / 1e3 * count / (replays * cycle)

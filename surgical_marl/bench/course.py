@@ -18,7 +18,7 @@ from surgical_marl.control.controller import Controller, actuators_of
 from surgical_marl.engines.choose import make_engine
 from surgical_marl.envs.env import Env
 from surgical_marl.physics.simulator import Simulator
-from surgical_marl.physics.state import ARMS, RIGID_BODIES
+from surgical_marl.physics.state import ARMS, RIGID_BODIES, Physics
 from surgical_marl.robots.rotation import matrix_of
 from surgical_marl.scenes.grasps import graspers
 from surgical_marl.scenes.load import load_scene
@@ -108,8 +108,13 @@ def make_course(workload: Workload) -> Course:
 
 
 def _drawn(
-    controller: Controller, motion: str, now: Any, rng: np.random.Generator, at: Any, move: Callable[[Any, Any], Any]
-) -> tuple[Any, list[dict[str, np.ndarray]]]:
+    controller: Controller,
+    motion: str,
+    now: Physics,
+    rng: np.random.Generator,
+    at: Callable[..., Physics],
+    move: Callable[[Physics, dict[str, np.ndarray]], Physics],
+) -> tuple[Physics, list[dict[str, np.ndarray]]]:
     """Return the states [n, ...] to which random actions lead from `now`, and the actions of a course from there.
 
     `at` returns the states of arms at rest at some qpos; `move` makes a control step.
@@ -145,7 +150,7 @@ def _back(drawn: dict[str, np.ndarray], closed: list[str]) -> dict[str, np.ndarr
     return back
 
 
-def _grasping(now: Any, starts: Starts, at: Any) -> Any:
+def _grasping(now: Physics, starts: Starts, at: Callable[..., Physics]) -> Physics:
     """Return the state [n, ...] in which jaws are about to close on objects."""
     qpos, position, turned = (x.astype(np.float32) for x in starts[:3])
     objects = now.rigid_bodies._replace(bodies=now.rigid_bodies.bodies._replace(position=position, quaternion=turned))
@@ -180,14 +185,14 @@ def _leaves(tree: Any) -> dict[str, Any]:
     return {jax.tree_util.keystr(path): leaf for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]}
 
 
-def _by_engine(workload: Workload, count: int) -> Callable[[Any], Any]:
+def _by_engine(workload: Workload, count: int) -> Callable[[Physics], Physics]:
     """Return a function that makes HOLD physics steps of `count` environments, by the fastest engine that can."""
     import jax
 
     engine = make_engine(PhysicsAlone(Env(**workload.of_environment())), count, "auto", workload.where)
     engine.reset(0)
 
-    def roll(now: Any) -> Any:
+    def roll(now: Physics) -> Physics:
         paths = [f".physics{path}" for path in _leaves(now)]
         for path, values in zip(paths, jax.tree.leaves(now), strict=True):
             engine.write(path, np.asarray(values))
@@ -198,16 +203,16 @@ def _by_engine(workload: Workload, count: int) -> Callable[[Any], Any]:
     return roll
 
 
-def _by_mujoco(model: Any, now: Any) -> Any:
+def _by_mujoco(model: mujoco.MjModel, now: Physics) -> Physics:
     """Make HOLD physics steps of C MuJoCo."""
-    state = full_state(now.qpos, now.qvel)
+    state = full_state(np.asarray(now.qpos), np.asarray(now.qvel))
     data = mujoco.MjData(model)
     found, _ = rollout.rollout(model, data, state, np.asarray(now.ctrl, float)[:, None], nstep=HOLD)
     end = np.asarray(found[:, -1], np.float32)
     return now.with_arms(qpos=end[:, 1 : 1 + model.nq], qvel=end[:, 1 + model.nq :])
 
 
-def _touching(model: Any, qpos: np.ndarray) -> float:
+def _touching(model: mujoco.MjModel, qpos: np.ndarray) -> float:
     data, count = mujoco.MjData(model), 0
     for posture in qpos:
         data.qpos[:] = posture

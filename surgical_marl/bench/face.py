@@ -25,11 +25,11 @@ class Face:
     """Seconds of a step on a CPU."""
 
     engine_s: float
-    """Of the engine alone, which reads no results: the median of all pairs, as in all that follows."""
+    """Time of the engine alone, which reads no results, s; median of all pairs, as the other times."""
     added_s: float
-    """Additional time of the interface, s."""
+    """Time that the interface adds, s."""
     share: float
-    """The same as a share of what the engine takes."""
+    """Time that the interface adds, as a share of the engine's."""
     num_envs: int | None
     """None for the environment that is not batched."""
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 import statistics
-import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
@@ -28,6 +27,7 @@ from surgical_marl.learning.train import make_training
 from surgical_marl.learning.trainer import Trainer
 from surgical_marl.machine import describe_machine
 from surgical_marl.plugins.task_file import label
+from surgical_marl.runs.progress import say
 from surgical_marl.runs.settings import Settings
 from surgical_marl.scenes.timing import TIMESTEP
 
@@ -58,7 +58,7 @@ class Speed(sim.Speed):
     train_env_steps_per_s: float
     """Environment steps, acted and learned from."""
     rollout_s: float
-    """Of an iteration, as `update_s` and `rest_s`."""
+    """Time of the rollout of an iteration, s; `update_s` and `rest_s` are the other parts."""
     update_s: float
     rest_s: float
 
@@ -122,7 +122,7 @@ def _learn(settings: Settings, seconds: float, repeats: int) -> tuple[BatchedEnv
             next(going)
             done, took = done + 1, time.perf_counter() - start
         laps.append((took / (done - first), slice(first, done)))
-        print(f"surgical-marl: timed {repeat + 1} of {repeats}", file=sys.stderr, flush=True)
+        say(f"timed {repeat + 1} of {repeats}")
     iteration, span = min(laps, key=lambda lap: lap[0])
     rollout, update = (statistics.fmean(watch.seconds(name)[span]) for name in ("rollout", "update"))
     return training.env.env, {

@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from types import ModuleType
 from typing import Any
 
 import mujoco
@@ -99,7 +100,7 @@ def mujoco_warp(workload: Workload, course: Course) -> Contender:
 
 
 RIVALS: dict[str, Callable[[Workload, Course], Contender]] = {"mujoco": c_mujoco, "mujoco_warp": mujoco_warp}
-"""By the name that `--engine` takes."""
+"""Functions that prepare another simulator, by the name that `--engine` takes."""
 
 
 def _exported(workload: Workload, course: Course) -> tuple[mujoco.MjModel, np.ndarray]:
@@ -128,7 +129,13 @@ def _most(model: mujoco.MjModel, states: np.ndarray, controls: np.ndarray) -> tu
 
 
 def _warp_lap(
-    wp: Any, workload: Workload, course: Course, model: mujoco.MjModel, states: np.ndarray, contacts: int, rows: int
+    wp: ModuleType,
+    workload: Workload,
+    course: Course,
+    model: mujoco.MjModel,
+    states: np.ndarray,
+    contacts: int,
+    rows: int,
 ) -> tuple[Callable[[Callable[[], None]], None], Callable[[], None], Any, bool]:
     """Return what makes a lap of steps, a step, its data after a lap, and whether it lacked room."""
     from mujoco.mjx.third_party import mujoco_warp as library

@@ -32,11 +32,7 @@ _COLORS = {"fused": "#1f6f8b", "mjx": "#b23a48", "mujoco": "#7a7a7a", "mujoco_wa
 
 
 def run(
-    workload: Workload,
-    engines: Sequence[str],
-    sweeping: bool = False,
-    as_json: bool = False,
-    out: Path | None = None,
+    workload: Workload, engines: Sequence[str], sweeping: bool = False, as_json: bool = False, out: Path | None = None
 ) -> str:
     """Run `surgical-marl bench sim`; return the text of its table, or JSON."""
     if sweeping:
@@ -141,12 +137,10 @@ def draw(points: Sequence[Point], title: str, out: Path) -> None:
 
     Physics steps are solid lines, environment steps dashed ones. Filled dots are of a GPU, white ones of a CPU.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.ticker import EngFormatter
 
     figure = Figure(figsize=(8, 4.8), layout="constrained")
-    FigureCanvasAgg(figure)
     axis = figure.subplots()
     for engine, device in dict.fromkeys((p.speed.engine, p.speed.device) for p in points):
         own = [p for p in points if (p.speed.engine, p.speed.device) == (engine, device)]

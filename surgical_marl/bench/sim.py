@@ -8,7 +8,6 @@ docs/benchmarks.md says what is timed, and how.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -20,6 +19,7 @@ from surgical_marl.bench.engines import ENGINES, prepare
 from surgical_marl.bench.other_simulators import MOST_ROLLED, Contender
 from surgical_marl.bench.workload import Workload
 from surgical_marl.engines.choose import DeviceName
+from surgical_marl.runs.progress import say
 from surgical_marl.scenes.timing import TIMESTEP
 
 SWEEP = tuple(4**k for k in range(12))
@@ -38,7 +38,7 @@ class Speed:
     env_steps_per_s: float | None
     """Steps of the task: observation, reward and reset included. None for other simulators, which have no tasks."""
     simulated_s_per_s: float
-    """Of all environments together, by environment steps where there are any."""
+    """Simulated time of all environments together, by environment steps where there are any."""
     num_envs: int
     engine: str
     device: str
@@ -48,7 +48,7 @@ class Speed:
     decimation: int
     """Physics steps an environment step."""
     compile_s: float
-    """From nothing but imported packages to the end of the first step, s."""
+    """Time from imported packages to the end of the first step, s."""
 
 
 def measure(
@@ -67,7 +67,7 @@ def measure(
     if not contenders:
         raise ValueError("; ".join(left_out.values()))
     for name, why in left_out.items():
-        _say(f"{name} is left out: {why}")
+        say(f"{name} is left out: {why}")
     return _time(workload, contenders, seconds, repeats), left_out
 
 
@@ -110,7 +110,7 @@ class Point(NamedTuple):
 
     speed: Speed
     bytes_per_env: int | None
-    """Of the arrays that the fused engine's kernel works on; None for the others."""
+    """Bytes of the arrays of the fused engine's kernel; None for other engines."""
 
 
 def sweep(
@@ -139,11 +139,11 @@ def _sweep_one(
 ) -> Iterator[Point]:
     where = f"{name} on {workload.where}"
     for count, following in zip(counts, [*counts[1:], None], strict=True):
-        _say(f"{where}, {count} environments")
+        say(f"{where}, {count} environments")
         had, sized = machine.restart_peak(), replace(workload, num_envs=count)
         contenders, left_out = _contenders(sized, (name,), course)
         if left_out:
-            return _say(f"{where} ends before {count} environments: {left_out[name]}")
+            return say(f"{where} ends before {count} environments: {left_out[name]}")
         speed = _time(sized, contenders, seconds, repeats)[name]
         used = machine.peak() - had
         yield Point(speed, contenders.pop(name).bytes_per_env)
@@ -158,9 +158,5 @@ def _sweep_one(
             why = f"a step of {following} would take more than {LONGEST:.0f} s"
         else:
             continue
-        _say(f"{where} ends at {count} environments: {why}")
+        say(f"{where} ends at {count} environments: {why}")
         return
-
-
-def _say(text: str) -> None:
-    print(f"surgical-marl: {text}", file=sys.stderr, flush=True)

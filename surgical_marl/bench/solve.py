@@ -13,16 +13,15 @@ from __future__ import annotations
 
 import json
 import statistics
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields, replace
-from typing import Any
 
 from surgical_marl import machine
 from surgical_marl.bench.learning import STARTING, Stopwatch, rows
+from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.evaluation.evaluate import Played, play
-from surgical_marl.evaluation.goal_set import is_standard
+from surgical_marl.evaluation.goal_set import STANDARD_EPISODES, STANDARD_SEED, is_standard
 from surgical_marl.evaluation.metrics import SUCCESS_MM, metrics
 from surgical_marl.evaluation.report import aligned
 from surgical_marl.learning.memory import in_memory
@@ -32,10 +31,9 @@ from surgical_marl.machine import describe_machine
 from surgical_marl.plugins.task_file import label
 from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.policies.actor import acting_policy
+from surgical_marl.runs.progress import say
 from surgical_marl.runs.settings import Settings, make_env
 
-EPISODES, SEED = 200, 0
-"""Episodes and seed of the standard goal sets."""
 WITHIN = f"success_{SUCCESS_MM}mm"
 """The metric of tips that stay near their targets."""
 EAGER, PATIENT = 1 / 3, 0.05
@@ -94,9 +92,9 @@ class Times:
     """The seconds of a training by part."""
 
     imports_s: float
-    """From the start of the process until its packages are imported."""
+    """Time from the start of the process until its packages are imported."""
     compile_s: float
-    """Environments, networks, graphs; and what the first two iterations take more than the others."""
+    """Time to make environments, networks and graphs, and what the first two iterations take more than the others."""
     rollout_s: float
     update_s: float
     evaluation_s: float
@@ -109,7 +107,7 @@ class Solution:
 
     solved: bool
     seconds: float
-    """From the start to the end of the last evaluation: the sum of `times`."""
+    """Time from the start to the end of the last evaluation: the sum of `times`."""
     times: Times
     iterations: int
     env_steps: int
@@ -148,22 +146,22 @@ def solve(
     """
     entered = time.perf_counter()
     began = entered if began is None else began
-    training, exam_env = make_training(settings), make_env(replace(settings, goals="held_out"), EPISODES)
+    training, exam_env = make_training(settings), make_env(replace(settings, goals="held_out"), STANDARD_EPISODES)
     env = training.env.env
-    watch, looks = Stopwatch(training), Looks(goal)
+    watch, schedule = Stopwatch(training), EvaluationSchedule(goal)
     made = time.perf_counter()
     training.imitate()
     exams, examining = [], 0.0
     for row in rows(training):
         now = time.perf_counter()
         over = give_up(now - began, now - made)
-        if over or looks.due(row["success_rate"], now - made):
+        if over or schedule.due(row["success_rate"], now - made):
             watch.wait()
             now = time.perf_counter()
             exams.append(examine(training, exam_env))
             end = time.perf_counter()
             examining += end - now
-            looks.add(row["success_rate"], exams[-1], end - made, end - now)
+            schedule.add(row["success_rate"], exams[-1], end - made, end - now)
             _say(f"{now - began:.1f} s, iteration {training.iteration}", exams[-1])
             if over or exams[-1].passes(goal):
                 break
@@ -198,8 +196,8 @@ def _times(began: float, entered: float, made: float, watch: Stopwatch, examinin
     return replace(times, rest_s=max(0.0, whole - sum(asdict(times).values())))
 
 
-class Looks:
-    """Decides when to evaluate, because evaluations take time too.
+class EvaluationSchedule:
+    """The times of evaluations, which are chosen because evaluations take time too.
 
     Training's own success, of actions with noise, is lower than that of an evaluation, so the first evaluation comes at
     a quarter of the goal. From then on a straight line to the point where both rates are 1 predicts at which success of
@@ -212,7 +210,7 @@ class Looks:
         self._ended = self._took = 0.0
 
     def due(self, success: float, learning: float) -> bool:
-        """Say whether to evaluate after an iteration.
+        """Return whether to evaluate after an iteration.
 
         Args:
             success: success rate of that iteration in training; NaN if no episode ended.
@@ -237,11 +235,11 @@ class Looks:
         self._promising = success + (1 - success) * min(missing, 1.0)
 
 
-def examine(training: Trainer, env: Any) -> Exam:
-    """Run the frozen evaluation of the policy as it is now, in `EPISODES` environments."""
+def examine(training: Trainer, env: BatchedEnv) -> Exam:
+    """Run the frozen evaluation of the policy as it is now, in `STANDARD_EPISODES` environments."""
     policy = acting_policy(training.algorithm.actor, training.env.layout, str(env.device))
     judged_by = WITHIN if TASKS.load(training.settings.task).has_targets else "success_rate"
-    return _exam(play(env, policy, EPISODES, SEED), judged_by)
+    return _exam(play(env, policy, STANDARD_EPISODES, STANDARD_SEED), judged_by)
 
 
 def _exam(played: Played, judged_by: str) -> Exam:
@@ -297,7 +295,7 @@ def table(settings: Settings, goal: Goal, found: Solution) -> str:
             "",
             f"{found.iterations} iterations of {found.num_envs} environments ({found.engine} engine, {found.device}), "
             f"{found.env_steps:,} samples, {found.evaluations} evaluations",
-            f"the last of {EPISODES} episodes: {exam.success:.1%} {exam.what}, median error "
+            f"the last of {STANDARD_EPISODES} episodes: {exam.success:.1%} {exam.what}, median error "
             f"{exam.median_error_mm:.2f} mm, {exam.collision_rate:.1%} collisions; goal set {exam.goal_set:.12} "
             f"({'standard' if exam.standard else 'not a standard one'})",
         ]
@@ -305,8 +303,4 @@ def table(settings: Settings, goal: Goal, found: Solution) -> str:
 
 
 def _say(when: str, exam: Exam) -> None:
-    print(
-        f"surgical-marl: {when}: {exam.success:.1%} {exam.what}, {exam.collision_rate:.1%} collisions",
-        file=sys.stderr,
-        flush=True,
-    )
+    say(f"{when}: {exam.success:.1%} {exam.what}, {exam.collision_rate:.1%} collisions")

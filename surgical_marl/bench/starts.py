@@ -86,11 +86,11 @@ class Starts(NamedTuple):
     """Start states of n environments."""
 
     qpos: np.ndarray
-    """[n, nq]"""
+    """Joint positions of the whole scene, [n, nq]."""
     position: np.ndarray
     """Centres of mass of the free objects, m, [n, k, 3]."""
     quaternion: np.ndarray
-    """Of the free objects, [n, k, 4]."""
+    """Orientations of the free objects, [n, k, 4]."""
     arms: np.ndarray
     """Number of jaws around the first object, [n]."""
 

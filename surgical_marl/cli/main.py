@@ -366,7 +366,7 @@ def _train(arguments: argparse.Namespace) -> None:
             print(run, flush=True)
 
 
-def _run_folder(settings: Any) -> Path:
+def _run_folder(settings: Settings) -> Path:
     name = f"{label(settings.task)}-{Path(settings.scene).stem}-{settings.algo}-seed{settings.seed}"
     return Path("runs") / f"{name}-{time.strftime('%Y%m%d-%H%M%S')}"
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from surgical_marl.cli.flags import add_flags, task_help, whole
 from surgical_marl.content import BASELINES, find, list_scenes
 from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.runs.process import ending_signals
-from surgical_marl.runs.progress import preparing
+from surgical_marl.runs.progress import preparing, say
 from surgical_marl.tasks.base.options import SAME, Options
 from surgical_marl.untrusted.files import is_file, user_path
 from surgical_marl.untrusted.values import plural
@@ -41,12 +42,13 @@ def add_play(commands: Any) -> None:
     _add_what(parser)
     parser.add_argument("--out", type=user_path, required=True, metavar="FILE", help="an .mp4, a .gif or a .webp")
     parser.add_argument("--episodes", type=whole(1, 1000), default=1, metavar="N")
-    parser.add_argument("--grid", type=_grid, default=(1, 1), metavar="RxC", help="so many environments, such as 4x4")
+    grid = _pair("rows and columns such as 4x4")
+    parser.add_argument("--grid", type=grid, default=(1, 1), metavar="RxC", help="so many environments, such as 4x4")
     parser.add_argument("--slow", type=_number, default=1.0, metavar="X", help="times slower than real time")
     what = "a camera of the scene by name, or AZIMUTH,ELEVATION,DISTANCE in degrees and m about the tool tips"
     parser.add_argument("--camera", metavar="CAMERA", help=what)
     what = "pixels of the picture of one environment (default: 480x360, and less in a grid)"
-    parser.add_argument("--size", type=_size, metavar="WxH", help=what)
+    parser.add_argument("--size", type=_pair("width and height in pixels such as 640x480"), metavar="WxH", help=what)
     parser.add_argument("--plain", action="store_true", help="without words in the picture")
     parser.set_defaults(check=_check_play, command=_play, name="play")
 
@@ -112,7 +114,7 @@ def _play(arguments: argparse.Namespace) -> None:
     print(path)
     if path.suffix != arguments.out.suffix:
         said = f"written as a {path.suffix[1:]}, because ffmpeg can't run here; `pip install imageio-ffmpeg` brings one"
-        print(f"surgical-marl: {said}", file=sys.stderr)
+        say(said)
 
 
 def _film(arguments: argparse.Namespace) -> Path:
@@ -130,18 +132,16 @@ def _film(arguments: argparse.Namespace) -> Path:
     return film(env, movers, arguments.out, look, arguments.episodes, arguments.seed)
 
 
-def _grid(text: str) -> tuple[int, int]:
-    rows, _, columns = text.partition("x")
-    if not (rows.isdecimal() and columns.isdecimal()):
-        raise argparse.ArgumentTypeError(f"must be rows and columns such as 4x4, not {text!r}")
-    return int(rows), int(columns)
+def _pair(what: str) -> Callable[[str], tuple[int, int]]:
+    """Return a reader, for `add_argument(type=...)`, of two whole numbers with an x between them."""
 
+    def read(text: str) -> tuple[int, int]:
+        first, _, second = text.partition("x")
+        if not (first.isdecimal() and second.isdecimal()):
+            raise argparse.ArgumentTypeError(f"must be {what}, not {text!r}")
+        return int(first), int(second)
 
-def _size(text: str) -> tuple[int, int]:
-    width, _, height = text.partition("x")
-    if not (width.isdecimal() and height.isdecimal()):
-        raise argparse.ArgumentTypeError(f"must be width and height in pixels such as 640x480, not {text!r}")
-    return int(width), int(height)
+    return read
 
 
 def _number(text: str) -> float:

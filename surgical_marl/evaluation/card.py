@@ -34,7 +34,7 @@ COLUMNS = (
     *("these weights: median error (mm)", "on training goals (mm)", "RMSE (mm)", "within 2 mm from random starts"),
     *("training", "misses"),
 )
-"""Of the table of all policies: means over the training seeds up to the collisions, then results of what ships."""
+"""Columns of the table of all policies: means over training seeds up to the collisions, then results of what ships."""
 _HOLDS = {"below": operator.lt, "at least": operator.ge}
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from surgical_marl.evaluation.environment import common_settings, find_policy
 from surgical_marl.evaluation.evaluate import EPISODES, MAX_BATCH, Played, difference, play, summarise, write_played
+from surgical_marl.evaluation.goal_set import STANDARD_EPISODES, STANDARD_SEED
 from surgical_marl.evaluation.report import ABOUT, format_table, write_csv
 from surgical_marl.files import write_text
 from surgical_marl.policies.policy import load_policy
@@ -21,7 +22,7 @@ from surgical_marl.untrusted.values import as_number
 
 if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv
-    from surgical_marl.policies.policy import Policy
+    from surgical_marl.policies.acting import Policy
 
 RESULT, FILM = "eval.json", "video.mp4"
 """Files that `judge` adds to a run."""
@@ -115,9 +116,10 @@ def judge(run: Path) -> None:
 
 def play_standard(run: Path) -> tuple[BatchedEnv, Policy, Played]:
     """Play the standard goals with a run or a shipped policy; also return the environment and the policy."""
-    env = make_env(read_settings(run, ["engine=auto", "device=auto", "goals=held_out"]), num_envs=200)
+    env = make_env(read_settings(run, ["engine=auto", "device=auto", "goals=held_out"]), STANDARD_EPISODES)
     policy = load_policy(run, env)
-    return env, policy, play(env, policy, 200, seed=0, show="evaluating 200 episodes")
+    show = f"evaluating {STANDARD_EPISODES} episodes"
+    return env, policy, play(env, policy, STANDARD_EPISODES, STANDARD_SEED, show)
 
 
 def read_result(path: Path) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from surgical_marl.evaluation.environment import common_settings, find_policy
 from surgical_marl.evaluation.evaluate import MAX_BATCH, Played, play
 from surgical_marl.evaluation.interval import interval
 from surgical_marl.evaluation.metrics import Metric
-from surgical_marl.evaluation.report import aligned
+from surgical_marl.evaluation.report import aligned, described
 from surgical_marl.files import write_atomic
 from surgical_marl.policies.oracle import oracle
 from surgical_marl.policies.team import Team
@@ -121,8 +121,7 @@ def report(result: Mapping[str, Any], as_json: bool, figure: Path | None) -> str
 
 def format_table(result: Mapping[str, Any]) -> str:
     """Return what `crossplay` returned as plain text."""
-    words = "{task} in {scene}, {difficulty}, {control} control, {goals} goals, {start} start: {episodes} episodes"
-    parts = [f"{words.format(**result)}, seed {result['seed']}"]
+    parts = [described(result)]
     for key, title in (("self_play", "self-play"), ("cross_play", "cross-play")):
         if (found := result[key]) is not None:
             bounds = "" if found["interval"] is None else " ({:.1%} to {:.1%})".format(*found["interval"])
@@ -149,7 +148,6 @@ def _text(cell: Mapping[str, float]) -> str:
 
 def _draw(path: Path, result: Mapping[str, Any]) -> None:
     """Draw the matrices, and the success with partners, as heat maps in a PNG."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     teams = result["teams"]
@@ -158,7 +156,6 @@ def _draw(path: Path, result: Mapping[str, Any]) -> None:
     whos = list(next(iter(lines.values())))
     panels.append(("that role is", list(lines), whos, [list(cells.values()) for cells in lines.values()]))
     figure = Figure(figsize=(1 + 4 * len(panels), 1.5 + 0.6 * len(lines)), layout="constrained")
-    FigureCanvasAgg(figure)
     figure.suptitle("team success: {task} in {scene}, {difficulty}, {episodes} episodes".format(**result), fontsize=11)
     for axis, (title, names, columns, rows) in zip(np.atleast_1d(figure.subplots(1, len(panels))), panels, strict=True):
         values = np.array([[cell["team_success"] for cell in row] for row in rows])

@@ -14,7 +14,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
+from tqdm import tqdm
 
+from surgical_marl.envs.infos import ERRORS
 from surgical_marl.evaluation.goal_set import check_same, describe_goals, episode_seed, goal_hash, read_goals
 from surgical_marl.evaluation.interval import interval
 from surgical_marl.evaluation.metrics import (
@@ -33,7 +35,7 @@ from surgical_marl.evaluation.metrics import (
     metrics,
 )
 from surgical_marl.evaluation.report import Evaluation
-from surgical_marl.files import write_atomic
+from surgical_marl.files import write_npz
 from surgical_marl.policies.acting import forget
 from surgical_marl.runs.progress import progress
 from surgical_marl.untrusted.arrays import read_npz
@@ -50,8 +52,6 @@ MEASURES = ("error", "held", "squared", "distance", "center", "success", "collid
 
 MAX_BATCH = 1024
 """Episodes run at once; make the environment with num_envs=min(episodes, MAX_BATCH)."""
-ERRORS = ("tip_error", "goal_error")
-"""Infos of how far a tool tip, or an object, is from its goal, m: the first that there is counts."""
 INFOS = ("success", "collision", "min_distance")
 KEPT = (*ERRORS, *INFOS, *LAST, *VIEWED, *TRAVEL, *PEAK, DROP, SEARCHING)
 """Names of infos that metrics are computed from, besides those that begin like `TERMS` and `STAGE`."""
@@ -72,10 +72,7 @@ class Played(NamedTuple):
 
 
 def evaluate(
-    env: BatchedEnv,
-    policy: Callable[[Mapping[str, Any]], Mapping[str, Any]],
-    episodes: int,
-    seed: int,
+    env: BatchedEnv, policy: Callable[[Mapping[str, Any]], Mapping[str, Any]], episodes: int, seed: int
 ) -> Evaluation:
     """Run a policy for a number of episodes.
 
@@ -93,11 +90,7 @@ def evaluate(
 
 
 def play(
-    env: BatchedEnv,
-    policy: Callable[[Mapping[str, Any]], Mapping[str, Any]],
-    episodes: int,
-    seed: int,
-    show: str = "",
+    env: BatchedEnv, policy: Callable[[Mapping[str, Any]], Mapping[str, Any]], episodes: int, seed: int, show: str = ""
 ) -> Played:
     """Play the episodes of `evaluate`, and return their measures without metrics.
 
@@ -174,7 +167,11 @@ def _numbers(found: Mapping[str, Metric], stages: Sequence[str]) -> dict[str, An
 
 
 def _first_episodes(
-    env: BatchedEnv, policy: Callable[..., Mapping[str, Any]], observations: Mapping[str, Any], count: int, bar: Any
+    env: BatchedEnv,
+    policy: Callable[..., Mapping[str, Any]],
+    observations: Mapping[str, Any],
+    count: int,
+    bar: tqdm | None,
 ) -> Trajectory:
     """Play the first episodes of the first `count` environments, which have just been reset."""
     lengths = np.zeros(count, int)
@@ -242,19 +239,9 @@ def _numpy(values: Any, count: int) -> np.ndarray:
 
 def write_played(path: Path, played: Played) -> None:
     """Write episodes as an npz file of float32 arrays [E, A], one for each measure, and `about`, a text in JSON."""
-    about = json.dumps({
-        "about": played.about,
-        "agents": played.agents,
-        "follows": played.follows,
-        "stages": played.stages,
-    })  # fmt: skip
-    measures: dict[str, Any] = {name: values.astype(np.float32) for name, values in played.measures.items()}
-
-    def save(temporary: Path) -> None:
-        with temporary.open("wb") as file:  # a name without .npz would get one
-            np.savez_compressed(file, about=np.array(about), **measures)
-
-    write_atomic(path, save)
+    about = {name: getattr(played, name) for name in ("about", "agents", "follows", "stages")}
+    measures = {name: values.astype(np.float32) for name, values in played.measures.items()}
+    write_npz(path, {"about": np.array(json.dumps(about)), **measures})
 
 
 def read_played(path: Path) -> Played:

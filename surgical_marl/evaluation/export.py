@@ -16,6 +16,7 @@ from surgical_marl.content import find
 from surgical_marl.evaluation.card import CARD, CLIP, EVALUATION, card, misses, worst_median
 from surgical_marl.evaluation.command import play_all
 from surgical_marl.evaluation.evaluate import summarise
+from surgical_marl.evaluation.goal_set import STANDARD_EPISODES, STANDARD_SEED
 from surgical_marl.files import write_text
 from surgical_marl.plugins.task_file import label
 from surgical_marl.plugins.tasks import TASKS
@@ -27,12 +28,11 @@ from surgical_marl.runs.content import copy_content, stored_scene
 from surgical_marl.runs.curve import draw_curve
 from surgical_marl.runs.folder import CONFIG, METRICS, read_origin, read_settings
 from surgical_marl.runs.identity import identity, setting
+from surgical_marl.runs.progress import say
 from surgical_marl.runs.settings import Settings, config_text, make_env
 from surgical_marl.untrusted.files import read_json
 from surgical_marl.view.record import record
 
-EPISODES, SEED = 200, 0
-"""Episodes and seed of the standard goal sets."""
 MAY_DIFFER = {"seed", "engine", "device"}
 
 
@@ -81,7 +81,7 @@ def _evaluate(runs: Sequence[str], seeds: Sequence[int], name: str) -> tuple[dic
 
     The result is what `eval --json` prints of the best run. `seeds` in it holds the results of all runs.
     """
-    played = list(play_all(list(runs), {}, EPISODES, SEED).values())
+    played = list(play_all(list(runs), {}, STANDARD_EPISODES, STANDARD_SEED).values())
     results = [{"policy": f"seed {seed}", **summarise([run])} for seed, run in zip(seeds, played, strict=True)]
     best = min(range(len(results)), key=lambda run: _rank(results[run]))
     whole = {"policy": "aggregate", **summarise(played)}
@@ -96,7 +96,7 @@ def evaluate_again(folder: Path) -> None:
     """
     path = folder / EVALUATION
     before = read_json(path)
-    (played,) = play_all([str(folder)], {}, EPISODES, SEED).values()
+    (played,) = play_all([str(folder)], {}, STANDARD_EPISODES, STANDARD_SEED).values()
     found = {"policy": folder.name, **summarise([played]), "seeds": before["seeds"], "also": _also(str(folder))}
     write_text(path, _compact(found))
     write_text(folder / CARD, card(folder, folder.name))
@@ -118,7 +118,10 @@ def _also(run: str) -> dict[str, Any]:
     task = TASKS.load(settings.task)
     if not getattr(task.levels[settings.difficulty], "own_starts", False):
         asked |= {f"{start} starts": {"start": start} for start in task.starts if start != settings.start}
-    return {name: summarise([play_all([run], other, EPISODES, SEED)[run]]) for name, other in asked.items()}
+    return {
+        name: summarise([play_all([run], other, STANDARD_EPISODES, STANDARD_SEED)[run]])
+        for name, other in asked.items()
+    }
 
 
 def _rank(result: dict[str, Any]) -> tuple[int, float, float]:
@@ -142,5 +145,5 @@ def _fill(folder: Path, run: Path, settings: Settings, evaluation: dict[str, Any
     try:
         record(env, load_policy(run, env), folder / CLIP, small=True)
     except (OSError, RuntimeError) as error:
-        print(f"surgical-marl: no clip, since this machine cannot make one: {error}", file=sys.stderr)
+        say(f"no clip, since this machine cannot make one: {error}")
     (folder / CARD).write_text(card(folder, evaluation["policy"]), encoding="utf-8")

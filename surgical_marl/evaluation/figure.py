@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter, PercentFormatter
 
@@ -26,7 +25,6 @@ def draw(path: Path, runs: Mapping[str, Played]) -> None:
     held = 1000 * np.stack([run.measures["held"] for run in runs.values()])
     error = 1000 * np.stack([run.measures["error"] for run in runs.values()])
     figure = Figure(figsize=(10, 4), layout="constrained")
-    FigureCanvasAgg(figure)
     of = next(iter(runs)) if len(runs) == 1 else f"{len(runs)} runs"
     figure.suptitle("{}: {task} in {scene}, {episodes} episodes, seed {seed}".format(of, **first.about), fontsize=11)
     left, right = figure.subplots(1, 2, width_ratios=(3, 2))

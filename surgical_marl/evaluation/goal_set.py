@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 PROTOCOL = 2
 """Increased when goals are drawn or a metric is computed in another way; results of different protocols don't
 compare."""
+STANDARD_EPISODES, STANDARD_SEED = 200, 0
+"""Number of episodes, and seed, of the standard goal sets."""
 ROUNDING = 1e-6
 """Goals are hashed as whole multiples of this, m, without digits that may differ between machines."""
 _FILE = Path(__file__).with_name("goal_sets.yaml")

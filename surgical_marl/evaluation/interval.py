@@ -1,4 +1,4 @@
-"""95 % confidence intervals of metrics (scipy). docs/evaluation.md says which kind of number has which."""
+"""Compute 95 % confidence intervals of metrics; docs/evaluation.md has the method for each kind of metric."""
 
 from __future__ import annotations
 

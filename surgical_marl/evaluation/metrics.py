@@ -171,10 +171,10 @@ def metrics(measures: Mapping[str, np.ndarray], following: bool) -> dict[str, Me
         f"team_success_{SUCCESS_MM}mm": success(mm["held"].max(-1, keepdims=True), SUCCESS_MM),
         "success_rate": Metric(measures["success"].astype(float), _mean, share=True),
         "collision_rate": Metric(measures["collided"].any(-1, keepdims=True).astype(float), _mean, share=True),
-        "time_to_success_s": Metric(measures["time"], _mean_of_known),
+        "time_to_success_s": Metric(measures["time"], mean_of_known),
         "path_length_mm": Metric(mm["path"], _mean),
-        "smoothness": Metric(measures["smoothness"], _mean_of_known),
-        "action_change": Metric(measures["action_change"], _mean_of_known),
+        "smoothness": Metric(measures["smoothness"], mean_of_known),
+        "action_change": Metric(measures["action_change"], mean_of_known),
         "min_distance_mm": Metric(mm["distance"], lambda values: values.min(-1), extreme=True),
         "remote_center_error_mm": Metric(mm["center"], lambda values: np.fmax.reduce(values, -1), extreme=True),
     }
@@ -184,9 +184,9 @@ def metrics(measures: Mapping[str, np.ndarray], following: bool) -> dict[str, Me
         found["drop_rate"] = Metric(measures[DROP].max(-1, keepdims=True), _mean, share=True)
     for name, (title, unit) in (LAST | VIEWED | TRAVEL | PEAK).items():
         if name in measures:
-            found[title] = Metric(unit * measures[name], _mean_of_known, share=title.endswith("_rate"))
+            found[title] = Metric(unit * measures[name], mean_of_known, share=title.endswith("_rate"))
     return found | {
-        name: Metric(values, _mean_of_known, share=name.startswith(SHARES))
+        name: Metric(values, mean_of_known, share=name.startswith(SHARES))
         for name, values in measures.items()
         if name.startswith((*TERMS, STAGE))
     }
@@ -245,7 +245,7 @@ def _percentile_95(values: np.ndarray) -> np.ndarray:
     return np.percentile(values, 95, axis=-1)
 
 
-def _mean_of_known(values: np.ndarray) -> np.ndarray:
+def mean_of_known(values: np.ndarray) -> np.ndarray:
     """Return the mean of the known values; NaN if there are none."""
     known = ~np.isnan(values)
     with np.errstate(invalid="ignore"):

@@ -65,10 +65,15 @@ def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
     ]
 
 
-def _describe(result: Mapping[str, Any]) -> str:
-    """Return what was played, as a text."""
+def described(result: Mapping[str, Any]) -> str:
+    """Return a text on the task, the options, the number of episodes and the seed of a result."""
     words = "{task} in {scene}, {difficulty}, {control} control, {goals} goals, {start} start: {episodes} episodes"
-    what = f"{words.format(**result)}, seed {result['seed']}"
+    return f"{words.format(**result)}, seed {result['seed']}"
+
+
+def _describe(result: Mapping[str, Any]) -> str:
+    """Return a text on what was played, with partners and goal set."""
+    what = described(result)
     what += "".join(f", {agent} is {who}" for agent, who in result.get("partners", {}).items())
     return f"{what}, goal set {result['goal_set']:.12} ({'standard' if is_standard(result) else 'not a standard one'})"
 

@@ -70,9 +70,9 @@ class SurgicalVectorEnv(LimitInSpec, VectorEnv[Any, np.ndarray, Any]):
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._seen: dict[str, Any] = {}
-        """What all arms observe, as it was last returned."""
+        """Observations of all arms, as they were last returned."""
         self._over = np.zeros(self.num_envs, bool)
-        """Where an episode is over and the next one has not been shown yet."""
+        """True for environments whose episode is over and whose next one has not been shown yet, [N] bool."""
         self._pictures: Any = None
         self.batch.autoreset = False
 

@@ -57,12 +57,12 @@ class Box(NamedTuple):
 
 
 class EnvState(NamedTuple):
-    """Where an environment is: all that its next step depends on, and what a critic sees of it."""
+    """State of an environment: everything that its next step depends on, and the view of a critic."""
 
     carry: Carry
-    """What the next step reads."""
+    """Input of the next step."""
     global_state: Array
-    """What a centralised critic sees, [S]: `state()` of the PettingZoo face."""
+    """View of a centralised critic, [S]: `state()` of the PettingZoo face."""
 
 
 class JaxEnv:
@@ -89,7 +89,7 @@ class JaxEnv:
 
     @property
     def name(self) -> str:
-        """What people call it, as in "reach on psm"."""
+        """Name for people, as in "reach on psm"."""
         return self.env.title
 
     def observation_space(self, agent: str) -> Box:

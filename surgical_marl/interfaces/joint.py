@@ -31,7 +31,7 @@ _TEAM: dict[str, Callable[[Any, Any], Any]] = {
     "drop": np.logical_or,
     "holding": np.logical_or,
 }
-"""How values of two arms make one of both; see also `_combine`."""
+"""Functions that make one value of those of two arms, by the name of the info; see also `_combine`."""
 
 
 class JointAgent:

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 class _Face:
-    """What both parallel environments have in common.
+    """Common part of both parallel environments.
 
     Each is a `ParallelEnv` itself, not by way of this class: skrl looks at an environment's direct bases.
     """
@@ -60,7 +60,7 @@ class _Face:
 
     @property
     def render_mode(self) -> str | None:
-        """What `render` does: "human", "rgb_array", or None for nothing."""
+        """Mode of `render`: "human", "rgb_array", or None for nothing."""
         return self._rendering.mode
 
     @property

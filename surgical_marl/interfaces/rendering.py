@@ -1,4 +1,4 @@
-"""What `render_mode` means: pictures of an environment as arrays, or in a window."""
+"""Pictures of an environment, as arrays or in a window: the meaning of `render_mode`."""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ class RslRlVecEnv(VecEnv):
 
     @property
     def capturable(self) -> bool:
-        """Whether a CUDA graph can hold `step`."""
+        """True if a CUDA graph can hold `step`."""
         return bool(self.env.device == "cuda" and self.env.engine.name == "fused")
 
     @property

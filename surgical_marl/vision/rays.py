@@ -140,7 +140,7 @@ def place(
     turns: wp.array2d[wp.mat33],
     eyes: wp.array2d[wp.vec3],
 ):
-    """From a camera's frame to a shape's: rotations, and where the eye is; both [pictures, shapes]."""
+    """Rotations from a camera's frame to a shape's, and places of the eye there; both [pictures, shapes]."""
     picture, shape = wp.tid()
     env, camera, geom = picture // cameras.shape[0], cameras[picture % cameras.shape[0]], geoms[shape]
     back = wp.transpose(geom_xmat[env, geom])

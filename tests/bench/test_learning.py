@@ -16,7 +16,7 @@ from surgical_marl import machine
 from surgical_marl.bench import course, solve
 from surgical_marl.bench import learning as train
 from surgical_marl.bench.learning import STARTING
-from surgical_marl.bench.solve import Exam, Goal, Looks
+from surgical_marl.bench.solve import EvaluationSchedule, Exam, Goal
 from surgical_marl.cli.main import main
 from surgical_marl.learning import train as learning_train
 from surgical_marl.learning.imitation import Imitation
@@ -111,7 +111,7 @@ def test_given_up(fakes: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
 
 def test_the_policy_is_examined_as_it_is(fakes: None) -> None:
     """An evaluation between two iterations changes nothing for the training."""
-    other = solve.make_env(SETTINGS, solve.EPISODES)
+    other = solve.make_env(SETTINGS, solve.STANDARD_EPISODES)
 
     def losses(examined: bool) -> list[float]:
         training, found = Trainer(SETTINGS, solve.make_env(SETTINGS)), []
@@ -141,16 +141,16 @@ def test_a_stopwatch_times_each_rollout_and_update(fakes: None, monkeypatch: pyt
     assert watch.seconds("rollout") == watch.seconds("update") == [1.0] * 3
 
 
-def test_looks_are_worth_their_time() -> None:
-    looks = Looks(Goal(0.9, 0.01))
-    assert not looks.due(math.nan, 10.0), "no episode ended"
-    assert not looks.due(0.2, 10.0) and looks.due(0.3, 10.0), "a quarter of the goal"
-    looks.add(0.4, exam(0.8), learning=100.0, took=1.0)
+def test_evaluations_are_worth_their_time() -> None:
+    schedule = EvaluationSchedule(Goal(0.9, 0.01))
+    assert not schedule.due(math.nan, 10.0), "no episode ended"
+    assert not schedule.due(0.2, 10.0) and schedule.due(0.3, 10.0), "a quarter of the goal"
+    schedule.add(0.4, exam(0.8), learning=100.0, took=1.0)
     # (0.4, 0.8) and (1, 1): 0.9 is expected at 0.7
-    assert not looks.due(0.69, 119.0) and looks.due(0.69, 121.0), "a twentieth of the time"
-    assert not looks.due(0.71, 102.5) and looks.due(0.71, 103.5), "a third of the time"
-    looks.add(0.7, exam(0.95, collisions=0.02), learning=200.0, took=1.0)
-    assert looks.due(0.7, 206.0), "only collisions are too many"
+    assert not schedule.due(0.69, 119.0) and schedule.due(0.69, 121.0), "a twentieth of the time"
+    assert not schedule.due(0.71, 102.5) and schedule.due(0.71, 103.5), "a third of the time"
+    schedule.add(0.7, exam(0.95, collisions=0.02), learning=200.0, took=1.0)
+    assert schedule.due(0.7, 206.0), "only collisions are too many"
 
 
 def test_a_goal_is_success_without_collisions() -> None:
@@ -159,7 +159,7 @@ def test_a_goal_is_success_without_collisions() -> None:
 
 
 def test_tasks_without_targets_of_tips_are_judged_by_their_own_success(fakes: None) -> None:
-    env = solve.make_env(SETTINGS, solve.EPISODES)
+    env = solve.make_env(SETTINGS, solve.STANDARD_EPISODES)
     found = {}
     for task in ("reach", "needle_pick"):
         training = Trainer(SETTINGS, solve.make_env(SETTINGS))
