@@ -137,7 +137,7 @@ def _warp_lap(
     contacts: int,
     rows: int,
 ) -> tuple[Callable[[Callable[[], None]], None], Callable[[], None], Any, bool]:
-    """Return what makes a lap of steps, a step, its data after a lap, and whether it lacked room."""
+    """Return functions for a lap and for a step, the data after a lap, and whether it lacked room."""
     from mujoco.mjx.third_party import mujoco_warp as library
 
     count, nq = workload.count, model.nq

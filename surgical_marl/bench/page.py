@@ -30,7 +30,7 @@ class Page:
     drawings_per_s: float
     """`surgical-marl view` wants 30; the clock on the wall tells, so other programs matter."""
     kilobytes_per_drawing: float
-    """Size of what the server sends."""
+    """Size of the messages that the server sends."""
     grown_mb: float
     """Memory that the process took on meanwhile, MB."""
     mover: str
@@ -94,7 +94,7 @@ def _client(address: str) -> Iterator[Any]:
 
 
 def _watch(address: str, joined: Event, taken: Any) -> None:
-    """Take what a page's server sends, as a browser would that draws nothing."""
+    """Receive the messages of a page's server, as a browser that draws nothing."""
     from importlib.metadata import version
 
     from websockets.exceptions import ConnectionClosed

@@ -55,7 +55,7 @@ class PhysicsAlone(Env):
 
 
 def bare_state(carry: Carry, distance: Array, infos: Any = None) -> State:
-    """Return a state of what is carried, the distances of all pairs that can touch, and some infos alone."""
+    """Return a state of a carry, the distances of all pairs that can touch, and some infos alone."""
     nothing: Any = {}
     return State(
         carry=carry,

@@ -89,7 +89,7 @@ def sweep_summary(workload: Workload, points: Iterable[Point]) -> dict[str, Any]
 
 
 def table(found: Mapping[str, Any]) -> str:
-    """Return what `summary` returned as a text table, in the form of the paper's Table I."""
+    """Return a `summary` as a text table, in the form of the paper's Table I."""
     rows = [(name, "a step of its own", speed, "quoted") for name, speed in found["quoted"].items()]
     for speed in found["engines"]:
         where = f"{speed['num_envs']} envs, {speed['device']}, first step after {speed['compile_s']:.1f} s"

@@ -65,7 +65,7 @@ class Exam:
     success_2mm: float
     """Share of arms whose tip, or object, stays within 2 mm of its goal."""
     success_rate: float
-    """Share of arms that do what the task calls success."""
+    """Share of arms that succeed by the task's own measure."""
     collision_rate: float
     median_error_mm: float
     goal_set: str
@@ -94,7 +94,7 @@ class Times:
     imports_s: float
     """Time from the start of the process until its packages are imported."""
     compile_s: float
-    """Time to make environments, networks and graphs, and what the first two iterations take more than the others."""
+    """Time to make environments, networks and graphs, and the excess of the first two iterations over the others."""
     rollout_s: float
     update_s: float
     evaluation_s: float
@@ -122,7 +122,7 @@ class Solution:
 
     @property
     def learning_s(self) -> float:
-        """Seconds without imports and compilation: what settings can change."""
+        """Seconds without imports and compilation: the part that settings can change."""
         return self.seconds - self.times.imports_s - self.times.compile_s
 
 

@@ -1,4 +1,4 @@
-"""States in which benchmarks start: those that a policy comes to (`policy`), and jaws around objects (`grasp`)."""
+"""States in which benchmarks start: on the way of a policy (`policy`), or with jaws around objects (`grasp`)."""
 
 from __future__ import annotations
 

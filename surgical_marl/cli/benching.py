@@ -40,7 +40,7 @@ def add_bench(commands: Any) -> None:
 
 
 def _bench_parser(kinds: Any, kind: str, what: str, of: type) -> argparse.ArgumentParser:
-    """Return the parser of one benchmark: the flags of what it measures, and those that all benchmarks take."""
+    """Return the parser of one benchmark, with the flags of its workload and the flags of all benchmarks."""
     parser: argparse.ArgumentParser = kinds.add_parser(kind, help=what)
     parser.add_argument("--task", default="reach", help=task_help())
     parser.add_argument("--scene", help=_OWN_SCENE)

@@ -74,7 +74,7 @@ def _look() -> Iterator[Finding]:
 
 
 def _tried(what: str, look: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:
-    """Yield what is found, and the error of a library that fails."""
+    """Yield findings, and the error of a library that fails."""
     try:
         yield from look()
     except Exception as error:  # each library has its own
@@ -142,7 +142,7 @@ def _torch_devices() -> Iterator[Finding]:
 
 
 def _caches() -> Iterator[Finding]:
-    """Yield the folders of what takes a while to make.
+    """Yield the folders of caches.
 
     They have what JAX compiles, our own tables and the sources of kernels, and the kernels that Warp compiles.
     """
@@ -186,7 +186,7 @@ def _video() -> Iterator[Finding]:
 
 
 def _xla_fault(bare: float | None, cured: float | None = None) -> Iterator[Finding]:
-    """Yield what is known of the fault from the growth of times without our flag, and with it if there is one."""
+    """Yield findings on the fault, from the growth of times without our flag, and with it if there is one."""
     if bare is None:
         yield Finding("XLA on CPU", "not measured: the probe did not finish")
         return

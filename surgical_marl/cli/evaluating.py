@@ -122,7 +122,7 @@ def _report(arguments: argparse.Namespace) -> None:
 
 
 def _check_played(arguments: argparse.Namespace, policies: Sequence[str]) -> None:
-    """Raise ValueError unless the task, the scene and the policies exist, and say what is played."""
+    """Raise ValueError unless the task, the scene and the policies exist, and name all that has to be named."""
     check_names(arguments)
     check_policies(policies)
     if policies and set(policies) <= set(BASELINES):

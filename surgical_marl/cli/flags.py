@@ -53,7 +53,7 @@ def task_help() -> str:
 
 
 def _reader(kind: Any, limits: tuple[int, int] | None) -> tuple[Callable[[str], Any], str]:
-    """Return what reads the text of a flag, and its placeholder."""
+    """Return a reader for the text of a flag, and its placeholder."""
     if get_origin(kind) in (Union, types.UnionType):
         kind = get_args(kind)[0]
     if get_origin(kind) is Literal:

@@ -62,7 +62,7 @@ def add_replay(commands: Any) -> None:
 
 
 def _add_what(parser: argparse.ArgumentParser) -> None:
-    """Add the flags that say what is shown."""
+    """Add the flags of task, scene, policy and options that are shown."""
     parser.add_argument("task", metavar="TASK", help=task_help())
     parser.add_argument(
         "--scene", help="a name (see `list scenes`) or a .yaml file (default: the policy's, or else the task's own)"
@@ -214,7 +214,7 @@ def _check_replay(arguments: argparse.Namespace) -> None:
 
 
 def _settings(arguments: argparse.Namespace) -> tuple[Any, str | None]:
-    """Return the settings of what is shown, and who moves the arms; ValueError if they don't fit together."""
+    """Return the settings of the environment, and who moves the arms; ValueError if they don't fit together."""
     # for policies that need torch: with few environments its threads wait for each other longer than they compute
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     from surgical_marl.evaluation.environment import common_settings

@@ -79,7 +79,7 @@ def misses(result: Mapping[str, Any]) -> list[str]:
 
 
 def facts(policy: str) -> str:
-    """Return what the table says of a shipped policy, as one line of text."""
+    """Return the row of the table of a shipped policy, as one line of text."""
     cells = zip(COLUMNS, _row(find("policies", policy)), strict=True)
     return "; ".join(f"{column}: {cell}" for column, cell in list(cells)[1:] if cell != "-")
 

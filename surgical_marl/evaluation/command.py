@@ -65,7 +65,7 @@ def report(
     csv: Path | None,
     figure: Path | None,
 ) -> str:
-    """Write the files that are asked for, and return what goes to stdout.
+    """Write the files that are asked for, and return the text for stdout.
 
     Args:
         older: name of a result to compare with, and the result.
@@ -97,9 +97,9 @@ def report(
 
 
 def judge(run: Path) -> None:
-    """Do what `surgical-marl train` does after training.
+    """Evaluate and film a run, as `surgical-marl train` does after training.
 
-    Evaluate the run on the standard goals, write and print the result, keep the episodes, and film the policy.
+    The evaluation plays the standard goals; its result is written and printed, and its episodes are kept.
     """
     env, policy, played = play_standard(run)
     rows = read_metrics(run)

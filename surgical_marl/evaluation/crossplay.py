@@ -110,7 +110,7 @@ def _mean(runs: Sequence[Played]) -> dict[str, Any]:
 
 
 def report(result: Mapping[str, Any], as_json: bool, figure: Path | None) -> str:
-    """Draw the figure if one is asked for, and return what goes to stdout. ValueError if it cannot be written."""
+    """Draw the figure if one is asked for, and return the text for stdout. ValueError if it cannot be written."""
     if figure:
         try:
             _draw(figure, result)
@@ -120,7 +120,7 @@ def report(result: Mapping[str, Any], as_json: bool, figure: Path | None) -> str
 
 
 def format_table(result: Mapping[str, Any]) -> str:
-    """Return what `crossplay` returned as plain text."""
+    """Return the result of `crossplay` as plain text."""
     parts = [described(result)]
     for key, title in (("self_play", "self-play"), ("cross_play", "cross-play")):
         if (found := result[key]) is not None:

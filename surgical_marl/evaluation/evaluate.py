@@ -245,7 +245,7 @@ def write_played(path: Path, played: Played) -> None:
 
 
 def read_played(path: Path) -> Played:
-    """Read what `write_played` wrote, as float64. ValueError if the file is damaged or of another kind."""
+    """Read a file of `write_played`, as float64. ValueError if the file is damaged or of another kind."""
     try:
         found = read_npz(path)
         kept = json.loads(str(found.pop("about")))

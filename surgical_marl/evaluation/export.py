@@ -108,7 +108,7 @@ def _compact(evaluation: dict[str, Any]) -> str:
 
 
 def _also(run: str) -> dict[str, Any]:
-    """Evaluate the same weights on other goals and starts than those of the standard set.
+    """Evaluate the same weights on other goals and starts than the standard ones.
 
     The results are named after what differs: "training goals", and "random starts" or "home starts" where the task has
     starts that are not those of the run.

@@ -1,4 +1,4 @@
-"""Frozen goal sets: a hash of what an evaluation played, and the hashes of the standard ones."""
+"""Frozen goal sets: the hash of the goals of an evaluation, and the hashes of the standard sets."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def episode_seed(seed: int, block: int) -> int:
 
 
 def describe_goals(env: BatchedEnv, episodes: int) -> dict[str, Any]:
-    """Return what a goal set depends on beside its goals; `control_dt` is in s."""
+    """Return the properties that a goal set depends on beside its goals; `control_dt` is in s."""
     return {
         "task": env.task_name,
         "scene": env.scene.name,

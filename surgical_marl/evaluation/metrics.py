@@ -34,9 +34,9 @@ VIEWED = {
     "object_in_view": ("object_in_view_rate", 1.0),
     "centre_error": ("centre_error", 1.0),
 }
-"""Infos of what an endoscope sees, whose mean over the steps that are not `SEARCHING` counts, likewise."""
+"""Infos of the view of an endoscope, whose mean over the steps that are not `SEARCHING` counts, likewise."""
 SEARCHING = "searching"
-"""True if an endoscope may still look for what it is to show, in `infos` of tasks with such a search."""
+"""True if an endoscope may still look for the tools, in `infos` of tasks with such a search."""
 TRAVEL = {"camera_travel": ("camera_travel_mm", 1000.0)}
 """Infos of how far something moved in a step, whose sum counts, likewise."""
 PEAK = {"contact_force": ("peak_force_n", 1.0)}
@@ -53,9 +53,9 @@ class Trajectory(NamedTuple):
     error: np.ndarray
     """[T, E, A], distance of tip, or object, and goal after each step, m; NaN in a task without such goals."""
     success: np.ndarray
-    """[T, E, A] bool, what the task calls success, after each step."""
+    """[T, E, A] bool, success by the task's own measure, after each step."""
     missed: np.ndarray
-    """[T, E, A] bool, not at the goal after each step: what the time to success is measured by."""
+    """[T, E, A] bool, not at the goal after each step: the time to success follows from it."""
     collision: np.ndarray
     """[T, E, A] bool, during each step."""
     distance: np.ndarray
@@ -155,7 +155,7 @@ def _reduced(name: str, values: np.ndarray, where: np.ndarray, final: Callable[[
 
 
 def metrics(measures: Mapping[str, np.ndarray], following: bool) -> dict[str, Metric]:
-    """Return the metrics that `surgical-marl eval` reports, from what `measure` gave for R runs, [R, E, A] each.
+    """Return the metrics that `surgical-marl eval` reports, from the measures of R runs, [R, E, A] each.
 
     `following` adds the root mean square error of tasks whose goal moves.
     """

@@ -41,7 +41,7 @@ class Evaluation(dict[str, Any]):
 
 
 def format_table(result: Mapping[str, Any], others: Mapping[str, Mapping[str, Any]] | None = None) -> str:
-    """Return what `evaluate` returned as plain text: one line for each metric, with its 95 % interval.
+    """Return a result as plain text: one line for each metric, with its 95 % interval.
 
     Args:
         result: what `evaluate` returned.
@@ -52,7 +52,7 @@ def format_table(result: Mapping[str, Any], others: Mapping[str, Mapping[str, An
 
 
 def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Return rows of cells, the first one a head, as lines of columns; those of numbers are aligned to the right."""
+    """Return rows of cells, the first one a head, as lines of columns; columns of numbers are aligned to the right."""
     columns = list(zip(*rows, strict=True))
     adjusts = [
         str.rjust if all(cell == "-" or cell.lstrip("-")[:1].isdigit() for cell in column[1:]) else str.ljust
@@ -72,7 +72,7 @@ def described(result: Mapping[str, Any]) -> str:
 
 
 def _describe(result: Mapping[str, Any]) -> str:
-    """Return a text on what was played, with partners and goal set."""
+    """Return a text on the task, options, episodes, partners and goal set of a result."""
     what = described(result)
     what += "".join(f", {agent} is {who}" for agent, who in result.get("partners", {}).items())
     return f"{what}, goal set {result['goal_set']:.12} ({'standard' if is_standard(result) else 'not a standard one'})"
@@ -141,7 +141,7 @@ def title(name: str) -> str:
 
 
 def explained(name: str) -> str:
-    """Return the title of a metric, and what it is where neither a unit nor a percent sign says so."""
+    """Return the title of a metric, with its kind where neither a unit nor a percent sign tells it."""
     return title(name) + next((f" ({what})" for start, what in KINDS.items() if name.startswith(start)), "")
 
 

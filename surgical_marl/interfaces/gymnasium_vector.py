@@ -1,4 +1,4 @@
-"""The Gymnasium face of many environments: what `gymnasium.make_vec` makes.
+"""The Gymnasium face of many environments, which `gymnasium.make_vec` makes.
 
     envs = gymnasium.make_vec("surgical_marl/Reach-v0", scene="psm", num_envs=1024)
 
@@ -139,7 +139,7 @@ class SurgicalVectorEnv(LimitInSpec, VectorEnv[Any, np.ndarray, Any]):
         return tuple(self._pictures.draw(self._pictures.pose(index)) for index in range(self.num_envs))
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
-        """Return an attribute of each environment, or what it returns if it is a function.
+        """Return an attribute of each environment, or its result if it is a function.
 
         All environments are alike: "render" and what `BatchedEnv` has an array [N, ...] of, such as "qpos" and
         "steps", differ from one to the next; all else is the same N times.

@@ -93,11 +93,11 @@ class JaxEnv:
         return self.env.title
 
     def observation_space(self, agent: str) -> Box:
-        """Return the space of what an agent observes. ValueError for an unknown agent."""
+        """Return the space of an agent's observations. ValueError for an unknown agent."""
         return self._of(agent, self.observation_spaces)
 
     def action_space(self, agent: str) -> Box:
-        """Return the space [-1, 1] of what an agent does. ValueError for an unknown agent."""
+        """Return the space [-1, 1] of an agent's actions. ValueError for an unknown agent."""
         return self._of(agent, self.action_spaces)
 
     def action_terms(self, agent: str) -> dict[str, slice]:

@@ -68,7 +68,7 @@ class JointAgent:
         self._shapes = {self._name: (ends[-1],) if alone else (batch.num_envs, ends[-1])}
 
     def observation(self, observations: Mapping[str, Any], index: int | slice = slice(None)) -> Any:
-        """Return what the arms observe, of all environments or of one: an array, or a dict of it and the pictures."""
+        """Return the observation of all environments or of one: an array, or a dict of it and the pictures."""
         felt = np.concatenate([proprioception(observations[arm])[index] for arm in self.arms], -1)
         pictures = _pictures({arm: observations[arm] for arm in self.arms})
         return {"proprioception": felt, **each(pictures, lambda part: np.array(part[index]))} if pictures else felt
@@ -84,7 +84,7 @@ class JointAgent:
         return reduce(np.add, [rewards[arm] for arm in self.arms])
 
     def info(self, infos: Infos, of: Callable[[Any], Any] = lambda values: values) -> dict[str, Any]:
-        """Return what is known of the agent and, under "agents", of each arm of a scene with several.
+        """Return the infos of the agent and, under "agents", of each arm of a scene with several.
 
         Args:
             infos: of all arms.
@@ -123,7 +123,7 @@ def _arms(batch: BatchedEnv, agent: str | None, others: Sequence[str]) -> list[s
 
 
 def _combine(name: str) -> Callable[[Any, Any], Any] | None:
-    """Return what makes one value of two arms' values of that name, or None where nothing does."""
+    """Return a function that makes one value of two arms' values of that name; None if there is none."""
     if name.startswith(("reward_", "cost")):
         return np.add
     return np.logical_and if name.startswith("stage_") else _TEAM.get(name)

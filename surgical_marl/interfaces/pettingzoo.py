@@ -79,11 +79,11 @@ class _Face:
         return self.batch.action_space(agent)
 
     def observation_terms(self, agent: str) -> dict[str, slice]:
-        """Return the names of what an agent observes, and where each stands in its vector."""
+        """Return the names of the terms that an agent observes, and the slice of each in its vector."""
         return self.batch.observation_terms(agent)
 
     def action_terms(self, agent: str) -> dict[str, slice]:
-        """Return the names of the terms of an agent's action, and where each stands in it."""
+        """Return the names of the terms of an agent's action, and the slice of each in it."""
         return self.batch.action_terms(agent)
 
     def state(self) -> Any:

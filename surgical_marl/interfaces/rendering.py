@@ -82,7 +82,7 @@ class Rendering:
         return None
 
     def follow(self) -> None:
-        """Show what has just happened, with mode "human"."""
+        """Show the current state, with mode "human"."""
         if self.mode == "human":
             self.render()
 

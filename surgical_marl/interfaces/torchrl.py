@@ -131,7 +131,7 @@ class TorchRLEnv(EnvBase):
         self._seed = seed
 
     def _group(self, observations: Mapping[str, Any], state: Tensor, infos: Mapping[str, Any]) -> TensorDict:
-        """Return what the agents of each group observe, and their infos, beside each other."""
+        """Return the observations and infos of the agents of each group, stacked."""
         count = self.env.num_envs
         found = TensorDict({"state": state}, batch_size=[count], device=self.device)
         for name, agents in self.group_map.items():

@@ -219,7 +219,7 @@ class Algorithm(PPO):
         return losses
 
     def learn(self) -> Tensor:
-        """Do what `update` does, without waiting for the device; returns `losses`."""
+        """Learn from the stored rollout without waiting for the device; return `losses`."""
         parts = self.parts()
         for index in self.order():
             parts[index]()
@@ -283,7 +283,7 @@ class Algorithm(PPO):
             own.zero_()
 
     def parameters(self) -> list[nn.Parameter]:
-        """Return all that the optimiser changes."""
+        """Return all parameters that the optimiser changes."""
         return [*self.actor.parameters(), *self.critic.parameters()]
 
     def _values(self, obs: TensorDict) -> Tensor:
@@ -356,7 +356,7 @@ class Algorithm(PPO):
 
 
 def clip_gradient(model: nn.Module, most: float) -> Tensor:
-    """Let the norm of a model's gradient be at most `most`; return what it was, `[]` on the model's device.
+    """Clip a model's gradient to a norm of at most `most`; return the norm before, `[]` on the model's device.
 
     It is 0 where a loss does not depend on the model. torch's own 0 would then be on the CPU.
     """

@@ -47,7 +47,7 @@ BEYOND = 25
 OWN = (".key", ".episode")
 """Parts of a carry that an environment keeps, whatever state it goes on from: its next episodes are drawn with them."""
 DISTURBED, LASTS = 0.1, 0.8
-"""Standard deviation of what is added to the actions of all joints but jaws, and how much of it lasts to the next step.
+"""Standard deviation of the noise on actions of all joints but jaws, and the share of it that lasts to the next step.
 With 0.3 an arm that holds a needle misses most handovers."""
 _NEITHER = "oracle_states.rate, imitation.steps and imitation.weight must be 0"
 
@@ -113,12 +113,12 @@ class Demonstrations:
         self.actions = torch.cat([pairs[f"action of {agent}"] for agent in layout.agents], -1)
 
     def draw(self, count: int) -> tuple[dict[str, Tensor], TensorDict]:
-        """Draw `count` states: their carry, and what is observed in them."""
+        """Draw `count` states; return their carry and observations."""
         chosen = torch.randint(len(self.observations), (count,), device=self.actions.device)
         return {name: part[chosen] for name, part in self.carry.items()}, self.observations[chosen]
 
     def ask(self, actor: MultiAgentActor) -> None:
-        """Add what the oracle would do in every step of `oracle_episodes` other episodes, which an actor plays."""
+        """Add the oracle's actions in every step of `oracle_episodes` other episodes, which an actor plays."""
         self._asked += 1
         env = make_env(self._settings, self._settings.oracle_episodes, "numpy")
         try:
@@ -255,7 +255,7 @@ def _jaws_rest(
 
 
 def _shapes(env: BatchedEnv) -> dict[str, dict[str, tuple[int, ...]]]:
-    """Return name -> shape of what is kept of one environment.
+    """Return name -> shape of the arrays that are kept of one environment.
 
     Of `states` that is its carry and what each agent and critics observe, of `pairs` what agents observe and do.
     """

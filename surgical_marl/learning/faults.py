@@ -1,4 +1,4 @@
-"""Finds what is not finite in an iteration. Faults are detected on the device, and read with the metrics."""
+"""Find numbers that are not finite in an iteration. Faults are detected on the device, and read with the metrics."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class Diverged(FloatingPointError):
 
     @property
     def summary(self) -> dict[str, Any]:
-        """Return it as values that JSON can hold."""
+        """Summary of the error as values that JSON can hold."""
         rate = self.learning_rate if math.isfinite(self.learning_rate) else None
         return {"iteration": self.iteration, "not_finite": self.found, "learning_rate": rate}
 

@@ -27,7 +27,7 @@ EVERY = 100
 
 
 class Imitation:
-    """Lets an actor's mean actions become those of the oracle, in the least squares sense.
+    """Fit an actor's mean actions to the oracle's by least squares.
 
     Its deviation stays as it is. Its normalisers of observations learn from the demonstrations first. With rounds, the
     steps are done in equal parts. Between two of them the actor plays, and what the oracle would do there is added to

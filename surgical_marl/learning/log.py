@@ -30,7 +30,7 @@ class Reports:
         self._lag = 1 if training.env.device == "cuda" else 0
 
     def add(self, report: Report) -> None:
-        """Take a report; read those whose iteration should be done."""
+        """Take a report; read the reports whose iteration should be done."""
         self._waiting.append(report)
         self._read(self._lag)
 
@@ -78,7 +78,7 @@ class Log:
         self._bar.update()
 
     def keep(self) -> None:
-        """Flush to disk, so that what was written survives a power loss."""
+        """Flush to disk, so that the metrics survive a power loss."""
         os.fsync(self._csv.fileno())
 
 

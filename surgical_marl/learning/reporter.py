@@ -49,7 +49,7 @@ class Report(NamedTuple):
     env_steps: int
     started: float
     values: Tensor
-    """On the host: once `arrived`. The first numbers are those that `row` reads, and the others the first fault."""
+    """The report on the host, once `arrived`: first the numbers that `row` reads, then the first fault."""
     arrived: torch.cuda.Event | None
     """None where nothing has to arrive."""
     marks: Sequence[Mark]
@@ -57,7 +57,7 @@ class Report(NamedTuple):
 
 
 class Reporter:
-    """Puts together what an iteration reports.
+    """Puts the report of an iteration together.
 
     What it calls within a rollout and after an update may be a part of a CUDA graph: it works in place, and nothing
     waits for the device.
@@ -122,7 +122,7 @@ class Reporter:
         self._faults[step].copy_(codes)
 
     def end(self, observations: TensorDict) -> None:
-        """Note what is not finite in the stored rollout and in what is observed after it."""
+        """Note which numbers are not finite in the stored rollout and in the observations after it."""
         stored = self._algorithm.storage
         columns = faults.mark_columns(stored.observations, observations)
         moves = self._env.layout.split(stored.actions).values()
@@ -139,7 +139,7 @@ class Reporter:
         self._fault.copy_(torch.cat([numbers.float(), self._before.index_select(0, index)[0], actions.flatten()]))
 
     def gather(self) -> None:
-        """Put together what `row` reads, of all processes."""
+        """Put together the numbers that `row` reads, summed over all processes."""
         algorithm = self._algorithm
         std = algorithm.actor.output_std.detach().mean()
         weights = torch.stack([weight.detach().sum() for _, weight in self._weights()])
@@ -215,12 +215,12 @@ class Reporter:
         return bool(self._sums(report)["stop"]["stop"])
 
     def _sums(self, report: Report) -> dict[str, dict[str, float]]:
-        """Return what `gather` has put together, by kind and name."""
+        """Return the numbers that `gather` has put together, by kind and name."""
         values = iter(_arrived(report)[: self._count].tolist())
         return {kind: {name: next(values) for name in names} for kind, names in self._names.items()}
 
     def _not_finite(self, sums: dict[str, dict[str, float]], count: int) -> dict[str, list[str]]:
-        """Return the names of what is not finite, by kind; `count` environments were at fault."""
+        """Return the names of values that are not finite, by kind; `count` environments were at fault."""
         many = faults.too_many(count, self._samples)
         done = {name: int(value) // distributed.size() for name, value in sums["before"].items()}
         gradients = {f"{name} in mini-batch {done[name] + 1}": value for name, value in sums["gradients"].items()}

@@ -50,7 +50,7 @@ class ValueScale(nn.Module):
         return (values - self.mean) / self.std
 
     def restore(self, predicted: Tensor) -> Tensor:
-        """Return what the critic predicts, `[..., W]`, in units of reward."""
+        """Return the critic's predictions, `[..., W]`, in units of reward."""
         return predicted * self.std + self.mean
 
 

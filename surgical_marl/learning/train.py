@@ -149,7 +149,7 @@ def finish(settings: Settings, run: Path) -> None:
 
 @contextmanager
 def _storing(out: Path) -> Iterator[None]:
-    """Turn a full disk, and whatever else keeps files from being written, into an error of one sentence."""
+    """Turn an error of writing files, such as a full disk, into an error of one sentence."""
     try:
         yield
     except OSError as error:
@@ -258,7 +258,7 @@ def _iterate(training: Trainer, out: Path) -> None:
 
 
 def _keep_fault(training: Trainer, out: Path, fault: Fault) -> None:
-    """Say on stderr what was at fault, and write what reproduces it, for the first faults of a run."""
+    """Report a fault on stderr, and write a file that reproduces it for the first faults of a run."""
     env, rank, seed = training.env.env, distributed.rank(), training.settings.seed
     place, index = str(env.fault_place(fault.code)), rank * env.num_envs + fault.number
     said = f"{place} became NaN or infinite in iteration {fault.iteration}, environment {index}, seed {seed}"
@@ -273,7 +273,7 @@ def _keep_fault(training: Trainer, out: Path, fault: Fault) -> None:
 
 
 def _read_resumed(settings: Settings, run: Path, goes_on: bool) -> dict[str, Any] | None:
-    """Return what this process resumes, or None if the run was stopped before its first checkpoint."""
+    """Return the state that this process resumes, or None if the run was stopped before its first checkpoint."""
     asked = identity(settings)
     for name, before in identity(read_settings(run)).items():
         if before != asked[name]:

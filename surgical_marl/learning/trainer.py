@@ -168,7 +168,7 @@ class Trainer:
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Names of what `row` returns."""
+        """Names of the metrics in a `row`."""
         return self._reporter.columns
 
     def fault(self, report: Report) -> Fault | None:
@@ -247,7 +247,7 @@ class Trainer:
             raise ValueError("the environments in the checkpoint are not of this run, or not whole") from None
 
     def _set_own(self, state: Mapping[str, Any]) -> None:
-        """Set what each process has of its own."""
+        """Set the parts `OWN` of a state, which each process has of its own."""
         self.env.set_carry(state["env"])
         for name, kept in self._observations.items():
             kept.copy_(state["env"]["observations"][name])

@@ -33,7 +33,7 @@ class PictureModel(CNNModel):
 
 
 def stack_pictures(seen: Sequence[Sequence[Tensor]], joint: bool = False) -> Tensor:
-    """Stack what agents see, pictures [..., H, W, c] each, along channels, channels first: [..., n, C, H, W].
+    """Stack the pictures of agents, [..., H, W, c] each, along channels, channels first: [..., n, C, H, W].
 
     Colours stay uint8. If there is depth, it is scaled to 0 to 255 at `FURTHEST`, and all pictures become float32.
     `joint`: stack all of it along channels, as what one agent sees.

@@ -77,7 +77,7 @@ class Graph(nn.Module):
 
 
 def write_onnx(path: Path, model: Any, pictures: Mapping[str, Any]) -> None:
-    """Write the network of one group of a `MultiAgentActor` on the CPU, beside what `write_weights` wrote of it.
+    """Write the network of one group of a `MultiAgentActor` on the CPU, beside the weights of `write_weights`.
 
     Args:
         pictures: what the group sees, of `Layout.pictures`.
@@ -103,7 +103,7 @@ def write_onnx(path: Path, model: Any, pictures: Mapping[str, Any]) -> None:
 
 
 def forget_paths(file: onnx.ModelProto) -> None:
-    """Remove what the exporter notes of each node: paths of the machine that it ran on, and thrice the node's size."""
+    """Remove the exporter's notes on each node: paths of the machine that it ran on, and thrice the node's size."""
     for node in file.graph.node:
         node.ClearField("metadata_props")
 

@@ -42,7 +42,7 @@ class Oracle(Protocol):
     """True if its tools wait for time to pass in an environment, [N] bool."""
 
     def __call__(self, observations: Mapping[str, Any]) -> dict[str, Any]:
-        """Return what agents do."""
+        """Return the actions of agents."""
         ...
 
 

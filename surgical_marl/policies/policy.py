@@ -100,7 +100,7 @@ class _Restating:
 
 
 class _Zero:
-    """Zeros. It observes nothing but the shapes of what it is shown."""
+    """The policy of zeros. It reads the shapes of observations alone."""
 
     def __init__(self, env: BatchedEnv) -> None:
         self._widths = {agent: env.action_space(agent).shape for agent in env.agents}

@@ -43,7 +43,7 @@ class RecurrentModel(MLPModel):
         self._memory: Tensor | None = None
 
     def get_latent(self, obs: TensorDict, masks: Tensor | None = None, hidden_state: Any = None) -> Tensor:
-        """Return what the cell computes from observations and memory, `[..., H]`.
+        """Compute the output of the cell from observations and memory, `[..., H]`.
 
         Args:
             obs: of one step; or of T steps of B environments, `[T, B, ...]`, if there are masks.

@@ -67,7 +67,7 @@ class Teammates:
         self._alone = alone
 
     def actions(self, observations: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the teammates' actions {agent: [N, a]} for what all agents observe, {agent: [N, d]}."""
+        """Return the teammates' actions {agent: [N, a]} for the observations of all agents, {agent: [N, d]}."""
         actions: dict[str, Any] = {}
         for policy, agents in self._policies:
             found = policy(observations)

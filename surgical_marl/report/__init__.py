@@ -1,1 +1,1 @@
-"""Reports of runs: what was trained, how it went and how well it does, as one HTML file."""
+"""Reports of runs as one HTML file: settings, curves of training, evaluation."""

@@ -45,7 +45,7 @@ _STYLE: dict[Any, Any] = {
 
 @dataclass(frozen=True)
 class Chart:
-    """A picture with what a reader needs who does not see it."""
+    """A picture with a title, a description and a table for readers who do not see it."""
 
     key: str
     """Unique in a page; a word of letters and digits."""

@@ -101,7 +101,7 @@ def _check(runs: Sequence[Run]) -> None:
 
 
 def _about(task: str) -> str:
-    """Return what the task is about; empty for a task that is not installed."""
+    """Return a sentence on the task; empty for a task that is not installed."""
     try:
         return TASKS.load(task).summary().partition(": ")[2]
     except ValueError:
@@ -109,7 +109,7 @@ def _about(task: str) -> str:
 
 
 def _statuses(runs: Sequence[Run]) -> list[tuple[str, str, bool]]:
-    """Return who, what and whether all is well, each sentence once for all runs that it holds for."""
+    """Return run names, a sentence on their status and whether it is good; each sentence once."""
     found: dict[tuple[str, bool], list[str]] = {}
     for run in runs:
         found.setdefault((run.status, run.finished), []).append(run.name)
@@ -243,7 +243,7 @@ def train_command(run: Run) -> str:
 
 
 def _settings_of(run: Run) -> dict[str, Any]:
-    """Return a run's settings by dotted name, with those that an older version did not write."""
+    """Return a run's settings by dotted name, with settings that an older version did not write."""
     try:
         return flatten(parse_yaml(config_text(read_settings(run.folder), {})))
     except (ValueError, TypeError):

@@ -51,7 +51,7 @@ class Run:
     """The episodes of that evaluation."""
     clip: Path | None
     notes: tuple[str, ...]
-    """Sentences about what is missing or damaged."""
+    """Sentences about missing or damaged files."""
 
     @cached_property
     def scene(self) -> str:

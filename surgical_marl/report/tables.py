@@ -1,4 +1,4 @@
-"""Tables of a report: its runs, their settings, what evaluations found, and where everything ran."""
+"""Tables of a report: runs, settings, results of evaluations, versions and devices."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Tile(NamedTuple):
 
 
 def runs(groups: Sequence[Group]) -> Table:
-    """Return a row for each run: what it is, how far it went, and its figures at the end of training."""
+    """Return a row for each run: its name and seed, how far it went, and its figures at the end of training."""
     head = ["run", "seed", "iterations", "environment steps", "training time", "success", "error (mm)", "collisions"]
     rows = []
     for group in groups:
@@ -113,7 +113,7 @@ def origins(groups: Sequence[Group]) -> Table:
 
 
 def results(groups: Sequence[Group]) -> Table | None:
-    """Return what evaluations found, with 95 % intervals; None if no run was evaluated.
+    """Return the metrics of evaluations, with 95 % intervals; None if no run was evaluated.
 
     One run alone has a column for each agent. Several have one for each group whose episodes are known, and else one
     for each run.

@@ -27,7 +27,7 @@ ROWS = 9
 
 
 def main(drawing: Drawing, groups: Sequence[Group]) -> list[Chart]:
-    """Return the curves of success, error, reward and collisions, those that there are."""
+    """Return the curves of success, error, reward and collisions that the runs have."""
     return _charts(drawing, groups, MAIN)
 
 
@@ -108,7 +108,7 @@ def _table(
 
 
 def _share_scale(name: str, values: np.ndarray) -> Scale:
-    """Return a scale to 100 %, or to less for what should be small, and is."""
+    """Return a scale to 100 %, or to less for a small share that should be small."""
     most = float(values.max())
     if most > 0.2 or name == "success_rate":
         return SHARE

@@ -82,7 +82,7 @@ def read_checkpoint(run: str | Path) -> dict[str, Any]:
 
 
 def _check_parts(tree: Any) -> None:
-    """Raise ValueError if what was loaded has too many parts, or a tensor has more numbers than the file.
+    """Raise ValueError if a loaded tree has too many parts, or a tensor has more numbers than the file.
 
     A tensor may repeat one number along an axis, and a list may hold another one many times: a file of a kilobyte could
     take any amount of memory or time.
@@ -104,7 +104,7 @@ def _check_parts(tree: Any) -> None:
 
 
 def _is_whole(checkpoint: dict[str, Any]) -> bool:
-    """Return whether a checkpoint has what every reader needs, counts that are some, and says what it is of."""
+    """Return whether a checkpoint has the keys that every reader needs, valid counts, and an identity."""
     counts = [checkpoint.get(name, 0) for name in ("iteration", "env_steps", "processes")]
     good = all(type(count) is int and 0 <= count < 2**62 for count in counts)
     told = isinstance(checkpoint.get("of", {}), dict)
@@ -127,7 +127,7 @@ def write_environments(run: Path, iteration: int, rank: int, processes: int, sta
 
 
 def read_environments(run: Path, iteration: int, rank: int, processes: int) -> dict[str, Any] | None:
-    """Read what `write_environments` wrote, on the CPU; None if it is not there or damaged."""
+    """Read a file of `write_environments`, on the CPU; None if it is not there or damaged."""
     path = _environments(run, iteration, rank, processes)
     try:
         check_checkpoint(path)

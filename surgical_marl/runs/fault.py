@@ -90,7 +90,7 @@ def write_fault(
 
 
 def read_fault(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]] | None:
-    """Return what `about` says, and all arrays by name; None if the file is of another kind.
+    """Return the content of `about`, and all arrays by name; None if the file is of another kind.
 
     Raises:
         ValueError: it is a fault, but not a whole one, or of another layout.

@@ -73,7 +73,7 @@ def claim_folder(out: Path) -> None:
 
 
 def check_own(out: Path, *ours: str) -> None:
-    """Raise ValueError if a folder holds more than temporary files, and what has these names, with `*` for any text."""
+    """Raise ValueError if a folder holds more than temporary files, and files of these names, with `*` for any text."""
     try:
         names = [path.name for path in out.iterdir()]
     except OSError:  # there is no such folder yet, or `check_writable` says what is wrong
@@ -139,7 +139,7 @@ def holds_weights(folder: Path) -> bool:
 
 
 def check_trained(run: Path) -> None:
-    """Raise ValueError if a folder holds no networks: a run before its first checkpoint, or what is no run."""
+    """Raise ValueError if a folder holds no networks: a run before its first checkpoint, or no run."""
     if not (run / CHECKPOINT).is_file() and not holds_weights(run):
         raise ValueError(
             f"{run} has no {CHECKPOINT} yet: a run has one after its first iterations, and `surgical-marl train "

@@ -1,4 +1,4 @@
-"""The identity of a run: all its settings but those that may change while it goes on.
+"""The identity of a run: all settings except the ones that may change when it is resumed.
 
 A checkpoint records them, so that its networks act in the problem that they were trained for, and in no other.
 """
@@ -43,7 +43,7 @@ def identity(settings: Settings) -> dict[str, Any]:
 
 
 def check_identity(of: Mapping[str, Any], settings: Settings, what: object) -> None:
-    """Raise ValueError if what a checkpoint says that it is of differs from the run that it lies in.
+    """Raise ValueError if the identity that a checkpoint records differs from that of the run that it lies in.
 
     Args:
         of: the `identity` of the training that wrote it; one of an older version has less, or nothing.

@@ -35,7 +35,7 @@ class _Lasting:
             self.write(line)
 
     def flush(self) -> None:
-        """Pass on what is buffered, or drop it."""
+        """Pass on the buffered text, or drop it."""
         with self._forgiving():
             self._stream.flush()
 

@@ -28,7 +28,7 @@ TICK = 0.5
 _waiting: list[threading.Timer] = []
 """Pending sentences of `preparing`."""
 SHORT = 20
-"""Characters of what is done for which there is room before a bar in a terminal; what is longer stands above it."""
+"""Longest title, in characters, that stands before a bar in a terminal; a longer one stands above it."""
 _NUMBERS = "{n_fmt}/{total_fmt} [{elapsed}<{remaining}{postfix}]"
 """Without tqdm's rate, for which a terminal of 80 columns has no room beside the figures."""
 _LAYOUTS = "{l_bar}{bar}| " + _NUMBERS, "{desc}" + _NUMBERS, _NUMBERS
@@ -73,7 +73,7 @@ def progress(total: int, unit: str, what: str = "", begun: int = 0, leave: bool 
 
 @contextmanager
 def preparing(what: str) -> Iterator[None]:
-    """Say on stderr what is prepared if that takes longer than `PATIENCE`, and no bar has appeared meanwhile.
+    """Name on stderr the work that is prepared, if it takes longer than `PATIENCE` and no bar has appeared meanwhile.
 
     Bad input is found sooner than that in most cases, and then there is only its error.
     """
@@ -89,7 +89,7 @@ def preparing(what: str) -> Iterator[None]:
 
 
 class Compilations:
-    """Shows on stderr what a compilation is at; `engines.stages.told` takes it.
+    """Shows the stage of a compilation on stderr; `engines.stages.told` takes it.
 
     In a terminal it is one line with the stage and the seconds so far, and at the end with how long it took. Elsewhere
     it is a line at the start, one for each later stage unless the last line is younger than `PAUSE`, one at the end.
@@ -138,7 +138,7 @@ class Compilations:
 
 
 def _kept() -> str:
-    """Return what becomes of a compilation, unless it is lost."""
+    """Return a text on where a compilation is kept; empty if it is lost."""
     return "" if has_temporary_caches() else "; a second start takes it from the cache"
 
 
@@ -177,14 +177,14 @@ def _has_widgets() -> bool:
 
 
 class _Bar(tqdm):
-    """A bar in a terminal that leaves out, as a whole, what there is no room for: the bar first, the last figures last.
+    """A bar in a terminal that leaves out whole parts for which there is no room: first the bar, then the last figures.
 
     tqdm itself would cut figures off in the middle of a word.
     """
 
     @property
     def format_dict(self) -> dict[str, Any]:
-        """Return what tqdm draws a bar from."""
+        """Values from which tqdm draws a bar."""
         found: dict[str, Any] = super().format_dict
         room = found["ncols"]
         if not room:  # unknown

@@ -242,7 +242,7 @@ def load_config(task: str, scene: str, overrides: Iterable[str] = ()) -> Setting
 
 
 def check_overrides(overrides: Iterable[str]) -> None:
-    """Raise ValueError for overrides that are wrong whatever the task and the scene are (see `load_config`)."""
+    """Raise ValueError for overrides that are wrong for every task and scene (see `load_config`)."""
     ALGORITHMS.check(_build(_override({}, overrides)).algo)
 
 

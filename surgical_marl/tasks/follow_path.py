@@ -46,13 +46,13 @@ class Task(PathTask):
     }
 
     def terms(self, agent: str) -> dict[str, Term | Picture]:
-        """Return those of `reach`, and `to_path_ahead` [9], the ways from the tip to three points ahead, m."""
+        """Return the terms of `reach`, and `to_path_ahead` [9], the ways from the tip to three points ahead, m."""
         terms = super().terms(agent)
         low, high = (np.tile(getattr(terms["to_target"], end), len(AHEAD)) for end in ("low", "high"))
         return {**terms, "to_path_ahead": Term(lambda w: self._ahead(w, agent), low, high, "goal")}
 
     def observes(self, agent: str) -> tuple[str, ...]:
-        """Return what is observed in `reach`, then the points ahead."""
+        """Return the names of the terms observed in `reach`, then `to_path_ahead`."""
         return (*super().observes(agent), "to_path_ahead")
 
     def _ahead(self, world: World, agent: str) -> Array:

@@ -45,11 +45,11 @@ if TYPE_CHECKING:
 POSTURES = 1024
 """Number of hidden postures; each has a target picture of 12 KiB."""
 NEAREST = 0.02
-"""The camera's least distance from what it sees, m."""
+"""Least distance of the camera from any geom in view, m."""
 IN_VIEW = 0.2
 """Least share of a target picture that shows pieces of tissue, and not just the field around them."""
 RAYS = 8
-"""Rays along each side of a picture, to find out what it shows."""
+"""Rays along each side of a picture, to test which geoms it shows."""
 
 
 class PictureGoal(NamedTuple):
@@ -95,7 +95,7 @@ class Task(TipTask):
         return Start(PictureGoal(self.tables["tips"][row], row))
 
     def terms(self, agent: str) -> dict[str, Term | Picture]:
-        """Return those of an arm, without its target, and the picture to be matched as `target`."""
+        """Return the terms of an arm, without its target, and the picture to be matched as `target`."""
         terms = super().terms(agent)
         del terms["to_target"]
         return {**terms, "target": Picture(self.camera, table="hidden")}
@@ -116,7 +116,7 @@ class Task(TipTask):
 
     @property
     def privileged_bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Limits of those joints."""
+        """Limits of the joints of the camera's arm."""
         return self._arm.lower, self._arm.upper
 
     def sense(self, pictures: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:

@@ -88,7 +88,7 @@ class Team(NamedTuple):
 
 
 class HandoverGoal(NamedTuple):
-    """The goal of an episode, and what was reached of it."""
+    """The goal of an episode, and the progress towards it."""
 
     row: Array
     """Row of the tables."""
@@ -133,7 +133,7 @@ class Task(ObjectTask):
     # -- what is measured
 
     def further(self, world: World, now: Now) -> Team:
-        """Return the best of both arms with what is measured now."""
+        """Return the best that both arms did so far, with the measurements of this step."""
         team, first, second = world.goal.team, now.held[self.picker], now.held[self.presenter]
         away, there = self._to_useful(world, self.presenter), self._usefully(now) & (now.lift >= 1.0)
         way = known(jnp.sqrt(jnp.sum(away * away)))

@@ -36,7 +36,7 @@ class Task(PathTask):
     }
 
     def terms(self, agent: str) -> dict[str, Term | Picture]:
-        """Return those of `reach`, and `target_velocity` [3], m/s."""
+        """Return the terms of `reach`, and `target_velocity` [3], m/s."""
         i, fastest = self.scene.agents.index(agent), np.full(3, 2 * max(level.speed for level in self.levels.values()))
         return {
             **super().terms(agent),
@@ -44,5 +44,5 @@ class Task(PathTask):
         }
 
     def observes(self, agent: str) -> tuple[str, ...]:
-        """Return what is observed in `reach`, then the target's velocity."""
+        """Return the names of the terms observed in `reach`, then `target_velocity`."""
         return (*super().observes(agent), "target_velocity")

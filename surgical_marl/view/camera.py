@@ -29,9 +29,9 @@ _NEAR = 0.15
 _AROUND = 0.03
 """Distance from the point in front of an arm within which its targets are looked for, m."""
 _SLACK = 0.012
-"""A point counts as seen if what a ray meets is at most so far in front of it, m: it may lie within a tool."""
+"""A point counts as seen if a ray ends at most so far in front of it, m: it may lie within a tool."""
 _FILLED, _LEAST = 0.75, 0.5
-"""Part of the picture that what matters fills; distance at least, over that of the scene's own camera."""
+"""Part of the picture that the points fill; least distance, over that of the scene's own camera."""
 _TABLES = {"points": 3, "starts": 7}
 """Tables of a task that hold places in the world, and how many numbers a row has."""
 _PLACES = 16
@@ -96,7 +96,7 @@ def seen(model: mujoco.MjModel, data: mujoco.MjData, eye: Array, points: Array) 
 
 
 def _score(scene: Scene, moments: list[_Moment], view: View, own: Array) -> float:
-    """Return how good a view is, 1 at most: the share of points that are seen, less what it costs otherwise."""
+    """Return the score of a view, 1 at most: the share of points that are seen, less costs of side and closeness."""
     eye, axes = view.pose()
     shares = [seen(scene.model, moment.data, eye, moment.points).mean() for moment in moments]
     side = np.tan(np.radians(_FOVY / 2)) * np.linspace(-1, 1, 9)
@@ -133,7 +133,7 @@ def _moments(scene: Scene, places: Array) -> list[_Moment]:
 
 
 def _hits(model: mujoco.MjModel, data: mujoco.MjData, eye: Array, rays: Array) -> Array:
-    """Return the distances of what rays from a place meet first, -1 for nothing."""
+    """Return the distances at which rays from a place first meet a geom, -1 for none."""
     count = len(rays)
     geom, distance = np.empty(count, np.int32), np.empty(count)
     mujoco.mj_multiRay(

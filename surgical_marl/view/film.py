@@ -186,7 +186,7 @@ def _wrapped(line: str, font: Any, width: float) -> list[str]:
 def _shots(
     env: BatchedEnv, movers: Movers, look: Look, picture: ScenePicture, episodes: int, seed: int
 ) -> Iterator[list[Shot]]:
-    """Yield what each frame shows, while the environments play."""
+    """Yield the shots of each frame, one per environment, while the environments play."""
     every, steps = steps_per_frame(env, look.fps * look.slow), episodes * env.max_steps
     for step, (infos, ended) in enumerate(played(env, movers.actions, movers.begin, steps, seed), 1):
         if step % every == 0 or ended.any():
@@ -200,7 +200,7 @@ def _words(env: BatchedEnv, infos: Any, index: int) -> list[str]:
 
 
 def _scope(env: BatchedEnv, look: Look) -> Callable[[Pose], Picture] | None:
-    """Return what draws the endoscope's view beside the picture; None in a scene without one, and in a grid."""
+    """Return a function that draws the endoscope's view; None in a scene without an endoscope, and in a grid."""
     cameras = [agent for agent, mount in env.scene.mounts.items() if mount.arm.camera is not None]
     if not cameras or look.grid != (1, 1):
         return None

@@ -63,7 +63,7 @@ class Hand:
         return [joint.name for joint in self._arm.actuated]
 
     def hold(self, observation: Any) -> None:
-        """Forget what was wanted: in the first environment the arm is to stay where it is sent to now.
+        """Want the arm to stay where it is sent to now in the first environment.
 
         Its jaw opens or closes, to whichever it is nearer.
 
@@ -102,7 +102,7 @@ class Hand:
         return tool_of(self.mount, self.q)
 
     def __call__(self, observation: Any) -> np.ndarray:
-        """Return the action [N, n] that moves commands towards what is wanted."""
+        """Return the action [N, n] that moves commands towards the wanted joint positions."""
         command = self._commands(observation)
         found = self._mover.action(command, self.q - command, 1.0 if self.jaw_open else -1.0)
         return np.clip(found, -1.0, 1.0).astype(np.float32)

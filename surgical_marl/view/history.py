@@ -55,7 +55,7 @@ class History:
         return np.arange(1 - min(self._count, self._room), 1) * self._dt
 
     def names(self, agent: str) -> list[str]:
-        """Return the names of what is remembered of an agent."""
+        """Return the names of the values that are remembered of an agent."""
         return [name for owner, name in self._rows if owner == agent]
 
     def read(self, agent: str, name: str) -> np.ndarray:
@@ -76,7 +76,7 @@ class History:
 
 
 def summary(info: Mapping[str, Any], index: int = 0) -> list[str]:
-    """Return what an agent's infos of a step say in short: error, stages, and what went wrong."""
+    """Summarise an agent's infos of a step: error, stages, success, collision and drop."""
 
     def read(name: str) -> float:
         return float(np.asarray(info[name])[index])

@@ -46,14 +46,14 @@ def ramp(low: float, high: float, x: float):
 
 @wp.func
 def backdrop(ray: wp.vec3):
-    """Return what is seen beyond everything: a plain wall, lighter at the horizon."""
+    """Return the background in a direction: a plain wall, lighter at the horizon."""
     up = wp.sqrt(wp.clamp(ray[2], 0.0, 1.0))
     return _HORIZON + up * (_CEILING - _HORIZON)
 
 
 @wp.func
 def room(ray: wp.vec3, blur: float, lamp: wp.vec3):
-    """Return what a mirror shows in a direction: drapes below, a wall around, a soft box overhead and one at the lamp.
+    """Return the reflection in a direction: drapes below, a wall around, a soft box overhead and one at the lamp.
 
     The more a mirror blurs, the wider and the weaker are the soft boxes.
     """

@@ -76,7 +76,7 @@ class Moment(NamedTuple):
 
 
 class Observer:
-    """Finds what there is to see in environments of one scene."""
+    """Reads moments from environments of one scene."""
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
@@ -99,7 +99,7 @@ class Observer:
         """Geoms of each free object."""
 
     def look(self, env: BatchedEnv, forces: Any = None) -> Moment:
-        """Return what there is to see now.
+        """Return the moment in which the environments are now.
 
         Args:
             env: environments of the scene, with numpy arrays.
@@ -154,7 +154,7 @@ class Observer:
 
 
 def _push(line: Near, force: float) -> Push:
-    """Return what the first shape does to the second one at the shortest line between the two."""
+    """Return the push of the first shape on the second one, at the shortest line between the two."""
     start, end = line.ends
     way = start - end if line.distance < 0 else end - start  # shapes that overlap have each end inside the other
     length = float(np.linalg.norm(way))

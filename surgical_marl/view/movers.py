@@ -68,7 +68,7 @@ class Movers:
             self.hands[new].hold(observations[new])
 
     def actions(self, observations: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the actions of all agents for what they observe, {agent: [N, d]}."""
+        """Return the actions of all agents for their observations, {agent: [N, d]}."""
         actions: dict[str, Any] = {}
         for group in self._groups.values():
             actions |= group.actions(observations)

@@ -37,7 +37,7 @@ class Pixels:
 
 @wp.func
 def look(world: World, shape: int, point: wp.vec3, normal: wp.vec3, ray: wp.vec3, light: wp.vec2):
-    """Return what a ray sees of a point of a shape; `light` are shares of the lamp and of the sky."""
+    """Return the light that a ray gets from a point of a shape; `light` are shares of the lamp and of the sky."""
     pattern, local = world.shapes[shape].pattern, world.shapes[shape].back @ (point - world.shapes[shape].place)
     base, slope = patterned(world.grain, world.shapes[shape].colour, local, pattern)
     bent = wp.normalize(normal + wp.transpose(world.shapes[shape].back) @ slope)

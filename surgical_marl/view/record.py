@@ -40,7 +40,7 @@ WIDTH, HEIGHT = 480, 360
 LEAST = 3.0
 """Radius of a goal's ball in the picture at least, pixels."""
 THROUGH = 0.45
-"""Share of a goal's colour that is seen through what hides it."""
+"""Share of a goal's colour that is seen through shapes in front of it."""
 
 
 def record(

@@ -32,7 +32,7 @@ _LAMP = np.array([-0.7, 0.6, 1.6])
 _LAMP_SIZE, _SKY_SIZE = 0.045, 0.55
 """Radii over distance of the lamp, and of the part of the sky that things near by hide."""
 _FAR, _SKY_FAR = 1e6, 0.2
-"""Distance of what hides the sky at most, in extents of the model."""
+"""Greatest distance of shapes that hide the lamp and the sky, in extents of the model."""
 _LAMP_TILES, _SKY_TILES = 128, 96
 _LIT = 1.6
 """Reach of shadows from the model's middle, in its extents."""

@@ -80,7 +80,7 @@ class Session:
         self.reset()
 
     def reset(self, seed: int | None = None) -> None:
-        """Begin the first episodes of a seed; without one, those of the last seed again.
+        """Begin the first episodes of a seed; without one, the first episodes of the last seed again.
 
         Raises:
             ValueError: a bad seed; nothing has changed then.
@@ -126,7 +126,7 @@ class Session:
             self._take.moved_by(agent, who)
 
     def moment(self) -> Moment:
-        """Return what there is to see now."""
+        """Return the current moment."""
         return self._trail[-1]
 
     def trails(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -140,7 +140,7 @@ class Session:
         return tips, objects, np.stack([own.held.any(-1) for own in past])
 
     def close(self) -> None:
-        """Write what is left of a recording, and free the environments."""
+        """Write the rest of a recording, and free the environments."""
         self._keep()
         self.env.close()
 

@@ -49,7 +49,7 @@ Array = NDArray[np.float64]
 GAMMA = 2.2  # colours are mixed in linear light; files give them as sRGB
 
 STEEL = (0.75, 0.20, 1.0)
-"""Gloss: reflectance straight on, blur of what is mirrored, share of a metal; each from 0 to 1."""
+"""Gloss: reflectance straight on, blur of the reflection, share of a metal; each from 0 to 1."""
 PAINT = (0.10, 0.45, 0.45)
 PLASTIC = (0.045, 0.30, 0.0)
 RUBBER = (0.04, 0.55, 0.0)
@@ -81,7 +81,7 @@ class Material(NamedTuple):
 
 
 def material(rgb: Array, fleshy: bool = False, broad: bool = False) -> Material:
-    """Return what a colour stands for.
+    """Return the material that a colour stands for.
 
     Greys are white plastic, bare steel, painted metal or black rubber, from light to dark. Colours are plastic, or
     tissue where it is `fleshy`. No `broad` plate is bare steel.
@@ -100,7 +100,7 @@ def material(rgb: Array, fleshy: bool = False, broad: bool = False) -> Material:
 def materials(
     model: mujoco.MjModel, paint: Mapping[int, Material | Sequence[float]] = MappingProxyType({})
 ) -> list[Material]:
-    """Return what each geom of a model is made of: a material or an rgb of `paint`, or else what its colour suggests.
+    """Return the material of each geom of a model: from `paint`, or else the one that its colour suggests.
 
     Tissue is what stands in the scene as tissue or as the operating field, and fixed objects in the colour of skin.
     """
@@ -120,7 +120,7 @@ def materials(
 
 
 def named(model: mujoco.MjModel, objects: Mapping[str, Placement]) -> dict[int, Material]:
-    """Return geom -> what it is made of, for the shapes of objects whose files name a material."""
+    """Return geom -> material, for the shapes of objects whose files name a material."""
     found = {}
     for name, place in objects.items():
         for number, shape in enumerate(place.object.shapes):

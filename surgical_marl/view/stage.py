@@ -30,11 +30,11 @@ _BED = 0.075
 """Reach of the mound under tissue beyond the middles of the pieces, m."""
 _BOOM, _BOOM_RADIUS = 1.5, 0.045
 _INSET = 0.006
-"""Distance of a stand's sides from those of the board on it, inwards, m."""
+"""Distance of a stand's sides from the sides of the board on it, inwards, m."""
 
 
 def stage(scene: Scene) -> list[Extra]:
-    """Return what stands around a scene."""
+    """Return the shapes that stand around a scene."""
     data = mujoco.MjData(scene.model)
     data.qpos[:] = scene.home
     mujoco.mj_kinematics(scene.model, data)
@@ -51,7 +51,7 @@ def stage(scene: Scene) -> list[Extra]:
 
 
 def paint(scene: Scene) -> dict[int, Material]:
-    """Return geom -> material of objects whose files name one, and of what shows whose an arm is.
+    """Return geom -> material of objects whose files name one, and of parts in the colour of an agent.
 
     That is its trocar or its foot, and its accent if it has just one: they have the agent's colour.
     """

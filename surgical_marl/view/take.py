@@ -67,7 +67,7 @@ class Take:
         self._about["movers"].append([len(self), agent, who])
 
     def add(self, actions: Mapping[str, np.ndarray], step: BatchStep) -> None:
-        """Note the actions of a step that the environment has just done, and what it led to."""
+        """Note the actions of a step that the environment has just done, and its outcome."""
         self._steps.append(
             {f"actions/{agent}": np.array(own) for agent, own in actions.items()} | _after(self._env, step)
         )
@@ -139,7 +139,7 @@ def replay(path: Path) -> Replayed:
 
 
 def read_take(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Return what `about` says, and all arrays by name; ValueError if the file is no take."""
+    """Return the content of `about`, and all arrays by name; ValueError if the file is no take."""
     try:
         arrays = read_npz(path)
         about = json.loads(str(arrays.pop("about")))

@@ -1,4 +1,4 @@
-"""Rays among the shapes of a picture: what they meet, and what stands between a point and a lamp.
+"""Trace rays among the shapes of a picture: to the first shape, and from a point to a lamp.
 
 `list_shapes` lists for every tile of a camera's or a lamp's picture the shapes that some of its rays may meet; rays
 then test only those. The kernels run on a CPU, one picture a thread of the caller.
@@ -92,7 +92,7 @@ class World:
     balls: wp.int32
     """Number of the first ball that is no part of the model; balls come last, the farthest first."""
     through: wp.float32
-    """Share of a ball's colour that is seen through what hides it."""
+    """Share of a ball's colour that is seen through shapes in front of it."""
     fade: wp.float32
     """Distance at which planes have faded, m."""
     grain: wp.array3d[wp.vec4]
@@ -233,7 +233,7 @@ def ray_of(eye: Eye, column: float, row: float):
 
 @wp.func
 def meet(world: World, column: float, row: float):
-    """Return how far a ray goes, the normal of what it meets, and the side of which shape that is; 0 for nothing."""
+    """Return the length of a ray, the normal where it ends, and the side of which shape that is; 0 for nothing."""
     eye = world.eyes[0]
     ray = ray_of(eye, column, row)
     tile = int(row) // TILE * eye.columns + int(column) // TILE

@@ -117,7 +117,7 @@ class Endoscope:
         self._warp.synchronize_device(device)  # the arrays were made on Warp's own stream
 
     def render(self, qpos: Any, objects: Poses | None = None) -> View:
-        """Return what the endoscopes see at joint positions [N, nq] of the whole scene.
+        """Draw the pictures of the endoscopes at joint positions [N, nq] of the whole scene.
 
         Free objects are where `objects` says, as `BatchedEnv.object_poses` does, in arrays of the same library as
         `qpos`; without it they are where the scene places them.

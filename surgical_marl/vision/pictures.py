@@ -75,7 +75,7 @@ class Pictures:
         }
 
     def is_matched(self, agent: str, name: str) -> bool:
-        """Return whether a term is a picture to be matched, and not what an endoscope sees now."""
+        """Return whether a term is a picture to be matched, and not an endoscope's current picture."""
         return self.terms[agent][name].table is not None
 
     def wanted(self, agent: str, name: str, rows: Any) -> Any:

@@ -121,7 +121,7 @@ def reach(kind: int, size: wp.vec3, n: wp.vec3):
 
 @wp.func
 def shine(light: wp.vec3, normal: wp.vec3, view: wp.vec3, colour: wp.vec3, diffuse: wp.vec3, specular: wp.vec3):
-    """Return what comes to the eye from one light, as in MuJoCo for a geom without settings of its material."""
+    """Return the light that comes to the eye from one lamp, as in MuJoCo for a geom without material settings."""
     facing = wp.dot(normal, light)
     if facing <= 0.0:
         return wp.vec3(0.0)

@@ -45,7 +45,7 @@ class HAPPO(Algorithm):
         self._orders = torch.Generator().manual_seed(torch.initial_seed())
 
     def parts(self) -> Sequence[Callable[[], None]]:
-        """Return what each agent learns, and the end of an update."""
+        """Return a function for each agent's part of an update, and one that ends the update."""
         return [*(partial(self._learn_agent, index) for index in range(len(self._actors))), self.conclude]
 
     def order(self) -> Sequence[int]:
@@ -92,7 +92,7 @@ class HAPPO(Algorithm):
         stored.advantages *= torch.exp(log_prob - own.old_actions_log_prob)
 
     def _own(self, index: int, batch: RolloutStorage.Batch) -> RolloutStorage.Batch:
-        """Return what an actor of one agent needs of a batch."""
+        """Return the part of a batch that the actor of one agent needs."""
         columns, place = self._columns[index], slice(index, index + 1)
         memory = batch.hidden_states[0]
         return RolloutStorage.Batch(

@@ -50,7 +50,7 @@ class Best(NamedTuple):
 
 
 class ObjectGoal(NamedTuple):
-    """The goal of an episode, and what was reached of it."""
+    """The goal of an episode, and the progress towards it."""
 
     row: Array
     """Row of the tables."""
@@ -141,14 +141,14 @@ class ObjectTask(Task):
     # -- what is measured
 
     def at_hand(self, world: World) -> World:
-        """Return the world in which the object to be moved now has the name `self.object`: this one, if there is one.
+        """Return the world in which the object to be moved now has the name `self.object`.
 
-        A task that moves several objects alike, one after the other, returns another one.
+        It is the same world, unless a task moves several objects alike, one after the other.
         """
         return world
 
     def now(self, world: World) -> Now:
-        """Return what is measured in a world."""
+        """Return the measurements in a world."""
         world = self.at_hand(world)
         body, goal = world.objects[self.object], world.goal
 
@@ -177,7 +177,7 @@ class ObjectTask(Task):
         return world.goal._replace(best=self.better(world.goal.best, self.now(world)))
 
     def better(self, best: Best, now: Now) -> Best:
-        """Return the best so far with what is measured now."""
+        """Return the best so far, with the measurements of this step."""
         presents = self.presents(now)
 
         def least(value: Array, before: Array) -> Array:
@@ -206,7 +206,7 @@ class ObjectTask(Task):
     # -- what agents get
 
     def reward_terms(self, world: World) -> dict[str, dict[str, Array]]:
-        """Return the terms of every task, and those of the team, which each agent gets.
+        """Return the terms of every task, and the team's terms, which each agent gets.
 
         Progress over the best of the episode so far: `reach` (m) of the arm that picks it up, `grasp` (1 when that
         first holds it), `lift` (up to 1 at `LIFT`) while it is held; `carry` (m) and `turn` (rad, where the goal has an
@@ -249,7 +249,7 @@ class ObjectTask(Task):
     # -- what agents observe
 
     def terms(self, agent: str) -> dict[str, Term | Picture]:
-        """Return the terms of every task, and those of the object's goal in the base frame.
+        """Return the terms of every task, and terms of the object's goal in the base frame.
 
         `to_object` [3] from the tool tip to the object's nearest bar; `target` [3] of its point, `to_target` [3] from
         that point, `target_rotation` [6], the first two columns of how it should be turned; `best_lift` [1]; with

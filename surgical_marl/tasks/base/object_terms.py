@@ -30,7 +30,7 @@ AT_HAND = "object"
 
 
 def object_terms(scene: Scene, agent: str) -> dict[str, Term]:
-    """Return what an arm can know of every free object of a scene, in its base frame and SI units.
+    """Return the terms of an arm about every free object of a scene, in its base frame and SI units.
 
     Of an object `needle` they are `needle_position` [3] of its origin, `needle_rotation` [6], the first two columns of
     its rotation matrix, `needle_velocity` [6], of its centre of mass and angular, and `needle_grip` [3]: the force of

@@ -87,7 +87,7 @@ class Options(Checked):
         return self.control if self.control_frame == "base" else f"{self.control} ({self.control_frame})"
 
     def of_environment(self) -> dict[str, Any]:
-        """Return the environment's options by name, without what a subclass adds to them."""
+        """Return the environment's options by name, without the fields of a subclass."""
         return {item.name: getattr(self, item.name) for item in fields(Options)}
 
 

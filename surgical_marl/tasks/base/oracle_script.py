@@ -50,7 +50,7 @@ class Step(NamedTuple):
     """A step of a script: all agents go where they should and wait there."""
 
     plan: Callable[[Snapshot], Mapping[str, Wish]]
-    """Return what each agent should do. Agents that are not named stay, with the jaw as it is."""
+    """Return the wish of each agent. Agents that are not named stay, with the jaw as it is."""
     wait: float = 0.0
     """Time after all agents have arrived, s. Below 0 the next step begins while they are still on their way."""
     pace: float = 1.0
@@ -58,4 +58,4 @@ class Step(NamedTuple):
     good: Callable[[Snapshot], np.ndarray] | None = None
     """Return whether the step was successful, [n] bool; where not, the script goes on with the step `back`."""
     back: int | Callable[[Snapshot], np.ndarray] = 0
-    """Number of a step, or what returns one for each environment, [n]."""
+    """Number of a step, or a function that returns one for each environment, [n]."""

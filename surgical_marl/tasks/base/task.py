@@ -100,7 +100,7 @@ class Task:
     has_targets: ClassVar[bool] = False
     """True if `targets` gives places for tool tips."""
     attends: tuple[str, ...] = ()
-    """Agents that follow no script but what the others do, as `attend` says."""
+    """Agents that follow the others by `attend`, and no script."""
     wanted: ClassVar[Mapping[str, tuple[str, float]]] = {}
     """Goals of a trained policy: metric -> ("below" or "at least", number)."""
 
@@ -152,18 +152,18 @@ class Task:
         return goal
 
     def remember(self, world: World) -> Any:
-        """Return the goal with what the task keeps of this step for later ones, such as the best distance so far.
+        """Return the goal with values of this step that later steps need, such as the best distance so far.
 
         It is called after the reward of each step, and also at the start of an episode.
         """
         return world.goal
 
     def terms(self, agent: str) -> dict[str, Term | Picture]:
-        """Return all that an agent may observe, by name."""
+        """Return all terms that an agent may observe, by name."""
         return {**arm_terms(self.scene, agent), **object_terms(self.scene, agent), **picture_terms(self.scene, agent)}
 
     def observes(self, agent: str) -> tuple[str, ...]:
-        """Return the names of the terms that it observes unless a scene or a call chooses others."""
+        """Return the names of the terms that an agent observes unless a scene or a call chooses others."""
         return tuple(name for name, term in arm_terms(self.scene, agent).items() if name != "contact_force")
 
     @property
@@ -172,7 +172,7 @@ class Task:
         return self.scene.agents[0]
 
     def privileged(self, goal: Any) -> Array:
-        """Return what only critics see: numbers of the goal that no agent observes, [p]."""
+        """Return numbers of the goal that critics see and no agent observes, [p]."""
         return jnp.zeros(0, jnp.float32)
 
     @property
@@ -223,7 +223,7 @@ class Task:
         return jnp.bool_(False)
 
     def sense(self, pictures: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-        """Return what `senses` names, [N] float32, from the pictures that agents see after a reset or a step.
+        """Compute the numbers of `senses`, [N] float32, from the pictures that agents see after a reset or a step.
 
         A metric of the same name must be the number itself: a reset puts it into the infos as it is.
 
@@ -239,7 +239,7 @@ class Task:
         return ()
 
     def attend(self, seen: Snapshot) -> Mapping[str, Wish]:
-        """Return what agents of `attends` should do now; the oracle asks at every control step."""
+        """Return the wishes of the agents of `attends` now; the oracle asks at every control step."""
         raise NotImplementedError
 
     def targets(self, goal: Any) -> np.ndarray:
@@ -265,7 +265,7 @@ class Task:
         return np.stack(own, 1)
 
     def goal_content(self, goal: Any) -> list[np.ndarray]:
-        """Return the numbers that say what the goals of N episodes are, [N, ...] each.
+        """Return numbers that tell the goals of N episodes apart, [N, ...] each.
 
         The hash of an evaluation is made from these numbers.
         """
@@ -331,7 +331,7 @@ class TipTask(Task):
 
 @cache
 def _length() -> Callable[[Array], Array]:
-    """Return what computes the length of a vector [3], with derivative zero at zero, where it has none.
+    """Return a function for the length of a vector [3], with derivative zero at zero, where it has none.
 
     That of `jnp.linalg.norm` is NaN there: one tip at its target would spoil the derivative of a whole episode.
     """

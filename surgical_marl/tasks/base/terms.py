@@ -1,4 +1,4 @@
-"""Observation terms: the named parts of what an agent observes.
+"""Observation terms: the named parts of an agent's observation.
 
 A term is declared once, with the function that reads it and its bounds. The vector of an observation, its space, and
 the names and slices within it all follow from this declaration.
@@ -57,7 +57,7 @@ class Term(NamedTuple):
     read: Callable[[World], Array]
     """The value [d] in a world."""
     low: np.ndarray
-    """Least value, [d]: what is observed is clipped to the bounds."""
+    """Least value, [d]: observations are clipped to the bounds."""
     high: np.ndarray
     about: About | None = None
     """Subject of the term. A task whose terms don't say it can be played at knowledge "task" alone."""

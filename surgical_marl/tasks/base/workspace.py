@@ -161,7 +161,7 @@ def _draw_starts(scene: Scene, spread: float, seed: int, rows: int) -> np.ndarra
 def _stay_apart(
     scene: Scene, starts: dict[str, np.ndarray], goals: dict[str, np.ndarray], rows: np.ndarray
 ) -> np.ndarray:
-    """Return those of some rows in which arms stay apart, and do not touch themselves, on straight paths of joints.
+    """Return the rows in which arms stay apart, and do not touch themselves, on straight paths of joints.
 
     Paths are looked at in ever smaller steps, until no two tips come as near to each other between two points as the
     arms have been: with `PATH_POINTS` alone, arms as large as STARs move by 0.2 m in between and may meet there.
@@ -169,8 +169,8 @@ def _stay_apart(
     Args:
         scene: the scene.
         starts: joint positions [N, n] of each agent.
-        goals: likewise, at the paths' ends.
-        rows: which of N to look at.
+        goals: joint positions [N, n] of each agent at the paths' ends.
+        rows: the rows of N to look at.
     """
     least = np.full(len(next(iter(goals.values()))), np.inf)
     shares, pieces = np.linspace(0.0, 1.0, PATH_POINTS + 1), PATH_POINTS

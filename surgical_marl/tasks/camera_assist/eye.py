@@ -22,7 +22,7 @@ CLOSE = 0.1
 """Least distance of the nearest point in a good view, m: there a square picture of 60 degrees is 115 mm wide.
 Tools part faster than an endoscope draws back."""
 FILL = 0.6
-"""At a good distance what is looked at fills this share of the picture, from its middle to its nearest edge."""
+"""At a good distance the points fill this share of the picture, from its middle to its nearest edge."""
 LONGEST = 0.2
 """The longest step of a joint in `look_at`, a share of its range."""
 STEPS = 20
@@ -110,7 +110,7 @@ class Eye:
     def _change(
         self, lower: np.ndarray, scale: np.ndarray, share: np.ndarray, places: np.ndarray, weight: float
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return what `aim` returns [n, 3], the distance times a weight, and its derivatives [n, 3, joints].
+        """Return the errors of `aim` [n, 3], the distance times a weight, and their derivatives [n, 3, joints].
 
         Joint positions are `lower` and a `share` [n, joints] of the ranges `scale`.
         """

@@ -61,13 +61,13 @@ if TYPE_CHECKING:
 SEARCH = TIME
 """Time in which the endoscope may look for the tools, s, unless it sees all before: as arms may take in `reach`."""
 LATER = 100
-"""Control steps that an episode has beyond those of the work."""
+"""Control steps of an episode after the work's own."""
 FOLLOWING = 6
 """Steps of `Eye.look_at` from the last posture."""
 FURTHEST_OFF, WORST_DEPTH = 3.0, 1.0
 """Greatest values of the terms `centring` and `depth`."""
 VIEW = {"in_view": 1.0, "centring": -0.5, "depth": -0.5, "travel": -10.0}
-"""Weights of the terms of the view beside those of `reach`, which like them count in each step."""
+"""Weights of the terms of the view, which count in each step, as the terms of `reach` do."""
 BESIDE_OBJECTS = 0.1
 """Factor of the weights `VIEW` beside the work with objects, whose progress counts once."""
 SELF = ("clearance", "collision", "action_change")
@@ -84,7 +84,7 @@ class Level(NamedTuple):
 
 
 class ViewGoal(NamedTuple):
-    """The goal of an episode, and what the endoscope has done by now."""
+    """The goal of an episode, and the endoscope's progress."""
 
     work: Any
     """Goal of the tools' work."""
@@ -167,7 +167,7 @@ class Task(BaseTask):
     # -- what is in view
 
     def places(self, world: World) -> dict[str, Array]:
-        """Return what can be seen, in the world, m, [3] each: tips by agent, free objects by name, goals.
+        """Return places that can be seen, in the world, m, [3] each: tips by agent, free objects by name, goals.
 
         The goal of an object is called `GOAL`; the target of a tool in `reach` is `<agent>/target`.
         """
@@ -186,7 +186,7 @@ class Task(BaseTask):
         return *self.tools, *([self.object] if self.object else [f"{agent}/target" for agent in self.tools])
 
     def sights(self, world: World) -> Sights:
-        """Return what the endoscope sees."""
+        """Return the places in the endoscope's frame, and which are in view."""
         axes, origin = self._eye.pose(world.arms[self.camera].qpos)
         seen = {name: (place - origin) @ axes for name, place in self.places(world).items()}
         return Sights(seen, {name: self._eye.sees(place) for name, place in seen.items()}, origin)
@@ -197,11 +197,11 @@ class Task(BaseTask):
         return point @ mount.rotation.T.astype(np.float32) + mount.position.astype(np.float32)
 
     def _inside(self, world: World) -> World:
-        """Return the world of the work."""
+        """Return the world with the goal of the tools' work, for functions of the work."""
         return world._replace(goal=world.goal.work)
 
     def remember(self, world: World) -> Any:
-        """Return the goal with what the work keeps, whether all has been in view, and where the endoscope's tip is."""
+        """Return the work's goal, whether all has been in view, and the place of the endoscope's tip."""
         _, visible, origin = self.sights(world)
         found = jnp.maximum(world.goal.found, as_float(self._all(visible)))
         return world.goal._replace(work=self.work.remember(self._inside(world)), found=found, origin=origin)
@@ -212,7 +212,7 @@ class Task(BaseTask):
     # -- what agents get
 
     def reward_terms(self, world: World) -> dict[str, dict[str, Array]]:
-        """Return the team's terms, of the work and of the view, and those of each arm for itself."""
+        """Return the team's terms, of the work and of the view, and the terms of each arm for itself."""
         work = self.work.reward_terms(self._inside(world))
         names = [name for name in work[self.tools[0]] if name not in SELF]
         team = {name: jnp.stack([work[agent][name] for agent in self.tools]).mean() for name in names}
@@ -247,7 +247,7 @@ class Task(BaseTask):
         return {agent: {**found, **(work[agent] or {"at_goal": done[agent]})} for agent in world.arms}
 
     def metrics(self, world: World) -> dict[str, dict[str, Array]]:
-        """Return what the work does; of the camera, where that has a tip's error, that of the tool with the larger one.
+        """Return the metrics of the work; `tip_error` of the camera is that of the tool with the larger error.
 
         `in_view`: whether the tool is in view; of the camera the share of the tools that are. Of the camera also
         `object_in_view`, likewise of the object or the targets; `centre_error`, the term `centring` without its bound,
@@ -280,11 +280,11 @@ class Task(BaseTask):
 
     @property
     def _shown(self) -> Shown:
-        """Observation terms of what the endoscope shows."""
+        """Observation terms of the endoscope's view."""
         return Shown(self.scene, self.camera, self.tools, self.object, self._eye, self.sights)
 
     def terms(self, agent: str) -> dict[str, Term | Picture]:
-        """Return the terms of the work, hidden from tools out of view, and those of the view."""
+        """Return the terms of the work, hidden from tools out of view, and the terms of the view."""
 
         def inside(read: Callable[[World], Array]) -> Callable[[World], Array]:
             return lambda world: read(self._inside(world))
@@ -294,7 +294,7 @@ class Task(BaseTask):
         return self._shown.to_tool(agent, work) if agent in self.tools else {**work, **self._views()}
 
     def _views(self) -> dict[str, Term]:
-        """Return the terms of the camera beside those of the work."""
+        """Return the camera's own terms, beside the terms of the work."""
         return self._shown.to_camera(self._tools_hold)
 
     def _tools_hold(self, world: World) -> Array:
@@ -303,7 +303,7 @@ class Task(BaseTask):
         return jnp.stack([arms[tool].handles[self.object].holding for tool in self.tools]).astype(jnp.float32)
 
     def observes(self, agent: str) -> tuple[str, ...]:
-        """Return what a tool observes at its work and what it sees; of the camera its joints and the view."""
+        """Return the terms of a tool at its work and in the view, or the joints and the view of the camera."""
         if agent == self.camera:
             return "qpos", "qvel", "tool_tip", "command", "min_distance", *self._views()
         work = (name for name in self.work.observes(agent) if name != "to_nearest_tip")
@@ -316,7 +316,7 @@ class Task(BaseTask):
         return self.camera
 
     def privileged(self, goal: Any) -> Array:
-        """Return what critics see of the work."""
+        """Return the privileged numbers of the work."""
         return self.work.privileged(goal.work)
 
     @property
@@ -327,12 +327,12 @@ class Task(BaseTask):
     # -- on the host
 
     def goal_content(self, goal: Any) -> list[np.ndarray]:
-        """Return what the goals of the work are, and where the endoscope begins."""
+        """Return the goal content of the work, and where the endoscope begins."""
         work, postures = self.work.goal_content(of_work(goal)), np.asarray(self.tables["postures"], float)
         return [*work, postures[goal.row][:, self.scene.qpos_index(self.camera)]]
 
     def marks(self, goal: Any) -> np.ndarray:
-        """Return what the work marks, without the camera's target."""
+        """Return the marks of the work, without the camera's target."""
         marks = self.work.marks(of_work(goal))
         return marks if self.object else marks[:, [self.scene.agents.index(agent) for agent in self.tools]]
 
@@ -351,7 +351,7 @@ class Task(BaseTask):
         return found
 
     def attend(self, seen: Snapshot) -> dict[str, Wish]:
-        """Return the wish that the endoscope looks at what is to be seen, and at the goal of an object on its way."""
+        """Return the wish to look at tips and object or targets, and at the goal of an object on its way."""
         places = [seen.tools[agent][:, :3, 3] for agent in self.tools]
         if self.object is None:
             places += list(np.moveaxis(self.marks(seen.goal), 1, 0))

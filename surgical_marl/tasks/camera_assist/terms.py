@@ -24,7 +24,7 @@ GOAL = "goal"
 
 
 class Shown(NamedTuple):
-    """Observation terms of what the endoscope shows of the tools' work."""
+    """Observation terms of the endoscope's view of the tools' work."""
 
     scene: Scene
     camera: str
@@ -37,7 +37,7 @@ class Shown(NamedTuple):
     """View of tips by agent, objects by name, and `GOAL` or the target of a tool as `<agent>/target`."""
 
     def to_tool(self, agent: str, work: Mapping[str, Term | Picture]) -> dict[str, Term | Picture]:
-        """Return all that a tool may observe: the terms of its work, 0 out of view, and what it sees."""
+        """Return all terms that a tool may observe: those of its work, 0 out of view, and those of the view."""
         terms, needs = dict(work), self._needs(agent)
         for name, term in terms.items():
             if name in needs and isinstance(term, Term):
@@ -54,7 +54,7 @@ class Shown(NamedTuple):
         }
 
     def to_camera(self, tools_hold: Callable[[World], Array]) -> dict[str, Term]:
-        """Return what the camera observes beside its joints: it has to know where to look.
+        """Return the terms of the camera beside its joints: it has to know where to look.
 
         Without `tools_hold`, whether each tool holds the object, it would follow an object to its goal only once it
         moves there, and wait for a tool that does not move it before it sees the goal.
@@ -65,7 +65,7 @@ class Shown(NamedTuple):
         return {"tips_in_view": tips, "work_in_view": work._replace(about="goal"), **held}
 
     def _axes(self, agent: str) -> Callable[[World], Array]:
-        """Return what reads the endoscope's axes right and up in an arm's base frame, [6]."""
+        """Return a function that reads the endoscope's axes right and up in an arm's base frame, [6]."""
         mount = self.scene.mounts[agent]
 
         def read(world: World) -> Array:

@@ -15,7 +15,7 @@ from surgical_marl.tasks.peg_transfer.trial import Turns
 APART = 0.029
 """Least distance between the pegs of a side that blocks stand on in a trial, m: a finger fits between 30 mm, not 20."""
 POOL = 256
-"""Draws of how a block stands on a peg, of which those that the arms reach are kept."""
+"""Number of random poses of a block on a peg; poses that the arms reach are kept."""
 Sides = tuple[np.ndarray, np.ndarray]
 """Pegs of the side that a block leaves, and of the one that it goes to, [n, 3] each, m."""
 

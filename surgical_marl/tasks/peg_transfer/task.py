@@ -99,14 +99,14 @@ class Team(NamedTuple):
 
 
 class PegGoal(NamedTuple):
-    """The goal of an episode, and what was reached of it."""
+    """The goal of an episode, and the progress towards it."""
 
     row: Array
     """Row of the tables."""
     best: Best
     team: Team
     trial: Any = ()
-    """At `hard` what happened in the `Trial` so far."""
+    """State of the `Trial` so far, at `hard`."""
 
 
 class Task(ObjectTask):
@@ -189,9 +189,9 @@ class Task(ObjectTask):
         return world if self.turns is None else self.turns.at_hand(world, self.object)
 
     def now(self, world: World) -> Now:
-        """Return what is measured in a world; a block that is around a peg is not dropped.
+        """Return the measurements in a world; a block that is around a peg is not dropped.
 
-        At `hard` what belongs to each arm is that of its role in this turn, and a block is dropped only once.
+        At `hard` the measurements of each arm are those of its role in this turn, and a block is dropped only once.
         """
         now = super().now(world)
         away = self._base(world)[:2] - self._pegs[:, :2]
@@ -207,7 +207,7 @@ class Task(ObjectTask):
         return now._replace(dropped=dropped, **parts)
 
     def further(self, world: World, now: Now) -> Team:
-        """Return what the arms have done by now, and whether this was the first time or not."""
+        """Return the best that the arms did so far, with the measurements of this step."""
         team, lifted = world.goal.team, now.lift >= 1.0
         both = jnp.stack(list(now.held.values())).sum() >= 2
         alone = self.presents(now) & lifted & self.level.handover
@@ -256,7 +256,7 @@ class Task(ObjectTask):
         return ~(heights >= self._pegs[0, 2]).all()
 
     def metrics(self, world: World) -> dict[str, dict[str, Array]]:
-        """Return those of all tasks with objects, and at `hard` `score` and `score_time`, s."""
+        """Return the metrics of all tasks with objects, and at `hard` `score` and `score_time`, s."""
         found = super().metrics(world)
         if self.turns is None:
             return found
@@ -318,7 +318,7 @@ class Task(ObjectTask):
         return found
 
     def _read_at_hand(self, term: Term) -> Callable[[World], Array]:
-        """Return what reads a term of the block whose turn it is."""
+        """Return a function that reads a term of the block in turn."""
         return lambda world: term.read(self.at_hand(world))
 
     def observes(self, agent: str) -> tuple[str, ...]:

@@ -49,11 +49,11 @@ class Turns:
         self.count = 2 * len(self.blocks)
 
     def number(self, row: Any) -> Any:
-        """Return the number of the block whose turn it is."""
+        """Return the number of the block in turn."""
         return row % len(self.blocks)
 
     def back(self, row: Any) -> Any:
-        """Return whether it goes back, from the second arm to the first."""
+        """Return whether the block in turn goes back, from the second arm to the first."""
         return row % self.count >= len(self.blocks)
 
     def following(self, row: Any) -> Any:
@@ -61,7 +61,7 @@ class Turns:
         return row - row % self.count + (row + 1) % self.count
 
     def at_hand(self, world: World, name: str) -> World:
-        """Return the world with the block whose turn it is under the name `name`, whichever one it is."""
+        """Return the world in which the block in turn has the name `name`."""
         number = self.number(world.goal.row)
 
         def chosen(of: Mapping[str, Any]) -> Any:
@@ -78,7 +78,7 @@ class Turns:
         return world._replace(arms=arms, objects={**world.objects, name: chosen(world.objects)})
 
     def roles(self, row: Array, of: Mapping[str, Array], picker: str, presenter: str) -> dict[str, Array]:
-        """Return what belongs to each agent with that of both arms exchanged where the block goes back."""
+        """Return values by agent, with those of `picker` and `presenter` exchanged where the block goes back."""
         back = self.back(row)
         changed = {
             picker: jnp.where(back, of[presenter], of[picker]),

@@ -1,4 +1,4 @@
-"""The menus of who moves each arm, and what a person moves an arm with: sliders, a handle at the tool tip, keys."""
+"""The menus of each arm's mover, and a person's controls: sliders, a handle at the tool tip, keys."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     )
 
 Ask = Callable[[Callable[[], None]], None]
-"""Lets the thread that steps do something."""
+"""Function that puts a call into the queue of the thread that steps."""
 
 STEP = 0.002
 """Distance by which a key moves the tool tip, m."""
@@ -65,7 +65,7 @@ class Arms:
         self._keys()
 
     def sync(self, refused: bool = False) -> None:
-        """Show who moves the arms and what a person wants, as the session has it.
+        """Show the movers of the arms, and the joint positions that a person wants, as the session has them.
 
         What was just chosen in a menu stays there until the session has heard of it, unless it was refused.
         """
@@ -158,7 +158,7 @@ class Controls:
         self.sync()
 
     def sync(self) -> None:
-        """Move all controls to what is wanted, unless somebody is using them."""
+        """Move all controls to the wanted joint positions, unless somebody is using them."""
         if self._jaw is not None and self._jaw.value != self._hand.jaw_open:
             self._jaw.value = self._hand.jaw_open
         if time.monotonic() - self._used < _QUIET:

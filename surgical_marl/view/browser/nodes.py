@@ -33,7 +33,7 @@ RED, GREY, GOLD = np.array([226, 40, 40]), np.array([120, 130, 140]), np.array([
 PARTS = ("targets", "paths", "trails", "trocars", "contacts", "grips", "distance")
 """Layers that can be hidden, beside arms and objects."""
 ROOM = 0.7
-"""Between environments that stand side by side, m, beside what the frames of their bodies take."""
+"""Gap between environments that stand side by side, m, beside the width of a scene."""
 _TIP_RADIUS = 0.0025
 _FADED = np.array([200, 205, 212])
 _NONE = np.zeros((0, 2, 3), np.float32)
@@ -94,7 +94,7 @@ class Nodes:
             handle.visible = visible
 
     def draw(self) -> None:
-        """Show what there is to see now."""
+        """Move all nodes to the current moment."""
         moment = self._session.moment()
         for body, handle in self._moving.items():
             handle.batched_positions = (moment.positions[:, body] + self.offsets).astype(np.float32)

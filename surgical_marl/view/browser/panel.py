@@ -44,7 +44,7 @@ class Choice:
 
 
 class Panel:
-    """The part of the page that says what is looked at, and how time passes.
+    """The part of the page with the menus of the view and the controls of time.
 
     Args:
         server: of viser.
@@ -105,14 +105,14 @@ class Panel:
         self._seed.on_update(self._then(begin))
 
     def add_menus(self, folder: GuiTabHandle, choose: Callable[[Choice], None]) -> None:
-        """Add the menus of what is looked at; `choose` looks at something else."""
+        """Add the menus of task, scene, difficulty and length; `choose` is called with a new choice."""
         with folder:
             chosen, menus = self._make_menus()
         for menu in menus:
             menu.on_update(self._then(lambda: choose(chosen())))
 
     def _make_menus(self) -> tuple[Callable[[], Choice], list[GuiInputHandle[Any]]]:
-        """Return what says what the menus say, and the menus."""
+        """Return a function that reads the choice from the menus, and the menus."""
         env, gui = self._session.env, self._gui
         scene = self._session.settings.scene
         scenes = list(dict.fromkeys([*list_scenes(), scene]))
@@ -145,7 +145,7 @@ class Panel:
 
 
 def status(session: Session, paused: bool = False) -> str:
-    """Return what the first environment is at, as HTML: its time, and errors, stages and contacts of all agents."""
+    """Return the status of the first environment as HTML: its time, and errors, stages and contacts of all agents."""
     env = session.env
     names = [as_html(one_line(name)) for name in (label(env.task_name), env.scene.name, session.settings.difficulty)]
     step, dt = int(np.asarray(env.steps)[0]), env.control_dt

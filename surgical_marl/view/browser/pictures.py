@@ -1,4 +1,4 @@
-"""Pictures on the page: what the endoscope sees, and what policies that see pictures see of it."""
+"""Pictures on the page: the endoscope's, and the pictures that policies observe."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Pictures:
         self.draw()
 
     def draw(self) -> None:
-        """Show what is seen now."""
+        """Show the current pictures."""
         shown = {}
         if self._endoscope is not None:
             qpos, poses = self._session.env.qpos, self._session.env.object_poses

@@ -75,7 +75,7 @@ class Viewer:
         """Number of drawings of the scene."""
 
     def run(self, until: Event) -> None:
-        """Step and draw until an event is set; then write what was recorded, and stop the server."""
+        """Step and draw until an event is set; then write the recording, and stop the server."""
         try:
             due = time.monotonic()
             while not until.is_set():
@@ -87,7 +87,7 @@ class Viewer:
             close_server(self.server)
 
     def turn(self, now: float) -> None:
-        """Do what was asked for, the steps that are due at a time in s, and draw."""
+        """Handle requests of the page, do the steps that are due at a time in s, and draw."""
         while not self._asked.empty():
             self._do(self._asked.get())
         for _ in range(self.pace.due(now)):
@@ -170,7 +170,7 @@ def _choice(session: Session) -> Choice:
 
 
 def _settings(choice: Choice, old: Session) -> tuple[Settings, dict[str, str] | None]:
-    """Return the settings of what is chosen, and who moves its arms.
+    """Return the settings of a choice, and who moves its arms.
 
     A task that was just chosen brings a scene of its own if it is not meant for the old one.
     """
