@@ -10,7 +10,6 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any
 
 from surgical_marl.learning.faults import Fault
 from surgical_marl.learning.reporter import Report
@@ -64,7 +63,7 @@ class Log:
     def __enter__(self) -> Log:
         return self
 
-    def __exit__(self, *_: Any) -> None:
+    def __exit__(self, *_: object) -> None:
         self._files.close()
 
     def write(self, row: dict[str, float]) -> None:

@@ -25,6 +25,7 @@ Difficulty    distance of needle and goal from the middle of these ends: easy 8 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import product
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -180,7 +181,7 @@ class Task(ObjectTask):
         """Return the way from a tool tip to the needle's middle half, in the arm's base frame, m, [3]."""
         return self.way_to_bars(world, agent, self._useful)
 
-    def reached(self, world: Any) -> dict[str, dict[str, Array]]:
+    def reached(self, world: World) -> dict[str, dict[str, Array]]:
         """Return which stages are reached now, for both arms."""
         now, lifted = self.now(world), self.now(world).lift >= 1.0
         first, second = now.held[self.picker], now.held[self.presenter]
@@ -233,7 +234,7 @@ class Task(ObjectTask):
             held = np.linalg.inv(seen.objects[self.object]) @ seen.tools[taker]
             return {taker: Wish(moved(self.goals[seen.goal.row] @ held, [0.0, 0.0, above]))}
 
-        def holds(agent: str) -> Any:
+        def holds(agent: str) -> Callable[[Snapshot], np.ndarray]:
             return lambda seen: seen.held[agent][:, self._number]
 
         return (

@@ -24,7 +24,7 @@ Difficulty    distance of the needle and of the goal from the middle: easy 10 mm
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -54,6 +54,7 @@ if TYPE_CHECKING:
 
     from surgical_marl.scenes.scene import Scene
     from surgical_marl.tasks.base.options import Options
+    from surgical_marl.tasks.base.world import World
 
 ROWS = 2048
 """Number of starts and goals."""
@@ -106,7 +107,7 @@ class Task(ObjectTask):
         place = self.tables["starts"][row]
         return Start(ObjectGoal(row, self.nothing), poses={self.object: Pose(place[:3], place[3:])})
 
-    def reached(self, world: Any) -> dict[str, dict[str, Array]]:
+    def reached(self, world: World) -> dict[str, dict[str, Array]]:
         """Return which stages are reached now."""
         now = self.now(world)
         return {

@@ -6,9 +6,8 @@ and the z axis, along which they point, is as near to a wanted direction as that
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
+from numpy.typing import ArrayLike
 
 from surgical_marl.robots.inverse_kinematics import inverse_kinematics
 from surgical_marl.scenes.objects import Object
@@ -28,7 +27,9 @@ def bars(item: Object) -> tuple[np.ndarray, np.ndarray]:
     return middles, directions
 
 
-def tool_poses(place: Any, along: Any, pointing: Any, beyond: Any = 0.0) -> np.ndarray:
+def tool_poses(
+    place: np.ndarray, along: np.ndarray, pointing: np.ndarray, beyond: float | np.ndarray = 0.0
+) -> np.ndarray:
     """Return poses [..., 4, 4] of tools that grip bars.
 
     Args:
@@ -45,7 +46,7 @@ def tool_poses(place: Any, along: Any, pointing: Any, beyond: Any = 0.0) -> np.n
     return poses
 
 
-def bar(body: np.ndarray, item: Object, number: Any) -> tuple[np.ndarray, np.ndarray]:
+def bar(body: np.ndarray, item: Object, number: int | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the middle [n, 3] and the direction [n, 3] of one bar of an object at poses [n, 4, 4].
 
     Args:
@@ -100,10 +101,10 @@ def lowest_bar(body: np.ndarray, item: Object) -> np.ndarray:
     return (body[:, None, 2, 3] + np.einsum("nj,cj->nc", body[:, 2, :3], middles)).min(1)
 
 
-def moved(poses: np.ndarray, way: Any) -> np.ndarray:
+def moved(poses: np.ndarray, way: ArrayLike) -> np.ndarray:
     """Return poses [n, 4, 4] shifted by a way [3] or [n, 3] in the world, m."""
     shifted = poses.copy()
-    shifted[:, :3, 3] += way
+    shifted[:, :3, 3] += np.asarray(way)
     return shifted
 
 
@@ -150,5 +151,5 @@ def frames(position: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
     return poses
 
 
-def _dot(one: Any, other: Any) -> Any:
+def _dot(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     return np.sum(one * other, -1, keepdims=True)

@@ -43,10 +43,10 @@ def _terms(scene: Scene, agent: str, name: str) -> dict[str, Term]:
     mount = scene.mounts[agent]
     turn, origin = mount.rotation.astype(np.float32), mount.position.astype(np.float32)
 
-    def position(world: World) -> Any:
+    def position(world: World) -> Array:
         return (world.objects[name].position - origin) @ turn
 
-    def rotation(world: World) -> Any:
+    def rotation(world: World) -> Array:
         return (turn.T @ world.objects[name].rotation)[:, :2].T.ravel()
 
     def velocity(world: World) -> Any:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from surgical_marl.tasks.base.grasp_poses import joints_at, moved, tool_of
 from surgical_marl.tasks.base.oracle_script import EARLY, Snapshot, Step, Wish
@@ -134,7 +135,7 @@ class Transfer:
         """
         giver, taker, across = self.giver, self.taker, self.across
 
-        def offer(seen: Snapshot, way: Any) -> dict[str, Wish]:
+        def offer(seen: Snapshot, way: ArrayLike) -> dict[str, Wish]:
             grip = self._held_at(seen)
             there = self.exchange(grip)
             held = np.linalg.inv(seen.objects[self.name]) @ seen.tools[giver]
@@ -208,6 +209,6 @@ class Transfer:
         return {agent: Wish(upright(np.broadcast_to(place, (len(held), 3)), np.degrees(yaw)) @ held)}
 
 
-def _shifted(seen: Snapshot, agent: str, way: Any, opens: float = 0.0) -> dict[str, Wish]:
+def _shifted(seen: Snapshot, agent: str, way: ArrayLike, opens: float = 0.0) -> dict[str, Wish]:
     """Return the wish that a tool goes some way in the world, [3], m."""
     return {agent: Wish(moved(seen.tools[agent], way), opens)}
