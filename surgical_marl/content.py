@@ -43,17 +43,17 @@ def content_dir(kind: str) -> Path:
 
 
 def list_arms() -> list[str]:
-    """Return the names of the arms that ship and of those of installed packages."""
+    """Return the names of all arms, shipped and of installed packages."""
     return _names("arms")
 
 
 def list_scenes() -> list[str]:
-    """Return the names of the scenes that ship and of those of installed packages."""
+    """Return the names of all scenes, shipped and of installed packages."""
     return _names("scenes")
 
 
 def list_objects() -> list[str]:
-    """Return the names of the objects that ship and of those of installed packages."""
+    """Return the names of all objects, shipped and of installed packages."""
     return _names("objects")
 
 
@@ -63,7 +63,7 @@ def list_configs() -> list[str]:
 
 
 def list_policies() -> list[str]:
-    """Return the names of the trained policies that ship and of those of installed packages."""
+    """Return the names of all trained policies, shipped and of installed packages."""
     return _names("policies")
 
 
@@ -130,7 +130,7 @@ def _names(kind: str) -> list[str]:
 
 
 def _places(kind: str) -> dict[str, list[Path]]:
-    """Return the files or folders of a kind of content by name, both shipped ones and those of installed packages."""
+    """Return the files or folders of a kind of content by name, shipped and of installed packages."""
     found: dict[str, list[Path]] = {}
     for folder in (content_dir(kind), *(root / _FOLDER.get(kind, kind) for root in _plugin_roots())):
         for path in folder.glob(f"[!._]*{_SUFFIX.get(kind, '')}"):

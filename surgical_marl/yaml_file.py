@@ -165,7 +165,7 @@ class _Reader:
         return self._mapping(depth) if isinstance(event, yaml.MappingStartEvent) else self._sequence(depth)
 
     def _check(self, event: yaml.Event, line: int, depth: int) -> None:
-        """Raise Malformed for what stands for more than it shows, and for too much of anything."""
+        """Raise Malformed for aliases and tags, and for too many values or too deep ones."""
         self._nodes += 1
         if self._nodes > MAX_NODES:
             raise Malformed(line, f"more than {MAX_NODES:,} values are not read")

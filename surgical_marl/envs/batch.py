@@ -195,13 +195,13 @@ class BatchedEnv:
         return {agent: with_vector(own, change[agent]) for agent, own in observations.items()}
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
-        """Of one environment: a Box, or a Dict for an agent that sees pictures; the same object each time."""
+        """Return an agent's space in one environment: a Box, or a Dict with pictures; the same object each time."""
         if agent not in self.observation_spaces:
             raise unknown("agent", agent, self.agents)
         return self.observation_spaces[agent]
 
     def action_space(self, agent: str) -> spaces.Box:
-        """Of one environment: Box [-1, 1]; the same object each time."""
+        """Return an agent's space in one environment: Box [-1, 1]; the same object each time."""
         if agent not in self.action_spaces:
             raise unknown("agent", agent, self.agents)
         return self.action_spaces[agent]
@@ -296,7 +296,7 @@ class BatchedEnv:
 
     @property
     def object_poses(self) -> Poses:
-        """Where the free objects are: `origin` [N, k, 3] in m and `quaternion` [N, k, 4], numpy.
+        """Poses of the free objects: `origin` [N, k, 3] in m and `quaternion` [N, k, 4], numpy.
 
         Object i is the i-th of `scene.free_objects`; k is 0 in a scene without any.
         """
@@ -387,7 +387,7 @@ def _check_seed(seed: Any) -> int | None:
 
 
 def _is_whole(value: Any) -> bool:
-    """Whether a value is a whole number, of Python or of numpy."""
+    """Return whether a value is a whole number, of Python or of numpy."""
     return isinstance(value, numbers.Integral) and not isinstance(value, bool)
 
 

@@ -99,7 +99,7 @@ class Env:
 
     @property
     def pauses(self) -> bool:
-        """Whether a step pauses after the physics, so that pictures can be drawn before it is finished.
+        """True if a step pauses after the physics, so that pictures can be drawn before it is finished.
 
         This is so if an agent observes pictures, or if the task computes numbers from them.
         """
@@ -107,7 +107,7 @@ class Env:
 
     @cached_property
     def begins_at_home(self) -> bool:
-        """Whether all episodes begin with all arms at home. It is kept on disk: JAX finds it out by tracing."""
+        """True if all episodes begin with all arms at home. It is kept on disk: JAX finds it out by tracing."""
 
         def start(key: Array, parameters: Any) -> Any:
             return self._bound(parameters)[0].start(key)

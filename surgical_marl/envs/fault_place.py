@@ -12,10 +12,10 @@ if TYPE_CHECKING:
 
 
 class FaultPlace(NamedTuple):
-    """Where a number that is NaN or infinite is."""
+    """The place of a number that is NaN or infinite."""
 
     agent: str
-    """Of an arm; "" if it belongs to none, as an object's position."""
+    """Name of the arm; "" for a number of no arm, as an object's position."""
     term: str
     """Such as "observation tool_tip[2]", "reward distance" or "state physics.arms.qpos[3] (joint psm_0/insertion)"."""
 

@@ -13,13 +13,13 @@ if TYPE_CHECKING:
     from surgical_marl.scenes.scene import Scene
 
 STATE = ".physics.rigid_bodies.bodies"
-"""Where an engine has the centres of mass and the orientations of objects."""
+"""Names of the parts of a carry with the objects' centres of mass and orientations."""
 SIZE = ".hidden.objects.size"
-"""Where it has by what their lengths are multiplied, if the scene randomises objects."""
+"""Name of the part with the factors of the objects' lengths, if the scene randomises objects."""
 HELD = ".physics.rigid_bodies.grips.held"
-"""Where it has for how long arms have held them."""
+"""Name of the part with the times for which arms have held objects."""
 FORCE = ".physics.rigid_bodies.grips.force"
-"""Where it has the normal forces of fingers on them."""
+"""Name of the part with the normal forces of fingers on objects."""
 
 
 class FreeObjects:

@@ -12,7 +12,7 @@ import numpy as np
 
 
 class Scale:
-    """How vectors between bounds are scaled: each number from -1 to 1. Numbers without finite bounds stay as they are.
+    """The scaling of vectors between bounds: each number from -1 to 1. Numbers without finite bounds stay as they are.
 
     Args:
         low: least vector, [d].

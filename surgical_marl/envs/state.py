@@ -67,7 +67,7 @@ class Moved(NamedTuple):
     contacts: Contacts
     arms: dict[str, ArmView]
     changes: Array
-    """How the actions of all arms differ from the last ones."""
+    """Differences of the actions of all arms from their last ones."""
     told: dict[str, dict[str, Array]]
     """Entries of `infos` that action terms give, by agent and name."""
 

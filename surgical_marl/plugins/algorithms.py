@@ -13,7 +13,7 @@ ALGORITHMS = Registry(
 
 
 def list_algorithms() -> list[str]:
-    """Return the names of all learning algorithms: shipped ones, those of installed packages, and registered ones."""
+    """Return the names of all learning algorithms: shipped, of installed packages, and registered."""
     return ALGORITHMS.names()
 
 

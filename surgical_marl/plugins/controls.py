@@ -13,7 +13,7 @@ CONTROLS = Registry(
 
 
 def list_controls() -> list[str]:
-    """Return the names of all controls: shipped ones, those of installed packages, and registered ones."""
+    """Return the names of all controls: shipped, of installed packages, and registered."""
     return CONTROLS.names()
 
 

@@ -1,4 +1,4 @@
-"""Finds classes by name: shipped ones, those of installed packages, and those that a program registers."""
+"""Find classes by name: shipped, of installed packages, or registered by a program."""
 
 from __future__ import annotations
 

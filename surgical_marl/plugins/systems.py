@@ -14,7 +14,7 @@ SYSTEMS = Registry(
 
 
 def list_systems() -> list[str]:
-    """Return the names of all systems: those of installed packages, and registered ones."""
+    """Return the names of all systems: of installed packages, and registered."""
     return SYSTEMS.names()
 
 

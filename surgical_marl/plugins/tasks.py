@@ -49,7 +49,7 @@ def module_name(task: str) -> str:
 
 
 def list_tasks() -> list[str]:
-    """Return the names of all tasks: shipped ones, those of installed packages, and registered ones."""
+    """Return the names of all tasks: shipped, of installed packages, and registered."""
     return TASKS.names()
 
 

@@ -1,1 +1,1 @@
-"""Reads what strangers wrote: files and numbers of limited size, fields of known types, short values in errors."""
+"""Read data of strangers: files and numbers of limited size, fields of known types, short values in errors."""

@@ -18,7 +18,7 @@ MAX_NPZ = 500 * MB
 MAX_WEIGHTS = 500 * MB
 """Bytes of a file of weights."""
 MAX_HEADER = MB
-"""Bytes of what a file says about its arrays."""
+"""Largest header of a file, which describes its arrays, in bytes."""
 MAX_MEMBERS = 10_000
 
 
@@ -55,7 +55,7 @@ def check_checkpoint(path: Path) -> None:
 
 
 def read_header(path: Path) -> tuple[dict[str, Any], int]:
-    """Return what a file of safetensors says of its tensors, and where their bytes begin.
+    """Return the header of a file of safetensors, and where the bytes of its tensors begin.
 
     ValueError if the file is too large, or says too much about them.
     """

@@ -75,7 +75,7 @@ def read_text(path: Path, most: int, within: Path | None = None) -> str:
 
 
 def read_json(path: Path, most: int = MAX_JSON) -> Any:
-    """Return what a file in JSON holds; ValueError if it can't be read or holds something else."""
+    """Return the content of a file in JSON; ValueError if it can't be read or holds something else."""
     text = read_text(path, most)
     try:
         return json.loads(text)

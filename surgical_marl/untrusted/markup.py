@@ -72,7 +72,7 @@ def template(path: Path) -> jinja2.Template:
 
 
 def check_name(name: str, what: str) -> None:
-    """Raise ValueError if a name holds what no menu and no terminal shows: control characters, ends of lines."""
+    """Raise ValueError if a name holds characters that menus and terminals do not show: controls, ends of lines."""
     bad = next((letter for letter in name if unicodedata.category(letter) in _NO_NAME), None)
     if bad is not None:
         raise ValueError(f"the name of {what}, {shown(name)}, holds {bad!a}, which can't be shown: give it another one")

@@ -1,4 +1,4 @@
-"""Pictures from a scene's endoscope for many environments at once: colour, depth and what each pixel shows.
+"""Pictures from a scene's endoscope for many environments at once: colour, depth and the geom of each pixel.
 
     endoscope = Endoscope(load_scene("trimanual_psm_ecm"), num_envs=1024)
     view = endoscope.render(env.qpos, env.object_poses)

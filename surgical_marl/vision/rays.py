@@ -222,7 +222,7 @@ def make_draw(meshes: bool) -> Any:
         depth: wp.array3d[float],
         segmentation: wp.array3d[int],
     ):
-        """Colour, depth and geom of a pixel; of what has pictures to write to."""
+        """Draw colour, depth and geom of a pixel, each if it has pictures to write to."""
         picture, tile, place_in_tile = wp.tid()
         columns = (width + TILE - 1) // TILE
         column = tile % columns * TILE + place_in_tile % TILE
