@@ -46,10 +46,10 @@ def _terms(scene: Scene, agent: str, name: str) -> dict[str, Term]:
     def position(world: World) -> Array:
         return (world.objects[name].position - origin) @ turn
 
-    def rotation(world: World) -> Array:
+    def rotation(world: World) -> Any:
         return (turn.T @ world.objects[name].rotation)[:, :2].T.ravel()
 
-    def velocity(world: World) -> Any:
+    def velocity(world: World) -> Array:
         return (world.objects[name].velocity.reshape(2, 3) @ turn).ravel()
 
     def grip(world: World) -> Array:
