@@ -305,6 +305,16 @@ class BatchedEnv:
         return Poses(found.origin, np.array(found.quaternion))  # a copy: a step gives its state away
 
     @property
+    def drawn_poses(self) -> Poses:
+        """Where all that moves but arms is: the free objects, then the edges of threads; numpy.
+
+        They are in the order of the mocap bodies of `scene.model`.
+        """
+        self._part(".steps", "numpy")
+        found = self._free_objects.read_drawn(self.engine, self.num_envs)
+        return Poses(found.origin, np.array(found.quaternion))
+
+    @property
     def held(self) -> np.ndarray:
         """Which arms hold which free objects, [N, k, arms] bool, numpy, in the order of `object_poses` and `agents`."""
         self._part(".steps", "numpy")

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from surgical_marl.scenes.poses import Poses, frames
+from surgical_marl.scenes.poses import Poses, along, frames
 
 if TYPE_CHECKING:
     from surgical_marl.engines.choose import Engine
@@ -28,6 +28,9 @@ class FreeObjects:
     def __init__(self, scene: Scene) -> None:
         centers = [place.object.center for place in scene.free_objects.values()]
         self.count, self._arms = len(centers), len(scene.agents)
+        self._threads = tuple(scene.threads)
+        self.drawn = self.count + sum(thread.nodes - 1 for thread in scene.threads.values())
+        """Number of things in `read_drawn`."""
         self._centers: Any = np.array(centers, np.float32).reshape(-1, 3)
 
     def held(self, engine: Engine, num_envs: int) -> np.ndarray:
@@ -43,6 +46,21 @@ class FreeObjects:
         if not self.count:
             return np.zeros((num_envs, 0, 0), np.float32)
         return np.array(engine.read(FORCE, "numpy"))
+
+    def read_drawn(self, engine: Engine, num_envs: int, library: str = "numpy", place: str = "") -> Poses:
+        """Return the poses of all that moves but arms, as `read`: free objects, then the edges of threads."""
+        found = [self.read(engine, num_envs, library, place)] if self.count or not self._threads else []
+        for name in self._threads:
+            nodes = engine.read(f"{place}.physics.{name}.chain.position", library)
+            found.append(Poses(*along(nodes[:, :-1], nodes[:, 1:])))
+        if len(found) == 1:
+            return found[0]
+        joined = np.concatenate
+        if library == "torch":
+            import torch
+
+            joined = torch.cat
+        return Poses(*(joined([getattr(own, field) for own in found], 1) for field in ("origin", "quaternion")))
 
     def read(self, engine: Engine, num_envs: int, library: str = "numpy", place: str = "") -> Poses:
         """Return poses in arrays of "numpy" or "torch".

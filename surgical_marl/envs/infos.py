@@ -65,6 +65,7 @@ def infos(
             **{f"stage_{name}": reached for name, reached in stages[agent].items()},
             **{f"reward_{name}": value for name, value in terms[agent].items()},
             **_handling(view),
+            **_pulled(world),
             "cost": sum((cost.astype(jnp.float32) for cost in broken.values()), start=jnp.float32(0.0)),
             **{f"cost_{name}": cost for name, cost in broken.items()},
             **told[agent],
@@ -81,6 +82,12 @@ def _handling(view: ArmView) -> dict[str, Array]:
     for name, handled in view.handles.items():
         found |= {f"{name}_{field}": value for field, value in handled._asdict().items()}
     return found
+
+
+def _pulled(world: World) -> dict[str, Array]:
+    """Return the largest tension of all threads, N; nothing in a scene without any."""
+    tensions = [jnp.max(view.tension) for view in world.systems.values() if hasattr(view, "tension")]
+    return {"tension": jnp.stack(tensions).max()} if tensions else {}
 
 
 def costs(arm: Arm, view: ArmView, tip_speed: Array) -> dict[str, Array]:

@@ -42,7 +42,7 @@ class PictureTerms:
         self._num_envs = num_envs
         self._seen: Seen = {}
         self._home: Seen = {}
-        if env.begins_at_home and not self._free_objects.count:  # home looks the same in all episodes
+        if env.begins_at_home and not self._free_objects.drawn:  # home looks the same in all episodes
             rows = self._own(np.zeros(num_envs, np.int64)) if self._matched else None
             drawn = self._pictures.draw(self._own(np.repeat(env.scene.home[None], num_envs, 0)), rows)
             # a list as the index makes a copy
@@ -95,8 +95,8 @@ class PictureTerms:
 
     def _draw(self, place: str) -> Seen:
         objects = None
-        if self._free_objects.count:
-            objects = self._free_objects.read(self._engine, self._num_envs, self._library, place)
+        if self._free_objects.drawn:
+            objects = self._free_objects.read_drawn(self._engine, self._num_envs, self._library, place)
         return self._pictures.draw(self._read(f"{place}.physics.arms.qpos"), self._rows(place), objects)
 
     def _rows(self, place: str) -> Any:

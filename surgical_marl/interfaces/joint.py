@@ -30,6 +30,7 @@ _TEAM: dict[str, Callable[[Any, Any], Any]] = {
     "goal_angle": np.maximum,
     "drop": np.logical_or,
     "holding": np.logical_or,
+    "tension": np.maximum,
 }
 """Functions that make one value of those of two arms, by the name of the info; see also `_combine`."""
 

@@ -68,8 +68,7 @@ class Simulator:
             if self.step.attachments:
                 poses = self.step.arms.dynamics.pose(qpos)
                 states[ATTACHMENTS] = self.step.attachments.start(poses, states[RIGID_BODIES].bodies)
-        states |= {name: system.start() for name, system in self.step.systems.items()}
-        return Physics(states)
+        return Physics(states | self.step.start_systems(states.get(RIGID_BODIES)))
 
     def _holding(self, qpos: Any) -> Any:
         """Return the commands [nu] that keep the arms where they are."""
@@ -239,7 +238,6 @@ class Simulator:
         physics: Any = Physics({ARMS: ArmState(self.scene.home, still, still, self._holding(self.scene.home))})  # type: ignore[arg-type]
         if self.step.bodies:
             physics = physics.with_systems(rigid_bodies=self.step.bodies.start({}))
-        physics = physics.with_systems(**{name: system.start() for name, system in self.step.systems.items()})
         sites = list(self._sites.values())
         views = self._view(np, physics, (data.site_xpos[sites], data.site_xmat[sites].reshape(-1, 3, 3)), contacts)
         kinds = {"b": jnp.bool_, "i": jnp.int32}

@@ -35,7 +35,7 @@ from surgical_marl.physics.systems.arms import ArmForces, Arms, accelerations_ap
 from surgical_marl.physics.systems.coupling import Coupling
 from surgical_marl.physics.systems.rigid_bodies import RigidBodies, RigidBodyState
 from surgical_marl.physics.systems.rigid_motion import Bodies
-from surgical_marl.physics.systems.system import Ends, Loads, System
+from surgical_marl.physics.systems.system import Ends, Response, System
 from surgical_marl.physics.tree_utils import absent
 from surgical_marl.scenes.scene import Scene
 
@@ -66,10 +66,10 @@ class Found(NamedTuple):
 class Meeting(NamedTuple):
     """What a system of plug-ins does before arms and rigid bodies are solved."""
 
-    motion: Any
-    """Its forces without contacts."""
     ends: Ends
-    loads: Loads
+    response: Response
+    expected: tuple[Array, Array]
+    """Accelerations of joints [a, m] and of bodies [k, 6] for which it responds: those of the last step."""
 
 
 class Step:
@@ -102,9 +102,7 @@ class Step:
         if self.bodies:
             self.detection = Detection(self.bodies.tables)
             self.grips = GripMemory(self.bodies.tables, self._solver.twists)
-            self._couplings = {
-                name: Coupling(self.bodies.tables, system.surface) for name, system in self.systems.items()
-            }
+            self._couplings = {name: Coupling(self.bodies.tables, system) for name, system in self.systems.items()}
 
     def __call__(self, physics: Physics, touch: Touch, distance: Array | None = None) -> tuple[Physics, Touch]:
         """Return the state after one physics step, and the hardest touch up to the start of that step.
@@ -166,7 +164,8 @@ class Step:
         forces = self.arms.free_motion(physics.arms)
         meetings = {name: self._meet(name, physics, found) for name in self.systems}
         for name, met in meetings.items():
-            forces = self._couplings[name].on_arms(forces, met.loads, met.ends, found.joints)
+            own, expected = self._couplings[name], met.expected[0]
+            forces = own.on_arms(forces, met.response, met.ends, found.joints, expected, self.arms.dt)
         near = overlap | (self._arm_of(found.slots) < self._agents).any() if self.detection.slots else overlap
 
         def coupled(physics: Physics, touch: Touch) -> tuple[Physics, Touch]:
@@ -190,13 +189,21 @@ class Step:
 
     # -- other systems
 
+    def start_systems(self, bodies: RigidBodyState | None) -> dict[str, Any]:
+        """Return the states of all systems at the beginning of an episode, by name."""
+        return {
+            name: system.start(self._couplings[name].tied(bodies.bodies))
+            for name, system in self.systems.items() if bodies
+        }  # fmt: skip
+
     def _meet(self, name: str, physics: Physics, found: Found) -> Meeting:
-        """Return the forces on a system, and its loads on what it touches."""
+        """Return the contacts of a system, and its answer to them."""
         system, state, dt = self.systems[name], physics.systems[name], self.arms.dt
-        bodies = physics.rigid_bodies.bodies
-        motion = system.free_motion(state, dt)
-        ends = self._couplings[name].ends(system.shapes(state), found.poses, found.joints, physics.qvel, bodies, dt)
-        return Meeting(motion, ends, system.respond(state, motion, ends, dt))
+        bodies, by_arm = physics.rigid_bodies.bodies, self._solver.twists.by_arm
+        expected = by_arm(physics.arms.qacc_warmstart), bodies.acceleration
+        motion = by_arm(physics.qvel) + dt * expected[0], bodies.velocity + dt * expected[1]
+        ends = self._couplings[name].ends(system.shapes(state), found.poses, found.joints, bodies, motion, dt)
+        return Meeting(ends, system.respond(state, system.free_motion(state, dt), ends, dt), expected)
 
     def _systems_moved(
         self, before: Physics, after: Physics, found: Found, meetings: dict[str, Meeting]
@@ -204,20 +211,18 @@ class Step:
         """Move all other systems by the accelerations that arms and bodies have had in the step."""
         dt, bodies, moved = self.arms.dt, before.rigid_bodies.bodies, {}
         for name, met in meetings.items():
-            by_arm = self._solver.twists.by_arm((after.qvel - before.qvel) / dt)
-            by_body = (after.rigid_bodies.bodies.velocity - bodies.velocity) / dt
-            ends = self._couplings[name].accelerations(met.ends, found.joints, bodies, by_arm, by_body)
-            moved[name] = self.systems[name].apply(before.systems[name], met.motion, met.ends, ends, dt)
+            by_arm = self._solver.twists.by_arm((after.qvel - before.qvel) / dt) - met.expected[0]
+            by_body = (after.rigid_bodies.bodies.velocity - bodies.velocity) / dt - met.expected[1]
+            beyond = self._couplings[name].accelerations(met.ends, found.joints, bodies, by_arm, by_body)
+            moved[name] = self.systems[name].apply(before.systems[name], met.response, met.ends, beyond, dt)
         return after.with_systems(**moved)
 
     def _loaded(self, touch: Touch, meetings: dict[str, Meeting]) -> Touch:
-        """Return the hardest touch with the loads of other systems on arms; those on fingers are no bumps."""
+        """Return the hardest touch with the forces of other systems on arms; those on fingers are no bumps."""
         for name, met in meetings.items():
-            coupling, force = self._couplings[name], jnp.max(jnp.abs(jnp.sum(met.loads.force * met.ends.normal, -1)), 0)
-            on_arm = coupling.arm[:, None] == np.arange(self._agents)
-            kinds = np.stack([on_arm, on_arm & ~coupling.fingers[:, None]])
-            most = jnp.max(jnp.where(kinds, force[:, None], 0.0), 1, initial=0.0)
-            touch = touch._replace(handled=jnp.maximum(touch.handled, most))
+            most = self._couplings[name].hardest(met.ends, met.response.force, self._agents)
+            overflow = jnp.maximum(touch.overflow, met.ends.left_out)
+            touch = touch._replace(handled=jnp.maximum(touch.handled, most), overflow=overflow)
         return touch
 
     def find(self, physics: Physics, poses: Any) -> Found:
@@ -272,7 +277,8 @@ class Step:
         awake = slots.awake if attached is False else slots.awake | attached
         masses, free = self._rigid.free_motion(bodies, awake)
         for name, met in meetings.items():
-            masses, free, touched = self._couplings[name].on_bodies(masses, free, met.loads, met.ends, bodies)
+            coupling = self._couplings[name]
+            masses, free, touched = coupling.on_bodies(masses, free, met.response, met.ends, bodies, self.arms.dt)
             awake |= touched
         return masses, free, awake
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from importlib import import_module
 from typing import Any
 
 from surgical_marl.plugins.registry import Registry
@@ -11,6 +12,15 @@ from surgical_marl.untrusted.schema import Place, as_mapping, check
 SYSTEMS = Registry(
     "system", package=None, group="surgical_marl.systems", base="surgical_marl.physics.systems.system:System"
 )
+
+SOFT = {"thread": "surgical_marl.physics.systems.thread:Thread"}
+"""Kinds of objects that are no rigid bodies, and the systems that they are."""
+
+
+def soft_kind(kind: str) -> Any:
+    """Return the class of a kind of objects that are no rigid bodies."""
+    module, _, name = SOFT[kind].partition(":")
+    return getattr(import_module(module), name)
 
 
 def list_systems() -> list[str]:

@@ -26,7 +26,14 @@ from surgical_marl.robots.spec import SOLREF
 from surgical_marl.scenes.build import build_scene, cached_model, compile_scene, weigh_shapes
 from surgical_marl.scenes.contacts import contact_pairs
 from surgical_marl.scenes.object_contacts import check_apart
-from surgical_marl.scenes.placing import MAX_OBJECTS, PlacementEntry, add_objects, read_placements
+from surgical_marl.scenes.placing import (
+    MAX_OBJECTS,
+    PlacementEntry,
+    add_objects,
+    add_threads,
+    read_placements,
+    take_soft,
+)
 from surgical_marl.scenes.scene import AttachmentEntry, Mount, Randomisation, Scene
 from surgical_marl.scenes.surroundings import TissueEntry, View, add_surroundings, add_tissue
 from surgical_marl.untrusted.markup import check_name
@@ -87,7 +94,8 @@ def load_scene(name: str | Path, control: str = "position") -> Scene:
               about.arms.items()}  # fmt: skip
     where = place.part("objects", settings)
     objects = read_placements(about.objects, where, settings.get("objects"), mounts)
-    systems = read_systems(about.systems, place.part("systems", settings), {**mounts, **objects})
+    soft = take_soft(objects, about.objects, where, settings.get("objects"))
+    systems = soft | read_systems(about.systems, place.part("systems", settings), {**mounts, **objects, **soft})
     observe = {agent: list(names) for agent, names in about.observe.items()}
     scene = partial(Scene, path.stem, about.description, control, mounts, randomisation=about.randomisation,
                     observe=observe, objects=objects, attachments=about.attachments, systems=systems)  # fmt: skip
@@ -98,6 +106,7 @@ def load_scene(name: str | Path, control: str = "position") -> Scene:
         for piece, entry in about.tissue.items():
             add_tissue(spec, f"tissue/{piece}", entry)
         add_objects(spec, objects)
+        add_threads(spec, soft)
         bare = scene(model=compile_scene(spec))
         for one, other in contact_pairs(bare):
             spec.add_pair(geomname1=one, geomname2=other, condim=1, solref=SOLREF)
@@ -107,7 +116,8 @@ def load_scene(name: str | Path, control: str = "position") -> Scene:
 
     contents = (part for mount in mounts.values() for part in mount.arm.content)
     held = (item.object.content for item in objects.values())
-    model = cached_model(compute, repr((path.stem, control, _without_sources(about))), *contents, *held)
+    pictured = repr(soft)
+    model = cached_model(compute, repr((path.stem, control, _without_sources(about))), *contents, *held, pictured)
     loaded = scene(model=model)
     _check_attachments(loaded, place.part("attachments", settings), settings.get("attachments"))
     return loaded

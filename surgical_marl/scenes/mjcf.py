@@ -38,6 +38,7 @@ def mjcf(scene: Scene, timestep: float | None = None) -> str:
 
     A free object has a free joint of its name, after all joints of the arms; in `scene.model` it has none. Gravity acts
     on objects, and contacts of objects are pairs with friction and a stiffness in N/m (`object_contacts.py`).
+    Threads are left out.
 
     Args:
         scene: the scene.
@@ -60,6 +61,8 @@ def mjcf(scene: Scene, timestep: float | None = None) -> str:
     bodies = [_add(root, "worldbody")]
     for body in range(model.nbody):
         if body > 0:
+            if model.body(body).name.partition("/")[0] in scene.threads:
+                continue  # the last bodies of the model
             place = scene.objects.get(model.body(body).name)
             parent = bodies[model.body_parentid[body]]
             bodies.append(_add_body(parent, model, body, bool(scene.objects), place.object if place else None))

@@ -18,14 +18,15 @@ import mujoco
 import numpy as np
 
 from surgical_marl.content import find
+from surgical_marl.plugins.systems import SOFT, soft_kind
 from surgical_marl.robots.rotation import matrix_of, quaternion, turned
 from surgical_marl.scenes.poses import Pose
 from surgical_marl.scenes.shapes import GREY, MAX_SHAPES, Material, ShapeEntry, make_shapes
 from surgical_marl.scenes.shapes import Shape as Shape
 from surgical_marl.untrusted.markup import check_name
 from surgical_marl.untrusted.schema import REQUIRED, Place, Vector, angles, check, lengths, number, rgb, several
-from surgical_marl.untrusted.values import LARGEST, LEAST
-from surgical_marl.yaml_file import read_as
+from surgical_marl.untrusted.values import LARGEST, LEAST, shown
+from surgical_marl.yaml_file import read_as, read_yaml
 
 MAX_SITES = 100
 HEAVIEST, LIGHTEST = 1e6, 1e-12
@@ -86,6 +87,9 @@ class Object:
     """Named places: position, m, [3], and axes, [3, 3]."""
     content: bytes = field(repr=False)
     """Everything that the object is made from but materials, which only pictures show. It is a key for caches."""
+
+    soft: Any = None
+    """The content of its file if it is no rigid body, such as `ThreadFile`; it has no shapes and sites then."""
 
     @property
     def surface(self) -> Surface:
@@ -174,6 +178,9 @@ def load_object(name: str | Path, colour: Any = None) -> Object:
     """
     path = find("objects", name)
     check_name(path.stem, "an object's file")
+    settings = read_yaml(path)
+    if (kind := settings.get("kind")) is not None:
+        return _soft(path, settings, kind)
     about = read_as(ObjectFile, path)
     painted = check(Place("colour"), colour, Vector | None, rgb().metadata) or about.colour or GREY
     shapes = make_shapes(about.shapes, painted, about.material or "", Place("shapes", path))
@@ -197,6 +204,17 @@ def load_object(name: str | Path, colour: Any = None) -> Object:
         sites={name: (np.array(site.position), turned(site.tilt)) for name, site in about.sites.items()},
         content=repr((path.stem, about, painted)).encode(),
     )
+
+
+def _soft(path: Path, settings: Any, kind: Any) -> Object:
+    """Return an object that is no rigid body, from the content of its file."""
+    if kind not in SOFT:
+        raise ValueError(f"{Place('kind', path).at(settings)} must be {' or '.join(SOFT)}, not {shown(kind)}")
+    about = check(Place(file=path), settings, soft_kind(kind).file)
+    friction = about.friction.sliding, about.friction.torsion
+    content = repr((path.stem, about)).encode()
+    return Object(path.stem, about.description, True, about.mass, np.zeros(3), np.zeros((3, 3)), friction,
+                  about.stiffness, (), {}, content, about)  # fmt: skip
 
 
 def _density(mass: float | None, shapes: tuple[Shape, ...]) -> float:

@@ -11,9 +11,11 @@ import mujoco
 import numpy as np
 
 from surgical_marl.content import find, list_scenes
+from surgical_marl.plugins.systems import soft_kind
 from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.robots.rotation import quaternion, turned
 from surgical_marl.scenes.objects import Placement, add_shape, load_object
+from surgical_marl.scenes.poses import along
 from surgical_marl.scenes.surroundings import STILL
 from surgical_marl.untrusted.schema import Place, Vector, angles, lengths, rgb
 from surgical_marl.yaml_file import read_yaml
@@ -26,6 +28,14 @@ TAKEN = re.compile(r"world|tissue|contact|target|(?:reward|cost|stage)(?:_\w*)?"
 
 
 @dataclass(frozen=True)
+class Tied:
+    """What the two ends of a thread are fastened to: "world", or a free object that has a site `tail`."""
+
+    first: str | None = None
+    last: str | None = None
+
+
+@dataclass(frozen=True)
 class PlacementEntry:
     """An object in a scene file; `object` is its name or its file."""
 
@@ -33,6 +43,8 @@ class PlacementEntry:
     position: Vector = lengths()
     tilt: Vector = angles()
     colour: Vector | None = rgb()
+    tied: Tied | None = None
+    """Of a thread: what its ends are fastened to."""
 
 
 def scenes_without_objects() -> list[str]:
@@ -69,7 +81,36 @@ def read_placements(
             raise ValueError(f"{where}: {name} is taken; give the object another name")
         source = find("objects", entry.object, str(where), where.folder)
         found[name] = Placement(load_object(source, entry.colour), np.array(entry.position), turned(entry.tilt))
+        if entry.tied and not found[name].object.soft:
+            raise ValueError(f"{where}.tied: only the ends of a thread are tied, and {entry.object} is none")
     return found
+
+
+def take_soft(
+    placements: dict[str, Placement], entries: Mapping[str, PlacementEntry], place: Place, settings: Any
+) -> dict[str, Any]:
+    """Remove all objects that are no rigid bodies from some placements, and return them as systems, by name.
+
+    Raises:
+        ValueError: one is fastened to nothing that there is.
+    """
+    soft = {name: placements.pop(name) for name in list(placements) if placements[name].object.soft}
+    return {
+        name: soft_kind(item.object.soft.kind).placed(item, entries[name], placements, place.at(settings, name))
+        for name, item in soft.items()
+    }
+
+
+def add_threads(spec: mujoco.MjSpec, threads: Mapping[str, Any]) -> None:
+    """Add a capsule for each edge of each thread, which only pictures show: a mocap body `<thread>/<number>`."""
+    for name, thread in threads.items():
+        path = np.array(thread.path)
+        middle, turn = along(path[:-1], path[1:])
+        half = float(np.linalg.norm(path[1] - path[0])) / 2
+        for number, (place, facing) in enumerate(zip(middle, turn, strict=True)):
+            body = spec.worldbody.add_body(name=f"{name}/{number}", pos=place, quat=facing, mocap=True)
+            body.add_geom(type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=[thread.diameter / 2, half, 0.0], mass=0,
+                          rgba=[*thread.colour, 1], **STILL)  # fmt: skip
 
 
 def add_objects(spec: mujoco.MjSpec, objects: dict[str, Placement]) -> None:

@@ -27,6 +27,25 @@ class Poses:
     """w, x, y, z, [N, k, 4]."""
 
 
+def along(start: Any, end: Any) -> tuple[Any, Any]:
+    """Return the middle [..., 3] of lines, and the quaternion [..., 4] that turns z along each.
+
+    Args:
+        start: of the lines, m, [..., 3], of numpy or torch.
+        end: likewise.
+    """
+    way, xp = end - start, np
+    if not isinstance(start, np.ndarray):
+        import torch
+
+        xp = torch
+    x, y, z = (way[..., axis] for axis in range(3))
+    real = (x * x + y * y + z * z) ** 0.5 + z  # half of the way from z to the line
+    down = real < 1e-3 * abs(z)  # against z, any axis across will do
+    turn = xp.stack([xp.where(down, 0 * z, real), xp.where(down, 0 * z + 1, -y), xp.where(down, 0 * z, x), 0 * z], -1)
+    return (start + end) / 2, turn / ((turn * turn).sum(-1) ** 0.5)[..., None]
+
+
 def frames(position: Any, quaternion: Any, centers: Any) -> Poses:
     """Return the poses of objects from their centres of mass.
 

@@ -114,7 +114,7 @@ class Scene:
     attachments: dict[str, AttachmentEntry] = field(default_factory=dict)
     """Name -> a free object and the link that it can be attached to."""
     systems: dict[str, Any] = field(default_factory=dict)
-    """Name -> a system of a plug-in (`surgical_marl.physics.systems.system.System`)."""
+    """Name -> a thread, or a system of a plug-in (`surgical_marl.physics.systems.system.System`)."""
 
     @property
     def agents(self) -> tuple[str, ...]:
@@ -125,6 +125,11 @@ class Scene:
     def free_objects(self) -> dict[str, Placement]:
         """The objects that move, by name, in the order of the mocap bodies of `model` and of physical states."""
         return {name: place for name, place in self.objects.items() if place.object.free}
+
+    @cached_property
+    def threads(self) -> dict[str, Any]:
+        """The threads among `systems`. In `model` the edge between two nodes is a mocap body, `<thread>/<number>`."""
+        return {name: system for name, system in self.systems.items() if hasattr(system, "path")}
 
     @cached_property
     def types(self) -> dict[str, tuple[str, ...]]:

@@ -105,7 +105,7 @@ class Observer:
             env: environments of the scene, with numpy arrays.
             forces: normal forces of `scene.pairs` in the last step, [N, P], N; None where there was no such step.
         """
-        qpos, poses, marks = env.qpos, env.object_poses, env.task.marks(env.goal)
+        qpos, poses, marks = env.qpos, env.drawn_poses, env.task.marks(env.goal)
         count, bodies = len(qpos), self._scene.model.nbody
         positions, quaternions = np.empty((count, bodies, 3)), np.empty((count, bodies, 4))
         tips = np.empty((count, len(self._sites), 3))
@@ -121,7 +121,9 @@ class Observer:
             pushes.append([] if forces is None else self._pushes(np.asarray(forces)[row]))
             grips.append(self._grips(pressed[row]))
         marks = np.asarray(marks, float) if marks.size else np.zeros((count, 0, 3))
-        return Moment(positions, quaternions, tips, poses.origin, env.held, marks, nearest, pushes, grips)
+        return Moment(
+            positions, quaternions, tips, poses.origin[:, : len(self._shapes)], env.held, marks, nearest, pushes, grips
+        )
 
     def _place(self, qpos: np.ndarray, origins: np.ndarray, quaternions: np.ndarray) -> None:
         data = self._data

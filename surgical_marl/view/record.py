@@ -158,9 +158,9 @@ class Pose(NamedTuple):
 
     qpos: NDArray[np.float64]
     origins: NDArray[np.float64]
-    """Origins of free objects, m, [k, 3]."""
+    """Origins of free objects and middles of edges of threads, m, [k, 3]."""
     quaternions: NDArray[np.float64]
-    """Orientations of free objects, w, x, y, z, [k, 4]."""
+    """Their orientations, w, x, y, z, [k, 4]."""
     balls: list[Sphere]
     """A ball at each arm's goal."""
 
@@ -201,7 +201,7 @@ class ScenePicture:
         marks = env.task.marks(env.goal)
         for number, place in enumerate(marks[index] if marks.size else []):
             balls.append((tuple(place), GOAL_RADIUS, (*goal_colour(number, marks.shape[1], len(env.agents)), 1.0)))
-        objects = env.object_poses
+        objects = env.drawn_poses
         qpos, origins, quaternions = (
             np.array(part[index], float) for part in (env.qpos, objects.origin, objects.quaternion)
         )

@@ -161,7 +161,7 @@ def read_take(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
 
 def _after(env: BatchedEnv, step: BatchStep) -> dict[str, np.ndarray]:
     """Return the numbers of a step that a replay is compared in."""
-    poses = env.object_poses
+    poses = env.drawn_poses
     return {
         **{f"rewards/{agent}": np.array(reward, np.float32) for agent, reward in step.rewards.items()},
         "qpos": np.array(env.qpos, np.float32),

@@ -1,7 +1,7 @@
 """Pictures from a scene's endoscope for many environments at once: colour, depth and the geom of each pixel.
 
     endoscope = Endoscope(load_scene("trimanual_psm_ecm"), num_envs=1024)
-    view = endoscope.render(env.qpos, env.object_poses)
+    view = endoscope.render(env.qpos, env.drawn_poses)
     view.rgb                                    # [N, eyes, 64, 64, 3] uint8
 
 Pictures depend on joint positions [N, nq] and on the poses of free objects alone, in numpy or torch. Any engine has
@@ -119,7 +119,7 @@ class Endoscope:
     def render(self, qpos: Any, objects: Poses | None = None) -> View:
         """Draw the pictures of the endoscopes at joint positions [N, nq] of the whole scene.
 
-        Free objects are where `objects` says, as `BatchedEnv.object_poses` does, in arrays of the same library as
+        Free objects are where `objects` says, as `BatchedEnv.drawn_poses` does, in arrays of the same library as
         `qpos`; without it they are where the scene places them.
 
         The pictures are numpy arrays for a numpy array, and torch tensors for a torch tensor.
@@ -187,7 +187,7 @@ def _is_tensor(values: Any) -> bool:
 
 def _labels(scene: Scene) -> tuple[np.ndarray, tuple[str, ...]]:
     """Return the label of each geom, int32 [ngeom + 1] with the last for -1, and the names of the labels."""
-    names = ("nothing", "tissue", *scene.agents, *scene.objects)
+    names = ("nothing", "tissue", *scene.agents, *scene.objects, *scene.threads)
     model = scene.model
     owners = [model.body(body).name.split("/")[0] for body in model.geom_bodyid]
     own = [names.index(owner) if owner in names[2:] else 1 for owner in owners]

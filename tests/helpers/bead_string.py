@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from surgical_marl.physics.contact.point_contact import accelerate, respond
-from surgical_marl.physics.systems.system import Ends, Loads, Spheres, System
+from surgical_marl.physics.contact.point_contact import moved, respond, yielding
+from surgical_marl.physics.systems.system import Ends, Response, Shapes, System
 from surgical_marl.scenes.objects import Surface
 from surgical_marl.untrusted.schema import Vector, lengths, number
 
@@ -47,12 +47,18 @@ class BeadString(System):
         below = np.cumsum(self.length + borne)
         return np.array(self.position) - below[:, None] * [0.0, 0.0, 1.0]
 
-    def start(self) -> Beads:
+    @property
+    def contacts(self) -> int:
+        return 4 * self.beads
+
+    def start(self, places: Array) -> Beads:
+        del places
         unstretched = np.array(self.position) - np.outer(self.length * np.arange(1, self.beads + 1), [0, 0, 1])
         return Beads(jnp.asarray(unstretched, jnp.float32), jnp.zeros((self.beads, 3), jnp.float32))
 
-    def shapes(self, state: Beads) -> Spheres:
-        return Spheres(state.position, jnp.full(self.beads, self.radius, jnp.float32), state.velocity)
+    def shapes(self, state: Beads) -> Shapes:
+        radius = jnp.full(self.beads, self.radius, jnp.float32)
+        return Shapes(state.position, state.position, radius, jnp.linalg.norm(state.velocity, axis=-1))
 
     def free_motion(self, state: Beads, dt: Any) -> tuple[Array, Array]:
         """Return matrices and forces of the beads: springs and dampers at the end of the step, neighbours go on."""
@@ -66,9 +72,12 @@ class BeadString(System):
         matrix = (self.mass + dt**2 * springs + dt * self.damping)[:, None, None] * np.eye(3)
         return jnp.asarray(matrix, jnp.float32), force
 
-    def respond(self, state: Beads, motion: tuple[Array, Array], ends: Ends, dt: Any) -> Loads:
+    def respond(self, state: Beads, motion: tuple[Array, Array], ends: Ends, dt: Any) -> Response:
         return respond(*motion, state.velocity, ends, dt)
 
-    def apply(self, state: Beads, motion: tuple[Array, Array], ends: Ends, accelerations: Array, dt: Any) -> Beads:
-        velocity = state.velocity + dt * accelerate(*motion, state.velocity, ends, accelerations, dt)
+    def yielding(self, response: Response, ends: Ends, accelerations: Array, dt: Any) -> Array:
+        return yielding(response, ends, accelerations, dt)
+
+    def apply(self, state: Beads, response: Response, ends: Ends, accelerations: Array, dt: Any) -> Beads:
+        velocity = moved(response, ends, accelerations, dt)
         return Beads(state.position + dt * velocity, velocity)

@@ -1,7 +1,7 @@
-"""The contact of a point mass with shapes of others: the force law of `contact_model`, at one point each.
+"""Contacts of point masses, each a sphere, for systems that consist of such: the law is that of `spring_contact`.
 
-loads = respond(mass, force, velocity, ends, dt)
-acceleration = accelerate(mass, force, velocity, ends, accelerations, dt)
+response = respond(mass, force, velocity, ends, dt)
+velocity = moved(response, ends, accelerations, dt)
 """
 
 from __future__ import annotations
@@ -12,135 +12,82 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from surgical_marl.physics.contact.contact_model import CREEP, FASTEST, FIRM
-from surgical_marl.physics.contact.contact_patch import AWAY, tangents
-from surgical_marl.physics.contact.friction_cone import (
-    Cone,
-    Parting,
-    Springs,
-    Stuck,
-    curvature,
-    nearest,
-    stretched,
-    wrench,
-)
-from surgical_marl.physics.contact.grips import DAMPING, SHEAR
-from surgical_marl.physics.solver.cholesky import cholesky, forward, packed, solve_factored
-from surgical_marl.physics.solver.newton import line_search, newton
-from surgical_marl.physics.systems.system import Ends, Loads
+from surgical_marl.physics.contact.spring_contact import each, feel
+from surgical_marl.physics.solver.cholesky import cholesky, solve_factored
+from surgical_marl.physics.systems.system import Ends, Response
+from surgical_marl.physics.tree_utils import row_of
 
 ITERATIONS = 6
-"""Newton steps for one point mass at most: each contact is linear but for a change between free, stuck and sliding."""
-LEAST = 1e-9
-"""Fall of the cost in a Newton step, N m/s2, after which none follows."""
-_BLOCK = packed(6)[:3, :3]
+"""Newton steps: each contact is linear but for a change between free, stuck and sliding."""
 
 
-class _Law(NamedTuple):
-    """The contact of one point mass with one shape."""
+class Solved(NamedTuple):
+    """A step of n point masses whose ends move as expected."""
 
-    cone: Cone
-    stuck: Stuck
+    shift: Array
+    """Displacements, m, [n, 3]."""
+    factor: Array
+    """Cholesky factor of the stiffness of each mass with its contacts, [n, 3, 3]."""
+    falls: Array
+    """Of the force of each contact as its point moves, N/m, [c, 3, 3]."""
 
 
-def respond(mass: Array, force: Array, velocity: Array, ends: Ends, dt: Any) -> Loads:
-    """Return the loads of n point masses on r shapes each, with the accelerations of the masses eliminated.
+def respond(mass: Array, force: Array, velocity: Array, ends: Ends, dt: Any) -> Response:
+    """Return the forces of n point masses on the ends of their contacts.
 
     Args:
         mass: matrices of the masses, with implicit parts of their other forces, kg, [n, 3, 3].
         force: sums of their other forces, N, [n, 3].
         velocity: m/s, [n, 3].
-        ends: of their contacts.
+        ends: of their contacts; the number of a part is that of its mass.
         dt: duration of a step, s.
     """
+    inertia = mass / (dt * dt)
 
-    def one(row: Any) -> Loads:
-        mass, force, velocity, own = row
-        laws = _laws(velocity, own, dt)
-        still = jnp.zeros_like(own.normal)
-        acceleration = _solve(mass, force, laws, still)
-        forces, stiffness = jax.lax.map(lambda law: _force(law, acceleration), laws)
-        factor = cholesky(mass + jnp.sum(stiffness, 0))
+    def summed(u: Array) -> tuple[Array, Array]:
+        def add(row: Array, sums: tuple[Array, Array]) -> tuple[Array, Array]:
+            end = row_of(ends.rows, row)
+            felt = feel(end, u[end.part] - end.shift)
+            return sums[0].at[end.part].add(felt.force), sums[1].at[end.part].add(felt.stiffness)
 
-        def condensed(block: Array) -> Array:
-            eased = forward(factor, block)
-            return block - eased.T @ eased
-
-        return Loads(-forces, jax.lax.map(condensed, stiffness))
-
-    loads: Loads = jax.lax.map(one, (mass, force, velocity, _by_point(ends)))
-    return loads
-
-
-def accelerate(mass: Array, force: Array, velocity: Array, ends: Ends, accelerations: Array, dt: Any) -> Array:
-    """Return the accelerations of point masses, m/s2, [n, 3], whose contacts' ends have these, m/s2, [n, r, 3]."""
-
-    def one(row: Any) -> Array:
-        mass, force, velocity, own, moves = row
-        return _solve(mass, force, _laws(velocity, own, dt), moves)
-
-    found: Array = jax.lax.map(one, (mass, force, velocity, _by_point(ends), accelerations))
-    return found
-
-
-def _by_point(ends: Ends) -> Ends:
-    """Return ends whose stiffness and friction have an axis for points too, [n, r]."""
-    shape = ends.depth.shape
-    return ends._replace(stiffness=jnp.broadcast_to(jnp.asarray(ends.stiffness), shape),
-                         sliding=jnp.broadcast_to(jnp.asarray(ends.sliding), shape))  # fmt: skip
-
-
-def _laws(velocity: Array, ends: Ends, dt: Any) -> _Law:
-    """Return the contacts of one point mass, [r]."""
-
-    def law(end: Ends) -> _Law:
-        frame = tangents(end.normal)
-        speed, *rubbed = frame @ (velocity - end.velocity)
-        reach = end.depth - dt * jnp.minimum(speed, 0.0)
-        k = jnp.where(reach > 0, end.stiffness, 0.0)
-        rate = k * jnp.maximum(dt + DAMPING * jnp.clip(reach / FIRM, 0.0, 1.0), end.depth / FASTEST)
-        drag = SHEAR * end.stiffness * CREEP
-        push = jnp.where(reach > 0, k * end.depth - rate * speed, AWAY)
-        springs = Springs((dt * rate)[None], dt * drag, end.sliding)
-        normal, across = jnp.zeros((1, 6)).at[0, :3].set(frame[0]), jnp.zeros((3, 6)).at[:2, :3].set(frame[1:])
-        return _Law(Cone(normal, across, springs), Stuck(push[None], -drag * jnp.stack([*rubbed, jnp.float32(0.0)])))
-
-    found: _Law = jax.lax.map(law, ends)
-    return found
-
-
-def _force(law: _Law, acceleration: Array) -> tuple[Array, Array]:
-    """Return the force on the point mass, N, [3], and how much it falls per relative acceleration, kg, [3, 3]."""
-    cone = law.cone
-    by = Parting(cone.normal[:, :3] @ acceleration, cone.along[:, :3] @ acceleration)
-    felt = nearest(cone.springs, stretched(cone.springs, law.stuck, by))
-    return wrench(cone, felt)[:3], curvature(cone, felt)[_BLOCK]
-
-
-def _solve(mass: Array, force: Array, laws: _Law, moves: Array) -> Array:
-    """Return the acceleration [3] at which all forces on one point mass balance, by Newton's method."""
-
-    def left(acceleration: Array) -> tuple[Array, Array]:
-        """Return the force that does not balance, and how much it falls per acceleration."""
-
-        def add(sums: Any, row: Any) -> tuple[Any, None]:
-            law, move = row
-            pushed, falls = _force(law, acceleration - move)
-            return (sums[0] + pushed, sums[1] + falls), None
-
-        found: tuple[Array, Array] = jax.lax.scan(add, (force - mass @ acceleration, mass), (laws, moves))[0]
+        found: tuple[Array, Array] = jax.lax.fori_loop(0, ends.count, add, (force, inertia))
         return found
 
-    def step_from(acceleration: Array, _: Array) -> tuple[Array, Array]:
-        excess, matrix = left(acceleration)
-        factor = cholesky(matrix)
-        step = solve_factored(factor, excess)
+    def step(_: Any, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        u = state[0]
+        pushed, stiffness = summed(u)
+        excess = pushed - jnp.einsum("nij,nj->ni", inertia, u - dt * velocity)
+        factor = jax.vmap(cholesky)(stiffness)
+        return u + jax.vmap(solve_factored)(factor, excess), factor
 
-        def measure(length: Array) -> tuple[Array, Array]:
-            excess, matrix = left(acceleration + length * step)
-            return -(step @ excess), step @ (matrix @ step)
+    u, factor = jax.lax.fori_loop(0, ITERATIONS, step, (dt * velocity, inertia))
+    felt = each(ends, lambda row, end: feel(end, u[end.part] - end.shift))
+    return Response(-felt.force, Solved(u, factor, felt.stiffness))
 
-        return acceleration + line_search(-(step @ excess), LEAST, measure).length * step, step @ excess <= LEAST
 
-    found: Array = newton(step_from, jnp.zeros(3), ITERATIONS)
+def yielding(response: Response, ends: Ends, accelerations: Array, dt: Any) -> Array:
+    """Return by how much the forces on the ends fall as these accelerate, N, [c, 3] (`System.yielding`)."""
+    solved: Solved = response.solved
+    carried = _carried(solved, ends, accelerations, dt)
+
+    def eased(row: Array, end: Any) -> Array:
+        return solved.falls[row] @ (dt * dt * accelerations[row] - carried[end.part])
+
+    found: Array = each(ends, eased)
     return found
+
+
+def moved(response: Response, ends: Ends, accelerations: Array, dt: Any) -> Array:
+    """Return the velocities of the masses after a step, m/s, [n, 3] (`System.apply`)."""
+    return (response.solved.shift + _carried(response.solved, ends, accelerations, dt)) / dt
+
+
+def _carried(solved: Solved, ends: Ends, accelerations: Array, dt: Any) -> Array:
+    """Return how far the ends carry the masses by accelerating, m, [n, 3]."""
+
+    def add(row: Array, sums: Array) -> Array:
+        pushed = solved.falls[row] @ (dt * dt * accelerations[row])
+        return sums.at[ends.rows.part[row]].add(pushed)
+
+    pushed = jax.lax.fori_loop(0, ends.count, add, jnp.zeros_like(solved.shift))
+    return jax.vmap(solve_factored)(solved.factor, pushed)

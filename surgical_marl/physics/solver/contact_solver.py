@@ -133,6 +133,8 @@ class ContactSolver:
         if len(self._dofs) < 2:
             return each(left)
         bridges, pressed = left.touched.sum(1) > 1, self._sides(problem, here).any()
+        if not self._objects:  # nothing joins arms but their own contacts
+            return jax.lax.cond(pressed, together, each, left)
 
         def joined(left: Any) -> Any:
             return jax.lax.cond(pressed | (bridges.sum() > 1), together, bridged, left)

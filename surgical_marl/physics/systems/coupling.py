@@ -1,4 +1,8 @@
-"""Contacts of systems of plug-ins with arms and rigid bodies: their ends, the loads on these, their accelerations."""
+"""Contacts of a system with arms and rigid bodies: their ends, the loads on these, and their accelerations.
+
+Shapes are numbered by kind: pads of fingers, capsules of links, capsules of free bodies, then what is fixed: plates and
+rods. So contacts with what moves come first in a list.
+"""
 
 from __future__ import annotations
 
@@ -9,179 +13,262 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from surgical_marl.physics.contact.broadphase import Displacement, Joints, Placed, Places
+from surgical_marl.physics.contact.broadphase import Joints, Placed, Places
 from surgical_marl.physics.contact.contact_pairs import ContactPairs
-from surgical_marl.physics.contact.shapes import Points, Segments, between_segments, on_plate
+from surgical_marl.physics.contact.part_detection import PartDetection, Scenery
+from surgical_marl.physics.contact.shapes import Plate, Segments
+from surgical_marl.physics.contact.spring_contact import each
 from surgical_marl.physics.solver.cholesky import cholesky, solve_factored
 from surgical_marl.physics.systems.arms import ArmForces
-from surgical_marl.physics.systems.rigid_motion import Bodies
-from surgical_marl.physics.systems.system import Ends, Loads, Spheres
+from surgical_marl.physics.systems.rigid_motion import Bodies, rotation
+from surgical_marl.physics.systems.system import End, Ends, Response, Shapes, System, Tie
 from surgical_marl.physics.tree_utils import row_of
-from surgical_marl.scenes.objects import JAW, LINK, Surface
+from surgical_marl.scenes.objects import JAW, LINK
+
+TIE = 2e4
+"""Stiffness of a tie, N/m: a pull of 1 N stretches it by 50 um."""
 
 
 class Coupling:
-    """The contacts of one system with all other shapes of a scene.
+    """The contacts of one system with all other shapes of a scene."""
 
-    Shapes are numbered by kind: pads of fingers, links of arms, free bodies, fixed plates, fixed rods.
-    """
-
-    def __init__(self, tables: ContactPairs, surface: Surface) -> None:
-        self._tables, self._places = tables, Places(tables)
-        self._counts = {"pads": len(tables.fingers), "links": len(tables.near), "objects": tables.count,
-                        "plates": len(tables.plates.radius), "rods": len(tables.rods.radius)}  # fmt: skip
-        others = [*[JAW] * self._counts["pads"], *[LINK] * self._counts["links"], *tables.surfaces["objects"],
-                  *tables.surfaces["plates"], *tables.surfaces["rods"]]  # fmt: skip
-        met = [surface.against(other) for other in others]
-        self._stiffness = np.array([one.stiffness for one in met], np.float32)
-        self._sliding = np.array([one.sliding for one in met], np.float32)
-        count, none = len(others), tables.count
-        self.arm, self.moves = np.full(count, tables.arms), np.zeros((count, tables.most), np.float32)
-        """The arm that each shape is on, and which of that arm's joints move it, [m]."""
-        self.body, start = np.full(count, none), 0
-        """The free body that each shape is of; the number of bodies for others."""
-        for kind, size in self._counts.items():
-            own = slice(start, start + size)
-            if kind in tables.bodies:
-                self.arm[own], self.moves[own] = tables.arm_of[kind], tables.moves[kind]
-            if kind == "objects":
-                self.body[own] = np.arange(size)
-            start += size
-        self.fingers = np.arange(count) < self._counts["pads"]
+    def __init__(self, tables: ContactPairs, system: System) -> None:
+        self._tables, self._places, self._system = tables, Places(tables), system
+        links, (k, c) = tables.bare, tables.radius.shape
+        counts = {"pads": len(tables.fingers), "links": len(links), "objects": k * c,
+                  "plates": len(tables.plates.radius), "rods": len(tables.rods.radius)}  # fmt: skip
+        self._starts = dict(zip(counts, np.cumsum([0, *counts.values()]), strict=False))
+        self._counts, self._shapes = counts, sum(counts.values())
+        bodies = np.repeat(np.arange(k), c)
+        arms = [JAW] * counts["pads"] + [LINK] * counts["links"]
+        fixed = [*tables.surfaces["plates"], *tables.surfaces["rods"]]
+        surfaces = [*arms, *(tables.surfaces["objects"][body] for body in bodies), *fixed]
+        met = [system.surface.against(other) for other in surfaces]
+        self._detection = PartDetection(counts, met, system.contacts)
+        none = self._shapes + 1  # the number of all shapes stands for none: the end of a tie to the world
+        self.arm, self.body = np.full(none, tables.arms, np.int32), np.full(none, k, np.int32)
+        """The arm and the free body that each shape is of, [r + 1]; their numbers where it is of none."""
+        self._moved = np.zeros((none, tables.most), np.float32)
+        fingers = slice(0, counts["pads"])
+        self.arm[fingers], self._moved[fingers] = tables.arm_of["pads"], tables.moves["pads"]
+        own = slice(self._starts["links"], self._starts["objects"])
+        self.arm[own], self._moved[own] = tables.arm_of["links"][links], tables.moves["links"][links]
+        self.body[self._starts["objects"] : self._starts["plates"]] = bodies
+        self.fingers = np.arange(none) < counts["pads"]
         """Which shapes are pads of fingers."""
 
-    def ends(self, spheres: Spheres, poses: Any, joints: Joints, qvel: Array, bodies: Bodies, dt: Any) -> Ends:
-        """Return the ends of all contacts of spheres [n] with shapes [r], from MJX's data with poses of the arms."""
-        placed = self._places.place(poses, joints, qvel, bodies, dt)
-        points, velocities = [], []
-        for kind in (kind for kind, size in self._counts.items() if size):
-            displacement = placed.displacements.get(kind)
+    # -- where it touches
 
-            def of_sphere(
-                row: Any, kind: str = kind, displacement: Displacement | None = displacement
-            ) -> tuple[Points, Array]:  # fmt: skip
-                centre, radius = row
-                sphere = Segments(centre, centre, radius)
+    def ends(
+        self, shapes: Shapes, poses: Any, joints: Joints, bodies: Bodies, motion: tuple[Array, Array], dt: Any
+    ) -> Ends:  # fmt: skip
+        """Return the contacts of a system.
 
-                def meet(number: Array) -> tuple[Points, Array]:
-                    point = self._point(placed, kind, number, sphere)
-                    if displacement is None:
-                        return point, jnp.zeros(3)
-                    own = row_of(displacement, number)
-                    return point, (own.shift + jnp.cross(own.turn, point.place)) / dt
+        Args:
+            shapes: of the system.
+            poses: MJX's data with the poses of the arms.
+            joints: axes of the arms' joints.
+            bodies: the free bodies.
+            motion: velocities of joints [a, m] and of bodies [k, 6] at the end of the step, if they accelerate as in
+                the last one.
+            dt: duration of a step, s.
+        """
+        ties = self._system.ties
+        of_bodies, of_world = (
+            [self._tied(tie, shapes, bodies) for tie in ties if (tie.body is None) == world] for world in (False, True)
+        )
+        found = self._detection.find(self._scenery(poses, joints, bodies, motion, dt), shapes, of_bodies, of_world, dt)
+        shift = dt * self.accelerations(found, joints, bodies, *motion)
+        return found._replace(rows=found.rows._replace(shift=shift))
 
-                return jax.lax.map(meet, jnp.arange(self._counts[kind]))
+    def _scenery(
+        self, poses: Any, joints: Joints, bodies: Bodies, motion: tuple[Array, Array], dt: Any
+    ) -> Scenery:  # fmt: skip
+        t = self._tables
+        qvel = jnp.zeros(len(poses.qpos) + 1).at[t.dofs].set(motion[0])[:-1]
+        placed = self._places.place(poses, joints, qvel, bodies._replace(velocity=motion[1]), dt)
+        plates = Plate(*map(_joined, placed.pads, t.plates))
+        links = row_of(placed.links, t.bare)
+        capsules = Segments(*map(_joined, links, self._capsules_of_bodies(placed), t.rods))
+        fixed = jnp.zeros(self._counts["plates"] + self._counts["rods"])
+        moves = {kind: placed.balls[kind].moves for kind in ("pads", "links", "objects")}
+        of_bodies = jnp.repeat(moves["objects"], t.radius.shape[1])
+        return Scenery(plates, capsules, jnp.concatenate([moves["pads"], moves["links"][t.bare], of_bodies, fixed]))
 
-            found = jax.lax.map(of_sphere, (spheres.centre, spheres.radius))
-            points.append(found[0])
-            velocities.append(found[1])
-        all_ = jax.tree.map(lambda *parts: jnp.concatenate(parts, 1), *points)
-        velocity = jnp.concatenate(velocities, 1)
-        return Ends(all_.depth, all_.place, all_.normal, velocity, self._stiffness, self._sliding)
+    def _capsules_of_bodies(self, placed: Placed) -> Segments:
+        """Return the capsules of all free bodies in the world, [k c]."""
+        t = self._tables
+        start, end = (placed.position[:, None] + jnp.einsum("kij,kcj->kci", placed.frames, x) for x in (t.start, t.end))
+        return Segments(start.reshape(-1, 3), end.reshape(-1, 3), t.radius.ravel())
 
-    def _point(self, placed: Placed, kind: str, number: Array, sphere: Segments) -> Points:
-        """Return where a sphere touches one shape."""
-        if kind in ("pads", "plates"):
-            return row_of(on_plate(sphere, self._places.plate(placed, kind, number)), 0)
-        capsules = self._places.capsules(placed, kind, number)
-        points = jax.vmap(lambda capsule: between_segments(sphere, capsule))(capsules)
-        return row_of(points, jnp.argmax(points.depth))
+    def _tied(self, tie: Tie, shapes: Shapes, bodies: Bodies) -> End:
+        """Return the contact by which the system is tied."""
+        shape, place = self._shapes, self._tied_to(tie, bodies)
+        if tie.body is not None:
+            shape = self._starts["objects"] + self._tables.names.index(tie.body) * self._tables.radius.shape[1]
+        point = shapes.start[tie.part] + tie.share * (shapes.end[tie.part] - shapes.start[tie.part])
+        normal, offset = jnp.array([0.0, 0.0, 1.0]), point - place
+        return End(
+            jnp.int32(tie.part), jnp.float32(tie.share), jnp.int32(shape), -offset[2], place, normal, jnp.float32(TIE),
+            jnp.float32(0.0), jnp.bool_(True), jnp.zeros(3), offset,
+        )  # fmt: skip
+
+    def tied(self, bodies: Bodies) -> Array:
+        """Return the places that the system is fastened to, m, [t, 3]."""
+        places = [self._tied_to(tie, bodies) for tie in self._system.ties]
+        return jnp.stack(places) if places else jnp.zeros((0, 3))
+
+    def _tied_to(self, tie: Tie, bodies: Bodies) -> Array:
+        place, t = jnp.asarray(tie.place, jnp.float32), self._tables
+        if tie.body is None:
+            return place
+        body = t.names.index(tie.body)
+        return bodies.position[body] + rotation(bodies.quaternion[body]) @ (place - t.centers[body])
 
     # -- loads
 
-    def on_arms(self, forces: ArmForces, loads: Loads, ends: Ends, joints: Joints) -> ArmForces:
-        """Return the forces on arms with loads: their forces in `smooth`, their stiffness in the mass matrices."""
+    def on_arms(
+        self, forces: ArmForces, response: Response, ends: Ends, joints: Joints, expected: Array, dt: Any
+    ) -> ArmForces:
+        """Return the forces on arms with a system's: in `smooth`, and how they fall with acceleration in the masses.
+
+        Args:
+            forces: on the arms.
+            response: of the system.
+            ends: of its contacts.
+            joints: axes of the arms' joints.
+            expected: accelerations of the joints for which the response holds, [a, m].
+            dt: duration of a step, s.
+        """
         a, m = forces.smooth.shape
-        lower = np.tril_indices(m)
+        arms, moved = jnp.asarray(self.arm), jnp.asarray(self._moved)
 
-        def add(sums: ArmForces, row: Any) -> tuple[ArmForces, None]:
-            arm, moves, force, stiffness, place = row
+        def jacobian(row: Array, end: End) -> Array:
+            return self._jacobian(joints, arms[end.shape], moved[end.shape], end.place).T
 
-            def loaded(sums: ArmForces) -> ArmForces:
-                jacobian = self._jacobian(joints, arm, moves, place)
-                block = (jacobian.T @ stiffness @ jacobian)[lower]
-                return sums._replace(
-                    mass=sums.mass.at[arm].add(block),
-                    implicit=sums.implicit.at[arm].add(block),
-                    smooth=sums.smooth.at[arm].add(force @ jacobian),
+        def loaded(arm: Array, pushed: Array, columns: Array) -> tuple[Array, Array]:
+            def column(j: Array) -> Array:
+                moves = each(ends, lambda row, end: columns[row, j] * (arms[end.shape] == arm), moving=True)
+                return self._sum(ends, columns, self._system.yielding(response, ends, moves, dt), arm)
+
+            block = jax.lax.map(column, jnp.arange(m, dtype=jnp.int32))
+            return block, pushed + block @ expected[arm]
+
+        def on_all(forces: ArmForces) -> ArmForces:
+            columns = each(ends, jacobian, moving=True)
+
+            def of_arm(arm: Array, forces: ArmForces) -> ArmForces:
+                pushed = self._sum(ends, columns, response.force, arm)
+                none = jnp.zeros((m, m)), jnp.zeros(m)
+                touched = (pushed != 0).any()
+                block, pushed = jax.lax.cond(touched, lambda: loaded(arm, pushed, columns), lambda: none)
+                lower = block[np.tril_indices(m)]
+                return forces._replace(  # a force is added to an array in place, outside of a branch
+                    mass=forces.mass.at[arm].add(lower, mode="promise_in_bounds"),
+                    implicit=forces.implicit.at[arm].add(lower, mode="promise_in_bounds"),
+                    smooth=forces.smooth.at[arm].add(pushed, mode="promise_in_bounds"),
                 )
 
-            touched = (arm < a) & (force != 0).any()
-            return jax.lax.cond(touched, loaded, lambda sums: sums, sums), None
+            return jax.lax.fori_loop(0, a, of_arm, forces)
 
-        rows = self._rows(loads, ends)
-        return jax.lax.scan(add, forces, (rows["arm"], rows["moves"], rows["force"], rows["stiffness"], rows["place"]))[
-            0
-        ]
+        return jax.lax.cond(ends.moving > 0, on_all, lambda forces: forces, forces) if a else forces
+
+    def _sum(self, ends: Ends, columns: Array, forces: Array, arm: Array) -> Array:
+        """Return the generalised force on one arm's joints, [m], by those on the ends, N, [c, 3]."""
+        arms = jnp.asarray(self.arm)
+
+        def add(row: Array, total: Array) -> Array:
+            mine = arms[ends.rows.shape[row]] == arm
+            return total + jnp.where(mine, columns[row] @ forces[row], 0.0)
+
+        found: Array = jax.lax.fori_loop(0, ends.moving, add, jnp.zeros(columns.shape[1]))
+        return found
 
     def on_bodies(
-        self, masses: Array, free: Array, loads: Loads, ends: Ends, bodies: Bodies
+        self, masses: Array, free: Array, response: Response, ends: Ends, bodies: Bodies, dt: Any
     ) -> tuple[Array, Array, Array]:
         """Return mass matrices [k, 6, 6] and accelerations [k, 6] of bodies with loads, and which have any, [k]."""
-        k = len(free)
+        k, owner = len(free), jnp.asarray(self.body)
         if not k:
             return masses, free, jnp.zeros(0, bool)
-        force = (masses @ free[..., None])[..., 0]
 
-        def add(sums: tuple[Array, Array, Array], row: Any) -> tuple[tuple[Array, Array, Array], None]:
-            body, pushed, stiffness, place = row
+        def of_body(row: tuple[Array, Array, Array, Bodies]) -> tuple[Array, Array, Array]:
+            number, mass, free, body = row
 
-            def loaded(sums: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-                motion = _motion_of(place - bodies.position.at[body].get(mode="clip"))
-                return (
-                    sums[0].at[body].add(motion.T @ stiffness @ motion),
-                    sums[1].at[body].add(pushed @ motion),
-                    sums[2].at[body].set(True),
-                )
+            def lever(end: End) -> Array:
+                return _motion_of(end.place - body.position)
 
-            touched = (body < k) & (pushed != 0).any()
-            return jax.lax.cond(touched, loaded, lambda sums: sums, sums), None
+            def total(forces: Array) -> Array:
+                def add(row: Array, total: Array) -> Array:
+                    end = row_of(ends.rows, row)
+                    return total + jnp.where(owner[end.shape] == number, forces[row] @ lever(end), 0.0)
 
-        rows = self._rows(loads, ends)
-        start = masses, force, jnp.zeros(k, bool)
-        (masses, force, touched), _ = jax.lax.scan(
-            add, start, (rows["body"], rows["force"], rows["stiffness"], rows["place"])
-        )
-        return masses, jax.vmap(lambda mass, own: solve_factored(cholesky(mass), own))(masses, force), touched
+                found: Array = jax.lax.fori_loop(0, ends.moving, add, jnp.zeros(6))
+                return found
 
-    def accelerations(
-        self, ends: Ends, joints: Joints, bodies: Bodies, by_arm: Array, by_body: Array
-    ) -> Array:  # fmt: skip
-        """Return the accelerations of the ends, m/s2, [n, r, 3], by those of joints [a, m] and of bodies [k, 6]."""
-        a, k = len(by_arm), len(by_body)
+            pushed = total(response.force)
+            touched = (pushed != 0).any()
 
-        def one(row: Any) -> Array:
-            arm, moves, body, place = row
-            found = jnp.zeros(3)
+            def loaded() -> tuple[Array, Array]:
+                def column(unit: Array) -> Array:
+                    moves = each(ends, lambda row, end: (lever(end) @ unit) * (owner[end.shape] == number), moving=True)
+                    return total(self._system.yielding(response, ends, moves, dt))
+
+                block = jax.lax.map(column, jnp.eye(6))
+                force = mass @ free + pushed + block @ body.acceleration
+                return mass + block, solve_factored(cholesky(mass + block), force)
+
+            return *jax.lax.cond(touched, loaded, lambda: (mass, free)), touched
+
+        found: tuple[Array, Array, Array] = jax.lax.map(of_body, (jnp.arange(k), masses, free, bodies))
+        return found
+
+    def accelerations(self, ends: Ends, joints: Joints, bodies: Bodies, by_arm: Array, by_body: Array) -> Array:
+        """Return the accelerations of the ends, m/s2, [c, 3], by those of joints [a, m] and of bodies [k, 6].
+
+        By velocities it returns velocities.
+        """
+        a, k, arms, owner = len(by_arm), len(by_body), jnp.asarray(self.arm), jnp.asarray(self.body)
+
+        def one(row: Array, end: End) -> Array:
+            del row
+            arm, body, found = arms[end.shape], owner[end.shape], jnp.zeros(3)
             if a:
+                moved = jnp.asarray(self._moved)[end.shape]
                 found = jax.lax.cond(
                     arm < a,
-                    lambda: self._jacobian(joints, arm, moves, place) @ by_arm.at[arm].get(mode="clip"),
+                    lambda: self._jacobian(joints, arm, moved, end.place) @ by_arm.at[arm].get(mode="clip"),
                     lambda: jnp.zeros(3),
                 )
             if k:
-                motion = _motion_of(place - bodies.position.at[body].get(mode="clip"))
+                motion = _motion_of(end.place - bodies.position.at[body].get(mode="clip"))
                 found += jnp.where(body < k, motion @ by_body.at[body].get(mode="clip"), 0.0)
             return found
 
-        rows = self._rows(None, ends)
-        found: Array = jax.lax.map(one, (rows["arm"], rows["moves"], rows["body"], rows["place"]))
-        return found.reshape(ends.place.shape)
+        accelerations: Array = each(ends, one, moving=True)
+        return accelerations
+
+    def hardest(self, ends: Ends, forces: Array, arms: int) -> Array:
+        """Return the largest normal force on each arm, N, and the largest one that is not a finger's, [2, a]."""
+        owner, fingers = jnp.asarray(self.arm), jnp.asarray(self.fingers)
+
+        def more(row: Array, most: Array) -> Array:
+            end = row_of(ends.rows, row)
+            on_arm = owner[end.shape] == np.arange(arms)
+            kinds = jnp.stack([on_arm, on_arm & ~fingers[end.shape]])
+            return jnp.maximum(most, jnp.where(kinds, jnp.abs(forces[row] @ end.normal), 0.0))
+
+        found: Array = jax.lax.fori_loop(0, ends.moving, more, jnp.zeros((2, arms)))
+        return found
 
     def _jacobian(self, joints: Joints, arm: Array, moves: Array, place: Array) -> Array:
         """Return the velocity of a place of a link by velocity of its arm's joints, [3, m]."""
         moving, _ = joints.columns(jnp.asarray(self._tables.slides), place)
         return (moving.at[arm].get(mode="clip") * moves[:, None]).T
 
-    def _rows(self, loads: Loads | None, ends: Ends) -> dict[str, Array]:
-        """Return the contacts of all spheres as rows, [n r], by column."""
-        n = len(ends.depth)
-        rows = {"arm": np.tile(self.arm, n), "moves": np.tile(self.moves, (n, 1)), "body": np.tile(self.body, n)}
-        found = {name: jnp.asarray(values) for name, values in rows.items()}
-        found["place"] = ends.place.reshape(-1, 3)
-        if loads is not None:
-            found["force"], found["stiffness"] = loads.force.reshape(-1, 3), loads.stiffness.reshape(-1, 3, 3)
-        return found
+
+def _joined(*parts: Any) -> Array:
+    return jnp.concatenate([jnp.asarray(part) for part in parts])
 
 
 def _motion_of(offset: Array) -> Array:

@@ -1,4 +1,4 @@
-"""A system of plug-ins: something that moves by its own equations and meets arms and rigid bodies in contacts.
+"""A system beside arms and rigid bodies: something that moves by its own equations and meets these in contacts.
 
 A package declares its systems in the entry-point group `surgical_marl.systems`, a program registers them
 (`surgical_marl.register_system`), and a scene file names them:
@@ -19,78 +19,130 @@ from jax import Array
 from surgical_marl.scenes.objects import Surface
 
 
-class Spheres(NamedTuple):
-    """The collision shapes of a system: n spheres. World."""
+class Shapes(NamedTuple):
+    """The collision shapes of a system: p capsules, its parts. A sphere's two ends are one point. World."""
 
-    centre: Array
-    """m, [n, 3]"""
-    radius: Array
-    """m, [n]"""
-    velocity: Array
-    """m/s, [n, 3]"""
+    start: Array
+    """m, [p, 3]"""
+    end: Array
+    """m, [p, 3]"""
+    radius: Any
+    """m, [p]"""
+    speed: Array
+    """Largest speed of any point of it, m/s, [p]."""
+
+
+class Tie(NamedTuple):
+    """A point of a system that is fastened to a free body or to the world."""
+
+    part: int
+    """Number of the part."""
+    share: float
+    """Where on it the point is: 0 at its start, 1 at its end."""
+    body: str | None
+    """Name of the body; None for the world."""
+    place: tuple[float, float, float]
+    """The place that it is fastened to: in the body's frame, from its origin, or in the world, m."""
+
+
+class End(NamedTuple):
+    """A contact of a part of a system with a shape of an arm, a rigid body or a fixed thing, [...]. World."""
+
+    part: Array
+    """Number of the part."""
+    share: Array
+    """Where on it the contact is: 0 at its start, 1 at its end."""
+    shape: Array
+    """Number of the shape."""
+    depth: Array
+    """Overlap, m; negative for a distance."""
+    place: Array
+    """Midway between the two surfaces, m, [..., 3]."""
+    normal: Array
+    """Unit vector from the shape to the part, [..., 3]."""
+    stiffness: Array
+    """Of the contact, along the normal and along the surface, N/m."""
+    sliding: Array
+    """Coefficient of friction."""
+    bilateral: Array
+    """Whether it ties both together: it pulls too, and does not slip."""
+    shift: Array
+    """How far the shape moves in the step if it accelerates as in the last one, m, [..., 3]."""
+    stretch: Array
+    """Of the spring along the surface at the start of the step, m, [..., 3]; 0 if nothing is remembered."""
 
 
 class Ends(NamedTuple):
-    """The ends, on arms, rigid bodies and fixed things, of contacts with n spheres: r shapes each. World."""
+    """All contacts of a system: a list of fixed size. Those with what moves come first."""
 
-    depth: Array
-    """Overlap, m, [n, r]; negative for a distance."""
-    place: Array
-    """Midway between the two surfaces, m, [n, r, 3]."""
-    normal: Array
-    """Unit vector from the shape to the sphere, [n, r, 3]."""
-    velocity: Array
-    """Of the shape at that place, m/s, [n, r, 3]."""
-    stiffness: Any
-    """Of the contact, N/m, [r]."""
-    sliding: Any
-    """Coefficient of friction, [r]."""
+    rows: End
+    """[c, ...]"""
+    moving: Array
+    """Number of contacts with arms and free bodies, []."""
+    count: Array
+    """Number of all contacts, []. Rows from there on are empty."""
+    left_out: Array
+    """Number of contacts that found no room, []."""
 
 
-class Loads(NamedTuple):
-    """Forces of a system on the ends of its contacts, linear in the accelerations of the ends, [n, r]. World."""
+class Response(NamedTuple):
+    """The answer of a system to its contacts."""
 
     force: Array
-    """At the start of the step's solve, while ends do not accelerate, N, [n, r, 3]."""
-    stiffness: Array
-    """By how much the force falls per acceleration of its end, kg, [n, r, 3, 3]; symmetric, positive semidefinite."""
+    """On the ends if they move by `shift`, N, [c, 3]."""
+    solved: Any
+    """Whatever `yielding` and `apply` need."""
 
 
 class System(ABC):
     """One system of a scene. Its state is a tree of arrays; all methods are pure JAX functions of one environment.
 
-    A physics step calls `shapes`, finds the ends of contacts, asks `respond` for the loads on them, solves arms and
-    rigid bodies with these, and calls `apply` with the accelerations of the ends.
+    A physics step calls `shapes`, finds the ends of contacts, asks `respond` for the forces on them, loads arms and
+    rigid bodies with these and with how they yield, solves them, and calls `apply` with the accelerations of the ends.
     """
 
     surface: Surface
-    """Friction and stiffness of its spheres."""
+    """Friction and stiffness of its parts."""
+    ties: tuple[Tie, ...] = ()
+    """Where it is fastened."""
+
+    @property
+    @abstractmethod
+    def contacts(self) -> int:
+        """Room for contacts, ties included."""
 
     @abstractmethod
-    def start(self) -> Any:
-        """Return the state at the beginning of an episode."""
+    def start(self, places: Array) -> Any:
+        """Return the state at the beginning of an episode, with its ties fastened at these places, m, [t, 3]."""
 
     @abstractmethod
-    def shapes(self, state: Any) -> Spheres:
-        """Return the spheres that others can touch."""
+    def shapes(self, state: Any) -> Shapes:
+        """Return the capsules that others can touch."""
 
     @abstractmethod
     def free_motion(self, state: Any, dt: Any) -> Any:
-        """Return the forces on the system without contacts, in any form that `respond` and `apply` take."""
+        """Return the forces on the system without contacts, in any form that `respond` takes."""
 
     @abstractmethod
-    def respond(self, state: Any, motion: Any, ends: Ends, dt: Any) -> Loads:
-        """Return the loads on the ends of contacts, with the system's own unknowns eliminated (Schur complement)."""
+    def respond(self, state: Any, motion: Any, ends: Ends, dt: Any) -> Response:
+        """Return the forces on the ends of contacts, with the system's own unknowns eliminated (Schur complement)."""
 
     @abstractmethod
-    def apply(self, state: Any, motion: Any, ends: Ends, accelerations: Array, dt: Any) -> Any:
-        """Return the state after a step in which the ends have these accelerations, m/s2, [n, r, 3]."""
+    def yielding(self, response: Response, ends: Ends, accelerations: Array, dt: Any) -> Array:
+        """Return by how much the forces on the ends fall as the ends accelerate, N, [c, 3].
+
+        It is linear in the accelerations beyond those of `shift`, m/s2, [c, 3], symmetric and positive semidefinite.
+        """
+
+    @abstractmethod
+    def apply(self, state: Any, response: Response, ends: Ends, accelerations: Array, dt: Any) -> Any:
+        """Return the state after a step in which the ends accelerate by so much beyond `shift`, m/s2, [c, 3]."""
 
     def view(self, state: Any) -> Any:
-        """Return the part of the state that tasks see: all of it by default. Nothing in this package calls it."""
+        """Return the part of the state that tasks see: all of it by default."""
         return state
 
     def randomise(self, key: Array) -> System:
-        """Return the system with values drawn by a key: itself by default. Nothing in this package calls it."""
+        """Return the system with values drawn by a key: itself by default."""
         del key
         return self

@@ -39,7 +39,7 @@ class Pictures:
         """Show the current pictures."""
         shown = {}
         if self._endoscope is not None:
-            qpos, poses = self._session.env.qpos, self._session.env.object_poses
+            qpos, poses = self._session.env.qpos, self._session.env.drawn_poses
             view = self._endoscope.render(qpos[:1], Poses(poses.origin[:1], poses.quaternion[:1]))
             shown[f"endoscope of {self._endoscope.agent}"] = view.rgb[0, 0]
         shown |= observed(self._session.observations)

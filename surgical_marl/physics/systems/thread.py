@@ -1,0 +1,258 @@
+"""Suture thread: a chain that arms, objects and boards touch, and that they hold by friction alone.
+
+thread = scene.systems["thread"]                 # of an object with `kind: thread`
+physics.systems["thread"].chain.position         # m, [n, 3]
+world.systems["thread"].tension                  # N, [n - 1]
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from surgical_marl.content import unknown
+from surgical_marl.physics.contact.spring_contact import Stretches, each, feel, none, recall, remember
+from surgical_marl.physics.systems.chain import ChainState, Loaded, Newton, Rod, free_forces, search, solve
+from surgical_marl.physics.systems.system import End, Ends, Response, Shapes, System, Tie
+from surgical_marl.physics.tree_utils import row_of
+from surgical_marl.scenes.objects import Placement, Surface
+from surgical_marl.scenes.thread_file import ThreadFile
+from surgical_marl.untrusted.schema import Place
+
+ITERATIONS = 4
+"""Newton steps of a physics step."""
+SPARE = 24
+"""Room for contacts beyond one for each edge: a thread may lie on a board, and be held by jaws too."""
+TAIL = "tail"
+"""The site of a needle that a thread is fastened to."""
+_LOWER = np.tril_indices(3)
+_FULL = np.array([[0, 1, 3], [1, 2, 4], [3, 4, 5]])
+
+
+class ThreadState(NamedTuple):
+    """The state of a thread."""
+
+    chain: ChainState
+    stretches: Stretches
+    holds: Array
+    """1 for edges that hold, 0 for a broken one and after the last node, [n]."""
+
+
+class ThreadView(NamedTuple):
+    """A thread of n nodes as tasks see it. World."""
+
+    position: Array
+    """m, [n, 3]"""
+    velocity: Array
+    """m/s, [n, 3]"""
+    tension: Array
+    """Of the edges between nodes, N, [n - 1]; negative where a stiff one is compressed."""
+    broken: Array
+    """Whether it has been torn, [] bool."""
+
+
+class Solved(NamedTuple):
+    """A step of a thread whose ends move as expected."""
+
+    newton: Newton
+    ends: Ends
+    """With the stretches that are remembered."""
+    falls: Array
+    """Of the force of each contact with what moves as its point moves, N/m: lower halves, [c, 6]."""
+    holds: Any
+    """As in `ThreadState`."""
+
+
+@dataclass(frozen=True)
+class Thread(System):
+    """A thread."""
+
+    nodes: int
+    length: float
+    """m"""
+    diameter: float
+    """m"""
+    young: float
+    """Young's modulus, Pa."""
+    density: float
+    """kg/m3"""
+    surface: Surface
+    path: tuple[tuple[float, float, float], ...]
+    """Where the nodes are at the start, m, [n, 3]."""
+    ties: tuple[Tie, ...] = ()
+    drag: float = 2.0
+    """Force of the air per mass and speed, 1/s."""
+    strength: float | None = None
+    """Tension at which it tears, N; None if it never does."""
+    colour: tuple[float, float, float] = (0.25, 0.2, 0.55)
+    """In pictures."""
+    file: ClassVar[type] = ThreadFile
+    """The content of its file."""
+
+    @classmethod
+    def placed(cls, item: Placement, entry: Any, others: Mapping[str, Placement], place: Place) -> Thread:
+        """Return a thread that lies in a scene.
+
+        Args:
+            item: its file and where its first node is.
+            entry: of the scene file (`PlacementEntry`).
+            others: rigid objects of the scene by name.
+            place: of the entry in the file.
+
+        Raises:
+            ValueError: an end is tied to what is not there or has no tail.
+        """
+        about: ThreadFile = item.object.soft
+        young, density = about.elasticity
+        path = item.position + about.path() @ item.rotation.T
+        last = about.nodes - 2
+        wanted = (0, 0.0, getattr(entry.tied, "first", None)), (last, 1.0, getattr(entry.tied, "last", None))
+        ties = tuple(
+            _tie(part, share, name, path[round(part + share)], others, place) for part, share, name in wanted if name
+        )
+        return cls(about.nodes, about.length, about.diameter, young, density, item.object.surface,
+                   tuple(map(tuple, path.tolist())), ties, about.drag, about.strength, about.colour)  # fmt: skip
+
+    @cached_property
+    def rod(self) -> Rod:
+        """Material and size of the chain."""
+        area, inertia = np.pi * self.diameter**2 / 4, np.pi * self.diameter**4 / 64
+        return Rod(self.nodes, self.length / (self.nodes - 1), self.density * area, self.young * area,
+                   self.young * inertia, self.drag)  # fmt: skip
+
+    @property
+    def contacts(self) -> int:
+        return self.nodes - 1 + SPARE + len(self.ties)
+
+    def start(self, places: Array) -> ThreadState:
+        """Return the thread at rest. It begins where its first tie is."""
+        position = jnp.asarray(self.path, jnp.float32)
+        if self.ties:
+            tie = self.ties[0]
+            position += places[0] - position[tie.part + round(tie.share)]
+        still = jnp.zeros((self.nodes, 3), jnp.float32)
+        holds = jnp.asarray(np.append(np.ones(self.nodes - 1), 0.0), jnp.float32)
+        return ThreadState(ChainState(position, still, still[:, 0]), none(self.contacts), holds)
+
+    def shapes(self, state: ThreadState) -> Shapes:
+        position = state.chain.position
+        speed = jnp.sqrt(jnp.sum(state.chain.velocity * state.chain.velocity, -1))
+        radius = np.full(self.nodes - 1, self.diameter / 2, np.float32)
+        return Shapes(position[:-1], position[1:], radius, jnp.maximum(speed[:-1], speed[1:]))
+
+    def free_motion(self, state: ThreadState, dt: Any) -> Array:
+        """Return inertia and weight of the nodes, N, [n, 3]."""
+        return free_forces(self.rod, state.chain, dt)
+
+    def respond(self, state: ThreadState, motion: Array, ends: Ends, dt: Any) -> Response:
+        ends, holds = recall(state.stretches, ends, self.nodes - 1), self._holds(state)
+        found = search(self.rod, state.chain, motion, lambda u: _load(ends, u), dt, ITERATIONS, holds)
+
+        def at_end(row: Array, end: End) -> tuple[Array, Array]:
+            del row
+            felt = feel(end, _point(end, found.shift) - end.shift)
+            force = felt.force - felt.stiffness @ _point(end, found.change[:, :3])
+            return -force, felt.stiffness[_LOWER]
+
+        force, falls = each(ends, at_end, moving=True)
+        return Response(force, Solved(found, ends, falls, holds))
+
+    def yielding(self, response: Response, ends: Ends, accelerations: Array, dt: Any) -> Array:
+        pushes, change = self._carried(response.solved, accelerations, dt)
+
+        def eased(row: Array, end: End) -> Array:
+            return pushes[row] - response.solved.falls[row][_FULL] @ _point(end, change[:, :3])
+
+        found: Array = each(ends, eased, moving=True)
+        return found
+
+    def apply(self, state: ThreadState, response: Response, ends: Ends, accelerations: Array, dt: Any) -> ThreadState:
+        found, own = response.solved.newton, response.solved.ends
+        carried = jax.lax.cond(
+            ends.moving > 0,
+            lambda: self._carried(response.solved, accelerations, dt)[1],
+            lambda: jnp.zeros((self.nodes, 4)),
+        )
+        change = found.change + carried
+        u, tension = found.shift + change[:, :3], found.tension + change[:, 3]
+        stretches = remember(
+            own,
+            lambda row, end: _point(end, u) - end.shift - dt * dt * accelerations[row],
+            self.nodes - 1,
+        )
+        holds = state.holds
+        if self.strength is not None:
+            holds = jnp.where(tension > self.strength, 0.0, holds)
+        return ThreadState(ChainState(state.chain.position + u, u / dt, tension), stretches, holds)
+
+    def view(self, state: ThreadState) -> ThreadView:
+        chain = state.chain
+        broken = jnp.sum(state.holds) < self.nodes - 1.5
+        return ThreadView(chain.position, chain.velocity, chain.tension[:-1], broken)
+
+    def _carried(self, solved: Solved, accelerations: Array, dt: Any) -> tuple[Array, Array]:
+        """Return what the ends add to the step by accelerating: pushes, N, [c, 3], and changes of unknowns, [n, 4]."""
+        ends, n = solved.ends, self.nodes
+        pushes: Array = each(
+            ends, lambda row, end: dt * dt * (solved.falls[row][_FULL] @ accelerations[row]), moving=True
+        )
+
+        def add(row: Array, sums: Array) -> Array:
+            end = row_of(ends.rows, row)
+            return _spread(sums, end.part, (1 - end.share) * pushes[row], end.share * pushes[row])
+
+        forces = jax.lax.fori_loop(0, ends.moving, add, jnp.zeros((n, 3)))
+        return pushes, solve(self.rod, solved.newton.factors, forces, solved.holds)
+
+    def _holds(self, state: ThreadState) -> Any:
+        """Return which edges hold, [n]: constants if the thread can't tear."""
+        return state.holds if self.strength is not None else np.append(np.ones(self.nodes - 1), 0.0).astype(np.float32)
+
+
+def _tie(
+    part: int, share: float, name: str, node: np.ndarray, others: Mapping[str, Placement], place: Place
+) -> Tie:  # fmt: skip
+    """Return the tie of a node to the tail of an object of this name, or to where it is in the world."""
+    if name == "world":
+        return Tie(part, share, None, tuple(node.tolist()))
+    good = [other for other, item in others.items() if item.object.free and TAIL in item.object.sites]
+    if name not in good:
+        raise ValueError(f"{place}.tied: {unknown('object with a tail', name, ['world', *good])}")
+    return Tie(part, share, name, tuple(others[name].object.sites[TAIL][0].tolist()))
+
+
+def _point(end: End, u: Array) -> Array:
+    """Return the displacement [3] of the point of a contact by those of the nodes, [n, 3]."""
+    return (1 - end.share) * u[end.part] + end.share * u[end.part + 1]
+
+
+def _spread(rows: Array, part: Array, first: Array, second: Array) -> Array:
+    """Return rows [n, ...] with more at both nodes of an edge."""
+    rows = rows.at[part].add(first, mode="promise_in_bounds")
+    return rows.at[part + 1].add(second, mode="promise_in_bounds")
+
+
+def _load(ends: Ends, u: Array) -> Loaded:
+    """Return the forces of contacts on the nodes at displacements u, m, [n, 3]."""
+
+    def add(row: Array, sums: Loaded) -> Loaded:
+        end = row_of(ends.rows, row)
+        felt = feel(end, _point(end, u) - end.shift)
+        first, second, falls = 1 - end.share, end.share, felt.stiffness[_LOWER]
+        return Loaded(
+            _spread(sums.force, end.part, first * felt.force, second * felt.force),
+            _spread(sums.own, end.part, first * first * falls, second * second * falls),
+            sums.across.at[end.part].add(first * second * falls, mode="promise_in_bounds"),
+        )
+
+    n = len(u)
+    start = Loaded(jnp.zeros((n, 3)), jnp.zeros((n, 6)), jnp.zeros((n, 6)))
+    found: Loaded = jax.lax.fori_loop(0, ends.count, add, start)
+    return found

@@ -1,0 +1,100 @@
+"""A thread that touches: friction as Coulomb says, on a board, around a cylinder, between pads; nothing creeps."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.helpers.thread_bench import DT, Bench, Told, axis_plate, suture
+
+
+def line(nodes: int, length: float, height: float = 0.0) -> np.ndarray:
+    return np.stack([np.linspace(0.0, length, nodes), np.zeros(nodes), np.full(nodes, height)], 1)
+
+
+def test_a_board_holds_back_what_is_dragged_over_it() -> None:
+    """By mu times its weight; the end that pulls hangs in the air."""
+    n, mu, speed = 20, 0.5, 0.01
+    thread = suture(line(n, 0.05, 0.11e-3), drag=0.0)
+    bench = Bench(thread, plates=[axis_plate([0, 0, -1e-4], [1, 1], 1e-4)], mu=mu)  # float32 knows thin plates best
+    end = thread.path[-1]
+
+    def told(k: object) -> Told:
+        return Told(ties=[(n - 2, 1.0, jnp.array(end) + speed * DT * (k + 1) * jnp.array([1.0, 0, 0]))])
+
+    _, seen = bench.run(bench.start(), 400, told)
+    weight = thread.rod.mass.sum() * 9.81
+    late = slice(200, None)
+    borne, pull = np.asarray(seen.normal)[late], np.asarray(seen.tied)[late, 0, 0]
+    np.testing.assert_allclose(-np.asarray(seen.friction)[late, 0], mu * borne, rtol=1e-3)
+    np.testing.assert_allclose(borne.mean(), weight, rtol=1e-2)  # the end that is led bears some
+    np.testing.assert_allclose(pull.mean(), mu * borne.mean(), rtol=1e-3)
+
+
+def test_a_cylinder_holds_back_as_a_capstan_does() -> None:
+    n, radius, mu, low = 48, 0.008, 0.3, 0.1
+    edge = 1.3e-3
+    r = radius + 0.11e-3
+    turn = 2 * np.arctan(edge / 2 / r)  # edges touch the cylinder with their middles
+    lead = (n - 1 - int(np.pi / turn)) // 2
+    angles = np.clip(np.arange(n - 1) - lead, 0, int(np.pi / turn)) * turn  # of each edge
+    steps = edge * np.stack([np.sin(angles), 0 * angles, np.cos(angles)], 1)
+    path = np.concatenate([[[-r, 0, -edge * (lead + 0.5)]], steps]).cumsum(0)
+    thread = suture(path, bending=0.01)
+    bench = Bench(thread, rods=[([0, -0.02, 0], [0, 0.02, 0], radius)], mu=mu)
+    pull = np.zeros((n, 3), np.float32)
+    pull[0, 2] = -low
+
+    def told(k: object) -> Told:
+        way = 0.004 * DT * jnp.maximum(k - 200, 0)
+        return Told(ties=[(n - 2, 1.0, jnp.array(path[-1]) - jnp.array([0.0, 0, 1.0]) * way)],
+                    pull=pull * jnp.minimum((k + 1) / 200, 1.0))  # fmt: skip
+
+    _, seen = bench.run(bench.start(), 700, told)
+    tension, edges = np.asarray(seen.tension)[400:], np.diff(np.asarray(seen.position)[400:], axis=1)
+    ratio = tension[:, n - 2] / tension[:, 0]
+    slopes = np.unwrap(np.arctan2(edges[..., 2], edges[..., 0]))
+    angle = slopes[:, 0] - slopes[:, -1]
+    assert angle.min() > 3.0
+    np.testing.assert_allclose(ratio.mean(), np.exp(mu * angle.mean()), rtol=1e-2)
+
+
+@pytest.fixture(scope="module")
+def pinched() -> tuple[Bench, float]:
+    """Return a thread between two pads of 10 mm, and the pull at which Coulomb lets it slip."""
+    n, mu, overlap = 30, 0.8, 5e-6
+    thread = suture(line(n, 0.06) - [0.03, 0, 0])
+    apart = 0.0006 + 0.11e-3 - overlap
+    bench = Bench(thread, plates=[axis_plate([0, 0, sign * apart], [0.0044, 0.002], 0.0006) for sign in (-1, 1)], mu=mu)
+    return bench, mu
+
+
+def pull_on(bench: Bench, size: object) -> np.ndarray:
+    pull = jnp.zeros((bench.thread.nodes, 3)).at[-1, 0].set(1.0)
+    return pull * size
+
+
+def test_pads_let_slip_at_mu_times_what_they_press_with(pinched: tuple[Bench, float]) -> None:
+    """And not before: until then the springs of friction give way by less than 0.1 um a step."""
+    bench, mu = pinched
+    settled, seen = bench.run(bench.start(), 50, lambda k: Told())
+    press, steps = float(seen.normal[-1]), 800
+    np.testing.assert_allclose(press, 2 * 1e4 * 5e-6 * 0.0088 / bench.thread.rod.length, rtol=1e-2)
+    _, seen = bench.run(settled, steps, lambda k: Told(pull=pull_on(bench, 1.1 * mu * press * (k + 1) / steps)))
+    place = np.asarray(seen.position)[:, 10:20, 0].mean(1)
+    slides = np.diff(place, prepend=place[0]) > 3e-7
+    assert slides.any()
+    np.testing.assert_allclose(1.1 * (slides.argmax() + 1) / steps, 1.0, atol=1e-2)
+
+
+def test_pads_hold_for_ten_seconds_without_creep(pinched: tuple[Bench, float]) -> None:
+    bench, mu = pinched
+    settled, seen = bench.run(bench.start(), 50, lambda k: Told())
+    press = float(seen.normal[-1])
+    held, _ = bench.run(
+        settled, 200, lambda k: Told(pull=pull_on(bench, 0.9 * mu * press * jnp.minimum((k + 1) / 100, 1)))
+    )
+    later, _ = bench.run(held, 4000, lambda k: Told(pull=pull_on(bench, 0.9 * mu * press)))
+    drift = np.abs(np.asarray(later.chain.position - held.chain.position)).max()
+    assert drift < 1e-6
