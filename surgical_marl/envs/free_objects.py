@@ -55,7 +55,7 @@ class FreeObjects:
             found.append(Poses(*along(nodes[:, :-1], nodes[:, 1:])))
         if len(found) == 1:
             return found[0]
-        joined = np.concatenate
+        joined: Any = np.concatenate
         if library == "torch":
             import torch
 

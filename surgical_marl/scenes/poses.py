@@ -34,7 +34,8 @@ def along(start: Any, end: Any) -> tuple[Any, Any]:
         start: of the lines, m, [..., 3], of numpy or torch.
         end: likewise.
     """
-    way, xp = end - start, np
+    way = end - start
+    xp: Any = np
     if not isinstance(start, np.ndarray):
         import torch
 

@@ -25,7 +25,7 @@ TIE = 2e4
 def suture(path: np.ndarray, diameter: float = 0.22e-3, bending: float = 1.0, **more: Any) -> Thread:
     """Return a thread of nylon along a path [n, 3] of equal edges; `bending` is a factor of its stiffness."""
     length = float(np.linalg.norm(np.diff(path, axis=0), axis=-1).sum())
-    given = {"young": 2e9, "density": 1140.0, "surface": Surface(0.3, 0.0, 1e4), "drag": 20.0} | more
+    given: dict[str, Any] = {"young": 2e9, "density": 1140.0, "surface": Surface(0.3, 0.0, 1e4), "drag": 20.0} | more
     thread = Thread(len(path), length, diameter, path=tuple(map(tuple, path.tolist())), **given)
     thread.__dict__["rod"] = thread.rod._replace(bending=bending * thread.rod.bending)
     return thread
@@ -123,8 +123,8 @@ class Bench:
 
         forces = each(ends, force)
         along = jnp.sum(forces * ends.rows.normal, -1)
-        touching = (jnp.arange(len(along)) < ends.count - ties)[:, None]
+        touching = (jnp.arange(len(along)) < ends.total - ties)[:, None]
         friction = jnp.where(touching, forces - along[:, None] * ends.rows.normal, 0.0).sum(0)
-        tied = jax.lax.dynamic_slice(forces, (ends.count - ties, 0), (ties, 3)) if ties else jnp.zeros((0, 3))
+        tied = jax.lax.dynamic_slice(forces, (ends.total - ties, 0), (ties, 3)) if ties else jnp.zeros((0, 3))
         chain = after.chain
         return Seen(chain.position, chain.tension, jnp.where(touching[:, 0], along, 0.0).sum(), friction, tied)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax import Array
 
 from tests.helpers.thread_bench import DT, Bench, Told, axis_plate, suture
 
@@ -20,7 +23,7 @@ def test_a_board_holds_back_what_is_dragged_over_it() -> None:
     bench = Bench(thread, plates=[axis_plate([0, 0, -1e-4], [1, 1], 1e-4)], mu=mu)  # float32 knows thin plates best
     end = thread.path[-1]
 
-    def told(k: object) -> Told:
+    def told(k: Any) -> Told:
         return Told(ties=[(n - 2, 1.0, jnp.array(end) + speed * DT * (k + 1) * jnp.array([1.0, 0, 0]))])
 
     _, seen = bench.run(bench.start(), 400, told)
@@ -46,7 +49,7 @@ def test_a_cylinder_holds_back_as_a_capstan_does() -> None:
     pull = np.zeros((n, 3), np.float32)
     pull[0, 2] = -low
 
-    def told(k: object) -> Told:
+    def told(k: Any) -> Told:
         way = 0.004 * DT * jnp.maximum(k - 200, 0)
         return Told(ties=[(n - 2, 1.0, jnp.array(path[-1]) - jnp.array([0.0, 0, 1.0]) * way)],
                     pull=pull * jnp.minimum((k + 1) / 200, 1.0))  # fmt: skip
@@ -70,7 +73,7 @@ def pinched() -> tuple[Bench, float]:
     return bench, mu
 
 
-def pull_on(bench: Bench, size: object) -> np.ndarray:
+def pull_on(bench: Bench, size: Any) -> Array:
     pull = jnp.zeros((bench.thread.nodes, 3)).at[-1, 0].set(1.0)
     return pull * size
 

@@ -13,7 +13,7 @@ from jax import Array
 from surgical_marl.physics.contact.broadphase import nearest, size
 from surgical_marl.physics.contact.shapes import Plate, Points, Segments, between_segments, in_frame
 from surgical_marl.physics.systems.system import End, Ends, Shapes
-from surgical_marl.physics.tree_utils import Listed, picked, put, room, row_of
+from surgical_marl.physics.tree_utils import Listed, picked, put, room
 from surgical_marl.scenes.objects import Surface
 
 NEAR = 1e-4
@@ -44,10 +44,18 @@ class PartDetection:
         counts: number of shapes of each kind, in the order of their numbers: pads, links, objects, plates, rods.
         surfaces: friction and stiffness of the contact with each shape.
         room: the most contacts.
+        tied: parts that do not touch some shapes, as they are fastened to these: number of the part, those of the
+            first shape and of the one after the last.
     """
 
-    def __init__(self, counts: Mapping[str, int], surfaces: Sequence[Surface], room: int) -> None:
-        self._counts, self._room, self._shapes = counts, room, sum(counts.values())
+    def __init__(
+        self,
+        counts: Mapping[str, int],
+        surfaces: Sequence[Surface],
+        room: int,
+        tied: Sequence[tuple[int, int, int]] = (),
+    ) -> None:
+        self._counts, self._room, self._shapes, self._tied = counts, room, sum(counts.values()), tied
         self._starts = dict(zip(counts, np.cumsum([0, *counts.values()]), strict=False))
         self._stiffness = np.array([one.stiffness for one in surfaces], np.float32)
         self._sliding = np.array([one.sliding for one in surfaces], np.float32)
@@ -77,15 +85,17 @@ class PartDetection:
             found = jax.lax.fori_loop(0, jnp.minimum(pairs.length, NEAREST), meet, found)
         for tie in last:
             found = self._with(found, tie, jnp.bool_(True))
-        left_out = jnp.maximum(found.count - self._room, 0) + jnp.maximum(pairs.length - NEAREST, 0)
-        return Ends(row_of(found.rows, slice(0, -1)), found.moving, jnp.minimum(found.count, self._room), left_out)
+        left_out = jnp.maximum(found.total - self._room, 0) + jnp.maximum(pairs.length - NEAREST, 0)
+        return Ends(
+            jax.tree.map(lambda x: x[:-1], found.rows), found.moving, jnp.minimum(found.total, self._room), left_out
+        )
 
     def _with(self, ends: Ends, end: End, belongs: Array) -> Ends:
         """Return contacts with one more, if it belongs to them."""
         last = self._room
-        rows = put(ends.rows, jnp.where(belongs, jnp.minimum(ends.count, last), last), end)
-        moves = belongs & (end.shape < self._starts["plates"]) & (ends.count < last)
-        return Ends(rows, ends.moving + moves, ends.count + belongs, ends.left_out)
+        rows = put(ends.rows, jnp.where(belongs, jnp.minimum(ends.total, last), last), end)
+        moves = belongs & (end.shape < self._starts["plates"]) & (ends.total < last)
+        return Ends(rows, ends.moving + moves, ends.total + belongs, ends.left_out)
 
     def _split(self, shape: Array) -> tuple[Array, Array, Array]:
         """Return whether a shape is a plate, its number among plates, and that among capsules."""
@@ -172,8 +182,14 @@ class PartDetection:
         along = own.end - own.start
         share = jnp.clip((point.place - own.start) @ along / jnp.maximum(along @ along, 1e-12), 0.0, 1.0)
         stiffness, sliding = (jnp.asarray(x)[shape] for x in (self._stiffness, self._sliding))
-        end = End(part, share, shape, *point, weight * stiffness, sliding, jnp.bool_(False), jnp.zeros(3), jnp.zeros(3))
-        return end, point.depth > -reach
+        end = _no_end()._replace(
+            part=part, share=share, shape=shape, depth=point.depth, place=point.place, normal=point.normal,
+            stiffness=weight * stiffness, sliding=sliding,
+        )  # fmt: skip
+        touches = point.depth > -reach
+        for own_part, low, high in self._tied:
+            touches &= (part != own_part) | (shape < low) | (shape >= high)
+        return end, touches
 
 
 def on_face(part: Segments, plate: Plate) -> tuple[Points, Array]:

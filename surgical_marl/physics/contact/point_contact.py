@@ -50,7 +50,7 @@ def respond(mass: Array, force: Array, velocity: Array, ends: Ends, dt: Any) -> 
             felt = feel(end, u[end.part] - end.shift)
             return sums[0].at[end.part].add(felt.force), sums[1].at[end.part].add(felt.stiffness)
 
-        found: tuple[Array, Array] = jax.lax.fori_loop(0, ends.count, add, (force, inertia))
+        found: tuple[Array, Array] = jax.lax.fori_loop(0, ends.total, add, (force, inertia))
         return found
 
     def step(_: Any, state: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -89,5 +89,5 @@ def _carried(solved: Solved, ends: Ends, accelerations: Array, dt: Any) -> Array
         pushed = solved.falls[row] @ (dt * dt * accelerations[row])
         return sums.at[ends.rows.part[row]].add(pushed)
 
-    pushed = jax.lax.fori_loop(0, ends.count, add, jnp.zeros_like(solved.shift))
+    pushed = jax.lax.fori_loop(0, ends.total, add, jnp.zeros_like(solved.shift))
     return jax.vmap(solve_factored)(solved.factor, pushed)

@@ -38,7 +38,7 @@ class Stretches(NamedTuple):
     """Numbers of shape and part in one, ascending, [c]."""
     stretch: Array
     """m, [c, 3]"""
-    count: Array
+    total: Array
     """Number of contacts, []."""
 
 
@@ -73,25 +73,25 @@ def recall(memory: Stretches, ends: Ends, parts: int) -> Ends:
         key = _key(end, parts)
 
         def behind(at: Array) -> Array:
-            return (at < memory.count) & (memory.key[jnp.minimum(at, last)] < key - 1)
+            return (at < memory.total) & (memory.key[jnp.minimum(at, last)] < key - 1)
 
         at = jax.lax.while_loop(behind, lambda at: at + 1, at)
         best, stretch = jnp.int32(2), end.stretch
         for ahead in range(3):
             place = jnp.minimum(at + ahead, last)
-            off = jnp.where(at + ahead < memory.count, jnp.abs(memory.key[place] - key), 2)
+            off = jnp.where(at + ahead < memory.total, jnp.abs(memory.key[place] - key), 2)
             nearer = (off < best) & ~end.bilateral
             stretch, best = jnp.where(nearer, memory.stretch[place], stretch), jnp.where(nearer, off, best)
         return stretches.at[row].set(stretch, mode="promise_in_bounds"), at
 
-    stretches, _ = jax.lax.fori_loop(0, ends.count, one, (ends.rows.stretch, jnp.int32(0)))
+    stretches, _ = jax.lax.fori_loop(0, ends.total, one, (ends.rows.stretch, jnp.int32(0)))
     return ends._replace(rows=ends.rows._replace(stretch=stretches))
 
 
 def remember(ends: Ends, moved: Callable[[Array, End], Array], parts: int) -> Stretches:
     """Return the memory of contacts whose points move by `moved` relative to the shapes, as `each` calls it."""
     key, stretch = each(ends, lambda row, end: (_key(end, parts), feel(end, moved(row, end)).stretch))
-    return Stretches(key, stretch, ends.count)
+    return Stretches(key, stretch, ends.total)
 
 
 def each(ends: Ends, of: Callable[[Array, End], Any], moving: bool = False) -> Any:
@@ -102,7 +102,7 @@ def each(ends: Ends, of: Callable[[Array, End], Any], moving: bool = False) -> A
     def note(row: Array, found: Any) -> Any:
         return put(found, row, of(row, row_of(ends.rows, row)))
 
-    return jax.lax.fori_loop(0, ends.moving if moving else ends.count, note, start)
+    return jax.lax.fori_loop(0, ends.moving if moving else ends.total, note, start)
 
 
 def _key(end: End, parts: int) -> Array:

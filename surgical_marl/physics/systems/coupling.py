@@ -44,7 +44,8 @@ class Coupling:
         fixed = [*tables.surfaces["plates"], *tables.surfaces["rods"]]
         surfaces = [*arms, *(tables.surfaces["objects"][body] for body in bodies), *fixed]
         met = [system.surface.against(other) for other in surfaces]
-        self._detection = PartDetection(counts, met, system.contacts)
+        tied = [(tie.part, first := self._first_shape(tie.body), first + c) for tie in system.ties if tie.body]
+        self._detection = PartDetection(counts, met, system.contacts, tied)
         none = self._shapes + 1  # the number of all shapes stands for none: the end of a tie to the world
         self.arm, self.body = np.full(none, tables.arms, np.int32), np.full(none, k, np.int32)
         """The arm and the free body that each shape is of, [r + 1]; their numbers where it is of none."""
@@ -101,11 +102,12 @@ class Coupling:
         start, end = (placed.position[:, None] + jnp.einsum("kij,kcj->kci", placed.frames, x) for x in (t.start, t.end))
         return Segments(start.reshape(-1, 3), end.reshape(-1, 3), t.radius.ravel())
 
+    def _first_shape(self, body: str) -> int:
+        return int(self._starts["objects"]) + self._tables.names.index(body) * self._tables.radius.shape[1]
+
     def _tied(self, tie: Tie, shapes: Shapes, bodies: Bodies) -> End:
         """Return the contact by which the system is tied."""
-        shape, place = self._shapes, self._tied_to(tie, bodies)
-        if tie.body is not None:
-            shape = self._starts["objects"] + self._tables.names.index(tie.body) * self._tables.radius.shape[1]
+        place, shape = self._tied_to(tie, bodies), self._shapes if tie.body is None else self._first_shape(tie.body)
         point = shapes.start[tie.part] + tie.share * (shapes.end[tie.part] - shapes.start[tie.part])
         normal, offset = jnp.array([0.0, 0.0, 1.0]), point - place
         return End(

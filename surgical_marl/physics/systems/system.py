@@ -79,7 +79,7 @@ class Ends(NamedTuple):
     """[c, ...]"""
     moving: Array
     """Number of contacts with arms and free bodies, []."""
-    count: Array
+    total: Array
     """Number of all contacts, []. Rows from there on are empty."""
     left_out: Array
     """Number of contacts that found no room, []."""

@@ -254,5 +254,5 @@ def _load(ends: Ends, u: Array) -> Loaded:
 
     n = len(u)
     start = Loaded(jnp.zeros((n, 3)), jnp.zeros((n, 6)), jnp.zeros((n, 6)))
-    found: Loaded = jax.lax.fori_loop(0, ends.count, add, start)
+    found: Loaded = jax.lax.fori_loop(0, ends.total, add, start)
     return found
