@@ -119,6 +119,25 @@ def read_as(kind: type[T], path: Path) -> T:
     return found
 
 
+def merged(base: Any, patch: YamlMapping) -> YamlMapping:
+    """Return a mapping of a file, changed by a merge patch (RFC 7396) of the same file; keys keep their lines.
+
+    A value of the patch takes the place of the base's, a mapping changes a mapping key by key, and null removes a key.
+    """
+    found = YamlMapping()
+    if isinstance(base, YamlMapping):
+        found.update(base)
+        found.lines.update(base.lines)
+    for key, value in patch.items():
+        if value is None:
+            found.pop(key, None)
+            found.lines.pop(key, None)
+        else:
+            found[key] = merged(found.get(key), value) if isinstance(value, YamlMapping) else value
+            found.lines[key] = patch.lines[key]
+    return found
+
+
 def dump_yaml(value: Any, flow: bool = False) -> str:
     """Return a text that `parse_yaml` reads as this value, keys in their order; with `flow` on one line."""
     text: str = yaml.dump(value, Dumper=_Dumper, sort_keys=False, default_flow_style=flow, width=10**9)

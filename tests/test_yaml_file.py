@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import surgical_marl
-from surgical_marl.yaml_file import dump_yaml, load_yaml, parse_yaml
+from surgical_marl.yaml_file import dump_yaml, load_yaml, merged, parse_yaml
 
 
 @pytest.mark.parametrize(
@@ -70,6 +70,28 @@ def test_lines_of_keys_and_parts() -> None:
     found = parse_yaml("# first\na: 1\n\nb:\n  - 2\n  - {c: 3,\n     d: 4}\n")
     assert found.lines == {"a": 2, "b": 4}
     assert found["b"].lines == {0: 5, 1: 6} and found["b"][1].lines == {"c": 6, "d": 7}
+
+
+@pytest.mark.parametrize(
+    ("base", "patch", "result"),
+    [  # those of RFC 7396, appendix A, that are mappings
+        ("{a: b}", "{a: c}", {"a": "c"}),
+        ("{a: b}", "{b: c}", {"a": "b", "b": "c"}),
+        ("{a: b}", "{a: null}", {}),
+        ("{a: b, b: c}", "{a: null}", {"b": "c"}),
+        ("{a: [b]}", "{a: c}", {"a": "c"}),
+        ("{a: c}", "{a: [b]}", {"a": ["b"]}),
+        ("{a: {b: c}}", "{a: {b: d, c: null}}", {"a": {"b": "d"}}),
+        ("{a: [{b: c}]}", "{a: [1]}", {"a": [1]}),
+        ("{e: null}", "{a: 1}", {"e": None, "a": 1}),
+        ("{}", "{a: {bb: {ccc: null}}}", {"a": {"bb": {}}}),
+    ],
+)
+def test_a_merge_patch_is_that_of_rfc_7396(base: str, patch: str, result: Any) -> None:
+    one, other = parse_yaml(base), parse_yaml(f"\n{patch}")
+    found = merged(one, other)
+    assert found == result and one == parse_yaml(base)
+    assert found.lines == {key: 2 if key in other else 1 for key in result}
 
 
 plain = st.none() | st.booleans() | st.integers(-(10**40), 10**40) | st.floats(allow_nan=False)

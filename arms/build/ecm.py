@@ -36,8 +36,8 @@ SCOPE_PARTS = [(1.5, (0, 0, 0.481), (0.070, 0.079, 0.229))]  # in the scope's ow
 
 
 def build() -> dict[str, str]:
-    """URDF text by arm name."""
-    return {name: _build(name, tilt) for name, tilt in TILTS.items()}
+    """URDF text by the name of its file in `arms/`."""
+    return {f"{name}/{name}.urdf": _build(name, tilt) for name, tilt in TILTS.items()}
 
 
 def _build(name: str, tilt: float) -> str:

@@ -1,4 +1,4 @@
-"""The patient side manipulators: Classic with a Large Needle Driver 400006, Si with a 420006. One chain, two tables.
+"""The patient side manipulators: Classic with a Large Needle Driver 400006 or Cadiere Forceps 400049, Si with a 420006.
 
 The base frame is the remote center of motion (RCM). At zero every link frame is parallel to it: z points out of the
 patient, the shaft points along -z, and the arm's base stands on the -y side: the published yaw axis points from the RCM
@@ -7,19 +7,57 @@ to the base, and it is -y. Numbers and their sources: arms/psm/README.md and arm
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import atan2, hypot, pi
 
 from robot import Box, Cylinder, Inertial, Limits, Robot, Sphere, Vector
 
-WRIST_TO_YAW = 0.0091  # a5 of the DH table: wrist-pitch axis to wrist-yaw axis
-TIP = 0.0102  # wrist-yaw axis to the point between the jaws
+WRIST_TO_YAW = 0.0091  # a5 of the DH table: wrist-pitch axis to wrist-yaw axis, of all instruments here
 ALONG_X, ALONG_Y = (0, pi / 2, 0), (pi / 2, 0, 0)  # turn a cylinder's z to the x or y axis
 
 
 @dataclass(frozen=True)
+class Finger:
+    """A finger of a jaw, on the side of -x, along -z from the wrist-yaw axis. Lengths in m, mass in kg."""
+
+    tip: float
+    """From the wrist-yaw axis to the point between the jaws."""
+    length: float
+    """Likewise to the end of the finger."""
+    radius: float
+    """Of its capsule; the axis of the capsule is half of the drawn thickness beside the middle."""
+    inertial: Inertial
+    shapes: tuple[Box, ...]
+
+    def beside(self, side: int) -> tuple[list[Box], Cylinder]:
+        """What is drawn of the finger on one side (-1 or 1), and its capsule."""
+        drawn = [Box(box.size, (-side * box.at[0], *box.at[1:]), material=box.material) for box in self.shapes]
+        return drawn, Cylinder(self.radius, self.length, (-side * self.shapes[0].at[0], 0, -self.length / 2))
+
+
+NEEDLE_DRIVER = Finger(
+    tip=0.0102, length=0.0106, radius=0.0012, inertial=Inertial(0.00025, (1e-8, 1e-8, 1e-8), at=(0, 0, -0.005)),
+    shapes=(
+        Box((0.0012, 0.0050, 0.0064), (-0.0006, 0, -0.0032), material="steel"),
+        Box((0.0012, 0.0034, 0.0042), (-0.0006, 0, -0.0085), material="steel"),
+    ),
+)  # fmt: skip
+# The window of the blade is 2.5 x 10 mm: two rails beside it, and a bridge at its far end.
+CADIERE = Finger(
+    tip=0.0155, length=0.0199, radius=0.0015, inertial=Inertial(0.00076, (3.2e-8, 3.2e-8, 1e-8), at=(0, 0, -0.0095)),
+    shapes=(
+        Box((0.0015, 0.0034, 0.0061), (-0.00075, 0, -0.00305), material="steel"),
+        Box((0.0015, 0.0052, 0.0012), (-0.00075, 0, -0.0067), material="steel"),
+        Box((0.0015, 0.00135, 0.0100), (-0.00075, -0.001925, -0.0123), material="steel"),
+        Box((0.0015, 0.00135, 0.0100), (-0.00075, 0.001925, -0.0123), material="steel"),
+        Box((0.0015, 0.0052, 0.0026), (-0.00075, 0, -0.0186), material="steel"),
+    ),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
 class Variant:
-    """What differs between the two machines. Lengths in m, angles in rad, efforts in N m, N m, N."""
+    """What differs between machines and instruments. Lengths in m, angles in rad, efforts in N m, N m, N."""
 
     title: str
     offset: float
@@ -34,32 +72,36 @@ class Variant:
     """Radius and length."""
     cannula: tuple[float, float]
     """Radius and length."""
+    finger: Finger = NEEDLE_DRIVER
 
 
-VARIANTS = {
-    "psm": Variant(
-        "da Vinci Classic patient side manipulator (PSM) with a Large Needle Driver (400006).",
-        offset=0.4318, shaft=0.4162, yaw=(-1.588, 1.588), pitch=(-0.925025, 0.925025), insertion=0.24,
-        efforts=(3.316101, 3.316101, 9.877926), shaft_capsule=(0.00423, 0.378), cannula=(0.007, 0.16),
-    ),
-    "psm_si": Variant(
-        "da Vinci Si patient side manipulator (PSM) with a Large Needle Driver (420006).",
-        offset=0.4826, shaft=0.4670, yaw=(-2.964, 2.964), pitch=(-1.265, 1.301), insertion=0.29,
-        efforts=(17.0845, 17.0845, 40.9063), shaft_capsule=(0.0042, 0.4318), cannula=(0.008, 0.165),
-    ),
-}  # fmt: skip
+CLASSIC = Variant(
+    "da Vinci Classic patient side manipulator (PSM) with a Large Needle Driver (400006).",
+    offset=0.4318, shaft=0.4162, yaw=(-1.588, 1.588), pitch=(-0.925025, 0.925025), insertion=0.24,
+    efforts=(3.316101, 3.316101, 9.877926), shaft_capsule=(0.00423, 0.378), cannula=(0.007, 0.16),
+)  # fmt: skip
+SI = Variant(
+    "da Vinci Si patient side manipulator (PSM) with a Large Needle Driver (420006).",
+    offset=0.4826, shaft=0.4670, yaw=(-2.964, 2.964), pitch=(-1.265, 1.301), insertion=0.29,
+    efforts=(17.0845, 17.0845, 40.9063), shaft_capsule=(0.0042, 0.4318), cannula=(0.008, 0.165),
+)  # fmt: skip
+FORCEPS = "da Vinci Classic patient side manipulator (PSM) with Cadiere Forceps (400049)."
 
 
 def build() -> dict[str, str]:
-    """URDF text by arm name."""
-    return {name: _build(name, variant) for name, variant in VARIANTS.items()}
+    """URDF text by the name of its file in `arms/`."""
+    return {
+        "psm/psm.urdf": _build("psm", CLASSIC),
+        "psm/psm_cadiere_forceps.urdf": _build("psm", replace(CLASSIC, title=FORCEPS, finger=CADIERE)),
+        "psm_si/psm_si.urdf": _build("psm_si", SI),
+    }
 
 
 def _build(name: str, variant: Variant) -> str:
     robot = Robot(name, f"{variant.title}\n     Numbers and their sources: README.md in this folder.")
     _positioning(robot, variant)
     _instrument(robot, variant)
-    _jaw(robot)
+    _jaw(robot, variant.finger)
     return robot.text()
 
 
@@ -121,25 +163,18 @@ def _instrument(robot: Robot, variant: Variant) -> None:
     robot.joint("wrist_yaw", "revolute", "wrist_pitch_link", "wrist_yaw_link", at, axis=(0, -1, 0), limits=limits)
 
 
-def _jaw(robot: Robot) -> None:
+def _jaw(robot: Robot, finger: Finger) -> None:
     """Two fingers that turn by half of the jaw's angle each, and the tip between them."""
     # A finger carries twice the jaw's friction: the jaw's angle is the sum of two fingers'.
     limits = Limits(0, 0.69813, velocity=18.8496, effort=0.16, viscous=0.0044, coulomb=0.0044)
     for name, side in (("jaw_left", -1), ("jaw_right", 1)):
-        robot.link(
-            f"{name}_link",
-            Inertial(0.00025, (1e-8, 1e-8, 1e-8), at=(0, 0, -0.005)),
-            [
-                Box((0.0012, 0.0050, 0.0064), (side * 0.0006, 0, -0.0032), material="steel"),
-                Box((0.0012, 0.0034, 0.0042), (side * 0.0006, 0, -0.0085), material="steel"),
-            ],
-            [Cylinder(0.0012, 0.0106, (side * 0.0006, 0, -0.0053), name=name)],
-        )
+        drawn, capsule = finger.beside(side)
+        robot.link(f"{name}_link", finger.inertial, drawn, [replace(capsule, name=name)])
         mimic = "jaw_left" if side > 0 else None
         axis = (0, -side, 0)
         robot.joint(name, "revolute", "wrist_yaw_link", f"{name}_link", axis=axis, limits=limits, mimic=mimic)
     robot.link("tool_tip")
-    robot.joint("tool_tip", "fixed", "wrist_yaw_link", "tool_tip", at=(0, 0, -TIP), rpy=(pi, 0, pi / 2))
+    robot.joint("tool_tip", "fixed", "wrist_yaw_link", "tool_tip", at=(0, 0, -finger.tip), rpy=(pi, 0, pi / 2))
 
 
 def _base() -> list[Box | Cylinder]:

@@ -47,7 +47,7 @@ LINKS = {
 
 
 def build() -> dict[str, str]:
-    """The URDF's text, by the name of the arm."""
+    """The URDF's text, by the name of its file in `arms/`."""
     robot = Robot(
         "star",
         "STAR: a KUKA LWR 4+ with an Endo360 suturing tool. The base frame is the base plate, z up. At zero\n"
@@ -65,7 +65,7 @@ def build() -> dict[str, str]:
     robot.link("flange")
     robot.joint("flange", "fixed", "link_7", "flange")
     _add_tool(robot)
-    return {"star": robot.text()}
+    return {"star/star.urdf": robot.text()}
 
 
 def _add_tool(robot: Robot) -> None:

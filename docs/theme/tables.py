@@ -76,7 +76,7 @@ def arms() -> str:
             yield [
                 f"[`{name}`](../arms/{name}/README.md)",
                 picture,
-                arm.description,
+                arm.description + (f"; tools {words(f'`{tool}`' for tool in arm.tools)}" if arm.tools else ""),
                 words(j.name for j in arm.actuated),
             ]
 

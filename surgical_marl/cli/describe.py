@@ -41,7 +41,7 @@ def _scene(scene: Scene) -> str:
         shaft = mount.rotation @ [0, 0, -1]
         way = f"shaft along ({shaft[0]:.2f}, {shaft[1]:.2f}, {shaft[2]:.2f}) at zero" if mount.arm.remote_center else ""
         point = "remote center" if mount.arm.remote_center else "base"
-        lines.append(f"    {agent:14} {point} at ({x:.3f}, {y:.3f}, {z:.3f}) m {way}".rstrip())
+        lines.append(f"    {scene.label(agent):14} {point} at ({x:.3f}, {y:.3f}, {z:.3f}) m {way}".rstrip())
     for name, placement in scene.objects.items():
         x, y, z = placement.position
         lines.append(f"    {name:14} {placement.object.name} at ({x:.3f}, {y:.3f}, {z:.3f}) m")
@@ -55,7 +55,8 @@ def _scene(scene: Scene) -> str:
 
 def _arm(name: str) -> str:
     arm = load_arm(name)
-    return f"{name:14} {arm.description}\n    {', '.join(joint.name for joint in arm.actuated)}"
+    tools = f"\n    tools: {', '.join(arm.tools)}" if arm.tools else ""
+    return f"{name:14} {arm.description}\n    {', '.join(joint.name for joint in arm.actuated)}{tools}"
 
 
 def _object(name: str) -> str:

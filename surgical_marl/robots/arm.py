@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from surgical_marl.content import find
+from surgical_marl.content import find, unknown
 from surgical_marl.robots.description import MOVING, Robot, RobotJoint, Vector
 from surgical_marl.robots.drives import Cable, Drive, TipSpeed
 from surgical_marl.robots.jaw import Jaw, JawEntry
@@ -25,12 +25,23 @@ from surgical_marl.robots.urdf import link_name, read_urdf
 from surgical_marl.robots.urdf_faults import robot_faults
 from surgical_marl.untrusted.files import is_file, read_bytes
 from surgical_marl.untrusted.markup import check_name
-from surgical_marl.untrusted.schema import REQUIRED, Faults, Place, check, collecting, number, several, unknown_keys
+from surgical_marl.untrusted.schema import (
+    REQUIRED,
+    Faults,
+    Place,
+    as_mapping,
+    check,
+    collecting,
+    fields_of,
+    number,
+    several,
+    unknown_keys,
+)
 from surgical_marl.untrusted.values import LONGEST, listed, shown
-from surgical_marl.yaml_file import read_yaml
+from surgical_marl.yaml_file import merged, read_yaml
 
-MAX_JOINTS = 200
-"""Joints of an `arm.yaml`, and cables."""
+MAX_JOINTS, MAX_TOOLS = 200, 50
+"""Joints of an `arm.yaml`, or cables; and its tools."""
 
 
 @dataclass(frozen=True)
@@ -85,6 +96,15 @@ class Arm:
     """How fast Cartesian control moves the tool tip."""
     urdf: Robot = field(repr=False)
     """Links, joints and shapes; meshes by their files in `folder`."""
+    tool: str | None = field(default=None, repr=False)
+    """The instrument that the arm holds; None if its `arm.yaml` has no choice of tools."""
+    tools: tuple[str, ...] = field(default=(), repr=False)
+    """The instruments to choose from; the first is the usual one."""
+
+    @property
+    def title(self) -> str:
+        """The arm's name, and that of its tool if it is another than the usual one."""
+        return f"{self.name} with {self.tool}" if self.tool in self.tools[1:] else self.name
 
     @property
     def content(self) -> tuple[bytes, ...]:
@@ -244,19 +264,25 @@ class ArmFile:
     cables: tuple[Cable, ...] | None = several("cables", MAX_JOINTS, empty=tuple)
     tip_speed: TipSpeed = field(default_factory=TipSpeed)
     jaw: JawEntry | None = None
+    tools: dict[str, Any] = several("tools", MAX_TOOLS)
+    """Name -> merge patch of this file. The first is the usual one."""
 
 
-def load_arm(name: str | Path) -> Arm:
+def load_arm(name: str | Path, tool: str | None = None) -> Arm:
     """Read an arm by a shipped name (`list_arms()`) or the path of a folder that holds `arm.yaml`.
 
+    Args:
+        name: of the arm, or its folder.
+        tool: a name under `tools` in its `arm.yaml`; None for the first one there, if there are any.
+
     Raises:
-        ValueError: if the name is unknown, or a URDF or `arm.yaml` lacks something or has a bad value. In most cases
-            the error is a `Faults`, which lists everything that is wrong.
+        ValueError: if the name or the tool is unknown, or a URDF or `arm.yaml` lacks something or has a bad value. In
+            most cases the error is a `Faults`, which lists everything that is wrong.
     """
     folder = find("arms", name)
     check_name(folder.name, "an arm's folder")
     place = Place(file=folder / "arm.yaml")
-    settings = read_yaml(folder / "arm.yaml")
+    settings, tools = _read_settings(folder, tool)
     about: ArmFile | None = None
     robot: Robot | None = None
     faults: list[str] = []
@@ -283,7 +309,49 @@ def load_arm(name: str | Path) -> Arm:
         cables=about.cables or (),
         tip_speed=about.tip_speed,
         urdf=robot,
+        tool=tool or next(iter(tools), None),
+        tools=tuple(tools),
     )
+
+
+def list_tools(name: str | Path) -> list[str]:
+    """Return the names of the tools that an arm can hold, the usual one first; none if its `arm.yaml` has no `tools`.
+
+    Raises:
+        ValueError: if the arm is unknown, or its `arm.yaml` can't be read.
+    """
+    return _read_settings(find("arms", name))[1]
+
+
+def arm_files(name: str | Path) -> list[str]:
+    """Return the names of all files of an arm, in its folder: `arm.yaml`, and the URDF and meshes of every tool.
+
+    Raises:
+        ValueError: as `load_arm`.
+    """
+    folder, found = find("arms", name), ["arm.yaml"]
+    for tool in tuple(list_tools(folder)) or (None,):
+        arm = load_arm(folder, tool)
+        found += [_read_settings(folder, tool)[0]["urdf"], *mesh_files(arm.urdf)]
+    return list(dict.fromkeys(found))
+
+
+def _read_settings(folder: Path, tool: str | None = None) -> tuple[dict[str, Any], list[str]]:
+    """Return the mapping of an `arm.yaml` as a tool changes it, by default the first, and the names of all tools."""
+    place, settings = Place(file=folder / "arm.yaml"), read_yaml(folder / "arm.yaml")
+    where, keys = place.part("tools", settings), [key for key in fields_of(ArmFile) if key != "tools"]
+    tools = as_mapping(where, settings.get("tools") or {}, "names to what a tool changes")
+    faults: list[str] = []
+    for name, patch in tools.items():
+        check_name(name, "a tool")
+        at = where.part(name, tools)
+        faults += unknown_keys(at, as_mapping(at, {} if patch is None else patch, listed(keys)), keys)
+    if faults:
+        raise Faults(faults)
+    if tool is not None and tool not in tools:
+        raise unknown(f"tool of arm {folder.name!r}", tool, list(tools))
+    patch = tools[tool or next(iter(tools))] if tools else None
+    return (merged(settings, patch) if patch else settings), list(tools)
 
 
 def _read_robot(folder: Path, name: str, place: Place) -> tuple[Robot, list[str]]:

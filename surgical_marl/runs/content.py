@@ -126,10 +126,10 @@ def _copy(source: Path, target: Path) -> None:
 
 def _check_arm(source: Path, copied: Path) -> None:
     """Raise ValueError if the copy of an arm lacks something: a URDF may name a mesh by a link."""
-    from surgical_marl.robots.arm import load_arm
+    from surgical_marl.robots.arm import arm_files
 
     try:
-        load_arm(copied)
+        arm_files(copied)
     except ValueError as error:
         raise ValueError(f"{source} cannot be copied, replace links in it by files: {error}") from None
 
@@ -156,9 +156,8 @@ def _files(part: _Part) -> Iterator[tuple[str, Path, int]]:
     if part.key == "object":
         yield name, part.path, MAX_YAML
         return
-    from surgical_marl.robots.arm import load_arm  # only now: settings are read before anything else is
-    from surgical_marl.robots.mesh import MAX_MESH, mesh_files
+    from surgical_marl.robots.arm import arm_files  # only now: settings are read before anything else is
+    from surgical_marl.robots.mesh import MAX_MESH
 
-    urdf = read_yaml(part.path / "arm.yaml").get("urdf")
-    for file in ("arm.yaml", str(urdf), *mesh_files(load_arm(part.path).urdf)):
+    for file in arm_files(part.path):
         yield f"{name}/{file}", folder / name / file, MAX_MESH

@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 
 from surgical_marl.content import as_name, find, list_arms, list_objects, list_scenes, unknown
-from surgical_marl.robots.arm import Arm, load_arm
+from surgical_marl.robots.arm import Arm, list_tools, load_arm
 from surgical_marl.robots.arm_findings import number_findings
 from surgical_marl.robots.inverse_kinematics import inverse_kinematics
 from surgical_marl.robots.spec import COLLISION_GROUP, build_spec
@@ -29,7 +29,7 @@ from surgical_marl.scenes.objects import load_object
 from surgical_marl.scenes.scene import Scene, collision_geoms
 from surgical_marl.scenes.timing import TIMESTEP
 from surgical_marl.untrusted.files import is_file, is_folder, user_path
-from surgical_marl.untrusted.schema import Faults
+from surgical_marl.untrusted.schema import Faults, collecting
 from surgical_marl.untrusted.values import plural
 from surgical_marl.yaml_file import read_yaml
 
@@ -66,7 +66,8 @@ def summary(source: str | Path) -> str:
 def _sum_up_arm(folder: Path) -> str:
     arm = load_arm(folder)
     shapes = sum(len(link.collisions) for link in arm.urdf.links)
-    return f"{_count(len(arm.actuated), 'joint')}, {_count(shapes, 'collision shape')}"
+    tools = f", {_count(len(arm.tools), 'tool')}" if arm.tools else ""
+    return f"{_count(len(arm.actuated), 'joint')}, {_count(shapes, 'collision shape')}{tools}"
 
 
 def _sum_up_scene(path: Path) -> str:
@@ -112,13 +113,10 @@ def _is_object(path: Path) -> bool:
 
 def _check_arm(folder: Path) -> list[str]:
     findings: list[str] = []
-    try:
-        for finding in _arm_findings(load_arm(folder)):
-            findings.append(finding)
-    except Faults as error:
-        return error.faults
-    except ValueError as error:
-        findings.append(str(error))
+    with collecting(findings):
+        for tool in tuple(list_tools(folder)) or (None,):
+            with collecting(findings):
+                findings.extend(_arm_findings(load_arm(folder, tool)))
     return findings
 
 
@@ -129,7 +127,7 @@ def _check_scene(path: Path) -> list[str]:
         return error.faults
     except ValueError as error:
         return [str(error)]
-    arms = {mount.arm.folder: mount.arm for mount in scene.mounts.values()}
+    arms = {(mount.arm.folder, mount.arm.tool): mount.arm for mount in scene.mounts.values()}
     findings = [finding for arm in arms.values() for finding in _arm_findings(arm)]
     return findings + list(_scene_findings(scene))
 
@@ -149,7 +147,7 @@ _SUMMARIES = {"arms": _sum_up_arm, "scenes": _sum_up_scene, "objects": _sum_up_o
 
 
 def _arm_findings(arm: Arm) -> Iterator[str]:
-    where = f"arm {arm.name!r}"
+    where = f"arm {arm.title!r}"
     for finding in (*number_findings(arm), *_remote_center_findings(arm)):
         yield f"{where}: {finding}"
     model = _model(arm)

@@ -110,7 +110,8 @@ def _can_meet(scene: Scene, candidates: list[tuple[int, int, float]]) -> np.ndar
     for (a, b, near), apart in zip(candidates, far, strict=True):
         key: object = (a, b)
         if owner[a] == owner[b]:
-            key = (scene.mounts[owner[a]].arm.folder, *(model.geom(geom).name.split("/", 1)[1] for geom in (a, b)))
+            arm = scene.mounts[owner[a]].arm
+            key = (arm.folder, arm.tool, *(model.geom(geom).name.split("/", 1)[1] for geom in (a, b)))
         if apart:
             known[key] = False
         if key not in known:

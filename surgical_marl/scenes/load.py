@@ -20,7 +20,7 @@ import numpy as np
 
 from surgical_marl.content import find, unknown
 from surgical_marl.plugins.systems import read_systems
-from surgical_marl.robots.arm import Arm, load_arm
+from surgical_marl.robots.arm import Arm, list_tools, load_arm
 from surgical_marl.robots.rotation import turned
 from surgical_marl.robots.spec import SOLREF
 from surgical_marl.scenes.build import build_scene, cached_model, compile_scene, weigh_shapes
@@ -50,6 +50,10 @@ class MountEntry:
     """An arm in a scene file; `arm` is its name or its folder."""
 
     arm: str
+    tool: str | None = field(
+        default=None, repr=False
+    )  # its values are in the arm's content, the key of the model's cache
+    """The tool that it holds, one of `tools` in its `arm.yaml`; None for the first."""
     position: Vector = lengths()
     """Origin of the base frame in the world."""
     turn: float = number(0.0, -LONGEST, LONGEST, unit="degrees")
@@ -142,8 +146,11 @@ def _without_sources(about: SceneFile) -> SceneFile:
     return replace(about, arms=arms, objects={name: replace(own, object="") for name, own in about.objects.items()})
 
 
-def _mount(agent: str, entry: MountEntry, place: Place, load: Callable[[str | Path], Arm]) -> Mount:
-    arm = load(find("arms", entry.arm, str(place), place.folder))
+def _mount(agent: str, entry: MountEntry, place: Place, load: Callable[[Path, str | None], Arm]) -> Mount:
+    folder = find("arms", entry.arm, str(place), place.folder)
+    if entry.tool is not None and entry.tool not in (tools := list_tools(folder)):
+        raise ValueError(f"{place}: {unknown(f'tool of arm {folder.name!r}', entry.tool, tools)}")
+    arm = load(folder, entry.tool)
     if not re.fullmatch(re.escape(arm.name) + r"_\d+", agent):
         raise ValueError(f"{place}: an agent of arm {arm.name!r} is called {arm.name}_0, {arm.name}_1 and so on")
     rotation = turned(entry.tilt) @ turned((0.0, 0.0, entry.turn))

@@ -149,6 +149,11 @@ class Scene:
             found[f"{name}-{taken + 1}" if taken else name] = tuple(group)
         return found
 
+    def label(self, agent: str) -> str:
+        """Return an agent's name, with its tool if that is not the usual one, as in "psm_1 with cadiere_forceps"."""
+        arm = self.mounts[agent].arm
+        return agent + arm.title.removeprefix(arm.name)
+
     def find_camera(self, agent: str | None = None) -> str:
         """Return the agent whose camera is used: `agent` if it is given, otherwise the first that has a camera.
 
@@ -252,7 +257,7 @@ def payload_body(agent: str, arm: Arm) -> str:
 
 def are_alike(one: Arm, other: Arm) -> bool:
     """Return whether two arms have the same model: bodies, joints, drives, shapes and colours."""
-    if one.folder == other.folder:
+    if (one.folder, one.tool) == (other.folder, other.tool):
         return True
     if [joint.name for joint in one.joints] != [joint.name for joint in other.joints]:
         return False

@@ -110,8 +110,10 @@ def test_a_copy_is_the_same_scene_and_stands_alone(tmp_path: Path) -> None:
     after = load_scene(copied)
     assert after.name == "mine" and after.agents == before.agents and after.fingerprint == before.fingerprint
     files = {path.relative_to(copied.parent).as_posix() for path in copied.parent.rglob("*") if path.is_file()}
-    own = {"lab_0/lab/arm.yaml", "lab_0/lab/psm.urdf", "lab_0/lab/meshes/part.stl", "table/table.yaml"}
-    assert files == {"mine.yaml", *own}, "all that it is made of but what has a name, and nothing else"
+    lab = ("arm.yaml", "psm.urdf", "psm_cadiere_forceps.urdf", "meshes/part.stl")
+    assert files == {"mine.yaml", "table/table.yaml", *(f"lab_0/lab/{name}" for name in lab)}, (
+        "all that it is made of but what has a name, and nothing else"
+    )
     copied.with_name("lab_0").joinpath("lab", "meshes", "part.stl").write_bytes(b"other")
     assert content.scene_label(str(copied)) != label
 

@@ -21,7 +21,7 @@ from tests.helpers import ROOT
 
 PAGE = (ROOT / "docs" / "your_own_arm.md").read_text()
 BLOCKS = [(kind, text) for kind, text in re.findall(r"```(\w+)\n(.*?)```", PAGE, re.DOTALL)]
-XML, (YAML, SCENE) = dict(BLOCKS)["xml"], [text for kind, text in BLOCKS if kind == "yaml"]
+XML, (YAML, TOOLS, SCENE) = dict(BLOCKS)["xml"], [text for kind, text in BLOCKS if kind == "yaml"]
 MESHES, ENV = [text for kind, text in BLOCKS if kind == "python"]
 
 
@@ -69,6 +69,16 @@ def test_the_page_makes_a_urdf_and_a_few_lines_an_agent_beside_a_psm(
         assert not any(terminations.values()) and not any(truncations.values())
     assert env.action_space("lab_arm_0").shape == (6,)
     assert all(np.isfinite(observation).all() for observation in observations.values())
+
+
+def test_the_page_gives_the_arm_a_choice_of_tools(own: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (own / "lab_arm" / "arm.yaml").write_text(YAML + TOOLS)
+    replace(own / "beside_psm.yaml", ("arm: lab_arm,", "arm: lab_arm, tool: bare,"))
+    assert main(["check", "lab_arm"]) == main(["check", "beside_psm.yaml"]) == 0
+    assert "4 collision shapes, 2 tools)" in capsys.readouterr().out
+    arm, usual = sm.load_scene(own / "beside_psm.yaml").mounts["lab_arm_0"].arm, sm.load_arm("lab_arm")
+    assert (arm.tool, usual.tool, arm.tool_tip, usual.tool_tip) == ("bare", "straight", "flange", "tool0")
+    assert arm.joints[-1].drive.armature == 0.0005 and arm.joints[-1].drive.stiffness == 4.0
 
 
 def test_a_scene_with_meshes_opens_in_plain_mujoco(own: Path) -> None:

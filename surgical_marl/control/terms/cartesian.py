@@ -205,4 +205,4 @@ def _endoscope(scene: Scene, agent: str) -> str:
 def _has_camera(scene: str) -> bool:
     """Return whether an arm of a shipped scene has a camera."""
     arms = read_yaml(find("scenes", scene))["arms"].values()
-    return any(load_arm(entry["arm"]).camera is not None for entry in arms)
+    return any(load_arm(entry["arm"], entry.get("tool")).camera is not None for entry in arms)

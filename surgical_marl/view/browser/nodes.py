@@ -165,7 +165,9 @@ class Nodes:
         for arm, (agent, mount) in enumerate(env.scene.mounts.items()):
             if mount.arm.remote_center:
                 self._trocars.append(
-                    self._scene.add_label(f"/names/{arm}", agent, position=mount.position + self.offsets[0])
+                    self._scene.add_label(
+                        f"/names/{arm}", env.scene.label(agent), position=mount.position + self.offsets[0]
+                    )
                 )
                 places = self.offsets + mount.position
                 wxyz = np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))
