@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from surgical_marl.engines.stages import told
+from surgical_marl.engines.compilation import told
 from surgical_marl.runs.progress import Compilations
 from surgical_marl.runtime import calm_threads
 

@@ -23,7 +23,7 @@ from surgical_marl.cli.evaluating import add_crossplay, add_eval, add_report
 from surgical_marl.cli.flags import add_flags, given, one_of, task_help
 from surgical_marl.cli.viewing import add_play, add_replay, add_view
 from surgical_marl.content import find, list_arms, list_objects, list_policies, list_scenes
-from surgical_marl.engines.stages import told
+from surgical_marl.engines.compilation import told
 from surgical_marl.machine import lacks_memory
 from surgical_marl.plugins.algorithms import list_algorithms
 from surgical_marl.plugins.controls import list_controls

@@ -13,10 +13,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.extend import core
 
+from surgical_marl.engines.compilation import compiling
 from surgical_marl.engines.faults import FINE, NEXT, checked, is_reward, places
 from surgical_marl.engines.fused.threefry import episode_keys
-from surgical_marl.engines.stages import compiling
+from surgical_marl.engines.split import Part, Run, Stage, split, walk
 from surgical_marl.engines.stepper import MOST_KEPT, Stepper, representative
 from surgical_marl.machine import cores
 from surgical_marl.runtime import jax_scope, no_collection
@@ -31,8 +33,7 @@ class Functions:
 
     reset: Any
     step: Any
-    move: Any
-    finish: Any
+    """A function, or the parts of a step that calls stages of the host."""
     carry: Any
     """Shapes of one environment's `Carry`."""
     traced: set[str] = field(default_factory=set)
@@ -45,13 +46,40 @@ def _functions(env: Stepper, num_envs: int) -> Functions:
         return jax.jit(jax.vmap(function, (*axes, None)))
 
     key, number = jax.ShapeDtypeStruct((2,), jnp.uint32), jax.ShapeDtypeStruct((), jnp.int32)
-    return Functions(
-        reset=every(env.reset, (0, 0)),
-        step=jax.jit(jax.vmap(env.step, (0, 0, None)), donate_argnums=0),
-        move=every(env.move, (0, 0)),
-        finish=every(env.finish, (0, 0)),
-        carry=jax.eval_shape(env.reset, key, number, env.parameters).carry,
-    )
+    carry = jax.eval_shape(env.reset, key, number, env.parameters).carry
+    step = _Parts(env, carry) if env.pauses else jax.jit(jax.vmap(env.step, (0, 0, None)), donate_argnums=0)
+    return Functions(every(env.reset, (0, 0)), step, carry)
+
+
+class _Parts:
+    """A step that is split where the host computes something, such as pictures.
+
+    Attributes:
+        parts: of the step. They read and write values by variable.
+        arguments: variables of the carry and the actions.
+        functions: name and function of each `Run`, which takes values [N, ...] of the variables `given`, and the
+            parameters.
+        state: structure of the `State`, whose leaves have numbers as variables: the first `results`.
+    """
+
+    def __init__(self, env: Stepper, carry: Any) -> None:
+        actions = {agent: jax.ShapeDtypeStruct((env.num_actions(agent),), jnp.float32) for agent in env.agents}
+        step, state = jax.make_jaxpr(env.step, return_shape=True)(carry, actions, env.parameters)
+        arguments, self.parts = split(step, lambda call: call.cuda is None)
+        count = len(jax.tree.leaves(env.parameters))
+        self.arguments, self._shared = arguments[: len(arguments) - count], arguments[len(arguments) - count :]
+        self.state, self.results = jax.tree.structure(state), len(jax.tree.leaves(state))
+        runs = [part for part in walk(self.parts) if isinstance(part, Run)]
+        self.given = {id(part): [one for one in part.reads if one not in self._shared] for part in runs}
+        self.functions = {id(part): (f"step_{number}", self._every(part)) for number, part in enumerate(runs)}
+
+    def _every(self, part: Run) -> Any:
+        def run(given: Any, parameters: Any) -> Any:
+            known = dict(zip(self.given[id(part)], given, strict=True))
+            known |= dict(zip(self._shared, jax.tree.leaves(parameters), strict=True))
+            return core.jaxpr_as_fun(part.jaxpr)(*(known[one] for one in part.reads))
+
+        return jax.jit(jax.vmap(run, (0, None)))
 
 
 @partial(jax.jit, static_argnums=1)
@@ -116,7 +144,7 @@ class MjxEngine:
         self._shares = next(n for n in range(max(shares, 1), 0, -1) if num_envs % n == 0)
         self._pool = ThreadPoolExecutor(self._shares, "surgical_marl")
         self._state: Any = None
-        self._moved: Any = None
+        self._seen: dict[str, Any] = {}
         self._leaving: Any = np.zeros(num_envs, bool)
         self._tree = jax.tree.structure(self._functions.carry)
         self.carry_shapes = {name: leaf.shape for name, leaf in _paths(self._functions.carry).items()}
@@ -142,19 +170,41 @@ class MjxEngine:
 
         Args:
             actions: [N, n] by agent, of any array library.
-            sense: returns what the environment senses, [N] each, once everything has moved: `.moved` can be read then.
+            sense: computes what the host does in a step: returns the results, [N] each, of a stage whose inputs can be
+                read by its name.
         """
         given = {agent: self._take(action).astype(jnp.float32) for agent, action in actions.items()}
-        if self.env.pauses:
-            self._moved = self._run("move", self._state.carry, given)
-            sensed = {name: self._take(values) for name, values in (sense() if sense else {}).items()}
-            self._state = self._run("finish", self._moved, sensed)
-        else:
-            self._state = self._run("step", self._state.carry, given)
+        step = self._functions.step
+        if not isinstance(step, _Parts):
+            self._state = self._run("step", step, self._state.carry, given)
+            return
+        values = dict(zip(step.arguments, jax.tree.leaves((self._state.carry, given)), strict=True))
+        self._run_parts(step, step.parts, values, sense)
+        self._state = jax.tree.unflatten(step.state, [values[k] for k in range(step.results)])
 
-    def _run(self, name: str, *given: Any) -> Any:
+    def _run_parts(
+        self, step: _Parts, parts: list[Part], values: dict[Any, Any], sense: Callable[[], dict[str, Any]] | None
+    ) -> None:
+        """Run parts of a step, which read and write values [N, ...] by variable."""
+        for part in parts:
+            if isinstance(part, Run):
+                given = tuple(values[one] for one in step.given[id(part)])
+                found = self._run(*step.functions[id(part)], given)
+                values.update(zip(part.writes, found, strict=True))
+            elif isinstance(part, Stage):
+                name, sees = part.call.name, zip(part.call.reads, part.reads, strict=True)
+                self._seen = {f"{name}.{path}": values[one] for path, one in sees}
+                sensed = sense() if sense else {}
+                for result, one in zip(part.call.writes, part.writes, strict=True):
+                    nothing = jnp.zeros((self.num_envs, *one.aval.shape), one.aval.dtype)
+                    values[one] = self._take(sensed[result]) if result in sensed else nothing
+            else:
+                for _ in range(part.length):
+                    self._run_parts(step, part.parts, values, sense)
+
+    def _run(self, name: str, function: Any, *given: Any) -> Any:
         """Run a function on all environments, with a share of them on each core."""
-        function, traced = getattr(self._functions, name), name in self._functions.traced
+        traced = name in self._functions.traced
         # Tracing makes some million objects that all stay: looking for garbage among them takes a quarter of the time.
         with self._compiling(name), contextlib.nullcontext() if traced else no_collection():
             if self._shares == 1:
@@ -174,8 +224,8 @@ class MjxEngine:
         if name in self._functions.traced:
             yield
             return
-        with compiling(f"{self.env.title} ({self.name}, {self.device})") as stage:
-            stage(f"tracing and compiling the {name}")
+        with compiling(f"{self.env.title} ({self.name}, {self.device})") as phase:
+            phase(f"tracing and compiling the {name}")
             yield
         self._functions.traced.add(name)
 
@@ -209,15 +259,13 @@ class MjxEngine:
 
     @jax_scope()
     def read(self, name: str, library: str) -> Any:
-        """Return a part of the `Carry` or of what has moved, [N, ...].
+        """Return a part of the `Carry` or of what a stage of the host reads, [N, ...].
 
-        A part of the `Carry` has a name in `carry_shapes`. A part of what has moved has a name as in
-        ".moved.carry.physics.qpos".
+        A part of the `Carry` has a name in `carry_shapes`. What a stage reads has a name such as
+        "pictures.physics.arms.qpos".
         """
-        tree, path = self._state.carry, name
-        if name.startswith(".moved"):
-            tree, path = self._moved, name.removeprefix(".moved")
-        return self._present(_paths(tree)[path], library)
+        seen = self._seen.get(name)
+        return self._present(_paths(self._state.carry)[name] if seen is None else seen, library)
 
     @jax_scope()
     def write(self, name: str, values: Any) -> None:

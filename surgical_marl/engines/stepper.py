@@ -19,9 +19,8 @@ MOST_KEPT = 16
 class Stepper(Protocol):
     """One environment as pure JAX functions.
 
-    An engine runs these functions for many environments, and uses nothing else of an environment.
-
-    A step is `finish(move(carry, actions), sensed)`. If nothing is sensed in between, `step` does both.
+    An engine runs these functions for many environments, and uses nothing else of an environment. A step may call
+    stages (`stages.py`), which engines run in other ways.
     """
 
     agents: tuple[str, ...]
@@ -52,11 +51,7 @@ class Stepper(Protocol):
 
     @property
     def pauses(self) -> bool:
-        """Whether `move` and `finish` are run separately, so that pictures can be drawn in between."""
-
-    @property
-    def senses(self) -> tuple[str, ...]:
-        """Names of numbers that are measured outside, between `move` and `finish`."""
+        """Whether a step calls a stage of the host, such as pictures."""
 
     def __hash__(self) -> int: ...
 
@@ -65,10 +60,6 @@ class Stepper(Protocol):
     def reset(self, key: Any, episode: Any, parameters: Any) -> Any: ...
 
     def step(self, carry: Any, actions: dict[str, Any], parameters: Any) -> Any: ...
-
-    def move(self, carry: Any, actions: dict[str, Any], parameters: Any) -> Any: ...
-
-    def finish(self, moved: Any, sensed: dict[str, Any], parameters: Any) -> Any: ...
 
 
 def representative(stepper: Stepper) -> Stepper:

@@ -42,6 +42,8 @@ if TYPE_CHECKING:
     from surgical_marl.physics.plant import Plant
     from surgical_marl.physics.simulator import Simulator
 
+PICTURES = "pictures"
+"""The stage in which the host draws what agents see."""
 HIDDEN, NOISE, PLACES = 2**31 - 1, 2**31 - 2, 2**31 - 3
 """Folded into an episode's key for the draws of a scene's randomisation, so that they are independent of a task's
 draws."""
@@ -99,7 +101,7 @@ class Env:
 
     @property
     def pauses(self) -> bool:
-        """True if a step pauses after the physics, so that pictures can be drawn before it is finished.
+        """True if a step calls a stage of the host: pictures are drawn after the physics.
 
         This is so if an agent observes pictures, or if the task computes numbers from them.
         """
@@ -120,11 +122,6 @@ class Env:
         return bool(cached("starts", trace, self.content, describe(self.parameters), classes=self.classes))
 
     @property
-    def senses(self) -> tuple[str, ...]:
-        """Names of numbers that are measured outside, between `move` and `finish`."""
-        return self.task.senses
-
-    @property
     def content(self) -> bytes:
         """All that a step depends on besides code and `parameters`.
 
@@ -134,7 +131,7 @@ class Env:
         mujoco.mj_saveModel(self.scene.model, None, model)
         observed = {agent: (seen.names, seen.stated) for agent, seen in self.observed.items()}
         control = self.options.control, self.options.control_frame
-        how = (control, self.decimation, self.scene.randomisation, self.options.start, self.scaled)
+        how = (control, self.decimation, self.scene.randomisation, self.options.start, self.scaled, self.pauses)
         physics = sorted(switched_off()), self.scene.attachments, self.scene.systems
         about = f"{self.task_name} {self.task.constants} {how} {physics} {observed} {self.messages}"
         return self.scene.fingerprint + about.encode() + model.tobytes()
@@ -240,12 +237,18 @@ class Env:
     def step(self, carry: Carry, actions: dict[str, Array], parameters: Any = None) -> State:
         """Do one control step, and a reset if it ends the episode.
 
-        Numbers that a task senses in pictures are 0 here.
+        Numbers that a task senses in pictures are 0 where no engine draws them.
         """
-        return self.finish(self.move(carry, actions, parameters), self._unsensed(), parameters)
+        moved = self._move(carry, actions, parameters)
+        sensed = self._unsensed()
+        if self.pauses:
+            from surgical_marl.engines.stages import host_stage
 
-    def move(self, carry: Carry, actions: dict[str, Array], parameters: Any = None) -> Moved:
-        """Do the first half of a step: physics, and the goals after it."""
+            sensed = host_stage(PICTURES, lambda carry: self._unsensed())(moved.carry)
+        return self._finish(moved, sensed, parameters)
+
+    def _move(self, carry: Carry, actions: dict[str, Array], parameters: Any) -> Moved:
+        """Do the first part of a step: physics, and the goals after it."""
         task, *_ = self._bound(parameters)
         actions, messages = self._part(actions)
         commanded = jnp.clip(jnp.concatenate([actions[agent] for agent in self.agents]), -1.0, 1.0)
@@ -267,8 +270,8 @@ class Env:
         said = jnp.stack([actions[agent][end:] for agent, end in ends.items()])
         return {agent: actions[agent][:end] for agent, end in ends.items()}, jnp.clip(said, -1.0, 1.0)
 
-    def finish(self, moved: Moved, sensed: dict[str, Array], parameters: Any = None) -> State:
-        """Do the second half of a step: observations, reward, and a reset if the step ends the episode."""
+    def _finish(self, moved: Moved, sensed: dict[str, Array], parameters: Any) -> State:
+        """Do the rest of a step: observations, reward, and a reset if the step ends the episode."""
         task, max_steps, autoreset = self._bound(parameters)
         carry, contacts = moved.carry, moved.contacts
         arms = {agent: moved.arms[agent] for agent in self.agents}  # JAX sorts them by name
@@ -310,7 +313,7 @@ class Env:
         return self.task.bound(known["weights"], known["tables"]), known["max_steps"], known["autoreset"]
 
     def _unsensed(self) -> dict[str, Array]:
-        return {name: jnp.float32(0.0) for name in self.senses}
+        return {name: jnp.float32(0.0) for name in self.task.senses}
 
     def _untold(self, carry: Carry) -> dict[str, dict[str, Array]]:
         """Return zeros for the infos of action terms, which tell nothing of a reset."""

@@ -69,7 +69,7 @@ class FreeObjects:
             engine: runs the environments.
             num_envs: their number.
             library: of the arrays.
-            place: "" for where objects are now, ".moved.carry" for where they are after the first half of a step.
+            place: "" for where objects are now, "pictures" for where they are in that stage of a step.
         """
         if not self.count:
             return Poses(np.zeros((num_envs, 0, 3), np.float32), np.zeros((num_envs, 0, 4), np.float32))

@@ -1,4 +1,4 @@
-"""Pictures as terms of agents' observations, drawn between and after the halves of a step."""
+"""Pictures as terms of agents' observations, drawn in a stage of a step, and after it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from gymnasium import spaces
 
-from surgical_marl.envs.env import Env
+from surgical_marl.envs.env import PICTURES, Env
 from surgical_marl.envs.free_objects import FreeObjects
 from surgical_marl.vision.pictures import Pictures, picture_space
 
@@ -68,8 +68,8 @@ class PictureTerms:
             found[kind] = self._with(found[kind], seen)
 
     def sense(self) -> dict[str, Any]:
-        """Draw the pictures after the first half of a step, and return what the task senses in them, [N] each."""
-        self._seen = self._draw(".moved.carry")
+        """Draw the pictures after the physics of a step, and return what the task senses in them, [N] each."""
+        self._seen = self._draw(PICTURES)
         return self._env.task.sense(self._seen)
 
     def show(self, found: dict[str, Any], autoreset: bool) -> None:

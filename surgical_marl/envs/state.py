@@ -59,7 +59,7 @@ class State(NamedTuple):
 
 
 class Moved(NamedTuple):
-    """The result of `Env.move`, which `Env.finish` continues from."""
+    """Where a step is after its physics, before pictures and rewards."""
 
     carry: Carry
     """After the step, before a reset."""

@@ -13,7 +13,7 @@ from typing import Any, TextIO
 
 from tqdm import tqdm
 
-from surgical_marl.engines.stages import DONE, FAILED
+from surgical_marl.engines.compilation import DONE, FAILED
 from surgical_marl.files import has_temporary_caches
 from surgical_marl.untrusted.values import plural
 
@@ -89,7 +89,7 @@ def preparing(what: str) -> Iterator[None]:
 
 
 class Compilations:
-    """Shows the stage of a compilation on stderr; `engines.stages.told` takes it.
+    """Shows the phase of a compilation on stderr; `engines.compilation.told` takes it.
 
     In a terminal it is one line with the stage and the seconds so far, and at the end with how long it took. Elsewhere
     it is a line at the start, one for each later stage unless the last line is younger than `PAUSE`, one at the end.

@@ -9,8 +9,8 @@ import jax
 import numpy as np
 import pytest
 
+from surgical_marl.engines.compilation import DONE, told
 from surgical_marl.engines.mjx import MjxEngine
-from surgical_marl.engines.stages import DONE, told
 from surgical_marl.envs.env import Env
 
 

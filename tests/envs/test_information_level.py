@@ -75,7 +75,7 @@ def test_nothing_that_an_arm_observes_depends_on_a_goal_that_it_does_not_know(ta
     start = env.task.start(jax.random.PRNGKey(0))
     physics = env.plant.at_rest(None, start.qpos, start.poses)
     views, objects = env.simulator.look(physics)[1], env.plant.objects(physics, None)
-    goal = env.task.remember(World(views, start.goal, {name: np.float32(0) for name in env.senses}, objects))
+    goal = env.task.remember(World(views, start.goal, {name: np.float32(0) for name in env.task.senses}, objects))
     found: dict[str, set[bytes]] = {agent: set() for agent in env.agents}
     for number in range(8):
         other = env.task.advance(env.task.start(jax.random.PRNGKey(number)).goal, 1.0)  # by then targets have moved

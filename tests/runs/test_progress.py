@@ -14,7 +14,7 @@ from contextlib import contextmanager, suppress
 
 import pytest
 
-from surgical_marl.engines.stages import compiling, told
+from surgical_marl.engines.compilation import compiling, told
 from surgical_marl.runs import progress as module
 from surgical_marl.runs.progress import Compilations, preparing, progress
 

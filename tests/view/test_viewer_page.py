@@ -29,7 +29,7 @@ from websockets.sync.client import connect
 from surgical_marl.bench import page
 from surgical_marl.cli.main import main
 from surgical_marl.content import find
-from surgical_marl.engines.stages import compiling
+from surgical_marl.engines.compilation import compiling
 from surgical_marl.runs.settings import Settings
 from surgical_marl.scenes.load import load_scene
 from surgical_marl.view.browser.nodes import distance_colour, offsets, segments

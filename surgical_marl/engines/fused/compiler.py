@@ -9,17 +9,19 @@ import jax
 import numpy as np
 from jax.extend import core
 
+from surgical_marl.engines.compilation import Phase
 from surgical_marl.engines.faults import checked
 from surgical_marl.engines.fused.graph import Graph, Value
 from surgical_marl.engines.fused.indexing import LEAST_TABLE, elements_of
 from surgical_marl.engines.fused.instrumentation import Watch
 from surgical_marl.engines.fused.jaxpr_interpreter import JaxprInterpreter
-from surgical_marl.engines.fused.kernel_layout import BUFFERS, Leaf, Source
+from surgical_marl.engines.fused.kernel_layout import BUFFERS, Leaf, Source, Stage
 from surgical_marl.engines.fused.lower import table_offsets
 from surgical_marl.engines.fused.operations import KINDS
 from surgical_marl.engines.fused.pipeline import CSE, Program, compile_program, switched_off
-from surgical_marl.engines.fused.symbolic_array import AnyArray, Table, array_of, values_of
-from surgical_marl.engines.stages import Stage
+from surgical_marl.engines.fused.stage_code import StageCode, load
+from surgical_marl.engines.fused.symbolic_array import AnyArray, Table, Unsupported, values_of
+from surgical_marl.engines.split import Unsplittable, split
 from surgical_marl.engines.stepper import Stepper
 
 RESULTS = {"f": "outs", "i": "counts", "u": "counts", "b": "flags"}
@@ -63,31 +65,25 @@ def trace(function: Callable[..., Any], *arguments: Any) -> Function:
     return Function(jaxpr, arguments, result)
 
 
-def trace_environment(env: Stepper, stage: Stage) -> dict[str, Function]:
-    """Trace an environment's functions: "reset", and "step" or "move" and "finish"."""
+def trace_environment(env: Stepper, phase: Phase) -> dict[str, Function]:
+    """Trace an environment's functions: "reset" and "step"."""
     parameters = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), env.parameters)
     key, number = jax.ShapeDtypeStruct((2,), np.uint32), jax.ShapeDtypeStruct((), np.int32)
-    stage("tracing the reset")
+    phase("tracing the reset")
     reset = trace(env.reset, key, number, parameters)
     actions = {agent: jax.ShapeDtypeStruct((env.num_actions(agent),), np.float32) for agent in env.agents}
-    stage("tracing the step")
-    if not env.pauses:
-        return {"reset": reset, "step": trace(env.step, reset.result.carry, actions, parameters)}
-    move = trace(env.move, reset.result.carry, actions, parameters)
-    finish = trace(
-        env.finish, move.result, {name: jax.ShapeDtypeStruct((), np.float32) for name in env.senses}, parameters
-    )
-    return {"reset": reset, "move": move, "finish": finish}
+    phase("tracing the step")
+    return {"reset": reset, "step": trace(env.step, reset.result.carry, actions, parameters)}
 
 
-def make_source(functions: dict[str, Function], parameters: Any, vector: bool, stage: Stage, title: str = "") -> Source:
+def make_source(functions: dict[str, Function], parameters: Any, vector: bool, phase: Phase, title: str = "") -> Source:
     """Return the source of an environment's kernels.
 
     Args:
         functions: what `trace_environment` returned.
         parameters: the environment's, a tree of numpy arrays.
         vector: whether the kernels are for a CPU, with vectors.
-        stage: is told the stages in which the source is made.
+        phase: is told the phases in which the source is made.
         title: of the environment, for the names of dumps.
 
     Raises:
@@ -96,18 +92,11 @@ def make_source(functions: dict[str, Function], parameters: Any, vector: bool, s
     fields, graph = Fields(), Graph(cse=CSE not in switched_off())
     given, places = _parameters(graph, parameters)
     carry = fields.place(functions["reset"].result.carry, "state")
-    one = "move" if "move" in functions else "step"
-    actions, moved, sensed = fields.actions(functions[one].arguments[1]), dict[str, Any](), dict[str, Leaf]()
-    if one == "move":
-        sensed = fields.actions(functions["finish"].arguments[1])
-    stage("interpreting the step")
-    kernels = {one: interpret(graph, functions[one], (carry, actions), given)}
-    if one == "move":
-        moved = fields.place(functions["move"].result, "state")
-        kernels["finish"] = interpret(graph, functions["finish"], (moved, sensed), given)
-    name, last = list(kernels.items())[-1]
-    found = functions[name].result
-    stage("interpreting the reset")
+    actions = fields.actions(functions["step"].arguments[1])
+    phase("interpreting the step")
+    kernels, stages, last = _step(graph, fields, functions["step"], (carry, actions), (given, places), vector)
+    found = functions["step"].result
+    phase("interpreting the reset")
     first = interpret(graph, functions["reset"], (carry.key, carry.episode), given)
     known = len(jax.tree.leaves(carry))
     leaves = [
@@ -115,18 +104,20 @@ def make_source(functions: dict[str, Function], parameters: Any, vector: bool, s
         *_share_fields(fields, jax.tree.leaves(found)[known:], last[known:], first[known:]),
     ]
     results = _nest([path for path, _ in jax.tree_util.tree_flatten_with_path(found)[0]], leaves)
-    stored = {name: jax.tree.leaves(moved) if name == "move" else leaves for name in kernels}
     fault = fields.leaf((), "bool", "flags")
     watched = [*jax.tree.leaves(carry), *(leaf for _, leaf in checked(results))]
     reals = [leaf for leaf in watched if leaf.dtype == "float32"]
     watch = Watch(frozenset(place for leaf in reals for place in _places(leaf)), fault.first)
+    kernels[stages[-1].name] += list(zip(leaves, last, strict=True))
+    kernels["reset"] = list(zip(leaves, first, strict=True))
     compiled = {}
-    for name, values in {**kernels, "reset": first}.items():
-        stage(f"scheduling the {name}")
-        stores = _stores(graph, stored.get(name, leaves), values)
-        compiled[name] = compile_program(Program(graph, stores, vector, watch), f"{title}.{name}" if title else name)
+    for name, stored in kernels.items():
+        phase(f"scheduling the {name}")
+        program = Program(graph, _stores(graph, stored), vector, watch)
+        compiled[name] = compile_program(program, f"{title}.{name}" if title else name)
     return Source(
         bodies={name: one.text for name, one in compiled.items()},
+        stages=stages,
         large_branches=sum(one.large_branches for one in compiled.values()),
         tables=tables(graph),
         sizes=fields.sizes,
@@ -134,8 +125,6 @@ def make_source(functions: dict[str, Function], parameters: Any, vector: bool, s
         actions=actions,
         results=results,
         parameters=places,
-        moved=_tree(moved),
-        sensed=sensed,
         fault=fault,
     )
 
@@ -158,9 +147,30 @@ def _parameters(graph: Graph, parameters: Any) -> tuple[list[AnyArray | Table], 
     return given, places
 
 
-def _tree(tree: Any) -> dict[str, Any]:
-    paths, leaves = zip(*jax.tree_util.tree_flatten_with_path(tree)[0], strict=True) if tree else ((), ())
-    return _nest(list(paths), list(leaves))
+Stored = list[tuple[Leaf, list[Value]]]
+"""The leaves that a kernel stores, and their values."""
+
+
+def _step(
+    graph: Graph, fields: Fields, step: Function, leaves: tuple[Any, Any],
+    parameters: tuple[list[AnyArray | Table], dict[str, Leaf]], vector: bool,
+) -> tuple[dict[str, Stored], list[Stage], list[list[Value]]]:  # fmt: skip
+    """Return what the kernels of a step store between its stages, the stages, and the values of its results.
+
+    A CPU runs no blocks: their reference is a part of its kernel.
+    """
+    given, places = parameters
+    try:
+        variables, parts = split(step.jaxpr, lambda call: call.cuda is None or not vector)
+    except Unsplittable as error:
+        raise Unsupported(str(error)) from None
+    if len(parts) == 1:
+        return {"step": []}, [Stage("thread", "step")], interpret(graph, step, leaves, given)
+    known = [*jax.tree.leaves(leaves), *places.values()]
+    tables = dict(zip(variables[len(known) - len(given) :], given, strict=True))
+    code = StageCode(graph, fields.leaf, dict(zip(variables, known, strict=True)), tables)
+    stages = code.stages(parts)
+    return code.kernels, stages, [code.results[number] for number in range(len(code.results))]
 
 
 def interpret(
@@ -180,11 +190,7 @@ def interpret(
     Raises:
         Unsupported: for something that has no kernel code, with the line of the source that uses it.
     """
-    inputs: list[AnyArray] = []
-    for leaf in jax.tree.leaves(arguments):
-        kind = KINDS[leaf.dtype]
-        ids = [graph.node("load", leaf.buffer, leaf.first + k, kind=kind) for k in range(leaf.size)]
-        inputs.append(array_of(graph, np.array(ids, np.int32).reshape(leaf.shape), np.dtype(leaf.dtype)))
+    inputs = [load(graph, leaf) for leaf in jax.tree.leaves(arguments)]
     outputs = JaxprInterpreter(graph).run(function.jaxpr, [*inputs, *given])
     return [values_of(graph, x).ravel().tolist() for x in outputs]
 
@@ -197,10 +203,10 @@ def tables(graph: Graph) -> dict[str, np.ndarray]:
     }
 
 
-def _stores(graph: Graph, leaves: list[Leaf], values: list[list[Value]]) -> list[tuple[str, int, Value]]:
+def _stores(graph: Graph, stored: Stored) -> list[tuple[str, int, Value]]:
     """Return the stores of each leaf's values in its fields. A value that was loaded from there needs none."""
     stores: dict[tuple[str, int], Value] = {}
-    for leaf, elements in zip(leaves, values, strict=True):
+    for leaf, elements in stored:
         for place, value in zip(_places(leaf), elements, strict=True):
             if value < 0 or graph.ops[value] != "load" or graph.args[value] != place:
                 stores[place] = value

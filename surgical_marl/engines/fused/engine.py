@@ -1,4 +1,4 @@
-"""The fused engine: a control step of an environment is one kernel.
+"""The fused engine: a control step of an environment is one kernel, or several where it has stages.
 
     engine = FusedEngine(env, num_envs=4096, device="cuda")
     engine.reset(seed=0)
@@ -20,15 +20,15 @@ from typing import Any
 
 import numpy as np
 
+from surgical_marl.engines.compilation import compiling
 from surgical_marl.engines.fused.arrays import make_arrays
 from surgical_marl.engines.fused.env_sorting import sorted_every
 from surgical_marl.engines.fused.finite_check import FiniteCheck
-from surgical_marl.engines.fused.kernel import compile_kernels, has_cuda
-from surgical_marl.engines.fused.kernel_layout import Source
+from surgical_marl.engines.fused.kernel import compile_block, compile_kernels, has_cuda
+from surgical_marl.engines.fused.kernel_layout import Source, Stage, all_stages
 from surgical_marl.engines.fused.macros import LANES
 from surgical_marl.engines.fused.source_cache import load_source
 from surgical_marl.engines.fused.threefry import episode_keys
-from surgical_marl.engines.stages import compiling
 from surgical_marl.engines.stepper import Stepper
 from surgical_marl.machine import cores
 
@@ -51,14 +51,22 @@ class FusedEngine:
             raise ValueError("device 'cuda' is not there: Warp finds no CUDA device; the other is cpu")
         self.env, self.num_envs = env, num_envs
         self.device = ("cuda" if has_cuda() else "cpu") if device == "auto" else device
-        with compiling(f"{env.title} ({self.name}, {self.device})") as stage:
-            self.source: Source = load_source(env, vector=self.device == "cpu", stage=stage)
+        with compiling(f"{env.title} ({self.name}, {self.device})") as phase:
+            self.source: Source = load_source(env, vector=self.device == "cpu", phase=phase)
+            self._blocks = {
+                stage.name: compile_block(stage.name, stage.code, stage.threads, phase)
+                for stage in all_stages(self.source.stages)
+                if stage.kind == "block"
+            }
             self._kernels = compile_kernels(
-                self.source.bodies, self.device, num_envs, large_branches=self.source.large_branches, stage=stage
+                self.source.bodies, self.device, num_envs, large_branches=self.source.large_branches, phase=phase
             )
         carry = flatten(self.source.carry)
         self.carry_shapes = {name: leaf.shape for name, leaf in carry.items()}
-        self._leaves = {**carry, **flatten(self.source.moved, ".moved")}
+        self._leaves = dict(carry)
+        for stage in all_stages(self.source.stages):
+            if stage.kind == "host":
+                self._leaves |= {f"{stage.name}.{name}": leaf for name, leaf in stage.reads.items()}
         self._stride = -(-num_envs // LANES) * LANES
         self._arrays = make_arrays(self.device, self.source, self._filled_tables(), self._stride, num_envs)
         self._finite_check: FiniteCheck | None = None
@@ -81,6 +89,7 @@ class FusedEngine:
         """Begin episodes by their number, [N] int32, among those of each environment's key, [N, 2] uint32."""
         self.write(".key", keys)
         self.write(".episode", episodes)
+        self._arrays.renew_results()
         self._launch("reset")
 
     def set_parameters(self) -> None:
@@ -92,19 +101,28 @@ class FusedEngine:
 
         Args:
             actions: [N, n] by agent, of any array library.
-            sense: called after the physics, when `.moved` can be read; returns the sensed numbers, [N] each.
+            sense: computes what the host does in a step: returns the results, [N] each, of a stage whose inputs can be
+                read by its name. Without it, these results stay as they are.
         """
         if self._arrays.order:
             self._arrays.order.sort_if_due()
         for agent, action in actions.items():
             self._arrays.write(self.source.actions[agent], action)
-        if self.env.pauses:
-            self._launch("move")
-            for name, values in (sense() if sense else {}).items():
-                self._arrays.write(self.source.sensed[name], values)
-            self._launch("finish")
-        else:
-            self._launch("step")
+        self._arrays.renew_results()
+        self._run(self.source.stages, sense)
+
+    def _run(self, stages: list[Stage], sense: Callable[[], dict[str, Any]] | None) -> None:
+        for stage in stages:
+            if stage.kind == "thread":
+                self._launch(stage.name)
+            elif stage.kind == "block":
+                self._blocks[stage.name].launch(self._arrays.all, self._stride, self.num_envs)
+            elif stage.kind == "loop":
+                for _ in range(stage.length):
+                    self._run(stage.stages, sense)
+            else:
+                for name, values in (sense() if sense else {}).items():
+                    self._arrays.write(stage.writes[name], values)
 
     @property
     def finite_check(self) -> FiniteCheck:
@@ -150,8 +168,8 @@ class FusedEngine:
     def read(self, name: str, library: str) -> Any:
         """Return a copy, [N, ...], of a part of the state.
 
-        A part of the `Carry` has a name in `carry_shapes`; a part of the state between `move` and `finish` has one such
-        as ".moved.carry.physics.qpos".
+        A part of the `Carry` has a name in `carry_shapes`; what a stage of the host reads has one such as
+        "pictures.physics.arms.qpos".
         """
         return self._arrays.read(self._leaves[name], library)
 
@@ -177,7 +195,6 @@ class FusedEngine:
         return filled
 
     def _launch(self, name: str) -> None:
-        self._arrays.renew_results()
         launch = partial(self._kernels[name].launch, self._arrays.all, self._stride)
         if len(self._shares) == 1:
             launch(*self._shares[0])

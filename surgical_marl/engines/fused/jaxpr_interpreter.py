@@ -31,13 +31,8 @@ from surgical_marl.engines.fused.symbolic_array import (
     dtype_of,
     values_of,
 )
-
-_INSIDE = {
-    "jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr", "remat": "jaxpr",
-    "remat2": "jaxpr", "checkpoint": "jaxpr", "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr",
-    "custom_vjp_call_jaxpr": "fun_jaxpr", "custom_vmap_call": "call",
-}  # fmt: skip
-"""Primitives that call a function, and the parameter that holds it."""
+from surgical_marl.engines.split import CALLS
+from surgical_marl.engines.stages import called
 
 
 class JaxprInterpreter:
@@ -80,8 +75,10 @@ class JaxprInterpreter:
 
     def _equation(self, equation: Any, xs: list[AnyArray]) -> list[AnyArray]:
         name, params = equation.primitive.name, equation.params
-        if name in _INSIDE:
-            return self.run(params[_INSIDE[name]], xs)
+        if (call := called(equation)) is not None:
+            return self.run(call.reference, xs)
+        if name in CALLS:
+            return self.run(params[CALLS[name]], xs)
         if name == "call_hi_primitive":
             return self.run(_expanded(params["_prim"]), xs)
         if name == "cond":

@@ -20,8 +20,8 @@ from pathlib import Path
 from typing import Any
 
 from surgical_marl.cache import locked
+from surgical_marl.engines.compilation import Phase, unsaid
 from surgical_marl.engines.fused.macros import CPU, CUDA, LANES, UNDEFINE, is_long
-from surgical_marl.engines.stages import Stage, unsaid
 from surgical_marl.engines.stepper import MOST_KEPT
 from surgical_marl.files import writable, write_text
 from surgical_marl.runtime import cache_dir, prepare_warp
@@ -45,7 +45,7 @@ def compile_kernels(
     num_envs: int = 0,
     large_branches: int = 0,
     max_registers: int | None = None,
-    stage: Stage = unsaid,
+    phase: Phase = unsaid,
 ) -> dict[str, Kernel]:
     """Compile C function bodies into kernels by name, in one module. Warp keeps compiled modules in its cache on disk.
 
@@ -55,7 +55,7 @@ def compile_kernels(
         num_envs: about how many environments there will be.
         large_branches: of the bodies (`Source`).
         max_registers: most registers of a thread on a GPU, None for CUDA's own limit.
-        stage: is told if the cache has none of these bodies.
+        phase: is told if the cache has none of these bodies.
     """
     cuda = device == "cuda"
     block, split = LEAST_BLOCK, 0
@@ -70,9 +70,29 @@ def compile_kernels(
     # Warp itself does not protect a module from two processes that compile it at the same time
     with locked(_records() / module.name), _checked(module.name):
         if not _folders(module.name):
-            stage("compiling the C code")
+            phase("compiling the C code")
         module.load(wp.get_device(device), block_dim=MOST_BLOCK if cuda else 1)
     return {name: Kernel(kernel, device, block, split) for name, kernel in made.items()}
+
+
+def compile_block(name: str, body: str, threads: int, phase: Phase = unsaid) -> Block:
+    """Compile the CUDA body of a stage that runs a block of threads an environment.
+
+    Args:
+        name: of the kernel.
+        body: as `compile_kernels` takes them; `t` is the environment's column.
+        threads: of a block.
+        phase: is told if the cache has no such kernel.
+    """
+    digest = hashlib.sha256(f"{threads} {body}".encode()).hexdigest()[:16]
+    module = wp.get_module(f"surgical_marl_{digest}")
+    module.options.update(enable_backward=False)
+    kernel = _made(digest, ((name, body),), module, None, threads)[name]
+    with locked(_records() / module.name), _checked(module.name):
+        if not _folders(module.name):
+            phase(f"compiling the stage {name}")
+        module.load(wp.get_device("cuda"), block_dim=threads)
+    return Block(kernel, threads)
 
 
 def block_of(num_envs: int, multiprocessors: int) -> int:
@@ -93,14 +113,16 @@ def split_of(num_envs: int, multiprocessors: int) -> int:
 
 
 @lru_cache(MOST_KEPT)
-def _made(digest: str, sources: tuple[tuple[str, str], ...], module: Any, max_registers: int | None) -> dict[str, Any]:
+def _made(
+    digest: str, sources: tuple[tuple[str, str], ...], module: Any, max_registers: int | None, threads: int = 1
+) -> dict[str, Any]:
     """Return Warp's kernels by name: the same for all environments of a process whose code is the same.
 
     `wp.func_native` keeps its frame, and so all frames that led to it and what they hold, until Python looks for cycles
     among its objects. Memory of a closed environment must not wait for that: a thread without such frames makes them.
     """
     with ThreadPoolExecutor(1, "surgical_marl") as apart:
-        calls = [apart.submit(_make, f"{name}_{digest}", own, module, max_registers) for name, own in sources]
+        calls = [apart.submit(_make, f"{name}_{digest}", own, module, max_registers, threads) for name, own in sources]
         return {name: call.result() for (name, _), call in zip(sources, calls, strict=True)}
 
 
@@ -148,7 +170,9 @@ def _digest(folders: list[Path]) -> str:
     return "\n".join(f"{file.name} {hashlib.sha256(file.read_bytes()).hexdigest()}" for file in files)
 
 
-def _make(name: str, source: str, module: Any, max_registers: int | None = None) -> Any:
+def _make(name: str, source: str, module: Any, max_registers: int | None = None, threads: int = 1) -> Any:
+    """Make a kernel with `threads` an environment; one of many has a block for each."""
+
     def body(
         state: _reals, counts: _wholes, actions: _reals, outs: _reals, flags: _bytes, reals: _reals, wholes: _wholes,
         work: _wholes, arrivals: _wholes, stride: int, t: int,
@@ -168,8 +192,19 @@ def _make(name: str, source: str, module: Any, max_registers: int | None = None)
         i -= wp.min(block, 2 * split) * (LEAST_BLOCK // 2)
         body(state, counts, actions, outs, flags, reals, wholes, work, arrivals, stride, start + i * lanes)
 
+    def run_block(
+        state: _reals, counts: _wholes, actions: _reals, outs: _reals, flags: _bytes, reals: _reals, wholes: _wholes,
+        work: _wholes, arrivals: _wholes, stride: int, threads: int,
+    ) -> None:  # fmt: skip
+        body(state, counts, actions, outs, flags, reals, wholes, work, arrivals, stride, wp.tid() // threads)
+
     return wp.kernel(
-        run, name=name, module=module, enable_backward=False, grid_stride=False, cuda_max_registers=max_registers
+        run if threads == 1 else run_block,
+        name=name,
+        module=module,
+        enable_backward=False,
+        grid_stride=False,
+        cuda_max_registers=max_registers,
     )
 
 
@@ -193,6 +228,20 @@ class Kernel:
         command = wp.launch(self._kernel, threads, inputs, device="cuda", block_dim=MOST_BLOCK, record_cmd=True)
         command.block_dim = self._block
         command.launch(torch_stream())
+
+
+class Block:
+    """A compiled stage, with a block of threads an environment, on a GPU."""
+
+    def __init__(self, kernel: Any, threads: int) -> None:
+        self._kernel, self._threads = kernel, threads
+
+    def launch(self, arrays: list[Any], stride: int, count: int) -> None:
+        """Run the first `count` columns, on torch's current stream."""
+        wp.launch(
+            self._kernel, count * self._threads, [*arrays, stride, self._threads],
+            device="cuda", block_dim=self._threads, stream=torch_stream(),
+        )  # fmt: skip
 
 
 def load_for_gpu(kernel: Any) -> None:

@@ -7,7 +7,8 @@ an array whose columns are environments.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -15,7 +16,7 @@ import numpy as np
 
 BUFFERS = ("state", "counts", "actions", "outs", "flags")
 """Arrays of environments that kernels work on: see `kernel.py`."""
-TREES = ("carry", "actions", "results", "parameters", "moved", "sensed", "fault")
+TREES = ("carry", "actions", "results", "parameters", "fault")
 
 
 @dataclass(frozen=True)
@@ -38,11 +39,42 @@ class Leaf:
 
 
 @dataclass(frozen=True)
+class Stage:
+    """A stage of a step: what an engine does next.
+
+    Its kind is "thread" or "block" for a kernel of this name with one or with many threads an environment, "host" for
+    numbers that are computed outside, or "loop".
+    """
+
+    kind: str
+    name: str
+    reads: dict[str, Leaf] = field(default_factory=dict)
+    """Of a block or the host, by name. A block reads constants and parameters in the tables "float32" and "int32"."""
+    writes: dict[str, Leaf] = field(default_factory=dict)
+    code: str = ""
+    """CUDA of a block."""
+    threads: int = 1
+    length: int = 1
+    """Rounds of a loop."""
+    stages: list[Stage] = field(default_factory=list)
+    """Of a loop."""
+
+
+def all_stages(stages: Iterable[Stage]) -> Iterator[Stage]:
+    """Yield stages, and those of loops, in their order."""
+    for stage in stages:
+        yield stage
+        yield from all_stages(stage.stages)
+
+
+@dataclass(frozen=True)
 class Source:
     """The kernels of an environment in C, and the layout of their data."""
 
     bodies: dict[str, str]
-    """C by the name of the kernel: "reset" and "step", or "move" and "finish" instead of that."""
+    """C by the name of the kernel: "reset" and "step", or "step_0", "step_1", ... where a step has several stages."""
+    stages: list[Stage]
+    """Of a step, in their order."""
     large_branches: int
     """In how many places of the kernels environments differ in how much they have to do."""
     tables: dict[str, np.ndarray]
@@ -56,8 +88,5 @@ class Source:
     """Leaves of the rest of the `State`."""
     parameters: dict[str, Any]
     """Places of parameters in the tables, by their paths: leaves whose buffer is "float32" or "int32"."""
-    moved: dict[str, Any]
-    """Leaves of the state between both halves of a step, and of the `sensed` numbers; none if a step is one kernel."""
-    sensed: dict[str, Any]
     fault: Leaf
     """A flag that kernels set, and never clear, when they store a NaN or infinity that `faults.checked` forbids."""

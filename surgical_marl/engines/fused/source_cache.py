@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 
 from surgical_marl.cache import cached, is_shipped
-from surgical_marl.engines.fused.kernel_layout import TREES, Leaf, Source
+from surgical_marl.engines.compilation import Phase, unsaid
+from surgical_marl.engines.fused.kernel_layout import TREES, Leaf, Source, Stage
 from surgical_marl.engines.fused.options import read_options
-from surgical_marl.engines.stages import Stage, unsaid
 from surgical_marl.engines.stepper import Stepper, describe
 from surgical_marl.runtime import jax_scope, no_collection
 
 
-def load_source(env: Stepper, vector: bool, stage: Stage = unsaid) -> Source:
+def load_source(env: Stepper, vector: bool, phase: Phase = unsaid) -> Source:
     """Return the source of an environment's kernels: for a CPU, with vectors, or for CUDA.
 
     The source is kept on disk. For an environment of this package alone, the key is the code of the package and the
@@ -27,7 +27,7 @@ def load_source(env: Stepper, vector: bool, stage: Stage = unsaid) -> Source:
     Args:
         env: the environment.
         vector: whether the kernels are for a CPU.
-        stage: is told the stages in which the source is made.
+        phase: is told the phases in which the source is made.
 
     Raises:
         Unsupported: the environment can't be traced.
@@ -35,38 +35,38 @@ def load_source(env: Stepper, vector: bool, stage: Stage = unsaid) -> Source:
     """
     options = read_options()
     about = f"vector={vector} {describe(env.parameters)} {options.switches}"
-    make = partial(_make, env.parameters, vector, stage, env.title)
+    make = partial(_make, env.parameters, vector, phase, env.title)
     if options.dump:
-        made = make(_trace(env, stage))
+        made = make(_trace(env, phase))
     elif is_shipped(*env.classes):
-        made = cached("fused", lambda: make(_trace(env, stage)), about, env.content, classes=env.classes)
+        made = cached("fused", lambda: make(_trace(env, phase)), about, env.content, classes=env.classes)
     else:
         from surgical_marl.engines.fused.jaxpr_digest import jaxpr_digest  # imports JAX
 
-        functions = _trace(env, stage)
+        functions = _trace(env, phase)
         made = cached("fused", lambda: make(functions), about, jaxpr_digest(functions))
     found = json.loads(made.tobytes())
     tables = {dtype: np.array(table, dtype) for dtype, table in found.pop("tables").items()}
     trees = {name: _leaves(found.pop(name)) for name in TREES}
-    return Source(tables=tables, **trees, **found)
+    return Source(tables=tables, stages=_stages(found.pop("stages")), **trees, **found)
 
 
 @jax_scope()
-def _trace(env: Stepper, stage: Stage) -> dict[str, Any]:
+def _trace(env: Stepper, phase: Phase) -> dict[str, Any]:
     from surgical_marl.engines.fused.compiler import trace_environment  # imports JAX
 
     # what tracing makes stays: to look for garbage among it takes a fifth of the time
     with no_collection():
-        return trace_environment(env, stage)
+        return trace_environment(env, phase)
 
 
 @jax_scope()
-def _make(parameters: Any, vector: bool, stage: Stage, title: str, functions: dict[str, Any]) -> np.ndarray:
+def _make(parameters: Any, vector: bool, phase: Phase, title: str, functions: dict[str, Any]) -> np.ndarray:
     """Return a source as bytes."""
     from surgical_marl.engines.fused.compiler import make_source  # imports JAX
 
     with no_collection():
-        source = make_source(functions, parameters, vector, stage, title)
+        source = make_source(functions, parameters, vector, phase, title)
     return np.frombuffer(json.dumps(asdict(source), default=np.ndarray.tolist).encode(), np.uint8)
 
 
@@ -74,3 +74,8 @@ def _leaves(tree: Any) -> Any:
     if "buffer" in tree and not isinstance(tree["buffer"], dict):
         return Leaf(tree["buffer"], tree["first"], tuple(tree["shape"]), tree["dtype"])
     return {name: _leaves(child) for name, child in tree.items()}
+
+
+def _stages(stages: list[dict[str, Any]]) -> list[Stage]:
+    trees = {"reads": _leaves, "writes": _leaves, "stages": _stages}
+    return [Stage(**{name: trees[name](own) if name in trees else own for name, own in one.items()}) for one in stages]

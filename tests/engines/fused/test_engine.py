@@ -78,7 +78,7 @@ def play(engine: Any, carry: dict[str, np.ndarray], actions: dict[str, np.ndarra
     engine.reset(3)
     for name, value in carry.items():
         engine.write(name, value)
-    senses = {name: np.linspace(0, 9, STATES, dtype=np.float32) for name in engine.env.senses}
+    senses = {name: np.linspace(0, 9, STATES, dtype=np.float32) for name in engine.env.task.senses}
     engine.step(actions, lambda: senses)
     found = flatten(engine.outcome("numpy")) | {name: engine.read(name, "numpy") for name in engine.carry_shapes}
     return {name: np.array(value).reshape(STATES, -1) for name, value in found.items()}

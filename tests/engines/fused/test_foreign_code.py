@@ -19,11 +19,11 @@ from hypothesis import strategies as st
 
 from surgical_marl import cache
 from surgical_marl.bench.physics import bare_state
+from surgical_marl.engines.compilation import unsaid
 from surgical_marl.engines.fused import source_cache
 from surgical_marl.engines.fused.compiler import trace
 from surgical_marl.engines.fused.jaxpr_digest import jaxpr_digest
 from surgical_marl.engines.fused.source_cache import load_source
-from surgical_marl.engines.stages import unsaid
 from surgical_marl.engines.stepper import representative
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.envs.env import Env
@@ -37,7 +37,7 @@ class Stepper:
     """The smallest environment: a number that each step adds something to."""
 
     agents, decimation, title, content, parameters = (), 1, "tiny", b"tiny", {}
-    pauses, senses = False, ()
+    pauses = False
 
     def __init__(self, add: Callable[[Any], Any]) -> None:
         self.add = add
