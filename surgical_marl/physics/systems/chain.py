@@ -26,6 +26,13 @@ import numpy as np
 from jax import Array
 
 GRAVITY = np.array([0.0, 0.0, -9.81], np.float32)
+ENOUGH = 1e-8
+"""Displacement, m, below which a Newton step is the last one."""
+FARTHEST = 1.0
+"""Displacement of a Newton step at most, in lengths of an edge: beyond it the linear equations say nothing."""
+KINKING = 100.0
+"""Compliance of an edge under compression, relative to that under tension: a thread kinks where it is pushed along
+itself, at loads that edges of this length can't show, as they are straight."""
 _EYE = np.eye(3, dtype=np.float32)
 _FULL = np.array([[0, 1, 3], [1, 2, 4], [3, 4, 5]])
 """Where each element of a symmetric matrix [3, 3] is among its lower half, row by row."""
@@ -120,7 +127,7 @@ def search(
         pull: `free_forces`, and other forces on nodes that do not depend on their displacements, N, [n, 3].
         load: takes displacements [n, 3], returns the forces of contacts there.
         dt: duration of the step, s.
-        iterations: Newton steps.
+        iterations: Newton steps at most.
         holds: 1 for edges that hold, 0 for a broken one and after the last node, [n].
     """
     n = rod.nodes
@@ -129,16 +136,23 @@ def search(
     apart = _after(state.position) - state.position  # from here on, edges are sums of small differences
     known = inertia, holds, _before(bends), bends, _after(bends), pull
 
-    def step(_: Any, found: Newton) -> Newton:
+    def going(loop: tuple[Newton, Array, Array]) -> Array:
+        _, most, count = loop
+        return (most > ENOUGH) & (count < iterations)
+
+    def step(loop: tuple[Newton, Array, Array]) -> tuple[Newton, Array, Array]:
+        found, _, count = loop
         u, q = found.shift + found.change[:, :3], found.tension + found.change[:, 3]
         edges = apart + _after(u) - u
         factors, reduced = _eliminate(rod, u, q, edges, known, load(u))
-        return Newton(u, q, _back(rod, bends, factors, reduced), factors)
+        change, most = _back(rod, bends, factors, reduced)
+        change *= jnp.minimum(1.0, FARTHEST * rod.length / jnp.maximum(most, 1e-12))
+        return Newton(u, q, change, factors), most, count + 1
 
     guess = jnp.concatenate([dt * state.velocity, jnp.zeros((n, 1))], 1)
     empty = Factors(*(jnp.zeros((n, *shape)) for shape in ((6,), (3,), (), (3, 3), (3,))))
-    start = Newton(jnp.zeros((n, 3)), state.tension, guess, empty)
-    found: Newton = jax.lax.fori_loop(0, iterations, step, start)
+    start = Newton(jnp.zeros((n, 3)), state.tension, guess, empty), jnp.float32(jnp.inf), jnp.int32(0)
+    found: Newton = jax.lax.while_loop(going, step, start)[0]
     return found
 
 
@@ -155,14 +169,14 @@ def solve(rod: Rod, factors: Factors, force: Array, holds: Any) -> Array:
 
     none = jnp.zeros(3)
     _, reduced = jax.lax.scan(forward, (none, none), (factors, skips, force))
-    return _back(rod, bends, factors, reduced)
+    return _back(rod, bends, factors, reduced)[0]
 
 
 def _eliminate(
     rod: Rod, u: Array, q: Array, edges: Array, known: tuple[Any, ...], load: Loaded
 ) -> tuple[Factors, Array]:  # fmt: skip
     """Return the eliminated matrix of a Newton step at displacements u and tensions q, and its right side, [n, 4]."""
-    stiffness, compliance = np.float32(rod.bending / rod.length**3), np.float32(rod.length / rod.axial)
+    stiffness, stretchy = np.float32(rod.bending / rod.length**3), np.float32(rod.length / rod.axial)
     length_at_rest = np.float32(rod.length)
 
     def node(carry: Any, row: Any) -> tuple[Any, tuple[Factors, Array]]:
@@ -171,7 +185,7 @@ def _eliminate(
         length = jnp.sqrt(jnp.maximum(edge @ edge, 1e-18))
         along = holds / length * edge
         bent_2 = bends_2 * (edge_2 - edge)
-        pulls = q * along
+        pulls, compliance = q * along, jnp.where(q < 0, KINKING * stretchy, stretchy)
         force = pull - inertia * u + pulls - pull_1 - stiffness * (bent_1 - 2 * bent + bent_2) + load.force + right
         slack = holds * (compliance * q - (length - length_at_rest)) + (1 - holds) * q
         # Tension resists what moves across an edge. Compression is left out, as the matrix has to stay definite.
@@ -205,19 +219,18 @@ def _eliminate(
     return eliminated
 
 
-def _back(rod: Rod, bends: Any, factors: Factors, reduced: Array) -> Array:
-    """Return the unknowns [n, 4] of eliminated equations."""
+def _back(rod: Rod, bends: Any, factors: Factors, reduced: Array) -> tuple[Array, Array]:
+    """Return the unknowns [n, 4] of eliminated equations, and the largest displacement among them, m, []."""
 
-    def node(carry: tuple[Array, Array], row: Any) -> tuple[tuple[Array, Array], Array]:
-        (next_1, next_2), (factor, skip, reduced) = carry, row
+    def node(carry: tuple[Array, Array, Array], row: Any) -> tuple[tuple[Array, Array, Array], Array]:
+        (next_1, next_2, most), (factor, skip, reduced) = carry, row
         moved = reduced[:3] - factor.one.T @ next_1 - skip * (factor.own[_FULL] @ next_2)
         tension = reduced[3] + factor.pulled @ next_1 + skip * (factor.tight @ next_2)
-        return (moved, next_1), jnp.append(moved, tension)
+        return (moved, next_1, jnp.maximum(most, jnp.max(jnp.abs(moved)))), jnp.append(moved, tension)
 
-    none = jnp.zeros(3)
-    _, found = jax.lax.scan(node, (none, none), (factors, _skips(rod, bends), reduced), reverse=True)
-    changes: Array = found
-    return changes
+    none, rows = jnp.zeros(3), (factors, _skips(rod, bends), reduced)
+    (_, _, most), changes = jax.lax.scan(node, (none, none, jnp.float32(0.0)), rows, reverse=True)
+    return changes, most
 
 
 def _skips(rod: Rod, bends: Any) -> Any:
