@@ -25,9 +25,10 @@ from surgical_marl.engines.mjx import MjxEngine
 from surgical_marl.engines.split import Loop, Part, Stage, Unsplittable, split
 from surgical_marl.engines.stages import Call, block_stage, host_stage
 from surgical_marl.envs.env import Env
+from surgical_marl.physics.systems.system import Response
 from surgical_marl.plugins.systems import SYSTEMS
 from tests.helpers.fused_kernels import gpu_code
-from tests.helpers.membrane import MIDDLE, PRESS, Membrane, Nodes, press, relax
+from tests.helpers.membrane import MIDDLE, RELAX, Membrane, Nodes, press, relax
 
 TABLE = np.arange(9, dtype=np.float32).reshape(3, 3) / 9
 
@@ -210,7 +211,9 @@ def physics(scene: str) -> PhysicsAlone:
 class Emulated:
     """A block stage that JAX computes from an engine's arrays, where there is no GPU."""
 
-    references = {"press": press, "relax": lambda height, speed, *rest: relax(Nodes(height, speed), *rest)}  # noqa: RUF012
+    @staticmethod
+    def relax(height: Any, speed: Any, middle: Any, part: Any, normal: Any, *rest: Any) -> Nodes:
+        return relax(Nodes(height, speed), middle, part, normal, Response(*rest[:2]), *rest[2:])
 
     def __init__(self, engine: Any, stage: Any) -> None:
         self.engine, self.stage = engine, stage
@@ -222,7 +225,8 @@ class Emulated:
         return np.repeat(table.reshape(1, *leaf.shape), ENVS, 0)
 
     def launch(self, *_: Any) -> None:
-        results = jax.vmap(self.references[self.stage.name])(*map(self.read, self.stage.reads.values()))
+        reference = press if self.stage.name == "press" else self.relax
+        results = jax.vmap(reference)(*map(self.read, self.stage.reads.values()))
         for leaf, values in zip(self.stage.writes.values(), results, strict=True):
             self.engine._arrays.write(leaf, values)
 
@@ -256,15 +260,17 @@ def test_a_gpu_moves_it_alike(scene: str) -> None:
 
 def test_a_kernel_reads_and_writes_what_it_declares(tmp_path: Path) -> None:
     """NVRTC compiles it without a GPU."""
-    reads = {"speed": Leaf("state", 3, (4,), "float32"), "depth": Leaf("state", 7, (4, 2), "float32"),
-             "normal": Leaf("state", 15, (4, 2, 3), "float32"), "velocity": Leaf("state", 39, (4, 2, 3), "float32"),
-             "dt": Leaf("float32", 11, (), "float32")}  # fmt: skip
-    writes = {"force": Leaf("state", 63, (4, 2, 3), "float32"), "stiffness": Leaf("outs", 87, (4, 2, 3, 3), "float32")}
-    body = block_code(PRESS, 32, reads, writes)
-    assert "reals.data + 11, 1, 1" in body and "outs.data + (size_t)87 * stride + t), (size_t)stride, 72" in body
+    tables = {"middle": Leaf("int32", 5, (4,), "int32"), "dt": Leaf("float32", 11, (), "float32")}
+    state = {"state.height": 0, "state.speed": 64, "normal": 130, "response.force": 154, "response.solved": 178,
+             "accelerations": 186}  # fmt: skip
+    reads = {name: Leaf("state", first, (24,), "float32") for name, first in state.items()}
+    part = {"part": Leaf("counts", 7, (8,), "int32")}
+    writes = {"height": Leaf("state", 210, (64,), "float32"), "speed": Leaf("outs", 87, (64,), "float32")}
+    body = block_code(RELAX, 64, reads | tables | part, writes)
+    assert "reals.data + 11, 1, 1" in body and "outs.data + (size_t)87 * stride + t), (size_t)stride, 64" in body
     module = kernel.wp.get_module("surgical_marl_test_stage")
     module.options.update(enable_backward=False)
-    kernel._make("press", body, module, threads=32)
-    module.options["block_dim"] = 32
+    kernel._make("relax", body, module, threads=64)
+    module.options["block_dim"] = 64
     (ptx,) = kernel.wp.compile_aot_module(module, arch=90, module_dir=tmp_path, use_ptx=True)
-    assert "press" in ptx.read_text()
+    assert ".shared" in (text := ptx.read_text()) and "bar.sync" in text
