@@ -81,6 +81,15 @@ def split(step: core.ClosedJaxpr, where: Where) -> tuple[list[Any], list[Part]]:
     return _Splitter(step, where).split()
 
 
+def scan_inputs(params: Any, inputs: Sequence[Any]) -> tuple[list[Any], list[Any], list[Any]]:
+    """Return the inputs of a scan, from its parameters: constants, what it carries, and arrays of rows."""
+    if "ft_in" in params:  # from JAX 0.11 on
+        constants, carried, rows = map(list, params["ft_in"].update(inputs).unpack())
+        return constants, carried, rows
+    fixed, end = params["num_consts"], params["num_consts"] + params["num_carry"]
+    return list(inputs[:fixed]), list(inputs[fixed:end]), list(inputs[end:])
+
+
 def walk(parts: Sequence[Part]) -> Iterator[Run | Stage]:
     """Yield all parts but loops."""
     for part in parts:
@@ -175,15 +184,12 @@ class _Splitter:
 
     def _loop(self, scan: Any) -> tuple[list[tuple[Any, Any]], Loop]:
         """Return how what a scan carries starts, and the scan as a loop. Its results are what it carries."""
-        params, carried = scan.params, scan.outvars
-        if (
-            scan.primitive.name != "scan"
-            or not len(carried) == params["num_carry"] == len(scan.invars) - params["num_consts"]
-        ):
-            name = next(call.name for call in _calls(scan) if self._where(call))
-            place = "a scan over rows" if scan.primitive.name == "scan" else f"`{scan.primitive.name}`"
-            raise Unsplittable(f"stage {name!r} inside of {place}; it can be in a step, or in a scan without rows")
-        constants, starts = scan.invars[: params["num_consts"]], scan.invars[params["num_consts"] :]
+        params, carried, name = scan.params, scan.outvars, scan.primitive.name
+        constants, starts, rows = scan_inputs(params, scan.invars) if name == "scan" else ([], [], [scan])
+        if rows or len(starts) != len(carried):
+            stage = next(call.name for call in _calls(scan) if self._where(call))
+            place = "a scan over rows" if name == "scan" else f"`{name}`"
+            raise Unsplittable(f"stage {stage!r} inside of {place}; it can be in a step, or in a scan without rows")
         inner = params["jaxpr"]
         equations, nexts = self._inline(inner.jaxpr, inner.consts, [*constants, *carried])
         changed = [(own, value) for own, value in zip(carried, nexts, strict=True) if value is not own]

@@ -31,7 +31,7 @@ from surgical_marl.engines.fused.symbolic_array import (
     dtype_of,
     values_of,
 )
-from surgical_marl.engines.split import CALLS
+from surgical_marl.engines.split import CALLS, scan_inputs
 from surgical_marl.engines.stages import called
 
 
@@ -173,11 +173,7 @@ class JaxprInterpreter:
 
     def _scan(self, params: Any, xs: list[AnyArray]) -> list[AnyArray]:
         body, length = params["jaxpr"], params["length"]
-        if "ft_in" in params:  # from JAX 0.11 on
-            constants, carry, rows = map(list, params["ft_in"].update(xs).unpack())
-        else:
-            fixed, number = params["num_consts"], params["num_carry"]
-            constants, carry, rows = xs[:fixed], xs[fixed : fixed + number], xs[fixed + number :]
+        constants, carry, rows = scan_inputs(params, xs)
         carried, outvars = len(carry), getattr(body, "jaxpr", body).outvars
         written = len(outvars) - carried
         if length > params["unroll"]:
