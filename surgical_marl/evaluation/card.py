@@ -11,7 +11,7 @@ from typing import Any
 from surgical_marl.content import find, list_policies
 from surgical_marl.evaluation.goal_set import is_standard
 from surgical_marl.evaluation.interval import Interval, over_seeds, share_interval
-from surgical_marl.evaluation.report import number, title
+from surgical_marl.evaluation.report import number, spanned, title
 from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.policies.onnx_file import SUFFIX, read_pictures
 from surgical_marl.policies.weights import read_weights
@@ -103,7 +103,7 @@ def _row(folder: Path) -> tuple[str, ...]:
         as_link(folder.name),
         "yes" if read_settings(folder).shown_by_oracle else "no",
         str(len(runs)),
-        _spanned("median_error_mm", *worst_over_seeds(runs)),
+        spanned("median_error_mm", *worst_over_seeds(runs)),
         "-" if SCORE in result else _with_interval("success_2mm", whole),
         _with_interval("collision_rate", whole),
         _worst(result),
@@ -164,13 +164,7 @@ def _shown(result: Mapping[str, Any]) -> list[str]:
 def _with_interval(key: str, result: Mapping[str, Any]) -> str:
     if key not in result:  # an older protocol did not measure it
         return "-"
-    return _spanned(key, result[key], result["intervals"][key])
-
-
-def _spanned(key: str, value: float | None, bounds: Interval) -> str:
-    """Return the value of a metric as text, with its interval in brackets where it has one."""
-    span = "" if bounds is None else f" ({' to '.join(number(key, bound) for bound in bounds)})"
-    return f"{number(key, value)}{span}"
+    return spanned(key, result[key], result["intervals"][key])
 
 
 def _train_command(folder: Path, settings: Settings) -> str:

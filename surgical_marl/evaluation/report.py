@@ -157,3 +157,9 @@ def number(name: str, value: float | None) -> str:
     texts = (f"{value:z.{digits}%}" for digits in (1, 2, 3))
     exact = next((text for text in texts if float(text[:-1]) not in (0, 100)), None)
     return exact or f"{value:z.1%}"
+
+
+def spanned(name: str, value: float | None, bounds: Sequence[float] | None) -> str:
+    """Return the value of a metric as text, with its interval in brackets where it has one."""
+    span = "" if value is None or bounds is None else f" ({' to '.join(number(name, bound) for bound in bounds)})"
+    return f"{number(name, value)}{span}"

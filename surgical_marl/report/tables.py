@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from surgical_marl.evaluation.card import SHOWN
-from surgical_marl.evaluation.report import explained, number
+from surgical_marl.evaluation.report import explained, number, spanned
 from surgical_marl.report.charts import percent, plain
 from surgical_marl.report.groups import Group, differences, numbers
 from surgical_marl.report.run import Run
@@ -44,7 +44,7 @@ def runs(groups: Sequence[Group]) -> Table:
                 run.seed,
                 plain(_end(run, "iteration")),
                 _count(_end(run, "env_steps")),
-                _duration(float(np.nansum(run.columns.get("seconds", np.array([np.nan]))))),
+                _duration(run),
                 percent(_tail(run, "success_rate")),
                 plain(_tail(run, "tip_error_mm")),
                 percent(_tail(run, "collision_rate")),
@@ -75,7 +75,7 @@ def tiles(run: Run) -> list[Tile]:
     else:
         found.append(Tile(percent(_tail(run, "success_rate")), "success in training"))
     found.append(Tile(_count(_end(run, "env_steps")), "environment steps"))
-    found.append(Tile(_duration(float(np.nansum(run.columns.get("seconds", np.array([np.nan]))))), "training"))
+    found.append(Tile(_duration(run), "training"))
     return found
 
 
@@ -172,19 +172,13 @@ def _columns(group: Group, several: bool) -> dict[str, dict[str, str]]:
     if played := group.played:
         count = f" ({len(played)} seeds)" if len(played) > 1 else ""
         found = numbers(played, [*SHOWN, *ALSO])
-        cells = {name: _cell(name, value if np.isfinite(value) else None, b) for name, (value, b) in found.items()}
+        cells = {name: spanned(name, value if np.isfinite(value) else None, b) for name, (value, b) in found.items()}
         return {f"{group.label}{count if several else ''}": cells}
     return {run.name: _cells(run.result) for run in group.runs if run.result is not None}
 
 
 def _cells(part: Mapping[str, Any]) -> dict[str, str]:
-    return {name: _cell(name, part.get(name), bounds) for name, bounds in part["intervals"].items()}
-
-
-def _cell(name: str, value: float | None, bounds: Sequence[float] | None) -> str:
-    if value is None or bounds is None:
-        return number(name, value)
-    return f"{number(name, value)} ({' to '.join(number(name, bound) for bound in bounds)})"
+    return {name: spanned(name, part.get(name), bounds) for name, bounds in part["intervals"].items()}
 
 
 def _plain(value: float | None) -> str:
@@ -210,7 +204,9 @@ def _count(value: float) -> str:
     return plain(value)
 
 
-def _duration(seconds: float) -> str:
+def _duration(run: Run) -> str:
+    """Return how long a training took, as text; "-" if that is unknown."""
+    seconds = float(np.nansum(run.columns.get("seconds", np.zeros(0))))
     if not seconds > 0:
         return "-"
     if seconds < 120:
