@@ -8,7 +8,7 @@ It returns what Gymnasium's `SyncVectorEnv` returns for as many single environme
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
@@ -19,6 +19,9 @@ from surgical_marl.interfaces.gymnasium import RENDER_MODES, LimitInSpec, make_b
 from surgical_marl.interfaces.joint import JointAgent
 from surgical_marl.interfaces.rendering import check_mode, check_size
 from surgical_marl.policies.teammates import Teammate, Teammates
+
+if TYPE_CHECKING:
+    from surgical_marl.view.record import ScenePicture
 
 
 class SurgicalVectorEnv(LimitInSpec, VectorEnv[Any, np.ndarray, Any]):
@@ -73,7 +76,7 @@ class SurgicalVectorEnv(LimitInSpec, VectorEnv[Any, np.ndarray, Any]):
         """Observations of all arms, as they were last returned."""
         self._over = np.zeros(self.num_envs, bool)
         """True for environments whose episode is over and whose next one has not been shown yet, [N] bool."""
-        self._pictures: Any = None
+        self._pictures: ScenePicture | None = None
         self.batch.autoreset = False
 
     def reset(
@@ -135,8 +138,8 @@ class SurgicalVectorEnv(LimitInSpec, VectorEnv[Any, np.ndarray, Any]):
             return None
         from surgical_marl.view.record import ScenePicture
 
-        self._pictures = self._pictures or ScenePicture(self.batch, *self._size)
-        return tuple(self._pictures.draw(self._pictures.pose(index)) for index in range(self.num_envs))
+        self._pictures = pictures = self._pictures or ScenePicture(self.batch, *self._size)
+        return tuple(pictures.draw(pictures.pose(index)) for index in range(self.num_envs))
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Return an attribute of each environment, or its result if it is a function.

@@ -11,6 +11,7 @@ import numpy as np
 
 if TYPE_CHECKING:
     from surgical_marl.envs.batch import BatchedEnv
+    from surgical_marl.view.record import ScenePicture
 
 MODES = ("human", "rgb_array")
 SIZE = (480, 360)
@@ -58,7 +59,7 @@ class Rendering:
     def __init__(self, batch: BatchedEnv, mode: str | None, size: tuple[int, int] | None = None) -> None:
         check_mode(mode)
         self.batch, self.mode, self.size = batch, mode, check_size(size)
-        self._picture: Any = None
+        self._picture: ScenePicture | None = None
         self._window: Any = None
 
     def render(self) -> np.ndarray | None:

@@ -10,7 +10,7 @@ arms in several postures about home. The same scene always gives the same view.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import mujoco
 import numpy as np
@@ -18,6 +18,9 @@ from numpy.typing import NDArray
 
 from surgical_marl.scenes.scene import Scene
 from surgical_marl.view.render import View
+
+if TYPE_CHECKING:
+    from surgical_marl.tasks.base.task import Task
 
 Array = NDArray[np.float64]
 
@@ -65,7 +68,7 @@ def best_view(scene: Scene, places: Array | None = None, aspect: float = 4 / 3) 
     return max(views, key=lambda view: _score(scene, moments, view, own))
 
 
-def task_places(task: Any) -> Array:
+def task_places(task: Task) -> Array:
     """Return points in the world that episodes of a task are about, [P, 3], m: where objects begin and should be.
 
     Goals of tool tips are near the points in front of the arms, which every view shows.

@@ -8,7 +8,7 @@ The environments of a grid play at the same time, and each frame holds all of th
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -172,7 +172,7 @@ def written(picture: Picture, lines: list[str]) -> Picture:
     return np.asarray(image)
 
 
-def _wrapped(line: str, font: Any, width: float) -> list[str]:
+def _wrapped(line: str, font: ImageFont.FreeTypeFont | ImageFont.ImageFont, width: float) -> list[str]:
     """Return a line as several, parted at commas where it would be wider than so many pixels."""
     found: list[str] = []
     for part in line.split(", "):
@@ -194,7 +194,7 @@ def _shots(
             yield [Shot(picture.pose(index), words[index]) for index in range(env.num_envs)]
 
 
-def _words(env: BatchedEnv, infos: Any, index: int) -> list[str]:
+def _words(env: BatchedEnv, infos: Mapping[str, Mapping[str, Any]], index: int) -> list[str]:
     time = float(np.asarray(env.steps)[index]) * env.control_dt
     return [f"{time:.2f} s", *(f"{agent}  {', '.join(summary(infos[agent], index))}" for agent in env.agents)]
 

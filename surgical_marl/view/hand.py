@@ -12,6 +12,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from surgical_marl.envs.observations import proprioception
 from surgical_marl.policies.target_mover import TargetMover
@@ -80,7 +81,7 @@ class Hand:
         lower, upper = self.limits
         self.q[index] = np.clip(value, lower[index], upper[index])
 
-    def reach(self, position: Any, rotation: Any = None) -> None:
+    def reach(self, position: ArrayLike, rotation: ArrayLike | None = None) -> None:
         """Want the tool tip at a position [3] in the world, m, and with a rotation [3, 3] if the arm can.
 
         Without a rotation the tool keeps the one that is wanted. Out of reach, the arm comes as near as it can.
@@ -93,7 +94,7 @@ class Hand:
         posed = np.count_nonzero(~self.jaw) >= POSED
         self.q = inverse_kinematics(self._arm, target if posed else target[:3, 3], self.q, starts=1)
 
-    def nudge(self, step: Any) -> None:
+    def nudge(self, step: ArrayLike) -> None:
         """Want the tool tip elsewhere by `step` [3] in the world, m."""
         self.reach(self.tip()[:3, 3] + np.asarray(step, float))
 

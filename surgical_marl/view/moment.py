@@ -8,7 +8,7 @@ Places follow from joint positions and object poses by C MuJoCo's kinematics, so
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import mujoco
 import numpy as np
@@ -98,7 +98,7 @@ class Observer:
         ]
         """Geoms of each free object."""
 
-    def look(self, env: BatchedEnv, forces: Any = None) -> Moment:
+    def look(self, env: BatchedEnv, forces: np.ndarray | None = None) -> Moment:
         """Return the moment in which the environments are now.
 
         Args:
@@ -118,7 +118,7 @@ class Observer:
             positions[row], quaternions[row] = self._data.xpos, self._data.xquat
             tips[row] = self._data.site_xpos[self._sites]
             nearest.append(self._nearest())
-            pushes.append([] if forces is None else self._pushes(np.asarray(forces)[row]))
+            pushes.append([] if forces is None else self._pushes(forces[row]))
             grips.append(self._grips(pressed[row]))
         marks = np.asarray(marks, float) if marks.size else np.zeros((count, 0, 3))
         return Moment(
