@@ -112,7 +112,7 @@ class BatchedEnv:
 
     @property
     def engine(self) -> Engine:
-        """What runs the environments. ValueError after `close`."""
+        """The engine that runs the environments. ValueError after `close`."""
         self.check_open()
         return self._engine  # type: ignore[return-value]
 
@@ -306,7 +306,7 @@ class BatchedEnv:
 
     @property
     def drawn_poses(self) -> Poses:
-        """Where all that moves but arms is: the free objects, then the edges of threads; numpy.
+        """Poses of all that moves but arms: the free objects, then the edges of threads; numpy.
 
         They are in the order of the mocap bodies of `scene.model`.
         """
@@ -332,7 +332,7 @@ class BatchedEnv:
 
     @property
     def goal(self) -> SimpleNamespace:
-        """What the episodes are after: the fields of the task's goal, [N, ...] each, numpy."""
+        """Goals of the episodes: the fields of the task's goal, [N, ...] each, numpy."""
         names = [name for name in self.engine.carry_shapes if name.startswith(".goal.")]
         return SimpleNamespace(**{name.removeprefix(".goal."): self._part(name, "numpy") for name in names})
 

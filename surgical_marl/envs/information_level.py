@@ -1,4 +1,4 @@
-"""Who knows what: the terms that an agent may observe, and those that it observes at a level of knowledge.
+"""Levels of knowledge: the terms that an agent may observe, and the terms that it observes at a level.
 
 Terms say what they are about, and a level is a rule for that. So every task whose terms say it has all levels.
 """
@@ -24,16 +24,16 @@ MESSAGES = "messages"
 
 
 class Rule(NamedTuple):
-    """What a level makes of the terms that the task shows an agent."""
+    """The rule of a level: which terms of the task an agent observes."""
 
     hides: tuple[About, ...]
-    """It does not observe terms about these."""
+    """Subjects of the terms that the agent does not observe."""
     adds: tuple[About, ...]
-    """It observes, besides, what the task shows its teammates about these."""
+    """Subjects of its teammates' terms that the agent observes too."""
 
 
 class InformationLevel:
-    """What an agent may observe, and what it does.
+    """The terms that an agent may observe, and the ones that it observes.
 
     Args:
         task: declares the terms.

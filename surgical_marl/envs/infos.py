@@ -1,4 +1,4 @@
-"""What is told of every agent after a step, besides its observation and reward."""
+"""The infos of every agent after a step, besides its observation and reward."""
 
 from __future__ import annotations
 

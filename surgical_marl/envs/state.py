@@ -1,4 +1,4 @@
-"""What a step of one environment takes and returns: trees of arrays, which JAX passes on from step to step."""
+"""Input and output of a step of one environment: trees of arrays, which JAX passes on from step to step."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Carry(NamedTuple):
     hidden: Hidden | None = None
     """Values that were drawn for the arms in this episode (`surgical_marl/physics/plant.py`)."""
     messages: Any = ()
-    """What each arm said in the last step, [arms, K]; () without messages."""
+    """Message of each arm in the last step, [arms, K]; () without messages."""
     actions: Any = ()
     """The actions of all arms in the last step without messages, in [-1, 1]; zeros at the start of an episode."""
 
@@ -59,7 +59,7 @@ class State(NamedTuple):
 
 
 class Moved(NamedTuple):
-    """Where a step is after its physics, before pictures and rewards."""
+    """State of a step after its physics, before pictures and rewards."""
 
     carry: Carry
     """After the step, before a reset."""

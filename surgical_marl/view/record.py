@@ -160,7 +160,7 @@ class Pose(NamedTuple):
     origins: NDArray[np.float64]
     """Origins of free objects and middles of edges of threads, m, [k, 3]."""
     quaternions: NDArray[np.float64]
-    """Their orientations, w, x, y, z, [k, 4]."""
+    """Orientations of the same, w, x, y, z, [k, 4]."""
     balls: list[Sphere]
     """A ball at each arm's goal."""
 

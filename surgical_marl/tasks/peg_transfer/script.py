@@ -25,8 +25,8 @@ OVER, RAISE, AWAY = 0.012, 0.030, 0.035
 """Height at which the tool tip stops above the bar, height by which it lifts the block, and distance from the wall
 before and after the exchange, m."""
 SIDE, NEXT = 150.0, -120.0
-"""In the exchange a tool of the left grips the bar that is this way from the block's axis, degrees about z, and one of
-the right the next bar clockwise, at 30 degrees."""
+"""Bearing from the block's axis of the bar that a tool of the left grips in the exchange, degrees about z, and the turn
+from there to the bar that a tool of the right grips, the next one clockwise, at 30 degrees."""
 THERE = 0.004
 """Largest distance of the block's middle from the place of the exchange when the oracle's taker comes, m."""
 SETTINGS = (ABOVE_WALL, PAST, WIDE, OVER, RAISE, AWAY, SIDE, NEXT)
