@@ -268,7 +268,7 @@ def _variables(equations: list[Any], results: Sequence[Any]) -> list[Any]:
 
 
 def _makes_key(equation: Any) -> bool:
-    return any(jax.dtypes.issubdtype(one.aval.dtype, jax.dtypes.prng_key) for one in equation.outvars)
+    return any(jax.numpy.issubdtype(one.aval.dtype, jax.dtypes.prng_key) for one in equation.outvars)
 
 
 def _calls(equation: Any) -> Iterator[Call]:
