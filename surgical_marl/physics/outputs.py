@@ -19,7 +19,7 @@ class Contacts(NamedTuple):
     force: Array
     """The largest normal force during the control step, N."""
     overflow: Array
-    """By how many pairs at most more overlapped in one physics step than contacts are computed for, []."""
+    """Largest number of overlapping pairs in one physics step beyond the contacts that are computed, []."""
 
 
 class Touch(NamedTuple):
@@ -36,18 +36,18 @@ class Touch(NamedTuple):
     """The largest force of an object or of a fixed thing on each arm, N, and the largest one that is not a finger's on
     a free object, [2, a]; [2, 0] in a scene without objects."""
     overflow: Array
-    """As in `Contacts`, []."""
+    """The same as in `Contacts`, []."""
 
 
 class Handled(NamedTuple):
-    """How an arm handles an object."""
+    """The grip of an arm on one object."""
 
     force: Array
     """Normal forces of its fingers on the object at the end of the step, together, N, []."""
     holding: Array
-    """Whether it has held the object for a while: both fingers press from opposite sides, [] bool."""
+    """True if it has held the object for a while: both fingers press from opposite sides, []."""
     slip: Array
-    """How far the object has slid along its fingers since they touched it, m, []."""
+    """Distance that the object has slid along its fingers since they touched it, m, []."""
 
 
 class ObjectView(NamedTuple):
@@ -58,9 +58,9 @@ class ObjectView(NamedTuple):
     rotation: Array
     """Axes of its frame, [3, 3]."""
     velocity: Array
-    """Of the centre of mass, then angular, [6]."""
+    """Velocity of the centre of mass, then angular velocity, [6]."""
     size: Array | float = 1.0
-    """By what all its lengths are multiplied, []; 1 unless the scene randomises sizes. Sites are at this times their
+    """Factor of all its lengths, []; 1 unless the scene randomises sizes. Sites are at this times their
     places in the object's file."""
 
 
@@ -81,12 +81,12 @@ class ArmView(NamedTuple):
     min_distance: Array
     """Least distance to any other arm, []; inf if there is none."""
     collision: Array
-    """Whether it touched another arm or itself during the step, []."""
+    """True if it touched another arm or itself during the step, []."""
     contact_force: Array
     """The largest normal force on it during the step, N, []."""
     bump_force: Array
-    """Likewise, but for what its fingers do to free objects: a grip is no bump."""
+    """The same without forces of its fingers on free objects: a grip is no bump."""
     contact_overflow: Array
     """`Contacts.overflow` of the whole scene."""
     handles: Mapping[str, Handled] = {}
-    """How it handles each free object of the scene."""
+    """Its grip on each free object of the scene."""

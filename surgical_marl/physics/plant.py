@@ -183,10 +183,6 @@ class Plant:
         """Advance physics by one control step, as `Simulator.advance` does, with the drawn values in place."""
         return self.actual(hidden).advance(physics)
 
-    def objects(self, physics: Physics, hidden: Hidden | None) -> dict[str, ObjectView]:
-        """Return the true view of every free object, by name."""
-        return self.actual(hidden).objects(physics)
-
     def things(self, physics: Physics, hidden: Hidden | None) -> tuple[dict[str, ObjectView], dict[str, Any]]:
         """Return the true views of every free object, and of every system of a plug-in, by name."""
         simulator = self.actual(hidden)

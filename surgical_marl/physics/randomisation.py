@@ -16,7 +16,7 @@ LENGTHS = "start", "end", "middle", "radius", "around", "bound", "centers"
 
 
 class Factors(NamedTuple):
-    """By what the values of k free objects are multiplied, [k] each."""
+    """Factors of the values of k free objects, [k] each."""
 
     size: Array
     """All lengths, about the origin of the object's frame."""

@@ -25,7 +25,6 @@ SKIPS = {
     "sleeping": "rigid bodies at rest with nothing near them are not moved",
     "bodies_apart": "rigid bodies that do not touch each other are solved one by one",
     "far_pairs": "pairs of bodies are not compared while all of their kind are far apart",
-    "line_search": "a Newton step is taken whole where the forces at its end are as foreseen",
 }
 """The kinds of work by name."""
 

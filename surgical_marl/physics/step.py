@@ -36,7 +36,7 @@ from surgical_marl.physics.systems.coupling import Coupling
 from surgical_marl.physics.systems.rigid_bodies import RigidBodies, RigidBodyState
 from surgical_marl.physics.systems.rigid_motion import Bodies
 from surgical_marl.physics.systems.system import Ends, Response, System
-from surgical_marl.physics.tree_utils import absent
+from surgical_marl.physics.tree_utils import empty_like
 from surgical_marl.scenes.scene import Scene
 
 
@@ -54,7 +54,7 @@ class ArmContacts(NamedTuple):
 
 
 class Found(NamedTuple):
-    """What a step finds out about contacts with rigid bodies before it moves anything."""
+    """Contacts with rigid bodies at the start of a step."""
 
     poses: Any
     """MJX's data with the poses of the arms."""
@@ -64,7 +64,7 @@ class Found(NamedTuple):
 
 
 class Meeting(NamedTuple):
-    """What a system of plug-ins does before arms and rigid bodies are solved."""
+    """A system of a plug-in before arms and rigid bodies are solved: its forces, contacts and loads."""
 
     ends: Ends
     response: Response
@@ -352,7 +352,7 @@ class Step:
             return self._contacts_of_arms(physics)
 
         def nothing(_: None) -> ArmContacts:
-            none: ArmContacts = absent(jax.eval_shape(lambda: found(None)))
+            none: ArmContacts = empty_like(jax.eval_shape(lambda: found(None)))
             return none
 
         between: ArmContacts = skip.cond("arm_contacts", overlap, found, nothing, None)

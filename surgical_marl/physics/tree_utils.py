@@ -3,12 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+
+Tree = TypeVar("Tree")
+
+
+def when(needed: Array, change: Callable[[Tree], Tree], state: Tree) -> Tree:
+    """Return `change(state)` where it is needed, [] bool, else the state."""
+    found: Tree = jax.lax.cond(needed, change, lambda state: state, state)
+    return found
+
+
+def for_each(needed: Array, change: Callable[[Tree, Array], Tree], state: Tree) -> Tree:
+    """Return a state after `change(state, n)`, one after the other, for each number n that is needed, [n] bool."""
+
+    def one(state: Tree, row: tuple[Array, Array]) -> tuple[Tree, None]:
+        n, needed = row
+        return when(needed, lambda state: change(state, n), state), None
+
+    return jax.lax.scan(one, state, (jnp.arange(len(needed)), needed))[0] if len(needed) else state
 
 
 def row_of(tree: Any, i: Array | np.ndarray | int) -> Any:
@@ -40,15 +58,15 @@ def add(tree: Any, i: Any, row: Any) -> Any:
     return jax.tree.map(lambda x, own: x.at[i].add(own, mode="promise_in_bounds"), tree, row)
 
 
-def absent(tree: Any) -> Any:
+def empty_like(tree: Any) -> Any:
     """Return arrays like those of a tree. They hold nothing that may be read before it is written; a number is 0."""
     empty = getattr(jax.lax, "empty", jnp.zeros)  # JAX before 0.7 has no other
     return jax.tree.map(lambda x: (empty if x.shape else jnp.zeros)(x.shape, x.dtype), tree)
 
 
 def room(tree: Any, rows: int) -> Any:
-    """Return arrays for `rows` trees like this one, as `absent` does."""
-    return absent(jax.tree.map(lambda x: jax.ShapeDtypeStruct((rows, *x.shape), x.dtype), tree))
+    """Return arrays for `rows` trees like this one, as `empty_like` does."""
+    return empty_like(jax.tree.map(lambda x: jax.ShapeDtypeStruct((rows, *x.shape), x.dtype), tree))
 
 
 class Listed(NamedTuple):

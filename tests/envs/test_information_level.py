@@ -74,7 +74,7 @@ def test_nothing_that_an_arm_observes_depends_on_a_goal_that_it_does_not_know(ta
     env = made(task, scene, "one")
     start = env.task.start(jax.random.PRNGKey(0))
     physics = env.plant.at_rest(None, start.qpos, start.poses)
-    views, objects = env.simulator.look(physics)[1], env.plant.objects(physics, None)
+    views, objects = env.simulator.look(physics)[1], env.simulator.objects(physics)
     goal = env.task.remember(World(views, start.goal, {name: np.float32(0) for name in env.task.senses}, objects))
     found: dict[str, set[bytes]] = {agent: set() for agent in env.agents}
     for number in range(8):
@@ -94,7 +94,7 @@ def test_at_own_nothing_depends_on_other_arms(task: str, scene: str) -> None:
     env = made(task, scene, "own")
     start = env.task.start(jax.random.PRNGKey(0))
     physics = env.plant.at_rest(None, start.qpos, start.poses)
-    objects = env.plant.objects(physics, None)
+    objects = env.simulator.objects(physics)
     moved = physics.with_arms(qpos=physics.qpos + np.float32(0.01))
     here, there = (env.simulator.look(now)[1] for now in (physics, moved))
     for agent, observed in env.observed.items():

@@ -57,7 +57,7 @@ def test_six_arms_step_as_in_c_mujoco(tmp_path: Path) -> None:
     engine = make_engine(PhysicsAlone(env), COUNT, "fused", "cpu")
     engine.reset(0)
     for name, values in (("qpos", qpos), ("qvel", qvel), ("ctrl", ctrl), ("qacc_warmstart", 0 * qvel)):
-        engine.write(f".physics.{name}", values)
+        engine.write(f".physics.arms.{name}", values)
     engine.step({})
     off = np.abs(engine.read(".physics.arms.qvel", "numpy") - expected) / limits
     assert off.max() < 1e-3

@@ -94,7 +94,7 @@ def test_what_lies_on_something_lies_there_whatever_its_size(tmp_path: Path) -> 
 
     def look(hidden: Hidden) -> Any:
         physics = plant.at_rest(hidden)
-        return plant.actual(hidden).step.depths(physics).max(), plant.objects(physics, hidden)["needle"]
+        return plant.actual(hidden).step.depths(physics).max(), plant.actual(hidden).objects(physics)["needle"]
 
     depth, needle = jax.jit(jax.vmap(look))(hidden)
     assert np.abs(depth).max() < 1e-7

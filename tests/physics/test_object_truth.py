@@ -97,7 +97,7 @@ def test_an_object_is_handed_over_as_in_plain_mujoco() -> None:
     While both arms hold it a needle stays within 0.13 mm, in four series of 60, but for one of the 240: jaws have
     rocked its arc and left it on its way, C MuJoCo moves it by 0.3 mm at once, and with half its step elsewhere.
 
-    With one Newton step instead of `PASSES` nine of ten are within 0.66 mm after the first jaw has opened, and within
+    With one Newton step instead of `STEPS` nine of ten are within 0.66 mm after the first jaw has opened, and within
     1.3 mm in the end; two steps are enough. Friction hardly matters, since a needle weighs next to nothing: the next
     test sees that.
     """

@@ -37,7 +37,7 @@ APART = 1e-5
 
 
 class Closest(NamedTuple):
-    """Where the two geoms of pairs are closest, [...]."""
+    """Closest points of the two geoms of pairs, [...]."""
 
     distance: Array
     """Signed, m: negative where they overlap."""
@@ -51,14 +51,14 @@ class Touching(NamedTuple):
     """The deepest contacts, [K] each."""
 
     pair: Array
-    """Which pair it is."""
+    """Number of the pair."""
     distance: Array
     jacobian: Array
     """Speed along the normal by joint velocity, [K, nv]; zero where nothing touches."""
     weight: Array
     """Inverse mass of the two bodies, 1/kg."""
     left_out: Array
-    """How many more pairs overlap, []."""
+    """Number of other pairs that overlap, []."""
 
 
 class Pairs:
@@ -202,7 +202,7 @@ def _closest(one: Capsule, other: Capsule) -> Closest:
 
 
 def moved_bodies(model: mujoco.MjModel) -> np.ndarray:
-    """Which bodies each joint moves, [nbody, nv]."""
+    """Return which bodies each joint moves, [nbody, nv], 1 or 0."""
     moved = np.zeros((model.nbody, model.nv))
     for body in range(1, model.nbody):
         moved[body] = moved[model.body_parentid[body]]

@@ -21,7 +21,7 @@ from surgical_marl.physics.systems.rigid_motion import Bodies, conjugate, produc
 from surgical_marl.scenes.scene import Scene
 
 STIFFNESS = 1e5
-"""Of an attachment, N/m: a needle of 0.1 g hangs 10 nm below where it was fastened."""
+"""Stiffness of an attachment, N/m: a needle of 0.1 g hangs 10 nm below where it was fastened."""
 ARM = 0.005
 """Distance at which this stiffness resists turning, m: the stiffness about an axis is STIFFNESS * ARM**2, N m/rad."""
 
@@ -30,7 +30,7 @@ class AttachmentState(NamedTuple):
     """The state of w attachments."""
 
     active: Array
-    """Which of them hold, [w] bool."""
+    """Attachments that hold, [w] bool."""
     position: Array
     """Centre of mass of the body in the frame of the link, m, [w, 3]."""
     quaternion: Array

@@ -70,9 +70,9 @@ class Placed(NamedTuple):
     links: Segments
     """Capsules of the arms' links, [l]."""
     displacements: dict[str, Displacement]
-    """By kind of body; fixed kinds have none."""
+    """Displacements by kind of body; fixed kinds have none."""
     balls: dict[str, Ball]
-    """By kind of body."""
+    """Bounding balls by kind of body."""
 
 
 class Places:

@@ -48,19 +48,19 @@ class _Kept(NamedTuple):
     """The part of a contact that is stored; the rest is computed again from the patch and the poses where needed."""
 
     second: Array
-    """As in `Contact`."""
+    """Number of the other object."""
     springs: Springs
     stuck: Stuck
     felt: Forces
     slip: Array
-    """As in `Felt`."""
+    """Stretch of friction's spring, m, [3]."""
 
 
 class _Speeds(NamedTuple):
     """Velocities of arms and objects."""
 
     joints: Array
-    """Of arms, [a, m]."""
+    """Velocities of the arms' joints, [a, m]."""
     objects: Array
     """[k, 6]"""
 

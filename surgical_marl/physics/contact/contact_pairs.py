@@ -15,9 +15,11 @@ import numpy as np
 from surgical_marl.physics.contact.arm_contacts import moved_bodies
 from surgical_marl.physics.contact.contact_patch import AWAY
 from surgical_marl.physics.contact.shapes import Plate, Segments, plate_of_box
+from surgical_marl.physics.systems.arms import joint_numbers
 from surgical_marl.physics.systems.rigid_motion import Masses
 from surgical_marl.robots.spec import COLLISION_GROUP, PAD_GROUP
 from surgical_marl.scenes.objects import JAW, LINK, Placement, Surface
+from surgical_marl.scenes.scene import Scene
 
 ENDLESS = 10.0
 """Half side of the plate that stands for a plane, m."""
@@ -55,31 +57,33 @@ class Meeting(NamedTuple):
 
 
 class ContactPairs:
-    """Constants of a scene with objects, or of its objects alone.
+    """Constants of a scene with objects.
 
     A number that stands for no body is the number of bodies of that kind, so that what is written there is dropped.
     """
 
-    def __init__(self, scene: Any, arms: bool = True) -> None:
+    def __init__(self, scene: Scene) -> None:
         model = scene.model
         free = scene.free_objects
         self.names, self.count = tuple(free), len(free)
-        self.arms = len(scene.agents) if arms else 0
+        self.arms, self.dofs = len(scene.agents), joint_numbers(scene)
+        """Number of arms, and degrees of freedom of each, [a, m]: `joint_numbers`."""
+        self.most = self.dofs.shape[1]
         self.fingers = tuple(
             Finger(agent, int(g), int(model.geom_bodyid[g]))
             for agent in scene.agents
             for g in np.flatnonzero(model.geom_group == PAD_GROUP)
-            if arms and model.geom(int(g)).name.startswith(f"{agent}/")
+            if model.geom(int(g)).name.startswith(f"{agent}/")
         )
         owners = [finger.agent for finger in self.fingers]
         numbers = {a: [f for f, owner in enumerate(owners) if owner == name] for a, name in enumerate(scene.agents)}
         self.jaws = {arm: (own[0], own[1]) for arm, own in numbers.items() if len(own) == 2}
         """Number of an arm -> its two fingers."""
-        self.near, self.bare = _near(scene) if arms else (np.zeros(0, int), np.zeros(0, int))
+        self.near, self.bare = _near(scene)
         self._read_free(free)
         self._read_links(model)
         self._read_fixed({n: place for n, place in scene.objects.items() if not place.object.free})
-        self._read_joints(model, scene.agents if arms else ())
+        self._read_joints(model, scene.agents)
         self._number(free)
 
     def _read_free(self, free: dict[str, Placement]) -> None:
@@ -144,17 +148,10 @@ class ContactPairs:
         }
 
     def _read_joints(self, model: mujoco.MjModel, agents: tuple[str, ...]) -> None:
-        """Set which joints each arm has, and which of them move the bodies of each kind."""
-        owner = np.array([agents.index(name) if name in agents else -1 for name in _owners(model, model.dof_bodyid)])
-        joints = [np.flatnonzero(owner == arm) for arm in range(len(agents))]
-        self.most = max(map(len, joints), default=0)
-        self.dofs = np.full((len(agents), self.most), model.nv)
-        """Degrees of freedom of each arm, [a, m]; `model.nv` where it has fewer than others."""
-        for arm, own in enumerate(joints):
-            self.dofs[arm, : len(own)] = own
+        """Set which joints are prismatic, and which joints of an arm move its bodies of each kind."""
         self.slides = np.append(model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE, False)[self.dofs]
         self.arm_of, self.moves = {}, {}
-        """Of each kind of body: the arm that it is on, and which of that arm's joints move it, [m]."""
+        """Arm of each body by kind, and which of that arm's joints move it, [m]."""
         for kind, bodies in self.bodies.items():
             self.arm_of[kind], self.moves[kind] = self.joints_of(model, agents, bodies)
 
@@ -164,8 +161,7 @@ class ContactPairs:
         """Return the arm that each of some bodies of arms is on, [n], and which of its joints move it, [n, m]."""
         moved = np.pad(moved_bodies(model), ((0, 0), (0, 1)))
         arms = np.array([agents.index(name) for name in _owners(model, bodies)], int)
-        own = self.dofs[arms] if len(bodies) else np.zeros((0, self.most), int)
-        return arms, np.take_along_axis(moved[bodies], own, 1).astype(np.float32)
+        return arms, np.take_along_axis(moved[bodies], self.dofs[arms], 1).astype(np.float32)
 
     def _number(self, free: dict[str, Placement]) -> None:
         """Set the number of each patch, the bodies that it is between, and how their surfaces feel."""
@@ -220,7 +216,7 @@ class ContactPairs:
                 self.owner[on], self.pulls[on] = self.arm_of[kind][of[on]], sign * self.moves[kind][of[on]]
 
 
-def _near(scene: Any) -> tuple[np.ndarray, np.ndarray]:
+def _near(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     """Return the geoms of links that come near objects, and which of these have no pad, which an object meets instead.
 
     They are the links that the first three joints all move.

@@ -1,4 +1,4 @@
-"""Where objects are touched: patches, each between two bodies, of a few points and one friction.
+"""Patches: contacts between two bodies, of a few points and one friction each.
 
 The points of a patch are the support of the contact: of all points at which the shapes of two bodies may touch, those
 that are deepest as the bodies are, and if one of them were tilted a little in each of three directions. Points that are
@@ -27,18 +27,18 @@ POINTS = 4
 AWAY = -100.0
 """Depth, m, of a point that is not there: no scene is so large."""
 TILT = 0.03
-"""By which a body is tilted to find the rim of a contact, rad. A wider rim may leave out what carries an object that
+"""Tilt of a body to find the rim of a contact, rad. A wider rim may leave out what carries an object that
 lies on a blunt edge, for what comes down only if it turns further: it would rock there for ever."""
 TILT_IN_JAW = 0.1
-"""By which it is tilted between fingers, rad. A firm grip dents a wire that is bent to a radius of 8 mm over 0.7 mm to
+"""Tilt between fingers, rad. A firm grip dents a wire that is bent to a radius of 8 mm over 0.7 mm to
 each side, where its direction differs by 0.08 rad. With a narrower rim nothing in a patch would stop the wire from
 turning while the jaw closes, and it would be thrown about."""
 LEAN = 0.005
-"""By which a body is tilted to find its deepest point, rad, if three points of the rim do not bear its weight: to the
+"""Tilt of a body to find its deepest point, rad, if three points of the rim do not bear its weight: to the
 side on which they don't. Those of a half circle that lies flat do not in most directions, and without this it would
 rock on them for ever."""
 ASIDE = 1e-3
-"""How far beyond them the weight is where this tilt is whole, m, and how far within where there is none."""
+"""Distance of the weight beyond them where this tilt is whole, m, and within them where there is none."""
 SHORT = 1e-4
 """Two points of the rim that are nearer than this count less as an edge, m."""
 BLEND = 1e-5
@@ -56,7 +56,7 @@ class Patch(NamedTuple):
     points: Points
     """[..., POINTS]"""
     centre: Array
-    """Where friction acts: the mean of the points, weighted by depth, [..., 3]."""
+    """Place where friction acts: the mean of the points, weighted by depth, [..., 3]."""
     normal: Array
     """[..., 3]"""
     radius: Array

@@ -21,7 +21,7 @@ from surgical_marl.physics.contact.contact_patch import BLEND, TILT, TILT_IN_JAW
 from surgical_marl.physics.contact.shapes import Points, Segments, between_segments, on_plate
 from surgical_marl.physics.systems.rigid_motion import Bodies
 from surgical_marl.physics.systems.sleeping import Company, company, moving
-from surgical_marl.physics.tree_utils import Listed, put, room, row_of
+from surgical_marl.physics.tree_utils import Listed, put, room, row_of, when
 from surgical_marl.scenes.object_contacts import SLOTS
 
 NEAREST = 16
@@ -40,13 +40,13 @@ class Slots(NamedTuple):
 
     patch: Patch
     number: Array
-    """Of each patch in `ContactPairs`, [s]."""
+    """Number of each patch in `ContactPairs`, [s]."""
     total: Array
-    """How many there are, []; more than there are slots if some found no room."""
+    """Number of patches, []; more than there are slots if some found no room."""
     company: Company
-    """What is near the objects."""
+    """Neighbours of the objects."""
     awake: Array
-    """Which objects are not at rest, [k] bool: those at rest have no patches."""
+    """Objects that are not at rest, [k] bool: objects at rest have no patches."""
 
     @property
     def found(self) -> Array:
@@ -103,7 +103,7 @@ class Detection:
             return slots._replace(patch=kept[0], number=kept[1], total=total)
 
         if most == 1:
-            return jax.lax.cond(count > 0, lambda slots: meet(jnp.int32(0), slots), lambda slots: slots, slots)
+            return when(count > 0, lambda slots: meet(jnp.int32(0), slots), slots)
         slots = jax.lax.fori_loop(0, jnp.minimum(count, most), meet, slots)
         return slots._replace(total=slots.total + jnp.maximum(count - most, 0))
 

@@ -15,6 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from surgical_marl.physics.tree_utils import when
+
 _FIRST, _SECOND = np.tril_indices(6)
 
 
@@ -22,9 +24,9 @@ class Springs(NamedTuple):
     """Resistance of a patch of s points to relative acceleration, at the end of the step."""
 
     stiff: Array
-    """By how much the normal force of each point falls per acceleration apart, kg, [s]."""
+    """Normal force of each point falls by this per acceleration apart, kg, [s]."""
     rub: Array
-    """By how much friction that sticks falls per acceleration along the surface, kg, []."""
+    """Friction that sticks falls by this per acceleration along the surface, kg, []."""
     coefficient: Array
     """Friction coefficient, []."""
 
@@ -44,12 +46,12 @@ class Cone(NamedTuple):
 
 
 class Parting(NamedTuple):
-    """How the two bodies accelerate relative to each other at a patch."""
+    """Relative acceleration of the two bodies at a patch."""
 
     normal: Array
     """Along the normal of each point, [s]."""
     along: Array
-    """As in `Cone.along`, [3]."""
+    """Along the rows of `Cone.along`, [3]."""
 
 
 class Stuck(NamedTuple):
@@ -69,7 +71,7 @@ class Forces(NamedTuple):
     friction: Array
     """N, [3]."""
     slips: Array
-    """Whether friction is at its bound, [] bool."""
+    """True if friction is at its bound, []."""
     direction: Array
     """Unit vector of friction, [3]."""
     left: Array
@@ -133,8 +135,7 @@ def curvature(cone: Cone, felt: Forces) -> Array:
         lower += rub * (ahead - across) * rubs[_FIRST] * rubs[_SECOND]
         return lower + soft * (raised[_FIRST] * mixed[_SECOND] + raised[_SECOND] * mixed[_FIRST])
 
-    found: Array = jax.lax.cond(felt.slips, slipping, lambda lower: lower, lower)
-    return found
+    return when(felt.slips, slipping, lower)
 
 
 def between(cone: Cone, other: Cone, felt: Forces) -> Array:

@@ -16,7 +16,7 @@ from surgical_marl.physics.contact.relative_motion import RelativeMotion
 from surgical_marl.physics.outputs import Handled
 from surgical_marl.physics.solver.problem import Contacts, Pressed
 from surgical_marl.physics.systems.rigid_motion import Bodies, carried, conjugate, product, rotation, turn, turned
-from surgical_marl.physics.tree_utils import picked, put, row_of
+from surgical_marl.physics.tree_utils import picked, put, row_of, when
 
 DAMPING = 5e-3
 """Damping of a contact in the normal direction, s: this times its stiffness, N s/m."""
@@ -46,7 +46,7 @@ class Grips(NamedTuple):
     slid: Array
     """Distance that the object has slid along the finger since it was touched, m, [k, f]."""
     held: Array
-    """For how long the arm has held the object, s, [k, a]: both fingers press, from opposite sides."""
+    """Time for which the arm has held the object, s, [k, a]: both fingers press, from opposite sides."""
 
 
 OF_FINGERS = Grips._fields[:4]
@@ -144,7 +144,7 @@ class GripMemory:
                 found = put(tuple(getattr(kept[0], name) for name in OF_FINGERS), place, new)
                 return kept[0]._replace(**dict(zip(OF_FINGERS, found, strict=True))), put(kept[1], place, patch.normal)
 
-            return jax.lax.cond(f < len(t.fingers), note, lambda kept: kept, kept)
+            return when(f < len(t.fingers), note, kept)
 
         kept, normal = jax.lax.fori_loop(0, slots.found, one, (fresh, normal))
         return kept._replace(held=self._held(normal, kept.force, kept.held, dt))

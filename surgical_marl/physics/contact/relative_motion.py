@@ -1,4 +1,4 @@
-"""How the two bodies of a contact move relative to each other, by motions of arms and objects."""
+"""Relative motion of the two bodies of a contact, by motions of arms and objects."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where shapes of objects touch those of arms and of other objects: points, depths and normals, in pure JAX.
+"""Contact points of shapes of objects with those of arms and other objects: places, depths and normals, in pure JAX.
 
 Every shape is a core with a radius: a point (sphere), a segment (capsule) or a rectangle (plate). A plate stands for a
 box: its core is the box's middle rectangle, its radius half of the thinnest side, so its faces are flat and its edges
@@ -21,7 +21,7 @@ EVEN = 0.2
 """Angle likewise up to which a capsule has a point near its farther end: more than it turns within a step, so that a
 step knows on what it will rest."""
 _POINTS = ((0.5, NEAR), (0.0, EVEN), (1.0, EVEN))
-"""Of each of a capsule's three points: its anchor, as a share of the length, and the angle of its penalty."""
+"""Anchor of each of a capsule's three points, as a share of the length, and the angle of its penalty."""
 
 
 class Segments(NamedTuple):

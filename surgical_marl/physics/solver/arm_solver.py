@@ -1,7 +1,7 @@
 """The Newton step of arms, once objects are eliminated from it.
 
-What belongs to arms has one row for each of a arms, with m numbers for their joints. An arm with fewer joints than
-others has joints in its row that are not there: nothing pushes them, and they stay at rest.
+Arrays have one row for each of a arms, with m numbers for their joints. An arm with fewer joints than others has joints
+in its row that are not there: nothing pushes them, and they stay at rest.
 """
 
 from __future__ import annotations
@@ -16,39 +16,33 @@ from jax import Array
 
 from surgical_marl.physics.solver.cholesky import packed
 from surgical_marl.physics.solver.constraint_rows import JointRows, Rows, row_forces, rows_of, solve
+from surgical_marl.physics.solver.joined_arms import ArmBlocks, JoinedArms
 from surgical_marl.physics.solver.problem import Problem
-from surgical_marl.physics.solver.woodbury import Own, Woodbury
+from surgical_marl.physics.solver.schur import Eliminated
+from surgical_marl.physics.tree_utils import when
 
 ITERATIONS = (6, 4)
-"""Newton steps for arms alone at most, and line search steps in each, while contacts are linear functions."""
-
-
+"""Newton steps for arms at most, and line search steps in each, while contacts are linear functions."""
 ITERATIONS_WITH_ROWS = (6, 6)
 """Newton steps, and line search steps in each, at most, of arms with their contacts as rows
 (`python -m docs.studies.solver_iterations`)."""
-MOST_DENSE = 32
-"""Joints up to which all arms are one dense problem with rows: the code of a dense one grows with the cube of them."""
 
 
-class Condensed(NamedTuple):
-    """What k objects and all contacts leave of the equations of arms."""
+class ArmSystem(NamedTuple):
+    """The linear system of arms, with contacts as linear functions and after the elimination of k objects."""
 
     stiff: Array
-    """How forces of contacts fall with the acceleration of joints, lower halves, [a, m (m + 1) / 2]."""
+    """Curvature of contacts: their force falls by this per acceleration of joints; lower halves,
+    [a, m (m + 1) / 2]."""
     on_arm: Array
-    """Which arms have contacts, [a]: `stiff` is nothing for others."""
+    """Arms that have contacts, [a] bool: `stiff` is not defined for others."""
     force: Array
     """Forces of contacts, [a, m]."""
-    half: Array
-    """Forces left over on objects, divided by the Cholesky factor of how these fall, [k, 6]."""
-    wide: Array
-    """How forces on objects fall with the acceleration of joints, as in `Eliminated`. Only read where touched."""
-    touched: Array
-    """Which objects touch which arms, or move them by other objects, [k, a]."""
+    objects: Eliminated
 
 
 class _Row(NamedTuple):
-    """What is known of an arm, or of each [a, ...]: see `Problem`, `Condensed` and `Arms`."""
+    """One arm, or each [a, ...]: fields of `Problem` and `ArmSystem`, and its acceleration `here`."""
 
     number: Array
     mass: Array
@@ -60,10 +54,10 @@ class _Row(NamedTuple):
     force: Array
 
 
-class Arms:
+class ArmSolver:
     """Solves for the directions of arms. `dofs` [a, m] are the numbers of their joints, as for `ContactSolver`.
 
-    Ways lead from an acceleration `here`, and are looked for from an acceleration `begin` on, [a, m] each.
+    Directions lead from an acceleration `here`, and Newton's method begins at an acceleration `begin`, [a, m] each.
     """
 
     def __init__(self, dofs: np.ndarray, joints: int) -> None:
@@ -91,19 +85,12 @@ class Arms:
         jacobian = jax.vmap(by_joint)(between.jacobian)
         own, contacts = rows_of(JointRows(*map(by_joint, joints))), between._replace(jacobian=jacobian)
         rows = Rows(*(jnp.concatenate(parts) for parts in zip(own, contacts, strict=True)))
-        arms = self._by_size if n > MOST_DENSE else []
-        qacc, force = solve(whole, by_joint(smooth), rows, by_joint(start), *ITERATIONS_WITH_ROWS, arms)
+        qacc, force = solve(whole, by_joint(smooth), rows, by_joint(start), *ITERATIONS_WITH_ROWS, dofs)
         return jnp.append(qacc, 0.0)[dofs], force[2 * n :]
 
-    @property
-    def _by_size(self) -> list[np.ndarray]:
-        """The joints of arms with the same number of joints, [a, m] for each number."""
-        sizes = self._there.sum(1)
-        return [self._dofs[sizes == size][:, :size] for size in np.unique(sizes)]
-
-    def together(self, problem: Problem, here: Array, begin: Array, left: Condensed) -> Array:
+    def together(self, problem: Problem, here: Array, begin: Array, left: ArmSystem) -> Array:
         """Return the directions [a, m] from an acceleration [a, m] of arms that objects, or contacts of arms, join."""
-        there, (first, second) = self._there, np.tril_indices(len(self._all))
+        there, (first, second), objects = self._there, np.tril_indices(len(self._all)), left.objects
 
         def flat(each: Array) -> Array:
             return jnp.concatenate([row[own] for row, own in zip(each, there, strict=True)])
@@ -123,20 +110,18 @@ class Arms:
             i, half, touched = row
 
             def less(total: tuple[Array, Array]) -> tuple[Array, Array]:
-                each = jnp.where(touched[:, None, None], left.wide[len(there) * i + np.arange(len(there))], 0.0)
+                each = jnp.where(touched[:, None, None], objects.coupling[len(there) * i + np.arange(len(there))], 0.0)
                 wide = jnp.concatenate([of_arm[:, own] for of_arm, own in zip(each, there, strict=True)], 1)
                 return total[0] - jnp.sum(wide[:, first] * wide[:, second], 0), total[1] - wide.T @ half
 
-            return jax.lax.cond(touched.any(), less, lambda total: total, total), None
+            return when(touched.any(), less, total), None
 
         total = stiff, force - mass @ start
         if len(problem.between.low):
-
-            def with_rows(total: Any) -> Any:
-                return jax.lax.scan(press, total, problem.between)[0]
-
-            total = jax.lax.cond(problem.overlap, with_rows, lambda total: total, total)
-        (stiff, force), _ = jax.lax.scan(subtract, total, (jnp.arange(len(left.half)), left.half, left.touched))
+            total = when(problem.overlap, lambda total: jax.lax.scan(press, total, problem.between)[0], total)
+        (stiff, force), _ = jax.lax.scan(
+            subtract, total, (jnp.arange(len(objects.force)), objects.force, objects.touched)
+        )
         joints = rows_of(JointRows(*map(flat, problem.joints)))
         found, rows = _direction_of(stiff[self._all], force, joints, start, flat(begin)), np.cumsum(there.sum(1))
         directions = [
@@ -145,12 +130,12 @@ class Arms:
         ]
         return jnp.stack(directions)
 
-    def each(self, problem: Problem, here: Array, begin: Array, moving: Array, left: Condensed) -> Array:
+    def each(self, problem: Problem, here: Array, begin: Array, moving: Array, left: ArmSystem) -> Array:
         """Return the directions [a, m] of arms of which no two are joined: one problem after the other.
 
         Those that are not `moving` [a] have none.
         """
-        takes = np.ones(len(left.half), bool)
+        takes = np.ones(len(left.objects.force), bool)
 
         def one(each: tuple[_Row, Array, Array]) -> Array:
             row, begin, moves = each
@@ -164,27 +149,27 @@ class Arms:
         found: Array = jax.lax.map(one, (self._rows(problem, here, left), begin, moving))
         return found
 
-    def bridged(self, problem: Problem, here: Array, begin: Array, left: Condensed) -> Array:
+    def joined(self, problem: Problem, here: Array, begin: Array, left: ArmSystem) -> Array:
         """Return the directions [a, m] of arms that one object joins and nothing else."""
-        a, k = len(self._there), len(left.half)
-        bridge = jnp.argmax(left.touched.sum(1) > 1)
+        a, k = len(self._there), len(left.objects.force)
+        joint = jnp.argmax(left.objects.touched.sum(1) > 1)
         rows = self._rows(problem, here, left)
-        stiff, force = jax.lax.map(partial(self._alone, left, np.arange(k) != bridge), rows)
+        stiff, force = jax.lax.map(partial(self._alone, left, np.arange(k) != joint), rows)
 
         def wide(arm: Array) -> Array:
-            found = left.wide[a * bridge + arm]
-            return found if a == 2 else jnp.where(left.touched[bridge, arm], found, 0.0)
+            found = left.objects.coupling[a * joint + arm]
+            return found if a == 2 else jnp.where(left.objects.touched[joint, arm], found, 0.0)
 
-        own = Own(rows.number, stiff, force, problem.joints, here)
+        own = ArmBlocks(rows.number, stiff, force, problem.joints, here)
         resisted = partial(self._resisted, problem, np.ones(a, bool))
-        return Woodbury(own, wide, resisted, self._places).solve(begin - here, ITERATIONS[0])
+        return JoinedArms(own, wide, resisted, self._places).solve(begin - here, ITERATIONS[0])
 
-    def _rows(self, problem: Problem, here: Array, left: Condensed) -> _Row:
+    def _rows(self, problem: Problem, here: Array, left: ArmSystem) -> _Row:
         arms = jnp.arange(len(self._there))
         contacts = left.on_arm, left.stiff, left.force
         return _Row(arms, problem.mass, problem.smooth, problem.joints, here, *contacts)
 
-    def _alone(self, left: Condensed, takes: Any, row: _Row) -> tuple[Array, Array]:
+    def _alone(self, left: ArmSystem, takes: Any, row: _Row) -> tuple[Array, Array]:
         """Return what is left of an arm's matrix, its lower half, and of the forces on it.
 
         `takes` [k] are those objects that take something from the matrix.
@@ -195,18 +180,18 @@ class Arms:
             i, half, touched, takes = of_object
 
             def less(total: tuple[Array, Array]) -> tuple[Array, Array]:
-                wide = left.wide[len(self._there) * i + row.number]
+                wide = left.objects.coupling[len(self._there) * i + row.number]
 
-                def lower(whole: Any) -> Any:
+                def lower(whole: Array) -> Array:
                     return whole - jnp.sum(wide[:, first] * wide[:, second], 0)
 
-                return jax.lax.cond(takes, lower, lambda whole: whole, total[0]), total[1] - wide.T @ half
+                return when(takes, lower, total[0]), total[1] - wide.T @ half
 
-            return jax.lax.cond(touched[row.number], less, lambda total: total, total), None
+            return when(touched[row.number], less, total), None
 
         whole = jax.lax.cond(row.on_arm, lambda: row.mass + row.stiff, lambda: row.mass)
         total = whole, row.smooth + row.force - row.mass[self._places] @ row.here
-        objects = jnp.arange(len(left.half)), left.half, left.touched, jnp.asarray(takes)
+        objects = jnp.arange(len(left.objects.force)), left.objects.force, left.objects.touched, jnp.asarray(takes)
         found: tuple[Array, Array] = jax.lax.scan(subtract, total, objects)[0]
         return found
 
@@ -228,13 +213,13 @@ class Arms:
                 whole = rest - force - rows.jacobian.T @ row_forces(rows, here)
                 return sums[0] + direction @ whole, sums[1] + direction @ rest, sums[2] + direction @ (mass @ direction)
 
-            return jax.lax.cond(moves, more, lambda sums: sums, sums), None
+            return when(moves, more, sums), None
 
         zero = jnp.float32(0.0)
         rows = moves, problem.mass, problem.smooth, problem.joints, here, direction, force
         whole, slope, growth = jax.lax.scan(add, (zero, zero, zero), rows)[0]
         if len(problem.between.low):
-            whole = jax.lax.cond(problem.overlap, lambda: whole - self._power(problem, here, direction), lambda: whole)
+            whole = when(problem.overlap, lambda whole: whole - self._power(problem, here, direction), whole)
         return whole, slope, growth
 
     def resisted(
@@ -254,10 +239,7 @@ class Arms:
             own = Rows(row.jacobian.reshape(1, -1), *(x[None] for x in row[1:]))
             return _added(sums, own, *flat, length), None
 
-        def with_rows(sums: Any) -> Any:
-            return jax.lax.scan(press, sums, problem.between)[0]
-
-        return jax.lax.cond(problem.overlap, with_rows, lambda sums: sums, found)
+        return when(problem.overlap, lambda sums: jax.lax.scan(press, sums, problem.between)[0], found)
 
     def between(self, problem: Problem, arms: Array) -> Array:
         """Return the forces of contacts of arms with arms at an acceleration [a, m], N, [r]."""
@@ -278,10 +260,7 @@ class Arms:
         def add(sums: tuple[Array, Array], row: Any) -> tuple[tuple[Array, Array], None]:
             moves, joints, here, direction = row
 
-            def added(sums: Any) -> Any:
-                return _added(sums, rows_of(joints), here, direction, length)
-
-            return jax.lax.cond(moves, added, lambda sums: sums, sums), None
+            return when(moves, lambda sums: _added(sums, rows_of(joints), here, direction, length), sums), None
 
         rows = moves, problem.joints, here, direction
         found: tuple[Array, Array] = jax.lax.scan(add, (jnp.float32(0.0),) * 2, rows)[0]

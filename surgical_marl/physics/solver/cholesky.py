@@ -1,7 +1,11 @@
-"""Symmetric matrices: lower halves, Cholesky factors of what is positive definite but for float32, and their use."""
+"""Symmetric matrices: lower halves, Cholesky factors that survive float32, and linear systems that these solve."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -50,3 +54,32 @@ def back(factor: Array, right: Array) -> Array:
 def solve_factored(factor: Array, right: Array) -> Array:
     """Return x [n] or [n, k] with factor @ factor.T @ x = right, for a lower factor [n, n]."""
     return back(factor, forward(factor, right))
+
+
+def woodbury(
+    system: Callable[[Any], tuple[Array, Array, Array]], arms: Any, rank: int, sign: float
+) -> tuple[Array, Array, Array]:
+    """Return right sides [a, m], factors of blocks [a, m, m] and shares [r], which solve for arms that few rows join.
+
+    The matrix of all arms is B + sign * W.T @ W, where B has one block for each arm and W has `rank` rows. By
+    Woodbury's identity (W. Hager, "Updating the inverse of a matrix", SIAM Review 31, 1989) the solution for the right
+    side e is that of B @ x = e - W.T @ share. So no matrix is larger than that of an arm, and arms share one loop.
+
+    Args:
+        system: from one row of `arms` to an arm's block of B [m, m], its part of e [m], and its columns of W [r, m].
+        arms: a tree of arrays [a, ...].
+        rank: number of rows of W, r.
+        sign: 1.0 or -1.0.
+    """
+
+    def factorise(sums: tuple[Array, Array], arm: Any) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        matrix, excess, across = system(arm)
+        factor = cholesky(matrix)
+        eased = forward(factor, jnp.concatenate([excess[:, None], across.T], 1))
+        joined = eased[:, 1:].T @ eased[:, 1:]
+        matrix = sums[0] + joined if sign > 0 else sums[0] - joined
+        return (matrix, sums[1] + eased[:, 1:].T @ eased[:, 0]), (excess, factor)
+
+    (matrix, right), (excess, factors) = jax.lax.scan(factorise, (jnp.eye(rank), jnp.zeros(rank)), arms)
+    share = solve_factored(cholesky(matrix), right)
+    return excess, factors, share if sign > 0 else -share

@@ -13,7 +13,6 @@ stiff, and a row that changes sides changes the whole step.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -23,6 +22,7 @@ import numpy as np
 from jax import Array
 from jax.scipy.linalg import cho_solve
 
+from surgical_marl.physics.solver.cholesky import solve_factored, woodbury
 from surgical_marl.physics.solver.newton import line_search, newton
 
 RELAXATION = 1.15
@@ -133,15 +133,15 @@ def solve(
     start: Array,
     iterations: int,
     looks: int,
-    arms: Sequence[np.ndarray] = (),
+    arms: np.ndarray | None = None,
     steady: int = 2,
 ) -> tuple[Array, Array]:
     """Return the acceleration [n] and the force of each row [r].
 
     They are found for a mass matrix [n, n] and the sum `smooth` [n] of all other forces, by Newton steps from `start`.
-    Each Newton step has `looks` steps of line search. If there are many arms, `arms` has the numbers of their
-    joints, [a, m] for each type, and the first 2 n rows are those of `rows_of`: then no matrix larger than that of an
-    arm is factorised (`_newton_step`), in loops over arms.
+    Each Newton step has `looks` steps of line search. Of several arms, `arms` has the numbers of their joints, [a, m],
+    filled up with n, and the first 2 n rows are those of `rows_of`: then no matrix larger than that of an arm is
+    factorised (`woodbury`).
 
     There are at most `iterations` Newton steps. A whole step over which no row changes sides ends at the solution, and
     a second such step removes its rounding error. After `steady` of them the search stops.
@@ -169,33 +169,35 @@ def solve(
     return qacc, row_forces(rows, qacc)
 
 
-def _newton_step(
-    mass: Array, jacobian: Array, gives: Array, excess: Array, arms: Sequence[np.ndarray]
-) -> Array:  # fmt: skip
+def _newton_step(mass: Array, jacobian: Array, gives: Array, excess: Array, arms: np.ndarray | None) -> Array:
     """Return x [n] with (mass + jacobian.T @ diag(gives) @ jacobian) @ x = excess.
 
     With `arms`, as for `solve`: without the rows after the first 2 n the matrix has a block for each arm and zeros
-    elsewhere. Those rows are added by Woodbury's identity (W. Hager, "Updating the inverse of a matrix", SIAM Review
-    31, 1989), which takes one small matrix more.
+    elsewhere.
     """
-    if not arms:
+    if arms is None:
         return solve_positive(mass + jacobian.T @ (gives[:, None] * jacobian), excess)
-    own, root = 2 * len(mass), jnp.sqrt(gives[2 * len(mass) :])[:, None] * jacobian[2 * len(mass) :]
-    blocks = mass + jacobian[:own].T @ (gives[:own, None] * jacobian[:own])
-    right = jnp.concatenate([excess[:, None], root.T], 1)
-    eased = jnp.zeros_like(right)
-    for dofs in arms:
-        each = blocks[dofs[:, :, None], dofs[:, None]], right[dofs]
-        eased = eased.at[dofs].set(jax.lax.map(lambda row: solve_positive(*row), each))
-    share = solve_positive(jnp.eye(len(root)) + root @ eased[:, 1:], root @ eased[:, 0])
-    return eased[:, 0] - eased[:, 1:] @ share
+    n = len(mass)
+    blocks = mass + jacobian[: 2 * n].T @ (gives[: 2 * n, None] * jacobian[: 2 * n])
+    root = jnp.sqrt(gives[2 * n :])[:, None] * jacobian[2 * n :]
+    pairs, there = (arms[:, :, None], arms[:, None]), arms < n
+    each = jnp.where(there[:, :, None] & there[:, None], jnp.pad(blocks, (0, 1))[pairs], np.eye(arms.shape[1]))
+    across = jnp.pad(root, ((0, 0), (0, 1)))[:, arms].swapaxes(0, 1)
+    rows = each, jnp.append(excess, 0.0)[arms], across
+    right, factors, share = woodbury(lambda arm: arm, rows, len(root), 1.0)
+
+    def one(row: tuple[Array, Array, Array]) -> Array:
+        factor, right, across = row
+        return solve_factored(factor, right - across.T @ share)
+
+    return jnp.zeros(n + 1).at[arms].set(jax.lax.map(one, (factors, right, across)))[:n]
 
 
 @solve.defjvp
 def _differentiate(
     iterations: int,
     looks: int,
-    arms: Sequence[np.ndarray],
+    arms: np.ndarray | None,
     steady: int,
     primals: tuple[Any, ...],
     tangents: tuple[Any, ...],

@@ -16,27 +16,23 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from surgical_marl.physics import skip
 from surgical_marl.physics.contact.friction_cone import Parting, parting
 from surgical_marl.physics.contact.relative_motion import RelativeMotion
 from surgical_marl.physics.solver import schur
-from surgical_marl.physics.solver.arm_solver import Arms, Condensed
+from surgical_marl.physics.solver.arm_solver import ArmSolver, ArmSystem
 from surgical_marl.physics.solver.constraint_rows import JointRows, Rows
-from surgical_marl.physics.solver.contact_line import Base, look_ahead, set_out
+from surgical_marl.physics.solver.contact_line import ContactState, set_out, whole_step
 from surgical_marl.physics.solver.hessian import Hessian
-from surgical_marl.physics.solver.newton import ENOUGH, line_search, newton
+from surgical_marl.physics.solver.newton import line_search, newton
 from surgical_marl.physics.solver.problem import Point, Problem, Solution
 from surgical_marl.physics.tree_utils import filled
 
-PASSES, ALONE = 12, 24
+STEPS, STEPS_ALONE = 12, 24
 """Newton steps at most, with arms and of objects alone, whose steps are short. A GPU waits for the last one of its
 environments (docs/physics.md)."""
 LEAST = 1e-7
 """Fall of the cost in a Newton step, N m/s2, after which none follows: that of a needle of 0.03 g whose acceleration
 changes by 0.06 m/s2."""
-FIRST = 10.0
-"""Slope at the end of the first Newton step, as a share of what contacts resist along it, up to which it is gone whole.
-A search might find a better place to go on from, but seldom saves a step."""
 
 
 class ContactSolver:
@@ -46,53 +42,45 @@ class ContactSolver:
     """
 
     def __init__(self, dofs: np.ndarray, joints: int, objects: int) -> None:
-        self._dofs, self._objects, self._arms = dofs, objects, Arms(dofs, joints)
+        self._dofs, self._objects, self._arms = dofs, objects, ArmSolver(dofs, joints)
         self.twists = RelativeMotion(dofs, objects)
-        self._passes = PASSES if len(dofs) else ALONE
+        self._steps = STEPS if len(dofs) else STEPS_ALONE
 
     def solve_arms(
         self, mass: Array, smooth: Array, joints: JointRows, start: Array, between: Rows
     ) -> tuple[Array, Array]:
-        """Return accelerations [a, m] and forces of contacts [r] of arms alone: see `Arms.with_rows`."""
+        """Return accelerations [a, m] and forces of contacts [r] of arms alone: see `ArmSolver.with_rows`."""
         return self._arms.with_rows(mass, smooth, joints, start, between)
 
     def solve(self, problem: Problem) -> Solution:
         """Return the accelerations and forces."""
 
-        def step(state: tuple[Point, Base], count: Array) -> tuple[tuple[Point, Base], Array]:
-            here, base = state
-            sums = Hessian.of(problem, base, here)
+        def step(state: tuple[Point, ContactState], count: Array) -> tuple[tuple[Point, ContactState], Array]:
+            here, forces = state
+            sums = Hessian.of(problem, forces, here)
             direction, touching = self._direction(problem, here, sums, count == 0), _touching(problem)
             # Arms that touch nothing take their whole step at once, as if nothing else were there, and are done.
             free = jnp.where(touching[:, None], 0.0, direction.arms)
             direction = direction._replace(arms=jnp.where(touching[:, None], direction.arms, 0.0))
             by, whole = self._partings(problem, direction), here.ahead(direction, jnp.float32(1.0))
-            end = look_ahead(problem, base, by, direction)
-            base, settled = base._replace(pressed=end.pressed), end.foreseen
-            good = jnp.abs(end.slope) <= jnp.where(count == 0, FIRST, ENOUGH) * end.growth
-            good &= end.growth > LEAST
+            pressed, converged = whole_step(problem, forces, by)
+            forces = forces._replace(pressed=pressed)
             if len(problem.between.low):
-                same = (self._sides(problem, here.arms) == self._sides(problem, whole.arms)).all()
-                settled, good = settled & same, good & same
+                converged &= (self._sides(problem, here.arms) == self._sides(problem, whole.arms)).all()
 
-            def searched() -> tuple[Array, Array]:
-                forces = Point(sums.arm_force, sums.force[: self._objects])
-                begin, along = set_out(self._arms, problem, forces, here, direction, touching, by)
-                found = line_search(begin, LEAST, along.measure(self._arms, problem, base.stuck))
-                return found.length, found.looks == 0
+            def search() -> tuple[Point, ContactState, Array]:
+                loads = Point(sums.arm_force, sums.force[: self._objects])
+                begin, along = set_out(self._arms, problem, loads, here, direction, touching, by)
+                found = line_search(begin, LEAST, along.measure(self._arms, problem, forces.stuck))
+                there = here.ahead(direction, found.length), forces.ahead(problem, by, found.length)
+                return *there, found.looks == 0
 
-            def gone_on() -> tuple[Point, Base, Array]:
-                length, settled = skip.cond(
-                    "line_search", ~good, searched, lambda: (jnp.float32(1.0), jnp.bool_(False))
-                )
-                return here.ahead(direction, length), base.ahead(problem, by, length), settled
-
-            there, base, settled = jax.lax.cond(settled, lambda: (whole, base, jnp.bool_(True)), gone_on)
-            return (there._replace(arms=there.arms + free), base), settled
+            there, forces, converged = jax.lax.cond(converged, lambda: (whole, forces, jnp.bool_(True)), search)
+            return (there._replace(arms=there.arms + free), forces), converged
 
         here = Point(jnp.zeros(self._dofs.shape), jnp.zeros((self._objects, 6)))
-        here, base = newton(step, (here, Base.of(problem.contacts)), self._passes)
-        return Solution(here.arms, here.objects, base.pressed, self._arms.between(problem, here.arms))
+        here, forces = newton(step, (here, ContactState.of(problem.contacts)), self._steps)
+        return Solution(here.arms, here.objects, forces.pressed, self._arms.between(problem, here.arms))
 
     def _partings(self, problem: Problem, direction: Point) -> Parting:
         """Return how the bodies of all contacts accelerate relative to each other per length of a direction, [s]."""
@@ -115,31 +103,29 @@ class ContactSolver:
         """
         k, linked = self._objects, sums.linked
         touched = sums.met.reshape(k + 1, len(self._dofs))[:k]
-        blocks = schur.Blocks(sums.object[:k], sums.cross)
-        gone = schur.eliminate(blocks, sums.force[:k], sums.coupling, touched, linked)
+        gone = schur.eliminate(sums.object[:k], sums.cross, sums.force[:k], sums.coupling, touched, linked)
         found = here.arms
         if len(self._dofs):
-            on = touched | (linked & touched.any(0))  # what an object touches moves those that it touches
-            left = Condensed(sums.arm, sums.on_arm, sums.arm_force, gone.half, gone.wide, on)
+            left = ArmSystem(sums.arm, sums.on_arm, sums.arm_force, gone)
             found = self._directions(problem, here.arms, left, first)
-        return Point(found, schur.back_substitute(gone, found, touched, linked))
+        return Point(found, schur.back_substitute(gone, found, linked))
 
-    def _directions(self, problem: Problem, here: Array, left: Condensed, first: Array) -> Array:
+    def _directions(self, problem: Problem, here: Array, left: ArmSystem, first: Array) -> Array:
         """Return the directions [a, m] of arms: of each alone, of those that one object joins, or of all at once."""
-        begin = jnp.where(first, problem.eased, here)
+        begin = jnp.where(first, problem.start, here)
         together = partial(self._arms.together, problem, here, begin)
-        bridged = partial(self._arms.bridged, problem, here, begin)
+        joined = partial(self._arms.joined, problem, here, begin)
         each = partial(self._arms.each, problem, here, begin, _touching(problem) | first)
         if len(self._dofs) < 2:
             return each(left)
-        bridges, pressed = left.touched.sum(1) > 1, self._sides(problem, here).any()
+        joins, pressed = left.objects.touched.sum(1) > 1, self._sides(problem, here).any()
         if not self._objects:  # nothing joins arms but their own contacts
             return jax.lax.cond(pressed, together, each, left)
 
-        def joined(left: Any) -> Any:
-            return jax.lax.cond(pressed | (bridges.sum() > 1), together, bridged, left)
+        def linked(left: ArmSystem) -> Any:
+            return jax.lax.cond(pressed | (joins.sum() > 1), together, joined, left)
 
-        return jax.lax.cond(pressed | bridges.any(), joined, each, left)
+        return jax.lax.cond(pressed | joins.any(), linked, each, left)
 
     def _sides(self, problem: Problem, arms: Array) -> Array:
         """Return which contacts of arms with arms press, [r] bool."""

@@ -12,44 +12,44 @@ from jax import Array
 from surgical_marl.physics.contact.friction_cone import Forces, between, curvature, wrench
 from surgical_marl.physics.contact.relative_motion import moved_cone
 from surgical_marl.physics.solver.cholesky import packed
-from surgical_marl.physics.solver.contact_line import Base
+from surgical_marl.physics.solver.contact_line import ContactState
 from surgical_marl.physics.solver.problem import AttachmentRows, Contact, Point, Problem
-from surgical_marl.physics.tree_utils import absent, add, put, row_of
+from surgical_marl.physics.tree_utils import add, empty_like, put, row_of, when
 
 _WHOLE = packed(6)
 
 
 class Hessian(NamedTuple):
-    """Sums over contacts of a arms with m joints each at most and of k objects, and of one that stands for none."""
+    """Forces and curvature of contacts, summed up for a arms with m joints each at most, k objects, and no object."""
 
     arm_force: Array
     """[a, m]"""
     force: Array
     """On objects, with the rest of what their acceleration takes, [k + 1, 6]."""
     arm: Array
-    """By how much those on arms fall, lower halves, [a, m (m + 1) / 2]; nothing for an arm on which nothing presses."""
+    """Curvature on arms, lower halves, [a, m (m + 1) / 2]; not defined for an arm on which nothing presses."""
     object: Array
-    """By how much those on objects do, with their masses, lower halves, [k + 1, 21]."""
+    """Curvature on objects, with their masses, lower halves, [k + 1, 21]."""
     cross: Array
-    """Of objects with each other: see `schur.Blocks`."""
+    """Curvature between two objects: see `schur.Eliminated.cross`."""
     coupling: Array
-    """Of object o and arm i in row a o + i, [(k + 1) a, 6, m]; nothing where they were not met."""
+    """Curvature between object o and arm i in row a o + i, [(k + 1) a, 6, m]; not defined where they do not touch."""
     met: Array
-    """Which objects press on which arms, [(k + 1) a] bool."""
+    """Pairs of object and arm that press on each other, [(k + 1) a] bool."""
     on_arm: Array
     """On which arms anything presses, [a] bool."""
     linked: Array
-    """Whether objects press on each other, [] bool."""
+    """True if objects press on each other, []."""
 
     @classmethod
-    def of(cls, problem: Problem, base: Base, here: Point) -> Hessian:
-        """Return sums over contacts and attachments at accelerations `here`, where contacts feel what `base` says."""
+    def of(cls, problem: Problem, forces: ContactState, here: Point) -> Hessian:
+        """Return sums over contacts and attachments at accelerations `here`, where contacts have these forces."""
 
         def one(i: Array, sums: Hessian) -> Hessian:
-            n = base.pressing.numbers[i]
-            return sums._and(problem.contacts.at(n), row_of(base.felt, n))
+            n = forces.pressing.numbers[i]
+            return sums._and(problem.contacts.at(n), row_of(forces.felt, n))
 
-        found: Hessian = jax.lax.fori_loop(0, base.pressing.length, one, cls._none(problem, here.objects))
+        found: Hessian = jax.lax.fori_loop(0, forces.pressing.length, one, cls._none(problem, here.objects))
         return found if problem.attachments is None else found._and_attachments(problem.attachments, here)
 
     @classmethod
@@ -62,10 +62,10 @@ class Hessian(NamedTuple):
         return cls(
             jnp.zeros((a, m)),
             _with_room(inertia),
-            absent(jax.ShapeDtypeStruct((a, m * (m + 1) // 2), jnp.float32)),
+            empty_like(jax.ShapeDtypeStruct((a, m * (m + 1) // 2), jnp.float32)),
             _with_room(problem.masses[:, *np.tril_indices(6)]),
-            jax.lax.cond(linked, jnp.zeros_like, absent, jnp.zeros(36 * k * k if k > 1 else 0)),
-            absent(jax.ShapeDtypeStruct(((k + 1) * a, 6, m), jnp.float32)),
+            jax.lax.cond(linked, jnp.zeros_like, empty_like, jnp.zeros(36 * k * k if k > 1 else 0)),
+            empty_like(jax.ShapeDtypeStruct(((k + 1) * a, 6, m), jnp.float32)),
             jnp.zeros((k + 1) * a, bool),
             jnp.zeros(a, bool),
             jnp.bool_(False),
@@ -90,9 +90,9 @@ class Hessian(NamedTuple):
         def on_arm(sums: Hessian) -> Hessian:
             return sums._on_arm(first, contact.arm, contact.jacobian, pull, stiff[_WHOLE])
 
-        sums = jax.lax.cond(second < k, on_other, lambda sums: sums, self) if k > 1 else self
+        sums = when(second < k, on_other, self) if k > 1 else self
         sums = sums._replace(force=add(sums.force, first, pull), object=add(sums.object, first, stiff))
-        return jax.lax.cond(contact.arm < a, on_arm, lambda sums: sums, sums) if a else sums
+        return when(contact.arm < a, on_arm, sums) if a else sums
 
     def _on_arm(self, body: Any, arm: Any, jacobian: Array, pull: Array, stiff: Array) -> Hessian:
         """Return sums with the end on an arm of a contact or an attachment.
@@ -125,13 +125,13 @@ class Hessian(NamedTuple):
                 sums = sums._replace(force=add(sums.force, body, felt), object=add(sums.object, body, lower))
                 return sums._on_arm(body, arm, rows.jacobian[n], felt, rows.stiffness)
 
-            sums = jax.lax.cond(rows.active[n], hold, lambda sums: sums, sums)
+            sums = when(rows.active[n], hold, sums)
         return sums
 
 
 def _with_room(each: Array) -> Array:
     """Return what belongs to objects [k, ...], and room for the one that stands for none, [k + 1, ...]."""
-    return jnp.concatenate([each, absent(jax.ShapeDtypeStruct((1, *each.shape[1:]), each.dtype))])
+    return jnp.concatenate([each, empty_like(jax.ShapeDtypeStruct((1, *each.shape[1:]), each.dtype))])
 
 
 def _begun(sums: Array, i: Array, row: Array, begun: Array) -> Array:

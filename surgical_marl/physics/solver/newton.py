@@ -1,7 +1,7 @@
 """Newton's method on convex functions: the loop over steps, and the line search within a step.
 
 All problems of this folder are of that kind: an arm alone and arms with contacts as rows (`constraint_rows.py`), arms
-that one body joins (`woodbury.py`), arms and bodies with friction cones (`contact_solver.py`), and point masses.
+that one object joins (`joined_arms.py`), arms and bodies with friction cones (`contact_solver.py`), and point masses.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What arms, objects and their contacts leave to be solved, and its solution."""
+"""The problem that arms, objects and their contacts leave to be solved, and its solution."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Contact(NamedTuple):
     arm: Array
     """Number of the arm that it is on, []."""
     origin: Array
-    """Of the twist, in the world, m, [3]."""
+    """Origin of the twist, in the world, m, [3]."""
     pulls: Array
     """The sign with which it moves with each of that arm's joints, [m]; 0 for joints that do not move it."""
     moving: Array
@@ -52,7 +52,7 @@ class Contacts(NamedTuple):
     """Contacts, [s]."""
 
     second: Array
-    """As in `Contact`, [s]."""
+    """Number of the other object, [s]."""
     springs: Springs
     """[s]"""
     stuck: Stuck
@@ -60,9 +60,9 @@ class Contacts(NamedTuple):
     felt: Forces
     """Without acceleration, [s]."""
     pressing: Listed
-    """Which of them press, without acceleration."""
+    """Contacts that press, without acceleration."""
     on_arm: Array
-    """Which arms have contacts, [a] bool."""
+    """Arms that have contacts, [a] bool."""
     at: Callable[[Array], Contact]
     """Makes one of them by its number, wherever it is needed: that takes less time than to load it from memory."""
 
@@ -82,7 +82,7 @@ class AttachmentRows(NamedTuple):
     wrench: Array
     """Force and torque on the body without any acceleration, N and N m, [w, 6]."""
     stiffness: Array
-    """How much they fall per relative acceleration, kg and kg m2, [6, 6]."""
+    """Force and torque fall by this per relative acceleration, kg and kg m2, [6, 6]."""
 
     def relative(self, n: int, point: Point) -> Array:
         """Return the acceleration [6] of a body relative to the link that it is attached to."""
@@ -106,7 +106,7 @@ class AttachmentRows(NamedTuple):
 
 
 class Problem(NamedTuple):
-    """What is to be solved: a arms with m joints each at most, k objects, s contacts."""
+    """The equations of a arms with m joints each at most, k objects and s contacts."""
 
     mass: Array
     """Mass matrices of the arms with the implicit parts of other forces, lower halves, [a, m (m + 1) / 2]."""
@@ -114,19 +114,19 @@ class Problem(NamedTuple):
     """Sums of all other forces on the arms, [a, m]."""
     joints: JointRows
     """Friction and limits of joints, [a, m]."""
-    eased: Array
+    start: Array
     """Accelerations at which friction of joints is what it was at the end of the step before, [a, m]."""
     between: Rows
     """Contacts of arms with arms; their Jacobian is [r, a, m]."""
     overlap: Array
-    """Whether any arms overlap, []: if not, there is nothing in `between`."""
+    """True if any arms overlap, []: if not, there is nothing in `between`."""
     masses: Array
     """Mass matrices of the objects, [k, 6, 6]."""
     free: Array
     """Accelerations of the objects without contacts, [k, 6]."""
     contacts: Contacts
     total: Array
-    """How many contacts there are, []; no more than there is room for."""
+    """Number of contacts, []; no more than there is room for."""
     attachments: AttachmentRows | None = None
     """None in a scene without any."""
 
@@ -141,11 +141,11 @@ class Pressed(NamedTuple):
     """The forces of contacts, [s]."""
 
     normal: Array
-    """Of all points together, N, [s]."""
+    """Normal force of all points together, N, [s]."""
     friction: Array
     """N, [s, 3]."""
     slips: Array
-    """Whether friction is at its bound, [s] bool."""
+    """Contacts whose friction is at its bound, [s] bool."""
 
     @classmethod
     def of(cls, felt: Forces) -> Pressed:

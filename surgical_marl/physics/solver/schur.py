@@ -1,212 +1,139 @@
-"""Objects are eliminated from a linear system: each alone, or by blocks of six where some touch each other."""
+"""Schur complement: objects are eliminated from the linear system of a Newton step, which leaves that of the arms.
+
+Let M be the matrix of objects, in blocks of six, and C its coupling with arms. With a Cholesky factor M = L @ L.T the
+arms lose (L^-1 @ C).T @ (L^-1 @ C) of their matrix and (L^-1 @ C).T @ (L^-1 @ f) of their forces. Objects are
+eliminated one after the other, and only objects that touch each other change each other's blocks.
+"""
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from surgical_marl.physics.solver.cholesky import back, cholesky, forward, packed
-from surgical_marl.physics.tree_utils import absent, put
+from surgical_marl.physics.tree_utils import add, for_each, put, when
+
+_FIRST, _SECOND = np.tril_indices(6)
+_Rows = tuple[Array, Array, Array, Array]
+"""Blocks on the diagonal and beside it, forces and coupling of objects that are being eliminated."""
 
 
 class Eliminated(NamedTuple):
-    """What the elimination of k objects leaves of their rows."""
+    """The rows of k objects after their elimination, with a arms of m joints each."""
 
-    half: Array
-    """Forces on objects, divided by the Cholesky factor of the objects' matrix, [k, 6]."""
-    wide: Array
-    """How they fall with the acceleration of arms, likewise: that of object o with arm i is row a o + i,
-    [(k + 1) a, 6, m]. Nothing where they don't touch, unless objects touch each other, and for the object k."""
+    force: Array
+    """L^-1 @ f for the forces f on objects, [k, 6]."""
+    coupling: Array
+    """L^-1 @ C: of object o and arm i in row a o + i, [(k + 1) a, 6, m]. Only defined where `touched`."""
     factor: Array
-    """Blocks on the factor's diagonal, lower, [k, 6, 6]: of objects that touch no other."""
-    rows: Array
-    """Of objects that touch each other, all that the elimination leaves: see `touching`. None of it is there of
-    others."""
-
-
-class Blocks(NamedTuple):
-    """A symmetric matrix of objects: how forces on each of them fall with the accelerations of all."""
-
-    own: Array
-    """The lower half of each object's own block, [k, 21]."""
+    """Blocks on the diagonal of L, lower, [k, 6, 6]."""
     cross: Array
-    """The block of objects i and j of each pair `i < j`, from 36 (k i + j) on; only read of objects that touch."""
+    """Blocks of L.T beside the diagonal: of objects i < j from 36 (k i + j) on. Only defined if objects touch."""
+    touched: Array
+    """Pairs of object and arm that touch, or do so by way of other objects, [k, a] bool."""
 
 
-def eliminate(blocks: Blocks, force: Array, coupling: Array, touched: Array, linked: Array) -> Eliminated:
-    """Return what is left of objects.
+def eliminate(own: Array, cross: Array, force: Array, coupling: Array, touched: Array, linked: Array) -> Eliminated:
+    """Return the rows of objects after their elimination.
 
     Args:
-        blocks: how forces fall with accelerations.
-        force: forces on the objects, [k, 6].
-        coupling: how they fall with the acceleration of arms, [(k + 1) a, 6, m]: see `Eliminated.wide`. Only read where
-            an object touches an arm.
-        touched: which objects touch which arms, [k, a].
-        linked: whether any objects touch each other, [].
+        own: lower half of each object's block of M, [k, 21].
+        cross: blocks of M beside the diagonal, as in `Eliminated`; zeros where two objects do not touch.
+        force: forces on objects, [k, 6].
+        coupling: C, as in `Eliminated`; only read where `touched`.
+        touched: objects that touch arms, [k, a] bool.
+        linked: true if any objects touch each other, [].
     """
+    (k, a), zeros = touched.shape, jnp.zeros(coupling.shape[1:])
 
-    def alone(coupling: Any) -> Any:
-        return apart(blocks.own, force, coupling, touched)
+    def one(state: _Rows, j: Array) -> tuple[_Rows, Array]:
+        own, cross, force, coupling = state
+        factor = cholesky(own[j][packed(6)])
 
-    if len(force) < 2:
-        return alone(coupling)
-    return jax.lax.cond(linked, lambda coupling: touching(blocks, force, coupling, touched), alone, coupling)
+        def divide(coupling: Array, arm: Array) -> Array:
+            return put(coupling, a * j + arm, forward(factor, coupling[a * j + arm]))
 
+        force, coupling = put(force, j, forward(factor, force[j])), for_each(touched[j], divide, coupling)
+        state = own, cross, force, coupling
+        if k > 1:
+            state = when(linked, partial(_subtract, j, touched, factor), state)
+        return state, factor
 
-def back_substitute(found: Eliminated, arms: Array, touched: Array, linked: Array) -> Array:
-    """Return the directions [k, 6] of objects, by those of the arms' joints [a, m]; the rest as for `eliminate`."""
-
-    def alone() -> Any:
-        return substituted_apart(found, arms, touched)
-
-    if len(touched) < 2:
-        return alone()
-    return jax.lax.cond(linked, lambda: substituted_touching(found, arms), alone)
-
-
-def apart(own: Array, force: Array, coupling: Array, touched: Array) -> Eliminated:
-    """Return what is left of objects of which no two touch; arguments as for `eliminate`.
-
-    `own` [k, 21] is the lower half of each object's block.
-    """
-    (k, a), m = touched.shape, coupling.shape[2]
-
-    def one(wide: Array, row: Any) -> tuple[Array, tuple[Array, Array]]:
-        i, own, force, touched = row
-        factor = cholesky(own[packed(6)])
-
-        def of_arm(wide: Array, arm: Array) -> tuple[Array, None]:
-            def divided(wide: Any) -> Any:
-                return put(wide, a * i + arm, forward(factor, wide[a * i + arm]))
-
-            return jax.lax.cond(touched[arm], divided, lambda wide: wide, wide), None
-
-        if coupling.size:
-            wide = jax.lax.scan(of_arm, wide, jnp.arange(a))[0]
-        return wide, (forward(factor, force), factor)
-
-    rows = absent(jax.ShapeDtypeStruct((_size(k, a, m) if k > 1 else 0,), force.dtype))
-    wide, (half, factor) = jax.lax.scan(one, coupling, (jnp.arange(k), own, force, touched))
-    return Eliminated(half, wide, factor, rows)
+    if not k:
+        return Eliminated(force, coupling, jnp.zeros((0, 6, 6)), cross, touched)
+    if k > 1:
+        filled = touched | (linked & touched.any(0))  # an arm meets all objects that touch those that it touches
+        coupling = for_each((filled & ~touched).ravel(), lambda rows, pair: put(rows, pair, zeros), coupling)
+        touched = filled
+    (_, cross, force, coupling), factor = jax.lax.scan(one, (own, cross, force, coupling), jnp.arange(k))
+    return Eliminated(force, coupling, factor, cross, touched)
 
 
-def substituted_apart(found: Eliminated, arms: Array, touched: Array) -> Array:
-    """Return the directions [k, 6] of objects of which no two touch, by those of the arms' joints [a, m]."""
+def _subtract(j: Array, touched: Array, factor: Array, state: _Rows) -> _Rows:
+    """Return the rows of all objects after object j is eliminated from those that it touches and that follow it."""
+    (k, a), (own, cross, force, coupling) = touched.shape, state
 
-    def one(row: Any) -> Array:
-        i, half, factor, touched = row
+    def divide(cross: Array, i: Array) -> Array:
+        return _put_block(cross, k * j + i, forward(factor, _block(cross, k * j + i)))
 
-        def of_arm(left: Array, arm: Array) -> tuple[Array, None]:
-            def less(left: Any) -> Any:
-                return left - found.wide[len(arms) * i + arm] @ arms[arm]
+    def subtract(state: _Rows, i: Array) -> _Rows:
+        own, cross, force, coupling = state
+        across = _block(cross, k * j + i)
 
-            return jax.lax.cond(touched[arm], less, lambda left: left, left), None
+        def from_cross(cross: Array, n: Array) -> Array:
+            return _put_block(cross, k * i + n, _block(cross, k * i + n) - across.T @ _block(cross, k * j + n))
 
-        left = jax.lax.scan(of_arm, half, jnp.arange(len(arms)))[0] if len(arms) else half
-        return back(factor, left)
+        def from_coupling(coupling: Array, arm: Array) -> Array:
+            return add(coupling, a * i + arm, -across.T @ coupling[a * j + arm])
 
-    found_steps: Array = jax.lax.map(one, (jnp.arange(len(touched)), found.half, found.factor, touched))
-    return found_steps
+        own = add(own, i, -jnp.sum(across[:, _FIRST] * across[:, _SECOND], 0))
+        cross = for_each(_after(i, cross, j, k), from_cross, cross)
+        return own, cross, add(force, i, -across.T @ force[j]), for_each(touched[j], from_coupling, coupling)
 
-
-def touching(blocks: Blocks, force: Array, coupling: Array, touched: Array) -> Eliminated:
-    """Return what is left of objects of which some touch each other. What is 0 costs little.
-
-    A row of blocks is kept as columns of six: those of all objects, the force, and those of all arms. All rows are one
-    array, [k * columns * 6], and what works on a column is in a loop: so the code is the same for any number of them.
-    """
-    (k, a), m = touched.shape, coupling.shape[2]
-    count, size = jnp.arange(k), _size(k, a, m)
-    width = size // (6 * k)
-
-    def note(rows: Array, row: Any) -> tuple[Array, None]:
-        j, own, force, touched = row
-
-        def other(rows: Array, i: Array) -> tuple[Array, None]:
-            at = 36 * (k * jnp.minimum(i, j) + jnp.maximum(i, j))
-            block = jax.lax.dynamic_slice(blocks.cross, (at,), (36,)).reshape(6, 6)
-            block = jnp.where(i == j, own[packed(6)], jnp.where(i < j, block, block.T))  # its columns, one by one
-            return _put(rows, j * width + 6 * i, block), None
-
-        rows = jax.lax.scan(other, rows, count)[0]
-        rows = _put(rows, j * width + 6 * k, force)
-
-        def of_arm(rows: Array, arm: Array) -> tuple[Array, None]:
-            columns = jax.lax.cond(touched[arm], lambda: coupling[a * j + arm].T, lambda: jnp.zeros((m, 6)))
-            return _put(rows, j * width + 6 * k + 1 + arm * m, columns), None
-
-        return (jax.lax.scan(of_arm, rows, jnp.arange(a))[0] if a else rows), None
-
-    def eliminate(rows: Array, j: Array) -> tuple[Array, None]:
-        diagonal = j * (width + 6)
-        factor = cholesky(_columns(rows, diagonal, 6))
-
-        def divide(rows: Array, at: Array) -> tuple[Array, None]:
-            column = _columns(rows, at, 1)[0]
-
-            def divided(rows: Any) -> Any:
-                return _put(rows, at, forward(factor, column))
-
-            return jax.lax.cond((column != 0).any(), divided, lambda rows: rows, rows), None
-
-        def subtract(rows: Array, i: Array) -> tuple[Array, None]:
-            block = _columns(rows, j * width + 6 * i, 6)
-
-            def column(rows: Array, c: Array) -> tuple[Array, None]:
-                at = i * width + c
-                less = _columns(rows, at, 1)[0] - block @ _columns(rows, j * width + c, 1)[0]
-                return _put(rows, at, less), None
-
-            def all_(rows: Any) -> Any:
-                return jax.lax.scan(column, rows, jnp.arange(width))[0]
-
-            return jax.lax.cond((i > j) & (block != 0).any(), all_, lambda rows: rows, rows), None
-
-        rows = jax.lax.scan(divide, rows, j * width + jnp.arange(width))[0]
-        rows = _put(rows, diagonal, factor)
-        return jax.lax.scan(subtract, rows, count)[0], None
-
-    def leave(wide: Array, pair: Array) -> tuple[Array, None]:
-        at = pair // a * width + 6 * k + 1 + pair % a * m
-        return put(wide, pair, _columns(rows, at, m).T), None
-
-    start = absent(jax.ShapeDtypeStruct((size,), force.dtype))
-    rows = jax.lax.scan(note, start, (count, blocks.own, force, touched))[0]
-    rows = jax.lax.scan(eliminate, rows, count)[0]
-    wide = jax.lax.scan(leave, coupling, jnp.arange(k * a))[0] if a else coupling
-    half = jax.lax.map(lambda j: _columns(rows, j * width + 6 * k, 1)[0], count)
-    return Eliminated(half, wide, absent(jax.ShapeDtypeStruct((k, 6, 6), force.dtype)), rows)
+    after = _after(j, cross, j, k)
+    cross = for_each(after, divide, cross)
+    return for_each(after, subtract, (own, cross, force, coupling))
 
 
-def substituted_touching(found: Eliminated, arms: Array) -> Array:
-    """Return the directions [k, 6] of objects of which some touch, by those of the arms' joints [a, m]."""
-    k, rows = len(found.half), found.rows
-    width = rows.size // (6 * k)
+def back_substitute(found: Eliminated, arms: Array, linked: Array) -> Array:
+    """Return the directions of objects, [k, 6], by those of the arms' joints, [a, m]; `linked` as in `eliminate`."""
+    k, a = found.touched.shape
 
-    def one(directions: Array, j: Array) -> tuple[Array, None]:
-        def add(total: Array, c: Array) -> tuple[Array, None]:
-            return total - directions[c] * _columns(rows, j * width + c, 1)[0], None
+    def one(directions: Array, row: Any) -> tuple[Array, None]:
+        j, left, factor, touched = row
+        left = for_each(touched, lambda left, arm: left - found.coupling[a * j + arm] @ arms[arm], left)
 
-        left = jax.lax.scan(add, jnp.zeros(6), jnp.arange(width))[0]  # those up to j are still 0
-        factor = _columns(rows, j * (width + 6), 6)
-        return jax.lax.dynamic_update_slice(directions, back(factor, left), (6 * j,)), None
+        def others(left: Array) -> Array:
+            def less(left: Array, i: Array) -> Array:
+                return left - _block(found.cross, k * j + i) @ directions[i]
 
-    all_ = jnp.concatenate([jnp.zeros(6 * k), -jnp.ones(1), arms.ravel()])
-    return jax.lax.scan(one, all_, jnp.arange(k), reverse=True)[0][: 6 * k].reshape(k, 6)
+            return for_each(_after(j, found.cross, j, k), less, left)
 
+        if k > 1:
+            left = when(linked, others, left)
+        return put(directions, j, back(factor, left)), None
 
-def _size(k: int, a: int, m: int) -> int:
-    """Return how many numbers the rows of `touching` are."""
-    return k * (6 * k + 1 + a * m) * 6
-
-
-def _columns(rows: Array, at: Array, count: int) -> Array:
-    """Return columns from the one with the number `at` on, [count, 6]."""
-    return jax.lax.dynamic_slice(rows, (6 * at,), (6 * count,)).reshape(count, 6)
+    rows = jnp.arange(k), found.force, found.factor, found.touched
+    if not k:
+        return found.force
+    return jax.lax.scan(one, jnp.zeros((k, 6)), rows, reverse=True)[0]
 
 
-def _put(rows: Array, at: Array, columns: Array) -> Array:
-    return jax.lax.dynamic_update_slice(rows, columns.ravel(), (6 * at,))
+def _after(i: Array, cross: Array, j: Array, k: int) -> Array:
+    """Return which objects follow object i and touch object j, [k] bool."""
+    found: Array = jax.lax.map(lambda n: (n > i) & (_block(cross, k * j + n) != 0).any(), jnp.arange(k))
+    return found
+
+
+def _block(cross: Array, number: Array) -> Array:
+    """Return one of the blocks [6, 6] of a flat array."""
+    return jax.lax.dynamic_slice(cross, (36 * number,), (36,)).reshape(6, 6)
+
+
+def _put_block(cross: Array, number: Array, block: Array) -> Array:
+    return jax.lax.dynamic_update_slice(cross, block.ravel(), (36 * number,))

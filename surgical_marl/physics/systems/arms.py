@@ -91,7 +91,7 @@ class Arms:
         self.dynamics = Dynamics(scene.model)
         self.dt, self._scene = self.dynamics.dt, scene
         self.types = [ArmType(scene, agents) for agents in scene.types.values()]
-        self.dofs = _dofs(scene)
+        self.dofs = joint_numbers(scene)
         self._fields: dict[str, Array] = {}
         self._friction_decay = _friction_decay(scene.model)[self.dofs]
 
@@ -241,15 +241,18 @@ def _whole(lower: Any) -> Array:
     return found
 
 
-def _dofs(scene: Scene) -> np.ndarray:
-    """Return the joints of each arm by their numbers in the scene, [a, m], padded with the number of all joints."""
+def joint_numbers(scene: Scene) -> np.ndarray:
+    """Return the numbers of each arm's joints among the scene's degrees of freedom, [a, m].
+
+    An arm with fewer joints than others has that of no joint, `nv`, in its last places.
+    """
     model = scene.model
     owner = np.array([model.joint(i).name.split("/")[0] for i in range(model.njnt)])
     joints = [np.flatnonzero(owner == agent) for agent in scene.agents]
-    dofs = np.full((len(joints), max(map(len, joints), default=0)), model.nv)
+    numbers = np.full((len(joints), max(map(len, joints), default=0)), model.nv)
     for arm, own in enumerate(joints):
-        dofs[arm, : len(own)] = own
-    return dofs
+        numbers[arm, : len(own)] = own
+    return numbers
 
 
 def _friction_decay(model: mujoco.MjModel) -> np.ndarray:

@@ -35,9 +35,9 @@ class RigidBodyState(NamedTuple):
 class RigidBodies:
     """All free rigid bodies of a scene, k of them."""
 
-    def __init__(self, scene: Scene, dt: Any, arms: bool = True) -> None:
+    def __init__(self, scene: Scene, dt: Any) -> None:
         self.dt, self._arms = dt, len(scene.agents)
-        self.tables = self._nominal = ContactPairs(scene, arms)
+        self.tables = self._nominal = ContactPairs(scene)
         self.names = self.tables.names
         self._places = [scene.objects[name] for name in self.names]
         self._factors: Factors | None = None

@@ -26,7 +26,7 @@ class Bodies(NamedTuple):
     quaternion: Array
     """Orientation of the objects' frames, w, x, y, z, [k, 4]."""
     velocity: Array
-    """Of the centres of mass, m/s, then angular, rad/s, both by the world's axes, [k, 6]."""
+    """Velocity of the centres of mass, m/s, then angular velocity, rad/s, both by the world's axes, [k, 6]."""
     acceleration: Array
     """Found by the last step, where the solver begins, [k, 6]."""
 

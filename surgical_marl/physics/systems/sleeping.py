@@ -28,9 +28,9 @@ class Company(NamedTuple):
     """Neighbours that keep objects awake."""
 
     arms: Array
-    """Which objects an arm is near, [k] bool."""
+    """Objects that an arm is near, [k] bool."""
     objects: Array
-    """Which objects are near each other, [k, k] bool."""
+    """Pairs of objects that are near each other, [k, k] bool."""
 
     def spread(self, awake: Array) -> Array:
         """Return which objects are awake, [k] bool: those of `awake`, those near an arm, and all their neighbours."""

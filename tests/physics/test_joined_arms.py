@@ -10,8 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from surgical_marl.physics.solver.arm_solver import Arms, Condensed
+from surgical_marl.physics.solver.arm_solver import ArmSolver, ArmSystem
 from surgical_marl.physics.solver.constraint_rows import JointRows, Rows, rows_of
+from surgical_marl.physics.solver.schur import Eliminated
 
 JOINTS = 5
 
@@ -58,7 +59,7 @@ class _Drawn(NamedTuple):
 
     problem: SimpleNamespace
     here: jax.Array
-    left: Condensed
+    left: ArmSystem
     whole: np.ndarray
     """The matrix of all joints, then all objects."""
     force: np.ndarray
@@ -92,7 +93,8 @@ def _drawn(rng: np.random.Generator, arms: int, objects: int, bridge: int) -> _D
         whole[dofs[i][:, None], dofs[i]] = mass[i] + stiff[i]
     none = Rows(single(np.zeros((0, *shape))), *[single([])] * 4)
     felt = -np.einsum("ijk,ik->ij", stiff, here)
-    left = Condensed(halves(stiff), jnp.ones(arms, bool), *map(single, (felt, half, wide)), jnp.asarray(touched))
+    gone = Eliminated(single(half), single(wide), *[single(np.nan)] * 2, jnp.asarray(touched))
+    left = ArmSystem(halves(stiff), jnp.ones(arms, bool), single(felt), gone)
     problem = SimpleNamespace(mass=halves(mass), smooth=single(smooth), joints=_joints(rng, arms), between=none)
     return _Drawn(problem, single(here), left, whole, np.concatenate([smooth.ravel(), push.ravel()]))
 
@@ -104,12 +106,12 @@ def test_arms_that_an_object_joins_are_solved_as_all_at_once_in_float64(
 ) -> None:
     monkeypatch.setattr("surgical_marl.physics.solver.arm_solver.ITERATIONS", (60, 4))  # six do not solve all of these
     rng, errors = np.random.default_rng(10 * arms + objects), []
-    solver = Arms(np.arange(arms * JOINTS).reshape(arms, JOINTS), arms * JOINTS)
-    bridged = jax.jit(lambda fields, *given: given[0] + solver.bridged(SimpleNamespace(**fields), *given))  # type: ignore[arg-type]
+    solver = ArmSolver(np.arange(arms * JOINTS).reshape(arms, JOINTS), arms * JOINTS)
+    joined = jax.jit(lambda fields, *given: given[0] + solver.joined(SimpleNamespace(**fields), *given))  # type: ignore[arg-type]
     for n in range(40):
         drawn = _drawn(rng, arms, objects, n % objects)
         begin = drawn.here * np.float32(rng.choice([1.0, 0.7, -2.0]))  # wherever it begins
-        found = bridged(vars(drawn.problem), drawn.here, begin, drawn.left)
+        found = joined(vars(drawn.problem), drawn.here, begin, drawn.left)
         flat = JointRows(*(np.asarray(column, np.float64).ravel() for column in drawn.problem.joints))
         rows = Rows(*(np.asarray(column, np.float64) for column in rows_of(flat)))  # type: ignore[arg-type]
         rows = rows._replace(jacobian=np.pad(rows.jacobian, ((0, 0), (0, 6 * objects))))

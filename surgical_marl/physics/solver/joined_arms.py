@@ -1,9 +1,7 @@
-"""The search direction of arms that one body joins: each arm is factorised alone, six numbers of the body join them.
+"""The direction of arms that one object joins: each arm is factorised alone, and six rows of the object join them.
 
-Without the object, the matrix B of all arms has one block for each arm. The object takes W.T @ W from it, where W is
-six rows. By Woodbury's identity (W. Hager, "Updating the inverse of a matrix", SIAM Review 31, 1989) the solution x of
-(B - W.T @ W) @ x = e is that of B @ x = e + W.T @ z, where (1 - W @ inv(B) @ W.T) @ z = W @ inv(B) @ e. So no matrix is
-larger than that of an arm, and all arms share the code of one, in loops.
+Without the object, the matrix of all arms has one block for each arm. The object takes W.T @ W from it, where W is its
+eliminated coupling (`schur.py`), six rows. `cholesky.woodbury` solves this in a loop over arms.
 """
 
 from __future__ import annotations
@@ -16,18 +14,18 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from surgical_marl.physics.solver.cholesky import cholesky, forward, solve_factored
+from surgical_marl.physics.solver.cholesky import solve_factored, woodbury
 from surgical_marl.physics.solver.constraint_rows import JointRows, Rows, giving, rows_of, unbounded_forces
 from surgical_marl.physics.solver.newton import line_search, newton
 
 
-class Own(NamedTuple):
-    """What belongs to each of a arms with m joints each at most."""
+class ArmBlocks(NamedTuple):
+    """The systems of a arms with m joints each at most, each without the others."""
 
     number: Array
     """[a]"""
     stiff: Array
-    """How forces fall with the acceleration of its joints, without the object: lower half, [a, m (m + 1) / 2]."""
+    """Lower halves of their matrices, without the object, [a, m (m + 1) / 2]."""
     force: Array
     """All forces at `here`, but for friction and limits of joints, [a, m]."""
     joints: JointRows
@@ -43,11 +41,11 @@ class _State(NamedTuple):
     """W times the directions, [6]."""
 
 
-class Woodbury:
-    """Solves for the directions of arms that one object joins.
+class JoinedArms:
+    """Newton's method for the directions of arms that one object joins.
 
     Args:
-        own: what belongs to each arm.
+        own: the system of each arm.
         wide: from the number of an arm to its columns of W, [6, m].
         resisted: from accelerations [a, m], directions [a, m] and a length to the slope of friction and limits of
             joints there, and by how much it grows per length.
@@ -56,7 +54,7 @@ class Woodbury:
 
     def __init__(
         self,
-        own: Own,
+        own: ArmBlocks,
         wide: Callable[[Array], Array],
         resisted: Callable[[Array, Array, Array], tuple[Array, Array]],
         places: np.ndarray,
@@ -79,12 +77,12 @@ class Woodbury:
 
     def _step(self, state: _State, _: Array) -> tuple[_State, Array]:
         """Return the state after a Newton step, and whether it was whole and changed no side."""
-        excess, factors, joined = self._factorise(state)
+        excess, factors, share = self._factorise(state)
 
         def step_of(sums: tuple[Array, Array, Array], row: Any) -> tuple[tuple[Array, Array, Array], Array]:
             own, direction, excess, factor = row
             across, (rows, force) = self._wide(own.number), _rows(own, direction)  # again: quicker than to keep them
-            step = solve_factored(factor, excess + across.T @ joined)
+            step = solve_factored(factor, excess - across.T @ share)
             end = force - rows.impedance * (rows.jacobian @ step)
             kept = ((force > rows.low) == (end > rows.low)) & ((force < rows.high) == (end < rows.high))
             moved, begin, whole = sums
@@ -100,22 +98,17 @@ class Woodbury:
         return _State(state.directions + length * steps, state.moved + length * moved), whole
 
     def _factorise(self, state: _State) -> tuple[Array, Array, Array]:
-        """Return the forces left over [a, m], the factors of the arms' matrices [a, m, m], and what joins them [6]."""
+        """Return the forces left over [a, m], the factors of the arms' matrices [a, m, m], and the shares [6]."""
 
-        def factorise(sums: tuple[Array, Array], row: Any) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        def system(row: Any) -> tuple[Array, Array, Array]:
             own, direction = row
             matrix, across, (rows, force) = own.stiff[self._places], self._wide(own.number), _rows(own, direction)
             excess = own.force + rows.jacobian.T @ jnp.clip(force, rows.low, rows.high)
             excess += across.T @ state.moved - matrix @ direction
             gives = giving(rows, force)
-            factor = cholesky(matrix + rows.jacobian.T @ (gives[:, None] * rows.jacobian))
-            eased = forward(factor, jnp.concatenate([excess[:, None], across.T], 1))
-            joined = sums[0] - eased[:, 1:].T @ eased[:, 1:], sums[1] + eased[:, 1:].T @ eased[:, 0]
-            return joined, (excess, factor)
+            return matrix + rows.jacobian.T @ (gives[:, None] * rows.jacobian), excess, across
 
-        none = jnp.eye(6), jnp.zeros(6)
-        (matrix, right), (excess, factors) = jax.lax.scan(factorise, none, (self._own, state.directions))
-        return excess, factors, solve_factored(cholesky(matrix), right)
+        return woodbury(system, (self._own, state.directions), 6, -1.0)
 
     def _length(self, state: _State, steps: Array, moved: Array, begin: Array) -> Array:
         """Return how far to go along steps [a, m], by which W moves `moved` [6]; `begin` is the slope before them."""
@@ -137,7 +130,7 @@ class Woodbury:
         return line_search(begin, 0.0, measure).length
 
 
-def _rows(own: Own, direction: Array) -> tuple[Rows, Array]:
+def _rows(own: ArmBlocks, direction: Array) -> tuple[Rows, Array]:
     """Return friction and limits of an arm's joints as rows, and their forces without bounds after a step."""
     rows = rows_of(own.joints)
     return rows, unbounded_forces(rows, own.here + direction)
