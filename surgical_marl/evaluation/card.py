@@ -171,7 +171,9 @@ def _train_command(folder: Path, settings: Settings) -> str:
     level = [] if settings.difficulty == "default" else ["--difficulty", settings.difficulty]
     start = [] if settings.start == "home" else ["--start", settings.start]
     what = ["surgical-marl", "train", settings.task, "--scene", stored_scene(settings.scene, folder), *level, *start]
-    return shlex.join([*what, "--seed", str(settings.seed)])
+    acts = {"control": settings.control, "control_frame": settings.control_frame}
+    own = [f"{name}={value}" for name, value in acts.items() if value != getattr(Settings, name)]
+    return shlex.join([*what, "--seed", str(settings.seed), *own])
 
 
 def _training(folder: Path) -> dict[str, float]:

@@ -17,6 +17,9 @@ from scipy.spatial.transform import Rotation
 from surgical_marl import list_arms, load_arm, load_scene
 from surgical_marl.control.action_term import Joints, lead_limit
 from surgical_marl.control.terms.cartesian import Cartesian
+from surgical_marl.envs.batch import BatchedEnv
+from surgical_marl.evaluation.evaluate import play
+from surgical_marl.policies.policy import load_policy
 from surgical_marl.robots.arm import Arm
 
 DT = 0.02
@@ -150,3 +153,46 @@ def test_a_camera_frame_is_that_of_the_picture(agent: str) -> None:
         q[term.joints] = term.to_commands(action, arms)
         moved = scene.mounts[agent].rotation @ (arm.forward_kinematics(q)[:3, 3] - before)
         np.testing.assert_allclose(moved, 0.3 * term.bounds.high[0] * DT * axes @ axis, atol=2e-5)
+
+
+@pytest.mark.parametrize(
+    ("scene", "frame", "agent"),
+    [
+        ("bimanual_psm_pegs", "base", "psm_0"),
+        ("trimanual_psm_ecm_pegs", "camera", "psm_1"),
+        ("trimanual_psm_ecm_pegs", "camera", "ecm_0"),
+    ],
+)
+def test_joints_go_where_an_oracle_wants_them(scene: str, frame: str, agent: str) -> None:
+    """Its actions are twists: from them follow the position targets of the joints that it had in mind."""
+    found, rng = load_scene(scene), np.random.default_rng(0)
+    now = {
+        name: (
+            mount.arm.lower
+            + rng.uniform(0.3, 0.7, (200, len(mount.arm.lower))) * np.ptp([mount.arm.lower, mount.arm.upper], 0)
+        )
+        for name, mount in found.mounts.items()
+    }
+    term, arm = Cartesian(found, agent, DT, frame), found.mounts[agent].arm
+    change = rng.uniform(-1, 1, now[agent].shape) * arm.speed * DT * ~arm.moves_jaw
+    change /= np.maximum(1.0, term.steps_of(now[agent], change))[:, None]
+    action = term.action_of(change, {name: Joints(q, q) for name, q in now.items()})
+    assert np.abs(action).max() <= 1 + 1e-6
+    rows = {name: Joints(*[jnp.asarray(q, jnp.float32)] * 2) for name, q in now.items()}
+    told = jax.jit(jax.vmap(term.to_commands))(jnp.asarray(action, jnp.float32), rows)
+    np.testing.assert_allclose(told, (now[agent] + change)[:, term.joints], atol=2e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("task", "scene", "frame"),
+    [
+        ("peg_transfer", "bimanual_psm_pegs", "base"),
+        ("peg_transfer", "trimanual_psm_ecm_pegs", "camera"),
+        ("camera_assist", "trimanual_psm_ecm", "camera"),
+    ],
+)
+def test_the_oracle_does_tasks_by_twists(task: str, scene: str, frame: str) -> None:
+    options: Any = {"control": "cartesian", "control_frame": frame, "goals": "held_out"}
+    env = BatchedEnv(task, scene, num_envs=32, **options)
+    assert np.mean(play(env, load_policy("oracle", env), 32, seed=0).measures["success"]) > 0.9
