@@ -373,7 +373,7 @@ def alike(env: Env) -> dict[str, list[str]]:
 def _of_type(env: Env, term: str) -> str:
     """Return the name of a term; if it is a teammate's, with the type of its arm for the teammate's name."""
     mate, stroke, name = term.partition("/")
-    return f"{env.scene.mounts[mate].arm.name}/{name}" if stroke else term
+    return f"{env.scene.type_of(mate)}/{name}" if stroke else term
 
 
 def _box(low: np.ndarray, high: np.ndarray) -> spaces.Box:

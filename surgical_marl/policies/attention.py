@@ -94,7 +94,7 @@ def _entities(env: BatchedEnv, agent: str) -> Entities:
         own = {name.partition("/")[2]: part for name, part in terms.items() if name.startswith(f"{mate}/")}
         if said is not None:
             own[MESSAGES] = slice(said.start + number * each, said.start + (number + 1) * each)
-        kind = (scene.mounts[mate].arm.name, *own) if len(own) > (said is not None) else ()
+        kind = (scene.type_of(mate), *own) if len(own) > (said is not None) else ()
         found.setdefault(kind, []).append(_columns(own))
     for thing in (*scene.free_objects, AT_HAND):
         own = {part: terms[name] for part in PARTS if (name := f"{thing}_{part}") in terms}

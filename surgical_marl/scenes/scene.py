@@ -149,6 +149,10 @@ class Scene:
             found[f"{name}-{taken + 1}" if taken else name] = tuple(group)
         return found
 
+    def type_of(self, agent: str) -> str:
+        """Return the name of an agent's type in `types`."""
+        return next(name for name, agents in self.types.items() if agent in agents)
+
     def label(self, agent: str) -> str:
         """Return an agent's name, with its tool if that is not the usual one, as in "psm_1 with cadiere_forceps"."""
         arm = self.mounts[agent].arm

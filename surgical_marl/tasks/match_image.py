@@ -77,7 +77,7 @@ class Task(TipTask):
     def __init__(self, scene: Scene, options: Options) -> None:
         super().__init__(scene, options)
         self.camera: str = scene.find_camera()
-        same = next(agents for agents in scene.types.values() if self.camera in agents)
+        same = scene.types[scene.type_of(self.camera)]
         if len(same) > 1:
             raise ValueError(f"match_image needs a scene with one endoscope; {scene.name!r} has {', '.join(same)}")
         self._arm = scene.mounts[self.camera].arm

@@ -13,6 +13,7 @@ import pytest
 
 from surgical_marl import load_arm
 from surgical_marl.cli.main import main
+from surgical_marl.envs.env import Env, alike
 from surgical_marl.robots.arm import arm_files, list_tools
 from surgical_marl.robots.spec import build_spec
 from surgical_marl.scenes.check import check
@@ -127,3 +128,14 @@ def test_a_tool_that_does_not_fit_is_found(tmp_path: Path, changes: Any, words: 
     (folder / "arm.yaml").write_text(dump_yaml(content))
     (found,) = [finding for finding in check(folder) if "collision" not in finding]
     assert re.search(words, found), found
+
+
+def test_agents_that_see_other_instruments_share_no_network(tmp_path: Path) -> None:
+    """Of three PSMs the first and the last are alike, but each sees the forceps at another place."""
+    path = write_scene(tmp_path, psm_1="cadiere_forceps")
+    content = read_yaml(path)
+    content["arms"]["psm_2"] = {"arm": "psm", "position": [0.0, 0.1, 0.15], "workspace": [0.0, 0.0, -0.11]}
+    path.write_text(dump_yaml(content))
+    env = Env("reach", str(path), knowledge="all")
+    assert env.scene.types == {"psm": ("psm_0", "psm_2"), "psm-2": ("psm_1",)}
+    assert alike(env) == {"psm": ["psm_0"], "psm-seeing-2": ["psm_2"], "psm-2": ["psm_1"]}
