@@ -135,17 +135,10 @@ def test_an_export_is_the_best_of_its_seeds(exported: Path) -> None:
     assert all(origin.values()) and str(origin["commit"]) in text and str(origin["device"]) in text
 
 
-def test_a_policy_for_cartesian_control_says_so(tmp_path: Path) -> None:
-    settings = replace(
-        SMALL, scene="trimanual_psm_ecm_needle", control="cartesian", control_frame="camera", iterations=1
-    )
-    with faked():
-        run = train.train(settings, out=tmp_path / "run")
-        out = export.export_policy([str(run)], tmp_path / "policy")
-    text = (out / card.CARD).read_text()
-    assert "--seed 0 control=cartesian control_frame=camera`" in text
-    assert "Made for cartesian (camera) control" in text
-    assert onnxruntime.InferenceSession(out / "psm.onnx").get_outputs()[0].name == "action"
+def test_the_command_of_a_card_has_the_control(tmp_path: Path) -> None:
+    settings = replace(SMALL, scene="trimanual_psm_ecm_needle", control="cartesian", control_frame="camera")
+    assert card._train_command(tmp_path, settings).endswith("--seed 0 control=cartesian control_frame=camera")
+    assert card._train_command(tmp_path, SMALL).endswith("--seed 0")
 
 
 def test_a_run_that_meets_its_goals_comes_before_one_that_is_more_exact(
