@@ -62,6 +62,8 @@ def _arm(name: str) -> str:
 def _object(name: str) -> str:
     item = load_object(name)
     mass = f"{1000 * item.mass:.3g} g" if item.free else "fixed"
+    if item.soft:
+        return f"{name:18} {item.description}\n    {item.soft.kind} of {mass}"
     sites = f", sites {', '.join(item.sites)}" if item.sites else ""
     return f"{name:18} {item.description}\n    {mass}, shapes: {len(item.shapes)}{sites}"
 

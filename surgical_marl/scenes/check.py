@@ -78,6 +78,8 @@ def _sum_up_scene(path: Path) -> str:
 
 def _sum_up_object(path: Path) -> str:
     item = load_object(path)
+    if item.soft:
+        return f"{item.soft.kind} of {1000 * item.mass:.3g} g"
     mass = f"free object of {1000 * item.mass:.3g} g" if item.free else "fixed object"
     return f"{mass}, {_count(len(item.shapes), 'shape')}"
 
@@ -108,7 +110,7 @@ def _find(source: str | Path) -> dict[str, Path]:
 def _is_object(path: Path) -> bool:
     """Return whether a file looks like an object's rather than a scene's; ValueError if it is no YAML mapping."""
     settings = read_yaml(path)
-    return "arms" not in settings and not {"shapes", "free"}.isdisjoint(settings)
+    return "arms" not in settings and not {"shapes", "free", "kind"}.isdisjoint(settings)
 
 
 def _check_arm(folder: Path) -> list[str]:

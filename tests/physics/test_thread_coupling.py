@@ -1,0 +1,85 @@
+"""A thread with arms and needles: in each step they feel minus what it feels, and both engines move all alike."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import yaml
+
+import surgical_marl as sm
+from surgical_marl.envs.batch import BatchedEnv
+from surgical_marl.physics.simulator import Simulator
+
+THREAD = {
+    "kind": "thread", "length": 0.05, "diameter": 0.00022, "material": "nylon", "nodes": 20, "drag": 0.0,
+    "friction": {"sliding": 0.3, "torsion": 0.0},
+}  # fmt: skip
+
+
+def scene_file(folder: Path, arm: str, objects: dict[str, Any]) -> str:
+    (folder / "suture.yaml").write_text(yaml.safe_dump(THREAD))
+    path = folder / "with_thread.yaml"
+    arms = {f"{arm}_0": {"arm": arm, "position": [0.0, 0.0, 0.15], "workspace": [0.0, 0.0, -0.11]}}
+    path.write_text(yaml.safe_dump({"arms": arms, "objects": objects}))
+    return str(path)
+
+
+def test_a_needle_and_its_thread_keep_their_momentum(tmp_path: Path) -> None:
+    """The thread is thrown sideways; together both fall as weight says, however they pull at each other."""
+    objects = {
+        "needle": {"object": "needle_sh", "position": [0.3, 0.0, 0.3]},
+        "thread": {"object": str(tmp_path / "suture.yaml"), "tied": {"first": "needle"}},
+    }
+    simulator, steps = Simulator(sm.load_scene(scene_file(tmp_path, "ecm", objects))), 60
+    mass = simulator.scene.systems["thread"].rod.mass
+    weight = float(simulator.step.bodies.tables.masses.mass[0])  # type: ignore[union-attr]
+    start = simulator.home
+    chain = start.systems["thread"].chain
+    thrown = chain._replace(velocity=chain.velocity.at[10:, 1].set(0.5))
+    start = start.with_systems(thread=start.systems["thread"]._replace(chain=thrown))
+
+    @jax.jit
+    def run(physics: Any) -> Any:
+        def step(physics: Any, _: None) -> Any:
+            physics, _ = simulator.step(physics, simulator.untouched)
+            thread = physics.systems["thread"].chain
+            return physics, (thread.velocity, physics.rigid_bodies.bodies.velocity[0, :3], thread.tension)
+
+        return jax.lax.scan(step, physics, None, length=steps)[1]
+
+    thread, needle, tension = (np.asarray(part, float) for part in run(start))
+    momentum = np.einsum("n,knj->kj", mass, thread) + weight * needle
+    begun = np.array([0.0, 0.5 * mass[10:].sum(), 0.0])
+    falls = -9.81 * (mass.sum() + weight) * 2.5e-3 * np.arange(1, steps + 1)[:, None] * [0, 0, 1]
+    assert tension.max() > 1e-3 and np.abs(needle[:, 1]).max() > 1e-3  # the thread pulls the needle along
+    np.testing.assert_allclose(momentum, begun + falls, atol=0.01 * begun[1])
+
+
+def test_both_engines_close_a_jaw_on_a_thread_and_lift_it_alike(tmp_path: Path) -> None:
+    """It is tied to the world at both ends, runs through the open jaw, and is held by it."""
+    arm = sm.load_arm("psm")
+    pose = arm.forward_kinematics(arm.home)
+    middle = pose[:3, 3] + [0.0, 0.0, 0.15] - 0.0044 * pose[:3, 2]
+    thread = {"object": str(tmp_path / "suture.yaml"), "position": (middle - 0.025 * pose[:3, 0]).tolist(),
+              "tilt": [0.0, 0.0, 90.0], "tied": {"first": "world", "last": "world"}}  # fmt: skip
+    path, found = scene_file(tmp_path, "psm", {"thread": thread}), []
+    for engine in ("mjx", "fused"):
+        env = BatchedEnv("reach", path, num_envs=2, engine=engine, device="cpu")
+        env.reset(seed=0)
+        action = np.zeros((2, len(arm.actuated)), np.float32)
+        action[0, -1] = -1.0  # one jaw closes, and is lifted; the other one stays open
+        for k in range(16):
+            action[:, 2] = -0.2 if k >= 12 else 0.0
+            step = env.step({"psm_0": action})
+        parts = (".physics.thread.chain.position", ".physics.thread.chain.tension", ".physics.arms.qpos")
+        found.append([env.engine.read(part, "numpy") for part in parts])
+        tension = step.infos["psm_0"]["tension"]
+        assert tension[0] > 0.1 > 0.01 > tension[1]
+        env.close()
+    (place, pulls, qpos), (other_place, other_pulls, other_qpos) = found
+    np.testing.assert_allclose(place, other_place, atol=2e-6)
+    np.testing.assert_allclose(pulls, other_pulls, atol=0.02)
+    np.testing.assert_allclose(qpos, other_qpos, atol=1e-5)
