@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import jax.numpy as jnp
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 from jax import Array
 
+from surgical_marl.physics.contact.shapes import Segments, between_segments
 from tests.helpers.thread_bench import DT, Bench, Told, axis_plate, suture
 
 
@@ -140,3 +142,38 @@ def test_it_tears_where_it_is_pulled_harder_than_it_is_strong() -> None:
     assert not thread.view(bench.start()).broken and thread.view(final).broken
     assert np.isfinite(pulls).all() and np.abs(pulls[-1]).max() < 1e-2
     assert np.linalg.norm(np.diff(np.asarray(final.chain.position), axis=0), axis=-1)[broken].min() > thread.rod.length
+
+
+def laid(corners: list[list[float]], edge: float) -> np.ndarray:
+    """Return nodes one edge apart along a line through some corners."""
+    way = [np.linspace(a, b, 300, endpoint=False) for a, b in itertools.pairwise(np.array(corners))]
+    nodes = [np.array(corners[0])]
+    for place in np.concatenate(way):
+        if (gap := np.linalg.norm(place - nodes[-1])) >= edge:
+            nodes.append(nodes[-1] + (place - nodes[-1]) * edge / gap)
+    return np.array(nodes)
+
+
+def test_a_crossing_that_is_pulled_tight_does_not_pass_through() -> None:
+    """One strand is tied at both ends, and a later one of the same thread is led down across it by 3 mm."""
+    turn = [[8 + 6 * np.sin(a), -6 + 6 * np.cos(a), 0.6 * a / np.pi] for a in np.linspace(0, 1.5 * np.pi, 20)]
+    path = laid([[1e-3 * x for x in corner] for corner in ([-8, 0, 0], *turn, [0.5, -6, 0.6], [0.5, 8, 0.6])], 2e-3)
+    thread, n = suture(path, bending=0.1), len(path)
+    one = int(np.linalg.norm(path - [8e-3, 0, 0], axis=1).argmin())
+    other = int(np.linalg.norm(path - [5e-4, -5e-3, 6e-4], axis=1).argmin())
+
+    def told(k: Any) -> Told:
+        down = jnp.array([0.0, 0.0, -25e-6]) * jnp.clip(k - 20.0, 0.0, 120.0)
+        fixed = [(0, 0.0, path[0]), (one, 0.0, path[one])]
+        return Told(ties=[*fixed, (other, 0.0, path[other] + down), (n - 2, 1.0, path[-1] + down)])
+
+    bench = Bench(thread)
+    final, seen = bench.run(bench.start(), 200, told)
+    parts, place = np.asarray(final.rubbed.key)[0], np.asarray(final.chain.position)
+    assert final.rubbed.total >= 1
+    under, over = int(parts // n), int(parts % n)  # the numbers of the two parts that touch
+    assert under < one and over >= other
+    point = between_segments(*(Segments(place[k], place[k + 1], 1.1e-4) for k in (over, under)))
+    assert 0 < point.depth < 1e-4 and point.normal[2] > 0.5
+    pulls = np.asarray(seen.tension)
+    assert pulls[-1].max() > 0.3 and np.abs(pulls[-1] - pulls[-20]).max() < 1e-3

@@ -109,6 +109,8 @@ class Newton(NamedTuple):
     change: Array
     """Change of displacements and tension by the Newton step, [n, 4]."""
     factors: Factors
+    joined: Any
+    """Whatever `join` has found last."""
 
 
 def free_forces(rod: Rod, state: ChainState, dt: Any) -> Array:
@@ -117,8 +119,9 @@ def free_forces(rod: Rod, state: ChainState, dt: Any) -> Array:
 
 
 def search(
-    rod: Rod, state: ChainState, pull: Array, load: Callable[[Array], Loaded], dt: Any, iterations: int, holds: Any
-) -> Newton:
+    rod: Rod, state: ChainState, pull: Array, load: Callable[[Array], Loaded], dt: Any, iterations: int, holds: Any,
+    join: Callable[[Array, Array, Array, Factors, Any], tuple[Array, Array, Any]] | None = None, joined: Any = (),
+) -> Newton:  # fmt: skip
     """Return the Newton iterations of a step, the last of which is not yet added to the displacements.
 
     Args:
@@ -129,6 +132,10 @@ def search(
         dt: duration of the step, s.
         iterations: Newton steps at most.
         holds: 1 for edges that hold, 0 for a broken one and after the last node, [n].
+        join: takes displacements [n, 3], a Newton step [n, 4], the largest displacement in it, its factors and what
+            it has found last; returns step and largest displacement with what joins nodes far apart, and what it has
+            found now.
+        joined: what it begins with.
     """
     n = rod.nodes
     bends = holds * _before(holds)
@@ -145,13 +152,15 @@ def search(
         u, q = found.shift + found.change[:, :3], found.tension + found.change[:, 3]
         edges = apart + _after(u) - u
         factors, reduced = _eliminate(rod, u, q, edges, known, load(u))
-        change, most = _back(rod, bends, factors, reduced)
+        (change, most), kept = _back(rod, bends, factors, reduced), found.joined
+        if join is not None:
+            change, most, kept = join(u, change, most, factors, kept)
         change *= jnp.minimum(1.0, FARTHEST * rod.length / jnp.maximum(most, 1e-12))
-        return Newton(u, q, change, factors), most, count + 1
+        return Newton(u, q, change, factors, kept), most, count + 1
 
     guess = jnp.concatenate([dt * state.velocity, jnp.zeros((n, 1))], 1)
     empty = Factors(*(jnp.zeros((n, *shape)) for shape in ((6,), (3,), (), (3, 3), (3,))))
-    start = Newton(jnp.zeros((n, 3)), state.tension, guess, empty), jnp.float32(jnp.inf), jnp.int32(0)
+    start = Newton(jnp.zeros((n, 3)), state.tension, guess, empty, joined), jnp.float32(jnp.inf), jnp.int32(0)
     found: Newton = jax.lax.while_loop(going, step, start)[0]
     return found
 

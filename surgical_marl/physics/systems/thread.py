@@ -19,7 +19,9 @@ from jax import Array
 
 from surgical_marl.content import unknown
 from surgical_marl.physics.contact.spring_contact import Stretches, each, feel, none, recall, remember
-from surgical_marl.physics.systems.chain import ChainState, Loaded, Newton, Rod, free_forces, search, solve
+from surgical_marl.physics.systems import crossings
+from surgical_marl.physics.systems.chain import ChainState, Factors, Loaded, Newton, Rod, free_forces, search, solve
+from surgical_marl.physics.systems.crossings import Joined
 from surgical_marl.physics.systems.system import End, Ends, Response, Shapes, System, Tie
 from surgical_marl.physics.tree_utils import row_of
 from surgical_marl.scenes.objects import Placement, Surface
@@ -41,6 +43,8 @@ class ThreadState(NamedTuple):
 
     chain: ChainState
     stretches: Stretches
+    rubbed: Stretches
+    """Friction of the thread with itself."""
     holds: Array
     """1 for edges that hold, 0 for a broken one and after the last node, [n]."""
 
@@ -64,6 +68,8 @@ class Solved(NamedTuple):
     newton: Newton
     ends: Ends
     """With the stretches that are remembered."""
+    pairs: Ends
+    """Where it touches itself."""
     falls: Array
     """Of the force of each contact with what moves as its point moves, N/m: lower halves, [c, 6]."""
     holds: Any
@@ -91,6 +97,8 @@ class Thread(System):
     """Force of the air per mass and speed, 1/s."""
     strength: float | None = None
     """Tension at which it tears, N; None if it never does."""
+    crossings: int = 4
+    """Room for contacts with itself."""
     colour: tuple[float, float, float] = (0.25, 0.2, 0.55)
     """In pictures."""
     file: ClassVar[type] = ThreadFile
@@ -118,7 +126,7 @@ class Thread(System):
             _tie(part, share, name, path[round(part + share)], others, place) for part, share, name in wanted if name
         )
         return cls(about.nodes, about.length, about.diameter, young, density, item.object.surface,
-                   tuple(map(tuple, path.tolist())), ties, about.drag, about.strength, about.colour)  # fmt: skip
+                   tuple(map(tuple, path.tolist())), ties, about.drag, about.strength, colour=about.colour)  # fmt: skip
 
     @cached_property
     def rod(self) -> Rod:
@@ -139,7 +147,8 @@ class Thread(System):
             position += places[0] - position[tie.part + round(tie.share)]
         still = jnp.zeros((self.nodes, 3), jnp.float32)
         holds = jnp.asarray(np.append(np.ones(self.nodes - 1), 0.0), jnp.float32)
-        return ThreadState(ChainState(position, still, still[:, 0]), none(self.contacts), holds)
+        chain = ChainState(position, still, still[:, 0])
+        return ThreadState(chain, none(self.contacts), none(self.crossings), holds)
 
     def shapes(self, state: ThreadState) -> Shapes:
         position = state.chain.position
@@ -153,7 +162,29 @@ class Thread(System):
 
     def respond(self, state: ThreadState, motion: Array, ends: Ends, dt: Any) -> Response:
         ends, holds = recall(state.stretches, ends, self.nodes - 1), self._holds(state)
-        found = search(self.rod, state.chain, motion, lambda u: _load(ends, u), dt, ITERATIONS, holds)
+        itself = self.surface.against(self.surface)
+        pairs = crossings.find(
+            self.shapes(state), state.chain.velocity, self.crossings, itself.stiffness, itself.sliding, dt
+        )
+        pairs = recall(state.rubbed, pairs, self.nodes - 1)
+
+        def load(u: Array) -> Loaded:
+            felt = _load(ends, u)
+            return felt._replace(force=felt.force + crossings.forces(pairs, u))
+
+        def join(
+            u: Array, change: Array, most: Array, factors: Factors, last: Joined
+        ) -> tuple[Array, Array, Joined]:  # fmt: skip
+            def some() -> tuple[Array, Array, Joined]:
+                own = crossings.joined(pairs, u, lambda force: solve(self.rod, factors, force, holds))
+                whole = crossings.add(pairs, u, own, change)
+                return whole, jnp.max(jnp.abs(whole[:, :3])), own
+
+            found: tuple[Array, Array, Joined] = jax.lax.cond(pairs.total > 0, some, lambda: (change, most, last))
+            return found
+
+        apart = crossings.apart_from_itself(self.crossings, self.nodes)
+        found = search(self.rod, state.chain, motion, load, dt, ITERATIONS, holds, join, apart)
 
         def at_end(row: Array, end: End) -> tuple[Array, Array]:
             del row
@@ -162,7 +193,7 @@ class Thread(System):
             return -force, felt.stiffness[_LOWER]
 
         force, falls = each(ends, at_end, moving=True)
-        return Response(force, Solved(found, ends, falls, holds))
+        return Response(force, Solved(found, ends, pairs, falls, holds))
 
     def yielding(self, response: Response, ends: Ends, accelerations: Array, dt: Any) -> Array:
         pushes, change = self._carried(response.solved, accelerations, dt)
@@ -190,7 +221,9 @@ class Thread(System):
         holds = state.holds
         if self.strength is not None:
             holds = jnp.where(tension > self.strength, 0.0, holds)
-        return ThreadState(ChainState(state.chain.position + u, u / dt, tension), stretches, holds)
+        pairs = response.solved.pairs
+        rubbed = remember(pairs, lambda row, end: crossings.apart(end, u), self.nodes - 1)
+        return ThreadState(ChainState(state.chain.position + u, u / dt, tension), stretches, rubbed, holds)
 
     def view(self, state: ThreadState) -> ThreadView:
         chain = state.chain
@@ -209,7 +242,13 @@ class Thread(System):
             return _spread(sums, end.part, (1 - end.share) * pushes[row], end.share * pushes[row])
 
         forces = jax.lax.fori_loop(0, ends.moving, add, jnp.zeros((n, 3)))
-        return pushes, solve(self.rod, solved.newton.factors, forces, solved.holds)
+        newton, pairs = solved.newton, solved.pairs
+        change = solve(self.rod, newton.factors, forces, solved.holds)
+        return pushes, jax.lax.cond(
+            pairs.total > 0,
+            lambda: crossings.add(pairs, newton.shift, newton.joined, change),
+            lambda: change,
+        )
 
     def _holds(self, state: ThreadState) -> Any:
         """Return which edges hold, [n]: constants if the thread can't tear."""
