@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.lax.linalg import triangular_solve
+from jax.scipy.linalg import cho_solve
 
 LEAST = 1e-7
 """Least pivot, as a share of the element of the diagonal that it is left of. What is smaller is rounding: of a light
@@ -54,6 +55,14 @@ def back(factor: Array, right: Array) -> Array:
 def solve_factored(factor: Array, right: Array) -> Array:
     """Return x [n] or [n, k] with factor @ factor.T @ x = right, for a lower factor [n, n]."""
     return back(factor, forward(factor, right))
+
+
+def solve_positive(matrix: Array, right: Array) -> Array:
+    """Return x [n] or [n, k] with matrix @ x = right, for a symmetric positive definite matrix [n, n].
+
+    Pivots are not guarded as in `cholesky`: matrices of arms are far from singular.
+    """
+    return cho_solve((jax.lax.linalg.cholesky(matrix, symmetrize_input=False), True), right)
 
 
 def woodbury(

@@ -20,9 +20,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.scipy.linalg import cho_solve
 
-from surgical_marl.physics.solver.cholesky import solve_factored, woodbury
+from surgical_marl.physics.solver.cholesky import solve_factored, solve_positive, woodbury
 from surgical_marl.physics.solver.newton import line_search, newton
 
 RELAXATION = 1.15
@@ -250,8 +249,3 @@ def _length(
 
     begin = slope_0 - along @ jnp.clip(unbounded, rows.low, rows.high)
     return line_search(begin, 0.0, measure, looks, 0.0).length
-
-
-def solve_positive(matrix: Array, right: Array) -> Array:
-    """Return x with matrix @ x = right [n] or [n, k], for a symmetric positive definite matrix [n, n]."""
-    return cho_solve((jax.lax.linalg.cholesky(matrix, symmetrize_input=False), True), right)

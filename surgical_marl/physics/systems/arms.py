@@ -21,8 +21,8 @@ import mujoco
 import numpy as np
 from jax import Array
 
-from surgical_marl.physics.solver.cholesky import packed
-from surgical_marl.physics.solver.constraint_rows import JointRows, relax, rows_of, solve, solve_positive
+from surgical_marl.physics.solver.cholesky import packed, solve_positive
+from surgical_marl.physics.solver.constraint_rows import JointRows, relax, rows_of, solve
 from surgical_marl.physics.solver.solref import response
 from surgical_marl.physics.state import ArmState
 from surgical_marl.physics.systems.dynamics import Dynamics
