@@ -157,7 +157,7 @@ class Brick:
         slow = inverse_symmetric(jnp.trace(stretch) * _EYE - stretch)  # turns, by the skew part of a change of F
         torque = slow @ jnp.sum(jnp.cross(resists, warped), 0)
         forces = self._forces(turn, self.volume * stress + _skew(torque), resists)
-        spin = self.shear * _EYE + (self.lame * grown - 2 * self.shear) * slow
+        spin = jnp.add(self.shear * _EYE, (self.lame * grown - 2 * self.shear) * slow)
         return Cell(turn, positive(spin)[LOWER], jnp.sqrt(stiff) * cofactors[LOWER]), -forces
 
     def product(self, cell: Any, u: Array) -> Array:
@@ -247,4 +247,4 @@ def _norm(vector: Array) -> Array:
 
 def _times(matrix: np.ndarray, modes: Array) -> Array:
     """Return a constant matrix [12, 12] times modes [4, 3]."""
-    return (matrix @ modes.ravel()).reshape(4, 3)
+    return jnp.reshape(matrix @ modes.ravel(), (4, 3))
