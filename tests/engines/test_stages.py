@@ -16,15 +16,18 @@ import yaml
 from jax.extend import core
 
 import surgical_marl as sm
-from surgical_marl.bench.physics import PhysicsAlone
+from surgical_marl.bench.physics import PhysicsAlone, bare_state
+from surgical_marl.engines.compilation import unsaid
 from surgical_marl.engines.fused import engine as fused_engine
 from surgical_marl.engines.fused import kernel
+from surgical_marl.engines.fused.compiler import make_source, trace_environment
 from surgical_marl.engines.fused.kernel_layout import BUFFERS, Leaf, all_stages
 from surgical_marl.engines.fused.stage_code import block_code
 from surgical_marl.engines.mjx import MjxEngine
 from surgical_marl.engines.split import Loop, Part, Stage, Unsplittable, split
 from surgical_marl.engines.stages import Call, block_stage, host_stage
 from surgical_marl.envs.env import Env
+from surgical_marl.envs.state import Carry
 from surgical_marl.physics.systems.system import Response
 from surgical_marl.plugins.systems import SYSTEMS
 from tests.helpers.fused_kernels import gpu_code
@@ -169,6 +172,31 @@ def test_jax_takes_a_stage_for_its_reference() -> None:
     for change in (jax.jit, jax.grad, jax.jacfwd, lambda f: jax.grad(jax.checkpoint(f))):
         np.testing.assert_allclose(change(staged)(x), change(whole)(x), rtol=1e-6)
     np.testing.assert_allclose(jax.jit(jax.vmap(staged))(many), jax.vmap(whole)(many), rtol=1e-6)
+
+
+class Stepper:
+    """A step with large branches before and after a stage."""
+
+    agents, decimation, title, content, parameters, pauses = (), 1, "branches", b"branches", {}, False
+    classes = ()
+
+    def reset(self, key: Any, episode: Any, parameters: Any) -> Any:
+        return bare_state(Carry(jnp.zeros(120), (), key, episode, jnp.int32(0)), jnp.zeros(1))  # type: ignore[arg-type]
+
+    def step(self, carry: Any, actions: Any, parameters: Any) -> Any:
+        def busy(x: Any) -> Any:
+            return jax.lax.cond(x[0] > 0, lambda x: jnp.sin(x) * x + 1.0, lambda x: x, x)
+
+        x = busy(carry.physics)
+        x = x.at[:3].set(turn({"x": x[:3]}, x[3:6], TABLE)["x"])
+        return bare_state(carry._replace(physics=busy(busy(x))), jnp.zeros(1))
+
+
+def test_the_part_with_most_branches_says_how_much_there_was_to_do() -> None:
+    """Environments are sorted by it: a later kernel must not write over it."""
+    found = make_source(trace_environment(Stepper(), unsaid), {}, False, unsaid)  # type: ignore[arg-type]
+    assert [name for name, text in found.bodies.items() if "STI(work" in text] == ["step_1"]
+    assert "WORK(" in found.bodies["step_0"]
 
 
 # -- a system with stages

@@ -18,7 +18,7 @@ from surgical_marl.engines.fused.jaxpr_interpreter import JaxprInterpreter
 from surgical_marl.engines.fused.kernel_layout import BUFFERS, Leaf, Source, Stage
 from surgical_marl.engines.fused.lower import table_offsets
 from surgical_marl.engines.fused.operations import KINDS
-from surgical_marl.engines.fused.pipeline import CSE, Program, compile_program, switched_off
+from surgical_marl.engines.fused.pipeline import CSE, Compiled, Program, compile_program, switched_off, without_report
 from surgical_marl.engines.fused.stage_code import StageCode, load
 from surgical_marl.engines.fused.symbolic_array import AnyArray, Table, Unsupported, values_of
 from surgical_marl.engines.split import Unsplittable, split
@@ -110,13 +110,17 @@ def make_source(functions: dict[str, Function], parameters: Any, vector: bool, p
     watch = Watch(frozenset(place for leaf in reals for place in _places(leaf)), fault.first)
     kernels[stages[-1].name] += list(zip(leaves, last, strict=True))
     kernels["reset"] = list(zip(leaves, first, strict=True))
-    compiled = {}
+    programs, compiled = dict[str, Program](), dict[str, Compiled]()
     for name, stored in kernels.items():
         phase(f"scheduling the {name}")
-        program = Program(graph, _stores(graph, stored), vector, watch)
-        compiled[name] = compile_program(program, f"{title}.{name}" if title else name)
+        programs[name] = Program(graph, _stores(graph, stored), vector, watch)
+        compiled[name] = compile_program(programs[name], f"{title}.{name}" if title else name)
+    bodies = {name: one.text for name, one in compiled.items()}
+    parts = [name for name in kernels if name != "reset"]
+    parts.remove(max(parts, key=lambda name: compiled[name].large_branches))
+    bodies |= {name: without_report(programs[name]) for name in parts}
     return Source(
-        bodies={name: one.text for name, one in compiled.items()},
+        bodies=bodies,
         stages=stages,
         large_branches=sum(one.large_branches for one in compiled.values()),
         tables=tables(graph),

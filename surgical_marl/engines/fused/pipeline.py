@@ -11,7 +11,7 @@ from surgical_marl.engines.fused import hints, options, schedule
 from surgical_marl.engines.fused.c_printer import CPrinter
 from surgical_marl.engines.fused.dump import schedule_text
 from surgical_marl.engines.fused.graph import Graph, Value
-from surgical_marl.engines.fused.instructions import Code, large_branches
+from surgical_marl.engines.fused.instructions import Code, ReportWork, large_branches
 from surgical_marl.engines.fused.instrumentation import Watch, check_finite, count_work
 from surgical_marl.engines.fused.lower import Stores, lower
 from surgical_marl.engines.fused.macros import is_long
@@ -153,6 +153,14 @@ def compile_program(program: Program, name: str = "kernel") -> Compiled:
             own.mkdir(parents=True, exist_ok=True)
             write_text(own / f"{number:02}-{one.name}.txt", _dumped(program, one))
     return Compiled(CPrinter(program.vector).text(program.code), large_branches(program.code))
+
+
+def without_report(program: Program) -> str:
+    """Return the C of a compiled program that does not note how much an environment had to do.
+
+    A step of several kernels has one that notes it for all.
+    """
+    return CPrinter(program.vector).text([one for one in program.code if not isinstance(one, ReportWork)])
 
 
 def _check(program: Program, one: Pass) -> None:
