@@ -21,8 +21,9 @@ from surgical_marl.engines.compilation import unsaid
 from surgical_marl.engines.fused import engine as fused_engine
 from surgical_marl.engines.fused import kernel
 from surgical_marl.engines.fused.compiler import make_source, trace_environment
-from surgical_marl.engines.fused.kernel_layout import BUFFERS, Leaf, all_stages
+from surgical_marl.engines.fused.kernel_layout import BUFFERS, Leaf, Source, all_stages
 from surgical_marl.engines.fused.stage_code import block_code
+from surgical_marl.engines.fused.symbolic_array import Unsupported
 from surgical_marl.engines.mjx import MjxEngine
 from surgical_marl.engines.split import Loop, Part, Stage, Unsplittable, split
 from surgical_marl.engines.stages import Call, block_stage, host_stage
@@ -175,7 +176,10 @@ def test_jax_takes_a_stage_for_its_reference() -> None:
 
 
 class Stepper:
-    """A step with large branches before and after a stage."""
+    """A step of numbers."""
+
+    def __init__(self, step: Callable[[Any], Any]) -> None:
+        self._step = step
 
     agents, decimation, title, content, parameters, pauses = (), 1, "branches", b"branches", {}, False
     classes = ()
@@ -184,19 +188,41 @@ class Stepper:
         return bare_state(Carry(jnp.zeros(120), (), key, episode, jnp.int32(0)), jnp.zeros(1))  # type: ignore[arg-type]
 
     def step(self, carry: Any, actions: Any, parameters: Any) -> Any:
-        def busy(x: Any) -> Any:
-            return jax.lax.cond(x[0] > 0, lambda x: jnp.sin(x) * x + 1.0, lambda x: x, x)
+        return bare_state(carry._replace(physics=self._step(carry.physics)), jnp.zeros(1))
 
-        x = busy(carry.physics)
-        x = x.at[:3].set(turn({"x": x[:3]}, x[3:6], TABLE)["x"])
-        return bare_state(carry._replace(physics=busy(busy(x))), jnp.zeros(1))
+    def source(self) -> Source:
+        """Return the source of its kernels on a GPU."""
+        return make_source(trace_environment(self, unsaid), {}, False, unsaid)  # type: ignore[arg-type]
+
+
+def between_branches(x: Any) -> Any:
+    def busy(x: Any) -> Any:
+        return jax.lax.cond(x[0] > 0, lambda x: jnp.sin(x) * x + 1.0, lambda x: x, x)
+
+    x = busy(x)
+    return busy(busy(x.at[:3].set(turn({"x": x[:3]}, x[3:6], TABLE)["x"])))
 
 
 def test_the_part_with_most_branches_says_how_much_there_was_to_do() -> None:
     """Environments are sorted by it: a later kernel must not write over it."""
-    found = make_source(trace_environment(Stepper(), unsaid), {}, False, unsaid)  # type: ignore[arg-type]
+    found = Stepper(between_branches).source()
     assert [name for name, text in found.bodies.items() if "STI(work" in text] == ["step_1"]
     assert "WORK(" in found.bodies["step_0"]
+
+
+def test_each_call_of_a_stage_has_its_own_fields() -> None:
+    def step(x: Any) -> Any:
+        return jax.lax.fori_loop(0, 2, lambda _, x: x.at[:3].set(in_a_row(x[:3], None, x[0])[0]), x)
+
+    loop = next(stage for stage in Stepper(step).source().stages if stage.kind == "loop")
+    first, second = (stage for stage in loop.stages if stage.kind == "block")
+    assert (first.name, second.name) == ("turned", "turned_1") and first.code != second.code
+    assert first.writes["x"] == second.reads["state.x"]
+
+
+def test_the_host_is_asked_once_in_a_step() -> None:
+    with pytest.raises(Unsupported, match="a second call of stage 'pictures' of the host"):
+        Stepper(lambda x: x + look({"x": x, "tip": look({"x": x, "tip": x})["seen"]})["seen"]).source()
 
 
 # -- a system with stages

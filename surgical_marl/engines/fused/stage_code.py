@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -46,6 +47,7 @@ class StageCode:
         self._graph, self._allocate, self._leaves, self._given = graph, allocate, leaves, given
         self.kernels: dict[str, list[tuple[Leaf, list[Value]]]] = {}
         self.results: dict[int, list[Value]] = {}
+        self._calls = Counter[str]()  # of each stage: every call reads and writes its own fields
 
     def stages(self, parts: Sequence[split.Part]) -> list[Stage]:
         """Return the stages of parts.
@@ -65,13 +67,17 @@ class StageCode:
         call = part.call
         reads = {name: self._input(one) for name, one in zip(call.reads, part.reads, strict=True)}
         writes = {name: self._output(one) for name, one in zip(call.writes, part.writes, strict=True)}
+        number = self._calls[call.name]
+        self._calls[call.name] += 1
         if call.cuda is None:
+            if number:
+                raise Unsupported(f"a second call of stage {call.name!r} of the host")
             if tables := [name for name, leaf in reads.items() if leaf.buffer in ("float32", "int32")]:
                 raise Unsupported(f"a parameter, {tables[0]}, as input of stage {call.name!r}")
             return Stage("host", call.name, reads, writes)
-        return Stage(
-            "block", call.name, reads, writes, block_code(call.cuda, call.threads, reads, writes), call.threads
-        )
+        name = f"{call.name}_{number}" if number else call.name
+        code = block_code(call.cuda, call.threads, reads, writes)
+        return Stage("block", name, reads, writes, code, call.threads)
 
     def _interpret(self, part: split.Run) -> list[tuple[Leaf, list[Value]]]:
         given = [self._given[one] if one in self._given else load(self._graph, self._leaves[one]) for one in part.reads]
