@@ -65,7 +65,7 @@ def infos(
             **{f"stage_{name}": reached for name, reached in stages[agent].items()},
             **{f"reward_{name}": value for name, value in terms[agent].items()},
             **_handling(view),
-            **_pulled(world),
+            **_soft(world),
             "cost": sum((cost.astype(jnp.float32) for cost in broken.values()), start=jnp.float32(0.0)),
             **{f"cost_{name}": cost for name, cost in broken.items()},
             **told[agent],
@@ -84,10 +84,14 @@ def _handling(view: ArmView) -> dict[str, Array]:
     return found
 
 
-def _pulled(world: World) -> dict[str, Array]:
-    """Return the largest tension of all threads, N; nothing in a scene without any."""
-    tensions = [jnp.max(view.tension) for view in world.systems.values() if hasattr(view, "tension")]
-    return {"tension": jnp.stack(tensions).max()} if tensions else {}
+def _soft(world: World) -> dict[str, Array]:
+    """Return the largest tension of threads and the largest force on tissue, N, where a scene has such."""
+    found = {}
+    for name in ("tension", "tissue_force"):
+        values = [jnp.max(getattr(view, name)) for view in world.systems.values() if hasattr(view, name)]
+        if values:
+            found[name] = jnp.stack(values).max()
+    return found
 
 
 def costs(arm: Arm, view: ArmView, tip_speed: Array) -> dict[str, Array]:

@@ -13,7 +13,10 @@ SYSTEMS = Registry(
     "system", package=None, group="surgical_marl.systems", base="surgical_marl.physics.systems.system:System"
 )
 
-SOFT = {"thread": "surgical_marl.physics.systems.thread:Thread"}
+SOFT = {
+    "thread": "surgical_marl.physics.systems.thread:Thread",
+    "tissue": "surgical_marl.physics.systems.tissue:Tissue",
+}
 """Kinds of objects that are no rigid bodies, and the systems that they are."""
 
 

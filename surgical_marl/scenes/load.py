@@ -110,7 +110,7 @@ def load_scene(name: str | Path, control: str = "position") -> Scene:
         for piece, entry in about.tissue.items():
             add_tissue(spec, f"tissue/{piece}", entry)
         add_objects(spec, objects)
-        add_threads(spec, soft)
+        add_threads(spec, {name: system for name, system in soft.items() if hasattr(system, "path")})
         bare = scene(model=compile_scene(spec))
         for one, other in contact_pairs(bare):
             spec.add_pair(geomname1=one, geomname2=other, condim=1, solref=SOLREF)

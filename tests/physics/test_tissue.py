@@ -31,7 +31,7 @@ def sheet(
     fixed = np.zeros(grid.nodes, bool)
     for side in held:
         fixed |= grid.side(side)
-    support = Support(fixed, np.zeros(grid.nodes, np.float32))
+    support = Support(fixed, np.zeros(grid.nodes, np.float32), grid.rest)
     return BrickSolver(grid, Brick(grid.cell, YOUNG, POISSON), support, **{"damping": 2e-3, "iterations": 60} | options)
 
 
@@ -40,7 +40,8 @@ def pushed(solver: BrickSolver, force: np.ndarray) -> Springs:
     (nodes,) = np.nonzero(np.abs(force).sum(1))
     four = np.repeat(nodes[:, None], 4, 1).astype(np.int32)
     none = np.zeros((len(nodes), 6), np.float32)
-    parts = four, np.full(four.shape, 0.25, np.float32), force[nodes].astype(np.float32), none
+    weights = np.tile(np.float32([1.0, 0.0, 0.0, 0.0]), (len(nodes), 1))
+    parts = four, weights, force[nodes].astype(np.float32), none
     return Springs(*map(jnp.asarray, parts), jnp.int32(len(nodes)))
 
 

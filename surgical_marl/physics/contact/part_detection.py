@@ -128,11 +128,18 @@ class PartDetection:
         parts, none = len(shapes.speed), Listed.none(NEAREST)
         if not self._shapes:
             return none
-        middle, half = (shapes.start + shapes.end) / 2, size(shapes.end - shapes.start) / 2 + shapes.radius
-        low = jnp.minimum(jnp.min(shapes.start, 0), jnp.min(shapes.end, 0))
-        high = jnp.maximum(jnp.max(shapes.start, 0), jnp.max(shapes.end, 0))
-        centre, fastest = (low + high) / 2, jnp.max(shapes.speed)
-        around = size(high - low) / 2 + jnp.max(jnp.asarray(shapes.radius))
+        radius = jnp.broadcast_to(jnp.asarray(shapes.radius), (parts,))
+        rows = shapes.start, shapes.end, radius, shapes.speed
+
+        def widen(found: Any, row: Any) -> tuple[Any, None]:
+            (low, high, fastest), (start, end, radius, speed) = found, row
+            low = jnp.minimum(low, jnp.minimum(start, end) - radius)
+            high = jnp.maximum(high, jnp.maximum(start, end) + radius)
+            return (low, high, jnp.maximum(fastest, speed)), None
+
+        first = shapes.start[0], shapes.start[0], jnp.float32(0.0)
+        (low, high, fastest), _ = jax.lax.scan(widen, first, rows)
+        centre, around = (low + high) / 2, size(high - low) / 2
 
         def look(found: Listed, shape: Array) -> tuple[Listed, None]:
             reach = around + NEAR + jnp.minimum(scenery.moves[shape] + dt * fastest, AHEAD)
@@ -150,12 +157,12 @@ class PartDetection:
 
             def along(gap: Callable[[Array], Array]) -> Listed:
                 def part(found: Listed, row: Any) -> tuple[Listed, None]:
-                    number, middle, half, speed = row
+                    number, start, end, radius, speed = row
+                    middle, half = (start + end) / 2, size(end - start) / 2 + radius
                     reach = half + NEAR + jnp.minimum(moves + dt * speed, AHEAD)
                     return found.after(shape * parts + number, gap(middle) < reach), None
 
-                rows = jnp.arange(parts, dtype=jnp.int32), middle, half, shapes.speed
-                return jax.lax.scan(part, found, rows)[0]
+                return jax.lax.scan(part, found, (jnp.arange(parts, dtype=jnp.int32), *rows))[0]
 
             listed: Listed = self._of_shape(
                 scenery, shape, lambda plate: along(lambda x: _from_plate(x, plate)),

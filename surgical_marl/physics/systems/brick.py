@@ -140,7 +140,7 @@ class Brick:
     def deformed(self, x: Array) -> tuple[Cell, Array]:
         """Return a brick whose nodes are at x, m, [8, 3], and the forces on these, N, [8, 3]."""
         modes = to_modes(x)
-        gradient = self._gradient(modes)
+        gradient = self.gradient(modes)
         turn = polar_rotation(gradient)
         stretch = turn.T @ gradient
         stretch = (stretch + stretch.T) / 2
@@ -167,14 +167,14 @@ class Brick:
         modes' own stress does not turn.
         """
         modes = to_modes(u)
-        change = cell.turn.T @ self._gradient(modes)
+        change = cell.turn.T @ self.gradient(modes)
         lost, crush = cell.crush[FULL], jnp.sum(cell.crush[FULL] * change)
         stress = self.shear * (change + change.T) + self.lame * jnp.trace(change) * _EYE + crush * lost
         turned = jnp.stack([change[2, 1] - change[1, 2], change[0, 2] - change[2, 0], change[1, 0] - change[0, 1]])
         stress += _skew(cell.spin[FULL] @ turned)
         return self._forces(cell.turn, self.volume * stress, _times(self.hourglass, modes[HOURGLASSES, :] @ cell.turn))
 
-    def _gradient(self, modes: Array) -> Array:
+    def gradient(self, modes: Array) -> Array:
         """Return the mean gradient [3, 3] of modes [8, 3]."""
         return modes[GRADIENTS, :].T * self._slope
 

@@ -24,7 +24,7 @@ class SurfacePoints(NamedTuple):
     weights: np.ndarray
     """Shares of the nodes, [s, 4]; they sum to 1."""
     inward: np.ndarray
-    """Node below or above the first of them, [s]: the direction to it is into the tissue."""
+    """What to add to a node's number for the node under it, in the tissue, [s]."""
 
 
 class BrickGrid:
@@ -75,7 +75,7 @@ class BrickGrid:
 
     def surface(self) -> SurfacePoints:
         """Return the nodes of both faces, and the points midway between them, on which others press."""
-        points: dict[tuple[int, ...], tuple[tuple[int, ...], int]] = {}
+        points: dict[tuple[int, ...], int] = {}
         strides = self.offsets[[4, 2, 1]]
         for layer, inward in ((0, 1), (self.cells[2] - 1, -1)):
             level = layer if inward == 1 else layer + 1
@@ -83,7 +83,8 @@ class BrickGrid:
                 corners = [int(np.array([i + a, j + b, level]) @ strides) for a in (0, 1) for b in (0, 1)]
                 for own in ((0,), (1,), (2,), (3,), (0, 1), (0, 2), (1, 3), (2, 3), (0, 1, 2, 3)):
                     nodes = tuple(corners[k] for k in own)
-                    points[nodes] = nodes * (4 // len(nodes)), nodes[0] + inward
-        nodes = np.array([found[0] for found in points.values()], np.int32)
-        weights = np.full(nodes.shape, 0.25, np.float32)
-        return SurfacePoints(nodes, weights, np.array([found[1] for found in points.values()], np.int32))
+                    points[nodes] = inward
+        nodes = np.array([(own * 4)[:4] for own in points], np.int32)
+        count = np.array([len(own) for own in points])[:, None]
+        weights = np.where(np.arange(4) < count, 1 / count, 0.0).astype(np.float32)
+        return SurfacePoints(nodes, weights, np.array([*points.values()], np.int32))

@@ -18,8 +18,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from surgical_marl.physics.systems.brick import FULL, LOWER, Brick, Cell, inverse_symmetric
+from surgical_marl.physics.systems.brick import FULL, LOWER, Brick, Cell, inverse_symmetric, to_modes
 from surgical_marl.physics.systems.brick_grid import BrickGrid
+
+LEFT, SHORTEST = 0.4, 1 / 16
+"""Share of its volume that a brick keeps in a step at least, and the shortest part of a step that is tried for this."""
 
 
 class Nodes(NamedTuple):
@@ -38,6 +41,8 @@ class Support(NamedTuple):
     """Which do not move, bool."""
     stiffness: np.ndarray
     """Of a spring to the place at rest, N/m; 0 for none."""
+    rest: np.ndarray
+    """The places at rest, m, [n, 3]."""
 
 
 class Springs(NamedTuple):
@@ -82,7 +87,6 @@ class BrickSolver:
         brick: Brick,
         support: Support,
         damping: float = 0.0,
-        drag: float = 0.0,
         iterations: int = 8,
     ) -> None:
         """Collect the constants.
@@ -92,11 +96,10 @@ class BrickSolver:
             brick: element.
             support: of the borders.
             damping: s; the force of damping is this times K times the velocity.
-            drag: force of what is around per mass and velocity, 1/s.
             iterations: of conjugate gradients.
         """
         self.grid, self.brick, self.support, self.iterations = grid, brick, support, iterations
-        self.damping, self.drag = damping, drag
+        self.damping = damping
         self.free = (~support.fixed & (grid.mass > 0)).astype(np.float32)
 
     def linearise(self, state: Nodes, dt: Any) -> Linear:
@@ -105,7 +108,7 @@ class BrickSolver:
 
         def begin(row: Any) -> tuple[Array, Array, Array, Array]:
             mass, support, free, x, rest, v = row
-            inertia = mass * (1 / dt**2 + self.drag / dt) + support
+            inertia = mass / dt**2 + support
             block = inertia * jnp.array([1.0, 0.0, 1.0, 0.0, 0.0, 1.0])
             return mass * (v / dt + self.gravity) - support * (x - rest), block, inertia, free * dt * v
 
@@ -118,7 +121,7 @@ class BrickSolver:
             block = block.at[nodes].add(own[:, *LOWER], mode="promise_in_bounds")
             return (force, block), cell
 
-        rows = (*self._constants, state.position, jnp.asarray(grid.rest), state.velocity)
+        rows = (*self._constants, state.position, jnp.asarray(self.support.rest), state.velocity)
         force, block, inertia, guess = jax.lax.map(begin, rows)
         (force, block), cells = jax.lax.scan(add, (force, block), jnp.asarray(grid.first))
         return Linear(cells, force, block, inertia, guess)
@@ -128,8 +131,8 @@ class BrickSolver:
         """Mass, stiffness of the support and freedom (0 or 1) of each node, [n]."""
         return jnp.asarray(self.grid.mass), jnp.asarray(self.support.stiffness), jnp.asarray(self.free)
 
-    def displacements(self, linear: Linear, springs: Springs | None, dt: Any) -> Array:
-        """Return the displacements of the nodes in a step, m, [n, 3]."""
+    def displacements(self, linear: Linear, springs: Springs | None, guess: Array, dt: Any) -> Array:
+        """Return the displacements of the nodes in a step, m, [n, 3], from a guess that leaves what is fixed."""
         free, right, block = jnp.asarray(self.free), linear.force, linear.block
         if springs is not None:
             right, block = _with_springs(springs, right, block)
@@ -146,8 +149,8 @@ class BrickSolver:
             p = inverse[FULL] @ residual
             return sum_ + residual @ p, (residual, p, inertia * p)
 
-        start = jax.lax.map(lambda row: row[0] * row[1], (linear.inertia, linear.guess))
-        rows = right, matrix(linear.guess, start), free, inverse, linear.inertia
+        start = jax.lax.map(lambda row: row[0] * row[1], (linear.inertia, guess))
+        rows = right, matrix(guess, start), free, inverse, linear.inertia
         rz, (residual, p, ap) = jax.lax.scan(begin, jnp.float32(0.0), rows)
 
         def iterate(_: Any, found: tuple[Array, ...]) -> tuple[Array, ...]:
@@ -177,7 +180,7 @@ class BrickSolver:
             p, ap = jax.lax.map(turn, (residual, p, inverse, linear.inertia))
             return u, residual, p, ap, after
 
-        found: Array = jax.lax.fori_loop(0, self.iterations, iterate, (linear.guess, residual, p, ap, rz))[0]
+        found: Array = jax.lax.fori_loop(0, self.iterations, iterate, (guess, residual, p, ap, rz))[0]
         return found
 
     def _elastic(self, cells: Cell, p: Array, sums: Array, dt: Any) -> Array:
@@ -200,7 +203,48 @@ class BrickSolver:
 
     def step(self, state: Nodes, dt: Any, springs: Springs | None = None) -> Nodes:
         """Return the state after a step in which nothing but its supports, its weight and springs act."""
-        return self.moved(state, self.displacements(self.linearise(state, dt), springs, dt), dt)
+        linear = self.linearise(state, dt)
+        return self.moved(state, self.displacements(linear, springs, linear.guess, dt), dt)
+
+    def shortened(self, state: Nodes, u: Array) -> Array:
+        """Return displacements u, m, [n, 3], as much shorter as no brick needs to keep a share `LEFT` of its volume.
+
+        One linearisation does not see how fast the resistance of a crushed brick grows.
+        """
+
+        def volume(x: Array) -> Array:
+            gradient = self.brick.gradient(to_modes(x))
+            return gradient[0] @ jnp.cross(gradient[1], gradient[2])
+
+        def crushed(length: Array) -> Array:
+            def look(found: Array, first: Array) -> tuple[Array, None]:
+                nodes = first + jnp.asarray(self.grid.offsets)
+                x = state.position[nodes]
+                return found | (volume(x + length * u[nodes]) < LEFT * volume(x)), None
+
+            any_: Array = jax.lax.scan(look, jnp.bool_(False), jnp.asarray(self.grid.first))[0]
+            return any_
+
+        def shorten(found: tuple[Array, Array]) -> tuple[Array, Array]:
+            length = jnp.where(found[0] > SHORTEST, found[0] / 2, 0.0)
+            return length, (length > 0) & crushed(length)
+
+        one = jnp.float32(1.0)
+        length, _ = jax.lax.while_loop(lambda found: found[1], shorten, (one, crushed(one)))
+        found: Array = jax.lax.cond(length < 1, lambda: jax.lax.map(lambda row: length * row, u), lambda: u)
+        return found
+
+    def stretched(self, position: Array, limit: float) -> Array:
+        """Return whether any brick is stretched past a ratio of lengths, [] bool."""
+
+        def look(found: Array, first: Array) -> tuple[Array, None]:
+            gradient = self.brick.gradient(to_modes(position[first + jnp.asarray(self.grid.offsets)]))
+            left = limit**2 * np.eye(3, dtype=np.float32) - gradient.T @ gradient  # positive definite below the limit
+            minor = left[0, 0] * left[1, 1] - left[0, 1] * left[1, 0]
+            return found | (left[0, 0] < 0) | (minor < 0) | (jnp.cross(left[0], left[1]) @ left[2] < 0), None
+
+        found: Array = jax.lax.scan(look, jnp.bool_(False), jnp.asarray(self.grid.first))[0]
+        return found
 
 
 def _each(springs: Springs, of: Callable[[Any, Any], Any], start: Any) -> Any:
