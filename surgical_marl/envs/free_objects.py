@@ -28,8 +28,8 @@ class FreeObjects:
     def __init__(self, scene: Scene) -> None:
         centers = [place.object.center for place in scene.free_objects.values()]
         self.count, self._arms = len(centers), len(scene.agents)
-        self._threads = tuple(scene.threads)
-        self.drawn = self.count + sum(thread.nodes - 1 for thread in scene.threads.values())
+        self._bars = scene.drawn
+        self.drawn = self.count + sum(len(bars.ends) for bars in self._bars.values())
         """Number of things in `read_drawn`."""
         self._centers: Any = np.array(centers, np.float32).reshape(-1, 3)
 
@@ -48,11 +48,11 @@ class FreeObjects:
         return np.array(engine.read(FORCE, "numpy"))
 
     def read_drawn(self, engine: Engine, num_envs: int, library: str = "numpy", place: str = "") -> Poses:
-        """Return the poses of all that moves but arms, as `read`: free objects, then the edges of threads."""
-        found = [self.read(engine, num_envs, library, place)] if self.count or not self._threads else []
-        for name in self._threads:
-            nodes = engine.read(f"{place}.physics.{name}.chain.position", library)
-            found.append(Poses(*along(nodes[:, :-1], nodes[:, 1:])))
+        """Return the poses of all that moves but arms, as `read`: free objects, then the bars of systems."""
+        found = [self.read(engine, num_envs, library, place)] if self.count or not self._bars else []
+        for name, bars in self._bars.items():
+            nodes = engine.read(f"{place}.physics.{name}.{bars.state}", library)
+            found.append(Poses(*along(*(nodes[:, bars.ends[:, side]].mean(2) for side in (0, 1)))))
         if len(found) == 1:
             return found[0]
         joined: Any = np.concatenate

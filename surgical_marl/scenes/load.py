@@ -29,8 +29,8 @@ from surgical_marl.scenes.object_contacts import check_apart
 from surgical_marl.scenes.placing import (
     MAX_OBJECTS,
     PlacementEntry,
+    add_bars,
     add_objects,
-    add_threads,
     read_placements,
     take_soft,
 )
@@ -110,7 +110,7 @@ def load_scene(name: str | Path, control: str = "position") -> Scene:
         for piece, entry in about.tissue.items():
             add_tissue(spec, f"tissue/{piece}", entry)
         add_objects(spec, objects)
-        add_threads(spec, {name: system for name, system in soft.items() if hasattr(system, "path")})
+        add_bars(spec, systems)
         bare = scene(model=compile_scene(spec))
         for one, other in contact_pairs(bare):
             spec.add_pair(geomname1=one, geomname2=other, condim=1, solref=SOLREF)
@@ -120,7 +120,7 @@ def load_scene(name: str | Path, control: str = "position") -> Scene:
 
     contents = (part for mount in mounts.values() for part in mount.arm.content)
     held = (item.object.content for item in objects.values())
-    pictured = repr(soft)
+    pictured = repr(systems)
     model = cached_model(compute, repr((path.stem, control, _without_sources(about))), *contents, *held, pictured)
     loaded = scene(model=model)
     _check_attachments(loaded, place.part("attachments", settings), settings.get("attachments"))

@@ -38,7 +38,7 @@ def mjcf(scene: Scene, timestep: float | None = None) -> str:
 
     A free object has a free joint of its name, after all joints of the arms; in `scene.model` it has none. Gravity acts
     on objects, and contacts of objects are pairs with friction and a stiffness in N/m (`object_contacts.py`).
-    Threads are left out.
+    Thread and tissue are left out.
 
     Args:
         scene: the scene.
@@ -61,7 +61,7 @@ def mjcf(scene: Scene, timestep: float | None = None) -> str:
     bodies = [_add(root, "worldbody")]
     for body in range(model.nbody):
         if body > 0:
-            if model.body(body).name.partition("/")[0] in scene.threads:
+            if model.body(body).name.partition("/")[0] in scene.drawn:
                 continue  # the last bodies of the model
             place = scene.objects.get(model.body(body).name)
             parent = bodies[model.body_parentid[body]]

@@ -101,16 +101,16 @@ def take_soft(
     }
 
 
-def add_threads(spec: mujoco.MjSpec, threads: Mapping[str, Any]) -> None:
-    """Add a capsule for each edge of each thread, which only pictures show: a mocap body `<thread>/<number>`."""
-    for name, thread in threads.items():
-        path = np.array(thread.path)
-        middle, turn = along(path[:-1], path[1:])
-        half = float(np.linalg.norm(path[1] - path[0])) / 2
+def add_bars(spec: mujoco.MjSpec, systems: Mapping[str, Any]) -> None:
+    """Add the capsules of systems, which only pictures show: a mocap body `<system>/<number>` for each."""
+    for name, bars in ((name, system.bars) for name, system in systems.items() if system.bars):
+        start, end = (bars.start[bars.ends[:, side]].mean(1) for side in (0, 1))
+        middle, turn = along(start, end)
+        half = np.linalg.norm(end - start, axis=1) / 2
         for number, (place, facing) in enumerate(zip(middle, turn, strict=True)):
             body = spec.worldbody.add_body(name=f"{name}/{number}", pos=place, quat=facing, mocap=True)
-            body.add_geom(type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=[thread.diameter / 2, half, 0.0], mass=0,
-                          rgba=[*thread.colour, 1], **STILL)  # fmt: skip
+            body.add_geom(type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=[bars.radius, half[number], 0.0], mass=0,
+                          rgba=[*bars.colour, 1], **STILL)  # fmt: skip
 
 
 def add_objects(spec: mujoco.MjSpec, objects: dict[str, Placement]) -> None:

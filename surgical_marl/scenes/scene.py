@@ -127,9 +127,9 @@ class Scene:
         return {name: place for name, place in self.objects.items() if place.object.free}
 
     @cached_property
-    def threads(self) -> dict[str, Any]:
-        """The threads among `systems`. In `model` the edge between two nodes is a mocap body, `<thread>/<number>`."""
-        return {name: system for name, system in self.systems.items() if hasattr(system, "path")}
+    def drawn(self) -> dict[str, Any]:
+        """The bars of each system that pictures show (`Bars`). In `model` each is a mocap body, `<system>/<number>`."""
+        return {name: bars for name, system in self.systems.items() if (bars := system.bars)}
 
     @cached_property
     def types(self) -> dict[str, tuple[str, ...]]:

@@ -187,7 +187,7 @@ def _is_tensor(values: Any) -> bool:
 
 def _labels(scene: Scene) -> tuple[np.ndarray, tuple[str, ...]]:
     """Return the label of each geom, int32 [ngeom + 1] with the last for -1, and the names of the labels."""
-    names = ("nothing", "tissue", *scene.agents, *scene.objects, *scene.threads)
+    names = ("nothing", "tissue", *scene.agents, *scene.objects, *scene.drawn)
     model = scene.model
     owners = [model.body(body).name.split("/")[0] for body in model.geom_bodyid]
     own = [names.index(owner) if owner in names[2:] else 1 for owner in owners]

@@ -14,6 +14,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from typing import Any, NamedTuple
 
+import numpy as np
 from jax import Array
 
 from surgical_marl.scenes.objects import Surface
@@ -94,6 +95,21 @@ class Response(NamedTuple):
     """Whatever `yielding` and `apply` need."""
 
 
+class Bars(NamedTuple):
+    """Capsules by which pictures show a system: b of them, between means of q nodes each."""
+
+    state: str
+    """Name of the part of the state with the positions of its nodes, as in "chain.position"."""
+    start: np.ndarray
+    """Where the nodes are at the start, m, [n, 3]."""
+    ends: np.ndarray
+    """Numbers of the nodes at both ends, [b, 2, q]."""
+    radius: float
+    """m"""
+    colour: tuple[float, float, float]
+    """Red, green and blue, from 0 to 1."""
+
+
 class System(ABC):
     """One system of a scene. Its state is a tree of arrays; all methods are pure JAX functions of one environment.
 
@@ -105,6 +121,11 @@ class System(ABC):
     """Friction and stiffness of its parts."""
     ties: tuple[Tie, ...] = ()
     """Where it is fastened."""
+
+    @property
+    def bars(self) -> Bars | None:
+        """What pictures show of it; None for nothing."""
+        return None
 
     @property
     @abstractmethod

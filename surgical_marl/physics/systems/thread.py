@@ -22,7 +22,7 @@ from surgical_marl.physics.contact.spring_contact import Stretches, each, feel, 
 from surgical_marl.physics.systems import crossings
 from surgical_marl.physics.systems.chain import ChainState, Factors, Loaded, Newton, Rod, free_forces, search, solve
 from surgical_marl.physics.systems.crossings import Joined
-from surgical_marl.physics.systems.system import End, Ends, Response, Shapes, System, Tie
+from surgical_marl.physics.systems.system import Bars, End, Ends, Response, Shapes, System, Tie
 from surgical_marl.physics.tree_utils import row_of
 from surgical_marl.scenes.objects import Placement, Surface
 from surgical_marl.scenes.thread_file import ThreadFile
@@ -134,6 +134,12 @@ class Thread(System):
         area, inertia = np.pi * self.diameter**2 / 4, np.pi * self.diameter**4 / 64
         return Rod(self.nodes, self.length / (self.nodes - 1), self.density * area, self.young * area,
                    self.young * inertia, self.drag)  # fmt: skip
+
+    @property
+    def bars(self) -> Bars:
+        """A capsule for each edge."""
+        edges = np.arange(self.nodes - 1)[:, None, None] + np.array([[0], [1]])
+        return Bars("chain.position", np.array(self.path), edges, self.diameter / 2, self.colour)
 
     @property
     def contacts(self) -> int:

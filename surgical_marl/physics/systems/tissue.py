@@ -21,7 +21,7 @@ from surgical_marl.physics.contact.spring_contact import Stretches, each, feel, 
 from surgical_marl.physics.systems.brick import FULL, LOWER, Brick
 from surgical_marl.physics.systems.brick_grid import BrickGrid, SurfacePoints
 from surgical_marl.physics.systems.brick_solve import BrickSolver, Linear, Nodes, Springs, Support
-from surgical_marl.physics.systems.system import End, Ends, Response, Shapes, System
+from surgical_marl.physics.systems.system import Bars, End, Ends, Response, Shapes, System
 from surgical_marl.physics.tree_utils import row_of
 from surgical_marl.scenes.objects import Placement, Surface
 from surgical_marl.scenes.tissue_file import TissueFile
@@ -150,6 +150,15 @@ class Tissue(System):
     def points(self) -> SurfacePoints:
         """The points that others touch."""
         return self.grid.surface()
+
+    @property
+    def bars(self) -> Bars:
+        """A capsule for each edge along x, in the middle of the thickness: side by side they look like a sheet."""
+        grid, (_, rows, levels) = self.grid, self.grid.counts
+        i, j = np.argwhere(grid.present.any(2)).T
+        lowest = np.unique([(i * rows + j) * levels, (i * rows + j + 1) * levels])
+        ends = lowest[:, None, None] + np.array([[0], [rows * levels]]) + np.array([0, levels - 1])
+        return Bars("nodes.position", self.rest, ends, min(self.size[2], float(grid.cell[1])) / 2, self.colour)
 
     @property
     def contacts(self) -> int:
