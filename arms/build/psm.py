@@ -1,4 +1,4 @@
-"""The patient side manipulators: Classic with a Large Needle Driver 400006 or Cadiere Forceps 400049, Si with a 420006.
+"""The patient side manipulators, Classic and Si, each with a Large Needle Driver or Cadiere Forceps. One chain.
 
 The base frame is the remote center of motion (RCM). At zero every link frame is parallel to it: z points out of the
 patient, the shaft points along -z, and the arm's base stands on the -y side: the published yaw axis points from the RCM
@@ -85,16 +85,22 @@ SI = Variant(
     offset=0.4826, shaft=0.4670, yaw=(-2.964, 2.964), pitch=(-1.265, 1.301), insertion=0.29,
     efforts=(17.0845, 17.0845, 40.9063), shaft_capsule=(0.0042, 0.4318), cannula=(0.008, 0.165),
 )  # fmt: skip
-FORCEPS = "da Vinci Classic patient side manipulator (PSM) with Cadiere Forceps (400049)."
 
 
 def build() -> dict[str, str]:
     """URDF text by the name of its file in `arms/`."""
     return {
         "psm/psm.urdf": _build("psm", CLASSIC),
-        "psm/psm_cadiere_forceps.urdf": _build("psm", replace(CLASSIC, title=FORCEPS, finger=CADIERE)),
+        "psm/psm_cadiere_forceps.urdf": _build("psm", _with_forceps(CLASSIC, "400049")),
         "psm_si/psm_si.urdf": _build("psm_si", SI),
+        "psm_si/psm_si_cadiere_forceps.urdf": _build("psm_si", _with_forceps(SI, "420049")),
     }
+
+
+def _with_forceps(variant: Variant, number: str) -> Variant:
+    """The same machine with Cadiere Forceps."""
+    machine, _, _ = variant.title.partition(" with ")
+    return replace(variant, title=f"{machine} with Cadiere Forceps ({number}).", finger=CADIERE)
 
 
 def _build(name: str, variant: Variant) -> str:

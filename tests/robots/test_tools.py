@@ -21,7 +21,7 @@ from surgical_marl.scenes.load import load_scene
 from surgical_marl.scenes.mjcf import mjcf
 from surgical_marl.yaml_file import dump_yaml, read_yaml
 
-PSM, FORCEPS = load_arm("psm"), load_arm("psm", "cadiere_forceps")
+PSM = load_arm("psm")
 PLACES = {"psm_0": [-0.08, 0.0, 0.15], "psm_1": [0.08, 0.0, 0.15]}
 
 
@@ -43,21 +43,26 @@ def test_the_first_tool_is_the_arm_without_a_choice() -> None:
     assert arm_files("psm") == ["arm.yaml", "psm.urdf", "psm_cadiere_forceps.urdf"]
 
 
-def test_cadiere_forceps_have_the_published_tip_and_jaw() -> None:
+@pytest.mark.parametrize("name", ["psm", "psm_si"])
+def test_cadiere_forceps_have_the_published_tip_and_jaw(name: str) -> None:
     """dVRK: wrist, limits and coupling of the needle driver. dvrk_model: tip 15.5 mm past the wrist-yaw axis."""
-    q = np.random.default_rng(0).uniform(PSM.lower, PSM.upper, (200, 7))
-    ours, theirs = FORCEPS.forward_kinematics(q), PSM.forward_kinematics(q)
+    arm, forceps = load_arm(name), load_arm(name, "cadiere_forceps")
+    q = np.random.default_rng(0).uniform(arm.lower, arm.upper, (200, 7))
+    ours, theirs = forceps.forward_kinematics(q), arm.forward_kinematics(q)
     assert np.abs(ours[:, :3, :3] - theirs[:, :3, :3]).max() < 1e-12
     past = theirs[:, :3, 3] + (0.0155 - 0.0102) * theirs[:, :3, 2]
     assert np.abs(ours[:, :3, 3] - past).max() < 1e-12
-    assert FORCEPS.joints == PSM.joints and FORCEPS.cables == PSM.cables
-    jaws = FORCEPS.jaw, PSM.jaw
-    assert all((jaw.joint, jaw.open, jaw.closed) == ("jaw_left", 0.5, 0.02) for jaw in jaws if jaw)
+    assert forceps.joints == arm.joints and forceps.cables == arm.cables and forceps.jaw != arm.jaw
+    assert forceps.jaw and (forceps.jaw.joint, forceps.jaw.open, forceps.jaw.closed) == ("jaw_left", 0.5, 0.02)
 
 
 @pytest.mark.parametrize(
     ("arm", "start", "end", "width", "thickness"),
-    [(PSM, 0.00095, 0.0106, 0.0048, 0.0012), (FORCEPS, 0.0061, 0.0199, 0.0052, 0.0015)],
+    [
+        (PSM, 0.00095, 0.0106, 0.0048, 0.0012),
+        (load_arm("psm", "cadiere_forceps"), 0.0061, 0.0199, 0.0052, 0.0015),
+        (load_arm("psm_si", "cadiere_forceps"), 0.0061, 0.0199, 0.0052, 0.0015),
+    ],
 )
 def test_closed_plates_touch_between_the_fingers(
     arm: Any, start: float, end: float, width: float, thickness: float
