@@ -82,8 +82,7 @@ class BrickGrid:
             for i, j in np.argwhere(self.present[:, :, layer]):
                 corners = [int(np.array([i + a, j + b, level]) @ strides) for a in (0, 1) for b in (0, 1)]
                 for own in ((0,), (1,), (2,), (3,), (0, 1), (0, 2), (1, 3), (2, 3), (0, 1, 2, 3)):
-                    nodes = tuple(corners[k] for k in own)
-                    points[nodes] = inward
+                    points[tuple(corners[k] for k in own)] = inward
         nodes = np.array([(own * 4)[:4] for own in points], np.int32)
         count = np.array([len(own) for own in points])[:, None]
         weights = np.where(np.arange(4) < count, 1 / count, 0.0).astype(np.float32)
