@@ -94,6 +94,12 @@ def test_an_end_is_tied_to_the_tail_of_a_needle_or_to_where_it_is(tmp_path: Path
     np.testing.assert_allclose(last.place, [0.1, 0.0, 0.1])
 
 
+def test_a_scene_paints_it(tmp_path: Path) -> None:
+    scene = scene_with(tmp_path, {"position": [0.0, 0.0, 0.1], "colour": [1.0, 0.5, 0.25]})
+    geom = scene.model.body("thread/3").geomadr[0]
+    np.testing.assert_allclose(scene.model.geom_rgba[geom], [1.0, 0.5, 0.25, 1.0])
+
+
 def test_mass_and_stiffness_are_those_of_its_material() -> None:
     item, thread = sm.load_object("thread_3_0"), sm.load_scene("bimanual_psm_thread").systems["thread"]
     area = np.pi * 0.00011**2

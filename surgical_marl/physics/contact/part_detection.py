@@ -24,8 +24,8 @@ STEEP = 0.5
 """Twice the sine of the angle to a plate from which on a part's end counts more than its middle."""
 RIM = 0.25
 """Least stiffness of a contact with a plate, as a share: only a little of a part may lie on it, or none at its rim."""
-NEAREST = 96
-"""Pairs of shapes and parts that are looked at closely in a step, at most."""
+NEAREST = 32
+"""Pairs of shapes and parts that are looked at closely in a step, at most, beyond the room for contacts."""
 
 
 class Scenery(NamedTuple):
@@ -56,6 +56,7 @@ class PartDetection:
         tied: Sequence[tuple[int, int, int]] = (),
     ) -> None:
         self._counts, self._room, self._shapes, self._tied = counts, room, sum(counts.values()), tied
+        self._nearest = room + NEAREST
         self._starts = dict(zip(counts, np.cumsum([0, *counts.values()]), strict=False))
         self._stiffness = np.array([one.stiffness for one in surfaces], np.float32)
         self._sliding = np.array([one.sliding for one in surfaces], np.float32)
@@ -82,10 +83,10 @@ class PartDetection:
             return self._with(found, *self._meet(scenery, shapes, pairs.numbers[row], dt))
 
         if self._shapes:
-            found = jax.lax.fori_loop(0, jnp.minimum(pairs.length, NEAREST), meet, found)
+            found = jax.lax.fori_loop(0, jnp.minimum(pairs.length, self._nearest), meet, found)
         for tie in last:
             found = self._with(found, tie, jnp.bool_(True))
-        left_out = jnp.maximum(found.total - self._room, 0) + jnp.maximum(pairs.length - NEAREST, 0)
+        left_out = jnp.maximum(found.total - self._room, 0) + jnp.maximum(pairs.length - self._nearest, 0)
         return Ends(
             jax.tree.map(lambda x: x[:-1], found.rows), found.moving, jnp.minimum(found.total, self._room), left_out
         )
@@ -125,7 +126,7 @@ class PartDetection:
 
     def _near(self, scenery: Scenery, shapes: Shapes, dt: Any) -> Listed:
         """Return the pairs of shapes and parts that are near each other, in their order: shape * parts + part."""
-        parts, none = len(shapes.speed), Listed.none(NEAREST)
+        parts, none = len(shapes.speed), Listed.none(self._nearest)
         if not self._shapes:
             return none
         radius = jnp.broadcast_to(jnp.asarray(shapes.radius), (parts,))

@@ -125,8 +125,11 @@ class Thread(System):
         ties = tuple(
             _tie(part, share, name, path[round(part + share)], others, place) for part, share, name in wanted if name
         )
-        return cls(about.nodes, about.length, about.diameter, young, density, item.object.surface,
-                   tuple(map(tuple, path.tolist())), ties, about.drag, about.strength, colour=about.colour)  # fmt: skip
+        nodes, colour = tuple(map(tuple, path.tolist())), entry.colour or about.colour
+        return cls(
+            about.nodes, about.length, about.diameter, young, density, item.object.surface, nodes, ties, about.drag,
+            about.strength, colour=colour,
+        )  # fmt: skip
 
     @cached_property
     def rod(self) -> Rod:
