@@ -285,20 +285,21 @@ class Emulated:
             self.engine._arrays.write(leaf, values)
 
 
-def pushed_as_on_a_gpu(scene: str) -> tuple[list[np.ndarray], list[Any]]:
+def pushed_as_on_a_gpu(env: PhysicsAlone) -> tuple[list[np.ndarray], list[Any]]:
     """Run the thread stages of a GPU on a CPU, and block stages by JAX; return what `pushed` does, and the stages."""
     with gpu_code(), patch.object(fused_engine, "compile_block", lambda *_: None):
-        engine: Any = fused_engine.FusedEngine(physics(scene), ENVS, "cpu")
+        engine: Any = fused_engine.FusedEngine(env, ENVS, "cpu")
         blocks = [one for one in all_stages(engine.source.stages) if one.kind == "block"]
         engine._blocks = {stage.name: Emulated(engine, stage) for stage in blocks}
         return pushed(engine), engine.source.stages
 
 
 def test_engines_move_it_alike(scene: str) -> None:
-    expected = pushed(MjxEngine(physics(scene), ENVS, "cpu"))
+    env = physics(scene)
+    expected = pushed(MjxEngine(env, ENVS, "cpu"))
     assert expected[0][0, MIDDLE].min() > 2e-3 and not expected[0][1].any()
-    split, (first, loop, last) = pushed_as_on_a_gpu(scene)
-    for found in (split, pushed(fused_engine.FusedEngine(physics(scene), ENVS, "cpu"))):
+    split, (first, loop, last) = pushed_as_on_a_gpu(env)
+    for found in (split, pushed(fused_engine.FusedEngine(env, ENVS, "cpu"))):
         for one, other in zip(found, expected, strict=True):
             np.testing.assert_allclose(one, other, atol=2e-6)
     assert (first.kind, last.kind, loop.kind, loop.length) == ("thread", "thread", "loop", STEP)
@@ -307,7 +308,8 @@ def test_engines_move_it_alike(scene: str) -> None:
 
 @pytest.mark.skipif(not kernel.has_cuda(), reason="needs a CUDA device")
 def test_a_gpu_moves_it_alike(scene: str) -> None:
-    engines = fused_engine.FusedEngine(physics(scene), ENVS, "cuda"), MjxEngine(physics(scene), ENVS, "cpu")
+    env = physics(scene)
+    engines = fused_engine.FusedEngine(env, ENVS, "cuda"), MjxEngine(env, ENVS, "cpu")
     for one, other in zip(*map(pushed, engines), strict=True):
         np.testing.assert_allclose(one, other, atol=5e-6)
 
