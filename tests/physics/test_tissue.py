@@ -132,7 +132,7 @@ def test_a_rotation_is_the_nearest_one_also_inside_out() -> None:
     np.testing.assert_allclose(found, turns, atol=2e-6)
 
 
-def test_a_crushed_brick_pushes_back_without_bound() -> None:
+def test_a_crushed_brick_pushes_back_much_harder() -> None:
     def pressure(share: float) -> float:
         x = jnp.asarray(CORNER * [1, 1, share], jnp.float32)
         return float(jax.jit(BRICK.deformed)(x)[1][CORNERS[:, 2] == 1, 2].sum()) / np.prod(BRICK.size[:2]) / YOUNG

@@ -15,6 +15,7 @@ import surgical_marl as sm
 from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.physics.contact.part_detection import PartDetection, Scenery
 from surgical_marl.physics.contact.shapes import Plate, Segments
+from surgical_marl.physics.systems.brick import CORNERS
 from surgical_marl.physics.systems.tissue import Tissue, TissueState
 from surgical_marl.scenes.objects import Surface
 
@@ -202,3 +203,28 @@ def test_tissue_that_is_stretched_past_its_limit_is_torn() -> None:
         turned = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
         position = jnp.asarray(tissue.rest * [1.0, stretch, 1.0] @ turned.T, jnp.float32)
         assert bool(tissue.solver.stretched(position, 1.5)) == torn
+
+
+@pytest.mark.slow
+def test_ten_minutes_of_random_arms_turn_no_brick_inside_out() -> None:
+    """All environments together; arms go down into the tissue and close their jaws at random."""
+    count, seconds = 32, 600
+    env = BatchedEnv("reach", "bimanual_psm_tissue", num_envs=count, engine="fused", device="cpu")
+    env.reset(seed=0)
+    grid, rng, pressed = env.scene.systems["sheet"].grid, np.random.default_rng(0), 0
+    slope = (2 * CORNERS - 1) / (4 * grid.cell)
+    for step in range(round(seconds / 0.02 / count)):
+        if step % 25 == 0:
+            actions = {}
+            for agent, mount in env.scene.mounts.items():
+                actions[agent] = rng.uniform(-1, 1, (count, len(mount.arm.actuated))).astype(np.float32)
+                actions[agent][:, 2] = np.abs(actions[agent][:, 2])  # insertion
+                actions[agent][:, -1] = rng.choice([-1.0, 1.0], count)
+        env.step(actions)
+        x = np.array(env.engine.read(".physics.sheet.nodes.position", "numpy"), float)
+        assert np.isfinite(x).all(), step
+        gradient = np.einsum("neai,aj->neij", x[:, grid.first[:, None] + grid.offsets], slope)
+        assert np.linalg.det(gradient).min() > 0, step
+        pressed += int((np.array(env.engine.read(".physics.sheet.force", "numpy")) > 0.1).sum())
+    assert pressed > 500  # the arms did press it
+    env.close()

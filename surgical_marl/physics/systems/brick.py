@@ -34,8 +34,8 @@ GRADIENTS, HOURGLASSES = (4, 2, 1), (3, 5, 6, 7)
 ITERATIONS = 3
 """Newton steps for a rotation, from the frame of two mean edges: it is then exact to rounding at a shear of 0.5."""
 CRUSHED, RESISTANCE = 0.4, 2.0
-"""Share of its volume below which a brick resists compression more than linearly, without bound as the volume goes to
-0; and how much: the pressure in Young's moduli at half that share."""
+"""Share of its volume below which a brick resists compression more than linearly, and how much: the pressure in Young's
+moduli at half that share. It grows to 64 times as much."""
 LOWER, FULL = np.tril_indices(3), np.array([[0, 1, 3], [1, 2, 4], [3, 4, 5]])
 """The lower half of a symmetric matrix [3, 3], and where each element of the matrix is in it."""
 _SIGNS = 2 * CORNERS - 1
@@ -146,9 +146,9 @@ class Brick:
         stretch = (stretch + stretch.T) / 2
         cofactors = _cofactors(stretch)
         volume = jnp.sum(stretch[0] * cofactors[0])
-        lost = jnp.maximum(CRUSHED - volume, 0.0) / jnp.maximum(volume, CRUSHED / 20)
+        lost = jnp.maximum(CRUSHED - volume, 0.0) / jnp.maximum(volume, CRUSHED / 8)
         pressure = RESISTANCE * self.young * lost**2
-        stiff = 2 * RESISTANCE * self.young * lost * CRUSHED / jnp.maximum(volume, CRUSHED / 20) ** 2
+        stiff = 2 * RESISTANCE * self.young * lost * CRUSHED / jnp.maximum(volume, CRUSHED / 8) ** 2
         grown = jnp.trace(stretch) - 3.0
         stress = 2 * self.shear * (stretch - _EYE) + self.lame * grown * _EYE - pressure * cofactors
 

@@ -156,13 +156,14 @@ class BrickSolver:
         def iterate(_: Any, found: tuple[Array, ...]) -> tuple[Array, ...]:
             u, residual, p, ap, rz = found
 
-            def project(sum_: Array, row: Any) -> tuple[Array, Array]:
-                own, p, free = row
+            def project(sums: tuple[Array, Array], row: Any) -> tuple[tuple[Array, Array], Array]:
+                own, p, free, inertia = row
                 own *= free
-                return sum_ + own @ p, own
+                return (sums[0] + own @ p, sums[1] + inertia * (p @ p)), own
 
-            pap, ap = jax.lax.scan(project, jnp.float32(0.0), (matrix(p, ap), p, free))
-            length = rz / jnp.maximum(pap, 1e-30)
+            none = jnp.float32(0.0), jnp.float32(0.0)
+            (pap, least), ap = jax.lax.scan(project, none, (matrix(p, ap), p, free, linear.inertia))
+            length = rz / jnp.maximum(jnp.maximum(pap, least), 1e-30)  # all but inertia adds to it, save for rounding
 
             def advance(sum_: Array, row: Any) -> tuple[Array, Any]:
                 u, residual, p, ap, inverse = row
