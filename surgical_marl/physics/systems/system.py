@@ -6,7 +6,7 @@ A package declares its systems in the entry-point group `surgical_marl.systems`,
     systems:
       beads: {type: bead_string, position: [0.0, 0.0, 0.05]}
 
-docs/physics.md walks through one.
+docs/your_own_system.md walks through one.
 """
 
 from __future__ import annotations
