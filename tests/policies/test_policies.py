@@ -269,7 +269,7 @@ def test_onnx_acts_as_torch_does(env: Any, algo: Any, recurrent: Any, tmp_path: 
     torch.manual_seed(0)
     network = NetworkSettings(hidden=(16,), recurrent=recurrent)
     layout = Layout(env, ALGORITHMS.load(algo).grouping)
-    actor = networks._actor(replace(SMALL, algo=algo, network=network), env, layout)
+    actor = networks.untrained_actor(replace(SMALL, algo=algo, network=network), env, layout)
     with torch.no_grad():
         for model in actor.models.values():  # fresh networks hardly act: so that some actions are beyond 1
             model.mlp[-1].weight.mul_(300)
@@ -312,7 +312,7 @@ def test_the_example_acts_without_torch(tmp_path: Path) -> None:
     from surgical_marl.envs.batch import BatchedEnv
 
     env = BatchedEnv("reach", "bimanual_psm", num_envs=1)
-    actor = networks._actor(replace(SMALL, scene="bimanual_psm"), env, Layout(env))
+    actor = networks.untrained_actor(replace(SMALL, scene="bimanual_psm"), env, Layout(env))
     folder = tmp_path / "policies" / "reach-bimanual_psm"
     folder.mkdir(parents=True)
     write_weights(folder, actor)
