@@ -85,3 +85,25 @@ def test_both_engines_close_a_jaw_on_a_thread_and_lift_it_alike(tmp_path: Path) 
     np.testing.assert_allclose(place, other_place, atol=2e-6)
     np.testing.assert_allclose(pulls, other_pulls, atol=0.02)
     np.testing.assert_allclose(qpos, other_qpos, atol=1e-5)
+
+
+@pytest.mark.slow
+def test_ten_minutes_of_random_arms_push_no_thread_through_its_pad() -> None:
+    """All environments together. A thread that slid over the pad's rim falls, and is not looked at any more."""
+    count, seconds, top, rim = 16, 600, 0.02, np.array([0.178, 0.0485])
+    env = BatchedEnv("reach", "bimanual_psm_thread", num_envs=count, engine="fused", device="cpu", max_steps=10**6)
+    env.reset(seed=1)
+    rng, on_it, pulled = np.random.default_rng(1), np.ones(count, bool), 0.0
+    for step in range(round(seconds / 0.02 / count)):
+        if step % 25 == 0:
+            sizes = {agent: (count, len(mount.arm.actuated)) for agent, mount in env.scene.mounts.items()}
+            actions = {agent: rng.uniform(-1, 1, size).astype(np.float32) for agent, size in sizes.items()}
+        env.step(actions)
+        nodes = np.asarray(env.engine.read(".physics.thread.chain.position", "numpy"))
+        assert np.isfinite(nodes).all(), step
+        on_it &= (nodes[..., 2] > 0).all(1)
+        over = (np.abs(nodes[..., :2]) < rim).all(-1) & on_it[:, None]
+        assert nodes[over, 2].min() > top - 1.1e-3, step
+        pulled = max(pulled, float(np.max(env.engine.read(".physics.thread.chain.tension", "numpy"))))
+    assert on_it.sum() > count / 2 and pulled > 0.1  # arms did pull at it
+    env.close()
