@@ -169,7 +169,7 @@ def test_only_scenes_with_objects_have_plates() -> None:
     """So that the models of all others stay what they were."""
     for name in sm.list_scenes():
         scene = sm.load_scene(name)
-        assert (scene.model.geom_group == PAD_GROUP).any() == bool(scene.objects)
+        assert (scene.model.geom_group == PAD_GROUP).any() == bool(scene.objects or scene.systems)
 
 
 @pytest.mark.parametrize("name", WITH_OBJECTS)
