@@ -41,16 +41,18 @@ jaw:
   open: 1
   closed: 0
   pads: {finger: {size: [1, 1, 1], position: [0, 0, 0], tilt: [0, 0, 0]}}
+tools: {driver: {}, forceps: {tool_tip: other}}
 """,
     SceneFile: """
 description: a scene
 arms:
-  psm_0: {arm: psm, position: [0, 0, 0], turn: 0, tilt: [0, 0, 0], workspace: [0, 0, 0]}
+  psm_0: {arm: psm, position: [0, 0, 0], turn: 0, tilt: [0, 0, 0], workspace: [0, 0, 0], tool: driver}
 view: {position: [1, 0, 0], target: [0, 0, 0]}
 tissue:
   liver: {shape: box, size: [1, 1, 1], colour: [1, 0, 0], position: [0, 0, 0], tilt: [0, 0, 0]}
 objects:
-  pad: {object: pad, position: [0, 0, 0], tilt: [0, 0, 0], colour: [1, 0, 0]}
+  pad: {object: pad, position: [0, 0, 0], tilt: [0, 0, 0], colour: [1, 0, 0],
+        tied: {first: world, last: pad}}
 attachments:
   weld: {body: pad, link: psm_0/tip, active: true}
 systems:
