@@ -25,6 +25,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from surgical_marl.physics.solver.cholesky import packed
+
 GRAVITY = np.array([0.0, 0.0, -9.81], np.float32)
 ENOUGH = 1e-8
 """Displacement, m, below which a Newton step is the last one."""
@@ -34,7 +36,7 @@ KINKING = 100.0
 """Compliance of an edge under compression, relative to that under tension: a thread kinks where it is pushed along
 itself, at loads that edges of this length can't show, as they are straight."""
 _EYE = np.eye(3, dtype=np.float32)
-_FULL = np.array([[0, 1, 3], [1, 2, 4], [3, 4, 5]])
+_FULL = packed(3)
 """Where each element of a symmetric matrix [3, 3] is among its lower half, row by row."""
 _LOWER = np.tril_indices(3)
 

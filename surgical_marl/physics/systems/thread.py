@@ -19,6 +19,7 @@ from jax import Array
 
 from surgical_marl.content import unknown
 from surgical_marl.physics.contact.spring_contact import Stretches, each, feel, none, recall, remember
+from surgical_marl.physics.solver.cholesky import packed
 from surgical_marl.physics.systems import crossings
 from surgical_marl.physics.systems.chain import ChainState, Factors, Loaded, Newton, Rod, free_forces, search, solve
 from surgical_marl.physics.systems.crossings import Joined
@@ -35,7 +36,7 @@ SPARE = 24
 TAIL = "tail"
 """The site of a needle that a thread is fastened to."""
 _LOWER = np.tril_indices(3)
-_FULL = np.array([[0, 1, 3], [1, 2, 4], [3, 4, 5]])
+_FULL = packed(3)
 
 
 class ThreadState(NamedTuple):
