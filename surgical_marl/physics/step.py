@@ -6,7 +6,8 @@
     move          positions and velocities at the end of the step
     outputs       the hardest touch so far
 
-Arms and bodies that touch nothing do not affect each other. `skip` leaves out what would only say so.
+Arms and bodies that touch nothing do not affect each other: `skip.cond` takes a cheaper branch then, in which each is
+solved alone.
 """
 
 from __future__ import annotations
@@ -69,7 +70,7 @@ class Meeting(NamedTuple):
     ends: Ends
     response: Response
     expected: tuple[Array, Array]
-    """Accelerations of joints [a, m] and of bodies [k, 6] for which it responds: those of the last step."""
+    """Accelerations of joints [a, m] and of bodies [k, 6] that its response assumes: those of the last step."""
 
 
 class Step:

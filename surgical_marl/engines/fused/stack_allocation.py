@@ -1,7 +1,7 @@
 """Lets arrays of a kernel share memory where they are never live at the same time.
 
-A C compiler gives each array memory of its own for the whole function, most of which would hold dead numbers, in the
-way of live ones in caches.
+A C compiler gives each array memory of its own for the whole function, most of which would hold dead numbers that
+take the place of live ones in caches.
 """
 
 from __future__ import annotations

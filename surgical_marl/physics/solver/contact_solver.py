@@ -31,8 +31,8 @@ STEPS, STEPS_ALONE = 12, 24
 """Newton steps at most, with arms and of objects alone, whose steps are short. A GPU waits for the last one of its
 environments (docs/physics.md)."""
 LEAST = 1e-7
-"""Fall of the cost in a Newton step, N m/s2, after which none follows: that of a needle of 0.03 g whose acceleration
-changes by 0.06 m/s2."""
+"""Slope of the cost along a Newton step, N m/s2 (about twice its fall), below which no step follows: that of a needle of
+0.03 g whose acceleration changes by 0.06 m/s2."""
 
 
 class ContactSolver:
@@ -96,10 +96,10 @@ class ContactSolver:
     # -- the search direction
 
     def _direction(self, problem: Problem, here: Point, sums: Hessian, first: Array) -> Point:
-        """Return the direction to the least cost with contacts as linear functions; joints keep friction and limits.
+        """Return the Newton direction: forces of contacts are linearised, friction and limits of joints are exact.
 
         Objects are eliminated, arms solved, and objects found from them. Unless it is the `first` Newton step, arms
-        that touch nothing are where their forces balance.
+        that touch nothing are solved already, and their direction is zero.
         """
         k, linked = self._objects, sums.linked
         touched = sums.met.reshape(k + 1, len(self._dofs))[:k]
@@ -133,5 +133,5 @@ class ContactSolver:
 
 
 def _touching(problem: Problem) -> Array:
-    """Return which arms touch anything, [a] bool."""
+    """Return which arms have contacts, [a] bool: all of them if any two overlap."""
     return problem.contacts.on_arm | problem.overlap

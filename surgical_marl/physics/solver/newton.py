@@ -21,7 +21,7 @@ LOOKS = 10
 
 
 def newton(step: Callable[[Any, Array], tuple[Any, Array]], start: Any, most: int, steady: int = 1) -> Any:
-    """Return the state after at most `most` Newton steps, fewer if `steady` of them in a row are the last ones needed.
+    """Return the state after at most `most` Newton steps, fewer if `steady` of them in a row report convergence.
 
     Args:
         step: from a state and the number of steps before to the next state, and whether no other step is needed, [].
