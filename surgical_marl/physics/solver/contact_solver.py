@@ -31,8 +31,8 @@ STEPS, STEPS_ALONE = 12, 24
 """Newton steps at most, with arms and of objects alone, whose steps are short. A GPU waits for the last one of its
 environments (docs/physics.md)."""
 LEAST = 1e-7
-"""Slope of the cost along a Newton step, N m/s2 (about twice its fall), below which no step follows: that of a needle of
-0.03 g whose acceleration changes by 0.06 m/s2."""
+"""Slope of the cost along a Newton step, N m/s2 (about twice its fall), below which no step follows: that of a needle
+of 0.03 g whose acceleration changes by 0.06 m/s2."""
 
 
 class ContactSolver:

@@ -67,7 +67,7 @@ def eliminate(own: Array, cross: Array, force: Array, coupling: Array, touched: 
     if not k:
         return Eliminated(force, coupling, jnp.zeros((0, 6, 6)), cross, touched)
     if k > 1:
-        filled = touched | (linked & touched.any(0))  # if any objects touch, an arm that touches one counts as touching all
+        filled = touched | (linked & touched.any(0))  # if objects touch, an arm that touches one counts for all
         coupling = for_each((filled & ~touched).ravel(), lambda rows, pair: put(rows, pair, zeros), coupling)
         touched = filled
     (_, cross, force, coupling), factor = jax.lax.scan(one, (own, cross, force, coupling), jnp.arange(k))
