@@ -30,7 +30,7 @@ class Finger:
     shapes: tuple[Box, ...]
 
     def beside(self, side: int) -> tuple[list[Box], Cylinder]:
-        """What is drawn of the finger on one side (-1 or 1), and its capsule."""
+        """Return the drawing of the finger on one side (-1 or 1), and its capsule."""
         drawn = [Box(box.size, (-side * box.at[0], *box.at[1:]), material=box.material) for box in self.shapes]
         return drawn, Cylinder(self.radius, self.length, (-side * self.shapes[0].at[0], 0, -self.length / 2))
 
@@ -57,7 +57,7 @@ CADIERE = Finger(
 
 @dataclass(frozen=True)
 class Variant:
-    """What differs between machines and instruments. Lengths in m, angles in rad, efforts in N m, N m, N."""
+    """Numbers that differ between machines and instruments. Lengths in m, angles in rad, efforts in N m, N m, N."""
 
     title: str
     offset: float

@@ -1,4 +1,4 @@
-"""How fast a task is learned under each control: `bench solve` by task, scene, control and seed, for docs/control.md.
+"""Time to learn a task under each control: `bench solve` by task, scene, control and seed, for docs/control.md.
 
     python -m docs.studies.control --gpus 8                # all runs, one process a GPU, then the table
     python -m docs.studies.control --seeds 1 --limit 60 num_envs=64       # on a CPU, one after the other

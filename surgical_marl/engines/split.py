@@ -29,7 +29,7 @@ CALLS = {
 """Primitives that call a function, and the parameter that holds it."""
 
 Where = Callable[[Call], bool]
-"""Whether a step is split at a stage."""
+"""Function that says of a stage if a step is split there."""
 
 
 @dataclass

@@ -31,7 +31,7 @@ R = TypeVar("R")
 
 
 class Call(NamedTuple):
-    """How a stage is called: the parameter of its equation in a jaxpr."""
+    """The call of a stage: the parameter of its equation in a jaxpr."""
 
     name: str
     reference: core.ClosedJaxpr

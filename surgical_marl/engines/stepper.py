@@ -51,7 +51,7 @@ class Stepper(Protocol):
 
     @property
     def pauses(self) -> bool:
-        """Whether a step calls a stage of the host, such as pictures."""
+        """True if a step calls a stage of the host, such as pictures."""
 
     def __hash__(self) -> int: ...
 

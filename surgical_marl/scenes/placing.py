@@ -29,7 +29,7 @@ TAKEN = re.compile(r"world|tissue|contact|target|(?:reward|cost|stage)(?:_\w*)?"
 
 @dataclass(frozen=True)
 class Tied:
-    """What the two ends of a thread are fastened to: "world", or a free object that has a site `tail`."""
+    """Fastenings of the two ends of a thread: "world", or a free object that has a site `tail`."""
 
     first: str | None = None
     last: str | None = None

@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from surgical_marl.physics.solver.cholesky import FULL
 from surgical_marl.physics.systems.system import End, Ends
 from surgical_marl.physics.tree_utils import put, room, row_of
 
@@ -103,6 +104,19 @@ def each(ends: Ends, of: Callable[[Array, End], Any], moving: bool = False) -> A
         return put(found, row, of(row, row_of(ends.rows, row)))
 
     return jax.lax.fori_loop(0, ends.moving if moving else ends.total, note, start)
+
+
+def pushes(ends: Ends, falls: Array, accelerations: Array, dt: Any) -> Array:
+    """Return what ends that accelerate push in a step in addition, N, [c, 3].
+
+    Args:
+        ends: the contacts.
+        falls: of the force of each contact as its end moves, N/m: lower halves, [c, 6].
+        accelerations: of the ends, beyond those that were expected, m/s2, [c, 3].
+        dt: duration of a step, s.
+    """
+    found: Array = each(ends, lambda row, end: dt * dt * (falls[row][FULL] @ accelerations[row]), moving=True)
+    return found
 
 
 def _key(end: End, parts: int) -> Array:

@@ -25,6 +25,10 @@ def packed(n: int) -> np.ndarray:
     return places
 
 
+LOWER, FULL = np.tril_indices(3), packed(3)
+"""Indices by which a symmetric matrix [3, 3] becomes its lower half [6], row by row, and that the matrix again."""
+
+
 def cholesky(matrix: Array) -> Array:
     """Return the lower factor [n, n] of a symmetric matrix [n, n].
 

@@ -25,6 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from surgical_marl.physics.solver.cholesky import FULL, LOWER
 from surgical_marl.physics.systems.rigid_motion import rotation
 
 CORNERS = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
@@ -36,8 +37,6 @@ ITERATIONS = 3
 CRUSHED, RESISTANCE = 0.4, 2.0
 """Share of its volume below which a brick resists compression more than linearly, and how much: the pressure in Young's
 moduli at half that share. It grows to 64 times as much."""
-LOWER, FULL = np.tril_indices(3), np.array([[0, 1, 3], [1, 2, 4], [3, 4, 5]])
-"""The lower half of a symmetric matrix [3, 3], and where each element of the matrix is in it."""
 _SIGNS = 2 * CORNERS - 1
 _EYE = np.eye(3, dtype=np.float32)
 

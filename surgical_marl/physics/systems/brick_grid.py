@@ -24,7 +24,7 @@ class SurfacePoints(NamedTuple):
     weights: np.ndarray
     """Shares of the nodes, [s, 4]; they sum to 1."""
     inward: np.ndarray
-    """What to add to a node's number for the node under it, in the tissue, [s]."""
+    """Difference of the numbers of the node under it, in the tissue, and of the node itself, [s]."""
 
 
 class BrickGrid:

@@ -18,7 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from surgical_marl.physics.systems.brick import FULL, LOWER, Brick, Cell, inverse_symmetric, to_modes
+from surgical_marl.physics.solver.cholesky import FULL, LOWER
+from surgical_marl.physics.systems.brick import Brick, Cell, inverse_symmetric, to_modes
 from surgical_marl.physics.systems.brick_grid import BrickGrid
 
 LEFT, SHORTEST = 0.4, 1 / 16
@@ -35,7 +36,7 @@ class Nodes(NamedTuple):
 
 
 class Support(NamedTuple):
-    """What holds the nodes: constants, [n]."""
+    """Supports of the nodes: constants, [n]."""
 
     fixed: np.ndarray
     """Which do not move, bool."""

@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from surgical_marl.physics.solver.cholesky import packed
+from surgical_marl.physics.solver.cholesky import FULL, LOWER
 
 GRAVITY = np.array([0.0, 0.0, -9.81], np.float32)
 ENOUGH = 1e-8
@@ -36,9 +36,6 @@ KINKING = 100.0
 """Compliance of an edge under compression, relative to that under tension: a thread kinks where it is pushed along
 itself, at loads that edges of this length can't show, as they are straight."""
 _EYE = np.eye(3, dtype=np.float32)
-_FULL = packed(3)
-"""Where each element of a symmetric matrix [3, 3] is among its lower half, row by row."""
-_LOWER = np.tril_indices(3)
 
 
 class Rod(NamedTuple):
@@ -175,7 +172,7 @@ def solve(rod: Rod, factors: Factors, force: Array, holds: Any) -> Array:
     def forward(carry: tuple[Array, Array], row: Any) -> tuple[tuple[Array, Array], Array]:
         factor, skip, force = row
         right, later = carry[0] + force, carry[1]
-        reduced = jnp.append(factor.own[_FULL] @ right, -factor.tight @ right)
+        reduced = jnp.append(factor.own[FULL] @ right, -factor.tight @ right)
         return (later - factor.one @ right, -skip * reduced[:3]), reduced
 
     none = jnp.zeros(3)
@@ -201,8 +198,8 @@ def _eliminate(
         slack = holds * (compliance * q - (length - length_at_rest)) + (1 - holds) * q
         # Tension resists what moves across an edge. Compression is left out, as the matrix has to stay definite.
         across = holds * jnp.maximum(q, 0.0) / length * (_EYE - jnp.outer(along, along))
-        block = block + load.own[_FULL] + across + (inertia + stiffness * (bends_1 + 4 * bends + bends_2)) * _EYE
-        meets = meets + load.across[_FULL] - across - 2 * stiffness * (bends + bends_2) * _EYE
+        block = block + load.own[FULL] + across + (inertia + stiffness * (bends_1 + 4 * bends + bends_2)) * _EYE
+        meets = meets + load.across[FULL] - across - 2 * stiffness * (bends + bends_2) * _EYE
         skip = stiffness * bends_2
         inverse = _inverse(block)
         gives = inverse @ along
@@ -221,7 +218,7 @@ def _eliminate(
             ),
             (-skip * skip * own, -skip * reduced[:3]),
         )
-        return carry, (Factors(own[_LOWER], tight, over, one, pulled), reduced)
+        return carry, (Factors(own[LOWER], tight, over, one, pulled), reduced)
 
     none, empty = jnp.zeros(3), jnp.zeros((3, 3))
     start = (none, none, none), (empty, empty, none), (empty, none)
@@ -235,7 +232,7 @@ def _back(rod: Rod, bends: Any, factors: Factors, reduced: Array) -> tuple[Array
 
     def node(carry: tuple[Array, Array, Array], row: Any) -> tuple[tuple[Array, Array, Array], Array]:
         (next_1, next_2, most), (factor, skip, reduced) = carry, row
-        moved = reduced[:3] - factor.one.T @ next_1 - skip * (factor.own[_FULL] @ next_2)
+        moved = reduced[:3] - factor.one.T @ next_1 - skip * (factor.own[FULL] @ next_2)
         tension = reduced[3] + factor.pulled @ next_1 + skip * (factor.tight @ next_2)
         return (moved, next_1, jnp.maximum(most, jnp.max(jnp.abs(moved)))), jnp.append(moved, tension)
 
@@ -251,7 +248,7 @@ def _skips(rod: Rod, bends: Any) -> Any:
 
 def _inverse(matrix: Array) -> Array:
     """Return the inverse of a positive definite matrix [3, 3] by L D L^T, stable where rows differ in size."""
-    a, b, c, d, e, f = (matrix[i, j] for i, j in zip(*_LOWER, strict=True))
+    a, b, c, d, e, f = (matrix[i, j] for i, j in zip(*LOWER, strict=True))
     p = 1 / a
     m, n = b * p, d * p
     q = 1 / jnp.maximum(c - m * b, 1e-7 * c)
@@ -259,7 +256,7 @@ def _inverse(matrix: Array) -> Array:
     r = 1 / jnp.maximum(f - n * d - s * (e - n * b), 1e-7 * f)
     t = m * s - n  # L^-1 has -m, t and -s below its diagonal
     low = jnp.stack([p + m * m * q + t * t * r, -m * q - t * s * r, q + s * s * r, t * r, -s * r, r])
-    return low[_FULL]
+    return low[FULL]
 
 
 def _after(x: Any) -> Any:

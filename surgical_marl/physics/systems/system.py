@@ -66,9 +66,9 @@ class End(NamedTuple):
     sliding: Array
     """Coefficient of friction."""
     bilateral: Array
-    """Whether it ties both together: it pulls too, and does not slip."""
+    """True of a tie, which pulls too and does not slip."""
     shift: Array
-    """How far the shape moves in the step if it accelerates as in the last one, m, [..., 3]."""
+    """Displacement of the shape in the step if it accelerates as in the last one, m, [..., 3]."""
     stretch: Array
     """Of the spring along the surface at the start of the step, m, [..., 3]; 0 if nothing is remembered."""
 
@@ -124,7 +124,7 @@ class System(ABC):
 
     @property
     def bars(self) -> Bars | None:
-        """What pictures show of it; None for nothing."""
+        """Return capsules that pictures show; None for nothing."""
         return None
 
     @property

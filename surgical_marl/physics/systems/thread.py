@@ -18,8 +18,8 @@ import numpy as np
 from jax import Array
 
 from surgical_marl.content import unknown
-from surgical_marl.physics.contact.spring_contact import Stretches, each, feel, none, recall, remember
-from surgical_marl.physics.solver.cholesky import packed
+from surgical_marl.physics.contact.spring_contact import Stretches, each, feel, none, pushes, recall, remember
+from surgical_marl.physics.solver.cholesky import FULL, LOWER
 from surgical_marl.physics.systems import crossings
 from surgical_marl.physics.systems.chain import ChainState, Factors, Loaded, Newton, Rod, free_forces, search, solve
 from surgical_marl.physics.systems.crossings import Joined
@@ -35,8 +35,6 @@ SPARE = 24
 """Room for contacts beyond one for each edge: a thread may lie on a board, and be held by jaws too."""
 TAIL = "tail"
 """The site of a needle that a thread is fastened to."""
-_LOWER = np.tril_indices(3)
-_FULL = packed(3)
 
 
 class ThreadState(NamedTuple):
@@ -60,7 +58,7 @@ class ThreadView(NamedTuple):
     tension: Array
     """Of the edges between nodes, N, [n - 1]; negative where a stiff one is compressed."""
     broken: Array
-    """Whether it has been torn, [] bool."""
+    """True once an edge has been torn, [] bool."""
 
 
 class Solved(NamedTuple):
@@ -200,16 +198,16 @@ class Thread(System):
             del row
             felt = feel(end, _point(end, found.shift) - end.shift)
             force = felt.force - felt.stiffness @ _point(end, found.change[:, :3])
-            return -force, felt.stiffness[_LOWER]
+            return -force, felt.stiffness[LOWER]
 
         force, falls = each(ends, at_end, moving=True)
         return Response(force, Solved(found, ends, pairs, falls, holds))
 
     def yielding(self, response: Response, ends: Ends, accelerations: Array, dt: Any) -> Array:
-        pushes, change = self._carried(response.solved, accelerations, dt)
+        pushed, change = self._carried(response.solved, accelerations, dt)
 
         def eased(row: Array, end: End) -> Array:
-            return pushes[row] - response.solved.falls[row][_FULL] @ _point(end, change[:, :3])
+            return pushed[row] - response.solved.falls[row][FULL] @ _point(end, change[:, :3])
 
         found: Array = each(ends, eased, moving=True)
         return found
@@ -243,18 +241,16 @@ class Thread(System):
     def _carried(self, solved: Solved, accelerations: Array, dt: Any) -> tuple[Array, Array]:
         """Return what the ends add to the step by accelerating: pushes, N, [c, 3], and changes of unknowns, [n, 4]."""
         ends, n = solved.ends, self.nodes
-        pushes: Array = each(
-            ends, lambda row, end: dt * dt * (solved.falls[row][_FULL] @ accelerations[row]), moving=True
-        )
+        pushed = pushes(ends, solved.falls, accelerations, dt)
 
         def add(row: Array, sums: Array) -> Array:
             end = row_of(ends.rows, row)
-            return _spread(sums, end.part, (1 - end.share) * pushes[row], end.share * pushes[row])
+            return _spread(sums, end.part, (1 - end.share) * pushed[row], end.share * pushed[row])
 
         forces = jax.lax.fori_loop(0, ends.moving, add, jnp.zeros((n, 3)))
         newton, pairs = solved.newton, solved.pairs
         change = solve(self.rod, newton.factors, forces, solved.holds)
-        return pushes, jax.lax.cond(
+        return pushed, jax.lax.cond(
             pairs.total > 0,
             lambda: crossings.add(pairs, newton.shift, newton.joined, change),
             lambda: change,
@@ -294,7 +290,7 @@ def _load(ends: Ends, u: Array) -> Loaded:
     def add(row: Array, sums: Loaded) -> Loaded:
         end = row_of(ends.rows, row)
         felt = feel(end, _point(end, u) - end.shift)
-        first, second, falls = 1 - end.share, end.share, felt.stiffness[_LOWER]
+        first, second, falls = 1 - end.share, end.share, felt.stiffness[LOWER]
         return Loaded(
             _spread(sums.force, end.part, first * felt.force, second * felt.force),
             _spread(sums.own, end.part, first * first * falls, second * second * falls),

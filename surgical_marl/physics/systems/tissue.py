@@ -17,8 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from surgical_marl.physics.contact.spring_contact import Stretches, each, feel, none, recall, remember
-from surgical_marl.physics.systems.brick import FULL, LOWER, Brick
+from surgical_marl.physics.contact.spring_contact import Stretches, each, feel, none, pushes, recall, remember
+from surgical_marl.physics.solver.cholesky import FULL, LOWER
+from surgical_marl.physics.systems.brick import Brick
 from surgical_marl.physics.systems.brick_grid import BrickGrid, SurfacePoints
 from surgical_marl.physics.systems.brick_solve import BrickSolver, Linear, Nodes, Springs, Support
 from surgical_marl.physics.systems.system import Bars, End, Ends, Response, Shapes, System
@@ -46,7 +47,7 @@ class TissueState(NamedTuple):
     place: Array
     """Where that was, m, [3]."""
     torn: Array
-    """Whether it has been stretched past what it bears, [] bool."""
+    """True once it has been stretched past `tears`, [] bool."""
 
 
 class TissueView(NamedTuple):
@@ -61,7 +62,7 @@ class TissueView(NamedTuple):
     place: Array
     """Where that is, m, [3]; the origin if nothing touches it."""
     torn: Array
-    """Whether it has been stretched past what it bears, [] bool."""
+    """True once it has been stretched past `tears`, [] bool."""
 
 
 class Solved(NamedTuple):
@@ -203,12 +204,14 @@ class Tissue(System):
         return Response(-force, Solved(u, motion.block, ends, force, falls))
 
     def yielding(self, response: Response, ends: Ends, accelerations: Array, dt: Any) -> Array:
-        return self._pushes(response.solved, accelerations, dt)
+        return pushes(response.solved.ends, response.solved.falls, accelerations, dt)
 
     def apply(self, state: TissueState, response: Response, ends: Ends, accelerations: Array, dt: Any) -> TissueState:
         own, parts = response.solved, len(self.points.nodes)
         u = jax.lax.cond(
-            own.ends.moving > 0, lambda: self._carried(own, self._pushes(own, accelerations, dt)), lambda: own.shift
+            own.ends.moving > 0,
+            lambda: self._carried(own, pushes(own.ends, own.falls, accelerations, dt)),
+            lambda: own.shift,
         )
         u = self.solver.shortened(state.nodes, u)
         stretches = remember(
@@ -265,14 +268,7 @@ class Tissue(System):
         found: Array = along * jnp.eye(3) + (normal - along) * jnp.outer(end.normal, end.normal)
         return found[LOWER]
 
-    def _pushes(self, solved: Solved, accelerations: Array, dt: Any) -> Array:
-        """Return what ends that accelerate push in addition, N, [c, 3]."""
-        found: Array = each(
-            solved.ends, lambda row, end: dt * dt * (solved.falls[row][FULL] @ accelerations[row]), moving=True
-        )
-        return found
-
-    def _carried(self, solved: Solved, pushes: Array) -> Array:
+    def _carried(self, solved: Solved, pushed: Array) -> Array:
         """Return the displacements of the nodes with additional forces at contacts, m, [n, 3]."""
         free = jnp.asarray(self.solver.free)
 
@@ -280,7 +276,7 @@ class Tissue(System):
             nodes, weights = self._nodes(row_of(solved.ends.rows, row))
             own = (solved.block[nodes, 0] + solved.block[nodes, 2] + solved.block[nodes, 5]) / 3
             for node, share in zip(nodes, weights * free[nodes] / own, strict=True):
-                u = u.at[node].add(share * pushes[row], mode="promise_in_bounds")
+                u = u.at[node].add(share * pushed[row], mode="promise_in_bounds")
             return u
 
         found: Array = jax.lax.fori_loop(0, solved.ends.moving, add, solved.shift)
