@@ -134,7 +134,7 @@ def learn_all(jobs: list[Job], path: Path, arguments: argparse.Namespace) -> int
     """Make all runs that have no line yet, as far as time allows; return how many failed."""
     began, failed = time.monotonic(), 0
     free: queue.Queue[int | None] = queue.Queue()
-    for gpu in range(arguments.gpus) or [None]:
+    for gpu in [*range(arguments.gpus)] * arguments.each or [None]:
         free.put(gpu)
 
     def one(job: Job) -> tuple[Job, dict[str, Any] | str]:
@@ -165,7 +165,8 @@ def learn_all(jobs: list[Job], path: Path, arguments: argparse.Namespace) -> int
 def main(argv: list[str] | None = None) -> int:
     parser = make_parser(__doc__, usage="%(prog)s [options] [key=value ...]")
     parser.add_argument("--out", type=Path, default=Path("runs/control"), metavar="DIR", help="(%(default)s)")
-    parser.add_argument("--gpus", type=whole(0), default=0, metavar="N", help="runs at once, one a GPU; 0: on the CPU")
+    parser.add_argument("--gpus", type=whole(0), default=0, metavar="N", help="GPUs; 0: on the CPU")
+    parser.add_argument("--each", type=whole(1), default=1, metavar="N", help="runs that share a GPU (%(default)s)")
     parser.add_argument("--seeds", type=whole(1), default=3, metavar="N", help="0 to N - 1 (%(default)s)")
     parser.add_argument("--tasks", nargs="+", choices=SCENES, default=list(SCENES), help="some of them")
     parser.add_argument("--limit", type=float, default=300.0, metavar="SECONDS", help="of a run (%(default)s)")
