@@ -151,6 +151,8 @@ def _package(code: Any) -> str:
 def code_digest(modules: frozenset[str]) -> str:
     """Return a hash of the source of modules of this package and of all that they import, directly or not, of it.
 
+    CUDA code belongs to all modules in its folder.
+
     Args:
         modules: names, as in "surgical_marl.tasks.reach".
     """
@@ -165,9 +167,19 @@ def code_digest(modules: frozenset[str]) -> str:
 
 @functools.cache
 def _read(path: Path) -> tuple[str, list[str]]:
-    """Return the hash of a source file, and the names that it may import: of modules, and of objects in modules."""
-    source = path.read_bytes()
-    return hashlib.sha256(source).hexdigest(), list(_imported(source.decode(errors="replace")))
+    """Return the hash of a source file with the CUDA code beside it, and the names that it may import.
+
+    These are of modules, and of objects in modules.
+    """
+    source, digest = path.read_bytes(), hashlib.sha256()
+    for part in (source, *_cuda_code(path.parent)):
+        digest.update(len(part).to_bytes(8, "little") + part)
+    return digest.hexdigest(), list(_imported(source.decode(errors="replace")))
+
+
+@functools.cache
+def _cuda_code(folder: Path) -> list[bytes]:
+    return [file.read_bytes() for file in sorted(folder.glob("*.cu"))]
 
 
 def _imported(text: str) -> Iterator[str]:

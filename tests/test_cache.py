@@ -54,6 +54,17 @@ def test_a_kernel_is_keyed_by_the_code_that_it_comes_from(
     assert (cache.code_digest(modules) != before) == matters
 
 
+def test_a_module_is_keyed_by_the_cuda_code_beside_it(tmp_path: Path) -> None:
+    (tmp_path / "solve.py").write_text("x = 1\n")
+    found = []
+    for code in (None, "x;", "y;"):
+        if code:
+            (tmp_path / "kernel.cu").write_text(code)
+        cache._cuda_code.cache_clear()
+        found.append(cache._read.__wrapped__(tmp_path / "solve.py")[0])  # type: ignore[attr-defined]
+    assert len(set(found)) == 3
+
+
 def held(value: Any) -> Callable[[], Any]:
     """Return a function that looks as if it were of this package, and holds a value."""
     function = lambda: value  # noqa: E731

@@ -132,8 +132,21 @@ class BrickSolver:
         """Mass, stiffness of the support and freedom (0 or 1) of each node, [n]."""
         return jnp.asarray(self.grid.mass), jnp.asarray(self.support.stiffness), jnp.asarray(self.free)
 
-    def displacements(self, linear: Linear, springs: Springs | None, guess: Array, dt: Any) -> Array:
-        """Return the displacements of the nodes in a step, m, [n, 3], from a guess that leaves what is fixed."""
+    def displacements(
+        self, linear: Linear, springs: Springs | None, guess: Array, dt: Any, iterations: Any = None,
+        enough: float = 0.0,
+    ) -> Array:  # fmt: skip
+        """Return the displacements of the nodes in a step, m, [n, 3].
+
+        Args:
+            linear: the step's equations.
+            springs: at points of the tissue.
+            guess: displacements that leave what is fixed.
+            dt: duration of the step, s.
+            iterations: most conjugate gradients; None for those of the solver.
+            enough: residual at which they stop, in the norm of the inverse of the nodes' own blocks, J.
+        """
+        most = self.iterations if iterations is None else iterations
         free, right, block = jnp.asarray(self.free), linear.force, linear.block
         if springs is not None:
             right, block = _with_springs(springs, right, block)
@@ -154,8 +167,12 @@ class BrickSolver:
         rows = right, matrix(guess, start), free, inverse, linear.inertia
         rz, (residual, p, ap) = jax.lax.scan(begin, jnp.float32(0.0), rows)
 
-        def iterate(_: Any, found: tuple[Array, ...]) -> tuple[Array, ...]:
-            u, residual, p, ap, rz = found
+        def goes_on(found: Any) -> Array:
+            done, *_, rz = found
+            return (done < most) & (rz > enough)
+
+        def iterate(found: Any) -> Any:
+            done, u, residual, p, ap, rz = found
 
             def project(sums: tuple[Array, Array], row: Any) -> tuple[tuple[Array, Array], Array]:
                 own, p, free, inertia = row
@@ -180,9 +197,9 @@ class BrickSolver:
                 return p, inertia * p
 
             p, ap = jax.lax.map(turn, (residual, p, inverse, linear.inertia))
-            return u, residual, p, ap, after
+            return done + 1, u, residual, p, ap, after
 
-        found: Array = jax.lax.fori_loop(0, self.iterations, iterate, (guess, residual, p, ap, rz))[0]
+        found: Array = jax.lax.while_loop(goes_on, iterate, (jnp.int32(0), guess, residual, p, ap, rz))[1]
         return found
 
     def _elastic(self, cells: Cell, p: Array, sums: Array, dt: Any) -> Array:

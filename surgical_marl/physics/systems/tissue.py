@@ -17,20 +17,17 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from surgical_marl.physics.contact.spring_contact import Stretches, each, feel, none, pushes, recall, remember
-from surgical_marl.physics.solver.cholesky import FULL, LOWER
+from surgical_marl.physics.contact.spring_contact import Stretches, each, none, pushes, recall, remember
 from surgical_marl.physics.systems.brick import Brick
 from surgical_marl.physics.systems.brick_grid import BrickGrid, SurfacePoints
-from surgical_marl.physics.systems.brick_solve import BrickSolver, Linear, Nodes, Springs, Support
-from surgical_marl.physics.systems.system import Bars, End, Ends, Response, Shapes, System
+from surgical_marl.physics.systems.brick_solve import BrickSolver, Nodes, Support
+from surgical_marl.physics.systems.system import Bars, Ends, Response, Shapes, System
+from surgical_marl.physics.systems.tissue_step import Answer, Held, TissueStep
 from surgical_marl.physics.tree_utils import row_of
 from surgical_marl.scenes.objects import Placement, Surface
 from surgical_marl.scenes.tissue_file import TissueFile
 from surgical_marl.untrusted.schema import Place
 
-ROUNDS, ITERATIONS = 4, 3
-"""Linearisations of contacts in a physics step, and conjugate gradients after each. With fewer, friction overshoots
-where it begins to slide."""
 ROOM = 48
 """Most contacts at a time."""
 SKIN = 0.1
@@ -68,16 +65,11 @@ class TissueView(NamedTuple):
 class Solved(NamedTuple):
     """A step of tissue whose contacts' ends move as expected."""
 
-    shift: Array
-    """Displacements of the nodes, m, [n, 3]."""
-    block: Array
-    """Each node's own block of the matrix, N/m, lower half, [n, 6]."""
+    answer: Answer
+    held: Held
+    """The points of contacts."""
     ends: Ends
     """With the stretches that are remembered."""
-    force: Array
-    """Of each contact on the tissue, N, [c, 3]."""
-    falls: Array
-    """Of that force as the end moves, with what the tissue at its point gives way, N/m: lower halves, [c, 6]."""
 
 
 @dataclass(frozen=True)
@@ -145,7 +137,7 @@ class Tissue(System):
         for name, per_area in self.springs:
             stiffness += per_area * grid.areas(name)
         support = Support(fixed, stiffness.astype(np.float32), self.rest)
-        return BrickSolver(grid, Brick(grid.cell, self.young, self.poisson), support, self.damping, ITERATIONS)
+        return BrickSolver(grid, Brick(grid.cell, self.young, self.poisson), support, self.damping)
 
     @cached_property
     def points(self) -> SurfacePoints:
@@ -187,99 +179,38 @@ class Tissue(System):
         radius = np.full(len(self.points.nodes), SKIN * self.grid.cell[2], np.float32)
         return Shapes(centre, centre, radius, speed)
 
-    def free_motion(self, state: TissueState, dt: Any) -> Linear:
-        """Return the step's linear equations without contacts."""
-        return self.solver.linearise(state.nodes, dt)
+    def free_motion(self, state: TissueState, dt: Any) -> tuple[()]:
+        """Return nothing: one stage has all forces."""
+        return ()
 
-    def respond(self, state: TissueState, motion: Linear, ends: Ends, dt: Any) -> Response:
-        ends = recall(state.stretches, ends, len(self.points.nodes))
-
-        def improve(_: Any, found: tuple[Array, Array]) -> tuple[Array, Array]:
-            felt = self._springs(ends, found[0])
-            u = self.solver.displacements(motion, felt, found[0], dt)
-            return u, self._forces(ends, felt, u)
-
-        u, force = jax.lax.fori_loop(0, ROUNDS, improve, (motion.guess, jnp.zeros((ROOM, 3))))
-        falls = each(ends, lambda row, end: self._eased(end, u, motion.block), moving=True)
-        return Response(-force, Solved(u, motion.block, ends, force, falls))
+    def respond(self, state: TissueState, motion: Any, ends: Ends, dt: Any) -> Response:
+        ends, held = recall(state.stretches, ends, len(self.points.nodes)), self._held(ends)
+        answer = self._step(dt).respond(state.nodes, held, ends)
+        return Response(-answer.force, Solved(answer, held, ends))
 
     def yielding(self, response: Response, ends: Ends, accelerations: Array, dt: Any) -> Array:
-        return pushes(response.solved.ends, response.solved.falls, accelerations, dt)
+        return pushes(response.solved.ends, response.solved.answer.falls, accelerations, dt)
 
     def apply(self, state: TissueState, response: Response, ends: Ends, accelerations: Array, dt: Any) -> TissueState:
-        own, parts = response.solved, len(self.points.nodes)
-        u = jax.lax.cond(
-            own.ends.moving > 0,
-            lambda: self._carried(own, pushes(own.ends, own.falls, accelerations, dt)),
-            lambda: own.shift,
-        )
-        u = self.solver.shortened(state.nodes, u)
+        answer, held, ends = response.solved
+        pushed = pushes(ends, answer.falls, accelerations, dt)
+        after = self._step(dt).move(state.nodes, held, ends, answer, pushed)
         stretches = remember(
-            own.ends, lambda row, end: self._point(end, u) - end.shift - dt * dt * accelerations[row], parts
+            ends, lambda row, end: after.points[row] - end.shift - dt * dt * accelerations[row], len(self.points.nodes)
         )
-        nodes = self.solver.moved(state.nodes, u, dt)
-        torn = state.torn if self.tears is None else state.torn | self.solver.stretched(nodes.position, self.tears)
-        return TissueState(nodes, stretches, *hardest(own.ends, own.force), torn)
+        nodes, torn = Nodes(after.position, after.velocity), state.torn | after.torn
+        return TissueState(nodes, stretches, *hardest(ends, answer.force), torn)
 
     def view(self, state: TissueState) -> TissueView:
         return TissueView(*state.nodes, state.force, state.place, state.torn)
 
-    def _nodes(self, end: End) -> tuple[Array, Array]:
-        """Return the nodes [4] of the point of a contact, and their shares [4]."""
-        return jnp.asarray(self.points.nodes)[end.part], jnp.asarray(self.points.weights)[end.part]
+    def _step(self, dt: Any) -> TissueStep:
+        return TissueStep(self.solver, self.tears, dt)
 
-    def _point(self, end: End, u: Array) -> Array:
-        """Return the displacement [3] of the point of a contact by those of the nodes, [n, 3]."""
-        nodes, weights = self._nodes(end)
-        return weights @ u[nodes]
-
-    def _springs(self, ends: Ends, u: Array) -> Springs:
-        """Return the forces of contacts, linearised at displacements u, m, [n, 3]."""
-
-        def spring(row: Array, end: End) -> tuple[Array, Array, Array, Array]:
-            del row
-            moved = self._point(end, u)
-            felt = feel(end, moved - end.shift)
-            return *self._nodes(end), felt.force + felt.stiffness @ moved, felt.stiffness[LOWER]
-
-        nodes, weights, force, stiffness = each(ends, spring)
-        return Springs(nodes, weights, force, stiffness, ends.total)
-
-    def _forces(self, ends: Ends, springs: Springs, u: Array) -> Array:
-        """Return the forces of linearised contacts on the tissue, N, [c, 3]."""
-        found: Array = each(
-            ends, lambda row, end: springs.force[row] - springs.stiffness[row][FULL] @ self._point(end, u)
-        )
-        return found
-
-    def _eased(self, end: End, u: Array, block: Array) -> Array:
-        """Return by how much the force of a contact falls as its end moves, N/m, lower half, [6].
-
-        The contact's spring is in series with the tissue at its point, whose stiffness is that of the nodes' own
-        blocks: the nodes around these stay.
-        """
-        nodes, weights = self._nodes(end)
-        stiffness = feel(end, self._point(end, u) - end.shift).stiffness
-        normal = end.normal @ stiffness @ end.normal
-        along = (jnp.trace(stiffness) - normal) / 2
-        own = (block[nodes, 0] + block[nodes, 2] + block[nodes, 5]) / 3
-        gives = jnp.sum(weights * weights * jnp.asarray(self.solver.free)[nodes] / own)
-        normal, along = (k / (1 + k * gives) for k in (normal, along))
-        found: Array = along * jnp.eye(3) + (normal - along) * jnp.outer(end.normal, end.normal)
-        return found[LOWER]
-
-    def _carried(self, solved: Solved, pushed: Array) -> Array:
-        """Return the displacements of the nodes with additional forces at contacts, m, [n, 3]."""
-        free = jnp.asarray(self.solver.free)
-
-        def add(row: Array, u: Array) -> Array:
-            nodes, weights = self._nodes(row_of(solved.ends.rows, row))
-            own = (solved.block[nodes, 0] + solved.block[nodes, 2] + solved.block[nodes, 5]) / 3
-            for node, share in zip(nodes, weights * free[nodes] / own, strict=True):
-                u = u.at[node].add(share * pushed[row], mode="promise_in_bounds")
-            return u
-
-        found: Array = jax.lax.fori_loop(0, solved.ends.moving, add, solved.shift)
+    def _held(self, ends: Ends) -> Held:
+        """Return the points of contacts."""
+        nodes, weights = jnp.asarray(self.points.nodes), jnp.asarray(self.points.weights)
+        found: Held = each(ends, lambda row, end: Held(nodes[end.part], weights[end.part]))
         return found
 
 

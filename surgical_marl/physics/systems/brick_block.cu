@@ -1,0 +1,58 @@
+// What the threads of a block have in common: nodes and bricks that they share, and sums over all of them.
+// A thread has bricks thread, thread + threads, ..., and nodes likewise: EACH gives its own ones, and their numbers.
+// With one thread this is also code for a CPU.
+#ifdef __CUDA_ARCH__
+#define UNROLL _Pragma("unroll")
+#else
+#define UNROLL
+#endif
+#define EACH(own, number, count) \
+    UNROLL for (int own = 0; own < ((count) + threads - 1) / threads; own++) \
+        if (const int number = thread + own * threads; number < (count))
+enum { BRICKS_EACH = (BRICKS + threads - 1) / threads, NODES_EACH = (NODES + threads - 1) / threads };
+
+struct Block {
+    // Sums up two numbers of each thread. Calls that follow each other take different boxes of 64 numbers.
+    static __device__ void sum(float *pair, float *box) {
+#ifdef __CUDA_ARCH__
+        for (int i = 0; i < 2; i++) {
+            for (int far = 16; far > 0; far /= 2) pair[i] += __shfl_xor_sync(~0u, pair[i], far);
+            if (threadIdx.x % 32 == 0) box[32 * i + threadIdx.x / 32] = pair[i];
+        }
+        __syncthreads();
+        for (int i = 0; i < 2; i++) {
+            pair[i] = 0.0f;
+            for (int warp = 0; warp < threads / 32; warp++) pair[i] += box[32 * i + warp];
+        }
+#endif
+    }
+    // The nodes of a brick: places [n, 3] that begin at its first one become [8, 3].
+    static __device__ void corners(const float *first, float *found) {
+        UNROLL
+        for (int node = 0; node < 8; node++) {
+            const float *own = first + 3 * ((node & 4 ? STRIDE_X : 0) + (node & 2 ? STRIDE_Y : 0) + (node & 1));
+            UNROLL
+            for (int i = 0; i < 3; i++) found[3 * node + i] = own[i];
+        }
+    }
+    static __device__ float mean(const float *lower) { return (lower[0] + lower[2] + lower[5]) / 3; }
+    // The place of a point on nodes, times its shares.
+    static __device__ void point(const float *x, const int *nodes, const float *weights, float *found) {
+        for (int i = 0; i < 3; i++) found[i] = 0.0f;
+        for (int k = 0; k < HELD; k++)
+            for (int i = 0; i < 3; i++) found[i] += weights[k] * x[3 * nodes[k] + i];
+    }
+};
+
+// Which contacts hang on each node: a chain of numbers HELD * row + k for each, that ends with -1.
+struct Hung {
+    static __device__ void link(const int *nodes, const float *weights, int rows, int node, short *first, short *next) {
+        int last = -1;
+        first[node] = -1;
+        for (int k = 0; k < HELD * rows; k++)
+            if (nodes[k] == node && weights[k] != 0.0f) {
+                (last < 0 ? first[node] : next[last]) = (short)k;
+                next[last = k] = -1;
+            }
+    }
+};

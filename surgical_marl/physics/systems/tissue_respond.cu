@@ -1,0 +1,197 @@
+// The step of tissue_step.py's `respond`: bricks are linearised, then contacts, and conjugate gradients follow, in rounds.
+__shared__ float p[3 * NODES], each[PAD * BRICKS], right[3 * NODES], block[6 * NODES];
+__shared__ float force[3 * ROOM], stiffness[6 * ROOM], pull[3 * ROOM], weights[HELD * ROOM], box[2][64];
+__shared__ int nodes[HELD * ROOM];
+__shared__ short first[NODES], next[HELD * ROOM];
+
+struct Contact {
+    float normal[3], shift[3], stretch[3], depth, stiffness, sliding;
+    bool both;
+
+    // Spring_contact.py's `feel`: force and stiffness, lower half, of a point that moves by this much.
+    __device__ void feel(const float *point, float *force, float *falls) const {
+        float moved[3], slid[3];
+        for (int i = 0; i < 3; i++) moved[i] = point[i] - shift[i];
+        const float along = Vector::dot(normal, moved), reach = depth - along, off = Vector::dot(normal, stretch);
+        const float pressing = stiffness * (both ? reach : fmaxf(reach, 0.0f));
+        for (int i = 0; i < 3; i++) slid[i] = stretch[i] - normal[i] * off + moved[i] - normal[i] * along;
+        const float secant = both ? stiffness : fminf(stiffness, sliding * pressing / Vector::size(slid));
+        const float pressed = both || reach > 0 ? stiffness : 0.0f;
+        for (int i = 0, k = 0; i < 3; i++) {
+            force[i] = pressing * normal[i] - secant * slid[i];
+            for (int j = 0; j <= i; j++, k++) falls[k] = (i == j ? secant : 0.0f) + (pressed - secant) * normal[i] * normal[j];
+        }
+    }
+};
+
+const auto contact = [&](int c) {
+    Contact own;
+    for (int i = 0; i < 3; i++) {
+        own.normal[i] = in.ends_rows_normal[3 * c + i];
+        own.shift[i] = in.ends_rows_shift[3 * c + i];
+        own.stretch[i] = in.ends_rows_stretch[3 * c + i];
+    }
+    own.depth = in.ends_rows_depth[c], own.stiffness = in.ends_rows_stiffness[c], own.sliding = in.ends_rows_sliding[c];
+    own.both = in.ends_rows_bilateral[c];
+    return own;
+};
+const float stiffer = in.stiffer[0], blend = stiffer * BLEND;
+const int rows = in.ends_total[0], moving = in.ends_moving[0];
+Brick brick[BRICKS_EACH];
+float u[NODES_EACH][3], residual[NODES_EACH][3], inverse[NODES_EACH][6], inertia[NODES_EACH], free[NODES_EACH];
+
+for (int k = thread; k < HELD * rows; k += threads) nodes[k] = in.held_nodes[k], weights[k] = in.held_weights[k];
+for (int k = thread; k < 3 * NODES; k += threads) p[k] = in.nodes_position[k];
+__syncthreads();
+
+// forces at the start, and each node's own block of the matrix
+EACH(a, e, BRICKS) {
+    float x[24];
+    Block::corners(p + 3 * in.mesh_bricks[e], x);
+    brick[a].deform(x, stiffer);
+    for (int i = 0; i < 24; i++) each[PAD * e + i] = x[i];
+}
+__syncthreads();
+EACH(a, n, NODES) {
+    const float mass = in.mesh_mass[n], support = in.mesh_support[n];
+    free[a] = in.mesh_free[n];
+    inertia[a] = mass / (DT * DT) + support;
+    Hung::link(nodes, weights, rows, n, first, next);
+    for (int i = 0; i < 3; i++) {
+        const float v = in.nodes_velocity[3 * n + i];
+        float sum = mass * (v / DT + (i == 2 ? GRAVITY : 0.0f)) - support * (p[3 * n + i] - in.mesh_rest[3 * n + i]);
+        for (int k = 0; k < 8; k++) {
+            const int at = in.mesh_around[8 * n + k];
+            if (at >= 0) sum += each[at + i];
+        }
+        right[3 * n + i] = sum;
+        u[a][i] = free[a] * DT * v;
+    }
+}
+__syncthreads();
+EACH(a, e, BRICKS)
+    for (int node = 0; node < 4; node++) brick[a].block(node, blend, each + PAD * e + 6 * node);
+__syncthreads();
+EACH(a, n, NODES) {
+    float sum[6] = {inertia[a], 0.0f, inertia[a], 0.0f, 0.0f, inertia[a]};
+    for (int k = 0; k < 8; k++) {
+        const int at = in.mesh_around[8 * n + k];
+        const int pair = at % PAD / 3, own = at - at % PAD + 6 * (pair < 4 ? pair : 7 - pair);
+        if (at >= 0)
+            for (int i = 0; i < 6; i++) sum[i] += each[own + i];
+    }
+    for (int i = 0; i < 6; i++) block[6 * n + i] = sum[i];
+    for (int i = 0; i < 3; i++) p[3 * n + i] = u[a][i];
+}
+__syncthreads();
+
+const int rounds = rows > 0 ? ROUNDS : 1, iterations = rows > 0 ? TURNS : ALONE;
+for (int round = 0; round < rounds; round++) {
+    float sums[2] = {0.0f, 0.0f};
+    for (int c = thread; c < rows; c += threads) {
+        const Contact own = contact(c);
+        float moved[3];
+        Block::point(p, nodes + HELD * c, weights + HELD * c, moved);
+        own.feel(moved, force + 3 * c, stiffness + 6 * c);
+        Symmetric::times(stiffness + 6 * c, moved, pull + 3 * c);
+        for (int i = 0; i < 3; i++) force[3 * c + i] += pull[3 * c + i];
+    }
+    for (int iteration = -1; iteration < iterations; iteration++) {
+        // the matrix times p: first what bricks and contacts add
+        EACH(a, e, BRICKS) {
+            float x[24];
+            Block::corners(p + 3 * in.mesh_bricks[e], x);
+            brick[a].product(x, blend);
+            for (int i = 0; i < 24; i++) each[PAD * e + i] = x[i];
+        }
+        if (iteration >= 0)
+            for (int c = thread; c < rows; c += threads) {
+                float moved[3];
+                Block::point(p, nodes + HELD * c, weights + HELD * c, moved);
+                Symmetric::times(stiffness + 6 * c, moved, pull + 3 * c);
+            }
+        __syncthreads();
+        float ap[NODES_EACH][3], pap[2] = {0.0f, 0.0f}, after[2] = {0.0f, 0.0f};
+        EACH(a, n, NODES) {
+            const float *own = p + 3 * n;
+            for (int i = 0; i < 3; i++) ap[a][i] = inertia[a] * own[i];
+            for (int k = 0; k < 8; k++) {
+                const int at = in.mesh_around[8 * n + k];
+                if (at >= 0)
+                    for (int i = 0; i < 3; i++) ap[a][i] += each[at + i];
+            }
+            for (int k = first[n]; k >= 0; k = next[k])
+                for (int i = 0; i < 3; i++) ap[a][i] += weights[k] * pull[3 * (k / HELD) + i];
+            for (int i = 0; i < 3; i++) ap[a][i] *= free[a];
+            pap[0] += Vector::dot(own, ap[a]);
+            pap[1] += inertia[a] * Vector::dot(own, own);
+        }
+        float length = 0.0f;
+        if (iteration >= 0) {
+            Block::sum(pap, box[0]);
+            length = sums[0] / fmaxf(fmaxf(pap[0], pap[1]), 1e-30f);
+        }
+        EACH(a, n, NODES) {
+            if (iteration < 0) {
+                float sum[6];
+                for (int i = 0; i < 6; i++) sum[i] = block[6 * n + i];
+                for (int i = 0; i < 3; i++) residual[a][i] = right[3 * n + i];
+                for (int k = first[n]; k >= 0; k = next[k]) {
+                    const int c = k / HELD;
+                    for (int i = 0; i < 6; i++) sum[i] += weights[k] * weights[k] * stiffness[6 * c + i];
+                    for (int i = 0; i < 3; i++) residual[a][i] += weights[k] * force[3 * c + i];
+                }
+                for (int i = 0; i < 3; i++) residual[a][i] = free[a] * residual[a][i] - ap[a][i];
+                Symmetric::invert(sum, inverse[a]);
+            } else
+                for (int i = 0; i < 3; i++) {
+                    u[a][i] += length * p[3 * n + i];
+                    residual[a][i] -= length * ap[a][i];
+                }
+            Symmetric::times(inverse[a], residual[a], ap[a]);
+            after[0] += Vector::dot(residual[a], ap[a]);
+        }
+        Block::sum(after, box[1]);
+        const float share = iteration < 0 ? 0.0f : after[0] / fmaxf(sums[0], 1e-30f);
+        EACH(a, n, NODES)
+            for (int i = 0; i < 3; i++) p[3 * n + i] = ap[a][i] + share * p[3 * n + i];
+        sums[0] = after[0];
+        __syncthreads();
+        if (after[0] <= ENOUGH) break;
+    }
+    EACH(a, n, NODES)
+        for (int i = 0; i < 3; i++) p[3 * n + i] = u[a][i];
+    __syncthreads();
+}
+
+for (int k = thread; k < 3 * NODES; k += threads) out.shift[k] = p[k];
+for (int c = thread; c < ROOM; c += threads) {
+    float on[3] = {0.0f, 0.0f, 0.0f}, eased[6] = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f}, gives[HELD];
+    for (int k = 0; k < HELD; k++) gives[k] = 0.0f;
+    if (c < rows) {
+        float moved[3], felt[3], falls[6], along[3];
+        Block::point(p, nodes + HELD * c, weights + HELD * c, moved);
+        Symmetric::times(stiffness + 6 * c, moved, felt);
+        for (int i = 0; i < 3; i++) on[i] = force[3 * c + i] - felt[i];
+        if (c < moving) {
+            const Contact own = contact(c);
+            own.feel(moved, felt, falls);
+            float soft = 0.0f;
+            for (int k = 0; k < HELD; k++) {
+                const int node = nodes[HELD * c + k];
+                gives[k] = weights[HELD * c + k] * in.mesh_free[node] / Block::mean(block + 6 * node);
+                soft += weights[HELD * c + k] * gives[k];
+            }
+            Symmetric::times(falls, own.normal, along);
+            float normal = Vector::dot(own.normal, along), slides = (falls[0] + falls[2] + falls[5] - normal) / 2;
+            normal /= 1 + normal * soft;
+            slides /= 1 + slides * soft;
+            for (int i = 0, k = 0; i < 3; i++)
+                for (int j = 0; j <= i; j++, k++)
+                    eased[k] = (i == j ? slides : 0.0f) + (normal - slides) * own.normal[i] * own.normal[j];
+        }
+    }
+    for (int i = 0; i < 3; i++) out.force[3 * c + i] = on[i];
+    for (int i = 0; i < 6; i++) out.falls[6 * c + i] = eased[i];
+    for (int k = 0; k < HELD; k++) out.gives[HELD * c + k] = gives[k];
+}

@@ -1,0 +1,241 @@
+"""The step of tissue with its contacts: on a GPU two stages, each with a block of threads an environment.
+
+    answer = step.respond(nodes, held, ends)               # displacements, and the forces on contacts
+    moved = step.move(nodes, held, ends, answer, pushed)   # the nodes after the step
+
+Functions of JAX are the reference. `tissue_respond.cu` and `tissue_move.cu` are the same in CUDA, with `brick.cu` for
+an element and `brick_block.cu` for what a block's threads share.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from surgical_marl.engines.stages import block_stage
+from surgical_marl.physics.contact.spring_contact import each, feel
+from surgical_marl.physics.solver.cholesky import FULL, LOWER
+from surgical_marl.physics.systems.brick import CRUSHED, ITERATIONS, RESISTANCE
+from surgical_marl.physics.systems.brick_solve import LEFT, SHORTEST, BrickSolver, Nodes, Springs
+from surgical_marl.physics.systems.system import End, Ends
+from surgical_marl.physics.tree_utils import put, row_of
+
+ROUNDS, TURNS = 4, 3
+"""Linearisations of contacts in a physics step, and conjugate gradients after each. With fewer, friction overshoots
+where it begins to slide."""
+ALONE = 6
+"""Conjugate gradients where nothing touches: more exact than as many in rounds, which begin anew."""
+ENOUGH = 1e-15
+"""Residual, in the norm of the inverse of the nodes' own blocks, at which conjugate gradients stop, J: displacements
+are then wrong by a few nm."""
+MOST_THREADS, PAD = 256, 25
+"""Threads of a block, and numbers in shared memory for a brick: one more than needed, so that threads use all banks."""
+MOST_SHARED = 48 * 1024
+"""Memory that the threads of a block can share, bytes."""
+
+R = TypeVar("R")
+
+
+class Held(NamedTuple):
+    """The points of c contacts, on q nodes each."""
+
+    nodes: Array
+    """[c, q]"""
+    weights: Array
+    """Shares of the nodes, [c, q]; they sum to 1."""
+
+
+class Answer(NamedTuple):
+    """A step of tissue whose contacts' ends move as expected."""
+
+    shift: Array
+    """Displacements of the nodes, m, [n, 3]."""
+    force: Array
+    """Of each contact on the tissue, N, [c, 3]."""
+    falls: Array
+    """Of that force as the end moves, with what the tissue at its point gives way, N/m: lower halves, [c, 6]. Of
+    contacts with what moves."""
+    gives: Array
+    """Displacements of each contact's nodes by a force on it, m/N, [c, q], likewise."""
+
+
+class Moved(NamedTuple):
+    """Tissue after a step."""
+
+    position: Array
+    """m, [n, 3]"""
+    velocity: Array
+    """m/s, [n, 3]"""
+    points: Array
+    """Displacements of the points of contacts, m, [c, 3]."""
+    torn: Array
+    """Whether any brick is stretched past its limit, [] bool."""
+
+
+class Mesh(NamedTuple):
+    """The constants of nodes and bricks that kernels read."""
+
+    mass: np.ndarray
+    """kg, [n]"""
+    support: np.ndarray
+    """Stiffness of the springs to the places at rest, N/m, [n]."""
+    free: np.ndarray
+    """0 or 1, [n]"""
+    rest: np.ndarray
+    """m, [n, 3]"""
+    bricks: np.ndarray
+    """First node of each brick, [e]."""
+    around: np.ndarray
+    """Where forces of bricks on a node begin, among 25 numbers a brick, [n, 8]; -1 where no brick is."""
+
+
+class TissueStep:
+    """The step of one piece of tissue.
+
+    Args:
+        solver: of its bricks.
+        tears: stretch past which it counts as torn; None for any.
+        dt: duration of a step, s.
+    """
+
+    def __init__(self, solver: BrickSolver, tears: float | None, dt: float) -> None:
+        self.solver, self.tears, self.dt = solver, tears, dt
+
+    def respond(self, nodes: Nodes, held: Held, ends: Ends) -> Answer:
+        """Return the displacements of nodes whose contacts' ends move as expected, and the forces on these."""
+        return self._stage("respond", self.answered, held)(nodes, held, ends, np.float32(1.0), self.mesh)
+
+    def move(self, nodes: Nodes, held: Held, ends: Ends, answer: Answer, pushed: Array) -> Moved:
+        """Return the tissue after displacements `answer.shift` and those by additional forces [c, 3] on contacts, N."""
+        stage = self._stage("move", self.moved, held)
+        return stage(nodes, held, ends.moving, ends.total, answer.shift, answer.gives, pushed, self.mesh)
+
+    def _stage(self, kernel: str, reference: Callable[..., R], held: Held) -> Callable[..., R]:
+        grid, (rows, q) = self.solver.grid, held.nodes.shape
+        threads = min(MOST_THREADS, 32 * -(-grid.nodes // 64))
+        shared = 4 * (12 * grid.nodes + PAD * len(grid.first) + rows * (12 + 3 * q)) + 2 * grid.nodes + 512
+        if shared > MOST_SHARED:
+            return reference
+        return block_stage(reference, self.cuda(kernel, held), threads, f"tissue_{kernel}")
+
+    # -- the reference
+
+    def answered(self, nodes: Nodes, held: Held, ends: Ends, stiffer: Any, mesh: Any) -> Answer:
+        """Return what `respond` does."""
+        del stiffer, mesh  # for the kernel
+        solver, dt, touched = self.solver, self.dt, ends.total > 0
+        linear = solver.linearise(nodes, dt)
+        iterations = jnp.where(touched, TURNS, ALONE)
+
+        def spring(row: Array, end: End, u: Array) -> tuple[Array, Array]:
+            felt = feel(end, _point(held, row, u) - end.shift)
+            return felt.force + felt.stiffness @ _point(held, row, u), felt.stiffness[LOWER]
+
+        def improve(_: Any, found: tuple[Array, Array]) -> tuple[Array, Array]:
+            u, _ = found
+            force, stiffness = each(ends, lambda row, end: spring(row, end, u))
+            springs = Springs(*held, force, stiffness, ends.total)
+            u = solver.displacements(linear, springs, u, dt, iterations, ENOUGH)
+            return u, each(ends, lambda row, _: force[row] - stiffness[row][FULL] @ _point(held, row, u))
+
+        start = linear.guess, jnp.zeros((len(held.nodes), 3))
+        u, force = jax.lax.fori_loop(0, jnp.where(touched, ROUNDS, 1), improve, start)
+
+        def eased(row: Array, end: End) -> tuple[Array, Array]:
+            # the contact's spring is in series with the tissue at its point, whose other nodes stay
+            own, weights = row_of(held, row)
+            block = linear.block[own]
+            gives = weights * jnp.asarray(solver.free)[own] / ((block[:, 0] + block[:, 2] + block[:, 5]) / 3)
+            stiffness = feel(end, _point(held, row, u) - end.shift).stiffness
+            normal = end.normal @ stiffness @ end.normal
+            along = (jnp.trace(stiffness) - normal) / 2
+            normal, along = (k / (1 + k * (weights @ gives)) for k in (normal, along))
+            return (along * jnp.eye(3) + (normal - along) * jnp.outer(end.normal, end.normal))[LOWER], gives
+
+        return Answer(u, force, *each(ends, eased, moving=True))
+
+    def moved(
+        self, nodes: Nodes, held: Held, moving: Array, total: Array, shift: Array, gives: Array, pushed: Array,
+        mesh: Any,
+    ) -> Moved:  # fmt: skip
+        """Return what `move` does."""
+        del mesh  # for the kernel
+
+        def add(row: Array, u: Array) -> Array:
+            for node, give in zip(held.nodes[row], gives[row], strict=True):
+                u = u.at[node].add(give * pushed[row], mode="promise_in_bounds")
+            return u
+
+        def note(row: Array, points: Array) -> Array:
+            return put(points, row, _point(held, row, u))
+
+        u = jax.lax.fori_loop(0, moving, add, shift)
+        u = self.solver.shortened(nodes, u)
+        after = self.solver.moved(nodes, u, self.dt)
+        torn = jnp.bool_(False) if self.tears is None else self.solver.stretched(after.position, self.tears)
+        return Moved(*after, jax.lax.fori_loop(0, total, note, jnp.zeros_like(pushed)), torn)
+
+    # -- the kernels
+
+    @property
+    def mesh(self) -> Mesh:
+        """The constants that kernels read."""
+        grid, support = self.solver.grid, self.solver.support
+        around = np.full((grid.nodes, 8), -1, np.int32)
+        for corner, offset in enumerate(grid.offsets):
+            around[grid.first + offset, corner] = PAD * np.arange(len(grid.first)) + 3 * corner
+        return Mesh(grid.mass, support.stiffness, self.solver.free, support.rest, grid.first, around)
+
+    def cuda(self, kernel: str, held: Held) -> str:
+        """Return the CUDA code of a kernel, "respond" or "move", for contacts of this form."""
+        rows, q = held.nodes.shape
+        solver, dt = self.solver, self.dt
+        grid, brick = solver.grid, solver.brick
+        wholes = {
+            "NODES": grid.nodes, "BRICKS": len(grid.first), "ROOM": rows, "HELD": q, "PAD": PAD,
+            "STRIDE_X": grid.offsets[4], "STRIDE_Y": grid.offsets[2],
+            "ROUNDS": ROUNDS, "TURNS": TURNS, "ALONE": ALONE, "NEWTON": ITERATIONS,
+        }  # fmt: skip
+        diagonal = {
+            f"DIAGONAL_{a}{b}": brick.diagonal[0, i, j]
+            for i, a in enumerate("XYZ")
+            for j, b in enumerate("XYZ")
+            if i <= j
+        }
+        reals = diagonal | {f"SLOPE_{axis}": x for axis, x in zip("XYZ", -2 / brick.size, strict=True)} | {
+            "VOLUME": brick.volume, "LAME": brick.lame, "SHEAR": brick.shear, "CRUSHED": CRUSHED,
+            "RESISTANCE": RESISTANCE * brick.young, "DT": dt, "BLEND": 1 + solver.damping / dt,
+            "GRAVITY": solver.gravity[2], "ENOUGH": ENOUGH, "LEFT": LEFT, "SHORTEST": SHORTEST,
+            "TEARS": self.tears or 0,
+        }  # fmt: skip
+        terms = " ".join(
+            f"y[{i}] = {' + '.join(f'{_real(row[j])} * x[{j}]' for j in np.flatnonzero(row))};"
+            for i, row in enumerate(brick.hourglass)
+        )
+        parts = [
+            f"enum {{ {', '.join(f'{name} = {x}' for name, x in wholes.items())} }};",
+            f"constexpr float {', '.join(f'{name} = {_real(x)}' for name, x in reals.items())};",
+            f"#define HOURGLASS(x, y) {terms}",
+            *map(_source, ("brick_block", "brick", f"tissue_{kernel}")),
+            "#undef HOURGLASS\n#undef EACH\n#undef UNROLL",
+        ]
+        return "\n".join(parts)
+
+
+def _point(held: Held, row: Array, u: Array) -> Array:
+    """Return the displacement [3] of the point of a contact by those of the nodes, [n, 3]."""
+    return held.weights[row] @ u[held.nodes[row]]
+
+
+def _real(x: Any) -> str:
+    return f"{np.float32(x):.9e}f"
+
+
+def _source(name: str) -> str:
+    return Path(__file__).with_name(f"{name}.cu").read_text(encoding="utf-8")
