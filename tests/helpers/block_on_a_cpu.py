@@ -52,7 +52,8 @@ def run_block(function: Callable[..., Any], *arguments: Any) -> dict[str, np.nda
     body = _ON_A_CPU + block_code(call.cuda or "", 1, reads, writes)
     with gpu_code():
         compiled = kernel.compile_kernels({"block": body}, "cpu")["block"]
-        arrays: Any = make_arrays("cpu", SimpleNamespace(sizes=layout.sizes), tables(Graph()), 1, 1)
+        source: Any = SimpleNamespace(sizes=layout.sizes)
+        arrays: Any = make_arrays("cpu", source, tables(Graph()), 1, 1)
         for leaf, values in zip(reads.values(), inputs, strict=True):
             arrays.write(leaf, values[None])
         compiled.launch(arrays.all, 1, 0, 1)

@@ -42,7 +42,10 @@ def touched(tissue: Tissue, contacts: int, q: int = 4) -> tuple[Held, Ends]:
     nodes = rng.choice(np.flatnonzero(tissue.grid.mass), (ROOM, q))
     held = Held(jnp.asarray(nodes, jnp.int32), jnp.asarray(weights / weights.sum(1, keepdims=True), jnp.float32))
     normal = rng.normal(size=(ROOM, 3))
-    real = lambda low, high, *more: jnp.asarray(rng.uniform(low, high, (ROOM, *more)), jnp.float32)  # noqa: E731
+
+    def real(low: float, high: float, *more: int) -> Any:
+        return jnp.asarray(rng.uniform(low, high, (ROOM, *more)), jnp.float32)
+
     whole = jnp.zeros(ROOM, jnp.int32)
     rows = End(
         whole, real(0, 1), whole, real(-1e-4, 3e-4), real(0, 0, 3),
