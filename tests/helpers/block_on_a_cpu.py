@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -13,6 +13,7 @@ from surgical_marl.engines.fused import kernel
 from surgical_marl.engines.fused.arrays import make_arrays
 from surgical_marl.engines.fused.compiler import Fields, tables
 from surgical_marl.engines.fused.graph import Graph
+from surgical_marl.engines.fused.kernel_layout import Leaf
 from surgical_marl.engines.fused.stage_code import block_code
 from surgical_marl.engines.stages import Call, called
 from tests.helpers.fused_kernels import gpu_code
@@ -28,33 +29,53 @@ struct { int x; } threadIdx = {0};
 """
 
 
-def call_of(function: Callable[..., Any], *arguments: Any) -> tuple[Call, list[np.ndarray]]:
-    """Return how a function calls a stage, and its inputs: the function does nothing else."""
-    traced = jax.make_jaxpr(function)(*arguments)
-    (equation,) = traced.eqns
-    call = called(equation)
-    assert call is not None and call.cuda is not None
-    given = dict(zip(traced.jaxpr.constvars, traced.consts, strict=True))
-    given |= dict(zip(traced.jaxpr.invars, jax.tree.leaves(arguments), strict=True))
-    return call, [np.asarray(one.val if hasattr(one, "val") else given[one]) for one in equation.invars]
+class Laid(NamedTuple):
+    """A stage, and where its inputs and results are."""
+
+    call: Call
+    inputs: list[np.ndarray]
+    layout: Fields
+    reads: dict[str, Leaf]
+    writes: dict[str, Leaf]
+
+    def body(self, threads: int) -> str:
+        """The kernel's body for a block of so many threads."""
+        return block_code(self.call.cuda or "", threads, self.reads, self.writes)
+
+
+def cuda_of(function: Callable[..., Any], *arguments: Any) -> tuple[str, int]:
+    """Return the body of the kernel of a stage, and how many threads a block has."""
+    laid = _laid(function, arguments)
+    return laid.body(laid.call.threads), laid.call.threads
 
 
 def run_block(function: Callable[..., Any], *arguments: Any) -> dict[str, np.ndarray]:
     """Return the results of a stage by name, of its CUDA code, for one environment."""
-    call, inputs = call_of(function, *arguments)
-    layout = Fields()
-    reads = {
-        name: layout.place(jax.ShapeDtypeStruct(one.shape, one.dtype), "state")
-        for name, one in zip(call.reads, inputs, strict=True)
-    }
-    results = zip(call.writes, call.reference.out_avals, strict=True)
-    writes = {name: layout.place(jax.ShapeDtypeStruct(one.shape, one.dtype), "state") for name, one in results}
-    body = _ON_A_CPU + block_code(call.cuda or "", 1, reads, writes)
+    laid = _laid(function, arguments)
     with gpu_code():
-        compiled = kernel.compile_kernels({"block": body}, "cpu")["block"]
-        source: Any = SimpleNamespace(sizes=layout.sizes)
+        compiled = kernel.compile_kernels({"block": _ON_A_CPU + laid.body(1)}, "cpu")["block"]
+        source: Any = SimpleNamespace(sizes=laid.layout.sizes)
         arrays: Any = make_arrays("cpu", source, tables(Graph()), 1, 1)
-        for leaf, values in zip(reads.values(), inputs, strict=True):
+        for leaf, values in zip(laid.reads.values(), laid.inputs, strict=True):
             arrays.write(leaf, values[None])
         compiled.launch(arrays.all, 1, 0, 1)
-        return {name: arrays.read(leaf, "numpy")[0] for name, leaf in writes.items()}
+        return {name: arrays.read(leaf, "numpy")[0] for name, leaf in laid.writes.items()}
+
+
+def _laid(function: Callable[..., Any], arguments: Any) -> Laid:
+    """Return the stage that a function calls: it does nothing else."""
+    traced = jax.make_jaxpr(function)(*arguments)
+    (equation,) = traced.eqns
+    call, layout = called(equation), Fields()
+    assert call is not None
+    given = dict(zip(traced.jaxpr.constvars, traced.consts, strict=True))
+    given |= dict(zip(traced.jaxpr.invars, jax.tree.leaves(arguments), strict=True))
+    inputs = [np.asarray(one.val if hasattr(one, "val") else given[one]) for one in equation.invars]
+    places = [
+        {
+            name: layout.leaf(one.shape, np.dtype(one.dtype).name, "state")
+            for name, one in zip(names, arrays, strict=True)
+        }
+        for names, arrays in ((call.reads, inputs), (call.writes, call.reference.out_avals))
+    ]
+    return Laid(call, inputs, layout, *places)

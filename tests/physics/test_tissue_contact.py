@@ -16,6 +16,7 @@ from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.physics.contact.part_detection import PartDetection, Scenery
 from surgical_marl.physics.contact.shapes import Plate, Segments
 from surgical_marl.physics.systems.brick import CORNERS
+from surgical_marl.physics.systems.brick_solve import Nodes
 from surgical_marl.physics.systems.tissue import Tissue, TissueState
 from surgical_marl.scenes.objects import Surface
 
@@ -116,6 +117,27 @@ def test_pads_that_close_crush_tissue_but_do_not_pass_through_it() -> None:
     seen = pinch(strip(0.4), SIZE[2] - 3.6e-3 * np.clip(t / 0.5, 0, 1), np.zeros((len(t), 3)))
     assert 3e-4 < seen.thinnest[-1] < 1.2e-3
     assert seen.normal[-1] / 2 > 5  # on each pad, N: harder than a jaw holds a needle
+
+
+def test_clusters_leave_out_no_point_that_is_near() -> None:
+    """Of a sheet that is bent over a plate and a capsule."""
+    tissue = strip(fixed=())
+    rng, counts = np.random.default_rng(0), {"pads": 1, "links": 1, "objects": 0, "plates": 0, "rods": 0}
+    detection, found = PartDetection(counts, [tissue.surface] * 2, tissue.contacts), 0
+    for _ in range(4):
+        noise = rng.normal(size=(2, *tissue.rest.shape)).astype(np.float32)
+        nodes = Nodes(jnp.asarray(tissue.rest + 1e-3 * noise[0]), jnp.asarray(0.1 * noise[1]))
+        shapes = tissue.shapes(tissue.start(jnp.zeros((0, 3)))._replace(nodes=nodes))
+        at = jnp.asarray(rng.uniform(0, SIZE, (2, 3)) + 0.004 * np.eye(3)[2], jnp.float32)
+        plates = Plate(at[:1], jnp.eye(3)[None], jnp.full((1, 2), 0.003), jnp.full(1, 0.001))
+        rods = Segments(at[1:], at[1:] + 0.01, jnp.full(1, 0.001))
+        scenery = Scenery(plates, rods, jnp.full(2, 2e-4))
+        one, other = (detection.find(scenery, own, [], [], DT) for own in (shapes, shapes._replace(clusters=None)))
+        assert one.total == other.total and one.left_out == other.left_out
+        for x, y in zip(one.rows, other.rows, strict=True):
+            np.testing.assert_allclose(x[: one.total], y[: one.total], atol=1e-6)
+        found += int(one.total)
+    assert found > 20
 
 
 # -- in a scene

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -9,12 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from surgical_marl.engines.fused import kernel
+from surgical_marl.envs.batch import BatchedEnv
 from surgical_marl.physics.systems.brick_solve import Nodes
 from surgical_marl.physics.systems.system import End, Ends
 from surgical_marl.physics.systems.tissue import Tissue
 from surgical_marl.physics.systems.tissue_step import Held, TissueStep
-from tests.helpers.block_on_a_cpu import run_block
-from tests.physics.test_tissue_contact import DT, strip
+from tests.helpers.block_on_a_cpu import cuda_of, run_block
+from tests.physics.test_tissue_contact import DT, scene_file, strip
 
 ROOM, CONTACTS = 12, 7
 HOLES = (((True, True),) * 3, ((True, True), (False, False), (True, True)), ((True, True),) * 3)
@@ -73,3 +76,38 @@ def test_cuda_code_computes_what_jax_does(sheet: str, contacts: int, q: int) -> 
     )
     args = nodes, held, ends, expected, pushed
     close(run_block(step.move, *args), jax.jit(step.move)(*args), 2e-6)
+
+
+@pytest.mark.skipif(not kernel.has_cuda(), reason="needs a CUDA device")
+def test_a_gpu_pushes_it_as_a_cpu_does(tmp_path: Path) -> None:
+    found = []
+    for device in ("cpu", "cuda"):
+        env = BatchedEnv("reach", scene_file(tmp_path), num_envs=2, engine="fused", device=device)
+        env.reset(seed=0)
+        action = np.zeros((2, len(env.scene.mounts["psm_0"].arm.actuated)), np.float32)
+        action[0, 2] = 1.0  # into the tissue
+        for _ in range(10):
+            step = env.step({"psm_0": action})
+        force = np.array(step.infos["psm_0"]["tissue_force"])
+        found.append([env.engine.read(f".physics.{part}", "numpy") for part in ("sheet.nodes.position", "arms.qpos")])
+        found[-1].append(force)
+        env.close()
+    assert found[0][2][0] > 0.05
+    for one, other, atol in zip(*found, (1e-5, 1e-5, 5e-3), strict=True):
+        np.testing.assert_allclose(one, other, atol=atol)
+
+
+def test_nvrtc_compiles_the_kernels(tmp_path: Path) -> None:
+    """Without a GPU; shared memory and barriers are there, and no thread has arrays in slow memory."""
+    tissue = SHEETS["sheet"]
+    step, nodes, (held, ends) = step_of(tissue), shaken(tissue, 1e-4), touched(tissue, 1)
+    answer: Any = jax.tree.map(lambda x: jnp.zeros(x.shape), jax.eval_shape(step.respond, nodes, held, ends))
+    pushed = jnp.zeros((ROOM, 3))
+    for name, function, args in (("respond", step.respond, ()), ("move", step.move, (answer, pushed))):
+        body, threads = cuda_of(function, nodes, held, ends, *args)
+        module = kernel.wp.get_module(f"surgical_marl_test_{name}")
+        module.options.update(enable_backward=False, block_dim=threads)
+        kernel._make(name, body, module, threads=threads)
+        (ptx,) = kernel.wp.compile_aot_module(module, arch=90, module_dir=tmp_path, use_ptx=True)
+        text = ptx.read_text()
+        assert ".shared" in text and "bar.sync" in text and ".local" not in text, name

@@ -130,7 +130,7 @@ class PartDetection:
         if not self._shapes:
             return none
         radius = jnp.broadcast_to(jnp.asarray(shapes.radius), (parts,))
-        rows = shapes.start, shapes.end, radius, shapes.speed
+        rows, clusters = (shapes.start, shapes.end, radius, shapes.speed), shapes.clusters
 
         def widen(found: Any, row: Any) -> tuple[Any, None]:
             (low, high, fastest), (start, end, radius, speed) = found, row
@@ -138,8 +138,12 @@ class PartDetection:
             high = jnp.maximum(high, jnp.maximum(start, end) + radius)
             return (low, high, jnp.maximum(fastest, speed)), None
 
-        first = shapes.start[0], shapes.start[0], jnp.float32(0.0)
-        (low, high, fastest), _ = jax.lax.scan(widen, first, rows)
+        bounds, fastest = rows, jnp.float32(0.0)
+        if clusters is not None:
+            still = np.zeros(len(clusters.radius), np.float32)
+            bounds, fastest = (clusters.centre, clusters.centre, clusters.radius, still), clusters.fastest
+        first = bounds[0][0]
+        (low, high, fastest), _ = jax.lax.scan(widen, (first, first, fastest), bounds)
         centre, around = (low + high) / 2, size(high - low) / 2
 
         def look(found: Listed, shape: Array) -> tuple[Listed, None]:
@@ -157,13 +161,28 @@ class PartDetection:
             moves = scenery.moves[shape]
 
             def along(gap: Callable[[Array], Array]) -> Listed:
+                def near(centre: Array, radius: Array, speed: Array) -> Array:
+                    return gap(centre) < radius + NEAR + jnp.minimum(moves + dt * speed, AHEAD)
+
                 def part(found: Listed, row: Any) -> tuple[Listed, None]:
                     number, start, end, radius, speed = row
                     middle, half = (start + end) / 2, size(end - start) / 2 + radius
-                    reach = half + NEAR + jnp.minimum(moves + dt * speed, AHEAD)
-                    return found.after(shape * parts + number, gap(middle) < reach), None
+                    return found.after(shape * parts + number, near(middle, half, speed)), None
 
-                return jax.lax.scan(part, found, (jnp.arange(parts, dtype=jnp.int32), *rows))[0]
+                def cluster(found: Listed, row: Any) -> tuple[Listed, None]:
+                    centre, around, first, last = row
+
+                    def sphere(number: Array, found: Listed) -> Listed:
+                        middle, speed = clusters.part(number)
+                        return found.after(shape * parts + number, near(middle, radius[number], speed))
+
+                    last = jnp.where(near(centre, around, clusters.fastest), last, first)
+                    return jax.lax.fori_loop(first, last, sphere, found), None
+
+                if clusters is None:
+                    return jax.lax.scan(part, found, (jnp.arange(parts, dtype=jnp.int32), *rows))[0]
+                runs = jnp.asarray(clusters.first[:-1]), jnp.asarray(clusters.first[1:])
+                return jax.lax.scan(cluster, found, (clusters.centre, clusters.radius, *runs))[0]
 
             listed: Listed = self._of_shape(
                 scenery, shape, lambda plate: along(lambda x: _from_plate(x, plate)),
@@ -179,14 +198,17 @@ class PartDetection:
         parts = len(shapes.speed)
         shape, part = pair // parts, pair % parts
         radius = jnp.broadcast_to(jnp.asarray(shapes.radius), (parts,))
-        own = Segments(shapes.start[part], shapes.end[part], radius[part])
+        own, speed = Segments(shapes.start[part], shapes.end[part], radius[part]), shapes.speed[part]
+        if shapes.clusters is not None:
+            centre, speed = shapes.clusters.part(part)
+            own = Segments(centre, centre, radius[part])
         point, weight = self._of_shape(
             scenery,
             shape,
             lambda plate: on_face(own, plate),
             lambda rod: (between_segments(own, rod), jnp.float32(1.0)),
         )
-        reach = NEAR + jnp.minimum(scenery.moves[shape] + dt * shapes.speed[part], AHEAD)
+        reach = NEAR + jnp.minimum(scenery.moves[shape] + dt * speed, AHEAD)
         along = own.end - own.start
         share = jnp.clip((point.place - own.start) @ along / jnp.maximum(along @ along, 1e-12), 0.0, 1.0)
         stiffness, sliding = (jnp.asarray(x)[shape] for x in (self._stiffness, self._sliding))

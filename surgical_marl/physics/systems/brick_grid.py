@@ -25,6 +25,10 @@ class SurfacePoints(NamedTuple):
     """Shares of the nodes, [s, 4]; they sum to 1."""
     inward: np.ndarray
     """Difference of the numbers of the node under it, in the tissue, and of the node itself, [s]."""
+    faces: np.ndarray
+    """Nodes of the faces of bricks on which they are, [f, 4]."""
+    first: np.ndarray
+    """Number of the first point of each face, and that of all points, [f + 1]: a point is of the first of its faces."""
 
 
 class BrickGrid:
@@ -76,14 +80,20 @@ class BrickGrid:
     def surface(self) -> SurfacePoints:
         """Return the nodes of both faces, and the points midway between them, on which others press."""
         points: dict[tuple[int, ...], int] = {}
+        faces, first = [], []
         strides = self.offsets[[4, 2, 1]]
         for layer, inward in ((0, 1), (self.cells[2] - 1, -1)):
             level = layer if inward == 1 else layer + 1
             for i, j in np.argwhere(self.present[:, :, layer]):
                 corners = [int(np.array([i + a, j + b, level]) @ strides) for a in (0, 1) for b in (0, 1)]
+                faces.append(corners)
+                first.append(len(points))
                 for own in ((0,), (1,), (2,), (3,), (0, 1), (0, 2), (1, 3), (2, 3), (0, 1, 2, 3)):
                     points[tuple(corners[k] for k in own)] = inward
         nodes = np.array([(own * 4)[:4] for own in points], np.int32)
         count = np.array([len(own) for own in points])[:, None]
         weights = np.where(np.arange(4) < count, 1 / count, 0.0).astype(np.float32)
-        return SurfacePoints(nodes, weights, np.array([*points.values()], np.int32))
+        inward = np.array([*points.values()], np.int32)
+        return SurfacePoints(
+            nodes, weights, inward, np.array(faces, np.int32), np.array([*first, len(points)], np.int32)
+        )

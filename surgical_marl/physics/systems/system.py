@@ -12,12 +12,28 @@ docs/your_own_system.md walks through one.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 from jax import Array
 
 from surgical_marl.scenes.objects import Surface
+
+
+class Clusters(NamedTuple):
+    """Balls around parts that follow each other, g of them: most of many parts are left out with their ball. World."""
+
+    centre: Array
+    """m, [g, 3]"""
+    radius: Array
+    """m, [g]"""
+    first: np.ndarray
+    """Number of the first part of each, and that of all parts, [g + 1]."""
+    fastest: Array
+    """Largest speed of any part, m/s, []."""
+    part: Callable[[Array], tuple[Array, Array]]
+    """Takes the number of a part, a sphere; returns its centre, m, [3], and speed, m/s: only of parts that are near."""
 
 
 class Shapes(NamedTuple):
@@ -31,6 +47,8 @@ class Shapes(NamedTuple):
     """m, [p]"""
     speed: Array
     """Largest speed of any point of it, m/s, [p]."""
+    clusters: Clusters | None = None
+    """Of many spheres. Then nothing else that is computed here is read."""
 
 
 class Tie(NamedTuple):

@@ -21,7 +21,7 @@ from surgical_marl.physics.contact.spring_contact import Stretches, each, none, 
 from surgical_marl.physics.systems.brick import Brick
 from surgical_marl.physics.systems.brick_grid import BrickGrid, SurfacePoints
 from surgical_marl.physics.systems.brick_solve import BrickSolver, Nodes, Support
-from surgical_marl.physics.systems.system import Bars, Ends, Response, Shapes, System
+from surgical_marl.physics.systems.system import Bars, Clusters, Ends, Response, Shapes, System
 from surgical_marl.physics.systems.tissue_step import Answer, Held, TissueStep
 from surgical_marl.physics.tree_utils import row_of
 from surgical_marl.scenes.objects import Placement, Surface
@@ -167,17 +167,33 @@ class Tissue(System):
 
     def shapes(self, state: TissueState) -> Shapes:
         """Return a ball at each surface point, under the surface."""
-        position, velocity = state.nodes
+        (position, velocity), points = state.nodes, self.points
+        nodes, weights, inward = (jnp.asarray(x) for x in points[:3])
+        ball = SKIN * self.grid.cell[2]
 
-        def ball(row: Any) -> tuple[Array, Array]:
-            nodes, weights, inward = row
-            skin, under = weights @ position[nodes], weights @ position[nodes + inward]
-            moves = weights @ velocity[nodes]
-            return (1 - SKIN) * skin + SKIN * under, jnp.sqrt(moves @ moves)
+        def under(node: Array, inward: Array) -> Array:
+            return (1 - SKIN) * position[node] + SKIN * position[node + inward]
 
-        centre, speed = jax.lax.map(ball, jax.tree.map(jnp.asarray, self.points))
-        radius = np.full(len(self.points.nodes), SKIN * self.grid.cell[2], np.float32)
-        return Shapes(centre, centre, radius, speed)
+        def part(number: Array) -> tuple[Array, Array]:
+            own, share = nodes[number], weights[number]
+            moves = share @ velocity[own]
+            return share @ under(own, inward[number]), jnp.sqrt(moves @ moves)
+
+        def around(face: Any) -> tuple[Array, Array]:
+            own, inward = face
+            corners = under(own, inward)
+            centre = jnp.sum(corners, 0) / 4
+            off = corners - centre
+            return centre, jnp.sqrt(jnp.max(jnp.sum(off * off, 1))) + ball
+
+        def faster(most: Array, v: Array) -> tuple[Array, None]:
+            return jnp.maximum(most, v @ v), None
+
+        fastest, _ = jax.lax.scan(faster, jnp.float32(0.0), velocity)
+        balls = jax.lax.map(around, (jnp.asarray(points.faces), inward[points.first[:-1]]))
+        clusters = Clusters(*balls, points.first, jnp.sqrt(fastest), part)
+        centre, speed = jax.lax.map(part, jnp.arange(len(nodes), dtype=jnp.int32))
+        return Shapes(centre, centre, np.full(len(nodes), ball, np.float32), speed, clusters)
 
     def free_motion(self, state: TissueState, dt: Any) -> tuple[()]:
         """Return nothing: one stage has all forces."""
