@@ -220,6 +220,20 @@ def test_each_call_of_a_stage_has_its_own_fields() -> None:
     assert first.writes["x"] == second.reads["state.x"]
 
 
+def test_numbers_that_change_places_are_not_copied_one_after_the_other() -> None:
+    """A kernel reads all of them first."""
+
+    def step(x: Any) -> Any:
+        def swap(found: Any, _: None) -> Any:
+            one, other = found
+            return (other, one.at[:3].set(turn({"x": one[:3]}, other[:3], TABLE)["x"])), None
+
+        return jnp.concatenate(jax.lax.scan(swap, (x, jnp.sin(x)), None, length=2)[0])[:120]
+
+    loop = next(stage for stage in Stepper(step).source().stages if stage.kind == "loop")
+    assert not [stage for stage in loop.stages if stage.kind == "copy"]
+
+
 def test_the_host_is_asked_once_in_a_step() -> None:
     with pytest.raises(Unsupported, match="a second call of stage 'pictures' of the host"):
         Stepper(lambda x: x + look({"x": x, "tip": look({"x": x, "tip": x})["seen"]})["seen"]).source()
@@ -298,12 +312,15 @@ def test_engines_move_it_alike(scene: str) -> None:
     env = physics(scene)
     expected = pushed(MjxEngine(env, ENVS, "cpu"))
     assert expected[0][0, MIDDLE].min() > 2e-3 and not expected[0][1].any()
-    split, (first, loop, last) = pushed_as_on_a_gpu(env)
+    split, (first, *copies, loop, last) = pushed_as_on_a_gpu(env)
     for found in (split, pushed(fused_engine.FusedEngine(env, ENVS, "cpu"))):
         for one, other in zip(found, expected, strict=True):
             np.testing.assert_allclose(one, other, atol=2e-6)
     assert (first.kind, last.kind, loop.kind, loop.length) == ("thread", "thread", "loop", STEP)
     assert [stage.name for stage in loop.stages if stage.kind == "block"] == ["press", "relax"]
+    moved = [stage for stage in loop.stages if stage.kind == "copy"]
+    assert len(copies) == 2 and [one.writes for one in copies] == [one.writes for one in moved]
+    assert loop.stages[-3].kind == "thread" and set(moved[0].reads.values()) <= set(loop.stages[-4].writes.values())
 
 
 @pytest.mark.skipif(not kernel.has_cuda(), reason="needs a CUDA device")

@@ -16,7 +16,7 @@ from surgical_marl.physics.systems.brick_solve import Nodes
 from surgical_marl.physics.systems.system import End, Ends
 from surgical_marl.physics.systems.tissue import Tissue
 from surgical_marl.physics.systems.tissue_step import Held, TissueStep
-from tests.helpers.block_on_a_cpu import cuda_of, run_block
+from tests.helpers.block_kernels import cuda_of, run_block
 from tests.physics.test_tissue_contact import DT, scene_file, strip
 
 ROOM, CONTACTS = 12, 7
@@ -25,6 +25,9 @@ SHEETS = {
     "sheet": strip(tears=1.5),
     "holes": strip(present=HOLES, size=(0.015, 0.012, 0.008), springs=(("front", 1e6),)),
 }
+
+
+DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not kernel.has_cuda(), reason="needs a CUDA device"))]
 
 
 def step_of(tissue: Tissue) -> TissueStep:
@@ -64,18 +67,19 @@ def close(found: dict[str, np.ndarray], expected: Any, share: float) -> None:
         np.testing.assert_allclose(found[name], values, atol=share * scale, err_msg=name)
 
 
+@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize(("sheet", "contacts", "q"), [("sheet", CONTACTS, 4), ("sheet", 0, 4), ("holes", CONTACTS, 8)])
-def test_cuda_code_computes_what_jax_does(sheet: str, contacts: int, q: int) -> None:
+def test_cuda_code_computes_what_jax_does(sheet: str, contacts: int, q: int, device: str) -> None:
     tissue = SHEETS[sheet]
     step, nodes, (held, ends) = step_of(tissue), shaken(tissue, 4e-4), touched(tissue, contacts, q)
     expected = jax.jit(step.respond)(nodes, held, ends)
     assert contacts == 0 or (np.abs(expected.force[:contacts]).max(1) > 0).sum() >= 4
-    close(run_block(step.respond, nodes, held, ends), expected, 2e-5)
+    close(run_block(device, step.respond, nodes, held, ends), expected, 2e-5)
     pushed = jnp.asarray(
         np.random.default_rng(2).normal(size=(ROOM, 3)) * (np.arange(ROOM) < contacts)[:, None], jnp.float32
     )
     args = nodes, held, ends, expected, pushed
-    close(run_block(step.move, *args), jax.jit(step.move)(*args), 2e-6)
+    close(run_block(device, step.move, *args), jax.jit(step.move)(*args), 2e-6)
 
 
 @pytest.mark.skipif(not kernel.has_cuda(), reason="needs a CUDA device")

@@ -132,6 +132,11 @@ class Arrays(ABC):
         """Return a view of all fields of "state", "counts", "actions", "outs" or "flags", [fields, columns]."""
         return self._buffers[buffer][:, : self.num_envs]
 
+    def copy(self, source: Leaf, target: Leaf) -> None:
+        """Copy the fields of a leaf, in all columns, to those of another one of the same size."""
+        to, given = (self._buffers[leaf.buffer][leaf.first : leaf.first + leaf.size] for leaf in (target, source))
+        to[:] = given
+
     def rows(self, leaf: Leaf) -> Any:
         """Return the fields of a leaf, of shape [size, columns], as an array of the device's own library.
 

@@ -117,6 +117,8 @@ class FusedEngine:
                 self._launch(stage.name)
             elif stage.kind == "block":
                 self._blocks[stage.name].launch(self._arrays.all, self._stride, self.num_envs)
+            elif stage.kind == "copy":
+                self._arrays.copy(stage.reads[""], stage.writes[""])
             elif stage.kind == "loop":
                 for _ in range(stage.length):
                     self._run(stage.stages, sense)

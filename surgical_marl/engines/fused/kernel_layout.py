@@ -43,7 +43,7 @@ class Stage:
     """A stage of a step: what an engine does next.
 
     Its kind is "thread" or "block" for a kernel of this name with one or with many threads an environment, "host" for
-    numbers that are computed outside, or "loop".
+    numbers that are computed outside, "copy" from the fields that it reads to those that it writes, or "loop".
     """
 
     kind: str

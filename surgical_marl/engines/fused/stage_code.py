@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,8 @@ from surgical_marl.engines.fused.symbolic_array import AnyArray, Table, Unsuppor
 
 Allocate = Callable[[tuple[int, ...], str, str], Leaf]
 """Takes a shape, a dtype and the buffer of real numbers, and returns new fields."""
+LEAST_COPY = 64
+"""Numbers that are copied between two kernels, and not by one: a C compiler takes long for so many lines."""
 
 
 def load(graph: Graph, leaf: Leaf) -> AnyArray:
@@ -55,15 +57,19 @@ class StageCode:
         Raises:
             Unsupported: something has no kernel code, or can't be stored between stages.
         """
-        return [self._stage(part) for part in parts]
+        return [stage for part in parts for stage in self._stages(part)]
 
-    def _stage(self, part: split.Part) -> Stage:
+    def _stages(self, part: split.Part) -> list[Stage]:
         if isinstance(part, split.Loop):
-            return Stage("loop", "", length=part.length, stages=self.stages(part.parts))
+            return [Stage("loop", "", length=part.length, stages=self.stages(part.parts))]
         if isinstance(part, split.Run):
-            name = f"step_{len(self.kernels)}"
-            self.kernels[name] = self._interpret(part)
-            return Stage("thread", name)
+            name, copied = f"step_{len(self.kernels)}", self._copied(part)
+            self.kernels[name] = self._interpret(part, copied)
+            copies = [Stage("copy", "", {"": self._leaves[copied[one]]}, {"": self._output(one)}) for one in copied]
+            return [Stage("thread", name), *copies]
+        return [self._call(part)]
+
+    def _call(self, part: split.Stage) -> Stage:
         call = part.call
         reads = {name: self._input(one) for name, one in zip(call.reads, part.reads, strict=True)}
         writes = {name: self._output(one) for name, one in zip(call.writes, part.writes, strict=True)}
@@ -79,14 +85,23 @@ class StageCode:
         code = block_code(call.cuda, call.threads, reads, writes)
         return Stage("block", name, reads, writes, code, call.threads)
 
-    def _interpret(self, part: split.Run) -> list[tuple[Leaf, list[Value]]]:
+    def _copied(self, part: split.Run) -> dict[Any, Any]:
+        """Return the variables that get all numbers of another one, which the part does not change, and that one."""
+        targets = {target for target, _ in part.assigns}
+        return {
+            target: value for target, value in part.assigns
+            if isinstance(target, core.Var) and value in part.reads and value not in targets
+            and value not in self._given and self._leaves[value].size >= LEAST_COPY
+        }  # fmt: skip
+
+    def _interpret(self, part: split.Run, copied: Collection[Any]) -> list[tuple[Leaf, list[Value]]]:
         given = [self._given[one] if one in self._given else load(self._graph, self._leaves[one]) for one in part.reads]
         stored = []
         for target, found in zip(part.writes, JaxprInterpreter(self._graph).run(part.jaxpr, given), strict=True):
             values = values_of(self._graph, found).ravel().tolist()
             if isinstance(target, int):
                 self.results[target] = values
-            else:
+            elif target not in copied:
                 stored.append((self._output(target), values))
         return stored
 

@@ -1,4 +1,7 @@
-"""The CUDA code of a block stage on a CPU, with one thread a block: barriers and sums over threads are nothing then."""
+"""The CUDA code of a block stage by itself: on a GPU, or on a CPU with one thread a block.
+
+Barriers and sums over threads are nothing then.
+"""
 
 from __future__ import annotations
 
@@ -49,17 +52,21 @@ def cuda_of(function: Callable[..., Any], *arguments: Any) -> tuple[str, int]:
     return laid.body(laid.call.threads), laid.call.threads
 
 
-def run_block(function: Callable[..., Any], *arguments: Any) -> dict[str, np.ndarray]:
+def run_block(device: str, function: Callable[..., Any], *arguments: Any) -> dict[str, np.ndarray]:
     """Return the results of a stage by name, of its CUDA code, for one environment."""
     laid = _laid(function, arguments)
-    with gpu_code():
-        compiled = kernel.compile_kernels({"block": _ON_A_CPU + laid.body(1)}, "cpu")["block"]
-        source: Any = SimpleNamespace(sizes=laid.layout.sizes)
-        arrays: Any = make_arrays("cpu", source, tables(Graph()), 1, 1)
-        for leaf, values in zip(laid.reads.values(), laid.inputs, strict=True):
-            arrays.write(leaf, values[None])
-        compiled.launch(arrays.all, 1, 0, 1)
-        return {name: arrays.read(leaf, "numpy")[0] for name, leaf in laid.writes.items()}
+    source: Any = SimpleNamespace(sizes=laid.layout.sizes)
+    arrays: Any = make_arrays(device, source, tables(Graph()), 1, 1)
+    for leaf, values in zip(laid.reads.values(), laid.inputs, strict=True):
+        arrays.write(leaf, values[None])
+    if device == "cpu":
+        with gpu_code():
+            body = _ON_A_CPU + laid.body(1)
+            kernel.compile_kernels({"block": body}, "cpu")["block"].launch(arrays.all, 1, 0, 1)
+    else:
+        threads = laid.call.threads
+        kernel.compile_block("block", laid.body(threads), threads).launch(arrays.all, 1, 1)
+    return {name: arrays.read(leaf, "numpy")[0] for name, leaf in laid.writes.items()}
 
 
 def _laid(function: Callable[..., Any], arguments: Any) -> Laid:
