@@ -12,8 +12,8 @@ from jax import Array
 
 from surgical_marl.physics.contact.broadphase import nearest, size
 from surgical_marl.physics.contact.shapes import Plate, Points, Segments, between_segments, in_frame
-from surgical_marl.physics.systems.system import End, Ends, Shapes
-from surgical_marl.physics.tree_utils import Listed, picked, put, room
+from surgical_marl.physics.systems.system import Clusters, End, Ends, Shapes
+from surgical_marl.physics.tree_utils import Listed, Tree, picked, put, room
 from surgical_marl.scenes.objects import Surface
 
 NEAR = 1e-4
@@ -138,7 +138,8 @@ class PartDetection:
             high = jnp.maximum(high, jnp.maximum(start, end) + radius)
             return (low, high, jnp.maximum(fastest, speed)), None
 
-        bounds, fastest = rows, jnp.float32(0.0)
+        bounds: Any = rows
+        fastest = jnp.float32(0.0)
         if clusters is not None:
             still = np.zeros(len(clusters.radius), np.float32)
             bounds, fastest = (clusters.centre, clusters.centre, clusters.radius, still), clusters.fastest
@@ -161,28 +162,20 @@ class PartDetection:
             moves = scenery.moves[shape]
 
             def along(gap: Callable[[Array], Array]) -> Listed:
-                def near(centre: Array, radius: Array, speed: Array) -> Array:
+                def reached(centre: Array, radius: Array, speed: Array) -> Array:
                     return gap(centre) < radius + NEAR + jnp.minimum(moves + dt * speed, AHEAD)
 
                 def part(found: Listed, row: Any) -> tuple[Listed, None]:
                     number, start, end, radius, speed = row
                     middle, half = (start + end) / 2, size(end - start) / 2 + radius
-                    return found.after(shape * parts + number, near(middle, half, speed)), None
+                    return found.after(shape * parts + number, reached(middle, half, speed)), None
 
-                def cluster(found: Listed, row: Any) -> tuple[Listed, None]:
-                    centre, around, first, last = row
+                def sphere(number: Array, middle: Array, speed: Array, found: Listed) -> Listed:
+                    return found.after(shape * parts + number, reached(middle, radius[number], speed))
 
-                    def sphere(number: Array, found: Listed) -> Listed:
-                        middle, speed = clusters.part(number)
-                        return found.after(shape * parts + number, near(middle, radius[number], speed))
-
-                    last = jnp.where(near(centre, around, clusters.fastest), last, first)
-                    return jax.lax.fori_loop(first, last, sphere, found), None
-
-                if clusters is None:
-                    return jax.lax.scan(part, found, (jnp.arange(parts, dtype=jnp.int32), *rows))[0]
-                runs = jnp.asarray(clusters.first[:-1]), jnp.asarray(clusters.first[1:])
-                return jax.lax.scan(cluster, found, (clusters.centre, clusters.radius, *runs))[0]
+                if clusters is not None:
+                    return _of_clusters(clusters, reached, sphere, found)
+                return jax.lax.scan(part, found, (jnp.arange(parts, dtype=jnp.int32), *rows))[0]
 
             listed: Listed = self._of_shape(
                 scenery, shape, lambda plate: along(lambda x: _from_plate(x, plate)),
@@ -220,6 +213,21 @@ class PartDetection:
         for own_part, low, high in self._tied:
             touches &= (part != own_part) | (shape < low) | (shape >= high)
         return end, touches
+
+
+def _of_clusters(
+    clusters: Clusters, reached: Callable[[Array, Array, Array], Array], sphere: Callable[..., Tree], found: Tree
+) -> Tree:  # fmt: skip
+    """Return what `sphere(number, centre, speed, found)` makes of each sphere in a cluster that is reached."""
+
+    def cluster(found: Tree, row: Any) -> tuple[Tree, None]:
+        centre, radius, first, last = row
+        last = jnp.where(reached(centre, radius, clusters.fastest), last, first)
+        return jax.lax.fori_loop(first, last, lambda n, found: sphere(n, *clusters.part(n), found), found), None
+
+    runs = jnp.asarray(clusters.first[:-1]), jnp.asarray(clusters.first[1:])
+    after: Tree = jax.lax.scan(cluster, found, (clusters.centre, clusters.radius, *runs))[0]
+    return after
 
 
 def on_face(part: Segments, plate: Plate) -> tuple[Points, Array]:

@@ -93,7 +93,7 @@ class BrickGrid:
         nodes = np.array([(own * 4)[:4] for own in points], np.int32)
         count = np.array([len(own) for own in points])[:, None]
         weights = np.where(np.arange(4) < count, 1 / count, 0.0).astype(np.float32)
-        inward = np.array([*points.values()], np.int32)
+        starts = np.array([*first, len(points)], np.int32)
         return SurfacePoints(
-            nodes, weights, inward, np.array(faces, np.int32), np.array([*first, len(points)], np.int32)
-        )
+            nodes, weights, np.array([*points.values()], np.int32), np.array(faces, np.int32), starts
+        )  # fmt: skip

@@ -190,8 +190,8 @@ class Tissue(System):
             return jnp.maximum(most, v @ v), None
 
         fastest, _ = jax.lax.scan(faster, jnp.float32(0.0), velocity)
-        balls = jax.lax.map(around, (jnp.asarray(points.faces), inward[points.first[:-1]]))
-        clusters = Clusters(*balls, points.first, jnp.sqrt(fastest), part)
+        centre, radius = jax.lax.map(around, (jnp.asarray(points.faces), inward[points.first[:-1]]))
+        clusters = Clusters(centre, radius, points.first, jnp.sqrt(fastest), part)
         centre, speed = jax.lax.map(part, jnp.arange(len(nodes), dtype=jnp.int32))
         return Shapes(centre, centre, np.full(len(nodes), ball, np.float32), speed, clusters)
 
