@@ -61,10 +61,12 @@ def touched(tissue: Tissue, contacts: int, q: int = 4) -> tuple[Held, Ends]:
     return held, Ends(rows, jnp.int32(max(contacts - 2, 0)), jnp.int32(contacts), jnp.int32(0))
 
 
-def close(found: dict[str, np.ndarray], expected: Any, share: float) -> None:
+def close(found: dict[str, np.ndarray], expected: Any, contacts: int, share: float) -> None:
     for name, values in expected._asdict().items():
-        scale = np.abs(values).max(initial=1e-12)
-        np.testing.assert_allclose(found[name], values, atol=share * scale, err_msg=name)
+        own, scale = found[name], np.abs(values).max(initial=1e-12)
+        if values.shape[:1] == (ROOM,):
+            own, values = own[:contacts], values[:contacts]
+        np.testing.assert_allclose(own, values, atol=share * scale, err_msg=name)
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -74,12 +76,12 @@ def test_cuda_code_computes_what_jax_does(sheet: str, contacts: int, q: int, dev
     step, nodes, (held, ends) = step_of(tissue), shaken(tissue, 4e-4), touched(tissue, contacts, q)
     expected = jax.jit(step.respond)(nodes, held, ends)
     assert contacts == 0 or (np.abs(expected.force[:contacts]).max(1) > 0).sum() >= 4
-    close(run_block(device, step.respond, nodes, held, ends), expected, 2e-5)
+    close(run_block(device, step.respond, nodes, held, ends), expected, contacts, 2e-5)
     pushed = jnp.asarray(
         np.random.default_rng(2).normal(size=(ROOM, 3)) * (np.arange(ROOM) < contacts)[:, None], jnp.float32
     )
     args = nodes, held, ends, expected, pushed
-    close(run_block(device, step.move, *args), jax.jit(step.move)(*args), 2e-6)
+    close(run_block(device, step.move, *args), jax.jit(step.move)(*args), contacts, 2e-6)
 
 
 @pytest.mark.skipif(not kernel.has_cuda(), reason="needs a CUDA device")

@@ -38,9 +38,9 @@ for (int k = thread; k < 3 * NODES; k += threads) {
     out.velocity[k] = u[k] / DT;
 }
 __syncthreads();
-for (int c = thread; c < ROOM; c += threads) {
-    float moved[3] = {0.0f, 0.0f, 0.0f};
-    if (c < rows) Block::point(u, nodes + HELD * c, weights + HELD * c, moved);
+for (int c = thread; c < rows; c += threads) {
+    float moved[3];
+    Block::point(u, nodes + HELD * c, weights + HELD * c, moved);
     for (int i = 0; i < 3; i++) out.points[3 * c + i] = moved[i];
 }
 bool torn = false;

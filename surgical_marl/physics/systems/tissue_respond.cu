@@ -38,6 +38,7 @@ const auto contact = [&](int c) {
 const float stiffer = in.stiffer[0], blend = stiffer * BLEND;
 const int rows = in.ends_total[0], moving = in.ends_moving[0];
 Brick brick[BRICKS_EACH];
+int corner[BRICKS_EACH];
 float u[NODES_EACH][3], residual[NODES_EACH][3], inverse[NODES_EACH][6], inertia[NODES_EACH], free[NODES_EACH];
 
 for (int k = thread; k < HELD * rows; k += threads) nodes[k] = in.held_nodes[k], weights[k] = in.held_weights[k];
@@ -47,7 +48,8 @@ __syncthreads();
 // forces at the start, and each node's own block of the matrix
 EACH(a, e, BRICKS) {
     float x[24];
-    Block::corners(p + 3 * in.mesh_bricks[e], x);
+    corner[a] = 3 * in.mesh_bricks[e];
+    Block::corners(p + corner[a], x);
     brick[a].deform(x, stiffer);
     for (int i = 0; i < 24; i++) each[PAD * e + i] = x[i];
 }
@@ -100,7 +102,7 @@ for (int round = 0; round < rounds; round++) {
         // the matrix times p: first what bricks and contacts add
         EACH(a, e, BRICKS) {
             float x[24];
-            Block::corners(p + 3 * in.mesh_bricks[e], x);
+            Block::corners(p + corner[a], x);
             brick[a].product(x, blend);
             for (int i = 0; i < 24; i++) each[PAD * e + i] = x[i];
         }
@@ -165,33 +167,28 @@ for (int round = 0; round < rounds; round++) {
 }
 
 for (int k = thread; k < 3 * NODES; k += threads) out.shift[k] = p[k];
-for (int c = thread; c < ROOM; c += threads) {
-    float on[3] = {0.0f, 0.0f, 0.0f}, eased[6] = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f}, gives[HELD];
-    for (int k = 0; k < HELD; k++) gives[k] = 0.0f;
-    if (c < rows) {
-        float moved[3], felt[3], falls[6], along[3];
-        Block::point(p, nodes + HELD * c, weights + HELD * c, moved);
-        Symmetric::times(stiffness + 6 * c, moved, felt);
-        for (int i = 0; i < 3; i++) on[i] = force[3 * c + i] - felt[i];
-        if (c < moving) {
-            const Contact own = contact(c);
-            own.feel(moved, felt, falls);
-            float soft = 0.0f;
-            for (int k = 0; k < HELD; k++) {
-                const int node = nodes[HELD * c + k];
-                gives[k] = weights[HELD * c + k] * in.mesh_free[node] / Block::mean(block + 6 * node);
-                soft += weights[HELD * c + k] * gives[k];
-            }
-            Symmetric::times(falls, own.normal, along);
-            float normal = Vector::dot(own.normal, along), slides = (falls[0] + falls[2] + falls[5] - normal) / 2;
-            normal /= 1 + normal * soft;
-            slides /= 1 + slides * soft;
-            for (int i = 0, k = 0; i < 3; i++)
-                for (int j = 0; j <= i; j++, k++)
-                    eased[k] = (i == j ? slides : 0.0f) + (normal - slides) * own.normal[i] * own.normal[j];
+for (int c = thread; c < rows; c += threads) {
+    float moved[3], felt[3], falls[6], along[3], eased[6] = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f}, gives[HELD] = {};
+    Block::point(p, nodes + HELD * c, weights + HELD * c, moved);
+    Symmetric::times(stiffness + 6 * c, moved, felt);
+    for (int i = 0; i < 3; i++) out.force[3 * c + i] = force[3 * c + i] - felt[i];
+    if (c < moving) {
+        const Contact own = contact(c);
+        own.feel(moved, felt, falls);
+        float soft = 0.0f;
+        for (int k = 0; k < HELD; k++) {
+            const int node = nodes[HELD * c + k];
+            gives[k] = weights[HELD * c + k] * in.mesh_free[node] / Block::mean(block + 6 * node);
+            soft += weights[HELD * c + k] * gives[k];
         }
+        Symmetric::times(falls, own.normal, along);
+        float normal = Vector::dot(own.normal, along), slides = (falls[0] + falls[2] + falls[5] - normal) / 2;
+        normal /= 1 + normal * soft;
+        slides /= 1 + slides * soft;
+        for (int i = 0, k = 0; i < 3; i++)
+            for (int j = 0; j <= i; j++, k++)
+                eased[k] = (i == j ? slides : 0.0f) + (normal - slides) * own.normal[i] * own.normal[j];
     }
-    for (int i = 0; i < 3; i++) out.force[3 * c + i] = on[i];
     for (int i = 0; i < 6; i++) out.falls[6 * c + i] = eased[i];
     for (int k = 0; k < HELD; k++) out.gives[HELD * c + k] = gives[k];
 }

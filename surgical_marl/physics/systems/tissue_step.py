@@ -52,7 +52,7 @@ class Held(NamedTuple):
 
 
 class Answer(NamedTuple):
-    """A step of tissue whose contacts' ends move as expected."""
+    """A step of tissue whose contacts' ends move as expected. Rows from the number of contacts on are empty."""
 
     shift: Array
     """Displacements of the nodes, m, [n, 3]."""
@@ -66,7 +66,7 @@ class Answer(NamedTuple):
 
 
 class Moved(NamedTuple):
-    """Tissue after a step."""
+    """Tissue after a step. Rows of contacts are as in `Answer`."""
 
     position: Array
     """m, [n, 3]"""
