@@ -70,6 +70,8 @@ class Graph:
         self.views: dict[tuple[Any, ...], Any] = {}
         """The results of `array_view.view`."""
         self._constant_ids: dict[tuple[str, Any], Value] = {}
+        self._constant_kinds: list[str] = []
+        self._folded: dict[tuple[Any, ...], Value] = {}
         self._table_numbers: dict[tuple[str, bytes], int] = {}
         self._known: dict[tuple[Any, ...], Value] = {}
         self._loads: dict[tuple[Any, ...], Value] = {}  # in any scope
@@ -89,10 +91,17 @@ class Graph:
         if found is None:
             found = self._constant_ids[key] = ~len(self.constants)
             self.constants.append(value if number else DTYPES[kind](0))
+            self._constant_kinds.append(kind)
         return found
 
+    def constants_of(self, array: np.ndarray) -> list[Value]:
+        """Return the constants of all elements of a numpy array, in a row."""
+        kind, known = KIND_OF[array.dtype], self._constant_ids
+        found = [known.get((kind, number or 0)) for number in array.ravel().tolist()]
+        return [self.constant(array.flat[k]) if value is None else value for k, value in enumerate(found)]
+
     def kind(self, value: Value) -> str:
-        return self.kinds[value] if value >= 0 else KIND_OF[self.constants[~value].dtype]
+        return self.kinds[value] if value >= 0 else self._constant_kinds[~value]
 
     def node(self, op: str, *args: Any, kind: str) -> Value:
         """Return a node as it is, not simplified; equal nodes are shared."""
@@ -122,8 +131,12 @@ class Graph:
         self._known = self._scopes.pop()
 
     def _fold(self, op: str, *args: Value) -> Value:
-        with np.errstate(all="ignore"):
-            return self.constant(np.asarray(FOLD[op](*(self.constants[~a] for a in args)))[()])
+        found = self._folded.get((op, *args))
+        if found is None:
+            with np.errstate(all="ignore"):
+                found = self.constant(np.asarray(FOLD[op](*(self.constants[~a] for a in args)))[()])
+            self._folded[op, *args] = found
+        return found
 
     def reads(self, value: Value) -> list[Value]:
         """Return the nodes that a node reads, without constants.

@@ -310,7 +310,8 @@ def _of_key(function: Callable[..., Any], *more: Any) -> Any:
 
 
 def _is_key(aval: Any) -> bool:
-    return bool(jax.numpy.issubdtype(aval.dtype, jax.dtypes.prng_key))
+    # only JAX's own dtypes, such as those of keys, are not numpy's
+    return not isinstance(aval.dtype, np.dtype) and bool(jax.numpy.issubdtype(aval.dtype, jax.dtypes.prng_key))
 
 
 def _row(g: Graph, x: AnyArray | Table, i: int) -> AnyArray:

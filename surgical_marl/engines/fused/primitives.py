@@ -214,7 +214,7 @@ def apply(g: Graph, name: str, avals: list[Any], params: dict[str, Any], xs: lis
         Unsupported: the primitive has no rule.
     """
     shape, dtype = avals[0].shape, avals[0].dtype
-    if all(0 in aval.shape for aval in avals):
+    if 0 in shape and all(0 in aval.shape for aval in avals):
         return [np.zeros(aval.shape, aval.dtype) for aval in avals]
     if name in _KNOWN and not any(isinstance(x, SymbolicArray) for x in xs):
         with np.errstate(all="ignore"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -78,21 +79,32 @@ def values_of(graph: Graph, array: AnyArray | Table) -> np.ndarray:
         raise Unsupported("more of a table than a look-up")
     array = np.asarray(array)
     kind_of(array.dtype)
-    flat = [graph.constant(element) for element in array.ravel()]
-    return np.array(flat, np.int32).reshape(array.shape)
+    return np.array(graph.constants_of(array), np.int32).reshape(array.shape)
 
 
 def array_of(graph: Graph, ids: np.ndarray, dtype: Any) -> AnyArray:
     """Return a numpy array if all values are constants, and otherwise a `SymbolicArray`."""
-    if ids.size and ids.max() >= 0:
+    flat = ids.ravel().tolist()
+    if flat and max(flat) >= 0:
         return SymbolicArray(ids)
-    flat = [graph.constants[~i] for i in ids.ravel().tolist()]
-    return np.array(flat, np.dtype(dtype)).reshape(ids.shape)
+    return np.array([graph.constants[~i] for i in flat], np.dtype(dtype)).reshape(ids.shape)
 
 
 def each(function: Callable[..., Value], g: Graph, shape: tuple[int, ...], *arrays: AnyArray) -> SymbolicArray:
     """`function(graph, *values)` of the elements, which are broadcast to `shape`."""
-    lifted = [values_of(g, array) for array in arrays]
-    columns = [(x if x.shape == shape else np.broadcast_to(x, shape)).ravel().tolist() for x in lifted]
+    columns = [_elements(g, array, shape) for array in arrays]
     flat = [function(g, *elements) for elements in zip(*columns, strict=True)]
     return SymbolicArray(np.array(flat, np.int32).reshape(shape))
+
+
+def _elements(g: Graph, array: AnyArray, shape: tuple[int, ...]) -> list[Value]:
+    """Return the values of an array, broadcast to a shape, in a row."""
+    if isinstance(array, SymbolicArray):
+        if array.ids.size == 1:
+            return [array.ids.item()] * math.prod(shape)
+        return (array.ids if array.ids.shape == shape else np.broadcast_to(array.ids, shape)).ravel().tolist()
+    if array.shape == shape or array.size == 1:
+        kind_of(array.dtype)
+        values = g.constants_of(array)
+        return values if len(values) > 1 else values * math.prod(shape)
+    return np.broadcast_to(values_of(g, array), shape).ravel().tolist()
