@@ -100,11 +100,11 @@ def test_random_starts_are_collision_free_postures(engine: str) -> None:
 
 def test_more_starts_are_drawn_to_learn_from_and_those_of_evaluations_stay() -> None:
     """From 4,096 starts three arms learned to know the rows: 99.6 % succeeded from them, 96.7 % from others."""
-    tables = {goals: Env("reach", "psm", start="random", goals=goals).task.tables for goals in ("training", "held_out")}
+    tables = {goals: Env("reach", "ecm", start="random", goals=goals).task.tables for goals in ("training", "held_out")}
     assert {goals: len(table["targets"]) for goals, table in tables.items()} == {"training": 32768, "held_out": 4096}
-    paths = {goals: Env("track", "psm", start="random", goals=goals).task.tables for goals in tables}
+    paths = {goals: Env("track", "ecm", start="random", goals=goals).task.tables for goals in tables}
     assert {goals: len(table["postures"]) for goals, table in paths.items()} == {"training": 16384, "held_out": 1024}
-    scene = load_scene("psm")
+    scene = load_scene("ecm")
     ways, targets = start_table(scene, 0.05, rows=100)
     for longer, shorter in zip([*start_table(scene, 0.05, rows=200)[0].values()], ways.values(), strict=True):
         assert np.array_equal(longer[:, :100], shorter)
@@ -139,11 +139,11 @@ def test_both_engines_begin_at_the_same_postures() -> None:
         assert np.allclose(found[0][agent], found[1][agent], atol=1e-5)
 
 
-@pytest.mark.parametrize(("task", "scene"), [("reach", "bimanual_psm"), ("track", "psm")])
+@pytest.mark.parametrize(("task", "scene"), [("reach", "bimanual_psm"), ("track", "ecm")])
 def test_the_oracle_reaches_its_goals_from_any_start(task: str, scene: str) -> None:
     from surgical_marl.policies.oracle import oracle
 
-    env = BatchedEnv(task, scene, num_envs=64, start="random")
+    env = BatchedEnv(task, scene, num_envs=64, start="random", goals="held_out")
     observations, *_ = env.reset(seed=0)
     act = oracle(env)
     for _ in range(99):
