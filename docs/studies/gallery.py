@@ -33,7 +33,7 @@ from surgical_marl import (
 from surgical_marl.plugins.tasks import scene_of
 from surgical_marl.robots.spec import VISUAL_GROUP
 from surgical_marl.scenes.objects import Placement
-from surgical_marl.scenes.placing import PlacementEntry, add_bars, add_objects, scenes_without_objects, take_soft
+from surgical_marl.scenes.placing import PlacementEntry, add_bars, add_objects, scenes_without_objects, soft_systems
 from surgical_marl.scenes.scene import Scene
 from surgical_marl.untrusted.schema import Place
 from surgical_marl.view.camera import best_view
@@ -80,8 +80,9 @@ def object_picture(name: str) -> Picture:
     """Draw one object on a white ground."""
     spec = mujoco.MjSpec()
     placed = {name: Placement(load_object(name), np.zeros(3), np.eye(3))}
-    add_bars(spec, take_soft(placed, {name: PlacementEntry(name)}, Place(), {name: {}}))
-    add_objects(spec, placed)
+    add_bars(spec, soft_systems(placed, {name: PlacementEntry(name)}, Place(), {name: {}}))
+    if not placed[name].object.soft:
+        add_objects(spec, placed)
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)

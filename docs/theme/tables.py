@@ -104,7 +104,7 @@ def scenes() -> str:
     def rows() -> Iterator[list[str]]:
         for name in list_scenes():
             scene = load_scene(name)
-            held = words(f"{key} (`{place.object.name}`)" for key, place in scene.objects.items()) or "-"
+            held = words(f"{key} (`{place.object.name}`)" for key, place in scene.placements.items()) or "-"
             tasks = words(f"`{task}`" for task in list_tasks() if name in scenes_for(task)) or "-"
             agents = words(f"`{agent}`" for agent in scene.agents)
             yield [f"`{name}`", shown("scenes", name), scene.description, agents, held, tasks]

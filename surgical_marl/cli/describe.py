@@ -42,7 +42,7 @@ def _scene(scene: Scene) -> str:
         way = f"shaft along ({shaft[0]:.2f}, {shaft[1]:.2f}, {shaft[2]:.2f}) at zero" if mount.arm.remote_center else ""
         point = "remote center" if mount.arm.remote_center else "base"
         lines.append(f"    {scene.label(agent):14} {point} at ({x:.3f}, {y:.3f}, {z:.3f}) m {way}".rstrip())
-    for name, placement in scene.objects.items():
+    for name, placement in scene.placements.items():
         x, y, z = placement.position
         lines.append(f"    {name:14} {placement.object.name} at ({x:.3f}, {y:.3f}, {z:.3f}) m")
     pairs = f"{len(scene.pairs)} pairs of shapes can touch"

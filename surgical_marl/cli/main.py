@@ -284,13 +284,16 @@ def _check_export_scene(arguments: argparse.Namespace) -> None:
 def _export_scene(arguments: argparse.Namespace) -> None:
     from surgical_marl.files import write_text
     from surgical_marl.scenes.load import load_scene
-    from surgical_marl.scenes.mjcf import mjcf
+    from surgical_marl.scenes.mjcf import left_out, mjcf
 
-    text = mjcf(load_scene(find("scenes", arguments.source), arguments.control))
+    scene = load_scene(find("scenes", arguments.source), arguments.control)
+    text = mjcf(scene)
     try:
         write_text(arguments.out, text)
     except OSError as error:
         raise ValueError(f"cannot write {arguments.out}: {error.strerror}") from None
+    if missing := left_out(scene):
+        print(f"left out of the file: {', '.join(missing)}", file=sys.stderr)
     print(arguments.out)
 
 

@@ -65,7 +65,7 @@ def infos(
             **{f"stage_{name}": reached for name, reached in stages[agent].items()},
             **{f"reward_{name}": value for name, value in terms[agent].items()},
             **_handling(view),
-            **_soft(world),
+            **_reported(scene, world),
             "cost": sum((cost.astype(jnp.float32) for cost in broken.values()), start=jnp.float32(0.0)),
             **{f"cost_{name}": cost for name, cost in broken.items()},
             **told[agent],
@@ -84,14 +84,13 @@ def _handling(view: ArmView) -> dict[str, Array]:
     return found
 
 
-def _soft(world: World) -> dict[str, Array]:
-    """Return the largest tension of threads and the largest force on tissue, N, where a scene has such."""
-    found = {}
-    for name in ("tension", "tissue_force"):
-        values = [jnp.max(getattr(view, name)) for view in world.systems.values() if hasattr(view, name)]
-        if values:
-            found[name] = jnp.stack(values).max()
-    return found
+def _reported(scene: Scene, world: World) -> dict[str, Array]:
+    """Return the infos about the systems of a scene: of each number that some report, the largest."""
+    found: dict[str, list[Array]] = {}
+    for name, system in scene.systems.items():
+        for field in system.reports:
+            found.setdefault(field, []).append(jnp.max(getattr(world.systems[name], field)))
+    return {field: jnp.stack(values).max() for field, values in found.items()}
 
 
 def costs(arm: Arm, view: ArmView, tip_speed: Array) -> dict[str, Array]:

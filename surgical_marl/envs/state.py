@@ -50,8 +50,8 @@ class State(NamedTuple):
     """success, collision, min_distance (m), contact_force (N), contact_overflow (how many
     contacts of arms in the scene were left out; 0 unless very many touch); with free objects `holding` any of them, and
     of each `<object>_force` (N), `<object>_holding` and `<object>_slip` (m); `stage_<name>` and the task's own metrics,
-    such as tip_error (m); with thread its largest `tension` (N); what action terms tell, as Cartesian control tells
-    `cartesian_error` (m);
+    such as tip_error (m); with thread its largest `tension` (N), with tissue the largest `tissue_force` on it (N); what
+    action terms tell, as Cartesian control tells `cartesian_error` (m);
     `reward_<term>`, the weighted terms that the reward is the sum of; `cost_<name>`, the limits broken
     (`surgical_marl/envs/infos.py`), and their number `cost`. Of this step's episode, even if it ended."""
     contacts: Contacts

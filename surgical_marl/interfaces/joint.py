@@ -30,9 +30,8 @@ _TEAM: dict[str, Callable[[Any, Any], Any]] = {
     "goal_angle": np.maximum,
     "drop": np.logical_or,
     "holding": np.logical_or,
-    "tension": np.maximum,
 }
-"""Functions that make one value of those of two arms, by the name of the info; see also `_combine`."""
+"""Functions that make one value of those of two arms, by the name of the info; see also `JointAgent._combine`."""
 
 
 class JointAgent:
@@ -66,6 +65,7 @@ class JointAgent:
         self._slices = {arm: slice(a, b) for arm, a, b in zip(self.arms, [0, *ends], ends, strict=False)}
         self.action_space = spaces.Box(-1.0, 1.0, (ends[-1],), np.float32)
         self._alone, self._name = alone, ", ".join(self.arms)
+        self._reported = {name for system in batch.scene.systems.values() for name in system.reports}
         self._shapes = {self._name: (ends[-1],) if alone else (batch.num_envs, ends[-1])}
 
     def observation(self, observations: Mapping[str, Any], index: int | slice = slice(None)) -> Any:
@@ -95,11 +95,19 @@ class JointAgent:
         if len(own) == 1:
             team = {name: of(values) for name, values in own[0].items()}
         else:
-            shared = [name for name in own[0] if _combine(name) and all(name in info for info in own)]
-            team = {name: of(reduce(_combine(name), [info[name] for info in own])) for name in shared}  # type: ignore[arg-type]
+            shared = [name for name in own[0] if self._combine(name) and all(name in info for info in own)]
+            team = {name: of(reduce(self._combine(name), [info[name] for info in own])) for name in shared}  # type: ignore[arg-type]
         if self.every:
             team["agents"] = {arm: {name: of(values) for name, values in infos[arm].items()} for arm in self.every}
         return team
+
+    def _combine(self, name: str) -> Callable[[Any, Any], Any] | None:
+        """Return a function that makes one value of two arms' values of that name; None if there is none."""
+        if name.startswith(("reward_", "cost")):
+            return np.add
+        if name in self._reported:
+            return np.maximum
+        return np.logical_and if name.startswith("stage_") else _TEAM.get(name)
 
 
 def _arms(batch: BatchedEnv, agent: str | None, others: Sequence[str]) -> list[str]:
@@ -121,13 +129,6 @@ def _arms(batch: BatchedEnv, agent: str | None, others: Sequence[str]) -> list[s
             f"no teammate moves {missing[0]!r}: say who does, as in teammates={{{missing[0]!r}: 'frozen'}}"
         )
     return [agent]
-
-
-def _combine(name: str) -> Callable[[Any, Any], Any] | None:
-    """Return a function that makes one value of two arms' values of that name; None if there is none."""
-    if name.startswith(("reward_", "cost")):
-        return np.add
-    return np.logical_and if name.startswith("stage_") else _TEAM.get(name)
 
 
 def _pictures(observations: Mapping[str, Any]) -> dict[str, Any]:

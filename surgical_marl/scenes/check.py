@@ -72,7 +72,7 @@ def _sum_up_arm(folder: Path) -> str:
 
 def _sum_up_scene(path: Path) -> str:
     scene = load_scene(path)
-    objects = f", {_count(len(scene.objects), 'object')}" if scene.objects else ""
+    objects = f", {_count(len(scene.placements), 'object')}" if scene.placements else ""
     return f"scene of {_count(len(scene.agents), 'arm')}{objects}"
 
 

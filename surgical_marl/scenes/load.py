@@ -32,7 +32,7 @@ from surgical_marl.scenes.placing import (
     add_bars,
     add_objects,
     read_placements,
-    take_soft,
+    soft_systems,
 )
 from surgical_marl.scenes.scene import AttachmentEntry, Mount, Randomisation, Scene
 from surgical_marl.scenes.surroundings import TissueEntry, View, add_surroundings, add_tissue
@@ -97,12 +97,15 @@ def load_scene(name: str | Path, control: str = "position") -> Scene:
     mounts = {agent: _mount(agent, entry, place.at(settings, "arms", agent), load) for agent, entry in
               about.arms.items()}  # fmt: skip
     where = place.part("objects", settings)
-    objects = read_placements(about.objects, where, settings.get("objects"), mounts)
-    soft = take_soft(objects, about.objects, where, settings.get("objects"))
-    systems = soft | read_systems(about.systems, place.part("systems", settings), {**mounts, **objects, **soft})
+    entries = about.objects, where, settings.get("objects")
+    placed = read_placements(*entries, mounts)
+    objects, soft = ({n: p for n, p in placed.items() if bool(p.object.soft) == kind} for kind in (False, True))
+    systems = soft_systems(placed, *entries, about.randomisation)
+    systems |= read_systems(about.systems, place.part("systems", settings), mounts | placed)
     observe = {agent: list(names) for agent, names in about.observe.items()}
     scene = partial(Scene, path.stem, about.description, control, mounts, randomisation=about.randomisation,
-                    observe=observe, objects=objects, attachments=about.attachments, systems=systems)  # fmt: skip
+                    observe=observe, objects=objects, soft=soft, attachments=about.attachments,
+                    systems=systems)  # fmt: skip
 
     def compute() -> mujoco.MjModel:
         spec = build_scene(path.stem, mounts, control, about.randomisation, pads=bool(objects or systems))
@@ -119,7 +122,7 @@ def load_scene(name: str | Path, control: str = "position") -> Scene:
         return model
 
     contents = (part for mount in mounts.values() for part in mount.arm.content)
-    held = (item.object.content for item in objects.values())
+    held = (item.object.content for item in placed.values())
     pictured = repr(systems)
     model = cached_model(compute, repr((path.stem, control, _without_sources(about))), *contents, *held, pictured)
     loaded = scene(model=model)

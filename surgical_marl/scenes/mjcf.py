@@ -9,9 +9,10 @@ as numbers.
 
 from __future__ import annotations
 
+import re
 from dataclasses import astuple
 from typing import Any
-from xml.etree.ElementTree import Element, SubElement, indent, tostring
+from xml.etree.ElementTree import Comment, Element, SubElement, indent, tostring
 
 import mujoco
 import numpy as np
@@ -38,7 +39,7 @@ def mjcf(scene: Scene, timestep: float | None = None) -> str:
 
     A free object has a free joint of its name, after all joints of the arms; in `scene.model` it has none. Gravity acts
     on objects, and contacts of objects are pairs with friction and a stiffness in N/m (`object_contacts.py`).
-    Thread and tissue are left out.
+    Systems, such as thread and tissue, and attachments are left out; a comment at the top names them (`left_out`).
 
     Args:
         scene: the scene.
@@ -47,6 +48,8 @@ def mjcf(scene: Scene, timestep: float | None = None) -> str:
     """
     model, timestep = scene.model, timestep or scene.model.opt.timestep
     root = Element("mujoco", model=scene.name)
+    if missing := left_out(scene):
+        root.append(Comment(f" left out: {re.sub('--+', '-', ', '.join(missing))} "))
     _add(root, "compiler", angle="radian")
     _add(root, "option", timestep=timestep, gravity=GRAVITY if scene.objects else model.opt.gravity,
          integrator=_word(mujoco.mjtIntegrator(model.opt.integrator)),
@@ -76,6 +79,13 @@ def mjcf(scene: Scene, timestep: float | None = None) -> str:
     _add(_add(root, "keyframe"), "key", name="home", qpos=_home(scene), ctrl=holding)
     indent(root)
     return tostring(root, encoding="unicode") + "\n"
+
+
+def left_out(scene: Scene) -> list[str]:
+    """Return what an MJCF file of a scene lacks, in words: "suture (thread)", "grip (attachment)"."""
+    systems = (scene.soft[name].object.soft.kind if name in scene.soft else "system" for name in scene.systems)
+    kinds = zip((*scene.systems, *scene.attachments), (*systems, *["attachment"] * len(scene.attachments)), strict=True)
+    return [f"{name} ({kind})" for name, kind in kinds]
 
 
 def _home(scene: Scene) -> np.ndarray:

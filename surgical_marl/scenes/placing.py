@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import mujoco
@@ -16,6 +16,7 @@ from surgical_marl.plugins.tasks import TASKS
 from surgical_marl.robots.rotation import quaternion, turned
 from surgical_marl.scenes.objects import Placement, add_shape, load_object
 from surgical_marl.scenes.poses import along
+from surgical_marl.scenes.scene import Randomisation
 from surgical_marl.scenes.surroundings import STILL
 from surgical_marl.untrusted.schema import Place, Vector, angles, lengths, rgb
 from surgical_marl.yaml_file import read_yaml
@@ -25,6 +26,10 @@ MAX_OBJECTS = 50
 
 TAKEN = re.compile(r"world|tissue|contact|target|(?:reward|cost|stage)(?:_\w*)?")
 """Names that parts of a model, observations or infos have or begin with: `contact_force`, `reward_reach`."""
+
+
+EXACT = Randomisation()
+"""Nothing is randomised."""
 
 
 @dataclass(frozen=True)
@@ -86,19 +91,31 @@ def read_placements(
     return found
 
 
-def take_soft(
-    placements: dict[str, Placement], entries: Mapping[str, PlacementEntry], place: Place, settings: Any
-) -> dict[str, Any]:
-    """Remove all objects that are no rigid bodies from some placements, and return them as systems, by name.
+def soft_systems(
+    placements: Mapping[str, Placement], entries: Mapping[str, PlacementEntry], place: Place, settings: Any,
+    ranges: Randomisation = EXACT,
+) -> dict[str, Any]:  # fmt: skip
+    """Return the systems that move those of some objects that are no rigid bodies, by name.
+
+    Args:
+        placements: objects of the scene by name.
+        entries: of the scene file.
+        place: of `settings` in the file.
+        settings: the mapping that `entries` were read from.
+        ranges: of domain randomisation.
 
     Raises:
         ValueError: one is fastened to nothing that there is.
     """
-    soft = {name: placements.pop(name) for name in list(placements) if placements[name].object.soft}
-    return {
-        name: soft_kind(item.object.soft.kind).placed(item, entries[name], placements, place.at(settings, name))
-        for name, item in soft.items()
-    }
+
+    def placed(name: str, item: Placement) -> Any:
+        kind = item.object.soft.kind
+        system = soft_kind(kind).placed(item, entries[name], rigid, place.at(settings, name))
+        own = (getattr(ranges, f"{kind}_{value}") for value in system.ranges._fields)
+        return replace(system, ranges=system.ranges._make(own))
+
+    rigid = {name: item for name, item in placements.items() if not item.object.soft}
+    return {name: placed(name, item) for name, item in placements.items() if item.object.soft}
 
 
 def add_bars(spec: mujoco.MjSpec, systems: Mapping[str, Any]) -> None:

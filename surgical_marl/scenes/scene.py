@@ -62,6 +62,14 @@ class Randomisation:
     """Their masses are off by up to this share of their value, whatever their size."""
     object_friction: float = number(0.0, 0.0, SHARE)
     """Their coefficients of friction likewise."""
+    thread_stiffness: float = number(0.0, 0.0, SHARE)
+    """Young's moduli of threads are off by up to this share of their value."""
+    thread_friction: float = number(0.0, 0.0, SHARE)
+    """Their coefficients of friction likewise."""
+    tissue_stiffness: float = number(0.0, 0.0, SHARE)
+    """Young's moduli of pieces of tissue are off by up to this share of their value."""
+    tissue_friction: float = number(0.0, 0.0, SHARE)
+    """Their coefficients of friction likewise."""
 
     def __bool__(self) -> bool:
         return any(getattr(self, item.name) for item in fields(self))
@@ -110,11 +118,13 @@ class Scene:
     observe: dict[str, list[str]] = field(default_factory=dict)
     """Agent -> names of the observation terms that it observes, instead of the task's own choice."""
     objects: dict[str, Placement] = field(default_factory=dict)
-    """Name -> object and where it is. In `model` free objects are mocap bodies of this name, which have no joints."""
+    """Name -> rigid object and where it is. In `model` free ones are mocap bodies of this name, without joints."""
     attachments: dict[str, AttachmentEntry] = field(default_factory=dict)
     """Name -> a free object and the link that it can be attached to."""
     systems: dict[str, Any] = field(default_factory=dict)
-    """Name -> a thread, or a system of a plug-in (`surgical_marl.physics.systems.system.System`)."""
+    """Name -> a thread, tissue, or a system of a plug-in (`surgical_marl.physics.systems.system.System`)."""
+    soft: dict[str, Placement] = field(default_factory=dict)
+    """Name -> thread or tissue and where its frame is; `systems` has what moves."""
 
     @property
     def agents(self) -> tuple[str, ...]:
@@ -125,6 +135,11 @@ class Scene:
     def free_objects(self) -> dict[str, Placement]:
         """The objects that move, by name, in the order of the mocap bodies of `model` and of physical states."""
         return {name: place for name, place in self.objects.items() if place.object.free}
+
+    @property
+    def placements(self) -> dict[str, Placement]:
+        """All objects by name, rigid, thread and tissue."""
+        return self.objects | self.soft
 
     @cached_property
     def drawn(self) -> dict[str, Any]:

@@ -153,7 +153,8 @@ def scene_file(folder: Path, **settings: Any) -> str:
     placed = {"object": "sheet.yaml", "position": [-0.015, -0.01, 0.0315]}
     (folder / "sheet.yaml").write_text(yaml.safe_dump(tissue | settings))
     path = folder / "over_tissue.yaml"
-    path.write_text(yaml.safe_dump({"arms": {"psm_0": arm}, "objects": {"sheet": placed}}))
+    drawn = {"tissue_stiffness": 0.3, "tissue_friction": 0.3}
+    path.write_text(yaml.safe_dump({"arms": {"psm_0": arm}, "objects": {"sheet": placed}, "randomisation": drawn}))
     return str(path)
 
 
@@ -233,7 +234,7 @@ def test_ten_minutes_of_random_arms_turn_no_brick_inside_out() -> None:
     count, seconds = 32, 600
     env = BatchedEnv("reach", "bimanual_psm_tissue", num_envs=count, engine="fused", device="cpu")
     env.reset(seed=0)
-    grid, rng, pressed = env.scene.systems["sheet"].grid, np.random.default_rng(0), 0
+    grid, rng, pressed = env.scene.systems["flap"].grid, np.random.default_rng(0), 0
     slope = (2 * CORNERS - 1) / (4 * grid.cell)
     for step in range(round(seconds / 0.02 / count)):
         if step % 25 == 0:
@@ -243,10 +244,10 @@ def test_ten_minutes_of_random_arms_turn_no_brick_inside_out() -> None:
                 actions[agent][:, 2] = np.abs(actions[agent][:, 2])  # insertion
                 actions[agent][:, -1] = rng.choice([-1.0, 1.0], count)
         env.step(actions)
-        x = np.array(env.engine.read(".physics.sheet.nodes.position", "numpy"), float)
+        x = np.array(env.engine.read(".physics.flap.nodes.position", "numpy"), float)
         assert np.isfinite(x).all(), step
         gradient = np.einsum("neai,aj->neij", x[:, grid.first[:, None] + grid.offsets], slope)
         assert np.linalg.det(gradient).min() > 0, step
-        pressed += int((np.array(env.engine.read(".physics.sheet.force", "numpy")) > 0.1).sum())
+        pressed += int((np.array(env.engine.read(".physics.flap.force", "numpy")) > 0.1).sum())
     assert pressed > 500  # the arms did press it
     env.close()

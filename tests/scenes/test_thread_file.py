@@ -118,7 +118,13 @@ def test_pictures_have_a_capsule_for_each_edge_and_mjcf_has_none() -> None:
         np.testing.assert_allclose(data.xpos[body.id], path[number : number + 2].mean(0), atol=1e-9)
         end = data.xpos[body.id] + geom.size[1] * data.xmat[body.id].reshape(3, 3)[:, 2]
         np.testing.assert_allclose(end, path[number + 1], atol=1e-9)
-    assert "thread/" not in mjcf(scene)
+
+
+def test_an_exported_scene_says_what_it_lacks() -> None:
+    text = mjcf(sm.load_scene("bimanual_star_suture"))
+    assert "<!-- left out: wound (tissue), thread (thread), grip (attachment) -->" in text
+    assert "thread/" not in text and "wound/" not in text
+    assert "left out" not in mjcf(sm.load_scene("bimanual_psm_needle"))
 
 
 def test_a_line_turns_z_along_itself() -> None:

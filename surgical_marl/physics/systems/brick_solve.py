@@ -10,6 +10,7 @@ K is a loop over bricks. Loops over bricks and nodes are scans, since the fused 
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -89,6 +90,7 @@ class BrickSolver:
         support: Support,
         damping: float = 0.0,
         iterations: int = 8,
+        stiffer: Any = 1.0,
     ) -> None:
         """Collect the constants.
 
@@ -98,14 +100,21 @@ class BrickSolver:
             support: of the borders.
             damping: s; the force of damping is this times K times the velocity.
             iterations: of conjugate gradients.
+            stiffer: factor of Young's modulus, in which all forces of bricks are linear.
         """
         self.grid, self.brick, self.support, self.iterations = grid, brick, support, iterations
-        self.damping = damping
+        self.damping, self.stiffer = damping, stiffer
         self.free = (~support.fixed & (grid.mass > 0)).astype(np.float32)
+
+    def stiffened(self, stiffer: Any) -> BrickSolver:
+        """Return the solver with another factor of Young's modulus."""
+        found = copy.copy(self)
+        found.stiffer = stiffer
+        return found
 
     def linearise(self, state: Nodes, dt: Any) -> Linear:
         """Return the forces on nodes and their derivatives."""
-        grid, blend = self.grid, 1 + self.damping / dt
+        grid, blend = self.grid, self._blend(dt)
 
         def begin(row: Any) -> tuple[Array, Array, Array, Array]:
             mass, support, free, x, rest, v = row
@@ -118,7 +127,7 @@ class BrickSolver:
             cell, forces = self.brick.deformed(state.position[nodes])
             own = blend * (cell.turn @ jnp.asarray(self.brick.diagonal) @ cell.turn.T)
             force, block = sums
-            force = force.at[nodes].add(forces, mode="promise_in_bounds")
+            force = force.at[nodes].add(self.stiffer * forces, mode="promise_in_bounds")
             block = block.at[nodes].add(own[:, *LOWER], mode="promise_in_bounds")
             return (force, block), cell
 
@@ -202,9 +211,13 @@ class BrickSolver:
         found: Array = jax.lax.while_loop(goes_on, iterate, (jnp.int32(0), guess, residual, p, ap, rz))[1]
         return found
 
+    def _blend(self, dt: Any) -> Any:
+        """Return the factor of the stiffness K of bricks in the matrix of a step: with damping."""
+        return self.stiffer * (1 + self.damping / dt)
+
     def _elastic(self, cells: Cell, p: Array, sums: Array, dt: Any) -> Array:
         """Return sums [n, 3] with the elastic part of the matrix times p, [n, 3]."""
-        blend = 1 + self.damping / dt
+        blend = self._blend(dt)
 
         def add(sums: Array, row: Any) -> tuple[Array, None]:
             first, cell = row

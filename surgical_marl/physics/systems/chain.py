@@ -184,8 +184,7 @@ def _eliminate(
     rod: Rod, u: Array, q: Array, edges: Array, known: tuple[Any, ...], load: Loaded
 ) -> tuple[Factors, Array]:  # fmt: skip
     """Return the eliminated matrix of a Newton step at displacements u and tensions q, and its right side, [n, 4]."""
-    stiffness, stretchy = np.float32(rod.bending / rod.length**3), np.float32(rod.length / rod.axial)
-    length_at_rest = np.float32(rod.length)
+    stiffness, stretchy, length_at_rest = rod.bending / rod.length**3, rod.length / rod.axial, rod.length
 
     def node(carry: Any, row: Any) -> tuple[Any, tuple[Factors, Array]]:
         (bent_1, bent, pull_1), (block, meets, right), (block_2, right_2) = carry
@@ -243,7 +242,7 @@ def _back(rod: Rod, bends: Any, factors: Factors, reduced: Array) -> tuple[Array
 
 def _skips(rod: Rod, bends: Any) -> Any:
     """Return the stiffness of bending between each node and the next but one, N/m, [n]."""
-    return np.float32(rod.bending / rod.length**3) * _after(bends)
+    return rod.bending / rod.length**3 * _after(bends)
 
 
 def _inverse(matrix: Array) -> Array:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from jax import Array
@@ -139,6 +139,8 @@ class System(ABC):
     """Friction and stiffness of its parts."""
     ties: tuple[Tie, ...] = ()
     """Where it is fastened."""
+    reports: ClassVar[tuple[str, ...]] = ()
+    """Fields of its view that are infos of every agent: numbers, of which the largest in a scene counts."""
 
     @property
     def bars(self) -> Bars | None:

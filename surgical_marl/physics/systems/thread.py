@@ -23,7 +23,8 @@ from surgical_marl.physics.solver.cholesky import FULL, LOWER
 from surgical_marl.physics.systems import crossings
 from surgical_marl.physics.systems.chain import ChainState, Factors, Loaded, Newton, Rod, free_forces, search, solve
 from surgical_marl.physics.systems.crossings import Joined
-from surgical_marl.physics.systems.system import Bars, End, Ends, Response, Shapes, System, Tie
+from surgical_marl.physics.systems.soft import Soft
+from surgical_marl.physics.systems.system import Bars, End, Ends, Response, Shapes, Tie
 from surgical_marl.physics.tree_utils import row_of
 from surgical_marl.scenes.objects import Placement, Surface
 from surgical_marl.scenes.thread_file import ThreadFile
@@ -76,7 +77,7 @@ class Solved(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Thread(System):
+class Thread(Soft):
     """A thread."""
 
     nodes: int
@@ -102,6 +103,7 @@ class Thread(System):
     """In pictures."""
     file: ClassVar[type] = ThreadFile
     """The content of its file."""
+    reports: ClassVar[tuple[str, ...]] = ("tension",)
 
     @classmethod
     def placed(cls, item: Placement, entry: Any, others: Mapping[str, Placement], place: Place) -> Thread:
@@ -134,8 +136,9 @@ class Thread(System):
     def rod(self) -> Rod:
         """Material and size of the chain."""
         area, inertia = np.pi * self.diameter**2 / 4, np.pi * self.diameter**4 / 64
-        return Rod(self.nodes, self.length / (self.nodes - 1), self.density * area, self.young * area,
-                   self.young * inertia, self.drag)  # fmt: skip
+        young = self.factors.stiffness * self.young
+        return Rod(self.nodes, self.length / (self.nodes - 1), self.density * area, young * area, young * inertia,
+                   self.drag)  # fmt: skip
 
     @property
     def bars(self) -> Bars:
@@ -169,10 +172,15 @@ class Thread(System):
         return free_forces(self.rod, state.chain, dt)
 
     def respond(self, state: ThreadState, motion: Array, ends: Ends, dt: Any) -> Response:
-        ends, holds = recall(state.stretches, ends, self.nodes - 1), self._holds(state)
+        ends, holds = recall(state.stretches, self.rubbed(ends), self.nodes - 1), self._holds(state)
         itself = self.surface.against(self.surface)
         pairs = crossings.find(
-            self.shapes(state), state.chain.velocity, self.crossings, itself.stiffness, itself.sliding, dt
+            self.shapes(state),
+            state.chain.velocity,
+            self.crossings,
+            itself.stiffness,
+            self.factors.friction * itself.sliding,
+            dt,
         )
         pairs = recall(state.rubbed, pairs, self.nodes - 1)
 

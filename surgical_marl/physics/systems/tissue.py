@@ -21,7 +21,8 @@ from surgical_marl.physics.contact.spring_contact import Stretches, each, none, 
 from surgical_marl.physics.systems.brick import Brick
 from surgical_marl.physics.systems.brick_grid import BrickGrid, SurfacePoints
 from surgical_marl.physics.systems.brick_solve import BrickSolver, Nodes, Support
-from surgical_marl.physics.systems.system import Bars, Clusters, Ends, Response, Shapes, System
+from surgical_marl.physics.systems.soft import Soft
+from surgical_marl.physics.systems.system import Bars, Clusters, Ends, Response, Shapes
 from surgical_marl.physics.systems.tissue_step import Answer, Held, TissueStep
 from surgical_marl.physics.tree_utils import row_of
 from surgical_marl.scenes.objects import Placement, Surface
@@ -73,7 +74,7 @@ class Solved(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Tissue(System):
+class Tissue(Soft):
     """A piece of tissue."""
 
     size: tuple[float, float, float]
@@ -103,6 +104,7 @@ class Tissue(System):
     """In pictures."""
     file: ClassVar[type] = TissueFile
     """The content of its file."""
+    reports: ClassVar[tuple[str, ...]] = ("tissue_force",)
 
     @classmethod
     def placed(cls, item: Placement, entry: Any, others: Mapping[str, Placement], place: Place) -> Tissue:
@@ -137,7 +139,8 @@ class Tissue(System):
         for name, per_area in self.springs:
             stiffness += per_area * grid.areas(name)
         support = Support(fixed, stiffness.astype(np.float32), self.rest)
-        return BrickSolver(grid, Brick(grid.cell, self.young, self.poisson), support, self.damping)
+        brick = Brick(grid.cell, self.young, self.poisson)
+        return BrickSolver(grid, brick, support, self.damping, stiffer=self.factors.stiffness)
 
     @cached_property
     def points(self) -> SurfacePoints:
@@ -200,7 +203,7 @@ class Tissue(System):
         return ()
 
     def respond(self, state: TissueState, motion: Any, ends: Ends, dt: Any) -> Response:
-        ends, held = recall(state.stretches, ends, len(self.points.nodes)), self._held(ends)
+        ends, held = recall(state.stretches, self.rubbed(ends), len(self.points.nodes)), self._held(ends)
         answer = self._step(dt).respond(state.nodes, held, ends)
         return Response(-answer.force, Solved(answer, held, ends))
 

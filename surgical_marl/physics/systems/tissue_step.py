@@ -109,7 +109,8 @@ class TissueStep:
 
     def respond(self, nodes: Nodes, held: Held, ends: Ends) -> Answer:
         """Return the displacements of nodes whose contacts' ends move as expected, and the forces on these."""
-        return self._stage("respond", self.answered, held)(nodes, held, ends, np.float32(1.0), self.mesh)
+        stage = self._stage("respond", self.answered, held)
+        return stage(nodes, held, ends, jnp.float32(self.solver.stiffer), self.mesh)
 
     def move(self, nodes: Nodes, held: Held, ends: Ends, answer: Answer, pushed: Array) -> Moved:
         """Return the tissue after displacements `answer.shift` and those by additional forces [c, 3] on contacts, N."""
@@ -128,8 +129,8 @@ class TissueStep:
 
     def answered(self, nodes: Nodes, held: Held, ends: Ends, stiffer: Any, mesh: Any) -> Answer:
         """Return what `respond` does."""
-        del stiffer, mesh  # for the kernel
-        solver, dt, touched = self.solver, self.dt, ends.total > 0
+        del mesh  # for the kernel
+        solver, dt, touched = self.solver.stiffened(stiffer), self.dt, ends.total > 0
         linear = solver.linearise(nodes, dt)
         iterations = jnp.where(touched, TURNS, ALONE)
 
