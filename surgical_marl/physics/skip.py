@@ -22,7 +22,7 @@ SKIPS = {
     "arms_apart": "arms in contact with nothing are solved one by one, not together with all others",
     "arm_planes": "pairs of capsules of two arms with a plane between them are not compared",
     "arm_contacts": "contacts between arms are not computed while no arms overlap",
-    "sleeping": "rigid bodies at rest with nothing near them are not moved",
+    "sleeping": "rigid bodies and threads at rest with nothing near them are not moved",
     "bodies_apart": "rigid bodies that do not touch each other are solved one by one",
     "far_pairs": "pairs of bodies are not compared while all of their kind are far apart",
 }

@@ -71,6 +71,8 @@ class Meeting(NamedTuple):
     response: Response
     expected: tuple[Array, Array]
     """Accelerations of joints [a, m] and of bodies [k, 6] that its response assumes: those of the last step."""
+    awake: Any
+    """Whether it moves, [] bool; True of a system that never sleeps. There is nothing in the rest unless it does."""
 
 
 class Step:
@@ -203,20 +205,39 @@ class Step:
         bodies, by_arm = physics.rigid_bodies.bodies, self._solver.twists.by_arm
         expected = by_arm(physics.arms.qacc_warmstart), bodies.acceleration
         motion = by_arm(physics.qvel) + dt * expected[0], bodies.velocity + dt * expected[1]
-        ends = self._couplings[name].ends(system.shapes(state), found.poses, found.joints, bodies, motion, dt)
-        return Meeting(ends, system.respond(state, system.free_motion(state, dt), ends, dt), expected)
+        shapes, coupling, awake = system.shapes(state), self._couplings[name], system.awake(state)
+        scenery = coupling.scenery(found.poses, found.joints, bodies, motion, dt)
+
+        def meet() -> tuple[Ends, Response]:
+            ends = coupling.ends(shapes, scenery, found.joints, bodies, motion, dt)
+            return ends, system.respond(state, system.free_motion(state, dt), ends, dt)
+
+        if awake is True:
+            ends, response = meet()
+            return Meeting(ends, response, expected, awake)
+        awake |= coupling.visited(shapes, scenery, dt)
+        nothing: Any = empty_like(jax.eval_shape(meet))
+        ends, response = skip.cond("sleeping", awake, meet, lambda: nothing)
+        return Meeting(ends, response, expected, awake)
 
     def _systems_moved(
         self, before: Physics, after: Physics, found: Found, meetings: dict[str, Meeting]
     ) -> Physics:  # fmt: skip
         """Move all other systems by the accelerations that arms and bodies have had in the step."""
-        dt, bodies, moved = self.arms.dt, before.rigid_bodies.bodies, {}
-        for name, met in meetings.items():
+        dt, bodies = self.arms.dt, before.rigid_bodies.bodies
+
+        def move(name: str, met: Meeting) -> Any:
             by_arm = self._solver.twists.by_arm((after.qvel - before.qvel) / dt) - met.expected[0]
             by_body = (after.rigid_bodies.bodies.velocity - bodies.velocity) / dt - met.expected[1]
             beyond = self._couplings[name].accelerations(met.ends, found.joints, bodies, by_arm, by_body)
-            moved[name] = self.systems[name].apply(before.systems[name], met.response, met.ends, beyond, dt)
-        return after.with_systems(**moved)
+            return self.systems[name].apply(before.systems[name], met.response, met.ends, beyond, dt)
+
+        def move_if(name: str, met: Meeting) -> Any:
+            if met.awake is True:
+                return move(name, met)
+            return skip.cond("sleeping", met.awake, lambda: move(name, met), lambda: before.systems[name])
+
+        return after.with_systems(**{name: move_if(name, met) for name, met in meetings.items()})
 
     def _loaded(self, touch: Touch, meetings: dict[str, Meeting]) -> Touch:
         """Return the hardest touch with the forces of other systems on arms; those on fingers are no bumps."""

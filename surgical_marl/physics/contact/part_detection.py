@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from surgical_marl.physics.contact.broadphase import nearest, size
+from surgical_marl.physics.contact.broadphase import Ball, size
 from surgical_marl.physics.contact.shapes import Plate, Points, Segments, between_segments, in_frame
-from surgical_marl.physics.systems.system import Clusters, End, Ends, Shapes
-from surgical_marl.physics.tree_utils import Listed, Tree, picked, put, room
+from surgical_marl.physics.systems.system import End, Ends, Shapes
+from surgical_marl.physics.tree_utils import Listed, picked, put, room, row_of
 from surgical_marl.scenes.objects import Surface
 
 NEAR = 1e-4
@@ -35,6 +35,30 @@ class Scenery(NamedTuple):
     capsules: Segments
     moves: Array
     """Largest displacement of any point in a step, m, [r]."""
+
+
+class Hull(NamedTuple):
+    """A plate, or a capsule: a rectangle without width. World."""
+
+    centre: Array
+    """m, [3]"""
+    axes: Array
+    """Directions of its sides, [2, 3]; 0 along the width of a capsule."""
+    half: Array
+    """Half sides, m, [2]."""
+    radius: Array
+    """m, []"""
+
+
+class Runs(NamedTuple):
+    """Balls around parts that follow each other, g of them: most parts are left out with their run."""
+
+    balls: Ball
+    """[g]"""
+    first: np.ndarray
+    """Number of the first part of each, and that of all parts, [g + 1]."""
+    part: Callable[[Array], Ball]
+    """Takes the number of a part."""
 
 
 class PartDetection:
@@ -91,6 +115,25 @@ class PartDetection:
             jax.tree.map(lambda x: x[:-1], found.rows), found.moving, jnp.minimum(found.total, self._room), left_out
         )
 
+    def visited(self, scenery: Scenery, shapes: Shapes, dt: Any) -> Array:
+        """Return whether any shape that moves may touch a run of parts in the step, [] bool."""
+        moving, balls = int(self._starts["plates"]), _runs(shapes, dt).balls
+        if not moving:
+            return jnp.bool_(False)
+
+        def by_shape(found: Array, row: tuple[Array, Array]) -> tuple[Array, None]:
+            shape, moves = row
+            hull = self._of_shape(scenery, shape, _of_plate, _of_capsule)
+
+            def of_run(found: Array, ball: Ball) -> tuple[Array, None]:
+                return found | _reaches(ball, hull, moves) & (moves > 0), None
+
+            return jax.lax.scan(of_run, found, balls)
+
+        rows = jnp.arange(moving, dtype=jnp.int32), scenery.moves[:moving]
+        found: Array = jax.lax.scan(by_shape, jnp.bool_(False), rows)[0]
+        return found
+
     def _with(self, ends: Ends, end: End, belongs: Array) -> Ends:
         """Return contacts with one more, if it belongs to them."""
         last = self._room
@@ -129,59 +172,33 @@ class PartDetection:
         parts, none = len(shapes.speed), Listed.none(self._nearest)
         if not self._shapes:
             return none
-        radius = jnp.broadcast_to(jnp.asarray(shapes.radius), (parts,))
-        rows, clusters = (shapes.start, shapes.end, radius, shapes.speed), shapes.clusters
+        runs = _runs(shapes, dt)
+        whole = _around(runs.balls)
 
-        def widen(found: Any, row: Any) -> tuple[Any, None]:
-            (low, high, fastest), (start, end, radius, speed) = found, row
-            low = jnp.minimum(low, jnp.minimum(start, end) - radius)
-            high = jnp.maximum(high, jnp.maximum(start, end) + radius)
-            return (low, high, jnp.maximum(fastest, speed)), None
+        def hull_of(shape: Array) -> Hull:
+            hull: Hull = self._of_shape(scenery, shape, _of_plate, _of_capsule)
+            return hull
 
-        bounds: Any = rows
-        fastest = jnp.float32(0.0)
-        if clusters is not None:
-            still = np.zeros(len(clusters.radius), np.float32)
-            bounds, fastest = (clusters.centre, clusters.centre, clusters.radius, still), clusters.fastest
-        first = bounds[0][0]
-        (low, high, fastest), _ = jax.lax.scan(widen, (first, first, fastest), bounds)
-        centre, around = (low + high) / 2, size(high - low) / 2
-
-        def look(found: Listed, shape: Array) -> tuple[Listed, None]:
-            reach = around + NEAR + jnp.minimum(scenery.moves[shape] + dt * fastest, AHEAD)
-            gap = self._of_shape(
-                scenery, shape, lambda plate: _from_plate(centre, plate), lambda rod: _from_capsule(centre, rod)
-            )
-            return found.after(shape, gap < reach), None
+        def look(found: Listed, row: tuple[Array, Array]) -> tuple[Listed, None]:
+            shape, moves = row
+            return found.after(shape, _reaches(whole, hull_of(shape), moves)), None
 
         everything = jnp.arange(self._shapes, dtype=jnp.int32)
-        near, _ = jax.lax.scan(look, Listed.none(self._shapes), everything)
+        near, _ = jax.lax.scan(look, Listed.none(self._shapes), (everything, scenery.moves))
 
         def of_shape(row: Array, found: Listed) -> Listed:
             shape = near.numbers[row]
-            moves = scenery.moves[shape]
+            hull, moves = hull_of(shape), scenery.moves[shape]
 
-            def along(gap: Callable[[Array], Array]) -> Listed:
-                def reached(centre: Array, radius: Array, speed: Array) -> Array:
-                    return gap(centre) < radius + NEAR + jnp.minimum(moves + dt * speed, AHEAD)
+            def part(number: Array, found: Listed) -> Listed:
+                return found.after(shape * parts + number, _reaches(runs.part(number), hull, moves))
 
-                def part(found: Listed, row: Any) -> tuple[Listed, None]:
-                    number, start, end, radius, speed = row
-                    middle, half = (start + end) / 2, size(end - start) / 2 + radius
-                    return found.after(shape * parts + number, reached(middle, half, speed)), None
+            def of_run(found: Listed, row: tuple[Ball, Array, Array]) -> tuple[Listed, None]:
+                ball, first, last = row
+                return jax.lax.fori_loop(first, jnp.where(_reaches(ball, hull, moves), last, first), part, found), None
 
-                def sphere(number: Array, middle: Array, speed: Array, found: Listed) -> Listed:
-                    return found.after(shape * parts + number, reached(middle, radius[number], speed))
-
-                if clusters is not None:
-                    return _of_clusters(clusters, reached, sphere, found)
-                return jax.lax.scan(part, found, (jnp.arange(parts, dtype=jnp.int32), *rows))[0]
-
-            listed: Listed = self._of_shape(
-                scenery, shape, lambda plate: along(lambda x: _from_plate(x, plate)),
-                lambda rod: along(lambda x: _from_capsule(x, rod)),
-            )  # fmt: skip
-            return listed
+            rows = runs.balls, jnp.asarray(runs.first[:-1]), jnp.asarray(runs.first[1:])
+            return jax.lax.scan(of_run, found, rows)[0]
 
         found: Listed = jax.lax.fori_loop(0, near.length, of_shape, none)
         return found
@@ -215,21 +232,6 @@ class PartDetection:
         return end, touches
 
 
-def _of_clusters(
-    clusters: Clusters, reached: Callable[[Array, Array, Array], Array], sphere: Callable[..., Tree], found: Tree
-) -> Tree:  # fmt: skip
-    """Return what `sphere(number, centre, speed, found)` makes of each sphere in a cluster that is reached."""
-
-    def cluster(found: Tree, row: Any) -> tuple[Tree, None]:
-        centre, radius, first, last = row
-        last = jnp.where(reached(centre, radius, clusters.fastest), last, first)
-        return jax.lax.fori_loop(first, last, lambda n, found: sphere(n, *clusters.part(n), found), found), None
-
-    runs = jnp.asarray(clusters.first[:-1]), jnp.asarray(clusters.first[1:])
-    after: Tree = jax.lax.scan(cluster, found, (clusters.centre, clusters.radius, *runs))[0]
-    return after
-
-
 def on_face(part: Segments, plate: Plate) -> tuple[Points, Array]:
     """Return where a capsule touches a plate, and the share of its length that lies on the plate's face.
 
@@ -260,13 +262,74 @@ def _no_end() -> End:
     return End(number, zero, number, zero, vector, vector, zero, zero, jnp.bool_(False), vector, vector)
 
 
-def _from_plate(point: Array, plate: Plate) -> Array:
-    """Return the distance of a point from a plate, m."""
-    local = in_frame(point, plate)
-    beside = local[:2] - jnp.clip(local[:2], -plate.half, plate.half)
-    return jnp.sqrt(beside @ beside + local[2] * local[2]) - plate.radius
+def _runs(shapes: Shapes, dt: Any) -> Runs:
+    """Return the runs of a system's parts: its clusters, or about as many as a run has parts."""
+    parts, clusters = len(shapes.speed), shapes.clusters
+    if clusters is not None:
+        radius = jnp.broadcast_to(jnp.asarray(shapes.radius), (parts,))
+        moves = jnp.broadcast_to(dt * clusters.fastest, clusters.radius.shape)
+
+        def sphere(number: Array) -> Ball:
+            centre, speed = clusters.part(number)
+            return Ball(centre, radius[number], dt * speed)
+
+        return Runs(Ball(clusters.centre, clusters.radius, moves), clusters.first, sphere)
+    length = int(np.ceil(np.sqrt(parts)))
+    first = np.append(np.arange(0, parts, length), parts).astype(np.int32)
+    balls, up_to = _balls(shapes, length, dt)
+    return Runs(row_of(up_to, first[1:] - 1), first, lambda number: row_of(balls, number))
 
 
-def _from_capsule(point: Array, capsule: Segments) -> Array:
-    """Return the distance of a point from a capsule, m."""
-    return size(point - nearest(capsule, point)) - capsule.radius
+def _around(balls: Ball) -> Ball:
+    """Return a ball around balls."""
+
+    def widen(found: Any, ball: Ball) -> tuple[Any, None]:
+        low, high, most = found
+        low, high = jnp.minimum(low, ball.centre - ball.radius), jnp.maximum(high, ball.centre + ball.radius)
+        return (low, high, jnp.maximum(most, ball.moves)), None
+
+    first = balls.centre[0], balls.centre[0], jnp.float32(0.0)
+    low, high, most = jax.lax.scan(widen, first, balls)[0]
+    return Ball((low + high) / 2, size(high - low) / 2, most)
+
+
+def _balls(shapes: Shapes, run: int, dt: Any) -> tuple[Ball, Ball]:
+    """Return a ball around each part, and one around the parts of its run up to it, [p]. Runs have so many parts."""
+    parts = len(shapes.speed)
+
+    def part(before: Any, row: Any) -> tuple[Any, tuple[Ball, Ball]]:
+        (low, high, fastest), (number, start, end, radius, speed) = before, row
+        own_low, own_high = jnp.minimum(start, end) - radius, jnp.maximum(start, end) + radius
+        goes_on = number % run > 0
+        low = jnp.where(goes_on, jnp.minimum(low, own_low), own_low)
+        high = jnp.where(goes_on, jnp.maximum(high, own_high), own_high)
+        fastest = jnp.where(goes_on, jnp.maximum(fastest, speed), speed)
+        own = Ball((start + end) / 2, size(end - start) / 2 + radius, dt * speed)
+        return (low, high, fastest), (own, Ball((low + high) / 2, size(high - low) / 2, dt * fastest))
+
+    radius, numbers = jnp.broadcast_to(jnp.asarray(shapes.radius), (parts,)), jnp.arange(parts, dtype=jnp.int32)
+    rows, zero = (numbers, shapes.start, shapes.end, radius, shapes.speed), jnp.zeros(3)
+    found: tuple[Ball, Ball] = jax.lax.scan(part, (zero, zero, jnp.float32(0.0)), rows)[1]
+    return found
+
+
+def _of_plate(plate: Plate) -> Hull:
+    """Return the hull of a plate."""
+    return Hull(plate.centre, plate.frame[:, :2].T, plate.half, plate.radius)
+
+
+def _of_capsule(capsule: Segments) -> Hull:
+    """Return the hull of a capsule."""
+    way, middle = capsule.end - capsule.start, (capsule.start + capsule.end) / 2
+    length = size(way)
+    axes = jnp.stack([way / jnp.maximum(length, 1e-12), jnp.zeros(3)])
+    return Hull(middle, axes, jnp.stack([length / 2, jnp.zeros_like(length)]), capsule.radius)
+
+
+def _reaches(ball: Ball, hull: Hull, moves: Array) -> Array:
+    """Return whether a ball may touch a shape that moves so far in the step, m."""
+    off = ball.centre - hull.centre
+    flat = hull.axes @ off
+    beside, above = flat - jnp.clip(flat, -hull.half, hull.half), off - flat @ hull.axes
+    gap = jnp.sqrt(beside @ beside + above @ above) - hull.radius - ball.radius
+    return gap < NEAR + jnp.minimum(moves + ball.moves, AHEAD)

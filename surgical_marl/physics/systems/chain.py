@@ -26,6 +26,7 @@ import numpy as np
 from jax import Array
 
 from surgical_marl.physics.solver.cholesky import FULL, LOWER
+from surgical_marl.physics.tree_utils import put
 
 GRAVITY = np.array([0.0, 0.0, -9.81], np.float32)
 ENOUGH = 1e-8
@@ -136,11 +137,10 @@ def search(
             found now.
         joined: what it begins with.
     """
-    n = rod.nodes
-    bends = holds * _before(holds)
+    n, bends = rod.nodes, holds * _before(holds)
     inertia = rod.mass * np.float32(1 / dt**2 + rod.drag / dt)
-    apart = _after(state.position) - state.position  # from here on, edges are sums of small differences
     known = inertia, holds, _before(bends), bends, _after(bends), pull
+    apart, guess = _start(state, dt)
 
     def going(loop: tuple[Newton, Array, Array]) -> Array:
         _, most, count = loop
@@ -148,20 +148,83 @@ def search(
 
     def step(loop: tuple[Newton, Array, Array]) -> tuple[Newton, Array, Array]:
         found, _, count = loop
-        u, q = found.shift + found.change[:, :3], found.tension + found.change[:, 3]
-        edges = apart + _after(u) - u
+        u, q, edges = _taken(found, apart)
         factors, reduced = _eliminate(rod, u, q, edges, known, load(u))
         (change, most), kept = _back(rod, bends, factors, reduced), found.joined
         if join is not None:
             change, most, kept = join(u, change, most, factors, kept)
-        change *= jnp.minimum(1.0, FARTHEST * rod.length / jnp.maximum(most, 1e-12))
-        return Newton(u, q, change, factors, kept), most, count + 1
+        return Newton(u, q, _shortened(change, FARTHEST * rod.length, most), factors, kept), most, count + 1
 
-    guess = jnp.concatenate([dt * state.velocity, jnp.zeros((n, 1))], 1)
     empty = Factors(*(jnp.zeros((n, *shape)) for shape in ((6,), (3,), (), (3, 3), (3,))))
     start = Newton(jnp.zeros((n, 3)), state.tension, guess, empty, joined), jnp.float32(jnp.inf), jnp.int32(0)
     found: Newton = jax.lax.while_loop(going, step, start)[0]
     return found
+
+
+# Arithmetic on all nodes is in scans, which the fused engine keeps as loops.
+
+
+def _start(state: ChainState, dt: Any) -> tuple[Array, Array]:
+    """Return the edges at the start of a step, m, [n, 3], and the first guess of the change of unknowns, [n, 4].
+
+    From here on, edges are sums of small differences.
+    """
+
+    def node(after: Array, row: tuple[Array, Array]) -> tuple[Array, tuple[Array, Array]]:
+        position, velocity = row
+        return position, (after - position, jnp.append(dt * velocity, 0.0))
+
+    rows = state.position, state.velocity
+    found: tuple[Array, Array] = jax.lax.scan(node, jnp.zeros(3), rows, reverse=True)[1]
+    return found
+
+
+def _taken(newton: Newton, apart: Array) -> tuple[Array, Array, Array]:
+    """Return displacements and tensions after a Newton step, and the edges after each node and the next, [n, 2, 3]."""
+
+    def node(after: tuple[Array, Array], row: Any) -> tuple[tuple[Array, Array], tuple[Array, Array, Array]]:
+        (u_1, edge_1), (shift, tension, change, apart) = after, row
+        u = shift + change[:3]
+        edge = apart + (u_1 - u)
+        return (u, edge), (u, tension + change[3], jnp.stack([edge, edge_1]))
+
+    none = jnp.zeros(3)
+    rows = newton.shift, newton.tension, newton.change, apart
+    found: tuple[Array, Array, Array] = jax.lax.scan(node, (none, none), rows, reverse=True)[1]
+    return found
+
+
+def _shortened(change: Array, most: float, largest: Array) -> Array:
+    """Return a Newton step [n, 4] whose largest displacement is `most` at most, m."""
+
+    def shorten(row: Array, change: Array) -> Array:
+        return put(change, row, most / largest * change[row])
+
+    rows = jnp.where(largest > most, len(change), 0)  # seldom any
+    found: Array = jax.lax.fori_loop(0, rows, shorten, change)
+    return found
+
+
+def moved(state: ChainState, newton: Newton, more: Array, dt: Any) -> tuple[ChainState, Array, Array]:
+    """Return a chain after a step, its displacements, m, [n, 3], and the largest one in this step and the last, m, [].
+
+    Args:
+        state: at the start of the step.
+        newton: of the step.
+        more: changes of the unknowns beyond it, [n, 4].
+        dt: duration of the step, s.
+    """
+
+    def node(most: Array, row: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
+        position, velocity, shift, tension, change, more = row
+        change += more
+        u = shift + change[:3]
+        most = jnp.maximum(most, jnp.max(jnp.maximum(jnp.abs(u), jnp.abs(dt * velocity))))
+        return most, (position + u, u / dt, tension + change[3], u)
+
+    rows = state.position, state.velocity, newton.shift, newton.tension, newton.change, more
+    most, (position, velocity, tension, u) = jax.lax.scan(node, jnp.float32(0.0), rows)
+    return ChainState(position, velocity, tension), u, most
 
 
 def solve(rod: Rod, factors: Factors, force: Array, holds: Any) -> Array:
@@ -183,12 +246,15 @@ def solve(rod: Rod, factors: Factors, force: Array, holds: Any) -> Array:
 def _eliminate(
     rod: Rod, u: Array, q: Array, edges: Array, known: tuple[Any, ...], load: Loaded
 ) -> tuple[Factors, Array]:  # fmt: skip
-    """Return the eliminated matrix of a Newton step at displacements u and tensions q, and its right side, [n, 4]."""
+    """Return the eliminated matrix of a Newton step at displacements u and tensions q, and its right side, [n, 4].
+
+    `edges` are those after each node and after the next one, m, [n, 2, 3].
+    """
     stiffness, stretchy, length_at_rest = rod.bending / rod.length**3, rod.length / rod.axial, rod.length
 
     def node(carry: Any, row: Any) -> tuple[Any, tuple[Factors, Array]]:
         (bent_1, bent, pull_1), (block, meets, right), (block_2, right_2) = carry
-        u, q, edge, edge_2, (inertia, holds, bends_1, bends, bends_2, pull), load = row
+        u, q, (edge, edge_2), (inertia, holds, bends_1, bends, bends_2, pull), load = row
         length = jnp.sqrt(jnp.maximum(edge @ edge, 1e-18))
         along = holds / length * edge
         bent_2 = bends_2 * (edge_2 - edge)
@@ -221,7 +287,7 @@ def _eliminate(
 
     none, empty = jnp.zeros(3), jnp.zeros((3, 3))
     start = (none, none, none), (empty, empty, none), (empty, none)
-    _, found = jax.lax.scan(node, start, (u, q, edges, _after(edges), known, load))
+    _, found = jax.lax.scan(node, start, (u, q, edges, known, load))
     eliminated: tuple[Factors, Array] = found
     return eliminated
 

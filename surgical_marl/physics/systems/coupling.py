@@ -61,13 +61,13 @@ class Coupling:
     # -- where it touches
 
     def ends(
-        self, shapes: Shapes, poses: Any, joints: Joints, bodies: Bodies, motion: tuple[Array, Array], dt: Any
+        self, shapes: Shapes, scenery: Scenery, joints: Joints, bodies: Bodies, motion: tuple[Array, Array], dt: Any
     ) -> Ends:  # fmt: skip
         """Return the contacts of a system.
 
         Args:
             shapes: of the system.
-            poses: MJX's data with the poses of the arms.
+            scenery: all shapes of others.
             joints: axes of the arms' joints.
             bodies: the free bodies.
             motion: velocities of joints [a, m] and of bodies [k, 6] at the end of the step, if they accelerate as in
@@ -78,13 +78,18 @@ class Coupling:
         of_bodies, of_world = (
             [self._tied(tie, shapes, bodies) for tie in ties if (tie.body is None) == world] for world in (False, True)
         )
-        found = self._detection.find(self._scenery(poses, joints, bodies, motion, dt), shapes, of_bodies, of_world, dt)
+        found = self._detection.find(scenery, shapes, of_bodies, of_world, dt)
         shift = dt * self.accelerations(found, joints, bodies, *motion)
         return found._replace(rows=found.rows._replace(shift=shift))
 
-    def _scenery(
+    def visited(self, shapes: Shapes, scenery: Scenery, dt: Any) -> Array:
+        """Return whether anything that moves may touch a system in the step, [] bool."""
+        return self._detection.visited(scenery, shapes, dt)
+
+    def scenery(
         self, poses: Any, joints: Joints, bodies: Bodies, motion: tuple[Array, Array], dt: Any
     ) -> Scenery:  # fmt: skip
+        """Return the shapes of arms, bodies and fixed things. Arguments are those of `ends`, and MJX's data."""
         t = self._tables
         qvel = jnp.zeros(len(poses.qpos) + 1).at[t.dofs].set(motion[0])[:-1]
         placed = self._places.place(poses, joints, qvel, bodies._replace(velocity=motion[1]), dt)

@@ -27,6 +27,25 @@ APART = 3
 """Parts between two that can touch, and one more: nearer ones meet at the nodes between them."""
 
 
+WIDER = (np.pi / 2 - 1) / 4
+"""An angle is at most its chord on the unit circle, c, times 1 + this times c^2."""
+
+
+class Course(NamedTuple):
+    """The course of a chain of p parts."""
+
+    middle: Array
+    """Of each part, m, [p, 3]."""
+    half: Array
+    """Half length of each part, m, [p]."""
+    turned: Array
+    """Angle by which the chain turns from its start to each part, never too small, rad, [p]."""
+    halves: tuple[Array, Array]
+    """Least and largest half length, m."""
+    speed: Array
+    """Largest speed, m/s, []."""
+
+
 class Joined(NamedTuple):
     """The pairs in the matrix of a step: p of them, [3 p, ...]."""
 
@@ -55,9 +74,10 @@ def find(shapes: Shapes, velocity: Array, rows: int, stiffness: float, sliding: 
         dt: duration of a step, s.
     """
     parts = len(shapes.speed)
-    middle, half = (shapes.start + shapes.end) / 2, size(shapes.end - shapes.start) / 2
     radius = jnp.broadcast_to(jnp.asarray(shapes.radius), (parts,))
-    longest, moves = 2 * jnp.max(half), jnp.minimum(2 * dt * jnp.max(shapes.speed), AHEAD)
+    course = _course(shapes)
+    longest, moves = 2 * course.halves[1], jnp.minimum(2 * dt * course.speed, AHEAD)
+    bent = _bent(2 * course.halves[0], 2 * jnp.max(radius) + NEAR + moves)
 
     def pair(first: Array, second: Array) -> tuple[End, Array]:
         one, other = (Segments(shapes.start[k], shapes.end[k], radius[k]) for k in (second, first))
@@ -68,29 +88,75 @@ def find(shapes: Shapes, velocity: Array, rows: int, stiffness: float, sliding: 
         nearer = -dt * (point.normal @ apart(end, velocity))
         return end, point.depth + jnp.clip(nearer, 0.0, AHEAD) > -NEAR
 
-    def of_part(found: Ends, first: Array) -> tuple[Ends, None]:
-        def going(loop: tuple[Array, Ends]) -> Array:
-            return loop[0] < parts
+    def next_near(first: Array, second: Array) -> Array:
+        """Return the next part, from the second one on, that is near the first one, or a number past the last one."""
+
+        def going(loop: tuple[Array, Array]) -> Array:
+            return (loop[0] < parts) & ~loop[1]
+
+        def look(loop: tuple[Array, Array]) -> tuple[Array, Array]:
+            k = loop[0]
+            off = size(course.middle[k] - course.middle[first])
+            gap = off - course.half[k] - course.half[first] - 2 * radius[first] - NEAR - moves
+            # the next parts are at most their lengths nearer: those that can't be near are passed over
+            on = jnp.maximum(jnp.floor(gap / longest).astype(jnp.int32), 1)
+            return jnp.where(gap < 0, k, k + on), gap < 0
+
+        return jax.lax.while_loop(going, look, (second, jnp.bool_(False)))[0]
+
+    def of_part(loop: tuple[Ends, Array], first: Array) -> tuple[tuple[Ends, Array], None]:
+        found, second = loop
+        straight = jax.lax.while_loop(
+            lambda k: (k < parts) & (course.turned[jnp.minimum(k, parts - 1)] - course.turned[first] < bent),
+            lambda k: k + 1,
+            jnp.maximum(second, first + APART),
+        )
 
         def look(loop: tuple[Array, Ends]) -> tuple[Array, Ends]:
             second, found = loop
-            gap = size(middle[second] - middle[first]) - half[first] - half[second] - 2 * radius[first] - NEAR - moves
-            end, touches = jax.lax.cond(
-                gap < 0, lambda: pair(first, second), lambda: (row_of(found.rows, rows), jnp.bool_(False))
-            )
+            end, touches = pair(first, second)
             kept = put(found.rows, jnp.where(touches, jnp.minimum(found.total, rows), rows), end)
-            # the next parts are at most their lengths nearer: those that can't be near are passed over
-            on = jnp.maximum(jnp.floor(gap / longest).astype(jnp.int32), 1)
-            return second + on, Ends(kept, found.moving, found.total + touches, found.left_out)
+            found = Ends(kept, found.moving, found.total + touches, found.left_out)
+            return next_near(first, second + 1), found
 
-        return jax.lax.while_loop(going, look, (first + APART, found))[1], None
+        start = next_near(first, straight), found
+        return (jax.lax.while_loop(lambda loop: loop[0] < parts, look, start)[1], straight), None
 
     shape = jax.eval_shape(lambda: pair(jnp.int32(0), jnp.int32(APART))[0])
-    start = Ends(room(shape, rows + 1), jnp.int32(0), jnp.int32(0), jnp.int32(0))
-    found, _ = jax.lax.scan(of_part, start, jnp.arange(parts - APART, dtype=jnp.int32))
+    start = Ends(room(shape, rows + 1), jnp.int32(0), jnp.int32(0), jnp.int32(0)), jnp.int32(0)
+    (found, _), _ = jax.lax.scan(of_part, start, jnp.arange(parts - APART, dtype=jnp.int32))
     kept = jax.tree.map(lambda x: x[:-1], found.rows)
     left_out = jnp.maximum(found.total - rows, 0)
     return Ends(kept, found.moving, jnp.minimum(found.total, rows), left_out)
+
+
+def _course(shapes: Shapes) -> Course:
+    """Return the course of a chain."""
+
+    def part(before: Any, row: Any) -> tuple[Any, tuple[Array, Array, Array]]:
+        (along, turned, shortest, longest, fastest), (start, end, speed) = before, row
+        way = end - start
+        half = size(way) / 2
+        own = way / jnp.maximum(2 * half, 1e-12)
+        chord = jnp.minimum(size(own - along), 2.0)
+        turned += chord * (1 + WIDER * chord * chord)
+        after = own, turned, jnp.minimum(shortest, half), jnp.maximum(longest, half), jnp.maximum(fastest, speed)
+        return after, ((start + end) / 2, half, turned)
+
+    zero = jnp.float32(0.0)
+    first = jnp.zeros(3), zero, jnp.float32(jnp.inf), zero, zero
+    last, (middle, half, turned) = jax.lax.scan(part, first, (shapes.start, shapes.end, shapes.speed))
+    return Course(middle, half, turned, last[2:4], last[4])
+
+
+def _bent(length: Array, reach: Array) -> Array:
+    """Return the angle, rad, by which a chain turns at least between two parts that are this near each other, m.
+
+    All directions of a curve that turns by an angle are within half of it of one direction. Along that direction the
+    edges between the two parts, of this length or more, m, add up to their lengths times the cosine of that half, and
+    cos(x / 2) >= 1 - x^2 / 8.
+    """
+    return jnp.sqrt(8 * jnp.maximum(1 - reach / jnp.maximum((APART - 1) * length, 1e-12), 0.0))
 
 
 def apart(end: End, u: Array) -> Array:
@@ -98,14 +164,14 @@ def apart(end: End, u: Array) -> Array:
     return _at(u, end.part, end.share) - _at(u, end.shape, end.place[0])
 
 
-def forces(pairs: Ends, u: Array) -> Array:
-    """Return the forces of pairs on the nodes, N, [n, 3], at displacements of these, m, [n, 3]."""
+def add_forces(pairs: Ends, u: Array, others: Array) -> Array:
+    """Return forces on the nodes with those of pairs, N, [n, 3], at displacements of the nodes, m, [n, 3]."""
 
     def add(row: Array, sums: Array) -> Array:
         end = row_of(pairs.rows, row)
         return pulled(end, sums, feel(end, apart(end, u)).force)
 
-    found: Array = jax.lax.fori_loop(0, pairs.total, add, jnp.zeros_like(u))
+    found: Array = jax.lax.fori_loop(0, pairs.total, add, others)
     return found
 
 
@@ -115,13 +181,14 @@ def pulled(end: End, sums: Array, force: Array) -> Array:
     return _spread(first, end.shape, end.place[0], -force)
 
 
-def joined(pairs: Ends, u: Array, solve: Callable[[Array], Array]) -> Joined:
-    """Return what pairs add to the matrix of a step at displacements u.
+def joined(pairs: Ends, u: Array, solve: Callable[[Array], Array], last: Joined) -> Joined:
+    """Return what pairs add to the matrix of a step at displacements u, in the place of what they added last.
 
     Args:
-        pairs: there is one at least.
+        pairs: the pairs.
         u: displacements of the nodes, m, [n, 3].
         solve: takes forces on nodes [n, 3], returns displacements and tensions [n, 4] of the chain without pairs.
+        last: of the Newton step before, or `apart_from_itself`.
     """
     p, roots = len(pairs.rows.part), _roots(pairs, u)
 
@@ -130,19 +197,25 @@ def joined(pairs: Ends, u: Array, solve: Callable[[Array], Array]) -> Joined:
         pull = roots[number // 3] @ jnp.where(jnp.arange(3) == number % 3, 1.0, 0.0)
         return solve(pulled(end, jnp.zeros_like(u), pull))
 
-    rows = room(jax.ShapeDtypeStruct((len(u), 4), jnp.float32), 3 * p)
-    start = jnp.zeros_like(rows)
-    moves = jax.lax.fori_loop(0, 3 * pairs.total, lambda k, found: put(found, k, column(k)), start)
-    across = jax.lax.map(lambda own: _projected(pairs, roots, own), moves)
-    return Joined(moves, cholesky(np.eye(3 * p, dtype=np.float32) + (across + across.T) / 2))
+    moves = jax.lax.fori_loop(0, 3 * pairs.total, lambda k, found: put(found, k, column(k)), last.moves)
+
+    def factored() -> Array:
+        across = jax.lax.map(lambda own: _projected(pairs, roots, own), moves)
+        return cholesky(np.eye(3 * p, dtype=np.float32) + (across + across.T) / 2)
+
+    return Joined(moves, jax.lax.cond(pairs.total > 0, factored, lambda: last.factor))
 
 
 def add(pairs: Ends, u: Array, own: Joined, change: Array) -> Array:
     """Return the solution [n, 4] of a step's equations with pairs, from that without them."""
-    weights = solve_factored(own.factor, _projected(pairs, _roots(pairs, u), change))
+
+    def weights() -> Array:
+        return solve_factored(own.factor, _projected(pairs, _roots(pairs, u), change))
+
+    pull = jax.lax.cond(pairs.total > 0, weights, lambda: jnp.zeros(3 * len(pairs.rows.part)))
 
     def less(k: Array, change: Array) -> Array:
-        return change - weights[k] * own.moves[k]
+        return change - pull[k] * own.moves[k]
 
     found: Array = jax.lax.fori_loop(0, 3 * pairs.total, less, change)
     return found

@@ -179,6 +179,14 @@ class System(ABC):
     def apply(self, state: Any, response: Response, ends: Ends, accelerations: Array, dt: Any) -> Any:
         """Return the state after a step in which the ends accelerate by so much beyond `shift`, m/s2, [c, 3]."""
 
+    def awake(self, state: Any) -> Any:
+        """Return whether it moves, [] bool; True if it never sleeps.
+
+        A system that sleeps keeps its state, and touches nothing, until what moves comes near it.
+        """
+        del state
+        return True
+
     def view(self, state: Any) -> Any:
         """Return the part of the state that tasks see: all of it by default."""
         return state

@@ -21,7 +21,18 @@ from surgical_marl.content import unknown
 from surgical_marl.physics.contact.spring_contact import Stretches, each, feel, none, pushes, recall, remember
 from surgical_marl.physics.solver.cholesky import FULL, LOWER
 from surgical_marl.physics.systems import crossings
-from surgical_marl.physics.systems.chain import ChainState, Factors, Loaded, Newton, Rod, free_forces, search, solve
+from surgical_marl.physics.systems.chain import (
+    ENOUGH,
+    ChainState,
+    Factors,
+    Loaded,
+    Newton,
+    Rod,
+    free_forces,
+    moved,
+    search,
+    solve,
+)
 from surgical_marl.physics.systems.crossings import Joined
 from surgical_marl.physics.systems.soft import Soft
 from surgical_marl.physics.systems.system import Bars, End, Ends, Response, Shapes, Tie
@@ -47,6 +58,8 @@ class ThreadState(NamedTuple):
     """Friction of the thread with itself."""
     holds: Array
     """1 for edges that hold, 0 for a broken one and after the last node, [n]."""
+    still: Array
+    """True if nothing that moves touches it, and no node moved further than `ENOUGH` in this step and the last, []."""
 
 
 class ThreadView(NamedTuple):
@@ -159,7 +172,7 @@ class Thread(Soft):
         still = jnp.zeros((self.nodes, 3), jnp.float32)
         holds = jnp.asarray(np.append(np.ones(self.nodes - 1), 0.0), jnp.float32)
         chain = ChainState(position, still, still[:, 0])
-        return ThreadState(chain, none(self.contacts), none(self.crossings), holds)
+        return ThreadState(chain, none(self.contacts), none(self.crossings), holds, jnp.bool_(False))
 
     def shapes(self, state: ThreadState) -> Shapes:
         position = state.chain.position
@@ -186,18 +199,15 @@ class Thread(Soft):
 
         def load(u: Array) -> Loaded:
             felt = _load(ends, u)
-            return felt._replace(force=felt.force + crossings.forces(pairs, u))
+            return felt._replace(force=crossings.add_forces(pairs, u, felt.force))
 
         def join(
             u: Array, change: Array, most: Array, factors: Factors, last: Joined
         ) -> tuple[Array, Array, Joined]:  # fmt: skip
-            def some() -> tuple[Array, Array, Joined]:
-                own = crossings.joined(pairs, u, lambda force: solve(self.rod, factors, force, holds))
-                whole = crossings.add(pairs, u, own, change)
-                return whole, jnp.max(jnp.abs(whole[:, :3])), own
-
-            found: tuple[Array, Array, Joined] = jax.lax.cond(pairs.total > 0, some, lambda: (change, most, last))
-            return found
+            own = crossings.joined(pairs, u, lambda force: solve(self.rod, factors, force, holds), last)
+            whole = crossings.add(pairs, u, own, change)
+            largest = jax.lax.cond(pairs.total > 0, lambda: jnp.max(jnp.abs(whole[:, :3])), lambda: most)
+            return whole, largest, own
 
         apart = crossings.apart_from_itself(self.crossings, self.nodes)
         found = search(self.rod, state.chain, motion, load, dt, ITERATIONS, holds, join, apart)
@@ -227,8 +237,7 @@ class Thread(Soft):
             lambda: self._carried(response.solved, accelerations, dt)[1],
             lambda: jnp.zeros((self.nodes, 4)),
         )
-        change = found.change + carried
-        u, tension = found.shift + change[:, :3], found.tension + change[:, 3]
+        chain, u, most = moved(state.chain, found, carried, dt)
         stretches = remember(
             own,
             lambda row, end: _point(end, u) - end.shift - dt * dt * accelerations[row],
@@ -236,10 +245,13 @@ class Thread(Soft):
         )
         holds = state.holds
         if self.strength is not None:
-            holds = jnp.where(tension > self.strength, 0.0, holds)
+            holds = jnp.where(chain.tension > self.strength, 0.0, holds)
         pairs = response.solved.pairs
         rubbed = remember(pairs, lambda row, end: crossings.apart(end, u), self.nodes - 1)
-        return ThreadState(ChainState(state.chain.position + u, u / dt, tension), stretches, rubbed, holds)
+        return ThreadState(chain, stretches, rubbed, holds, (ends.moving == 0) & (most < ENOUGH))
+
+    def awake(self, state: ThreadState) -> Array:
+        return ~state.still
 
     def view(self, state: ThreadState) -> ThreadView:
         chain = state.chain
@@ -258,11 +270,7 @@ class Thread(Soft):
         forces = jax.lax.fori_loop(0, ends.moving, add, jnp.zeros((n, 3)))
         newton, pairs = solved.newton, solved.pairs
         change = solve(self.rod, newton.factors, forces, solved.holds)
-        return pushed, jax.lax.cond(
-            pairs.total > 0,
-            lambda: crossings.add(pairs, newton.shift, newton.joined, change),
-            lambda: change,
-        )
+        return pushed, crossings.add(pairs, newton.shift, newton.joined, change)
 
     def _holds(self, state: ThreadState) -> Any:
         """Return which edges hold, [n]: constants if the thread can't tear."""
