@@ -374,3 +374,9 @@ def test_bad_options_are_one_sentence(scene: str, options: dict[str, Any], words
     with pytest.raises(ValueError, match=words) as caught:
         sm.parallel_env(TASK, scene=scene, **options)
     assert "\n" not in str(caught.value)
+
+
+def test_a_wrong_difficulty_is_refused_before_anything_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("surgical_marl.tasks.camera_assist.task.work_in", lambda scene: pytest.fail("the work begins"))
+    with pytest.raises(ValueError, match="unknown difficulty 'crossing'"):
+        Env(TASK, SCENE, difficulty="crossing")

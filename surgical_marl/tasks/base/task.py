@@ -105,10 +105,7 @@ class Task:
     """Goals of a trained policy: metric -> ("below" or "at least", number)."""
 
     def __init__(self, scene: Scene, options: Options) -> None:
-        if options.difficulty not in self.levels:
-            raise unknown("difficulty", options.difficulty, list(self.levels))
-        if options.start not in self.starts:
-            raise unknown(f"start of task {label(options.task)!r}", options.start, self.starts)
+        self._check(options)
         self.scene, self.level, self.starts_at = scene, self.levels[options.difficulty], options.start
         self.seed = SEEDS[options.goals]
         """Seed of the draws on the host: held-out goals come from another seed than those of training."""
@@ -122,6 +119,13 @@ class Task:
         """Tables of `qpos` of the whole scene, [rows, nq] each, for target pictures."""
         self.watched: dict[str, tuple[str, ...]] = {}
         """Agent -> pictures that `sense` reads, whether or not the agent observes them."""
+
+    def _check(self, options: Options) -> None:
+        """Raise a ValueError for a difficulty or a start that this task does not have."""
+        if options.difficulty not in self.levels:
+            raise unknown("difficulty", options.difficulty, list(self.levels))
+        if options.start not in self.starts:
+            raise unknown(f"start of task {label(options.task)!r}", options.start, self.starts)
 
     @property
     def constants(self) -> tuple[Any, ...]:

@@ -112,6 +112,7 @@ class Task(BaseTask):
 
     def __init__(self, scene: Scene, options: Options) -> None:
         self.camera, self.tools = find_roles(scene)
+        self._check(options)  # before the work draws its tables
         name, work = work_in(scene)
         if getattr(work.levels.get(options.difficulty), "trial", False):
             raise ValueError(
