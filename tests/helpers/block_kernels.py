@@ -32,6 +32,11 @@ struct { int x; } threadIdx = {0};
 """
 
 
+def has_clang() -> bool:
+    """Return whether Warp can compile for a CPU: some builds of it have no Clang."""
+    return bool(kernel.wp._src.context.runtime.llvm)
+
+
 class Laid(NamedTuple):
     """A stage, and where its inputs and results are."""
 

@@ -16,7 +16,7 @@ from surgical_marl.physics.systems.brick_solve import Nodes
 from surgical_marl.physics.systems.system import End, Ends
 from surgical_marl.physics.systems.tissue import Tissue
 from surgical_marl.physics.systems.tissue_step import Held, TissueStep
-from tests.helpers.block_kernels import cuda_of, run_block
+from tests.helpers.block_kernels import cuda_of, has_clang, run_block
 from tests.physics.test_tissue_contact import DT, scene_file, strip
 
 ROOM, CONTACTS = 12, 7
@@ -27,7 +27,10 @@ SHEETS = {
 }
 
 
-DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not kernel.has_cuda(), reason="needs a CUDA device"))]
+DEVICES = [
+    pytest.param("cpu", marks=pytest.mark.skipif(not has_clang(), reason="needs Warp's compiler for a CPU")),
+    pytest.param("cuda", marks=pytest.mark.skipif(not kernel.has_cuda(), reason="needs a CUDA device")),
+]
 
 
 def step_of(tissue: Tissue) -> TissueStep:

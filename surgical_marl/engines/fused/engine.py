@@ -20,11 +20,11 @@ from typing import Any
 
 import numpy as np
 
-from surgical_marl.engines.compilation import compiling
+from surgical_marl.engines.compilation import Phase, compiling
 from surgical_marl.engines.fused.arrays import make_arrays
 from surgical_marl.engines.fused.env_sorting import sorted_every
 from surgical_marl.engines.fused.finite_check import FiniteCheck
-from surgical_marl.engines.fused.kernel import compile_block, compile_kernels, has_cuda
+from surgical_marl.engines.fused.kernel import Block, Kernel, compile_block, compile_kernels, has_cuda
 from surgical_marl.engines.fused.kernel_layout import Source, Stage, all_stages
 from surgical_marl.engines.fused.macros import LANES
 from surgical_marl.engines.fused.source_cache import load_source
@@ -53,14 +53,7 @@ class FusedEngine:
         self.device = ("cuda" if has_cuda() else "cpu") if device == "auto" else device
         with compiling(f"{env.title} ({self.name}, {self.device})") as phase:
             self.source: Source = load_source(env, vector=self.device == "cpu", phase=phase)
-            self._blocks = {
-                stage.name: compile_block(stage.name, stage.code, stage.threads, phase)
-                for stage in all_stages(self.source.stages)
-                if stage.kind == "block"
-            }
-            self._kernels = compile_kernels(
-                self.source.bodies, self.device, num_envs, large_branches=self.source.large_branches, phase=phase
-            )
+            self._kernels, self._blocks = self._compile(phase)
         carry = flatten(self.source.carry)
         self.carry_shapes = {name: leaf.shape for name, leaf in carry.items()}
         self._leaves = dict(carry)
@@ -80,6 +73,22 @@ class FusedEngine:
             self._arrays.sort_columns(every, shares, any(kernel.split for kernel in self._kernels.values()))
         self._pool: ThreadPoolExecutor | None = None
         self._process = 0
+
+    def _compile(self, phase: Phase) -> tuple[dict[str, Kernel], dict[str, Block]]:
+        """Return the kernels by name, with a thread or a block an environment; stages are compiled side by side."""
+        source = self.source
+
+        def compiled(bodies: dict[str, str]) -> dict[str, Kernel]:
+            return compile_kernels(bodies, self.device, self.num_envs, source.large_branches, phase=phase)
+
+        blocks = [one for one in all_stages(source.stages) if one.kind == "block"]
+        if not blocks:
+            return compiled(source.bodies), {}
+        with ThreadPoolExecutor(cores(), "surgical_marl") as pool:
+            made = pool.map(lambda one: compile_block(one.name, one.code, one.threads, phase), blocks)
+            kernels = pool.map(lambda name: compiled({name: source.bodies[name]})[name], source.bodies)
+            names = [one.name for one in blocks]
+            return dict(zip(source.bodies, kernels, strict=True)), dict(zip(names, made, strict=True))
 
     def reset(self, seed: int, first: int = 0) -> None:
         """Start first episodes. Environment i depends on `seed` and `first` + i alone, and not on `num_envs`."""

@@ -30,6 +30,8 @@ wp = prepare_warp()
 
 LEAST_BLOCK, MOST_BLOCK = 32, 256
 """Fewest and most threads in a CUDA block."""
+BLOCK_REGISTERS = 128
+"""Most registers of a thread of a block: a multiprocessor then has 16 warps or more, which hide each other's waits."""
 FLAGS = "-march=native -ffp-contract=fast -fno-optimize-sibling-calls"
 """For Clang. Contraction: a * b + c is one rounding, as on a GPU. There are no calls to optimise, and looking for them
 takes a quarter of the time."""
@@ -78,6 +80,8 @@ def compile_kernels(
 def compile_block(name: str, body: str, threads: int, phase: Phase = unsaid) -> Block:
     """Compile the CUDA body of a stage that runs a block of threads an environment.
 
+    Division and square root are CUDA's approximate ones, as in other kernels.
+
     Args:
         name: of the kernel.
         body: as `compile_kernels` takes them; `t` is the environment's column.
@@ -86,8 +90,8 @@ def compile_block(name: str, body: str, threads: int, phase: Phase = unsaid) -> 
     """
     digest = hashlib.sha256(f"{threads} {body}".encode()).hexdigest()[:16]
     module = wp.get_module(f"surgical_marl_{digest}")
-    module.options.update(enable_backward=False)
-    kernel = _made(digest, ((name, body),), module, None, threads)[name]
+    module.options.update(enable_backward=False, fast_math=True)
+    kernel = _made(digest, ((name, body),), module, BLOCK_REGISTERS, threads)[name]
     with locked(_records() / module.name), _checked(module.name):
         if not _folders(module.name):
             phase(f"compiling the stage {name}")

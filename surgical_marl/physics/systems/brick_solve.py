@@ -141,24 +141,35 @@ class BrickSolver:
         """Mass, stiffness of the support and freedom (0 or 1) of each node, [n]."""
         return jnp.asarray(self.grid.mass), jnp.asarray(self.support.stiffness), jnp.asarray(self.free)
 
-    def displacements(
-        self, linear: Linear, springs: Springs | None, guess: Array, dt: Any, iterations: Any = None,
+    def displacements(self, linear: Linear, springs: Springs | None, guess: Array, dt: Any) -> Array:
+        """Return the displacements of the nodes in a step, m, [n, 3], from a guess that leaves what is fixed."""
+        return self.improved(linear, springs, guess, self.residual(linear, guess, dt), dt, self.iterations)[0]
+
+    def residual(self, linear: Linear, u: Array, dt: Any) -> Array:
+        """Return the forces that are left on nodes with displacements u, m, [n, 3], without springs: N, [n, 3]."""
+        inertial = jax.lax.map(lambda row: row[0] * row[1], (linear.inertia, u))
+        rows = linear.force, self._elastic(linear.cells, u, inertial, dt)
+        found: Array = jax.lax.map(lambda row: row[0] - row[1], rows)
+        return found
+
+    def improved(
+        self, linear: Linear, springs: Springs | None, u: Array, residual: Array, dt: Any, most: Any,
         enough: float = 0.0,
-    ) -> Array:  # fmt: skip
-        """Return the displacements of the nodes in a step, m, [n, 3].
+    ) -> tuple[Array, Array]:  # fmt: skip
+        """Return better displacements, m, [n, 3], and the forces that these leave without springs, N, [n, 3].
 
         Args:
             linear: the step's equations.
             springs: at points of the tissue.
-            guess: displacements that leave what is fixed.
+            u: displacements that leave what is fixed.
+            residual: the forces that these leave without springs.
             dt: duration of the step, s.
-            iterations: most conjugate gradients; None for those of the solver.
+            most: most conjugate gradients.
             enough: residual at which they stop, in the norm of the inverse of the nodes' own blocks, J.
         """
-        most = self.iterations if iterations is None else iterations
-        free, right, block = jnp.asarray(self.free), linear.force, linear.block
+        free, block = jnp.asarray(self.free), linear.block
         if springs is not None:
-            right, block = _with_springs(springs, right, block)
+            residual, block = _pushed(springs, u, residual), _stiffened(springs, block)
         inverse = jax.lax.map(lambda lower: inverse_symmetric(lower[FULL])[LOWER], block)
 
         def matrix(p: Array, sums: Array) -> Array:
@@ -167,13 +178,12 @@ class BrickSolver:
             return sums if springs is None else _springs_times(springs, p, sums)
 
         def begin(sum_: Array, row: Any) -> tuple[Array, Any]:
-            right, moved, free, inverse, inertia = row
-            residual = free * (right - moved)
+            residual, free, inverse, inertia = row
+            residual *= free
             p = inverse[FULL] @ residual
             return sum_ + residual @ p, (residual, p, inertia * p)
 
-        start = jax.lax.map(lambda row: row[0] * row[1], (linear.inertia, guess))
-        rows = right, matrix(guess, start), free, inverse, linear.inertia
+        rows = residual, free, inverse, linear.inertia
         rz, (residual, p, ap) = jax.lax.scan(begin, jnp.float32(0.0), rows)
 
         def goes_on(found: Any) -> Array:
@@ -208,8 +218,9 @@ class BrickSolver:
             p, ap = jax.lax.map(turn, (residual, p, inverse, linear.inertia))
             return done + 1, u, residual, p, ap, after
 
-        found: Array = jax.lax.while_loop(goes_on, iterate, (jnp.int32(0), guess, residual, p, ap, rz))[1]
-        return found
+        start = jnp.int32(0), u, residual, p, ap, rz
+        _, u, residual, *_ = jax.lax.while_loop(goes_on, iterate, start)
+        return u, residual if springs is None else _pushed(springs, u, residual, -1.0)
 
     def _blend(self, dt: Any) -> Any:
         """Return the factor of the stiffness K of bricks in the matrix of a step: with damping."""
@@ -286,15 +297,26 @@ def _each(springs: Springs, of: Callable[[Any, Any], Any], start: Any) -> Any:
     return jax.lax.fori_loop(0, springs.used, add, start)
 
 
-def _with_springs(springs: Springs, right: Array, block: Array) -> tuple[Array, Array]:
-    def add(own: Any, sums: tuple[Array, Array]) -> tuple[Array, Array]:
-        right, block = sums
-        for node, weight in zip(own.nodes, own.weights, strict=True):
-            right = right.at[node].add(weight * own.force, mode="promise_in_bounds")
-            block = block.at[node].add(weight * weight * own.stiffness, mode="promise_in_bounds")
-        return right, block
+def _pushed(springs: Springs, u: Array, forces: Array, share: float = 1.0) -> Array:
+    """Return forces on nodes, N, [n, 3], with a share of those of springs at displacements u, m, [n, 3]."""
 
-    found: tuple[Array, Array] = _each(springs, add, (right, block))
+    def add(own: Any, forces: Array) -> Array:
+        force = share * (own.force - own.stiffness[FULL] @ (own.weights @ u[own.nodes]))
+        for node, weight in zip(own.nodes, own.weights, strict=True):
+            forces = forces.at[node].add(weight * force, mode="promise_in_bounds")
+        return forces
+
+    found: Array = _each(springs, add, forces)
+    return found
+
+
+def _stiffened(springs: Springs, block: Array) -> Array:
+    def add(own: Any, block: Array) -> Array:
+        for node, weight in zip(own.nodes, own.weights, strict=True):
+            block = block.at[node].add(weight * weight * own.stiffness, mode="promise_in_bounds")
+        return block
+
+    found: Array = _each(springs, add, block)
     return found
 
 

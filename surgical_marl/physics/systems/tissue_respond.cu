@@ -87,82 +87,111 @@ EACH(a, n, NODES) {
 }
 __syncthreads();
 
+// what bricks add to the matrix times p; after a barrier, its sum over the bricks around a node
+const auto bricks_times = [&]() {
+    EACH(a, e, BRICKS) {
+        float x[24];
+        Block::corners(p + corner[a], x);
+        brick[a].product(x, blend);
+        for (int i = 0; i < 24; i++) each[PAD * e + i] = x[i];
+    }
+};
+const auto add_bricks = [&](int n, float *sum) {
+    for (int k = 0; k < 8; k++) {
+        const int at = in.mesh_around[8 * n + k];
+        if (at >= 0)
+            for (int i = 0; i < 3; i++) sum[i] += each[at + i];
+    }
+};
+const auto add_pulls = [&](int n, float *sum) {
+    for (int k = first[n]; k >= 0; k = next[k])
+        for (int i = 0; i < 3; i++) sum[i] += weights[k] * pull[3 * (k / HELD) + i];
+};
+
 const int rounds = rows > 0 ? ROUNDS : 1, iterations = rows > 0 ? TURNS : ALONE;
 for (int round = 0; round < rounds; round++) {
-    float sums[2] = {0.0f, 0.0f};
+    // contacts anew: by how much their forces differ from those in the residual
     for (int c = thread; c < rows; c += threads) {
         const Contact own = contact(c);
-        float moved[3];
+        float moved[3], was[3] = {0.0f, 0.0f, 0.0f}, felt[3];
         Block::point(p, nodes + HELD * c, weights + HELD * c, moved);
-        own.feel(moved, force + 3 * c, stiffness + 6 * c);
-        Symmetric::times(stiffness + 6 * c, moved, pull + 3 * c);
-        for (int i = 0; i < 3; i++) force[3 * c + i] += pull[3 * c + i];
-    }
-    for (int iteration = -1; iteration < iterations; iteration++) {
-        // the matrix times p: first what bricks and contacts add
-        EACH(a, e, BRICKS) {
-            float x[24];
-            Block::corners(p + corner[a], x);
-            brick[a].product(x, blend);
-            for (int i = 0; i < 24; i++) each[PAD * e + i] = x[i];
+        if (round > 0) {
+            Symmetric::times(stiffness + 6 * c, moved, was);
+            for (int i = 0; i < 3; i++) was[i] = force[3 * c + i] - was[i];
         }
-        if (iteration >= 0)
-            for (int c = thread; c < rows; c += threads) {
-                float moved[3];
-                Block::point(p, nodes + HELD * c, weights + HELD * c, moved);
-                Symmetric::times(stiffness + 6 * c, moved, pull + 3 * c);
-            }
+        own.feel(moved, felt, stiffness + 6 * c);
+        Symmetric::times(stiffness + 6 * c, moved, force + 3 * c);
+        for (int i = 0; i < 3; i++) {
+            pull[3 * c + i] = felt[i] - was[i];
+            force[3 * c + i] += felt[i];
+        }
+    }
+    if (round == 0) bricks_times();
+    __syncthreads();
+    float z[NODES_EACH][3], rz[2] = {0.0f, 0.0f};
+    EACH(a, n, NODES) {
+        if (round == 0) {
+            float sum[3];
+            for (int i = 0; i < 3; i++) sum[i] = inertia[a] * p[3 * n + i];
+            add_bricks(n, sum);
+            for (int i = 0; i < 3; i++) residual[a][i] = right[3 * n + i] - sum[i];
+        }
+        add_pulls(n, residual[a]);
+        float sum[6];
+        for (int i = 0; i < 6; i++) sum[i] = block[6 * n + i];
+        for (int k = first[n]; k >= 0; k = next[k])
+            for (int i = 0; i < 6; i++) sum[i] += weights[k] * weights[k] * stiffness[6 * (k / HELD) + i];
+        for (int i = 0; i < 3; i++) residual[a][i] *= free[a];
+        Symmetric::invert(sum, inverse[a]);
+        Symmetric::times(inverse[a], residual[a], z[a]);
+        rz[0] += Vector::dot(residual[a], z[a]);
+    }
+    Block::sum(rz, box[1]);
+    EACH(a, n, NODES) {
+        for (int i = 0; i < 3; i++) p[3 * n + i] = z[a][i];
+    }
+    __syncthreads();
+
+    // conjugate gradients
+    for (int iteration = 0; iteration < iterations && rz[0] > ENOUGH; iteration++) {
+        bricks_times();
+        for (int c = thread; c < rows; c += threads) {
+            float moved[3];
+            Block::point(p, nodes + HELD * c, weights + HELD * c, moved);
+            Symmetric::times(stiffness + 6 * c, moved, pull + 3 * c);
+        }
         __syncthreads();
         float ap[NODES_EACH][3], pap[2] = {0.0f, 0.0f}, after[2] = {0.0f, 0.0f};
         EACH(a, n, NODES) {
             const float *own = p + 3 * n;
             for (int i = 0; i < 3; i++) ap[a][i] = inertia[a] * own[i];
-            for (int k = 0; k < 8; k++) {
-                const int at = in.mesh_around[8 * n + k];
-                if (at >= 0)
-                    for (int i = 0; i < 3; i++) ap[a][i] += each[at + i];
-            }
-            for (int k = first[n]; k >= 0; k = next[k])
-                for (int i = 0; i < 3; i++) ap[a][i] += weights[k] * pull[3 * (k / HELD) + i];
+            add_bricks(n, ap[a]);
+            add_pulls(n, ap[a]);
             for (int i = 0; i < 3; i++) ap[a][i] *= free[a];
             pap[0] += Vector::dot(own, ap[a]);
             pap[1] += inertia[a] * Vector::dot(own, own);
         }
-        float length = 0.0f;
-        if (iteration >= 0) {
-            Block::sum(pap, box[0]);
-            length = sums[0] / fmaxf(fmaxf(pap[0], pap[1]), 1e-30f);
-        }
+        Block::sum(pap, box[0]);
+        const float length = rz[0] / fmaxf(fmaxf(pap[0], pap[1]), 1e-30f);
         EACH(a, n, NODES) {
-            if (iteration < 0) {
-                float sum[6];
-                for (int i = 0; i < 6; i++) sum[i] = block[6 * n + i];
-                for (int i = 0; i < 3; i++) residual[a][i] = right[3 * n + i];
-                for (int k = first[n]; k >= 0; k = next[k]) {
-                    const int c = k / HELD;
-                    for (int i = 0; i < 6; i++) sum[i] += weights[k] * weights[k] * stiffness[6 * c + i];
-                    for (int i = 0; i < 3; i++) residual[a][i] += weights[k] * force[3 * c + i];
-                }
-                for (int i = 0; i < 3; i++) residual[a][i] = free[a] * residual[a][i] - ap[a][i];
-                Symmetric::invert(sum, inverse[a]);
-            } else
-                for (int i = 0; i < 3; i++) {
-                    u[a][i] += length * p[3 * n + i];
-                    residual[a][i] -= length * ap[a][i];
-                }
-            Symmetric::times(inverse[a], residual[a], ap[a]);
-            after[0] += Vector::dot(residual[a], ap[a]);
+            for (int i = 0; i < 3; i++) {
+                u[a][i] += length * p[3 * n + i];
+                residual[a][i] -= length * ap[a][i];
+            }
+            Symmetric::times(inverse[a], residual[a], z[a]);
+            after[0] += Vector::dot(residual[a], z[a]);
         }
         Block::sum(after, box[1]);
-        const float share = iteration < 0 ? 0.0f : after[0] / fmaxf(sums[0], 1e-30f);
-        EACH(a, n, NODES)
-            for (int i = 0; i < 3; i++) p[3 * n + i] = ap[a][i] + share * p[3 * n + i];
-        sums[0] = after[0];
+        const float share = after[0] / fmaxf(rz[0], 1e-30f);
+        EACH(a, n, NODES) {
+            for (int i = 0; i < 3; i++) p[3 * n + i] = z[a][i] + share * p[3 * n + i];
+        }
+        rz[0] = after[0];
         __syncthreads();
-        if (after[0] <= ENOUGH) break;
     }
-    EACH(a, n, NODES)
+    EACH(a, n, NODES) {
         for (int i = 0; i < 3; i++) p[3 * n + i] = u[a][i];
+    }
     __syncthreads();
 }
 

@@ -138,15 +138,15 @@ class TissueStep:
             felt = feel(end, _point(held, row, u) - end.shift)
             return felt.force + felt.stiffness @ _point(held, row, u), felt.stiffness[LOWER]
 
-        def improve(_: Any, found: tuple[Array, Array]) -> tuple[Array, Array]:
-            u, _ = found
+        def improve(_: Any, found: tuple[Array, ...]) -> tuple[Array, ...]:
+            u, residual, _ = found
             force, stiffness = each(ends, lambda row, end: spring(row, end, u))
             springs = Springs(*held, force, stiffness, ends.total)
-            u = solver.displacements(linear, springs, u, dt, iterations, ENOUGH)
-            return u, each(ends, lambda row, _: force[row] - stiffness[row][FULL] @ _point(held, row, u))
+            u, residual = solver.improved(linear, springs, u, residual, dt, iterations, ENOUGH)
+            return u, residual, each(ends, lambda row, _: force[row] - stiffness[row][FULL] @ _point(held, row, u))
 
-        start = linear.guess, jnp.zeros((len(held.nodes), 3))
-        u, force = jax.lax.fori_loop(0, jnp.where(touched, ROUNDS, 1), improve, start)
+        start = linear.guess, solver.residual(linear, linear.guess, dt), jnp.zeros((len(held.nodes), 3))
+        u, _, force = jax.lax.fori_loop(0, jnp.where(touched, ROUNDS, 1), improve, start)
 
         def eased(row: Array, end: End) -> tuple[Array, Array]:
             # the contact's spring is in series with the tissue at its point, whose other nodes stay
