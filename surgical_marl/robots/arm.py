@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from surgical_marl.cache import cached
 from surgical_marl.content import find, unknown
 from surgical_marl.robots.description import MOVING, Robot, RobotJoint, Vector
 from surgical_marl.robots.drives import Cable, Drive, TipSpeed
@@ -152,7 +153,12 @@ class Arm:
     def reach(self) -> Box:
         """Bounds of where the tool tip can be, [3] each, in the base frame, m, with a tenth to spare at each end."""
         limits = Box(self.lower, self.upper)
-        return box_of(lambda q: self.forward_kinematics(q)[..., :3, 3], limits).widened(0.1, 0.01)
+
+        def search() -> np.ndarray:
+            return np.stack(box_of(lambda q: self.forward_kinematics(q)[..., :3, 3], limits))
+
+        chain = repr((self.tool_tip, self.joints, self.urdf.joints))
+        return Box(*cached("reach", search, chain)).widened(0.1, 0.01)
 
     @property
     def speed(self) -> np.ndarray:
