@@ -223,7 +223,7 @@ def test_the_schedule_of_every_block() -> None:
         assert_schedule_is_right(partial(all_blocks, group), random_arrays(0))
 
 
-@settings(max_examples=50, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+@settings(max_examples=30, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
 @given(st.lists(programs(2), min_size=1, max_size=1))
 def test_the_schedule_of_programs(written: list[list[Any]]) -> None:
     assert_schedule_is_right(partial(several, written), random_arrays(0))
