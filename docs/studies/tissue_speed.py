@@ -1,4 +1,4 @@
-"""Measures environment steps of two PSMs over a sheet of tissue, as arms move at random and as they go into it.
+"""Measures environment steps of two PSMs over tissue, as arms move at random and as they go into it.
 
 On a GPU it says what each stage of a step takes too, one after the other: together they take longer than side by side.
 
@@ -7,13 +7,15 @@ Run: python -m docs.studies.tissue_speed --num-envs 16384 --device cuda
 
 from __future__ import annotations
 
+import sys
 import time
 from collections import defaultdict
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from docs.studies.command import make_parser
+from docs.studies.command import make_parser, run
 from surgical_marl.engines.fused.engine import FusedEngine
 from surgical_marl.engines.fused.kernel_layout import Stage
 from surgical_marl.envs.env import Env
@@ -43,65 +45,72 @@ def waited(device: str) -> float:
     return time.perf_counter()
 
 
-def measured(engine: FusedEngine, drawn: list[Any], hold: int, steps: int) -> tuple[float, float]:
+def measured(engine: Any, drawn: list[Any], hold: int, steps: int) -> tuple[float, float]:
     """Return environment steps/s, and the share of environments in which something touches the tissue."""
     for k in range(SETTLE):
         engine.step(drawn[k // hold % len(drawn)])
     start = waited(engine.device)
     for k in range(steps):
         engine.step(drawn[k // hold % len(drawn)])
-    rate = steps * engine.num_envs / (waited(engine.device) - start)
-    return rate, float((engine.read(".physics.sheet.force", "numpy") > 0).mean())
+    rate, name = steps * engine.num_envs / (waited(engine.device) - start), next(iter(engine.env.scene.systems))
+    return rate, float((engine.read(f".physics.{name}.force", "numpy") > 0).mean())
 
 
-def stage_times(engine: FusedEngine, actions: Any, steps: int) -> dict[str, float]:
+def stage_times(engine: Any, actions: Any, steps: int) -> dict[str, float]:
     """Return what each stage takes of a control step, s, by its name: all calls together."""
     spent: dict[str, float] = defaultdict(float)
     plain = engine._run
 
-    def run(stages: list[Stage], sense: Any) -> None:
+    def timed(stages: list[Stage], sense: Any) -> None:
         for stage in stages:
             if stage.kind == "loop":
                 for _ in range(stage.length):
-                    run(stage.stages, sense)
+                    timed(stage.stages, sense)
                 continue
             start = waited(engine.device)
             plain([stage], sense)
             spent[f"{stage.kind} {stage.name}".strip()] += (waited(engine.device) - start) / steps
 
-    engine._run = run  # type: ignore[method-assign]
+    engine._run = timed
     for _ in range(steps):
         engine.step(actions)
-    engine._run = plain  # type: ignore[method-assign]
+    engine._run = plain
     return spent
 
 
-def main(argv: list[str] | None = None) -> None:
-    """Measure, and print tables."""
-    parser = make_parser(__doc__)
-    parser.add_argument("--num-envs", type=int, default=64)
-    parser.add_argument("--device", default="cpu", choices=("cpu", "cuda"))
-    parser.add_argument("--steps", type=int, default=50)
-    a = parser.parse_args(argv)
-    start, env = time.perf_counter(), Env("reach", "bimanual_psm_tissue")
-    engine, rng = FusedEngine(env, a.num_envs, a.device), np.random.default_rng(0)
+def report(scene: str, count: int, device: str, steps: int) -> int:
+    """Print tables."""
+    start, env = time.perf_counter(), Env("reach", scene)
+    engine, rng = FusedEngine(env, count, device), np.random.default_rng(0)
     engine.reset(seed=0)
-    print(f"{a.num_envs} environments on {a.device}, compiled in {time.perf_counter() - start:.1f} s")
+    print(f"{count} environments on {device}, compiled in {time.perf_counter() - start:.1f} s")
     print("\n| motion | environment steps/s | tissue touched in |\n|---|---|---|")
     for motion in MOTIONS:
-        drawn = [actions_of(motion, env, a.num_envs, rng) for _ in range(4)]
-        if a.device == "cuda":
+        drawn: list[Any] = [actions_of(motion, env, count, rng) for _ in range(4)]
+        if device == "cuda":
             import torch
 
             drawn = [{name: torch.from_numpy(own).cuda() for name, own in one.items()} for one in drawn]
-        rate, touched = measured(engine, drawn, 1 if motion == "random" else HELD, a.steps)
+        rate, touched = measured(engine, drawn, 1 if motion == "random" else HELD, steps)
         print(f"| {motion} | {rate:,.0f} | {touched:.0%} |", flush=True)
-    if a.device == "cuda":
+    if device == "cuda":
         print("\n| stage | ms of a control step |\n|---|---|")
         for name, seconds in stage_times(engine, drawn[0], 10).items():
             print(f"| {name} | {1e3 * seconds:.3f} |")
     engine.close()
+    return 0
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Measure, and print tables."""
+    parser = make_parser(__doc__)
+    parser.add_argument("--scene", default="bimanual_psm_tissue")
+    parser.add_argument("--num-envs", type=int, default=64)
+    parser.add_argument("--device", default="cpu", choices=("cpu", "cuda"))
+    parser.add_argument("--steps", type=int, default=50)
+    a = parser.parse_args(argv)
+    return run("tissue_speed", partial(report, a.scene, a.num_envs, a.device, a.steps))
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())
