@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -33,8 +35,11 @@ DEVICES = [
 ]
 
 
-def step_of(tissue: Tissue) -> TissueStep:
-    return TissueStep(tissue.solver, tissue.tears, DT)
+@cache
+def step_of(sheet: str) -> tuple[TissueStep, Callable[..., Any], Callable[..., Any]]:
+    """The step of a sheet, and its functions as JAX compiles them."""
+    step = TissueStep(SHEETS[sheet].solver, SHEETS[sheet].tears, DT)
+    return step, jax.jit(step.respond), jax.jit(step.move)
 
 
 def shaken(tissue: Tissue, size: float) -> Nodes:
@@ -76,29 +81,30 @@ def close(found: dict[str, np.ndarray], expected: Any, contacts: int, share: flo
 @pytest.mark.parametrize(("sheet", "contacts", "q"), [("sheet", CONTACTS, 4), ("sheet", 0, 4), ("holes", CONTACTS, 8)])
 def test_cuda_code_computes_what_jax_does(sheet: str, contacts: int, q: int, device: str) -> None:
     tissue = SHEETS[sheet]
-    step, nodes, (held, ends) = step_of(tissue), shaken(tissue, 4e-4), touched(tissue, contacts, q)
-    expected = jax.jit(step.respond)(nodes, held, ends)
+    (step, respond, move), nodes, (held, ends) = step_of(sheet), shaken(tissue, 4e-4), touched(tissue, contacts, q)
+    expected = respond(nodes, held, ends)
     assert contacts == 0 or (np.abs(expected.force[:contacts]).max(1) > 0).sum() >= 4
     close(run_block(device, step.respond, nodes, held, ends), expected, contacts, 2e-5)
     pushed = jnp.asarray(
         np.random.default_rng(2).normal(size=(ROOM, 3)) * (np.arange(ROOM) < contacts)[:, None], jnp.float32
     )
     args = nodes, held, ends, expected, pushed
-    close(run_block(device, step.move, *args), jax.jit(step.move)(*args), contacts, 2e-6)
+    close(run_block(device, step.move, *args), move(*args), contacts, 2e-6)
 
 
 @pytest.mark.skipif(not kernel.has_cuda(), reason="needs a CUDA device")
 def test_a_gpu_pushes_it_as_a_cpu_does(tmp_path: Path) -> None:
     found = []
-    for device in ("cpu", "cuda"):
-        env = BatchedEnv("reach", scene_file(tmp_path), num_envs=2, engine="fused", device=device)
+    devices: Any = (("mjx", "cpu"), ("fused", "cuda"))
+    for engine, device in devices:
+        env = BatchedEnv("reach", scene_file(tmp_path), num_envs=2, engine=engine, device=device)
         env.reset(seed=0)
         action = np.zeros((2, len(env.scene.mounts["psm_0"].arm.actuated)), np.float32)
         action[0, 2] = 1.0  # into the tissue
         for _ in range(10):
             step = env.step({"psm_0": action})
         force = np.array(step.infos["psm_0"]["tissue_force"])
-        found.append([env.engine.read(f".physics.{part}", "numpy") for part in ("sheet.nodes.position", "arms.qpos")])
+        found.append([env.engine.read(f".physics.{name}", "numpy") for name in ("sheet.nodes.position", "arms.qpos")])
         found[-1].append(force)
         env.close()
     assert found[0][2][0] > 0.05
@@ -108,8 +114,8 @@ def test_a_gpu_pushes_it_as_a_cpu_does(tmp_path: Path) -> None:
 
 def test_nvrtc_compiles_the_kernels(tmp_path: Path) -> None:
     """Without a GPU; shared memory and barriers are there, and no thread has arrays in slow memory."""
-    tissue = SHEETS["sheet"]
-    step, nodes, (held, ends) = step_of(tissue), shaken(tissue, 1e-4), touched(tissue, 1)
+    tissue, step = SHEETS["sheet"], step_of("sheet")[0]
+    nodes, (held, ends) = shaken(tissue, 1e-4), touched(tissue, 1)
     answer: Any = jax.tree.map(lambda x: jnp.zeros(x.shape), jax.eval_shape(step.respond, nodes, held, ends))
     pushed = jnp.zeros((ROOM, 3))
     for name, function, args in (("respond", step.respond, ()), ("move", step.move, (answer, pushed))):
