@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 import yaml
@@ -17,7 +18,8 @@ from surgical_marl.physics.contact.part_detection import PartDetection, Scenery
 from surgical_marl.physics.contact.shapes import Plate, Segments
 from surgical_marl.physics.systems.brick import CORNERS
 from surgical_marl.physics.systems.brick_solve import Nodes
-from surgical_marl.physics.systems.tissue import Tissue, TissueState
+from surgical_marl.physics.systems.tissue import SKIN, Tissue, TissueState
+from surgical_marl.robots.spec import PAD_GROUP
 from surgical_marl.scenes.objects import Surface
 
 CELLS, SIZE, DT = (6, 2, 1), (0.03, 0.01, 0.005), 2.5e-3
@@ -183,6 +185,55 @@ def test_both_engines_push_it_alike_and_a_reset_forgets(tmp_path: Path) -> None:
         np.testing.assert_allclose(one, other, atol=close)
 
 
+def beside_pads(scene: Any, qpos: np.ndarray, points: np.ndarray) -> float:
+    """Return the least distance of points [n, 3] from the plates of a jaw, m; below 0 in a plate."""
+    data, least = mujoco.MjData(scene.model), np.inf
+    data.qpos[:] = qpos
+    mujoco.mj_kinematics(scene.model, data)
+    for pad in np.flatnonzero(scene.model.geom_group == PAD_GROUP):
+        off = np.abs((points - data.geom_xpos[pad]) @ data.geom_xmat[pad].reshape(3, 3)) - scene.model.geom_size[pad]
+        outside = np.linalg.norm(np.maximum(off, 0.0), axis=1)
+        least = min(least, float((outside + np.minimum(off.max(1), 0.0)).min()))
+    return least
+
+
+def test_a_jaw_gathers_tissue_lifts_it_and_holds_it_for_ten_seconds(tmp_path: Path) -> None:
+    """An open jaw presses the sheet down, closes on a fold of it, and goes up until it is 5 mm above the sheet."""
+    env = BatchedEnv("reach", scene_file(tmp_path), num_envs=2, engine="fused", device="cpu", max_steps=10**6)
+    env.reset(seed=0)
+    tissue: Any = env.scene.systems["sheet"]
+    top, nearest = tissue.grid.places[:, 2] == 1, np.inf
+
+    def read(part: str) -> np.ndarray:
+        return np.array(env.engine.read(f".physics.{part}", "numpy"), float)
+
+    def go(steps: int, insertion: float, jaw: float, force: float = np.inf) -> None:
+        nonlocal nearest
+        action = np.zeros((2, len(env.scene.mounts["psm_0"].arm.actuated)), np.float32)
+        action[:, 2], action[:, -1] = insertion, jaw
+        for _ in range(steps):
+            env.step({"psm_0": action})
+            x = read("sheet.nodes.position")[0]
+            under = (1 - SKIN) * x[top] + SKIN * x[~top]  # the balls that pads touch
+            nearest = min(nearest, beside_pads(env.scene, read("arms.qpos")[0], under))
+            if read("sheet.force")[0] > force:
+                return
+
+    go(12, 0.0, 1.0)
+    go(60, 0.25, 1.0, force=0.2)
+    go(60, 0.0, -1.0)
+    go(14, -0.2, -1.0)
+    go(100, 0.0, -1.0)
+    held, height = read("sheet.nodes.position")[0], tissue.rest[:, 2].max()
+    go(500, 0.0, -1.0)
+    after = read("sheet.nodes.position")[0]
+    assert after[:, 2].max() > height + 3e-3 and read("sheet.force")[0] > 1.0
+    assert read("arms.qpos")[0, -1] > 0.022  # something is between its fingers, which would close to 0.020 rad
+    assert np.abs(after - held).max() < 1e-4
+    assert nearest > 0, nearest  # no ball has gone into a plate with its middle
+    env.close()
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
@@ -215,6 +266,9 @@ def test_bricks_are_cut_out_of_a_grid(tmp_path: Path) -> None:
     assert not present[2:4, :3].any() and present[2:4, 3].all()
     held = tissue.solver.support.stiffness
     assert held.sum() == pytest.approx(1e6 * 4 * 0.005 * 0.005) and held[tissue.grid.places[:, 1] > 0].sum() == 0
+    drawn = tissue.bars.start[tissue.bars.ends].mean((1, 2)) - tissue.position
+    bricks = np.argwhere(present)
+    np.testing.assert_allclose(drawn[:, :2], (bricks + 0.5) * 0.005, atol=1e-6)
     parts = tissue.points.nodes[tissue.points.weights > 0]
     assert (tissue.grid.mass[parts] > 0).all()
     np.testing.assert_allclose(tissue.points.weights.sum(1), 1.0)

@@ -149,11 +149,11 @@ class Tissue(Soft):
 
     @property
     def bars(self) -> Bars:
-        """A capsule for each edge along x, in the middle of the thickness: side by side they look like a sheet."""
+        """A capsule along x for each brick seen from above, in the middle of the thickness: together they are a sheet."""
         grid, (_, rows, levels) = self.grid, self.grid.counts
         i, j = np.argwhere(grid.present.any(2)).T
-        lowest = np.unique([(i * rows + j) * levels, (i * rows + j + 1) * levels])
-        ends = lowest[:, None, None] + np.array([[0], [rows * levels]]) + np.array([0, levels - 1])
+        side = (np.array([0, rows])[:, None, None] + np.array([0, 1])[:, None]) * levels + np.array([0, levels - 1])
+        ends = ((i * rows + j) * levels)[:, None, None] + side.reshape(2, 4)
         return Bars("nodes.position", self.rest, ends, min(self.size[2], float(grid.cell[1])) / 2, self.colour)
 
     @property
