@@ -149,7 +149,7 @@ class Tissue(Soft):
 
     @property
     def bars(self) -> Bars:
-        """A capsule along x for each brick seen from above, in the middle of the thickness: together they are a sheet."""
+        """A capsule along x for each brick seen from above, in the middle of the thickness. They fill a sheet."""
         grid, (_, rows, levels) = self.grid, self.grid.counts
         i, j = np.argwhere(grid.present.any(2)).T
         side = (np.array([0, rows])[:, None, None] + np.array([0, 1])[:, None]) * levels + np.array([0, levels - 1])
