@@ -91,7 +91,9 @@ def test_both_engines_close_a_jaw_on_a_thread_and_lift_it_alike(tmp_path: Path) 
 def test_ten_minutes_of_random_arms_push_no_thread_through_its_pad() -> None:
     """All environments together. A thread that slid over the pad's rim falls, and is not looked at any more."""
     count, seconds, top, rim = 16, 600, 0.02, np.array([0.178, 0.0485])
-    env = BatchedEnv("reach", "bimanual_psm_thread", num_envs=count, engine="fused", device="cpu", max_steps=10**6)
+    env = BatchedEnv(
+        "reach", "bimanual_psm_thread_alone", num_envs=count, engine="fused", device="cpu", max_steps=10**6
+    )
     env.reset(seed=1)
     rng, on_it, pulled = np.random.default_rng(1), np.ones(count, bool), 0.0
     for step in range(round(seconds / 0.02 / count)):

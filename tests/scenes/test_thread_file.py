@@ -101,14 +101,14 @@ def test_a_scene_paints_it(tmp_path: Path) -> None:
 
 
 def test_mass_and_stiffness_are_those_of_its_material() -> None:
-    item, thread = sm.load_object("thread_3_0"), sm.load_scene("bimanual_psm_thread").systems["thread"]
+    item, thread = sm.load_object("thread_3_0"), sm.load_scene("bimanual_psm_thread_alone").systems["thread"]
     area = np.pi * 0.00011**2
     np.testing.assert_allclose([item.mass, thread.rod.mass.sum()], 1140 * area * 0.1, rtol=1e-6)
     np.testing.assert_allclose([thread.rod.axial, thread.rod.bending], [2e9 * area, 2e9 * area * 0.00011**2 / 4])
 
 
 def test_pictures_have_a_capsule_for_each_edge_and_mjcf_has_none() -> None:
-    scene = sm.load_scene("bimanual_psm_thread")
+    scene = sm.load_scene("bimanual_psm_thread_alone")
     data = mujoco.MjData(scene.model)
     mujoco.mj_kinematics(scene.model, data)
     path = np.array(scene.systems["thread"].path)
