@@ -11,6 +11,7 @@ import torch
 
 import surgical_marl as sm
 from surgical_marl import BatchedEnv
+from surgical_marl.envs.free_objects import FreeObjects
 from surgical_marl.policies.policy import zero_policy
 from surgical_marl.robots.rotation import matrix_of
 from surgical_marl.scenes.poses import Poses, frames
@@ -207,3 +208,36 @@ def test_poses_of_a_wrong_shape_are_named() -> None:
     np.testing.assert_array_equal(
         Endoscope(bare).render(bare.home[None], none).rgb, Endoscope(bare).render(bare.home[None]).rgb
     )
+
+
+@pytest.mark.parametrize("library", ["numpy", "torch"])
+def test_the_endoscope_sees_thread_and_tissue_where_their_nodes_are(library: str) -> None:
+    """Colours, depth and segmentation of a wound that is lifted by 10 mm, and of a thread beside it."""
+    scene = sm.load_scene("trimanual_psm_ecm_suture")
+    endoscope = Endoscope(scene, 2, "cpu", channels=CHANNELS)
+    needle, wound, thread = scene.objects["needle"], scene.systems["wound"].rest, scene.systems["thread"].path
+    lifted = {
+        "rigid_bodies.bodies.position": [[needle.position + needle.rotation @ needle.object.center]] * 2,
+        "rigid_bodies.bodies.quaternion": [[needle.pose.quaternion]] * 2,
+        "wound.nodes.position": wound + np.array([0.0, 0.01])[:, None, None] * [0, 0, 1],
+        "thread.chain.position": [thread] * 2,
+    }
+
+    class Engine:
+        carry_shapes: tuple[str, ...] = ()
+
+        def read(self, part: str, library: str) -> Any:
+            values = np.array(lifted[part.removeprefix(".physics.")], np.float32)
+            return torch.from_numpy(values) if library == "torch" else values
+
+    engine: Any = Engine()
+    poses, qpos = FreeObjects(scene).read_drawn(engine, 2, library), np.repeat(scene.home[None], 2, 0)
+    seen = endoscope.render(torch.from_numpy(qpos) if library == "torch" else qpos, poses)
+    labels = endoscope.labels[np.asarray(seen.segmentation)]
+    for name, pixels in (("wound", 100), ("thread", 4), ("pad", 100)):  # a thread is thin
+        assert (labels == endoscope.label_names.index(name)).sum() >= pixels, name
+    both = (labels == endoscope.label_names.index("wound")).all(0)
+    depth, rgb = np.asarray(seen.depth), np.asarray(seen.rgb)
+    nearer = (depth[0] - depth[1])[both]
+    assert 0.005 < np.median(nearer) < 0.02
+    assert rgb[1][both].mean(0).argmax() == 0  # red
