@@ -13,7 +13,7 @@ from jax import Array
 from surgical_marl.physics.contact.broadphase import Ball, size
 from surgical_marl.physics.contact.shapes import Plate, Points, Segments, between_segments, in_frame
 from surgical_marl.physics.systems.system import End, Ends, Shapes
-from surgical_marl.physics.tree_utils import Listed, picked, put, room, row_of
+from surgical_marl.physics.tree_utils import Listed, Tree, picked, put, room, row_of
 from surgical_marl.scenes.objects import Surface
 
 NEAR = 1e-4
@@ -116,19 +116,15 @@ class PartDetection:
         )
 
     def visited(self, scenery: Scenery, shapes: Shapes, dt: Any) -> Array:
-        """Return whether any shape that moves may touch a run of parts in the step, [] bool."""
-        moving, balls = int(self._starts["plates"]), _runs(shapes, dt).balls
+        """Return whether any shape that moves may touch a part in the step, [] bool."""
+        moving, runs = int(self._starts["plates"]), _runs(shapes, dt)
         if not moving:
             return jnp.bool_(False)
 
         def by_shape(found: Array, row: tuple[Array, Array]) -> tuple[Array, None]:
             shape, moves = row
             hull = self._of_shape(scenery, shape, _of_plate, _of_capsule)
-
-            def of_run(found: Array, ball: Ball) -> tuple[Array, None]:
-                return found | _reaches(ball, hull, moves) & (moves > 0), None
-
-            return jax.lax.scan(of_run, found, balls)
+            return _along(runs, hull, moves, lambda _, reached, found: found | (reached & (moves > 0)), found), None
 
         rows = jnp.arange(moving, dtype=jnp.int32), scenery.moves[:moving]
         found: Array = jax.lax.scan(by_shape, jnp.bool_(False), rows)[0]
@@ -190,15 +186,10 @@ class PartDetection:
             shape = near.numbers[row]
             hull, moves = hull_of(shape), scenery.moves[shape]
 
-            def part(number: Array, found: Listed) -> Listed:
-                return found.after(shape * parts + number, _reaches(runs.part(number), hull, moves))
+            def part(number: Array, reached: Array, found: Listed) -> Listed:
+                return found.after(shape * parts + number, reached)
 
-            def of_run(found: Listed, row: tuple[Ball, Array, Array]) -> tuple[Listed, None]:
-                ball, first, last = row
-                return jax.lax.fori_loop(first, jnp.where(_reaches(ball, hull, moves), last, first), part, found), None
-
-            rows = runs.balls, jnp.asarray(runs.first[:-1]), jnp.asarray(runs.first[1:])
-            return jax.lax.scan(of_run, found, rows)[0]
+            return _along(runs, hull, moves, part, found)
 
         found: Listed = jax.lax.fori_loop(0, near.length, of_shape, none)
         return found
@@ -291,6 +282,30 @@ def _around(balls: Ball) -> Ball:
     first = balls.centre[0], balls.centre[0], jnp.float32(0.0)
     low, high, most = jax.lax.scan(widen, first, balls)[0]
     return Ball((low + high) / 2, size(high - low) / 2, most)
+
+
+def _along(runs: Runs, hull: Hull, moves: Array, part: Callable[[Array, Array, Tree], Tree], found: Tree) -> Tree:
+    """Return what `part(number, reached, found)` makes of each part of the runs that a shape may touch in the step.
+
+    Args:
+        runs: of a system.
+        hull: of the shape.
+        moves: its displacement in the step, m.
+        part: is told the number of a part, and whether the shape may touch it.
+        found: what it begins with.
+    """
+
+    def of_run(found: Tree, row: tuple[Ball, Array, Array]) -> tuple[Tree, None]:
+        ball, first, last = row
+
+        def one(number: Array, found: Tree) -> Tree:
+            return part(number, _reaches(runs.part(number), hull, moves), found)
+
+        return jax.lax.fori_loop(first, jnp.where(_reaches(ball, hull, moves), last, first), one, found), None
+
+    rows = runs.balls, jnp.asarray(runs.first[:-1]), jnp.asarray(runs.first[1:])
+    after: Tree = jax.lax.scan(of_run, found, rows)[0]
+    return after
 
 
 def _balls(shapes: Shapes, run: int, dt: Any) -> tuple[Ball, Ball]:

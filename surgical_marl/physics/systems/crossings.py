@@ -215,7 +215,8 @@ def add(pairs: Ends, u: Array, own: Joined, change: Array) -> Array:
     pull = jax.lax.cond(pairs.total > 0, weights, lambda: jnp.zeros(3 * len(pairs.rows.part)))
 
     def less(k: Array, change: Array) -> Array:
-        return change - pull[k] * own.moves[k]
+        share = pull[k]
+        return jax.lax.map(lambda row: row[0] - share * row[1], (change, own.moves[k]))
 
     found: Array = jax.lax.fori_loop(0, 3 * pairs.total, less, change)
     return found
