@@ -73,6 +73,8 @@ class Meeting(NamedTuple):
     """Accelerations of joints [a, m] and of bodies [k, 6] that its response assumes: those of the last step."""
     awake: Any
     """Whether it moves, [] bool; True of a system that never sleeps. There is nothing in the rest unless it does."""
+    state: Any = None
+    """At the start of the step, if it follows needles; None for that after the last step."""
 
 
 class Step:
@@ -208,17 +210,20 @@ class Step:
         shapes, coupling, awake = system.shapes(state), self._couplings[name], system.awake(state)
         scenery = coupling.scenery(found.poses, found.joints, bodies, motion, dt)
 
-        def meet() -> tuple[Ends, Response]:
-            ends = coupling.ends(shapes, scenery, found.joints, bodies, motion, dt)
-            return ends, system.respond(state, system.free_motion(state, dt), ends, dt)
+        def meet() -> tuple[Ends, Response, Any]:
+            now, ends = state, coupling.ends(shapes, scenery, found.joints, bodies, motion, dt)
+            if system.follows:
+                now, ends = system.follow(state, ends, coupling.followed(bodies, motion[1]), dt)
+            response = system.respond(now, system.free_motion(now, dt), ends, dt)
+            return ends, response, now if system.follows else None
 
         if awake is True:
-            ends, response = meet()
-            return Meeting(ends, response, expected, awake)
+            ends, response, now = meet()
+            return Meeting(ends, response, expected, awake, now)
         awake |= coupling.visited(shapes, scenery, dt)
         nothing: Any = empty_like(jax.eval_shape(meet))
-        ends, response = skip.cond("sleeping", awake, meet, lambda: nothing)
-        return Meeting(ends, response, expected, awake)
+        ends, response, now = skip.cond("sleeping", awake, meet, lambda: nothing)
+        return Meeting(ends, response, expected, awake, now)
 
     def _systems_moved(
         self, before: Physics, after: Physics, found: Found, meetings: dict[str, Meeting]
@@ -230,7 +235,8 @@ class Step:
             by_arm = self._solver.twists.by_arm((after.qvel - before.qvel) / dt) - met.expected[0]
             by_body = (after.rigid_bodies.bodies.velocity - bodies.velocity) / dt - met.expected[1]
             beyond = self._couplings[name].accelerations(met.ends, found.joints, bodies, by_arm, by_body)
-            return self.systems[name].apply(before.systems[name], met.response, met.ends, beyond, dt)
+            state = before.systems[name] if met.state is None else met.state
+            return self.systems[name].apply(state, met.response, met.ends, beyond, dt)
 
         def move_if(name: str, met: Meeting) -> Any:
             if met.awake is True:

@@ -7,6 +7,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from surgical_marl.scenes.channel_file import ChannelFile
 from surgical_marl.scenes.objects import Friction
 from surgical_marl.untrusted.schema import REQUIRED, Vector, number, rgb, several
 from surgical_marl.untrusted.values import shown
@@ -42,6 +43,8 @@ class TissueFile:
     """Of one contact point."""
     tears: float | None = number(None, 1.01, 10.0)
     """Stretch, as a ratio of lengths, past which tissue counts as torn. It holds on nevertheless."""
+    channels: ChannelFile | None = None
+    """What needles feel that go through; none does without this."""
     colour: Vector = rgb((0.75, 0.35, 0.33))
 
     def __post_init__(self) -> None:

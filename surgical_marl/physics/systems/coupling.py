@@ -21,7 +21,7 @@ from surgical_marl.physics.contact.spring_contact import each
 from surgical_marl.physics.solver.cholesky import cholesky, solve_factored
 from surgical_marl.physics.systems.arms import ArmForces
 from surgical_marl.physics.systems.rigid_motion import Bodies, rotation
-from surgical_marl.physics.systems.system import End, Ends, Response, Shapes, System, Tie
+from surgical_marl.physics.systems.system import End, Ends, Followed, Response, Shapes, System, Tie
 from surgical_marl.physics.tree_utils import row_of
 from surgical_marl.scenes.objects import JAW, LINK
 
@@ -50,6 +50,7 @@ class Coupling:
         self.arm, self.body = np.full(none, tables.arms, np.int32), np.full(none, k, np.int32)
         """The arm and the free body that each shape is of, [r + 1]; their numbers where it is of none."""
         self._moved = np.zeros((none, tables.most), np.float32)
+        self._wires = np.array([tables.radius[tables.names.index(name), 0] for name in system.follows], np.float32)
         fingers = slice(0, counts["pads"])
         self.arm[fingers], self._moved[fingers] = tables.arm_of["pads"], tables.moves["pads"]
         own = slice(self._starts["links"], self._starts["objects"])
@@ -85,6 +86,23 @@ class Coupling:
     def visited(self, shapes: Shapes, scenery: Scenery, dt: Any) -> Array:
         """Return whether anything that moves may touch a system in the step, [] bool."""
         return self._detection.visited(scenery, shapes, dt)
+
+    def followed(self, bodies: Bodies, velocity: Array) -> Followed:
+        """Return the free bodies that the system follows.
+
+        Args:
+            bodies: the free bodies.
+            velocity: theirs at the end of the step, if they accelerate as in the last one, [k, 6].
+        """
+        t, names = self._tables, self._system.follows
+        own = np.array([t.names.index(name) for name in names], np.int32)
+        frames, centres = rotation(bodies.quaternion[own]), jnp.asarray(t.centers)[own]
+        origins = bodies.position[own] - jnp.einsum("kij,kj->ki", frames, centres)
+        shapes, size = t.radius.shape[1], jnp.asarray(t.radius)[own, 0] / self._wires
+        first = self._starts["objects"] + own * shapes
+        return Followed(
+            origins, frames, size, bodies.position[own], velocity[own], jnp.asarray(first), jnp.full(len(own), shapes)
+        )  # fmt: skip
 
     def scenery(
         self, poses: Any, joints: Joints, bodies: Bodies, motion: tuple[Array, Array], dt: Any

@@ -104,6 +104,25 @@ class Ends(NamedTuple):
     """Number of contacts that found no room, []."""
 
 
+class Followed(NamedTuple):
+    """The free bodies that a system follows, n of them. World."""
+
+    origin: Array
+    """Of their frames, m, [n, 3]."""
+    axes: Array
+    """Of their frames, [n, 3, 3]."""
+    size: Any
+    """Factors of all their lengths, [n]."""
+    centre: Array
+    """Of mass, m, [n, 3]."""
+    velocity: Array
+    """Of the centres, m/s, and angular, rad/s, at the end of the step if they accelerate as in the last one, [n, 6]."""
+    shape: Any
+    """Number of the first shape of each, [n]."""
+    shapes: Any
+    """Number of shapes of each, [n]."""
+
+
 class Response(NamedTuple):
     """The answer of a system to its contacts."""
 
@@ -141,6 +160,8 @@ class System(ABC):
     """Where it is fastened."""
     reports: ClassVar[tuple[str, ...]] = ()
     """Fields of its view that are infos of every agent: numbers, of which the largest in a scene counts."""
+    follows: tuple[str, ...] = ()
+    """Names of free bodies that its contacts depend on beyond their shapes: needles that go through it."""
 
     @property
     def bars(self) -> Bars | None:
@@ -159,6 +180,11 @@ class System(ABC):
     @abstractmethod
     def shapes(self, state: Any) -> Shapes:
         """Return the capsules that others can touch."""
+
+    def follow(self, state: Any, ends: Ends, bodies: Followed, dt: Any) -> tuple[Any, Ends]:
+        """Return state and contacts as the bodies are now that it `follows`."""
+        del bodies, dt
+        return state, ends
 
     @abstractmethod
     def free_motion(self, state: Any, dt: Any) -> Any:

@@ -21,10 +21,14 @@ from surgical_marl.physics.contact.spring_contact import Stretches, each, none, 
 from surgical_marl.physics.systems.brick import Brick
 from surgical_marl.physics.systems.brick_grid import BrickGrid, SurfacePoints
 from surgical_marl.physics.systems.brick_solve import BrickSolver, Nodes, Support
+from surgical_marl.physics.systems.channel import Channels
+from surgical_marl.physics.systems.channel_state import ChannelState, ChannelView
+from surgical_marl.physics.systems.needle import Needle
 from surgical_marl.physics.systems.soft import Soft
-from surgical_marl.physics.systems.system import Bars, Clusters, Ends, Response, Shapes
+from surgical_marl.physics.systems.system import Bars, Clusters, End, Ends, Followed, Response, Shapes
 from surgical_marl.physics.systems.tissue_step import Answer, Held, TissueStep
 from surgical_marl.physics.tree_utils import row_of
+from surgical_marl.scenes.channel_file import ChannelFile
 from surgical_marl.scenes.objects import Placement, Surface
 from surgical_marl.scenes.tissue_file import TissueFile
 from surgical_marl.untrusted.schema import Place
@@ -46,6 +50,8 @@ class TissueState(NamedTuple):
     """Where that was, m, [3]."""
     torn: Array
     """True once it has been stretched past `tears`, [] bool."""
+    channels: ChannelState | None = None
+    """Where needles go through it; None if none can."""
 
 
 class TissueView(NamedTuple):
@@ -61,6 +67,8 @@ class TissueView(NamedTuple):
     """Where that is, m, [3]; the origin if nothing touches it."""
     torn: Array
     """True once it has been stretched past `tears`, [] bool."""
+    channels: ChannelView | None = None
+    """Where needles go or went through it; None if none can."""
 
 
 class Solved(NamedTuple):
@@ -102,6 +110,10 @@ class Tissue(Soft):
     """Stretch past which it counts as torn."""
     colour: tuple[float, float, float] = (0.75, 0.35, 0.33)
     """In pictures."""
+    channel: ChannelFile | None = None
+    """What needles feel that go through it."""
+    needles: tuple[Needle, ...] = ()
+    """The needles that may."""
     file: ClassVar[type] = TissueFile
     """The content of its file."""
     reports: ClassVar[tuple[str, ...]] = ("tissue_force",)
@@ -109,14 +121,15 @@ class Tissue(Soft):
     @classmethod
     def placed(cls, item: Placement, entry: Any, others: Mapping[str, Placement], place: Place) -> Tissue:
         """Return tissue that is held in a scene, from its file and the place of its frame."""
-        del others
         if entry.tied:
             raise ValueError(f"{place}.tied: only the ends of a thread are tied, and {entry.object} is tissue")
         about: TissueFile = item.object.soft
         present = tuple(tuple(map(tuple, plane)) for plane in about.present.tolist())
+        needles = [Needle.of(name, other.object) for name, other in others.items()] if about.channels else []
         return cls(about.size, present, about.young, about.poisson, about.density, about.damping, about.fixed,
                    tuple((about.springs or {}).items()), item.object.surface, tuple(item.position.tolist()),
-                   tuple(map(tuple, item.rotation.tolist())), about.tears, about.colour)  # fmt: skip
+                   tuple(map(tuple, item.rotation.tolist())), about.tears, about.colour,
+                   about.channels, tuple(filter(None, needles)))  # fmt: skip
 
     @cached_property
     def grid(self) -> BrickGrid:
@@ -147,6 +160,17 @@ class Tissue(Soft):
         """The points that others touch."""
         return self.grid.surface()
 
+    @cached_property
+    def channels(self) -> Channels | None:
+        """Channels of needles; None if none can go through."""
+        if not (self.channel and self.needles):
+            return None
+        return Channels(self.channel, self.needles, self.grid, len(self.points.nodes), self.surface.stiffness)
+
+    @property
+    def follows(self) -> tuple[str, ...]:  # type: ignore[override]
+        return tuple(needle.body for needle in self.needles) if self.channels else ()
+
     @property
     def bars(self) -> Bars:
         """A capsule along x for each brick seen from above, in the middle of the thickness. They fill a sheet."""
@@ -158,15 +182,24 @@ class Tissue(Soft):
 
     @property
     def contacts(self) -> int:
-        return ROOM
+        return ROOM + (self.channels.rows if self.channels else 0)
 
     def start(self, places: Array) -> TissueState:
         """Return the tissue at rest, without weight."""
         del places
         rest = jnp.asarray(self.rest)
         return TissueState(
-            Nodes(rest, jnp.zeros_like(rest)), none(ROOM), jnp.float32(0.0), jnp.zeros(3), jnp.bool_(False)
-        )
+            Nodes(rest, jnp.zeros_like(rest)), none(self.contacts), jnp.float32(0.0), jnp.zeros(3), jnp.bool_(False),
+            self.channels.start() if self.channels else None,
+        )  # fmt: skip
+
+    def follow(
+        self, state: TissueState, ends: Ends, bodies: Followed, dt: Any
+    ) -> tuple[TissueState, Ends]:  # fmt: skip
+        assert self.channels and state.channels, "only tissue with channels follows needles"
+        others = self.rubbed(ends)  # friction in channels is not that of surfaces
+        channels, ends = self.channels.follow(state.channels, state.nodes.position, others, bodies, dt)
+        return state._replace(channels=channels), ends
 
     def shapes(self, state: TissueState) -> Shapes:
         """Return a ball at each surface point, under the surface."""
@@ -203,7 +236,8 @@ class Tissue(Soft):
         return ()
 
     def respond(self, state: TissueState, motion: Any, ends: Ends, dt: Any) -> Response:
-        ends, held = recall(state.stretches, self.rubbed(ends), len(self.points.nodes)), self._held(ends)
+        ends = ends if self.channels else self.rubbed(ends)
+        ends, held = recall(state.stretches, ends, len(self.points.nodes)), self._held(state, ends)
         answer = self._step(dt).respond(state.nodes, held, ends)
         return Response(-answer.force, Solved(answer, held, ends))
 
@@ -214,22 +248,38 @@ class Tissue(Soft):
         answer, held, ends = response.solved
         pushed = pushes(ends, answer.falls, accelerations, dt)
         after = self._step(dt).move(state.nodes, held, ends, answer, pushed)
-        stretches = remember(
-            ends, lambda row, end: after.points[row] - end.shift - dt * dt * accelerations[row], len(self.points.nodes)
-        )
+
+        def moved(row: Array, end: End) -> Array:
+            return after.points[row] - end.shift - dt * dt * accelerations[row]
+
+        stretches, channels = remember(ends, moved, len(self.points.nodes)), state.channels
+        if self.channels and channels:
+            channels = self.channels.remember(channels, ends, moved)
         nodes, torn = Nodes(after.position, after.velocity), state.torn | after.torn
-        return TissueState(nodes, stretches, *hardest(ends, answer.force), torn)
+        return TissueState(nodes, stretches, *hardest(ends, answer.force), torn, channels)
 
     def view(self, state: TissueState) -> TissueView:
-        return TissueView(*state.nodes, state.force, state.place, state.torn)
+        channels, inner = None, state.channels
+        if self.channels and inner:
+            channels = self.channels.view(inner, state.nodes.position)
+        return TissueView(*state.nodes, state.force, state.place, state.torn, channels)
 
     def _step(self, dt: Any) -> TissueStep:
-        return TissueStep(self.solver, self.tears, dt)
+        return TissueStep(self.solver, self.tears, dt, self.channels)
 
-    def _held(self, ends: Ends) -> Held:
+    def _held(self, state: TissueState, ends: Ends) -> Held:
         """Return the points of contacts."""
         nodes, weights = jnp.asarray(self.points.nodes), jnp.asarray(self.points.weights)
-        found: Held = each(ends, lambda row, end: Held(nodes[end.part], weights[end.part]))
+
+        def at(row: Array, end: End) -> Held:
+            del row
+            if not (self.channels and state.channels):
+                return Held(nodes[end.part], weights[end.part])
+            part = jnp.minimum(end.part, len(nodes) - 1)
+            inner, outer = self.channels.spot(state.channels, end), Held(nodes[part], weights[part])
+            return Held(*(jnp.where(self.channels.own(end), a, b) for a, b in zip(inner, outer, strict=True)))
+
+        found: Held = each(ends, at)
         return found
 
 

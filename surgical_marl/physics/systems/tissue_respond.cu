@@ -6,12 +6,25 @@ __shared__ short first[NODES], next[HELD * ROOM];
 
 struct Contact {
     float normal[3], shift[3], stretch[3], depth, stiffness, sliding;
-    bool both;
+    bool both, holds;
+
+    // Channel.py's `hold`, likewise: springs across what is in a channel, and friction along it.
+    __device__ void hold(const float *moved, float *force, float *falls) const {
+        float whole[3];
+        for (int i = 0; i < 3; i++) whole[i] = stretch[i] + moved[i];
+        const float slid = Vector::dot(normal, whole), most = slid < 0 ? sliding : fmaxf(depth, 0.0f);
+        const float secant = fminf(stiffness, most / fmaxf(fabsf(slid), 1e-12f)), aside = depth < 0 ? 0.0f : stiffness;
+        for (int i = 0, k = 0; i < 3; i++) {
+            force[i] = -aside * (whole[i] - slid * normal[i]) - secant * slid * normal[i];
+            for (int j = 0; j <= i; j++, k++) falls[k] = (i == j ? aside : 0.0f) + (secant - aside) * normal[i] * normal[j];
+        }
+    }
 
     // Spring_contact.py's `feel`: force and stiffness, lower half, of a point that moves by this much.
     __device__ void feel(const float *point, float *force, float *falls) const {
         float moved[3], slid[3];
         for (int i = 0; i < 3; i++) moved[i] = point[i] - shift[i];
+        if (HOLDS >= 0 && holds) return hold(moved, force, falls);
         const float along = Vector::dot(normal, moved), reach = depth - along, off = Vector::dot(normal, stretch);
         const float pressing = stiffness * (both ? reach : fmaxf(reach, 0.0f));
         for (int i = 0; i < 3; i++) slid[i] = stretch[i] - normal[i] * off + moved[i] - normal[i] * along;
@@ -32,7 +45,11 @@ const auto contact = [&](int c) {
         own.stretch[i] = in.ends_rows_stretch[3 * c + i];
     }
     own.depth = in.ends_rows_depth[c], own.stiffness = in.ends_rows_stiffness[c], own.sliding = in.ends_rows_sliding[c];
-    own.both = in.ends_rows_bilateral[c];
+    own.both = in.ends_rows_bilateral[c], own.holds = false;
+    if (HOLDS >= 0) {
+        const int part = in.ends_rows_part[c];
+        own.both = own.both && part < HOLDS, own.holds = part >= HOLDS && part < PRESSES;
+    }
     return own;
 };
 const float stiffer = in.stiffer[0], blend = stiffer * BLEND;

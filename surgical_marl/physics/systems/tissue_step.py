@@ -23,6 +23,7 @@ from surgical_marl.physics.contact.spring_contact import each, feel
 from surgical_marl.physics.solver.cholesky import FULL, LOWER
 from surgical_marl.physics.systems.brick import CRUSHED, ITERATIONS, RESISTANCE
 from surgical_marl.physics.systems.brick_solve import LEFT, SHORTEST, BrickSolver, Nodes, Springs
+from surgical_marl.physics.systems.channel import Channels
 from surgical_marl.physics.systems.system import End, Ends
 from surgical_marl.physics.tree_utils import put, row_of
 
@@ -102,10 +103,14 @@ class TissueStep:
         solver: of its bricks.
         tears: stretch past which it counts as torn; None for any.
         dt: duration of a step, s.
+        channels: of needles; None if none can go through.
     """
 
-    def __init__(self, solver: BrickSolver, tears: float | None, dt: float) -> None:
-        self.solver, self.tears, self.dt = solver, tears, dt
+    def __init__(
+        self, solver: BrickSolver, tears: float | None, dt: float, channels: Channels | None = None
+    ) -> None:  # fmt: skip
+        self.solver, self.tears, self.dt, self.channels = solver, tears, dt, channels
+        self.feel = channels.feel if channels else feel
 
     def respond(self, nodes: Nodes, held: Held, ends: Ends) -> Answer:
         """Return the displacements of nodes whose contacts' ends move as expected, and the forces on these."""
@@ -135,7 +140,7 @@ class TissueStep:
         iterations = jnp.where(touched, TURNS, ALONE)
 
         def spring(row: Array, end: End, u: Array) -> tuple[Array, Array]:
-            felt = feel(end, _point(held, row, u) - end.shift)
+            felt = self.feel(end, _point(held, row, u) - end.shift)
             return felt.force + felt.stiffness @ _point(held, row, u), felt.stiffness[LOWER]
 
         def improve(_: Any, found: tuple[Array, ...]) -> tuple[Array, ...]:
@@ -153,7 +158,7 @@ class TissueStep:
             own, weights = row_of(held, row)
             block = linear.block[own]
             gives = weights * jnp.asarray(solver.free)[own] / ((block[:, 0] + block[:, 2] + block[:, 5]) / 3)
-            stiffness = feel(end, _point(held, row, u) - end.shift).stiffness
+            stiffness = self.feel(end, _point(held, row, u) - end.shift).stiffness
             normal = end.normal @ stiffness @ end.normal
             along = (jnp.trace(stiffness) - normal) / 2
             normal, along = (k / (1 + k * (weights @ gives)) for k in (normal, along))
@@ -201,6 +206,8 @@ class TissueStep:
         wholes = {
             "NODES": grid.nodes, "BRICKS": len(grid.first), "ROOM": rows, "HELD": q, "PAD": PAD,
             "STRIDE_X": grid.offsets[4], "STRIDE_Y": grid.offsets[2],
+            "HOLDS": self.channels.first if self.channels else -1,
+            "PRESSES": self.channels.pressing if self.channels else -1,
             "ROUNDS": ROUNDS, "TURNS": TURNS, "ALONE": ALONE, "NEWTON": ITERATIONS,
         }  # fmt: skip
         diagonal = {

@@ -1,0 +1,146 @@
+"""Needles that go through tissue: forces against those that are set, work, and channels that stay."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from surgical_marl.physics.systems.channel_state import CUTS, PRESSES
+from surgical_marl.physics.systems.tissue import TissueState
+from surgical_marl.scenes.channel_file import ChannelFile
+from tests.helpers.needle_bench import (
+    ARC,
+    PIN,
+    SIZE,
+    Seen,
+    away,
+    joined,
+    lead,
+    sheet,
+    straight,
+    turning,
+)  # fmt: skip
+
+SET = ChannelFile(puncture=0.2, cutting=0.05)
+TISSUE = sheet((PIN, ARC), SET)
+"""All tests share one piece of tissue, since its step is compiled once."""
+PLACE = np.array([0.0131, 0.0117, 0.0])
+CENTRE = (0.0165, 0.0083, 0.0055)
+"""Of the arc: half a millimetre above the sheet, whose lower face is at 0."""
+ENTERED = -1.9
+"""Angle of the arc at which it has gone through, rad."""
+
+
+def down(start: float, end: float, steps: int) -> np.ndarray:
+    """Places of the pin's tip as it moves down, m, [steps + 1, 3]."""
+    return PLACE + np.linspace(start, end, steps + 1)[:, None] * [0, 0, 1]
+
+
+def below(height: float) -> np.ndarray:
+    """A place on the pin's way, m, [3]."""
+    return PLACE + np.array([0, 0, height])
+
+
+def drive(way: np.ndarray, state: TissueState | None = None) -> tuple[TissueState, Seen]:
+    """Lead the pin alone."""
+    return lead(TISSUE, joined(straight(way), away(len(way))), state)
+
+
+def curve(angles: np.ndarray, state: TissueState | None = None, **options: np.ndarray) -> tuple[TissueState, Seen]:
+    """Lead the arc alone about its centre, which may move, m, [t, 3]."""
+    pose = turning(CENTRE, angles)
+    pose = pose._replace(origin=pose.origin + options.get("shift", np.zeros((len(angles), 3)))[:, None])
+    return lead(TISSUE, joined(away(len(angles)), pose), state)
+
+
+@pytest.fixture(scope="module")
+def pierced() -> tuple[TissueState, Seen]:
+    """The pin, as it has gone through: its tip is 4 mm below the sheet."""
+    return drive(down(0.006, -0.004, 300))
+
+
+@pytest.fixture(scope="module")
+def sewn() -> tuple[TissueState, Seen]:
+    """The arc, as it has gone through."""
+    return curve(np.linspace(0.1, ENTERED, 501))
+
+
+def test_a_tip_enters_at_the_threshold(pierced: tuple[TissueState, Seen], sewn: tuple[TissueState, Seen]) -> None:
+    for n, (_, seen) in enumerate((pierced, sewn)):
+        force, cuts = seen.pressed[:, n], seen.does[:, n] == CUTS
+        assert force.max() == pytest.approx(SET.puncture, rel=0.05)
+        assert np.flatnonzero(cuts)[0] > np.argmax(force)
+        assert seen.does[0, n] == PRESSES  # a little above the sheet, where nothing is felt
+        assert force[0] == 0
+
+
+def test_a_channel_is_where_the_needle_went(pierced: tuple[TissueState, Seen]) -> None:
+    view = pierced[1].channels
+    assert view.there[-1].tolist() == [True, False, False, False] and view.through[-1, 0] and view.needle[-1, 0] == 0
+    np.testing.assert_allclose(view.entry_at_rest[-1, 0], [*PLACE[:2], SIZE[2]], atol=3e-4)
+    np.testing.assert_allclose(view.exit_at_rest[-1, 0], [*PLACE[:2], 0], atol=5e-4)
+    assert view.depth[-1, 0] == pytest.approx(SIZE[2]) and view.swept[-1, 0] < 2e-4
+
+
+def length(state: TissueState, channel: int = 0) -> float:
+    """Length of a channel at rest, m."""
+    assert state.channels
+    places = np.asarray(state.channels.places[channel])[: int(state.channels.total[channel])] * TISSUE.grid.cell
+    return float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
+
+
+def test_friction_is_that_of_the_length_inside(pierced: tuple[TissueState, Seen]) -> None:
+    """In both directions."""
+    state, _ = pierced
+    expected = SET.friction * length(state)
+    assert expected == pytest.approx(SET.friction * SIZE[2], rel=0.05)
+    state, more = drive(down(-0.004, -0.008, 100), state)
+    _, back = drive(down(-0.008, -0.004, 100), state)
+    assert more.force[-1, 0, 2] == pytest.approx(expected, rel=0.02)
+    assert back.force[-1, 0, 2] == pytest.approx(-expected, rel=0.02)
+
+
+def test_a_curved_needle_has_the_friction_of_its_length_too(sewn: tuple[TissueState, Seen]) -> None:
+    state, _ = sewn
+    step = 2e-3
+    _, more = curve(ENTERED - step * np.arange(101), state)
+    along = more.work[-20:] / (step * 0.008)
+    assert along.mean() == pytest.approx(SET.friction * length(state), rel=0.02)
+
+
+def test_off_its_arc_a_needle_costs_work_and_gives_none(sewn: tuple[TissueState, Seen]) -> None:
+    """On a way that ends where it began, whatever the tissue gives back was put in before."""
+    state, before = sewn
+    assert before.channels.swept[-1, 0] < 1e-4
+    way = 0.003 * np.concatenate([np.linspace(0, 1, 101), np.linspace(1, 0, 100)])
+    for axis in np.eye(3)[[0, 1]]:
+        _, seen = curve(np.full(201, ENTERED), state, shift=np.outer(way, axis))
+        out, back = seen.work[:100].sum(), seen.work[100:].sum()
+        assert out > 2e-4 and out + back > 0
+        assert -back > 0.3 * out  # most of it was elastic
+        assert 0.002 < seen.channels.swept[-1, 0] < 0.008
+        lateral = np.abs(before.force[-1, 1, 1])
+        assert np.abs(seen.force[99, 1] @ axis) > 4 * lateral
+
+
+def test_turned_back_it_leaves_and_the_tissue_relaxes(sewn: tuple[TissueState, Seen]) -> None:
+    state, seen = curve(np.linspace(ENTERED, 0.1, 501), sewn[0])
+    assert state.channels and int(state.channels.needle[0]) == -1 and int(state.channels.total[0]) > 3
+    assert np.abs(np.asarray(state.nodes.position) - TISSUE.rest).max() < 1e-6
+    assert np.abs(seen.force[-1]).max() == 0
+    again, seen = curve(np.linspace(0.1, ENTERED, 501), state)
+    assert seen.pressed.max() < 0.2 * SET.puncture and not (seen.does == CUTS).any()  # no cutting in what is cut
+    assert again.channels and int(again.channels.needle[0]) == 1 and int(again.channels.total[1]) == 0
+
+
+def test_a_long_channel_keeps_every_other_place() -> None:
+    """A pin that goes along the sheet, in its middle, for 25 mm."""
+    turn = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])  # down becomes along x
+    begin = np.array([-0.002, 0.0026, 0.0024])
+    way = begin + np.linspace(0, 0.028, 601)[:, None] * [1, 0, 0]
+    state, seen = lead(TISSUE, joined(straight(way, turn), away(601)))
+    assert state.channels
+    reached = seen.channels.exit_at_rest[-1, 0, 0] - seen.channels.entry_at_rest[-1, 0, 0]
+    assert reached > 0.023 and int(state.channels.total[0]) <= 16
+    # the tip cuts; the needle of 20 mm is inside with all of its length
+    assert -seen.force[-1, 0, 0] == pytest.approx(SET.friction * 0.02 + SET.cutting, rel=0.03)
