@@ -36,7 +36,7 @@ from surgical_marl.physics.systems.arms import ArmForces, Arms, accelerations_ap
 from surgical_marl.physics.systems.coupling import Coupling
 from surgical_marl.physics.systems.rigid_bodies import RigidBodies, RigidBodyState
 from surgical_marl.physics.systems.rigid_motion import Bodies
-from surgical_marl.physics.systems.system import Ends, Response, System
+from surgical_marl.physics.systems.system import Ends, Load, Response, Skin, SkinnedSystem, System
 from surgical_marl.physics.tree_utils import empty_like
 from surgical_marl.scenes.scene import Scene
 
@@ -69,6 +69,8 @@ class Meeting(NamedTuple):
 
     ends: Ends
     response: Response
+    felt: Response
+    """The same with the forces on arms and bodies as the skins of other systems move."""
     expected: tuple[Array, Array]
     """Accelerations of joints [a, m] and of bodies [k, 6] that its response assumes: those of the last step."""
     awake: Any
@@ -107,7 +109,18 @@ class Step:
         if self.bodies:
             self.detection = Detection(self.bodies.tables)
             self.grips = GripMemory(self.bodies.tables, self._solver.twists)
-            self._couplings = {name: Coupling(self.bodies.tables, system) for name, system in self.systems.items()}
+            self._skinned = {name: one for name, one in self.systems.items() if isinstance(one, SkinnedSystem)}
+            self._couplings = {
+                name: Coupling(self.bodies.tables, system, self._skinned_of(system))
+                for name, system in self.systems.items()
+            }
+
+    def _skinned_of(self, system: System) -> dict[str, SkinnedSystem]:
+        """Return the systems whose skins one touches. A thread goes with its needle into tissue, so it touches none."""
+        tied = {tie.body for tie in system.ties}
+        if isinstance(system, SkinnedSystem):
+            return {}
+        return {name: one for name, one in self._skinned.items() if not tied & {*one.follows}}
 
     def __call__(self, physics: Physics, touch: Touch, distance: Array | None = None) -> tuple[Physics, Touch]:
         """Return the state after one physics step, and the hardest touch up to the start of that step.
@@ -167,10 +180,10 @@ class Step:
     ) -> tuple[Physics, Touch]:  # fmt: skip
         """Step arms and bodies: together if an arm touches anything, else each on its own."""
         forces = self.arms.free_motion(physics.arms)
-        meetings = {name: self._meet(name, physics, found) for name in self.systems}
+        meetings = self._meetings(physics, found)
         for name, met in meetings.items():
             own, expected = self._couplings[name], met.expected[0]
-            forces = own.on_arms(forces, met.response, met.ends, found.joints, expected, self.arms.dt)
+            forces = own.on_arms(forces, met.felt, met.ends, found.joints, expected, self.arms.dt)
         near = overlap | (self._arm_of(found.slots) < self._agents).any() if self.detection.slots else overlap
 
         def coupled(physics: Physics, touch: Touch) -> tuple[Physics, Touch]:
@@ -201,55 +214,86 @@ class Step:
             for name, system in self.systems.items() if bodies
         }  # fmt: skip
 
-    def _meet(self, name: str, physics: Physics, found: Found) -> Meeting:
-        """Return the contacts of a system, and its answer to them."""
+    def _meetings(self, physics: Physics, found: Found) -> dict[str, Meeting]:
+        """Return the contacts of all systems, and their answers. Systems with skins come last: others load them."""
+        meetings: dict[str, Meeting] = {}
+        for name in sorted(self.systems, key=lambda name: name in self._skinned):
+            meetings[name] = self._meet(name, physics, found, meetings)
+        moved = {name: one.displacements(meetings[name].response) for name, one in self._skinned.items()}
+        for name, met in meetings.items():
+            if touched := [moved[other] for other in self._couplings[name].skinned]:
+                felt = self._couplings[name].after_skins(met.response, met.ends, touched, self.arms.dt)
+                meetings[name] = met._replace(felt=felt)
+        return meetings
+
+    def _meet(self, name: str, physics: Physics, found: Found, others: dict[str, Meeting]) -> Meeting:
+        """Return the contacts of a system, and its answer to them and to the loads of others on its skin."""
         system, state, dt = self.systems[name], physics.systems[name], self.arms.dt
         bodies, by_arm = physics.rigid_bodies.bodies, self._solver.twists.by_arm
         expected = by_arm(physics.arms.qacc_warmstart), bodies.acceleration
         motion = by_arm(physics.qvel) + dt * expected[0], bodies.velocity + dt * expected[1]
         shapes, coupling, awake = system.shapes(state), self._couplings[name], system.awake(state)
         scenery = coupling.scenery(found.poses, found.joints, bodies, motion, dt)
+        skins, loads = self._skins_of(name, physics), self._loads(name, physics, others)
 
         def meet() -> tuple[Ends, Response, Any]:
-            now, ends = state, coupling.ends(shapes, scenery, found.joints, bodies, motion, dt)
+            now, ends = state, coupling.ends(shapes, skins, scenery, found.joints, bodies, motion, dt)
             if system.follows:
                 now, ends = system.follow(state, ends, coupling.followed(bodies, motion[1]), dt)
-            response = system.respond(now, system.free_motion(now, dt), ends, dt)
+            response = system.respond(now, system.free_motion(now, dt), ends, dt, **loads)
             return ends, response, now if system.follows else None
 
         if awake is True:
             ends, response, now = meet()
-            return Meeting(ends, response, expected, awake, now)
-        awake |= coupling.visited(shapes, scenery, dt)
+            return Meeting(ends, response, response, expected, awake, now)
+        awake |= coupling.visited(shapes, skins, scenery, dt)
         nothing: Any = empty_like(jax.eval_shape(meet))
         ends, response, now = skip.cond("sleeping", awake, meet, lambda: nothing)
-        return Meeting(ends, response, expected, awake, now)
+        return Meeting(ends, response, response, expected, awake, now)
+
+    def _skins_of(self, name: str, physics: Physics) -> list[Skin]:
+        """Return the skins that a system touches."""
+        return [other.skin(physics.systems[at]) for at, other in self._couplings[name].skinned.items()]
+
+    def _loads(self, name: str, physics: Physics, others: dict[str, Meeting]) -> dict[str, Load]:
+        """Return the load of other systems on the skin of one as an argument of `respond`; nothing if none can be."""
+        if name not in self._skinned:
+            return {}
+        nodes = len(self._skinned[name].skin(physics.systems[name]).position)
+        loads = [
+            self._couplings[other].on_skin(name, met.response, met.ends, nodes, self.arms.dt)
+            for other, met in others.items() if name in self._couplings[other].skinned
+        ]  # fmt: skip
+        return {"load": Load.sum(loads)} if loads else {}
 
     def _systems_moved(
         self, before: Physics, after: Physics, found: Found, meetings: dict[str, Meeting]
     ) -> Physics:  # fmt: skip
-        """Move all other systems by the accelerations that arms and bodies have had in the step."""
+        """Move all other systems by the accelerations of arms, bodies and skins in the step. Skins move first."""
         dt, bodies = self.arms.dt, before.rigid_bodies.bodies
 
-        def move(name: str, met: Meeting) -> Any:
+        def move(name: str, met: Meeting, after: Physics) -> Any:
             by_arm = self._solver.twists.by_arm((after.qvel - before.qvel) / dt) - met.expected[0]
             by_body = (after.rigid_bodies.bodies.velocity - bodies.velocity) / dt - met.expected[1]
-            beyond = self._couplings[name].accelerations(met.ends, found.joints, bodies, by_arm, by_body)
+            moved = [dt * skin.velocity for skin in self._skins_of(name, after)]
+            beyond = self._couplings[name].beyond(met.ends, found.joints, bodies, by_arm, by_body, moved, dt)
             state = before.systems[name] if met.state is None else met.state
             return self.systems[name].apply(state, met.response, met.ends, beyond, dt)
 
-        def move_if(name: str, met: Meeting) -> Any:
+        def move_if(name: str, met: Meeting, after: Physics) -> Any:
             if met.awake is True:
-                return move(name, met)
-            return skip.cond("sleeping", met.awake, lambda: move(name, met), lambda: before.systems[name])
+                return move(name, met, after)
+            return skip.cond("sleeping", met.awake, lambda: move(name, met, after), lambda: before.systems[name])
 
-        return after.with_systems(**{name: move_if(name, met) for name, met in meetings.items()})
+        for name, met in sorted(meetings.items(), key=lambda item: item[0] not in self._skinned):
+            after = after.with_systems(**{name: move_if(name, met, after)})
+        return after
 
     def _loaded(self, touch: Touch, meetings: dict[str, Meeting]) -> Touch:
         """Return the hardest touch with the forces of other systems on arms; those on fingers are no bumps."""
         for name, met in meetings.items():
-            most = self._couplings[name].hardest(met.ends, met.response.force, self._agents)
-            overflow = jnp.maximum(touch.overflow, met.ends.left_out)
+            most = self._couplings[name].hardest(met.ends, met.felt.force, self._agents)
+            overflow = jnp.maximum(touch.overflow, met.ends.left_out + met.response.left_out)
             touch = touch._replace(handled=jnp.maximum(touch.handled, most), overflow=overflow)
         return touch
 
@@ -306,7 +350,7 @@ class Step:
         masses, free = self._rigid.free_motion(bodies, awake)
         for name, met in meetings.items():
             coupling = self._couplings[name]
-            masses, free, touched = coupling.on_bodies(masses, free, met.response, met.ends, bodies, self.arms.dt)
+            masses, free, touched = coupling.on_bodies(masses, free, met.felt, met.ends, bodies, self.arms.dt)
             awake |= touched
         return masses, free, awake
 

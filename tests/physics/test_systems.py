@@ -70,7 +70,7 @@ def test_a_finger_pushes_it_as_hard_as_its_springs_pull_back(pushed: tuple[Simul
     assert way[-1, 0] > 4e-3 and np.abs(drift).max() < 1e-3
     poses = step.arms.dynamics.pose(now.qpos)
     found = step.find(now, poses)
-    met = step._meet("beads", now, found)
+    met = step._meetings(now, found)["beads"]
     force = np.asarray(met.response.force, float)
     resists = system.stiffness * way[0, 0] + system.damping * drift[:, 0].sum()
     np.testing.assert_allclose(-force.sum(0)[0], resists, rtol=2e-2)

@@ -12,7 +12,7 @@ from jax import Array
 
 from surgical_marl.physics.contact.broadphase import Ball, size
 from surgical_marl.physics.contact.shapes import Plate, Points, Segments, between_segments, in_frame
-from surgical_marl.physics.systems.system import End, Ends, Shapes
+from surgical_marl.physics.systems.system import End, Ends, Shapes, Spot
 from surgical_marl.physics.tree_utils import Listed, Tree, picked, put, room, row_of
 from surgical_marl.scenes.objects import Surface
 
@@ -26,6 +26,8 @@ RIM = 0.25
 """Least stiffness of a contact with a plate, as a share: only a little of a part may lie on it, or none at its rim."""
 NEAREST = 32
 """Pairs of shapes and parts that are looked at closely in a step, at most, beyond the room for contacts."""
+NOWHERE = Spot(np.zeros(4, np.int32), np.zeros(4, np.float32))
+"""The place on a skin of what is on none."""
 
 
 class Scenery(NamedTuple):
@@ -85,8 +87,14 @@ class PartDetection:
         self._stiffness = np.array([one.stiffness for one in surfaces], np.float32)
         self._sliding = np.array([one.sliding for one in surfaces], np.float32)
 
+    def nothing(self, on: Spot | None = None) -> Ends:
+        """Return an empty list of contacts, with one row more than there is room for: it takes what finds none."""
+        rows = room(jax.eval_shape(lambda: _no_end()._replace(on=on)), self._room + 1)
+        return Ends(rows, jnp.int32(0), jnp.int32(0), jnp.int32(0))
+
     def find(
-        self, scenery: Scenery, shapes: Shapes, first: Sequence[End], last: Sequence[End], dt: Any
+        self, scenery: Scenery, shapes: Shapes, first: Sequence[End], last: Sequence[End], dt: Any,
+        begun: Ends | None = None,
     ) -> Ends:  # fmt: skip
         """Return the contacts, with nothing known of how ends move.
 
@@ -96,10 +104,10 @@ class PartDetection:
             first: ties to bodies, which come first.
             last: ties to the world, which come last.
             dt: duration of a step, s.
+            begun: contacts with other systems, which come first of all; in a list made by `nothing`.
         """
         pairs = self._near(scenery, shapes, dt)
-        rows = room(jax.eval_shape(_no_end), self._room + 1)  # a contact that finds no room goes to the last one
-        found = Ends(rows, jnp.int32(0), jnp.int32(0), jnp.int32(0))
+        found = self.nothing() if begun is None else begun
         for tie in first:
             found = self._with(found, tie, jnp.bool_(True))
 
@@ -133,6 +141,8 @@ class PartDetection:
     def _with(self, ends: Ends, end: End, belongs: Array) -> Ends:
         """Return contacts with one more, if it belongs to them."""
         last = self._room
+        if ends.rows.on is not None and end.on is None:
+            end = end._replace(on=NOWHERE)
         rows = put(ends.rows, jnp.where(belongs, jnp.minimum(ends.total, last), last), end)
         moves = belongs & (end.shape < self._starts["plates"]) & (ends.total < last)
         return Ends(rows, ends.moving + moves, ends.total + belongs, ends.left_out)

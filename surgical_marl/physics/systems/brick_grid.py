@@ -77,6 +77,16 @@ class BrickGrid:
         np.add.at(found, corners, np.delete(self.cell, axis).prod() / 4)
         return found
 
+    def faces(self) -> np.ndarray:
+        """Return the nodes around each outer face of a brick, counterclockwise as seen from outside, [f, 4]."""
+        around, found = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]), []
+        for axis, end in np.ndindex(3, 2):
+            beyond = np.roll(np.pad(self.present, 1), 1 - 2 * end, axis)[1:-1, 1:-1, 1:-1]
+            order = np.insert(around if end else around[::-1], 0, end, 1)  # this axis, and the next two after it
+            corners = self.offsets[np.roll(order, axis, 1) @ [4, 2, 1]]
+            found.append(self.first[~beyond[self.present]][:, None] + corners)
+        return np.concatenate(found).astype(np.int32)
+
     def surface(self) -> SurfacePoints:
         """Return the nodes of both faces, and the points midway between them, on which others press."""
         points: dict[tuple[int, ...], int] = {}

@@ -154,7 +154,7 @@ class BrickSolver:
 
     def improved(
         self, linear: Linear, springs: Springs | None, u: Array, residual: Array, dt: Any, most: Any,
-        enough: float = 0.0,
+        enough: float = 0.0, falls: Callable[[Array], Array] | None = None,
     ) -> tuple[Array, Array]:  # fmt: skip
         """Return better displacements, m, [n, 3], and the forces that these leave without springs, N, [n, 3].
 
@@ -166,6 +166,7 @@ class BrickSolver:
             dt: duration of the step, s.
             most: most conjugate gradients.
             enough: residual at which they stop, in the norm of the inverse of the nodes' own blocks, J.
+            falls: takes displacements, m, returns by how much other forces fall with these, N, [n, 3].
         """
         free, block = jnp.asarray(self.free), linear.block
         if springs is not None:
@@ -175,6 +176,8 @@ class BrickSolver:
         def matrix(p: Array, sums: Array) -> Array:
             """Return the matrix times p, [n, 3], in the rows of `sums`, which hold inertia times p."""
             sums = self._elastic(linear.cells, p, sums, dt)
+            if falls is not None:
+                sums += falls(p)
             return sums if springs is None else _springs_times(springs, p, sums)
 
         def begin(sum_: Array, row: Any) -> tuple[Array, Any]:

@@ -1,11 +1,14 @@
-"""Contacts of a system with arms and rigid bodies: their ends, the loads on these, and their accelerations.
+"""Contacts of a system with arms, rigid bodies and other systems: their ends, the loads on these, their accelerations.
 
 Shapes are numbered by kind: pads of fingers, capsules of links, capsules of free bodies, then what is fixed: plates and
-rods. So contacts with what moves come first in a list.
+rods. Skins of other systems have the numbers below 0. So contacts with what moves come first in a list.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial, reduce
+from operator import add, or_
 from typing import Any
 
 import jax
@@ -15,13 +18,26 @@ from jax import Array
 
 from surgical_marl.physics.contact.broadphase import Joints, Placed, Places
 from surgical_marl.physics.contact.contact_pairs import ContactPairs
-from surgical_marl.physics.contact.part_detection import PartDetection, Scenery
+from surgical_marl.physics.contact.part_detection import NOWHERE, PartDetection, Scenery
 from surgical_marl.physics.contact.shapes import Plate, Segments
+from surgical_marl.physics.contact.skin_detection import add_skin_contacts, near_skin
 from surgical_marl.physics.contact.spring_contact import each
 from surgical_marl.physics.solver.cholesky import cholesky, solve_factored
 from surgical_marl.physics.systems.arms import ArmForces
 from surgical_marl.physics.systems.rigid_motion import Bodies, rotation
-from surgical_marl.physics.systems.system import End, Ends, Followed, Response, Shapes, System, Tie
+from surgical_marl.physics.systems.system import (
+    End,
+    Ends,
+    Followed,
+    Load,
+    Response,
+    Shapes,
+    Skin,
+    SkinnedSystem,
+    Spot,
+    System,
+    Tie,
+)
 from surgical_marl.physics.tree_utils import row_of
 from surgical_marl.scenes.objects import JAW, LINK
 
@@ -32,7 +48,15 @@ TIE = 2e4
 class Coupling:
     """The contacts of one system with all other shapes of a scene."""
 
-    def __init__(self, tables: ContactPairs, system: System) -> None:
+    def __init__(self, tables: ContactPairs, system: System, skinned: Mapping[str, SkinnedSystem]) -> None:
+        """Give numbers to the shapes.
+
+        Args:
+            tables: of arms and rigid bodies.
+            system: whose contacts these are.
+            skinned: systems whose skins it touches, by name.
+        """
+        self.skinned = skinned
         self._tables, self._places, self._system = tables, Places(tables), system
         links, (k, c) = tables.bare, tables.radius.shape
         counts = {"pads": len(tables.fingers), "links": len(links), "objects": k * c,
@@ -46,7 +70,8 @@ class Coupling:
         met = [system.surface.against(other) for other in surfaces]
         tied = [(tie.part, first := self._first_shape(tie.body), first + c) for tie in system.ties if tie.body]
         self._detection = PartDetection(counts, met, system.contacts, tied)
-        none = self._shapes + 1  # the number of all shapes stands for none: the end of a tie to the world
+        # The number of all shapes stands for none: the end of a tie to the world. So do numbers from the end: skins.
+        none = self._shapes + 1 + len(skinned)
         self.arm, self.body = np.full(none, tables.arms, np.int32), np.full(none, k, np.int32)
         """The arm and the free body that each shape is of, [r + 1]; their numbers where it is of none."""
         self._moved = np.zeros((none, tables.most), np.float32)
@@ -62,12 +87,14 @@ class Coupling:
     # -- where it touches
 
     def ends(
-        self, shapes: Shapes, scenery: Scenery, joints: Joints, bodies: Bodies, motion: tuple[Array, Array], dt: Any
+        self, shapes: Shapes, skins: Sequence[Skin], scenery: Scenery, joints: Joints, bodies: Bodies,
+        motion: tuple[Array, Array], dt: Any,
     ) -> Ends:  # fmt: skip
         """Return the contacts of a system.
 
         Args:
             shapes: of the system.
+            skins: that it touches.
             scenery: all shapes of others.
             joints: axes of the arms' joints.
             bodies: the free bodies.
@@ -79,13 +106,26 @@ class Coupling:
         of_bodies, of_world = (
             [self._tied(tie, shapes, bodies) for tie in ties if (tie.body is None) == world] for world in (False, True)
         )
-        found = self._detection.find(scenery, shapes, of_bodies, of_world, dt)
-        shift = dt * self.accelerations(found, joints, bodies, *motion)
+        begun = self._on_skins(shapes, skins, dt) if skins else None
+        found = self._detection.find(scenery, shapes, of_bodies, of_world, dt, begun)
+        by_skins = partial(_mean_of, [skin.velocity for skin in skins]) if skins else None
+        shift = dt * self.accelerations(found, joints, bodies, *motion, by_skins)
+        if skins:
+            shift = each(found, lambda row, end: _towards(end, shift[row]), moving=True)
         return found._replace(rows=found.rows._replace(shift=shift))
 
-    def visited(self, shapes: Shapes, scenery: Scenery, dt: Any) -> Array:
+    def _on_skins(self, shapes: Shapes, skins: Sequence[Skin], dt: Any) -> Ends:
+        """Return the contacts with skins, in the order of their numbers: the last one first."""
+        found, touched = self._detection.nothing(NOWHERE), [*enumerate(zip(skins, self.skinned.values(), strict=True))]
+        for number, (skin, other) in reversed(touched):
+            met, room = self._system.surface.against(other.surface), self._system.contacts
+            found = add_skin_contacts(found, number, skin, other.faces, shapes, met, room, dt)
+        return found
+
+    def visited(self, shapes: Shapes, skins: Sequence[Skin], scenery: Scenery, dt: Any) -> Array:
         """Return whether anything that moves may touch a system in the step, [] bool."""
-        return self._detection.visited(scenery, shapes, dt)
+        by_skins = [near_skin(skin, shapes, dt) for skin in skins]
+        return reduce(or_, by_skins, self._detection.visited(scenery, shapes, dt))
 
     def followed(self, bodies: Bodies, velocity: Array) -> Followed:
         """Return the free bodies that the system follows.
@@ -248,10 +288,72 @@ class Coupling:
         found: tuple[Array, Array, Array] = jax.lax.map(of_body, (jnp.arange(k), masses, free, bodies))
         return found
 
-    def accelerations(self, ends: Ends, joints: Joints, bodies: Bodies, by_arm: Array, by_body: Array) -> Array:
+    def on_skin(self, name: str, response: Response, ends: Ends, nodes: int, dt: Any) -> Load:
+        """Return the forces on the n nodes of a skin, and by how much these fall as the nodes move."""
+        number = [*self.skinned].index(name)
+
+        def spread(forces: Array) -> Array:
+            def add(row: Array, sums: Array) -> Array:
+                spot = _spot(row_of(ends.rows, row), number)
+                for node, weight in zip(spot.nodes, spot.weights, strict=True):
+                    sums = sums.at[node].add(weight * forces[row], mode="promise_in_bounds")
+                return sums
+
+            found: Array = jax.lax.fori_loop(0, ends.moving, add, jnp.zeros((nodes, 3)))
+            return found
+
+        def fallen(moved: Callable[[End], Array]) -> Array:
+            accelerations = each(ends, lambda row, end: moved(end) / (dt * dt), moving=True)
+            return self._system.yielding(response, ends, accelerations, dt)
+
+        def unmoved() -> Array:
+            return spread(response.force + fallen(lambda end: jnp.where(end.shape == -1 - number, end.shift, 0.0)))
+
+        def falls(u: Array) -> Array:
+            return spread(fallen(lambda end: _mean(_spot(end, number), u)))
+
+        touched = self._on_skins_now(ends)
+        force = jax.lax.cond(touched, unmoved, lambda: jnp.zeros((nodes, 3)))
+        return Load(force, lambda u: jax.lax.cond(touched, falls, jnp.zeros_like, u), touched)
+
+    def after_skins(self, response: Response, ends: Ends, moved: Sequence[Array], dt: Any) -> Response:
+        """Return the response with its forces as the nodes of each skin move by this much, m, [n, 3]."""
+
+        def eased() -> Array:
+            beyond = each(ends, lambda row, end: _beyond(end, moved, dt), moving=True)
+            return response.force - self._system.yielding(response, ends, beyond, dt)
+
+        force = jax.lax.cond(self._on_skins_now(ends), eased, lambda: response.force)
+        return response._replace(force=force)
+
+    def beyond(
+        self, ends: Ends, joints: Joints, bodies: Bodies, by_arm: Array, by_body: Array, moved: Sequence[Array], dt: Any
+    ) -> Array:
+        """Return the accelerations of the ends beyond those of `shift`, m/s2, [c, 3].
+
+        Args:
+            ends: of the contacts.
+            joints: axes of the arms' joints.
+            bodies: the free bodies at the start of the step.
+            by_arm: accelerations of joints beyond those of the last step, [a, m].
+            by_body: the same of bodies, [k, 6].
+            moved: displacements of the nodes of each skin, m, [n, 3].
+            dt: duration of a step, s.
+        """
+        by_skins = (lambda end: _beyond(end, moved, dt)) if moved else None
+        return self.accelerations(ends, joints, bodies, by_arm, by_body, by_skins)
+
+    def _on_skins_now(self, ends: Ends) -> Array:
+        """Return whether the system touches any skin: such contacts come first."""
+        return (ends.moving > 0) & (ends.rows.shape[0] < 0)
+
+    def accelerations(
+        self, ends: Ends, joints: Joints, bodies: Bodies, by_arm: Array, by_body: Array,
+        by_skins: Callable[[End], Array] | None = None,
+    ) -> Array:  # fmt: skip
         """Return the accelerations of the ends, m/s2, [c, 3], by those of joints [a, m] and of bodies [k, 6].
 
-        By velocities it returns velocities.
+        By velocities it returns velocities. `by_skins` has that of an end by the motion of skins.
         """
         a, k, arms, owner = len(by_arm), len(by_body), jnp.asarray(self.arm), jnp.asarray(self.body)
 
@@ -268,7 +370,7 @@ class Coupling:
             if k:
                 motion = _motion_of(end.place - bodies.position.at[body].get(mode="clip"))
                 found += jnp.where(body < k, motion @ by_body.at[body].get(mode="clip"), 0.0)
-            return found
+            return found + by_skins(end) if by_skins else found
 
         accelerations: Array = each(ends, one, moving=True)
         return accelerations
@@ -290,6 +392,36 @@ class Coupling:
         """Return the velocity of a place of a link by velocity of its arm's joints, [3, m]."""
         moving, _ = joints.columns(jnp.asarray(self._tables.slides), place)
         return (moving.at[arm].get(mode="clip") * moves[:, None]).T
+
+
+def _spot(end: End, number: int) -> Spot:
+    """Return where an end is on the skin of this number. On another one it has no weight."""
+    assert end.on
+    mine = end.shape == -1 - number
+    return Spot(jnp.where(mine, end.on.nodes, 0), jnp.where(mine, end.on.weights, 0.0))
+
+
+def _mean(spot: Spot, moves: Array) -> Array:
+    return spot.weights @ moves[spot.nodes]
+
+
+def _mean_of(moves: Sequence[Array], end: End) -> Array:
+    """Return the motion of an end, [3], by those of the nodes of all skins, [n, 3] each; 0 if it is on none."""
+    return reduce(add, [_mean(_spot(end, number), of_nodes) for number, of_nodes in enumerate(moves)])
+
+
+def _beyond(end: End, moved: Sequence[Array], dt: Any) -> Array:
+    """Return the acceleration of an end on a skin beyond that of `shift`, m/s2, [3]; 0 if it is on none."""
+    return jnp.where(end.shape < 0, _mean_of(moved, end) - end.shift, 0.0) / (dt * dt)
+
+
+def _towards(end: End, shift: Array) -> Array:
+    """Return the displacement that is expected of an end, [3]: a skin is not expected to go away from what touches it.
+
+    It would press on nothing, and come back in the next step: soft tissue has no momentum that would carry it away.
+    """
+    away = jnp.where(end.shape < 0, jnp.minimum(end.normal @ shift, 0.0), 0.0)
+    return shift - away * end.normal
 
 
 def _joined(*parts: Any) -> Array:

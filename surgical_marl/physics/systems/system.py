@@ -12,7 +12,9 @@ docs/your_own_system.md walks through one.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import reduce
+from operator import add, or_
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -64,15 +66,24 @@ class Tie(NamedTuple):
     """The place that it is fastened to: in the body's frame, from its origin, or in the world, m."""
 
 
+class Spot(NamedTuple):
+    """A point of a system's skin, or in its material: a mean of q of its nodes, [...]."""
+
+    nodes: Any
+    """Their numbers, [..., q]."""
+    weights: Any
+    """Their shares, [..., q]; they sum to 1."""
+
+
 class End(NamedTuple):
-    """A contact of a part of a system with a shape of an arm, a rigid body or a fixed thing, [...]. World."""
+    """A contact of a part of a system with a shape of an arm, a body, a fixed thing or another system, [...]. World."""
 
     part: Array
     """Number of the part."""
     share: Array
     """Where on it the contact is: 0 at its start, 1 at its end."""
     shape: Array
-    """Number of the shape."""
+    """Number of the shape; below 0 for another system's skin: -1 for the first one."""
     depth: Array
     """Overlap, m; negative for a distance."""
     place: Array
@@ -89,6 +100,8 @@ class End(NamedTuple):
     """Displacement of the shape in the step if it accelerates as in the last one, m, [..., 3]."""
     stretch: Array
     """Of the spring along the surface at the start of the step, m, [..., 3]; 0 if nothing is remembered."""
+    on: Spot | None = None
+    """Where it is on the skin of another system; None in a scene where this system meets no skin."""
 
 
 class Ends(NamedTuple):
@@ -97,7 +110,7 @@ class Ends(NamedTuple):
     rows: End
     """[c, ...]"""
     moving: Array
-    """Number of contacts with arms and free bodies, []."""
+    """Number of contacts with other systems, arms and free bodies, []. Those with other systems come first."""
     total: Array
     """Number of all contacts, []. Rows from there on are empty."""
     left_out: Array
@@ -130,6 +143,36 @@ class Response(NamedTuple):
     """On the ends if they move by `shift`, N, [c, 3]."""
     solved: Any
     """Whatever `yielding` and `apply` need."""
+    left_out: Any = 0
+    """Number of contacts with itself that found no room, []."""
+
+
+class Skin(NamedTuple):
+    """The nodes of a system whose skin others touch, n of them. World."""
+
+    position: Array
+    """m, [n, 3]"""
+    velocity: Array
+    """m/s, [n, 3]"""
+
+
+class Load(NamedTuple):
+    """Forces of other systems on the nodes of one, linear in the displacements of these in the step."""
+
+    force: Array
+    """Without displacement, N, [n, 3]."""
+    falls: Callable[[Array], Array]
+    """Takes displacements, m, [n, 3], returns by how much the forces fall, N, [n, 3]: symmetric and positive
+    semidefinite, with the unknowns of the other systems eliminated."""
+    touching: Array
+    """Whether there is any, [] bool."""
+
+    @classmethod
+    def sum(cls, loads: Sequence[Load]) -> Load:
+        """Return all of some loads as one."""
+        force = reduce(add, [load.force for load in loads])
+        touching = reduce(or_, [load.touching for load in loads])
+        return cls(force, lambda u: reduce(add, [load.falls(u) for load in loads]), touching)
 
 
 class Bars(NamedTuple):
@@ -221,3 +264,28 @@ class System(ABC):
         """Return the system with values drawn by a key: itself by default."""
         del key
         return self
+
+
+class SkinnedSystem(System):
+    """A system whose skin others touch: faces of four nodes each.
+
+    Its own parts touch arms, bodies and fixed things. Systems that have no skin touch it, in the same step: they
+    respond first, and load it with their forces and with how these fall as it moves.
+    """
+
+    @property
+    @abstractmethod
+    def faces(self) -> np.ndarray:
+        """Return the nodes around each face, counterclockwise as seen from outside, [f, 4]."""
+
+    @abstractmethod
+    def skin(self, state: Any) -> Skin:
+        """Return the nodes."""
+
+    @abstractmethod
+    def respond(self, state: Any, motion: Any, ends: Ends, dt: Any, load: Load | None = None) -> Response:
+        """Return the forces on the ends of its own contacts, as it bears a load, if any other system can touch it."""
+
+    @abstractmethod
+    def displacements(self, response: Response) -> Array:
+        """Return the displacements of the nodes in the step if the ends move by `shift`, m, [n, 3]."""

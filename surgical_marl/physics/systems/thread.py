@@ -219,7 +219,7 @@ class Thread(Soft):
             return -force, felt.stiffness[LOWER]
 
         force, falls = each(ends, at_end, moving=True)
-        return Response(force, Solved(found, ends, pairs, falls, holds))
+        return Response(force, Solved(found, ends, pairs, falls, holds), pairs.left_out)
 
     def yielding(self, response: Response, ends: Ends, accelerations: Array, dt: Any) -> Array:
         pushed, change = self._carried(response.solved, accelerations, dt)

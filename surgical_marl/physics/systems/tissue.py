@@ -25,7 +25,18 @@ from surgical_marl.physics.systems.channel import Channels
 from surgical_marl.physics.systems.channel_state import ChannelState, ChannelView
 from surgical_marl.physics.systems.needle import Needle
 from surgical_marl.physics.systems.soft import Soft
-from surgical_marl.physics.systems.system import Bars, Clusters, End, Ends, Followed, Response, Shapes
+from surgical_marl.physics.systems.system import (
+    Bars,
+    Clusters,
+    End,
+    Ends,
+    Followed,
+    Load,
+    Response,
+    Shapes,
+    Skin,
+    SkinnedSystem,
+)
 from surgical_marl.physics.systems.tissue_step import Answer, Held, TissueStep
 from surgical_marl.physics.tree_utils import row_of
 from surgical_marl.scenes.channel_file import ChannelFile
@@ -82,7 +93,7 @@ class Solved(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Tissue(Soft):
+class Tissue(Soft, SkinnedSystem):
     """A piece of tissue."""
 
     size: tuple[float, float, float]
@@ -161,6 +172,11 @@ class Tissue(Soft):
         return self.grid.surface()
 
     @cached_property
+    def faces(self) -> np.ndarray:
+        """The outer faces of its bricks, which threads touch."""
+        return self.grid.faces()
+
+    @cached_property
     def channels(self) -> Channels | None:
         """Channels of needles; None if none can go through."""
         if not (self.channel and self.needles):
@@ -231,15 +247,22 @@ class Tissue(Soft):
         centre, speed = jax.lax.map(part, jnp.arange(len(nodes), dtype=jnp.int32))
         return Shapes(centre, centre, np.full(len(nodes), ball, np.float32), speed, clusters)
 
+    def skin(self, state: TissueState) -> Skin:
+        return Skin(*state.nodes)
+
     def free_motion(self, state: TissueState, dt: Any) -> tuple[()]:
         """Return nothing: one stage has all forces."""
         return ()
 
-    def respond(self, state: TissueState, motion: Any, ends: Ends, dt: Any) -> Response:
+    def respond(self, state: TissueState, motion: Any, ends: Ends, dt: Any, load: Load | None = None) -> Response:
         ends = ends if self.channels else self.rubbed(ends)
         ends, held = recall(state.stretches, ends, len(self.points.nodes)), self._held(state, ends)
-        answer = self._step(dt).respond(state.nodes, held, ends)
+        answer = self._step(dt).respond(state.nodes, held, ends, load)
         return Response(-answer.force, Solved(answer, held, ends))
+
+    def displacements(self, response: Response) -> Array:
+        found: Array = response.solved.answer.shift
+        return found
 
     def yielding(self, response: Response, ends: Ends, accelerations: Array, dt: Any) -> Array:
         return pushes(response.solved.ends, response.solved.answer.falls, accelerations, dt)

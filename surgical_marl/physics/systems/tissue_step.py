@@ -24,7 +24,7 @@ from surgical_marl.physics.solver.cholesky import FULL, LOWER
 from surgical_marl.physics.systems.brick import CRUSHED, ITERATIONS, RESISTANCE
 from surgical_marl.physics.systems.brick_solve import LEFT, SHORTEST, BrickSolver, Nodes, Springs
 from surgical_marl.physics.systems.channel import Channels
-from surgical_marl.physics.systems.system import End, Ends
+from surgical_marl.physics.systems.system import End, Ends, Load
 from surgical_marl.physics.tree_utils import put, row_of
 
 ROUNDS, TURNS = 4, 3
@@ -112,8 +112,13 @@ class TissueStep:
         self.solver, self.tears, self.dt, self.channels = solver, tears, dt, channels
         self.feel = channels.feel if channels else feel
 
-    def respond(self, nodes: Nodes, held: Held, ends: Ends) -> Answer:
-        """Return the displacements of nodes whose contacts' ends move as expected, and the forces on these."""
+    def respond(self, nodes: Nodes, held: Held, ends: Ends, load: Load | None = None) -> Answer:
+        """Return the displacements of nodes whose contacts' ends move as expected, and the forces on these.
+
+        The load of other systems is no array that a kernel could read: with it the reference runs on a GPU too.
+        """
+        if load:
+            return self.answered(nodes, held, ends, self.solver.stiffer, self.mesh, load)
         stage = self._stage("respond", self.answered, held)
         return stage(nodes, held, ends, jnp.float32(self.solver.stiffer), self.mesh)
 
@@ -132,11 +137,15 @@ class TissueStep:
 
     # -- the reference
 
-    def answered(self, nodes: Nodes, held: Held, ends: Ends, stiffer: Any, mesh: Any) -> Answer:
+    def answered(
+        self, nodes: Nodes, held: Held, ends: Ends, stiffer: Any, mesh: Any, load: Load | None = None
+    ) -> Answer:  # fmt: skip
         """Return what `respond` does."""
         del mesh  # for the kernel
         solver, dt, touched = self.solver.stiffened(stiffer), self.dt, ends.total > 0
         linear = solver.linearise(nodes, dt)
+        if load:
+            linear, touched = linear._replace(force=linear.force + load.force), touched | load.touching
         iterations = jnp.where(touched, TURNS, ALONE)
 
         def spring(row: Array, end: End, u: Array) -> tuple[Array, Array]:
@@ -147,10 +156,13 @@ class TissueStep:
             u, residual, _ = found
             force, stiffness = each(ends, lambda row, end: spring(row, end, u))
             springs = Springs(*held, force, stiffness, ends.total)
-            u, residual = solver.improved(linear, springs, u, residual, dt, iterations, ENOUGH)
+            u, residual = solver.improved(linear, springs, u, residual, dt, iterations, ENOUGH, load and load.falls)
             return u, residual, each(ends, lambda row, _: force[row] - stiffness[row][FULL] @ _point(held, row, u))
 
-        start = linear.guess, solver.residual(linear, linear.guess, dt), jnp.zeros((len(held.nodes), 3))
+        residual = solver.residual(linear, linear.guess, dt)
+        if load:
+            residual -= load.falls(linear.guess)
+        start = linear.guess, residual, jnp.zeros((len(held.nodes), 3))
         u, _, force = jax.lax.fori_loop(0, jnp.where(touched, ROUNDS, 1), improve, start)
 
         def eased(row: Array, end: End) -> tuple[Array, Array]:
