@@ -2,24 +2,33 @@
 
 from __future__ import annotations
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from surgical_marl.physics.systems.channel_state import CUTS, PRESSES
+from surgical_marl.physics.systems.system import Ends
 from surgical_marl.physics.systems.tissue import TissueState
+from surgical_marl.physics.systems.tissue_step import TissueStep
 from surgical_marl.scenes.channel_file import ChannelFile
+from tests.helpers.block_kernels import run_block
 from tests.helpers.needle_bench import (
     ARC,
+    DT,
     PIN,
     SIZE,
     Seen,
     away,
+    bodies_at,
     joined,
     lead,
+    no_ends,
     sheet,
     straight,
     turning,
 )  # fmt: skip
+from tests.physics.test_tissue_step import DEVICES, close, shaken, touched
 
 SET = ChannelFile(puncture=0.2, cutting=0.05)
 TISSUE = sheet((PIN, ARC), SET)
@@ -144,3 +153,46 @@ def test_a_long_channel_keeps_every_other_place() -> None:
     assert reached > 0.023 and int(state.channels.total[0]) <= 16
     # the tip cuts; the needle of 20 mm is inside with all of its length
     assert -seen.force[-1, 0, 0] == pytest.approx(SET.friction * 0.02 + SET.cutting, rel=0.03)
+
+
+def test_other_contacts_of_a_needle_in_tissue_are_left_out(pierced: tuple[TissueState, Seen]) -> None:
+    """They would push it out near its entry and its exit. Others stay, in their order."""
+    state, _ = pierced
+    assert TISSUE.channels and state.channels
+    bodies = bodies_at(np.stack([below(-0.004), np.full(3, 0.3)]))
+    touching = jnp.asarray(np.stack([below(0.005), below(0.012), below(0.001)]))
+    rows = no_ends(TISSUE).rows
+    rows = rows._replace(
+        shape=rows.shape.at[:3].set(jnp.array([0, 0, 5])), place=rows.place.at[:3].set(touching),
+        depth=rows.depth.at[:3].set(jnp.array([1e-4, 2e-4, 3e-4])),
+    )  # fmt: skip
+    ends = Ends(rows, jnp.int32(2), jnp.int32(3), jnp.int32(0))
+    _, found = jax.jit(TISSUE.channels.follow, static_argnums=4)(
+        state.channels, state.nodes.position, ends, bodies, DT
+    )  # fmt: skip
+    own = int(found.total) - 2
+    assert (
+        own >= 6 and int(found.moving) == own + 1 and (np.asarray(found.rows.part)[:own] >= TISSUE.channels.first).all()
+    )
+    np.testing.assert_allclose(found.rows.depth[own : own + 2], [2e-4, 3e-4])
+
+
+def test_a_start_knows_nothing_of_what_was(pierced: tuple[TissueState, Seen]) -> None:
+    fresh = jax.tree.leaves(TISSUE.start(jnp.zeros((0, 3))))
+    changed = [np.any(np.asarray(a) != np.asarray(b)) for a, b in zip(fresh, jax.tree.leaves(pierced[0]), strict=True)]
+    assert sum(changed) > 8
+    again = drive(down(0.006, -0.004, 300))[1]
+    np.testing.assert_array_equal(again.force, pierced[1].force)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_cuda_code_has_the_same_forces(device: str) -> None:
+    """Of surface points, of what is in a channel, of tips that cut and of tips that press, mixed."""
+    channels = TISSUE.channels
+    assert channels
+    step, nodes, (held, ends) = TissueStep(TISSUE.solver, None, DT, channels), shaken(TISSUE, 3e-4), touched(TISSUE, 7)
+    kinds = np.array([0, channels.first, channels.pressing - 1, channels.pressing])
+    rows = ends.rows._replace(part=jnp.asarray(kinds[np.arange(len(ends.rows.part)) % 4], jnp.int32))
+    ends = ends._replace(rows=rows._replace(depth=jnp.where(rows.part == kinds[2], -1.0, rows.depth)))
+    expected = jax.jit(step.respond)(nodes, held, ends)
+    close(run_block(device, step.respond, nodes, held, ends), expected, 7, 2e-5)
