@@ -43,7 +43,7 @@ SIZE, CELLS, TISSUE = (0.06, 0.04, 0.005), (12, 8, 1), (27040.0, 0.4287, 1000.0)
 WEIGHT = {"thread": -9.81, "tissue": -0.981}
 """Gravity along z, m/s2."""
 HANGS = {"thread": 9.36, "tissue": 0.0976}
-"""Droop of the thread's end by the elastica, and of the sheet by a converged mesh (docs/soft.md), mm."""
+"""Droop of the thread's end by the elastica, and of the sheet by a converged mesh (docs/tissue.md), mm."""
 SETTLES = 0.05
 """Damping of the others' thread, as a share of its bending stiffness, s: about critical, so that it hangs still."""
 MOST_ROLLED = 256

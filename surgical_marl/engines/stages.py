@@ -81,16 +81,17 @@ def host_stage(name: str, reference: Callable[..., R]) -> Callable[..., R]:
 
 
 def _stage(name: str, reference: Callable[..., R], cuda: str | None = None, threads: int = 1) -> Callable[..., R]:
-    given = tuple(inspect.signature(reference).parameters)
+    given = inspect.signature(reference)
 
     @wraps(reference)
     def call(*arguments: Any) -> R:
         traced, shapes = jax.make_jaxpr(reference, return_shape=True)(*arguments)
         if any(isinstance(value, jax.core.Tracer) for value in traced.consts):
             raise ValueError(f"stage {name!r} uses a traced array that is not an argument: hand it over")
-        reads = [path for one, own in zip(given, arguments, strict=True) for path in _inputs(one, own)]
+        named = given.bind(*arguments).arguments  # without those that have a default and are not given
+        reads = [path for one, own in named.items() for path in _inputs(one, own)]
         if cuda is None:  # the host knows its only argument by the name of the stage
-            reads = [path.removeprefix(f"{given[0]}.") for path in reads]
+            reads = [path.removeprefix(f"{next(iter(named))}.") for path in reads]
         how = Call(name, traced, tuple(reads), paths(shapes), cuda, threads)
         found = _stage_p.bind(*jax.tree.leaves(arguments), call=how)
         return jax.tree.unflatten(jax.tree.structure(shapes), found)
