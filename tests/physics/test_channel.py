@@ -142,6 +142,23 @@ def test_turned_back_it_leaves_and_the_tissue_relaxes(sewn: tuple[TissueState, S
     assert again.channels and int(again.channels.needle[0]) == 1 and int(again.channels.total[1]) == 0
 
 
+def test_several_channels_at_once_and_room_for_four() -> None:
+    """A pin goes in and is drawn out again at five places, then two needles go in."""
+    state, steps = None, 200
+    way = np.concatenate([np.linspace(0.0055, -0.005, steps // 2 + 1), np.linspace(-0.005, 0.03, steps // 2)])
+    for number in range(5):
+        place = np.array([0.006 + 0.004 * number, 0.01, 0.0])
+        state, seen = lead(TISSUE, joined(straight(place + way[:, None] * [0, 0, 1]), away(steps + 1)), state)
+        expected = [True] * min(number + 1, 4) + [False] * max(3 - number, 0)
+        assert seen.channels.there[-1].tolist() == seen.channels.through[-1].tolist() == expected
+        assert seen.channels.needle[-1].tolist() == [-1] * 4
+    # the fifth has taken the place of one that nothing was in
+    assert np.abs(seen.channels.entry_at_rest[-1, :, 0] - (0.006 + 0.004 * 4)).min() < 5e-4
+    both = joined(straight(down(0.0055, -0.002, 200)), turning((0.024, 0.0083, 0.0055), np.linspace(0.1, -1.3, 201)))
+    _, seen = lead(TISSUE, both)
+    assert set(seen.channels.needle[-1].tolist()) == {-1, 0, 1}
+
+
 def test_a_long_channel_keeps_every_other_place() -> None:
     """A pin that goes along the sheet, in its middle, for 25 mm."""
     turn = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])  # down becomes along x

@@ -24,7 +24,7 @@ from surgical_marl.physics.systems.brick_grid import BrickGrid
 from surgical_marl.physics.systems.channel_state import CUTS, FREE, POINTS, ChannelState, ChannelView, Tips, hold
 from surgical_marl.physics.systems.material import Material, Spot
 from surgical_marl.physics.systems.needle import Arc, Needle
-from surgical_marl.physics.systems.puncture import Advance
+from surgical_marl.physics.systems.puncture import Advance, Punctures, ends_of
 from surgical_marl.physics.systems.system import End, Ends, Followed
 from surgical_marl.physics.tree_utils import put, room, row_of
 from surgical_marl.scenes.channel_file import ChannelFile
@@ -57,6 +57,7 @@ class Channels:
         """The first number of these parts; from `pressing` on they are tips that press."""
         self._cutting = points + about.most * POINTS
         self.pressing = self._cutting + len(needles)
+        self._punctures = Punctures(about, self.material, tuple(needle.wire for needle in needles), tip)
         self._clear = 0.6 * float(max(grid.cell[:2]))  # surface points are half a brick apart
 
     @property
@@ -128,7 +129,7 @@ class Channels:
 
         def of_needle(n: Array, now: tuple[ChannelState, Ends]) -> tuple[ChannelState, Ends]:
             arc = row_of(arcs, n)
-            state, refused = Advance(self, n, arc, position).after(now[0])
+            state, refused = Advance(self._punctures, n, arc, position).after(now[0])
             state, found = self._of_needle(state, n, arc, position, now[1], row_of(bodies, n), dt)
             return state, found._replace(left_out=found.left_out + refused)
 
@@ -179,7 +180,7 @@ class Channels:
 
         state, ends = jax.lax.fori_loop(0, self.about.most, of_own, (state, ends))
         tips = row_of(state.tips, n)
-        place, inwards = self.surface(position, tips.face, tips.touch)
+        place, inwards = self.material.surface(position, tips.face, tips.touch)
         presses = row(
             self.pressing + n, arc.tip, depth=inwards @ (arc.tip - place), normal=inwards,
             stiffness=jnp.float32(self.tip), sliding=jnp.float32(SHARP), stretch=tips.stretch,
@@ -191,14 +192,6 @@ class Channels:
         )  # fmt: skip
         end = jax.tree.map(lambda a, b: jnp.where(tips.does == CUTS, a, b), cuts, presses)
         return state, _after(ends, end, tips.does != FREE, True)
-
-    def surface(self, position: Array, face: Array, touch: Array) -> tuple[Array, Array]:
-        """Return the place of a point of a face in the world, m, [3], and the unit vector inwards there, [3]."""
-        sign = 1.0 - 2.0 * (face % 2)
-        axis = (np.arange(3) == face // 2).astype(jnp.float32)
-        slopes = self.material.slopes(position, touch + 1e-3 * sign * axis)
-        inwards = sign * (axis @ slopes)
-        return self.material.place(position, touch), inwards / jnp.sqrt(jnp.maximum(inwards @ inwards, 1e-12))
 
     def _inside(self, state: ChannelState, c: Array, i: Array, s: Array, arc: Arc) -> Array:
         """Return the length of a needle that a place of a channel holds, m: half the way to both neighbours.
@@ -219,7 +212,7 @@ class Channels:
 
         def span(c: Array) -> Array:
             arc = row_of(arcs, jnp.maximum(state.needle[c], 0))
-            first, last = self.ends_of(state, c, arc, position)
+            first, last = ends_of(self.material, state, c, arc, position)
             return jnp.stack([last - self._clear, first + self._clear])
 
         spans = jax.lax.map(span, jnp.arange(self.about.most, dtype=jnp.int32))
@@ -234,12 +227,6 @@ class Channels:
             return _after(found, end, keeps, row < ends.moving)
 
         return jax.lax.fori_loop(0, ends.total, add, found)
-
-    def ends_of(self, state: ChannelState, c: Array, arc: Arc, position: Array) -> tuple[Array, Array]:
-        """Return how far behind a tip the first and the last place of a channel are along a centre line, m."""
-        last = jnp.maximum(state.total[c] - 1, 0)
-        first, last = (self.material.place(position, state.places[c, i]) for i in (0, last))
-        return arc.nearest(first), arc.nearest(last)
 
     # -- outputs
 

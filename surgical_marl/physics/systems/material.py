@@ -58,6 +58,20 @@ class Material:
         nodes, _, ranks = self._tetrahedron(at)
         return _slopes(position[nodes], ranks)
 
+    def surface(self, position: Array, face: Array, touch: Array) -> tuple[Array, Array]:
+        """Return the place of a point of a face in the world, m, [3], and the unit vector inwards there, [3].
+
+        Args:
+            position: of the nodes, m, [n, 3].
+            face: twice the axis that it is across, plus 1 if inwards is down along it.
+            touch: the point's place in the material, [3].
+        """
+        sign = 1.0 - 2.0 * (face % 2)
+        axis = (np.arange(3) == face // 2).astype(jnp.float32)
+        slopes = self.slopes(position, touch + 1e-3 * sign * axis)
+        inwards = sign * (axis @ slopes)
+        return self.place(position, touch), inwards / jnp.sqrt(jnp.maximum(inwards @ inwards, 1e-12))
+
     def locate(self, position: Array, guess: Array, place: Array) -> Array:
         """Return the place in the material [3] that is at a place in the world, m, [3], beginning at a guess."""
         far = self.cells + BESIDE

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,22 +10,32 @@ import numpy as np
 from jax import Array
 
 from surgical_marl.physics.systems.channel_state import CUTS, FREE, POINTS, PRESSES, ChannelState, Tips
+from surgical_marl.physics.systems.material import Material
 from surgical_marl.physics.systems.needle import Arc
 from surgical_marl.physics.tree_utils import put, row_of
-
-if TYPE_CHECKING:
-    from surgical_marl.physics.systems.channel import Channels
+from surgical_marl.scenes.channel_file import ChannelFile
 
 AHEAD = 0.002
 """Distance from a face below which the contact of a tip is listed, m."""
 
 
+class Punctures(NamedTuple):
+    """The constants of tips in one piece of tissue."""
+
+    about: ChannelFile
+    material: Material
+    wires: tuple[float, ...]
+    """Radius of each needle, m."""
+    tip: float
+    """Stiffness of the contact of a tip, N/m."""
+
+
 class Advance:
     """What becomes of one needle's channels as its tip has moved in the last step."""
 
-    def __init__(self, channels: Channels, n: Array, arc: Arc, position: Array) -> None:
-        self._channels, self._n, self._arc, self._position = channels, n, arc, position
-        self._about, self._material = channels.about, channels.material
+    def __init__(self, constants: Punctures, n: Array, arc: Arc, position: Array) -> None:
+        self._about, self._material, self._wires, self._stiffness = constants
+        self._n, self._arc, self._position = n, arc, position
 
     def after(self, state: ChannelState) -> tuple[ChannelState, Array]:
         """Return the state, and 1 if a tip would enter and there is no room for its channel."""
@@ -45,7 +55,7 @@ class Advance:
         )
         cuts = ((cut >= 0) & (front >= 0) & ~state.through[jnp.maximum(cut, 0)]) | (opened == 1)
         does = jnp.where(cuts, CUTS, jnp.where(presses & (opened < 0), PRESSES, FREE))
-        start = -self._about.cutting / self._channels.tip * self._arc.along
+        start = -self._about.cutting / self._stiffness * self._arc.along
         stretch = jnp.where(opened == 1, start, before.stretch)
         own = Tips(at, face, touch, does, jnp.where(does == before.does, before.stretch, stretch), before.pressed)
         return state._replace(tips=put(state.tips, n, own)), refused
@@ -54,13 +64,13 @@ class Advance:
         """Return channels without those that the needle has left, and in which it is.
 
         Return also the number of the channel that it cuts, -1 for none, how far its tip is ahead of that channel's last
-        place, m, and whether the tip is in a channel that goes on ahead of it.
+        place, m, and whether the tip is in a channel that goes on ahead of it, or at its exit.
         """
         room = self._about.spacing / 2
 
         def look(c: Array, found: tuple[Array, ...]) -> tuple[Array, ...]:
             count, needle, cut, front, within = found
-            first, last = self._channels.ends_of(state, c, self._arc, self._position)
+            first, last = ends_of(self._material, state, c, self._arc, self._position)
             mine = needle[c] == self._n
             out = mine & ((~inside & (first < -room)) | (last > self._arc.length + room))
             mine &= ~out
@@ -68,7 +78,7 @@ class Advance:
             return (
                 count.at[c].set(jnp.where(out & (count[c] < 2), 0, count[c]), mode="promise_in_bounds"),
                 needle.at[c].set(jnp.where(out, -1, needle[c]), mode="promise_in_bounds"),
-                jnp.where(cuts, c, cut), jnp.where(cuts, last, front), within | (mine & (last < 0)),
+                jnp.where(cuts, c, cut), jnp.where(cuts, last, front), within | (mine & (last < room)),
             )  # fmt: skip
 
         start = state.total, state.needle, jnp.int32(-1), jnp.float32(0.0), jnp.bool_(False)
@@ -111,13 +121,13 @@ class Advance:
         plane = jnp.where(inside, before.touch, jnp.floor(at) + (1 - face % 2))
         touch = jnp.where(axes, plane, at)
         under = jnp.floor(touch + 0.5 * axes * (1 - 2 * (face % 2))).astype(jnp.int32)
-        place, inwards = self._channels.surface(self._position, face, touch)
+        place, inwards = self._material.surface(self._position, face, touch)
         near = (face >= 0) & material.there(under) & (inwards @ (self._arc.tip - place) > -AHEAD)
         return face, touch, near
 
     def _deep(self, face: Array, touch: Array) -> Array:
         """Return whether the tip is below its face."""
-        place, inwards = self._channels.surface(self._position, face, touch)
+        place, inwards = self._material.surface(self._position, face, touch)
         return inwards @ (self._arc.tip - place) > 0
 
     def _opened(self, state: ChannelState, pressed: Array, touch: Array) -> tuple[ChannelState, Array, Array]:
@@ -126,7 +136,7 @@ class Advance:
         Return also 1 for a new channel, 0 for another one and -1 for none, and 1 if there was no room for one.
         """
         tip, none = self._arc.tip, jnp.int32(-1)
-        reach = 2 * jnp.asarray([needle.wire for needle in self._channels.needles])[self._n]
+        reach = 2 * jnp.asarray(self._wires)[self._n]
 
         def look(c: Array, found: tuple[Array, ...]) -> tuple[Array, ...]:
             again, empty, spare = found
@@ -165,3 +175,10 @@ def _crossed(before: Array, after: Array) -> Array:
     plane = jnp.where(way > 0, jnp.floor(before) + 1, jnp.floor(before))
     share = jnp.where(jnp.abs(way) > 1e-9, (plane - before) / jnp.where(jnp.abs(way) > 1e-9, way, 1.0), 1.0)
     return before + jnp.clip(jnp.min(share), 0.0, 1.0) * way
+
+
+def ends_of(material: Material, state: ChannelState, c: Array, arc: Arc, position: Array) -> tuple[Array, Array]:
+    """Return how far behind a tip the first and the last place of a channel are along a centre line, m."""
+    last = jnp.maximum(state.total[c] - 1, 0)
+    first, last = (material.place(position, state.places[c, i]) for i in (0, last))
+    return arc.nearest(first), arc.nearest(last)
