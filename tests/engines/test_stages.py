@@ -281,7 +281,7 @@ class Emulated:
 
     @staticmethod
     def relax(height: Any, speed: Any, middle: Any, part: Any, normal: Any, *rest: Any) -> Nodes:
-        return relax(Nodes(height, speed), middle, part, normal, Response(*rest[:2]), *rest[2:])
+        return relax(Nodes(height, speed), middle, part, normal, Response(*rest[:3]), *rest[3:])
 
     def __init__(self, engine: Any, stage: Any) -> None:
         self.engine, self.stage = engine, stage
@@ -295,7 +295,7 @@ class Emulated:
     def launch(self, *_: Any) -> None:
         reference = press if self.stage.name == "press" else self.relax
         results = jax.vmap(reference)(*map(self.read, self.stage.reads.values()))
-        for leaf, values in zip(self.stage.writes.values(), results, strict=True):
+        for leaf, values in zip(self.stage.writes.values(), jax.tree.leaves(results), strict=True):
             self.engine._arrays.write(leaf, values)
 
 

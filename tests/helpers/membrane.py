@@ -36,12 +36,12 @@ class Nodes(NamedTuple):
 def press(
     speed: Array, middle: Array, total: Array, part: Array, depth: Array, normal: Array, shift: Array,
     stiffness: Array, dt: Array,
-) -> Response:  # fmt: skip
+) -> dict[str, Array]:  # fmt: skip
     """Return the forces of springs on the ends of contacts, N, [c, 3], and by how much they yield, N per m/s2, [c]."""
     ahead = depth + jnp.sum(shift * normal, -1) - dt * speed[middle[part]] * normal[:, 0]
     pressing = (np.arange(ROOM) < total) & (depth > 0) & (ahead > 0)
     felt = jnp.where(pressing, stiffness, 0.0)
-    return Response(-(felt * ahead)[:, None] * normal, dt**2 * felt)
+    return {"force": -(felt * ahead)[:, None] * normal, "solved": dt**2 * felt}
 
 
 PRESS = """
@@ -82,6 +82,15 @@ def relax(
     start = state.height.reshape(ROWS, COLUMNS), state.speed.reshape(ROWS, COLUMNS)
     height, speed = jax.lax.fori_loop(0, SWEEPS, sweep, start)
     return Nodes(height.ravel(), speed.ravel())
+
+
+def found(ends: Ends, rows: Any) -> Any:
+    """Return rows of contacts with zeros where there are none: those are not defined."""
+
+    def there(x: Array) -> Array:
+        return jnp.where((np.arange(ROOM) < ends.total).reshape(-1, *[1] * (x.ndim - 1)), x, jnp.zeros_like(x))
+
+    return jax.tree.map(there, rows)
 
 
 RELAX = (
@@ -146,14 +155,15 @@ class Membrane(System):
         return ()
 
     def respond(self, state: Nodes, motion: Any, ends: Ends, dt: Any) -> Response:
-        r = ends.rows
+        r = found(ends, ends.rows)
         seen = state.speed, MIDDLE, ends.total, r.part, r.depth, r.normal, r.shift, r.stiffness
-        return block_stage(press, PRESS, threads=32)(*seen, np.float32(dt))
+        return Response(**block_stage(press, PRESS, threads=32)(*seen, np.float32(dt)))
 
     def yielding(self, response: Response, ends: Ends, accelerations: Array, dt: Any) -> Array:
-        along = jnp.sum(ends.rows.normal * accelerations, -1)
-        return (response.solved * along)[:, None] * ends.rows.normal
+        normal, accelerations = found(ends, (ends.rows.normal, accelerations))
+        return (response.solved * jnp.sum(normal * accelerations, -1))[:, None] * normal
 
     def apply(self, state: Nodes, response: Response, ends: Ends, accelerations: Array, dt: Any) -> Nodes:
         stage = block_stage(relax, RELAX, threads=NODES)
-        return stage(state, MIDDLE, ends.rows.part, ends.rows.normal, response, accelerations, np.float32(dt))
+        part, normal, accelerations = found(ends, (ends.rows.part, ends.rows.normal, accelerations))
+        return stage(state, MIDDLE, part, normal, response, accelerations, np.float32(dt))

@@ -62,7 +62,7 @@ systems:
 randomisation:
   {offset_angle: 0, offset_slide: 0, backlash_angle: 0, backlash_slide: 0, noise_angle: 0, noise_slide: 0, stiffness: 0,
    damping: 0, friction: 0, payload: 0, latency: 0, object_shift: 0, object_turn: 0, object_size: 0, object_mass: 0,
-   object_friction: 0}
+   object_friction: 0, thread_stiffness: 0, thread_friction: 0, tissue_stiffness: 0, tissue_friction: 0}
 observe: {psm_0: [qpos]}
 """,
     ObjectFile: f"""
@@ -114,6 +114,7 @@ springs: {right: 1.0e+6}
 friction: {sliding: 1, torsion: 0}
 stiffness: 5000
 tears: 2
+channels: {most: 1, puncture: 1, cutting: 1, friction: 1, stiffness: 1000, spacing: 0.001}
 colour: [1, 0, 0]
 """,
 }

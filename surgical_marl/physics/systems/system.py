@@ -112,7 +112,7 @@ class Ends(NamedTuple):
     moving: Array
     """Number of contacts with other systems, arms and free bodies, []. Those with other systems come first."""
     total: Array
-    """Number of all contacts, []. Rows from there on are empty."""
+    """Number of all contacts, []. Rows from there on may hold anything."""
     left_out: Array
     """Number of contacts that found no room, []."""
 
