@@ -28,6 +28,7 @@ def scene_file(folder: Path, arm: str, objects: dict[str, Any]) -> str:
     return str(path)
 
 
+@pytest.mark.slow
 def test_a_needle_and_its_thread_keep_their_momentum(tmp_path: Path) -> None:
     """The thread is thrown away along itself; together both fall as weight says, however they pull at each other."""
     objects = {

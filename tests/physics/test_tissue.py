@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import multiprocessing
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
 from itertools import pairwise
 from typing import Any
 
@@ -97,8 +100,14 @@ def test_its_own_modes_leave_six_free_motions() -> None:
     assert (np.abs(values) < 1e-9 * values[-1]).sum() == 6
 
 
-def test_its_forces_are_a_gradient_and_conjugate_gradients_can_use_its_derivative() -> None:
-    """On random shapes: no net force, no torque; the derivative is symmetric, its model too and positive."""
+def in_float64(function: Callable[[], Any]) -> Any:
+    """Return the results of a function in a process of its own, where JAX has met no other type before."""
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        return pool.submit(function).result()
+
+
+def gradients() -> tuple[np.ndarray, ...]:
+    """Return random shapes of a brick [50, 8, 3], its forces, their derivative and the model of it, in float64."""
 
     def one(x: Any) -> tuple[Any, Any, Any]:
         forces = lambda x: BRICK.deformed(x)[1]  # noqa: E731
@@ -109,19 +118,31 @@ def test_its_forces_are_a_gradient_and_conjugate_gradients_can_use_its_derivativ
     shapes = np.random.default_rng(0).uniform(0.4, 2.0, (50, 2)) * [1, 2e-4]
     with jax.enable_x64(True):
         x = np.stack([turned(k, stretch, noise) for k, (stretch, noise) in enumerate(shapes)])
-        forces, falls, model = (np.asarray(part) for part in jax.jit(jax.vmap(one))(jnp.asarray(x)))
+        return x, *(np.asarray(part) for part in jax.jit(jax.vmap(one))(jnp.asarray(x)))
+
+
+def test_its_forces_are_a_gradient_and_conjugate_gradients_can_use_its_derivative() -> None:
+    """On random shapes: no net force, no torque; the derivative is symmetric, its model too and positive."""
+    x, forces, falls, model = in_float64(gradients)
     largest = np.abs(falls).max((1, 2), keepdims=True)
+    assert forces.dtype == np.float64
     assert np.abs(forces.sum(1)).max() < 1e-12 and np.abs(np.cross(x, forces).sum(1)).max() < 1e-12
     assert np.abs((falls - falls.swapaxes(1, 2)) / largest).max() < 1e-6
     assert np.abs((model - model.swapaxes(1, 2)) / largest).max() < 1e-9
     assert (np.linalg.eigvalsh(model)[:, 0] > -1e-9 * largest[:, 0, 0]).all()
 
 
-def test_its_derivative_is_exact_when_stretched() -> None:
+def derivative() -> tuple[np.ndarray, np.ndarray]:
+    """Return the model's derivative along a direction, and the exact one, both in float64."""
     with jax.enable_x64(True):
         x, u = jnp.asarray(turned(0, 1.5, 0.0)), jnp.asarray(np.random.default_rng(1).normal(size=(8, 3)))
         exact = -jax.jit(lambda x, u: jax.jvp(lambda x: BRICK.deformed(x)[1], (x,), (u,))[1])(x, u)
         found = jax.jit(lambda x, u: BRICK.product(BRICK.deformed(x)[0], u))(x, u)
+        return np.asarray(found), np.asarray(exact)
+
+
+def test_its_derivative_is_exact_when_stretched() -> None:
+    found, exact = in_float64(derivative)
     np.testing.assert_allclose(found, exact, atol=1e-6 * np.abs(exact).max())
 
 
