@@ -74,7 +74,7 @@ class Meeting(NamedTuple):
     expected: tuple[Array, Array]
     """Accelerations of joints [a, m] and of bodies [k, 6] that its response assumes: those of the last step."""
     awake: Any
-    """Whether it moves, [] bool; True of a system that never sleeps. There is nothing in the rest unless it does."""
+    """True if it moves, [] bool; always of a system that never sleeps. There is nothing in the rest unless it does."""
     state: Any = None
     """At the start of the step, if it follows needles; None for that after the last step."""
 

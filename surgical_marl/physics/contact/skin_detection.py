@@ -19,7 +19,7 @@ from surgical_marl.physics.tree_utils import put, when
 from surgical_marl.scenes.objects import Surface
 
 DEEPEST = 0.004
-"""How deep in another system a part may be at most, m. Past it the part is not found."""
+"""Greatest depth of a part in another system, m. Past it the part is not found."""
 CLOSE = 2e-5
 """Distance of a part's middle from a skin, m, below which their direction is that of the face."""
 

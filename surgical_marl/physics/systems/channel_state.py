@@ -45,7 +45,7 @@ class ChannelState(NamedTuple):
     needle: Array
     """Number of the needle that is in it, [c]; -1 for none."""
     through: Array
-    """Whether the tip has come out at the other end, [c] bool."""
+    """True once the tip has come out at the other end, [c] bool."""
     swept: Array
     """Way of the needle across its centre line in it, m, [c]."""
     tips: Tips
@@ -68,7 +68,7 @@ class ChannelView(NamedTuple):
     there: Array
     """Which there are, [c] bool; all else is 0 of the others."""
     through: Array
-    """Whether the tip has come out at the other end, [c] bool."""
+    """True once the tip has come out at the other end, [c] bool."""
     needle: Array
     """Number of the needle that is in each, [c]; -1 for none."""
 

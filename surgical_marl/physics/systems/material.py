@@ -22,7 +22,7 @@ from surgical_marl.physics.systems.brick_grid import BrickGrid
 REPETITIONS = 4
 """Newton steps to locate a place. The map is linear but for what is between a guess and the place."""
 BESIDE = 2.0
-"""How far outside of the grid places are told apart, in bricks."""
+"""Distance from the grid up to which places are told apart, in bricks."""
 
 
 class Spot(NamedTuple):

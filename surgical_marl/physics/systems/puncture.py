@@ -31,7 +31,7 @@ class Punctures(NamedTuple):
 
 
 class Advance:
-    """What becomes of one needle's channels as its tip has moved in the last step."""
+    """The change of one needle's channels as its tip has moved in the last step."""
 
     def __init__(self, constants: Punctures, n: Array, arc: Arc, position: Array) -> None:
         self._about, self._material, self._wires, self._stiffness = constants
