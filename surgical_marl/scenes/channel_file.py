@@ -9,7 +9,7 @@ from surgical_marl.untrusted.schema import number
 
 @dataclass(frozen=True)
 class ChannelFile:
-    """What a needle feels in tissue. Forces of puncture and cutting are those of needles in soft tissue."""
+    """The forces on a needle in tissue. Those of puncture and cutting are those of needles in soft tissue."""
 
     most: int = number(4, 1, 16)
     """Channels at a time."""

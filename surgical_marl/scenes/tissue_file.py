@@ -44,7 +44,7 @@ class TissueFile:
     tears: float | None = number(None, 1.01, 10.0)
     """Stretch, as a ratio of lengths, past which tissue counts as torn. It holds on nevertheless."""
     channels: ChannelFile | None = None
-    """What needles feel that go through; none does without this."""
+    """The forces on needles that go through; none does without this."""
     colour: Vector = rgb((0.75, 0.35, 0.33))
 
     def __post_init__(self) -> None:

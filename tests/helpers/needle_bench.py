@@ -53,7 +53,7 @@ class Pose(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """What is noted in each step."""
+    """The notes of each step."""
 
     force: Any
     """Of the tissue on each needle, N, [t, n, 3]."""

@@ -30,7 +30,7 @@ SHEET = {
 
 
 class Seen(NamedTuple):
-    """What is noted in each step."""
+    """The notes of each step."""
 
     place: Any
     """Of the thread's nodes, m, [n, 3]."""

@@ -40,7 +40,7 @@ def strip(sliding: float = 0.4, **settings: Any) -> Tissue:
 
 
 class Seen(NamedTuple):
-    """What is noted in each step."""
+    """The notes of each step."""
 
     friction: Any
     """Of both pads on the tissue, along x, N."""

@@ -22,10 +22,10 @@ from jax import Array
 from surgical_marl.physics.contact.spring_contact import Felt, feel
 from surgical_marl.physics.systems.brick_grid import BrickGrid
 from surgical_marl.physics.systems.channel_state import CUTS, FREE, POINTS, ChannelState, ChannelView, Tips, hold
-from surgical_marl.physics.systems.material import Material, Spot
+from surgical_marl.physics.systems.material import Material
 from surgical_marl.physics.systems.needle import Arc, Needle
 from surgical_marl.physics.systems.puncture import Advance, Punctures, ends_of
-from surgical_marl.physics.systems.system import End, Ends, Followed
+from surgical_marl.physics.systems.system import End, Ends, Followed, Spot
 from surgical_marl.physics.tree_utils import put, room, row_of
 from surgical_marl.scenes.channel_file import ChannelFile
 

@@ -10,28 +10,18 @@ nodes, and neighbouring bricks agree on their faces. Outside of the grid the map
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from surgical_marl.physics.systems.brick_grid import BrickGrid
+from surgical_marl.physics.systems.system import Spot
 
 REPETITIONS = 4
 """Newton steps to locate a place. The map is linear but for what is between a guess and the place."""
 BESIDE = 2.0
 """Distance from the grid up to which places are told apart, in bricks."""
-
-
-class Spot(NamedTuple):
-    """A point of the material on four nodes."""
-
-    nodes: Array
-    """[4]"""
-    weights: Array
-    """Their shares, [4]; they sum to 1."""
 
 
 class Material:

@@ -165,7 +165,7 @@ class Load(NamedTuple):
     """Takes displacements, m, [n, 3], returns by how much the forces fall, N, [n, 3]: symmetric and positive
     semidefinite, with the unknowns of the other systems eliminated."""
     touching: Array
-    """Whether there is any, [] bool."""
+    """True if there is any, [] bool."""
 
     @classmethod
     def sum(cls, loads: Sequence[Load]) -> Load:

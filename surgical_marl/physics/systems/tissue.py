@@ -122,7 +122,7 @@ class Tissue(Soft, SkinnedSystem):
     colour: tuple[float, float, float] = (0.75, 0.35, 0.33)
     """In pictures."""
     channel: ChannelFile | None = None
-    """What needles feel that go through it."""
+    """The forces on needles that go through it."""
     needles: tuple[Needle, ...] = ()
     """The needles that may."""
     file: ClassVar[type] = TissueFile

@@ -76,7 +76,7 @@ class Moved(NamedTuple):
     points: Array
     """Displacements of the points of contacts, m, [c, 3]."""
     torn: Array
-    """Whether any brick is stretched past its limit, [] bool."""
+    """True if any brick is stretched past its limit, [] bool."""
 
 
 class Mesh(NamedTuple):
